@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from bms_estimator.sources.captures.replay import load_capture
 
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
-"""Highlighting starts colorama, whose exit handler would block on an unread terminal."""
+"""numba highlights error messages with colorama, whose exit handler would block on an unread terminal."""
 
 __all__ = ["Estimator", "__version__", "estimate", "identify", "load_capture", "load_cell", "validate"]
 
-_HOME = {
+_MODULES = {
     "Estimator": "estimator",
     "estimate": "estimator",
     "identify": "calibration.elements.identify",
@@ -29,14 +29,14 @@ _HOME = {
     "load_cell": "model.cell",
     "validate": "calibration.validate",
 }
-"""Module of each public name. It is imported on first use, because numba alone takes longer than ``bms-estimator
---help`` may."""
+"""Module of each public name, imported on first use: importing numba alone would make ``bms-estimator --help`` too
+slow."""
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -25,8 +25,11 @@ from numba.core.dispatcher import Dispatcher
 __all__ = ["COMPILED_IN", "njit"]
 
 DIGEST_BYTES = 32
-_FILE: Any = IndexDataCacheFile
-_DUMP, _LOAD = _FILE._dump, _FILE._load_data  # noqa: SLF001 - numba has no other place for a check
+# Any, because methods of these classes are replaced below
+_Cache: Any = Cache
+_CacheFile: Any = IndexDataCacheFile
+_Dispatcher: Any = Dispatcher
+_numba_dump, _numba_load = _CacheFile._dump, _CacheFile._load_data  # noqa: SLF001 - numba has no public hook for a check
 _PACKAGE = Path(__file__).parent
 COMPILED_IN = (
     *sorted((_PACKAGE / "kernels").rglob("*.py")),
@@ -51,7 +54,7 @@ COMPILED_IN = (
 def _cache_folder() -> Path | None:
     """Return the folder of compiled kernels: NUMBA_CACHE_DIR, systemd's CacheDirectory, or the user's cache.
 
-    None without any.
+    Return None if none of these folders can be written.
     """
     digest = hashlib.sha256()
     for source in COMPILED_IN:
@@ -64,7 +67,7 @@ def _cache_folder() -> Path | None:
     ]
     for candidate in candidates:
         if candidate:
-            with contextlib.suppress(OSError, RuntimeError):  # the latter of a user without a home
+            with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: the user has no home folder
                 folder = Path(candidate).expanduser() / digest.hexdigest()[:16]
                 folder.mkdir(parents=True, exist_ok=True)
                 tempfile.TemporaryFile(dir=folder).close()
@@ -73,8 +76,8 @@ def _cache_folder() -> Path | None:
 
 
 @contextlib.contextmanager
-def _go_on(cache: Any) -> Iterator[None]:
-    """Context of each use of a kernel's files: any error costs only a compilation."""
+def _warn_on_cache_error(cache: Any) -> Iterator[None]:
+    """Turn errors of the cache into warnings: numba then compiles the kernel instead of loading it."""
     try:
         yield
     except OSError as error:
@@ -82,38 +85,38 @@ def _go_on(cache: Any) -> Iterator[None]:
     except Exception as error:  # noqa: BLE001 - a damaged file may raise anything
         warnings.warn(f"a compiled kernel cannot be read: {error!r}", RuntimeWarning, stacklevel=1)
         with contextlib.suppress(OSError):
-            cache.flush()
+            cache.flush()  # empties the index, so that the damaged file is not read again
 
 
-def _sealed(file: Any, kernel: Any) -> bytes:
-    """Append the digest to a cached kernel, or to the list of them."""
-    content: bytes = _DUMP(file, kernel)
+def _dump_with_digest(file: Any, kernel: Any) -> bytes:
+    """Serialize a kernel, or the index of a function's kernels, and append a digest."""
+    content: bytes = _numba_dump(file, kernel)
     return content + hashlib.sha256(content).digest()
 
 
-def _opened(file: Any, name: str) -> Any:
-    """Read a cached kernel and verify its digest.
+def _load_verified(file: Any, name: str) -> Any:
+    """Read a cached kernel and verify its digest. The index contains no machine code and is not verified.
 
     Raises:
-        ValueError: The file is not as it was written.
+        ValueError: The file was changed after it was written.
     """
-    kept = Path(file._data_path(name)).read_bytes()  # noqa: SLF001 - as numba's own method has it
-    if hashlib.sha256(kept[:-DIGEST_BYTES]).digest() != kept[-DIGEST_BYTES:]:
+    stored = Path(file._data_path(name)).read_bytes()  # noqa: SLF001 - as in numba's own method
+    content, digest = stored[:-DIGEST_BYTES], stored[-DIGEST_BYTES:]
+    if hashlib.sha256(content).digest() != digest:
         raise ValueError(f"{name} is damaged")
-    return _LOAD(file, name)
+    return _numba_load(file, name)  # unpickling ignores the digest after the pickle
 
 
-def _keep(folder: Path | None) -> None:
-    """Have numba keep compiled kernels in ``folder``."""
-    cache: Any = Cache  # methods of both are replaced, which the types do not express
-    kernel: Any = Dispatcher
+def _enable_disk_cache(folder: Path | None) -> None:
+    """Let numba store compiled kernels in ``folder``. Without a folder each process compiles them."""
     if folder is None:
         warnings.warn("compiled kernels are not kept: no folder can be written", RuntimeWarning, stacklevel=1)
-        kernel.enable_caching = lambda _: None
+        _Dispatcher.enable_caching = lambda _: None
         return
     numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
-    cache._guard_against_spurious_io_errors = _go_on  # noqa: SLF001 - numba's place for it, empty but on Windows
-    _FILE._dump, _FILE._load_data = _sealed, _opened  # noqa: SLF001
+    # numba's context manager around each access to the cache; numba's own does nothing except on Windows
+    _Cache._guard_against_spurious_io_errors = _warn_on_cache_error  # noqa: SLF001
+    _CacheFile._dump, _CacheFile._load_data = _dump_with_digest, _load_verified  # noqa: SLF001
 
 
-_keep(_cache_folder())
+_enable_disk_cache(_cache_folder())

@@ -6,7 +6,8 @@ from typing import Self
 
 import numpy as np
 
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
+from bms_estimator.sources.source import ReceivedSamples
 
 
 class ScriptedSource:
@@ -14,10 +15,9 @@ class ScriptedSource:
 
     def __init__(self) -> None:
         self.counters: dict[str, int] = {"frames_received": 0, "frames_lost": 0, "crc_errors": 0, "reconnects": 0}
-        self.message: str | None = None
+        self.silence_reason: str | None = None
         self.board: dict[str, str] = {}
         self.clock_ppm: float | None = None
-        self.cells: CellBlock = NO_CELLS
         self._queue: asyncio.Queue[SampleBlock | None] = asyncio.Queue()
 
     async def __aenter__(self) -> Self:
@@ -26,10 +26,10 @@ class ScriptedSource:
     async def __aexit__(self, *_: object) -> None:
         pass
 
-    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+    async def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         while (block := await self._queue.get()) is not None:
             self.counters["frames_received"] += block.size
-            yield block
+            yield ReceivedSamples(block, NO_CELLS)
 
     def give(self, *rows: tuple[float, float, float] | tuple[float, float, float, float, int]) -> None:
         """Add a block with rows of (time_s, current_a, voltage_v[, temperature_c, status])."""

@@ -1,7 +1,8 @@
-"""Identification of a fuel cell from polarisation curves and records under changing current, section 7.3 of the thesis.
+"""Identification of a fuel cell from polarization curves and records under changing current, section 7.3 of the thesis.
 
-The voltage is fitted by least squares over the logarithms of all parameters, with the kernel that the observer runs. A
-parameter with a relative std above ``MAX_RELATIVE_STD`` is not changed, and the result states the reason.
+The voltage is fitted by least squares with the kernel that the observer runs. The unknowns theta are the logarithms of
+the parameters relative to their initial values. A parameter with a relative std above ``MAX_RELATIVE_STD`` is not
+changed, and the result states the reason.
 """
 
 import math
@@ -23,7 +24,7 @@ from bms_estimator.model.fuel_cell import FuelCellModel, Parameter
 MAX_RELATIVE_STD = 0.3
 """Maximum relative std of a parameter that the data determine."""
 MAX_LN_CHANGE = math.log(100.0)
-"""Maximum magnitude of ln of the ratio between a parameter and its value in the file."""
+"""Maximum magnitude of theta, the ln of the ratio between a parameter and its initial value."""
 FIT_PASSES = 3
 """Number of successive fits. The residuals of each fit give the weights of the sources in the next."""
 MIN_STD_V = 1e-4
@@ -46,11 +47,11 @@ REQUIRED_DATA = {
 
 @dataclass(frozen=True)
 class Source:
-    """Measured voltages of a polarisation curve or a record. Arrays have shape (n,).
+    """Measured voltages of a polarization curve or a record. Arrays have shape (n,).
 
     Attributes:
         name: Name for messages.
-        time_s: Increasing times [s]; None: a polarisation curve of steady-state points.
+        time_s: Increasing times [s]; None: a polarization curve of steady-state points.
         current_a: Current [A], positive when the stack delivers power.
         voltage_v: Voltage of the stack [V].
         temperature_c: Temperature [C]; NaN without a sensor.
@@ -62,11 +63,11 @@ class Source:
     voltage_v: Floats
     temperature_c: Floats
 
-    def predict(self, file: Floats, theta: Floats) -> tuple[Floats, Floats]:
-        """Return the model's voltage [V] and its derivatives by theta, shape (n, 8)."""
+    def predict(self, initial_parameters: Floats, theta: Floats) -> tuple[Floats, Floats]:
+        """Return the model's voltage [V] and its derivatives by theta, shape (n, LEARNABLE)."""
         if self.time_s is None:
-            return polarisation(file, theta, self.current_a, self.temperature_c)
-        return open_loop(file, theta, self.time_s, self.current_a, self.temperature_c)
+            return polarisation(initial_parameters, theta, self.current_a, self.temperature_c)
+        return open_loop(initial_parameters, theta, self.time_s, self.current_a, self.temperature_c)
 
 
 @dataclass(frozen=True)
@@ -88,33 +89,35 @@ def fit_fuel_cell(sources: Sequence[Source], start: FuelCellModel) -> FuelCellFi
     """Identify the parameters of a stack.
 
     Args:
-        sources: Polarisation curves and records.
+        sources: Polarization curves and records.
         start: Initial values. A parameter that the data do not determine has its initial value in the result.
 
     Raises:
         UserError: The data determine no parameter.
     """
-    file, free, undetermined = start.a, list(range(len(NAMES))), dict[Parameter, str]()
+    initial_parameters, free, undetermined = start.a, list(range(len(NAMES))), dict[Parameter, str]()
     while free:
-        theta, covariance = _fit(sources, file, free)
+        theta, covariance = _fit(sources, initial_parameters, free)
         std = np.sqrt(np.diagonal(covariance))
         worst = int(np.argmax(std))
         if std[worst] <= MAX_RELATIVE_STD:
             break
-        j = free.pop(worst)
+        parameter = free.pop(worst)
         accuracy = f"only to {std[worst]:.0%}" if std[worst] < 1.0 else "not"
-        undetermined[KEYS[j]] = f"{accuracy} determined by these data; it needs {REQUIRED_DATA[NAMES[j]]}"
+        undetermined[KEYS[parameter]] = (
+            f"{accuracy} determined by these data; it needs {REQUIRED_DATA[NAMES[parameter]]}"
+        )
     if not free:
         reasons = "; ".join(f"{key}: it needs {REQUIRED_DATA[name]}" for key, name in zip(KEYS, NAMES, strict=True))
         raise UserError(f"these data determine no parameter of a fuel cell: {reasons}")
-    a = file.copy()
+    a = initial_parameters.copy()
     a[1 : 1 + len(NAMES)] *= np.exp(theta[: len(NAMES)])
-    rms_v = {source.name: _rms(source.voltage_v - source.predict(file, theta)[0]) for source in sources}
+    rms_v = {source.name: _rms(source.voltage_v - source.predict(initial_parameters, theta)[0]) for source in sources}
     return FuelCellFit(start.identified(a, _errors(a, free, covariance)), rms_v, undetermined)
 
 
-def _fit(sources: Sequence[Source], file: Floats, free: list[int]) -> tuple[Floats, Floats]:
-    """Fit the parameters ``free``; return theta, shape (8,), and their covariance."""
+def _fit(sources: Sequence[Source], initial_parameters: Floats, free: list[int]) -> tuple[Floats, Floats]:
+    """Fit the parameters with the indices ``free``; return theta, shape (LEARNABLE,), and their covariance."""
     theta, weights = np.zeros(LEARNABLE), np.ones(len(sources))
 
     def full_theta(values: Floats) -> Floats:
@@ -122,22 +125,22 @@ def _fit(sources: Sequence[Source], file: Floats, free: list[int]) -> tuple[Floa
         full[free] = values
         return full
 
-    @lru_cache(maxsize=2)
+    @lru_cache(maxsize=2)  # residual and jacobian are called with equal values
     def predictions(values: bytes) -> list[tuple[Floats, Floats]]:
-        return [source.predict(file, full_theta(np.frombuffer(values))) for source in sources]
+        return [source.predict(initial_parameters, full_theta(np.frombuffer(values))) for source in sources]
 
     def residual(values: Floats) -> Floats:
         pairs = zip(weights, sources, predictions(values.tobytes()), strict=True)
-        return np.concatenate([w * (source.voltage_v - voltage_v) for w, source, (voltage_v, _) in pairs])
+        return np.concatenate([weight * (source.voltage_v - voltage_v) for weight, source, (voltage_v, _) in pairs])
 
     def jacobian(values: Floats) -> Floats:
         pairs = zip(weights, predictions(values.tobytes()), strict=True)
-        return np.concatenate([-w * psi[:, free] for w, (_, psi) in pairs])
+        return np.concatenate([-weight * derivatives[:, free] for weight, (_, derivatives) in pairs])
 
     for _ in range(FIT_PASSES):
-        found = least_squares(residual, theta[free], jacobian, bounds=(-MAX_LN_CHANGE, MAX_LN_CHANGE), x_scale=0.1)
-        theta = full_theta(found.x)
-        weights = np.array([_weight(source, file, theta, len(free)) for source in sources])
+        solution = least_squares(residual, theta[free], jacobian, bounds=(-MAX_LN_CHANGE, MAX_LN_CHANGE), x_scale=0.1)
+        theta = full_theta(solution.x)
+        weights = np.array([_weight(source, initial_parameters, theta, len(free)) for source in sources])
     information = jacobian(theta[free])
     return theta, np.linalg.pinv(information.T @ information, hermitian=True) + _null_space_variance(information)
 
@@ -150,9 +153,9 @@ def _null_space_variance(jacobian: Floats) -> Floats:
     return variance
 
 
-def _weight(source: Source, file: Floats, theta: Floats, parameters: int) -> float:
+def _weight(source: Source, initial_parameters: Floats, theta: Floats, parameters: int) -> float:
     """Return the inverse std of a source's voltage, reduced for correlated errors of successive samples."""
-    error_v = source.voltage_v - source.predict(file, theta)[0]
+    error_v = source.voltage_v - source.predict(initial_parameters, theta)[0]
     freedom = max(error_v.size - parameters, 1) / error_v.size
     rms_v = max(_rms(error_v) / math.sqrt(freedom), MIN_STD_V)
     return 1.0 / (rms_v * math.sqrt(_correlation_length(error_v) if source.time_s is not None else 1.0))

@@ -1,6 +1,7 @@
 """Validation of a cell on a capture: open-loop simulation with constant parameters.
 
-Section 5.3 and chapter 6 of the thesis validate in this way. (2.2)-(2.9) are equations of the thesis.
+Section 5.3 and chapter 6 of the thesis validate in this way. (2.2)-(2.9) of the thesis are the model of Chen and Mora:
+two RC pairs and a series resistance, whose elements are functions of SOC.
 """
 
 from dataclasses import dataclass
@@ -52,10 +53,11 @@ class Validation:
         final_soc: SOC at the last sample by coulomb counting.
         all: Errors over all samples.
         above: Errors over the samples at SOC above ``LOW_SOC``.
-        resting: Errors over the samples of ``above`` without current. They are errors of the OCV and of the relaxation.
+        resting: Errors over the samples of ``above`` without current, caused by the OCV and the relaxation.
         loaded: Errors over the samples of ``above`` with current.
-        extra_ohm: Additional series resistance that minimizes the errors ``above``, as of contacts, temperature or age [ohm].
-        without_extra_ohm: Errors over the samples of ``above`` with that resistance added.
+        extra_ohm: Additional series resistance that minimizes the errors ``above`` [ohm]. Its cause may be a contact,
+            the temperature or age.
+        with_extra_ohm: Errors over the samples of ``above`` that remain after ``extra_ohm`` was added to the model.
         warnings: Contradictions between capture and cell.
         time_s: Shape (n,), times of the good samples, from 0 [s].
         error_v: Shape (n,), measured less simulated voltage [V].
@@ -72,7 +74,7 @@ class Validation:
     resting: Errors
     loaded: Errors
     extra_ohm: float
-    without_extra_ohm: Errors
+    with_extra_ohm: Errors
     warnings: tuple[str, ...]
     time_s: Floats
     error_v: Floats
@@ -83,8 +85,8 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     """Simulate a capture's voltage from its current alone and compare it with the measured voltage.
 
     The simulation uses the RC ladder of the cell file at the capture's temperature, or (2.2)-(2.9) without a ladder.
-    Negative C_ts and C_tl (below delta1, delta2) are replaced with a small positive value, so that the simulation
-    continues.
+    Near empty the model's C_ts and C_tl are negative. They are replaced with a small positive value, so that the
+    simulation continues.
 
     Args:
         capture: Raw samples, rows of dtype ``SAMPLE``; it should start from rest.
@@ -107,19 +109,19 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     resting = np.abs(load.current_a) < REST_C_RATE * cell.cell.capacity_ah
     current_a = load.current_a[above]
     extra_ohm = -float(error_v[above] @ current_a) / max(float(current_a @ current_a), 1e-12)
-    found_from = "first rest" if load.resting_samples else "first sample under load"
+    measured_from = "first rest" if load.resting_samples else "first sample under load"
     return Validation(
         samples=load.samples,
         glitches=load.glitches,
         initial_soc=start,
-        initial_soc_from=found_from if initial_soc is None else "given",
+        initial_soc_from=measured_from if initial_soc is None else "given",
         final_soc=float(soc[-1]),
         all=_errors(error_v, load.voltage_v),
         above=_errors(error_v[above], load.voltage_v[above]),
         resting=_errors(error_v[above & resting], load.voltage_v[above & resting]),
         loaded=_errors(error_v[above & ~resting], load.voltage_v[above & ~resting]),
         extra_ohm=extra_ohm,
-        without_extra_ohm=_errors(error_v[above] + extra_ohm * current_a, load.voltage_v[above]),
+        with_extra_ohm=_errors(error_v[above] + extra_ohm * current_a, load.voltage_v[above]),
         warnings=tuple(warnings),
         time_s=load.time_s,
         error_v=error_v,

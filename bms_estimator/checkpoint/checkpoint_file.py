@@ -42,7 +42,7 @@ MAX_FILES = 8
 REJECTED = "refused: "
 """Prefix of the reason for rejecting a file."""
 MAX_LATER_FILES = 4
-"""Maximum number of quarantined files of later formats, for a return to their version."""
+"""Maximum number of quarantined files of later formats, which serve a return to the later version."""
 _COUNTER_FIELDS = "restarts", "total", "clean", "alarms"
 """Field names of the run counters in the file."""
 MAX_COUNT = 1e15
@@ -59,7 +59,7 @@ class RunCounters:
         restarts: Number of starts that found a checkpoint.
         total: Totals over all runs.
         clean: True if the last run ended without a crash or kill; False while it runs.
-        alarms: State of the alarms, as ``AlarmEvaluator.kept``.
+        alarms: State of the alarms, in the format of ``AlarmEvaluator.saved_state``.
     """
 
     restarts: int
@@ -150,32 +150,33 @@ class CheckpointFile:
 
     def load(self) -> CheckpointContent:
         """Read the file. An error is returned as the result's ``reason``."""
-        new = RunCounters(0, new_totals(self._now().wall_s))
+        zero_counters = RunCounters(0, new_totals(self._now().wall_s))
         try:
             with np.load(io.BytesIO(read_private(self.path, MAX_FILE_BYTES)), allow_pickle=False) as file:
                 return self._validate(file)
         except FileNotFoundError:
-            return CheckpointContent({}, 0.0, new, "none found")
+            return CheckpointContent({}, 0.0, zero_counters, "none found")
         except _RejectedError as error:
-            return CheckpointContent({}, 0.0, error.counters or new, f"{REJECTED}{error}")
+            return CheckpointContent({}, 0.0, error.counters or zero_counters, f"{REJECTED}{error}")
         except UnsafeFileError as error:
-            return CheckpointContent({}, 0.0, new, f"{REJECTED}{error}")
+            return CheckpointContent({}, 0.0, zero_counters, f"{REJECTED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
             return CheckpointContent(
-                {}, 0.0, new, f"{REJECTED}damaged, perhaps by a power cut ({type(error).__name__})"
+                {}, 0.0, zero_counters, f"{REJECTED}damaged, perhaps by a power cut ({type(error).__name__})"
             )
 
     def quarantine(self) -> str:
         """Rename a rejected file, so that the next save does not overwrite it. Return a description for the user.
 
         A file of a later format is valid. It gets a separate name, so that the later version can use it after a
-        re-upgrade. The user must restore the file, because this version meanwhile writes newer files, although these may
-        contain less learning.
+        re-upgrade. The user must rename it back: it is not loaded automatically, because this version meanwhile writes
+        newer files, although these may contain less learning.
         """
         quarantined = self.path.with_name(f"{self._name}.refused.npz")
         if self._is_later:
             paths = [self.path.with_name(f"{self._name}.later-{n}.npz") for n in range(1, MAX_LATER_FILES + 1)]
-            quarantined = next((path for path in paths if not path.exists()), paths[-1])
+            unused_paths = (path for path in paths if not path.exists())
+            quarantined = next(unused_paths, paths[-1])  # without an unused name the last file is overwritten
         self._content = {}
         try:
             self.path.replace(quarantined)
@@ -213,7 +214,6 @@ class CheckpointFile:
             days = f"{unseen_s / DAY_S:.1f} days old"
             raise _RejectedError(f"it is {days}, state.longest_days is {self._longest_days:g}", counters)
         self._content = {name: v for name, v in file.items() if name not in ("format", *_COUNTER_FIELDS)}
-        self._content |= {"identity": self._identity}
         if str(file["observer"]) != self._observer:
             state = without_observer(state)
         return CheckpointContent(state, unseen_s, counters, "")

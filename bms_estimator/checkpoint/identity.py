@@ -19,12 +19,12 @@ def pack_identity(settings: Settings, cell: PackModel) -> str:
     current. For a fuel cell, these are all parameters and the sign of the current. A changed description, tuning value
     or other setting does not change the hash.
     """
-    if isinstance(cell, FuelCellModel):  # the learned theta is relative to the parameters of the cell file
+    if isinstance(cell, FuelCellModel):  # learned parameters are stored relative to all parameters of the cell file
         return hashlib.sha256(repr((*cell.a, settings.sensor.current_sign)).encode()).hexdigest()
     ocv = cell.ocv
     curve = ocv.a if isinstance(ocv, ChenMoraOcv) else (*ocv.soc, *ocv.ocv_v)
-    meaning = (cell.cell.series_count, cell.cell.capacity_ah, settings.sensor.current_sign, *curve)
-    return hashlib.sha256(repr(meaning).encode()).hexdigest()
+    parts = (cell.cell.series_count, cell.cell.capacity_ah, settings.sensor.current_sign, *curve)
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 def observer_identity(settings: Settings, cell: PackModel) -> str:
@@ -36,18 +36,18 @@ def observer_identity(settings: Settings, cell: PackModel) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-def fields(record: NDArray[np.void], part: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
+def fields(record: NDArray[np.void], prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield name and view of each field of a structured array, recursively as ``part.field``."""
     for name in record.dtype.names or ():
         if record[name].dtype.names:
-            yield from fields(record[name], f"{part}{name}.")
+            yield from fields(record[name], f"{prefix}{name}.")
         else:
-            yield f"{part}{name}", record[name]
+            yield f"{prefix}{name}", record[name]
 
 
 def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Return the fields of a state that stay valid with another observer identity."""
     valid = "observer.soc", "observer.soc_coulomb", "observer.started"
-    # both of them are computed from the observer's estimates and are discarded with these
+    # ``learning`` and ``series_resistance`` are computed from the observer's estimates and are discarded with them
     prefixes = "observer.", "learning.", "series_resistance."
     return {name: v for name, v in state.items() if name in valid or not name.startswith(prefixes)}

@@ -19,11 +19,13 @@ from bms_estimator.kernels.observer.records import OBSERVER_STATE
 _DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
 OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
 """Fields of the observer's state that count since start."""
+_PARTS_WITHOUT_FILTER = ("observer.", "learning.", "series_resistance.")
+"""Prefixes of the fields that are also estimated while the filter is off."""
 EXTENDABLE_FIELDS = {"filter.mean": 1, "filter.covariance": 2}
 """Number of trailing axes along the filter's states, by field. Later versions append states at the end of these axes."""
 MAX_SOC_DIFFERENCE = 0.03
 """Maximum difference between the SOC of filter and observer. A larger difference shows that the filter was switched
-off."""
+off for some time, so that its state is outdated."""
 
 
 def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
@@ -40,21 +42,16 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
     Returns:
         Reason for which the state is invalid; empty if the estimator was restored.
     """
-    new = estimator.record.copy()
-    estimator.step(0.0, 0.0, estimator.cell.cell.nominal_voltage_v)
+    record_before = estimator.record.copy()
+    estimator.step(time_s=0.0, current_a=0.0, voltage_v=estimator.cell.cell.nominal_voltage_v)
     after_first_sample = estimator.record.copy()
     filter_was_on = bool(saved.get("filter.started", np.zeros(1))[0])
-    copy_known_fields(
-        estimator.record,
-        {
-            name: v
-            for name, v in saved.items()
-            if filter_was_on or name.startswith(("observer.", "learning.", "series_resistance."))
-        },
-    )
+    # a filter that was off has not initialized its fields
+    restored = {name: v for name, v in saved.items() if filter_was_on or name.startswith(_PARTS_WITHOUT_FILTER)}
+    copy_known_fields(estimator.record, restored)
     reason = _invalid_state_reason(estimator, after_first_sample)
     if reason:
-        estimator.record[...] = new
+        estimator.record[...] = record_before
         return reason
     f = estimator.record["filter"]
     soc_difference = abs(f["soc"][0] - estimator.state["soc"][0])
@@ -109,33 +106,34 @@ def _reset_switched_states(estimator: Estimator) -> None:
             f["covariance"][best, j, j] = variance
 
 
-def _invalid_state_reason(estimator: Estimator, first_state: NDArray[np.void]) -> str:
+def _invalid_state_reason(estimator: Estimator, after_first_sample: NDArray[np.void]) -> str:
     """Return the reason for which a state is invalid; empty if it is valid.
 
-    Values that are not finite after a first sample, in ``first_state``, are not checked.
+    Values that are not finite after a first sample are not checked.
     """
     record, cell = estimator.record, estimator.cell.cell
-    for (name, field), (_, first) in zip(fields(record), fields(first_state), strict=True):
+    for (name, field), (_, first_field) in zip(fields(record), fields(after_first_sample), strict=True):
         part, _, quantity = name.partition(".")
-        checked = np.isfinite(first)
+        checked = np.isfinite(first_field)
         if (
             part in ("observer", "learning", "series_resistance", "filter", "checks", "map")
             and not np.isfinite(field[checked]).all()
         ):
             return f"{quantity} of the {part} is not finite"
-    s = record[0]["observer"]
+    s, first = record[0]["observer"], after_first_sample[0]["observer"]
     if not s["started"]:
         return "it contains no sample"
     ranges = {
         "soc": (0.0, 1.0),
-        "v_ts": (-cell.voltage_max_v, cell.voltage_max_v),
+        "v_ts": (-cell.voltage_max_v, cell.voltage_max_v),  # voltages of the fast and the slow RC pair
         "v_tl": (-cell.voltage_max_v, cell.voltage_max_v),
-        "k": (0.0, np.inf),
+        "k": (0.0, np.inf),  # adaptive gain
     }
     for name, (low, high) in ranges.items():
-        if not low <= s[name] <= high and np.isfinite(first_state[0]["observer"][name]):
+        if not low <= s[name] <= high and np.isfinite(first[name]):
             return f"{name} = {s[name]} is outside {low}..{high}"
-    if not (s["a"][first_state[0]["observer"]["a"] > 0.0] > 0.0).all():
+    is_used = first["a"] > 0.0  # unused elements of the array are zero after a first sample
+    if not (s["a"][is_used] > 0.0).all():
         return "a parameter a1..a15 is not positive"
     return _invalid_filter_reason(record[0]["filter"]) if estimator.identifying else ""
 

@@ -10,35 +10,37 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 
-class Entry(NamedTuple):
+class LazyCommand(NamedTuple):
     """Command that has not been imported yet."""
 
     target: str
-    """``module:name`` of a function or a ``Typer``."""
+    """``module:name`` of a command function, or of a ``Typer`` that has subcommands."""
     help: str
+    """Help text in the list of commands; a function's own docstring replaces it in the help of the command."""
 
 
 class LazyGroup(TyperGroup):
     """Group that lists the commands in ``entries`` of a subclass and imports the one that is called."""
 
-    entries: ClassVar[dict[str, Entry]]
+    entries: ClassVar[dict[str, LazyCommand]]
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 - the signature is the base's
         """Return the names of all commands in the order of ``entries``."""
         return list(self.entries)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """Return a placeholder of a command for the list of commands."""
+        """Return a placeholder with the help text of a command, for the list of commands; None if there is no such command."""
         entry = self.entries.get(cmd_name)
         return TyperCommand(cmd_name, help=entry.help) if entry else None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Import and return the command that is called."""
-        name, listed, rest = super().resolve_command(ctx, args)
-        return name, _import(name, self.entries[name]) if name in self.entries else listed, rest
+        name, placeholder, remaining_args = super().resolve_command(ctx, args)
+        command = _import(name, self.entries[name]) if name in self.entries else placeholder
+        return name, command, remaining_args
 
 
-def _import(name: str, entry: Entry) -> Any:
+def _import(name: str, entry: LazyCommand) -> Any:
     module, attribute = entry.target.split(":")
     target = getattr(importlib.import_module(module), attribute)
     if not isinstance(target, typer.Typer):

@@ -8,71 +8,77 @@ from pathlib import Path
 
 import typer
 
-from bms_estimator.cli.lazy_group import Entry, LazyGroup
+from bms_estimator.cli.lazy_group import LazyCommand, LazyGroup
 from bms_estimator.model.errors import UserError
 from bms_estimator.version import __version__
 
 COMMANDS = {
-    "run": Entry(
+    "run": LazyCommand(
         "bms_estimator.cli.live.run:run",
         "Run the live service: estimate from a BMS, monitor or sensor board, and publish.",
     ),
-    "top": Entry(
+    "top": LazyCommand(
         "bms_estimator.cli.live.top:top", "Show all packs that publish to an MQTT broker, as a table in the terminal."
     ),
-    "edge": Entry(
+    "edge": LazyCommand(
         "bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet server, whose workers estimate."
     ),
-    "replay": Entry(
+    "replay": LazyCommand(
         "bms_estimator.cli.captures.replay:replay",
         "Run the estimator over a capture: recorded raw bytes, CSV or Parquet.",
     ),
-    "alarms": Entry("bms_estimator.cli.captures.alarms:alarms", "List the alarms that a capture would have raised."),
-    "record": Entry("bms_estimator.cli.live.record:record", "Record a device's raw bytes with their arrival times."),
-    "simulate": Entry(
+    "alarms": LazyCommand(
+        "bms_estimator.cli.captures.alarms:alarms", "List the alarms that a capture would have raised."
+    ),
+    "record": LazyCommand(
+        "bms_estimator.cli.live.record:record", "Record a device's raw bytes with their arrival times."
+    ),
+    "simulate": LazyCommand(
         "bms_estimator.cli.live.simulate:simulate", "Simulate a sensor board, BMS or battery monitor for tests."
     ),
-    "ports": Entry("bms_estimator.cli.live.ports:ports", "List serial ports, and identify the devices on them."),
-    "board": Entry(
+    "ports": LazyCommand("bms_estimator.cli.live.ports:ports", "List serial ports, and identify the devices on them."),
+    "board": LazyCommand(
         "bms_estimator.cli.live.board:board",
         "Show a sensor board's properties, and set its calibration and serial number.",
     ),
-    "dashboard": Entry(
+    "dashboard": LazyCommand(
         "bms_estimator.cli.live.dashboard:dashboard",
         "Serve a live web page of all packs that publish to an MQTT broker.",
     ),
-    "demo": Entry("bms_estimator.cli.live.demo:demo", "Run an MQTT broker, a simulated board and the live service."),
-    "ocv": Entry(
+    "demo": LazyCommand(
+        "bms_estimator.cli.live.demo:demo", "Run an MQTT broker, a simulated board and the live service."
+    ),
+    "ocv": LazyCommand(
         "bms_estimator.cli.cell.ocv:ocv",
         "Write a cell file with the OCV curve from rests, slow discharges or a table.",
     ),
-    "identify": Entry(
+    "identify": LazyCommand(
         "bms_estimator.cli.cell.identify:identify_command", "Write a cell file with the resistances that captures show."
     ),
-    "adapt": Entry(
+    "adapt": LazyCommand(
         "bms_estimator.cli.cell.adapt:adapt_command",
         "Write a cell file by the method of the thesis; identify gives better files.",
     ),
-    "capacity": Entry(
+    "capacity": LazyCommand(
         "bms_estimator.cli.cell.capacity:capacity", "Measure a cell's capacity from rests and the charge between them."
     ),
-    "cell": Entry(
+    "cell": LazyCommand(
         "bms_estimator.cli.cell.export:app", "Write a cell file from the learned state of a pack's live service."
     ),
-    "history": Entry("bms_estimator.cli.live.history:history", "Print a pack's stored history as CSV."),
-    "validate": Entry(
+    "history": LazyCommand("bms_estimator.cli.live.history:history", "Print a pack's stored history as CSV."),
+    "validate": LazyCommand(
         "bms_estimator.cli.captures.validate:validate_command",
         "Compare the voltage of a cell file's model with a capture, open loop.",
     ),
-    "thesis": Entry(
+    "thesis": LazyCommand(
         "bms_estimator.cli.captures.thesis:thesis",
         "Recompute the tables and figures of the thesis, and write a report.",
     ),
-    "asyncapi": Entry(
+    "asyncapi": LazyCommand(
         "bms_estimator.cli.settings.asyncapi:asyncapi", "Print the MQTT topics and payloads as an AsyncAPI document."
     ),
-    "fleet": Entry("bms_estimator.cli.fleet.commands:app", "Estimate many packs: server, workers and queries."),
-    "config": Entry("bms_estimator.cli.settings.config:app", "Write, check or show a pack's settings."),
+    "fleet": LazyCommand("bms_estimator.cli.fleet.commands:app", "Estimate many packs: server, workers and queries."),
+    "config": LazyCommand("bms_estimator.cli.settings.config:app", "Write, check or show a pack's settings."),
 }
 
 EXTRAS = {
@@ -88,7 +94,7 @@ EXTRAS = {
     "duckdb": "fleet",
     "nkeys": "fleet",
 }
-"""Extras of ``bms_estimator`` by optional package."""
+"""Extra of ``bms_estimator`` that installs an optional package, by the module name of the package."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """Error numbers of a full or broken disk. Their exit code makes systemd restart a service, because disk space may be
 freed."""
@@ -154,16 +160,16 @@ def _run(arguments: Sequence[str] | None) -> None:
     try:
         app(None if arguments is None else list(arguments), prog_name="bms-estimator")
     except SystemExit:
-        if sys.stdout:
+        if sys.stdout:  # None if the process was started without a stdout
             sys.stdout.flush()
         raise
 
 
 def _is_disk_fault(error: BaseException | None) -> bool:
-    """Return True if an error, or its cause, is a full or broken disk."""
-    if error is None or isinstance(error, OSError):
-        return error is not None and error.errno in DISK_FAULTS
-    return _is_disk_fault(error.__cause__ or error.__context__)
+    """Return True if the first OSError in an error's chain of causes is that of a full or broken disk."""
+    while error is not None and not isinstance(error, OSError):
+        error = error.__cause__ or error.__context__
+    return error is not None and error.errno in DISK_FAULTS
 
 
 def _redirect_stdout_to_null() -> None:

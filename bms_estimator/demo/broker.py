@@ -1,4 +1,4 @@
-"""MQTT broker of the demo: a nats-server on loopback without passwords, whose data are deleted at its end."""
+"""MQTT broker of the demo: a nats-server on loopback without passwords. Its data are deleted when it ends."""
 
 import asyncio
 import contextlib
@@ -19,7 +19,7 @@ LOOPBACK = "127.0.0.1"
 POLL_S = 0.02
 """Interval at which the server's start is checked [s]."""
 START_S = 60.0
-"""Timeout of the server's start on a busy machine [s]."""
+"""Timeout of the server's start [s]. It is long because the machine may be busy."""
 
 
 class DemoBroker:
@@ -43,7 +43,7 @@ class DemoBroker:
         return f"mqtt://{LOOPBACK}:{self.port}"
 
     @property
-    def look_command(self) -> str:
+    def subscribe_command(self) -> str:
         """Command that shows all topics in a second terminal."""
         port = "" if self.port == MQTT_PORT else f" -p {self.port}"
         return f"mosquitto_sub{port} -t 'bms/#' -v"
@@ -72,7 +72,7 @@ class DemoBroker:
             preexec_fn=ends_with_us(),
             start_new_session=True,  # Ctrl-C in the terminal must end the service before its broker
         )
-        stack.push_async_callback(_end, process)
+        stack.push_async_callback(_terminate, process)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(START_S):
                 while not _listens(folder) and process.returncode is None:  # noqa: ASYNC110 - the server reports its start only by a file
@@ -87,7 +87,7 @@ def _listens(folder: Path) -> bool:
     return any(folder.glob("*.ports"))
 
 
-async def _end(process: asyncio.subprocess.Process) -> None:
+async def _terminate(process: asyncio.subprocess.Process) -> None:
     with contextlib.suppress(ProcessLookupError):
         process.terminate()
     await process.wait()
@@ -103,33 +103,33 @@ mqtt {{ listen: "{LOOPBACK}:{mqtt_port}" }}
 """
 
 
-def choose_port(port: int | None, usual: int) -> int:
-    """Return the port to listen on: the requested port, otherwise the usual port, otherwise any free port.
+def choose_port(port: int | None, default_port: int) -> int:
+    """Return the port to listen on: the requested port; without one, the default port or any free port.
 
     Raises:
         UserError: The requested port is in use.
     """
     if port is not None:
-        if not _free(port):
+        if not _is_free(port):
             raise UserError(f"port {port}: taken by another program; leave --port out to have a free one chosen")
         return port
-    return usual if _free(usual) else _any_free()
+    return default_port if _is_free(default_port) else _any_free_port()
 
 
-def _free(port: int) -> bool:
+def _is_free(port: int) -> bool:
     """Return True if the port is free."""
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port with old connections in TIME_WAIT is free
         try:
             probe.bind((LOOPBACK, port))
         except OSError as error:
-            if error.errno in (errno.EADDRINUSE, errno.EACCES):
+            if error.errno in (errno.EADDRINUSE, errno.EACCES):  # EACCES: a privileged port
                 return False
             raise
     return True
 
 
-def _any_free() -> int:
+def _any_free_port() -> int:
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])

@@ -1,4 +1,7 @@
-"""Demo: broker, simulated board and the real service. The estimator starts with a wrong SOC and converges to the true one."""
+"""Demo: broker, simulated board and the real service.
+
+The estimator starts with a wrong SOC and converges to the true one.
+"""
 
 import asyncio
 import sys
@@ -33,11 +36,13 @@ TRUE_SOC = 0.9
 INITIAL_SOC = 0.7
 """Wrong initial SOC of the estimator, which assumes a std of 0.2."""
 RESOLUTION_V = 5e-3
-"""Resolution of the board's voltage [V]. It is a fifth of the converter's step, because the board averages noisy conversions."""
+"""Resolution of the board's voltage [V]. The board averages noisy conversions, so that it is a fifth of the converter's
+step."""
 PUBLISH_RATE_HZ = 4.0
 """Publish rate [Hz]."""
 LAMBDA = 1e4
-"""Lambda of the gain, (3.10) of the thesis. With the default of 1 the growth of k becomes visible only after hours."""
+"""Factor lambda of the observer's gain N(k), (3.10) of the thesis. With the default of 1 the growth of the gain's state
+k becomes visible only after hours."""
 
 
 async def run_demo(
@@ -70,7 +75,7 @@ async def run_demo(
     result = DemoResult(INITIAL_SOC - TRUE_SOC, truth.soc)
     async with DemoBroker(port) as broker, _running_board(truth, rate_hz, speed) as board:
         page = f"{LOOPBACK}:{choose_port(page_port, parse_listen(DEFAULT_LISTEN).port)}"
-        hint = f"live page: http://{page}/; in a second terminal: {broker.look_command}"
+        hint = f"live page: http://{page}/; in a second terminal: {broker.subscribe_command}"
         if not sys.stdout.isatty():
             sys.stdout.write(f"{hint}\n")
         if seconds is not None:
@@ -78,7 +83,7 @@ async def run_demo(
         settings = _settings(board, broker.url, page, rate_hz)
         view = TerminalSink(log=log, hint=hint, true_soc=truth.soc)
         pages = Pages(opened)
-        # without a state folder each run starts with the initial state
+        # the settings contain no state folder, so that each run starts with the initial state
         await run_pack_service(settings, cell, sinks=[view, result], tap=truth, stop=stop, pages=pages)
     return result.summary()
 
@@ -110,12 +115,12 @@ class DemoResult:
     """Sink that stores the last estimate and the true SOC at that time.
 
     Args:
-        first_error: Error of the initial SOC, 0..1.
+        initial_error: Estimated minus true SOC at the start.
         true_soc: Returns the true SOC at the last sample, 0..1.
     """
 
-    def __init__(self, first_error: float, true_soc: Callable[[], float]) -> None:
-        self._first_error, self._true_soc = first_error, true_soc
+    def __init__(self, initial_error: float, true_soc: Callable[[], float]) -> None:
+        self._initial_error, self._true_soc = initial_error, true_soc
         self._last: Estimate | None = None
         self._last_true_soc = 0.0
         self._started_s = time.monotonic()
@@ -134,13 +139,13 @@ class DemoResult:
 
     def summary(self) -> str:
         """Return a summary of the run in one line."""
-        e, elapsed_s = self._last, time.monotonic() - self._started_s
-        if e is None or e.soc is None or e.soc_std is None:
+        estimate, elapsed_s = self._last, time.monotonic() - self._started_s
+        if estimate is None or estimate.soc is None or estimate.soc_std is None:
             return f"{elapsed_s:.1f} s, no sample arrived"
-        error, band = e.soc - self._last_true_soc, BAND_STDS * e.soc_std
-        inside = "inside" if abs(error) <= band else "outside"
+        soc_error, band = estimate.soc - self._last_true_soc, BAND_STDS * estimate.soc_std
+        inside = "inside" if abs(soc_error) <= band else "outside"
         return (
-            f"{elapsed_s:.1f} s: {e.frames_received:,} frames, {e.frames_lost} lost, {e.crc_errors} CRC errors; "
-            f"SOC error {self._first_error:+.2%} at the start, {error:+.2%} at the end: true SOC {self._last_true_soc:.2%} "
-            f"{inside} the estimate {e.soc:.2%} ± {band:.2%} (2 std); observer {'in lock' if e.lock else 'out of lock'}"
+            f"{elapsed_s:.1f} s: {estimate.frames_received:,} frames, {estimate.frames_lost} lost, {estimate.crc_errors} CRC errors; "
+            f"SOC error {self._initial_error:+.2%} at the start, {soc_error:+.2%} at the end: true SOC {self._last_true_soc:.2%} "
+            f"{inside} the estimate {estimate.soc:.2%} ± {band:.2%} (2 std); observer {'in lock' if estimate.lock else 'out of lock'}"
         )

@@ -14,18 +14,21 @@ from bms_estimator.simulation.simulated_pack import SimulatedPack
 from bms_estimator.simulation.virtual_adc import Reading
 
 TAIL_BYTES = 256
-"""Number of stored bytes; enough to contain a complete sample frame."""
+"""Number of the board's last bytes that are stored, enough to contain a complete sample frame."""
 
 
 class TrueSoc:
-    """Signal of a simulated pack for a board, and a tap on the board's line that reads the board's clock in each frame.
+    """Simulated pack as a board's signal that remembers the SOC of each sample.
+
+    It is also a tap on the board's line: the board's clock in the last frame tells which sample the host has received.
 
     Args:
-        pack: Simulated pack. The board may read the pack before its samples arrive. Therefore past SOCs are stored.
+        pack: Simulated pack. The board may read it before the samples arrive at the host. Therefore past SOCs are
+            stored.
     """
 
     missed_reads = 0
-    """Number of missed reads: always 0."""
+    """Number of reads that the tap missed, which is always 0."""
 
     def __init__(self, pack: SimulatedPack) -> None:
         self._pack = pack
@@ -47,7 +50,7 @@ class TrueSoc:
         """Return the pack's SOC, 0..1, at the last received sample; the initial SOC before the first one."""
         for frame in reversed(self._tail.split(DELIMITER)[:-1]):
             if (board_us := _board_us(frame)) is not None:
-                self._board_us += (board_us - self._board_us) % MODULUS
+                self._board_us += (board_us - self._board_us) % MODULUS  # the clock in a frame rolls over
                 break
         while len(self._soc_history) > 1 and self._soc_history[1][0] <= 1e-6 * self._board_us:
             self._soc_history.popleft()

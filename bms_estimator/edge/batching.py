@@ -8,7 +8,7 @@ from bms_estimator.model.sample import SampleBlock
 
 MAX_SAMPLES = 7_000
 """Maximum number of samples in a block. A block of this many incompressible samples stays below
-``streams.MAX_BLOCK_BYTES``."""
+``fleet.nats.streams.MAX_BLOCK_BYTES``."""
 
 
 class ReadyBlock(NamedTuple):
@@ -30,7 +30,8 @@ class Batcher:
     def __init__(self, block_s: float, max_samples: int = MAX_SAMPLES) -> None:
         self._block_s, self._max_samples = block_s, max_samples
         self._parts: list[SampleBlock] = []
-        self._count, self._arrival_s, self._end_s = 0, 0.0, 0.0
+        self._count, self._arrival_s = 0, 0.0  # samples in the open block, and arrival of the last one
+        self._end_s = 0.0  # sample time at which the open block ends
 
     def __len__(self) -> int:
         """Return the number of samples in the open block."""
@@ -42,8 +43,8 @@ class Batcher:
         while samples.size:
             if not self._count:
                 self._end_s = float(samples["time_s"][0]) + self._block_s
-            fits = int(np.searchsorted(samples["time_s"], self._end_s))
-            part, samples = np.split(samples, [min(fits, self._max_samples - self._count)])
+            before_end = int(np.searchsorted(samples["time_s"], self._end_s))
+            part, samples = np.split(samples, [min(before_end, self._max_samples - self._count)])
             self._parts.append(part)
             self._count += part.size
             self._arrival_s = arrival_s if part.size else self._arrival_s

@@ -28,13 +28,14 @@ from numpy.typing import NDArray
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 _HEADER = struct.Struct("<4sBxHQQQd")
-_OLDEST = 24
+_OLDEST_OFFSET = 24
 """Offset of the field ``oldest`` in the header [bytes]."""
 _MAGIC, _VERSION = b"BMSB", 1
 MAX_SAMPLES = 65_535
 """Maximum number of samples of a block."""
 MAX_NUMBER = 2**63
-"""Limit of the creation time of a store [ns since 1970] and of the number of a block: they fit a signed integer."""
+"""Exclusive upper limit of creation times of stores [ns since 1970] and of block numbers, so that both fit a signed
+64-bit integer."""
 _COLUMNS = tuple((name, np.dtype(SAMPLE[name]).newbyteorder("<")) for name in SAMPLE.names or ())
 _SAMPLE_BYTES = sum(dtype.itemsize for _, dtype in _COLUMNS)
 
@@ -80,7 +81,7 @@ def encode(block: Block) -> bytes:
 
 def with_oldest(data: bytes, oldest: int) -> bytes:
     """Return an encoded block with another ``oldest``."""
-    return data[:_OLDEST] + oldest.to_bytes(8, "little") + data[_OLDEST + 8 :]
+    return data[:_OLDEST_OFFSET] + oldest.to_bytes(8, "little") + data[_OLDEST_OFFSET + 8 :]
 
 
 def decode(data: bytes) -> Block:
@@ -96,13 +97,13 @@ def decode(data: bytes) -> Block:
         raise BlockError(f"version {version}; this program reads version {_VERSION}")
     if not (1 <= oldest <= number < MAX_NUMBER and 0 < store < MAX_NUMBER and math.isfinite(arrival_s)):
         raise BlockError(f"implausible header: store {store}, number {number}, oldest {oldest}, arrival {arrival_s}")
-    return Block(store, number, oldest, arrival_s, _samples(data[_HEADER.size :], count))
+    return Block(store, number, oldest, arrival_s, _decode_samples(data[_HEADER.size :], count))
 
 
 def peek_header(data: bytes) -> tuple[int, float]:
-    """Return number of samples and arrival time [s since 1970] from a block's header.
+    """Return the number of samples and the arrival time of the last one [s since 1970] from a block's header.
 
-    Bytes that are not a block give 0 and infinity.
+    Return 0 and infinity for bytes that are not a block.
     """
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         return 0, math.inf
@@ -110,11 +111,11 @@ def peek_header(data: bytes) -> tuple[int, float]:
     return count, arrival_s if math.isfinite(arrival_s) else math.inf
 
 
-def _samples(body: bytes, count: int) -> SampleBlock:
+def _decode_samples(body: bytes, count: int) -> SampleBlock:
     size = count * _SAMPLE_BYTES
     unpacker = zlib.decompressobj()
     try:
-        raw = unpacker.decompress(body, size + 1)  # upper limit for a damaged header
+        raw = unpacker.decompress(body, size + 1)  # one byte more shows that the body is too long
     except zlib.error as error:
         raise BlockError(str(error)) from None
     if len(raw) != size or count == 0 or not unpacker.eof or unpacker.unused_data:

@@ -55,14 +55,14 @@ class BlockSender:
         connect: Opens a connection; default: over TCP.
         clock: Clock whose wall time dates samples.
         steady: Monotonic clock that continues during suspend [s].
-        most_samples: Maximum number of samples of a block.
+        max_samples: Maximum number of samples of a block.
         first_delay_s: Delay after a lost connection or a temporary rejection [s].
         retry_s: Delay before a failed disk is retried [s].
         handover_s: Time limit for sending the remaining blocks at shutdown [s].
 
     Attributes:
         delivery: Delivery statistics of the blocks.
-        unread: Number of invalid messages on the workers' topic.
+        invalid_messages: Number of invalid messages on the workers' topic.
 
     Raises:
         UserError: A URL or a file of ``settings`` cannot be used.
@@ -77,23 +77,24 @@ class BlockSender:
         connect: Connect | None = None,
         clock: Clock | None = None,
         steady: Callable[[], float] = since_boot,
-        most_samples: int = MAX_SAMPLES,
+        max_samples: int = MAX_SAMPLES,
         first_delay_s: float = FIRST_DELAY_S,
         retry_s: float = RETRY_S,
         handover_s: float = HANDOVER_S,
     ) -> None:
         self._clock, self._steady, self._handover_s = clock or Clock(), steady, handover_s
-        self._block_s, self._batcher = settings.block_s, Batcher(settings.block_s, most_samples)
+        self._block_s, self._batcher = settings.block_s, Batcher(settings.block_s, max_samples)
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
-        self._request_topic = _topic(subjects.awaits(pack))
-        most_bytes = int(settings.store_mib * MIB)
-        self.store = BlockStore(self._database, _topic(subjects.raw(pack)), most_bytes, wall=self._clock.wall)
-        self.delivery, self.unread = DeliveryStats(), 0
+        self._request_topic = _topic(subjects.block_request(pack))
+        max_bytes = int(settings.store_mib * MIB)
+        self.store = BlockStore(self._database, _topic(subjects.raw(pack)), max_bytes, wall=self._clock.wall)
+        self.delivery, self.invalid_messages = DeliveryStats(), 0
+        # blocks are not retained, so that there is nothing to send again after a rejection
         self._denied = DeniedTopics(self.delivery, lambda: None, first_delay_s)
         self._sender = QueueSender(self.store, self.delivery, self._denied, first_delay_s)
         for warning in check(settings):
             log.warning("secret is readable by other users", reason=warning)
-        options = ConnectOptions(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._count_unread)
+        options = ConnectOptions(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._count_invalid)
         self._link = ReconnectLoop(
             brokers(settings), options, connect or BrokerConnector(settings), self._serve, self.delivery, first_delay_s
         )
@@ -170,7 +171,7 @@ class BlockSender:
             for topic, reason in rejected.items():
                 self._denied.deny(topic, f"not allowed to read it: {reason}")
             async with asyncio.TaskGroup() as tasks:
-                others = [
+                transfers = [
                     tasks.create_task(self._receive(connection)),
                     tasks.create_task(self._sender.send(connection)),
                 ]
@@ -178,7 +179,7 @@ class BlockSender:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(self._handover_s):
                         await self._sender.wait_until_empty()
-                for task in others:
+                for task in transfers:
                     task.cancel()
         finally:
             self._denied.end()
@@ -187,17 +188,17 @@ class BlockSender:
         while True:
             message = await connection.receive()
             try:
-                awaits = subjects.BlockRequest.model_validate_json(message.payload)
+                request = subjects.BlockRequest.model_validate_json(message.payload)
             except ValidationError:
-                self._count_unread("unreadable", message.topic)
+                self._count_invalid("unreadable", message.topic)
             else:
-                self.store.on_request(awaits)
+                self.store.on_request(request)
 
-    def _count_unread(self, kind: str, topic: str) -> None:
+    def _count_invalid(self, reason: str, topic: str) -> None:
         """Count an invalid message on the workers' topic, and log the first one."""
-        if not self.unread:
-            log.warning("invalid message on the workers' topic", reason=kind, topic=topic[:100])
-        self.unread += 1
+        if not self.invalid_messages:
+            log.warning("invalid message on the workers' topic", reason=reason, topic=topic[:100])
+        self.invalid_messages += 1
 
 
 def _topic(subject: str) -> str:

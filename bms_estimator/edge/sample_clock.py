@@ -1,4 +1,4 @@
-"""Timestamps of samples for a fleet: a source's clock is mapped to a clock that never steps back. Pure."""
+"""Timestamps of samples for a fleet. A source's clock is mapped to a clock that never steps back. Pure."""
 
 import math
 
@@ -7,20 +7,20 @@ from numpy.typing import NDArray
 
 Times = NDArray[np.float64]
 
-BAND_S = 1.0
+DEAD_BAND_S = 1.0
 """Maximum difference between the source's clock and the host's that is not corrected [s], because transport delays vary
 too."""
 STEP_S = 10.0
 """Minimum difference between the clocks that counts as a step and not as drift [s]. The skipped time becomes a gap."""
 SLEW = 0.01
-"""Relative rate at which a difference between ``BAND_S`` and ``STEP_S`` is corrected. It exceeds the drift of any
+"""Relative rate at which a difference between ``DEAD_BAND_S`` and ``STEP_S`` is corrected. It exceeds the drift of any
 resonator."""
 WINDOW_S = 600.0
 """Window over which the smallest delay is taken [s]. Samples arrive late and never early, so the smallest delay is the
 lag of the source's clock."""
 GRID = 2.0**20
-"""Inverse of the step of clock offsets [1/s]. With offsets on this grid, a constant period stays constant to the last
-bit, which compresses best."""
+"""Clock offsets are multiples of ``1 / GRID`` seconds. With these offsets, a constant sample period stays constant to
+the last bit, which compresses best."""
 
 
 class SampleClock:
@@ -34,7 +34,7 @@ class SampleClock:
         last_s: Time of the last sample of an earlier run [s since 1970]; minus infinity without one.
 
     Attributes:
-        steps: Number of times that a clock was set or the source restarted.
+        steps: Number of times that a clock was set or the source started.
     """
 
     def __init__(self, last_s: float = -math.inf) -> None:
@@ -60,7 +60,7 @@ class SampleClock:
             steady_s: Monotonic clock that continues during suspend [s].
         """
         now_s = self._now(wall_s, steady_s)
-        source_s = _finite(source_s, self._source_s)
+        source_s = _fill_non_finite(source_s, self._source_s)
         runs = np.split(source_s, np.flatnonzero(np.diff(source_s) < 0.0) + 1)
         return np.concatenate([self._place(run, now_s) for run in runs if run.size] or [source_s])
 
@@ -83,7 +83,7 @@ class SampleClock:
             self._update_drift(delay_s, now_s)
         placed = source_s + self._offset_s
         span_s = float(source_s[-1]) - self._source_s
-        if self._slew_s and span_s > 0.0:
+        if self._slew_s and span_s > 0.0:  # spread the correction evenly over the samples
             shift_s = min(max(self._slew_s, -SLEW * span_s), SLEW * span_s)
             placed += shift_s * (source_s - self._source_s) / span_s
             self._offset_s += shift_s
@@ -102,7 +102,7 @@ class SampleClock:
 
     def _update_drift(self, delay_s: float, now_s: float) -> None:
         """Schedule a correction if the source's clock runs ahead or falls behind."""
-        if delay_s < -BAND_S:
+        if delay_s < -DEAD_BAND_S:  # a sample from the future is proof at once, because transport only delays
             self._slew_s = delay_s
         self._min_delay_s = min(self._min_delay_s, delay_s)
         if now_s - self._window_s < WINDOW_S:
@@ -112,15 +112,15 @@ class SampleClock:
             self._offset_s += math.floor(behind_s * GRID) / GRID
             self._slew_s = 0.0
             self.steps += 1
-        elif behind_s > BAND_S:
+        elif behind_s > DEAD_BAND_S:
             self._slew_s = behind_s
 
 
-def _finite(source_s: Times, before_s: float) -> Times:
-    """Replace each non-finite time by the previous time."""
+def _fill_non_finite(source_s: Times, previous_s: float) -> Times:
+    """Replace each non-finite time by the previous time, or by 0 without one."""
     if np.isfinite(source_s).all():
         return source_s
     filled = source_s.copy()
     for i in np.flatnonzero(~np.isfinite(source_s)):
-        filled[i] = filled[i - 1] if i else before_s if math.isfinite(before_s) else 0.0
+        filled[i] = filled[i - 1] if i else (previous_s if math.isfinite(previous_s) else 0.0)
     return filled

@@ -2,12 +2,12 @@
 
 ===========================  ================================================================================
 ``raw.<pack>``               blocks of an edge (module ``block``), received by the stream ``RAW``
-``p.<partition>.raw.<pack>`` blocks in the stream ``RAW``; a message published to this subject reaches no stream
+``p.<partition>.raw.<pack>`` these blocks as the stream ``RAW`` stores them; publishing to this subject has no effect
 ``edge.<pack>.awaits``       ``BlockRequest`` to the edge: the block that a worker awaits next
-``bms.<pack>.<topic>``       estimates, published as by ``run``
+``bms.<pack>.<topic>``       estimates, in the format of the command ``run``
 ``hours.<pack>``             one-hour summaries by a worker, stored in the stream ``HOURS``
-``fleet.worker.<id>``        heartbeat of a worker each second, with its partitions and its lag
-``fleet.unknown.<pack>``     report of a worker, once, that it has blocks of an unregistered pack, with the reason
+``fleet.worker.<id>``        heartbeat of a worker, once a second, with its partitions and its lag
+``fleet.unknown.<pack>``     one report of a worker that it has blocks of an unregistered pack, with the reason
 ===========================  ================================================================================
 """
 
@@ -17,10 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 RAW_STREAM, HOURS_STREAM = "RAW", "HOURS"
 PACKS_BUCKET, CELLS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "cells", "checkpoints", "states"
-"""Key-value buckets: settings by pack, cell files by name, last checkpoint by partition. Object bucket: content of the
-checkpoints."""
+"""Names of buckets. The first three are key-value buckets: settings by pack, cell files by name, and the last checkpoint
+by partition. The fourth is an object bucket with the content of the checkpoints."""
 PARTITIONS = 64
-"""Default number of partitions, which is fixed when the streams are created."""
+"""Default number of partitions. The number cannot be changed after the streams were created."""
 
 
 def raw(pack: str) -> str:
@@ -38,7 +38,7 @@ def mapping(partitions: int) -> tuple[str, str]:
     return "raw.*", f"p.{{{{partition({partitions},1)}}}}.raw.{{{{wildcard(1)}}}}"
 
 
-def awaits(pack: str) -> str:
+def block_request(pack: str) -> str:
     """Return the subject of a worker's requests to an edge."""
     return f"edge.{pack}.awaits"
 

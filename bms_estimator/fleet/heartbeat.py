@@ -29,8 +29,8 @@ class Heartbeat(BaseModel):
     faults: int = 0
     """Blocks skipped because of an internal error since the worker's start; the log has the tracebacks."""
     lag_s: float | None = None
-    """Largest time from the arrival of a block's last sample at the edge to its processing since the last heartbeat
-    [s]; None without a block."""
+    """Largest lag since the previous heartbeat [s]: time from the arrival of a block's last sample at the edge to the
+    processing of the block. None without a block."""
     counters: dict[str, int] = Field(default_factory=dict)
     """Counters of the partitions by name: resends, gaps, lost blocks, damaged blocks and others."""
     unknown_count: int = 0

@@ -108,7 +108,7 @@ def _broker(section: str, address: str) -> Broker:
         raise UserError(f"{section}.url = {address}: {error}") from None
     if not host:
         raise UserError(f"{section}.url = {address}: must be mqtt://host:port")
-    return Broker(address, host, port, url.scheme == "mqtts")
+    return Broker(address, host, port, tls=url.scheme == "mqtts")
 
 
 def _load_client_certificate(context: ssl.SSLContext, settings: BrokerSettings, cert_file: Path) -> None:
@@ -146,5 +146,5 @@ def _refuse_password(section: str) -> str:
         UserError: Always.
     """
     raise UserError(
-        f"{section}.key_file: is encrypted, and nobody is there to type its password; give a key without one"
+        f"{section}.key_file: is encrypted, but a service cannot ask for its password; give a key without a password"
     )

@@ -30,7 +30,7 @@ class DeniedTopics:
         self._resend_timer: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
-        """Clear the denied topics for a new connection."""
+        """Clear the denied topics at the beginning of a connection."""
         self.end()
         for topics in (self._logged, self._denied, self._temporarily_denied):
             topics.clear()
@@ -38,7 +38,7 @@ class DeniedTopics:
         self._backoff.reset()
 
     def end(self) -> None:
-        """Cancel a pending resend."""
+        """Cancel a pending resend at the end of a connection."""
         if self._resend_timer is not None:
             self._resend_timer.cancel()
             self._resend_timer = None
@@ -62,7 +62,7 @@ class DeniedTopics:
                 delay_s = self._backoff.next_s()
                 self._resend_timer = asyncio.get_running_loop().call_later(delay_s, self._resend)
             return
-        # An accepted message does not allow a denied topic: the denial may concern reading
+        # a denied topic stays denied after an accepted message, because the denial may concern reading
         if message.topic in self._temporarily_denied:
             del self._temporarily_denied[message.topic]
             self._update_stats()

@@ -32,8 +32,8 @@ class BrokerConnector:
 
     def __init__(self, settings: BrokerSettings, timeouts: Timeouts = DEFAULT_TIMEOUTS) -> None:
         self._settings, self._timeouts = settings, timeouts
-        # URLs that did not respond to MQTT 5: the broker is stopped, or too old to reject the version
-        self._silent: set[str] = set()
+        # URLs to try with MQTT 3.1.1 next, because MQTT 5 got no response: the broker is stopped, or too old to reject it
+        self._v311_urls: set[str] = set()
 
     @contextlib.asynccontextmanager
     async def __call__(self, broker: Broker, options: ConnectOptions) -> AsyncIterator[Client]:
@@ -56,7 +56,7 @@ class BrokerConnector:
     async def _connect(
         self, stack: contextlib.AsyncExitStack, arguments: dict[str, Any], url: str, options: ConnectOptions
     ) -> Client:
-        protocol = ProtocolVersion.V311 if url in self._silent else ProtocolVersion.V5
+        protocol = ProtocolVersion.V311 if url in self._v311_urls else ProtocolVersion.V5
         try:
             async with asyncio.timeout(self._timeouts.connect_s):
                 try:
@@ -68,7 +68,7 @@ class BrokerConnector:
                     open_client(arguments, ProtocolVersion.V311, options, self._timeouts)
                 )
         except TimeoutError:
-            self._silent ^= {url}  # try the other version next time
+            self._v311_urls ^= {url}  # try the other version next time
             raise BrokerConnectionError(f"no answer within {self._timeouts.connect_s:g} s") from None
 
     def _arguments(self, broker: Broker) -> dict[str, Any]:

@@ -9,23 +9,23 @@ _NOT_ALLOWED = (
     "name or password wrong, or not allowed; see mqtt.username, mqtt.password_file and the broker's access list"
 )
 HINTS = {
-    133: "another mqtt.base_topic or pack.name may help",
-    134: _NOT_ALLOWED,
-    135: _NOT_ALLOWED,
-    136: "the broker is not ready",
-    138: "the broker does not want this client",
-    141: "it received nothing from this client for too long",
-    142: "another client has the same name",
-    149: "a message is longer than the broker takes",
-    151: "the broker allows no more",
-    159: "too many connections in a short time",
+    133: "another mqtt.base_topic or pack.name may help",  # client identifier not valid
+    134: _NOT_ALLOWED,  # bad user name or password
+    135: _NOT_ALLOWED,  # not authorized
+    136: "the broker is not ready",  # server unavailable
+    138: "the broker does not want this client",  # banned
+    141: "it received nothing from this client for too long",  # keep alive timeout
+    142: "another client has the same name",  # session taken over
+    149: "a message is longer than the broker takes",  # packet too large
+    151: "the broker allows no more",  # quota exceeded
+    159: "too many connections in a short time",  # connection rate exceeded
 }
 """Causes and remedies by reason code."""
 
 FINAL = {
-    135,  # not authorised
+    135,  # not authorized
     144,  # topic name invalid
-    149,  # too large
+    149,  # packet too large
     153,  # payload format invalid
 }
 """Reason codes of permanent rejections. All other codes (busy, quota, unspecified) may be temporary."""

@@ -53,31 +53,31 @@ class ReconnectLoop:
 
     async def run(self) -> None:
         """Stay connected until ``closing`` is set."""
-        failed = 0
+        failed_attempts = 0
         for broker in itertools.cycle(self._brokers):
             if self.closing.is_set():
                 return
             if await self._attempt(broker):
-                failed = 0
+                failed_attempts = 0
                 self._backoff.reset()
-            failed += 1
-            if failed % len(self._brokers) == 0:
+            failed_attempts += 1  # also after a successful connection, which is lost now
+            if failed_attempts % len(self._brokers) == 0:
                 await self._pause(self._backoff.next_s())
 
     async def _attempt(self, broker: Broker) -> bool:
         """Connect to one broker and serve. Return True if the connection lasted ``MIN_CONNECTION_S``."""
         loop = asyncio.get_running_loop()
-        since_s: float | None = None
+        connected_at_s: float | None = None
         try:
             async with self._connect(broker, self._options) as connection:
-                since_s = loop.time()
+                connected_at_s = loop.time()
                 log.info("broker connected", url=broker.url, protocol=connection.protocol)
                 self._logged.clear()
                 await self._serve(connection)
         except* BrokerConnectionError as errors:
-            self._delivery.losses += since_s is not None
-            self._log_loss(broker, "broker not reachable" if since_s is None else "broker lost", errors)
-        return since_s is not None and loop.time() - since_s >= MIN_CONNECTION_S
+            self._delivery.losses += connected_at_s is not None
+            self._log_loss(broker, "broker not reachable" if connected_at_s is None else "broker lost", errors)
+        return connected_at_s is not None and loop.time() - connected_at_s >= MIN_CONNECTION_S
 
     def _log_loss(self, broker: Broker, event: str, errors: BaseException) -> None:
         """Log a changed reason at once, and an unchanged reason every ``LOG_S``: a broker may be absent for days."""

@@ -23,7 +23,8 @@ MAX_WAITING = 2000
 twenty for each device."""
 MAX_BYTES = 65_536
 """Maximum length of a message [bytes]. The longest message, of topic ``schema``, has a quarter of this length."""
-REASONS = {"too_long": f"longer than {MAX_BYTES} bytes", "overflow": "faster than they are read"}
+LOSS_REASONS = {"too_long": f"longer than {MAX_BYTES} bytes", "overflow": "faster than they are read"}
+"""Reasons for dropped messages, by their name in ``ConnectOptions.on_message_lost``."""
 LOG_S = 60.0
 """Minimum time between two log lines on dropped messages [s]."""
 CLOSING_S = 3.0
@@ -41,7 +42,7 @@ class Subscriber:
         on_message: Called with each message of a device after it is stored.
         on_link_change: Called after the broker was connected or lost; ``lost_since`` distinguishes the two.
         connect: Opens a connection; default: over TCP.
-        left_out: Called with the name of a device that is not stored because there are too many.
+        on_hidden: Called with the name of a device that is not stored because there are too many.
         clock: Wall clock and monotonic clock.
         first_delay_s: Delay before a lost broker is retried [s]; it grows as in ``Backoff``.
 
@@ -56,33 +57,41 @@ class Subscriber:
         on_link_change: Callable[[], None] = lambda: None,
         *,
         connect: Connect | None = None,
-        left_out: Callable[[str], object] = str,
+        on_hidden: Callable[[str], object] = str,
         clock: Clock | None = None,
         first_delay_s: float = FIRST_DELAY_S,
     ) -> None:
         check(settings)
         self._on_message, self._on_link_change, self._clock = on_message, on_link_change, clock or Clock()
         self._topic = f"{settings.base_topic}/#"
-        self._published = TopicCache(settings.base_topic, left_out)
+        self._cache = TopicCache(settings.base_topic, on_hidden)
         self._delivery = DeliveryStats()
         self._lost_since: float | None = self._clock.wall()
-        options = ConnectOptions(f"bms-view-{secrets.token_hex(4)}", None, self._lose, MAX_WAITING, MAX_BYTES)
+        options = ConnectOptions(
+            f"bms-view-{secrets.token_hex(4)}",
+            will=None,
+            on_message_lost=self._count_lost,
+            max_waiting=MAX_WAITING,
+            max_bytes=MAX_BYTES,
+        )
         connect = connect or BrokerConnector(settings)
-        self._link = ReconnectLoop(brokers(settings), options, connect, self._serve, self._delivery, first_delay_s)
+        self._reconnect_loop = ReconnectLoop(
+            brokers(settings), options, connect, self._serve, self._delivery, first_delay_s
+        )
         self._task: asyncio.Task[None] | None = None
-        self._loss_logged_s: float | None = None
+        self._loss_log_time_s: float | None = None
         self.lost_messages = 0
         """Number of messages that were too long or arrived too fast."""
 
     @property
     def devices(self) -> Mapping[str, DeviceTopics]:
-        """Last publications of each device by name, in the order of their first message."""
-        return self._published.devices
+        """Last messages of each device by name, in the order of the devices' first messages."""
+        return self._cache.devices
 
     @property
     def hidden(self) -> int:
         """Number of devices that publish but are not stored, because there are too many."""
-        return self._published.hidden
+        return self._cache.hidden
 
     @property
     def lost_since(self) -> float | None:
@@ -102,7 +111,7 @@ class Subscriber:
 
     async def __aenter__(self) -> Self:
         """Start connecting to the broker."""
-        self._task = asyncio.create_task(self._link.run(), name="subscriber")
+        self._task = asyncio.create_task(self._reconnect_loop.run(), name="subscriber")
         return self
 
     async def __aexit__(self, *_error: object) -> None:
@@ -113,7 +122,7 @@ class Subscriber:
         """
         if self._task is None:
             return
-        self._link.closing.set()
+        self._reconnect_loop.closing.set()
         done, _ = await asyncio.wait([self._task], timeout=CLOSING_S)
         if not done:
             self._task.cancel()
@@ -122,13 +131,13 @@ class Subscriber:
 
     async def _serve(self, connection: Connection) -> None:
         """Receive until the connection is lost or the subscriber closes."""
-        for topic, why in (await connection.subscribe(self._topic, [])).items():
-            raise BrokerConnectionError(f"not allowed to read {topic}: {why}")
+        for topic, reason in (await connection.subscribe(self._topic, [])).items():
+            raise BrokerConnectionError(f"not allowed to read {topic}: {reason}")
         self._report_link(None)
         try:
             async with asyncio.TaskGroup() as tasks:
                 receiving = tasks.create_task(self._receive(connection))
-                await self._link.closing.wait()
+                await self._reconnect_loop.closing.wait()
                 receiving.cancel()
         finally:
             self._report_link(self._clock.wall())
@@ -136,7 +145,7 @@ class Subscriber:
     async def _receive(self, connection: Connection) -> None:
         while True:
             message = await connection.receive()
-            device_message = self._published.take(message.topic, message.payload, self._clock.wall())
+            device_message = self._cache.take(message.topic, message.payload, self._clock.wall())
             if device_message is not None:
                 self._on_message(device_message)
 
@@ -144,9 +153,9 @@ class Subscriber:
         self._lost_since = lost_since
         self._on_link_change()
 
-    def _lose(self, kind: str, topic: str) -> None:
+    def _count_lost(self, kind: str, topic: str) -> None:
         self.lost_messages += 1
         now_s = self._clock.monotonic()
-        if self._loss_logged_s is None or now_s >= self._loss_logged_s + LOG_S:
-            self._loss_logged_s = now_s
-            log.warning("messages are dropped", reason=REASONS[kind], topic=topic, dropped=self.lost_messages)
+        if self._loss_log_time_s is None or now_s >= self._loss_log_time_s + LOG_S:
+            self._loss_log_time_s = now_s
+            log.warning("messages are dropped", reason=LOSS_REASONS[kind], topic=topic, dropped=self.lost_messages)

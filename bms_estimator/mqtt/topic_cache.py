@@ -45,7 +45,7 @@ class DeviceTopics:
 
     topics: dict[str, Any] = field(default_factory=dict)
     """Payloads by topic, parsed JSON or text."""
-    heard_s: dict[str, float] = field(default_factory=dict)
+    received_s: dict[str, float] = field(default_factory=dict)
     """Time of the last message by topic, seconds since 1970."""
     sizes: dict[str, int] = field(default_factory=dict)
     """Sizes of the payloads [bytes]."""
@@ -65,11 +65,11 @@ class TopicCache:
 
     Args:
         base_topic: First part of all topics.
-        left_out: Called with the name of a device that is not stored: a new device, or a device that was replaced.
+        on_hidden: Called with the name of a device that is not stored: a new device, or a device that was replaced.
     """
 
-    def __init__(self, base_topic: str, left_out: Callable[[str], object] = str) -> None:
-        self._root, self._left_out = f"{base_topic}/", left_out
+    def __init__(self, base_topic: str, on_hidden: Callable[[str], object] = str) -> None:
+        self._root, self._on_hidden = f"{base_topic}/", on_hidden
         self.devices: dict[str, DeviceTopics] = {}
         """Devices by name, in the order of their first message."""
         self._hidden: set[str] = set()
@@ -90,35 +90,40 @@ class TopicCache:
         Returns:
             The parsed message; None if the topic is not a device's, or a limit is exceeded.
         """
-        name, _, rest = topic.removeprefix(self._root).partition("/")
-        if not topic.startswith(self._root) or not rest or rest.split("/")[0] in REQUEST_LEVELS:
+        name, _, device_topic = topic.removeprefix(self._root).partition("/")
+        if not topic.startswith(self._root) or not device_topic or device_topic.split("/")[0] in REQUEST_LEVELS:
             return None
         if not re.fullmatch(DEVICE_NAME, name):
             return None
         if not payload:
-            return self._forget(name, rest)
-        return self._store(name, rest, payload, now_s)
+            return self._remove_topic(name, device_topic)
+        return self._store(name, device_topic, payload, now_s)
 
     def _store(self, name: str, topic: str, payload: bytes, now_s: float) -> DeviceMessage | None:
         value = parse_payload(payload)
-        raised = topic.startswith(ALARM) and isinstance(value, dict) and value.get("active") is True
+        is_raised_alarm = topic.startswith(ALARM) and isinstance(value, dict) and value.get("active") is True
         device = self.devices.get(name) or DeviceTopics()
         if topic not in device.topics and len(device.topics) >= MAX_TOPICS:
             return None
         if sum(device.sizes.values()) + len(payload) - device.sizes.get(topic, 0) > MAX_DEVICE_BYTES:
             return None
-        if name not in self.devices and not self._make_room(now_s, urgent=raised):
+        if name not in self.devices and not self._make_room(now_s, urgent=is_raised_alarm):
             self._hide(name)
             return None
-        device.topics[topic], device.heard_s[topic], device.sizes[topic] = value, now_s, len(payload)
+        device.topics[topic], device.received_s[topic], device.sizes[topic] = value, now_s, len(payload)
         device.last_s = now_s
-        (device.alarms.add if raised else device.alarms.discard)(topic)
+        (device.alarms.add if is_raised_alarm else device.alarms.discard)(topic)
         self.devices[name] = device
         self._hidden.discard(name)
         return DeviceMessage(name, topic, value)
 
     def _make_room(self, now_s: float, *, urgent: bool) -> bool:
-        """Return True if one more device may be stored, after dropping the least important one if necessary."""
+        """Return True if one more device may be stored; drop the device with the lowest priority if necessary.
+
+        Args:
+            now_s: Present time, seconds since 1970.
+            urgent: True if the new device has a raised alarm.
+        """
         if len(self.devices) < MAX_DEVICES:
             return True
         name = min(self.devices, key=lambda each: self.devices[each].priority)
@@ -132,14 +137,14 @@ class TopicCache:
     def _hide(self, name: str) -> None:
         if len(self._hidden) < MAX_HIDDEN:
             self._hidden.add(name)
-        self._left_out(name)
+        self._on_hidden(name)
 
-    def _forget(self, name: str, topic: str) -> DeviceMessage | None:
+    def _remove_topic(self, name: str, topic: str) -> DeviceMessage | None:
         self._hidden.discard(name)
         device = self.devices.get(name)
         if device is None or topic not in device.topics:
             return None
-        del device.topics[topic], device.heard_s[topic], device.sizes[topic]
+        del device.topics[topic], device.received_s[topic], device.sizes[topic]
         device.alarms.discard(topic)
         if not device.topics:
             del self.devices[name]

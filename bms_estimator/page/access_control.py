@@ -26,7 +26,7 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
 }
-"""Headers of every response: load nothing from elsewhere, forbid framing, and send no referrer that may hold a token."""
+"""Headers of every response. They forbid loading from other servers, framing, and referrers, which may contain a token."""
 
 
 class AccessControl:
@@ -38,8 +38,8 @@ class AccessControl:
     """
 
     def __init__(self, hosts: Iterable[str] = (), token: str | None = None) -> None:
-        own = socket.gethostname().lower()
-        self._hosts = {"localhost", own, f"{own}.local", *(host.lower() for host in hosts)}
+        machine = socket.gethostname().lower()
+        self._hosts = {"localhost", machine, f"{machine}.local", *(host.lower() for host in hosts)}
         self._token = token.encode() if token is not None else None
 
     @property
@@ -57,11 +57,11 @@ class AccessControl:
 
     def is_valid_token(self, token: str) -> bool:
         """Return True for the right token, or if none is required. The time of the comparison does not depend on the token."""
-        return self._token is None or hmac.compare_digest(_bytes(token), self._token)
+        return self._token is None or hmac.compare_digest(_encode_header(token), self._token)
 
     def is_valid_cookie(self, cookie: str) -> bool:
         """Return True for the cookie of the token, or if none is required."""
-        return self._token is None or hmac.compare_digest(_bytes(cookie), self.cookie.encode())
+        return self._token is None or hmac.compare_digest(_encode_header(cookie), self.cookie.encode())
 
 
 def make_access_control(settings: PageSettings) -> AccessControl:
@@ -91,7 +91,7 @@ def _token(settings: PageSettings) -> str | None:
     return token
 
 
-def _bytes(header: str) -> bytes:
+def _encode_header(header: str) -> bytes:
     """Return a header as received: aiohttp passes invalid UTF-8 as surrogates."""
     return header.encode(errors="surrogateescape")
 

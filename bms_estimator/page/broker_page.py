@@ -15,7 +15,7 @@ from bms_estimator.settings.page import PageSettings
 
 @contextlib.asynccontextmanager
 async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) -> AsyncIterator[str]:
-    """Serve the page while the context lasts.
+    """Serve the page within the context.
 
     Args:
         broker: Settings of the broker.
@@ -35,18 +35,18 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
         if message.device not in hub.packs:
             history.add(message.device, folder / f"{message.device}.sqlite")
         hub.put(*message)
-        hub.hide(subscriber.hidden)
+        hub.set_hidden_count(subscriber.hidden)
 
     def on_hidden(device: str) -> None:
         hub.drop(device)
         history.drop(device)
-        hub.hide(subscriber.hidden)
+        hub.set_hidden_count(subscriber.hidden)
 
     def on_link_change() -> None:
         lost = subscriber.lost_since is not None
         hub.set_link_state(subscriber.trouble or "the broker is lost" if lost else None)
 
-    async with PageServer(settings, hub, history, patient=False) as server:
-        subscriber = Subscriber(broker, on_message, on_link_change, left_out=on_hidden)
+    async with PageServer(settings, hub, history, retry=False) as server:
+        subscriber = Subscriber(broker, on_message, on_link_change, on_hidden=on_hidden)
         async with subscriber:
             yield server.url

@@ -1,6 +1,6 @@
-"""Newest text of each key, and queues of its readers. No I/O.
+"""Latest text of each key, and queues of its readers. No I/O.
 
-A slow reader receives only the newest text of each key.
+A slow reader receives only the latest text of each key.
 """
 
 import asyncio
@@ -27,11 +27,11 @@ class LatestValues:
         return len(self._readers)
 
     def keys(self) -> list[str]:
-        """Return the keys that a new reader is sent."""
+        """Return the keys whose texts a new reader receives."""
         return list(self._texts)
 
     def text(self, key: str) -> str | None:
-        """Return the newest text of a key; None: there is nothing to send."""
+        """Return the latest text of a key; None: there is nothing to send."""
         return self._texts.get(key)
 
     def set_value(self, key: str, text: str) -> None:
@@ -45,13 +45,13 @@ class LatestValues:
         self.set_value(LINK, json.dumps({"up": trouble is None, "reason": trouble}))
 
     def broadcast(self, key: str) -> None:
-        """Queue the newest text of a key for all readers."""
+        """Queue the latest text of a key for all readers."""
         for reader in self._readers:
             reader.put(key)
 
     @contextmanager
     def reading(self) -> Iterator["Reader"]:
-        """Yield a new reader, which first receives all present values."""
+        """Register a new reader within the context. It first receives all present values."""
         reader = Reader(self)
         self._readers.add(reader)
         try:
@@ -66,28 +66,28 @@ class LatestValues:
 
 
 class Reader:
-    """Queue of the keys whose newest text has not been sent to one reader. All readers share the texts.
+    """Queue of the keys whose latest text has not been sent to one reader. All readers share the texts.
 
     Args:
-        newest: Source of the keys and texts.
+        latest: Source of the keys and texts.
     """
 
-    def __init__(self, newest: LatestValues) -> None:
-        self._newest = newest
-        self._waiting = dict.fromkeys(newest.keys())
-        self._due = asyncio.Event()
-        self._due.set()
+    def __init__(self, latest: LatestValues) -> None:
+        self._latest = latest
+        self._waiting = dict.fromkeys(latest.keys())
+        self._has_news = asyncio.Event()
+        self._has_news.set()
         self.closed = False
 
     def put(self, key: str) -> None:
         """Mark a key whose text has changed."""
         self._waiting[key] = None
-        self._due.set()
+        self._has_news.set()
 
     def close(self) -> None:
         """End the stream."""
         self.closed = True
-        self._due.set()
+        self._has_news.set()
 
     async def next(self, timeout_s: float) -> str:
         """Return the waiting texts as one JSON object of at most ``MAX_MESSAGE_BYTES``, or of one text if that is longer.
@@ -96,19 +96,20 @@ class Reader:
         """
         try:
             async with asyncio.timeout(timeout_s):
-                await self._due.wait()
+                await self._has_news.wait()
         except TimeoutError:
             return ""
-        parts = self._take()
+        parts = self._next_texts()
         if not self._waiting:
-            self._due.clear()
+            self._has_news.clear()
         return f"{{{','.join(parts)}}}" if parts else ""
 
-    def _take(self) -> list[str]:
+    def _next_texts(self) -> list[str]:
+        """Remove the first waiting keys; return them with their texts, as members of a JSON object."""
         parts, size = list[str](), 0
         while self._waiting:
             key = next(iter(self._waiting))
-            text = self._newest.text(key)
+            text = self._latest.text(key)
             if text is not None:
                 size += len(key) + len(text)
                 if parts and size > MAX_MESSAGE_BYTES:

@@ -13,6 +13,8 @@ from bms_estimator.store.minute import MINUTE_S
 
 MAX_EVENTS = 50
 """Maximum number of events in a response; the latest are sent."""
+MAX_CACHE_AGE_S = MINUTE_S / 2
+"""Maximum age of a cached response [s]."""
 FIELDS = (
     "time_s",
     "voltage_v",
@@ -41,7 +43,7 @@ SPANS = {"hour": Span(3600, MINUTE_S), "day": Span(86_400, 5 * MINUTE_S), "month
 
 
 class HistoryQuery:
-    """Reader of histories with a cache. Each span is read at most every half minute.
+    """Reader of histories with a cache. Each span is read at most once in ``MAX_CACHE_AGE_S``.
 
     Args:
         clock: Wall clock [s since 1970].
@@ -49,7 +51,7 @@ class HistoryQuery:
 
     def __init__(self, clock: Callable[[], float] = time.time) -> None:
         self._files: dict[str, Path] = {}
-        self._read: dict[tuple[str, str], tuple[float, bytes]] = {}
+        self._cache: dict[tuple[str, str], tuple[float, bytes]] = {}  # read time and JSON, by pack and name of the span
         self._clock = clock
         self.thread = DiskThread("page")
 
@@ -60,15 +62,15 @@ class HistoryQuery:
     def drop(self, pack: str) -> None:
         """Remove a pack."""
         self._files.pop(pack, None)
-        for name in SPANS:
-            self._read.pop((pack, name), None)
+        for span in SPANS:
+            self._cache.pop((pack, span), None)
 
-    def read(self, pack: str, name: str) -> bytes:
+    def read(self, pack: str, span: str) -> bytes:
         """Read a span of a pack's history as JSON columns; call it in ``thread``.
 
         Args:
             pack: Name of the pack.
-            name: One of ``SPANS``.
+            span: Name of a span, one of ``SPANS``.
 
         Raises:
             UserError: The file is missing or cannot be read.
@@ -76,14 +78,14 @@ class HistoryQuery:
         if pack not in self._files:
             raise UserError(f"{pack}: there is no history here")
         now_s = self._clock()
-        read_s, text = self._read.get((pack, name), (0.0, b""))
-        if not 0.0 <= now_s - read_s < MINUTE_S / 2:
-            text = _columns(HistoryFile(self._files[pack]), SPANS[name], now_s)
-            self._read[pack, name] = now_s, text
+        cached_s, text = self._cache.get((pack, span), (0.0, b""))
+        if not 0.0 <= now_s - cached_s < MAX_CACHE_AGE_S:
+            text = _query_columns(HistoryFile(self._files[pack]), SPANS[span], now_s)
+            self._cache[pack, span] = now_s, text
         return text
 
 
-def _columns(file: HistoryFile, span: Span, now_s: float) -> bytes:
+def _query_columns(file: HistoryFile, span: Span, now_s: float) -> bytes:
     since_s, until_s = now_s - span.length_s, now_s + MINUTE_S
     rows = file.rows(since_s, until_s, span.step_s)
     events = file.events(since_s, until_s)[-MAX_EVENTS:]

@@ -25,7 +25,8 @@ RECENT_STEP_S = 1.0
 MAX_AHEAD_S = 86_400.0
 """Maximum lead of a state's time over the wall clock [s]. A state with a larger lead is ignored."""
 SET_BACK_S = 60.0
-"""Maximum lead of a stored state over the wall clock and the next state [s]. With a larger lead its clock was wrong."""
+"""Maximum lead of a stored state over both the wall clock and the next state [s]. A state with a larger lead is removed,
+because its clock was wrong."""
 RECENT_FIELDS = ("voltage_v", "voltage_estimate_v", "current_a", "power_w", "soc", "soc_std", "innovation_v")
 
 _Row = tuple[float, tuple[float | None, ...]]
@@ -83,14 +84,14 @@ class PackTopics(LatestValues):
         self._elements.pop(pack, None)
         self._publish_packs()
 
-    def hide(self, count: int) -> None:
-        """Report the number of packs that are not shown."""
+    def set_hidden_count(self, count: int) -> None:
+        """Set the number of packs that are not shown, and send it to the readers."""
         if count != self._hidden:
             self._hidden = count
             self._publish_packs()
 
     def keys(self) -> list[str]:
-        """Return the keys that a new reader is sent."""
+        """Return the keys whose texts a new reader receives."""
         keys = super().keys()
         for pack, topics in self._topics.items():
             keys += [f"{pack}/{topic}" for topic in (*topics, RECENT, ELEMENTS)]
@@ -129,16 +130,16 @@ class PackTopics(LatestValues):
     def _store_state(self, pack: str, state: Mapping[str, Any]) -> None:
         """Store a state for the curves, at most once a second. A late state, or one far in the future, is ignored."""
         try:
-            row = epoch_s(state["time"]), tuple(_number(state.get(field)) for field in RECENT_FIELDS)
+            time_s, values = epoch_s(state["time"]), tuple(_number(state.get(field)) for field in RECENT_FIELDS)
         except (TypeError, ValueError, KeyError):  # invalid, from another publisher
             return
-        if row[0] > self._wall() + MAX_AHEAD_S:  # it would hide all later states
+        if time_s > self._wall() + MAX_AHEAD_S:  # it would hide all later states
             return
         rows = self._recent.setdefault(pack, deque(maxlen=RECENT_STATES))
-        while rows and rows[-1][0] > max(row[0], self._wall()) + SET_BACK_S:
+        while rows and rows[-1][0] > max(time_s, self._wall()) + SET_BACK_S:
             rows.pop()
-        if not rows or row[0] >= rows[-1][0] + RECENT_STEP_S:
-            rows.append(row)
+        if not rows or time_s >= rows[-1][0] + RECENT_STEP_S:
+            rows.append((time_s, values))
 
     def _store_elements(self, pack: str, report: Mapping[str, Any]) -> None:
         """Store the last value and standard deviation of each element, by percent of SOC."""
@@ -154,8 +155,8 @@ class PackTopics(LatestValues):
 
 def _columns(rows: Iterable[_Row]) -> dict[str, list[float | None]]:
     """Return the columns by name."""
-    found: dict[str, list[float | None]] = {"time_s": [time_s for time_s, _ in rows]}
-    return found | {field: [values[i] for _, values in rows] for i, field in enumerate(RECENT_FIELDS)}
+    times: dict[str, list[float | None]] = {"time_s": [time_s for time_s, _ in rows]}
+    return times | {field: [values[i] for _, values in rows] for i, field in enumerate(RECENT_FIELDS)}
 
 
 def _json(value: Any) -> str:

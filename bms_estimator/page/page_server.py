@@ -15,7 +15,7 @@ from bms_estimator.settings.page import PageSettings
 HISTORY_TIMEOUT_S = 10.0
 """Timeout of a history query [s]. A disk that needs longer counts as hung."""
 MAX_HISTORY_QUERIES = 4
-"""Maximum number of history queries that wait for the disk; further ones wait for these."""
+"""Maximum number of history queries that wait for the disk. Further queries wait until one of these has ended."""
 
 STATIC = Path(__file__).with_name("static")
 FILES = {
@@ -37,9 +37,9 @@ class PageServer(WebServer):
     Args:
         settings: Address and access of the page.
         hub: Present state of the packs.
-        past: History of the packs.
-        opened: Called with its address once it is served.
-        patient: True: retry an address that is in use or does not exist yet; False: raise an error.
+        history: History of the packs.
+        on_listening: Called with the address of the page once the server listens.
+        retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
     Raises:
         UserError: The token cannot be read.
@@ -49,23 +49,25 @@ class PageServer(WebServer):
         self,
         settings: PageSettings,
         hub: PackTopics,
-        past: HistoryQuery,
+        history: HistoryQuery,
         *,
-        opened: Callable[[str], object] = str,
-        patient: bool = True,
+        on_listening: Callable[[str], object] = str,
+        retry: bool = True,
     ) -> None:
-        super().__init__(settings, FILES, hub, {"/history": self._history}, opened=opened, patient=patient)
-        self._past = past
-        self._histories = asyncio.Semaphore(MAX_HISTORY_QUERIES)
+        super().__init__(
+            settings, FILES, hub, {"/history": self._answer_history}, on_listening=on_listening, retry=retry
+        )
+        self._history = history
+        self._query_slots = asyncio.Semaphore(MAX_HISTORY_QUERIES)
 
-    async def _history(self, request: web.Request) -> web.StreamResponse:
+    async def _answer_history(self, request: web.Request) -> web.StreamResponse:
         pack, span = request.query.get("pack", ""), request.query.get("span", "")
         if span not in SPANS:
             raise web.HTTPBadRequest(text=f"span: must be one of {', '.join(SPANS)}\n")
         loop = asyncio.get_running_loop()
         try:
-            async with asyncio.timeout(HISTORY_TIMEOUT_S), self._histories:
-                body = await loop.run_in_executor(self._past.thread, self._past.read, pack, span)
+            async with asyncio.timeout(HISTORY_TIMEOUT_S), self._query_slots:
+                body = await loop.run_in_executor(self._history.thread, self._history.read, pack, span)
         except UserError as error:
             raise web.HTTPNotFound(text=f"{error}\n") from None
         except TimeoutError:

@@ -30,7 +30,7 @@ class PageSink:
     def __init__(self, pages: "Pages", settings: PageSettings, pack: str, history: Path | None = None) -> None:
         self._pages, self._settings, self._pack, self._history = pages, settings, pack, history
         self._messages = MessageBuilder("", pack)
-        self._before: Snapshot | None = None
+        self._previous: Snapshot | None = None
         self._sent = PublishedState()
         self._hub = PackTopics()
         self._stack = contextlib.AsyncExitStack()
@@ -52,8 +52,8 @@ class PageSink:
         """Store a snapshot for the page, without blocking."""
         now_s = asyncio.get_running_loop().time()
         messages, self._sent = self._messages.live_messages(self._sent, snapshot, now_s)
-        self._put(self._messages.must_deliver(self._before, snapshot) + messages)
-        self._before = snapshot
+        self._put(self._messages.guaranteed_messages(self._previous, snapshot) + messages)
+        self._previous = snapshot
 
     def _put(self, messages: list[Message]) -> None:
         root = f"{self._messages.root}/"
@@ -66,12 +66,12 @@ class Pages:
     """Page servers of a process, one for each configured address.
 
     Args:
-        opened: Called with the address of each server once it listens.
+        on_listening: Called with the address of each server once it listens.
     """
 
-    def __init__(self, opened: Callable[[str], object] = str) -> None:
-        self._opened = opened
-        self._open: dict[str, _Page] = {}
+    def __init__(self, on_listening: Callable[[str], object] = str) -> None:
+        self._on_listening = on_listening
+        self._by_address: dict[str, _Page] = {}
 
     @contextlib.asynccontextmanager
     async def serving(self, settings: PageSettings, pack: str, history: Path | None) -> AsyncIterator[PackTopics]:
@@ -80,41 +80,41 @@ class Pages:
         Raises:
             UserError: Two packs have one address with different tokens, or the token cannot be read.
         """
-        page = self._open.get(settings.listen)
+        page = self._by_address.get(settings.listen)
         if page is None:
-            page = self._open[settings.listen] = _Page(settings, self._opened)
+            page = self._by_address[settings.listen] = _Page(settings, self._on_listening)
         page.packs += 1
         try:
             if page.settings != settings:
                 raise UserError(f"page: packs that share listen = {settings.listen} must share token_file and hosts")
             if history:
-                page.past.add(pack, history)
+                page.history_query.add(pack, history)
             await page.start()
             yield page.hub
         finally:
             page.packs -= 1
             if not page.packs:
-                del self._open[settings.listen]
+                del self._by_address[settings.listen]
                 await page.stop()
 
 
 class _Page:
     """Page server and the number of its packs."""
 
-    def __init__(self, settings: PageSettings, opened: Callable[[str], object]) -> None:
+    def __init__(self, settings: PageSettings, on_listening: Callable[[str], object]) -> None:
         self.settings, self.packs = settings, 0
-        self.hub, self.past = PackTopics(), HistoryQuery()
-        self._server = PageServer(settings, self.hub, self.past, opened=opened)
-        self._started: asyncio.Task[PageServer] | None = None
+        self.hub, self.history_query = PackTopics(), HistoryQuery()
+        self._server = PageServer(settings, self.hub, self.history_query, on_listening=on_listening)
+        self._start_task: asyncio.Task[PageServer] | None = None
 
     async def start(self) -> None:
         """Start the server, unless an earlier pack started it."""
-        if self._started is None:
-            self._started = asyncio.ensure_future(self._server.__aenter__())
-        await asyncio.shield(self._started)
+        if self._start_task is None:
+            self._start_task = asyncio.ensure_future(self._server.__aenter__())
+        await asyncio.shield(self._start_task)
 
     async def stop(self) -> None:
         """End the server, if it was started."""
-        if self._started is not None:
-            await asyncio.wait([self._started])
+        if self._start_task is not None:
+            await asyncio.wait([self._start_task])
             await self._server.__aexit__(None, None, None)

@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.page.access_control import HEADERS, AccessControl, make_access_control
 from bms_estimator.page.event_stream import LatestValues, Reader
 from bms_estimator.process.listener import CONNECTIONS, Listener
-from bms_estimator.settings.page import Listen, PageSettings
+from bms_estimator.settings.page import ListenAddress, PageSettings
 
 PING_S = 5.0
 """Interval of keep-alive events to a silent reader [s]; the page counts the connection as lost after three of them."""
@@ -25,6 +25,8 @@ MAX_STREAMS = 32
 """Maximum number of concurrent event streams."""
 RETRY_S = 10.0
 """Retry interval of an address that cannot be listened on [s]."""
+COOKIE_S = 31_536_000
+"""Lifetime of the cookie, one year [s]."""
 SHUTDOWN_TIMEOUT_S = 1.0
 """Timeout of open connections at shutdown [s]."""
 
@@ -42,17 +44,20 @@ class File(NamedTuple):
     """File that is served unchanged."""
 
     path: Path
-    kind: str
-    """Media type."""
+    media_type: str
 
 
-class _Read(NamedTuple):
+class _LoadedFile(NamedTuple):
+    """File in memory, with its media type and its HTTP entity tag."""
+
     body: bytes
-    kind: str
-    tag: str
+    media_type: str
+    etag: str
 
 
 class _Stream(NamedTuple):
+    """Open event stream of a client."""
+
     address: str | None
     transport: asyncio.Transport | None
 
@@ -63,10 +68,10 @@ class WebServer:
     Args:
         settings: Address and access of the page.
         files: Static files by the path of their URL.
-        newest: Content of the event stream ``/events``.
+        latest: Content of the event stream ``/events``.
         handlers: Handlers of queries, by path.
-        opened: Called with the address once the server listens.
-        patient: True: retry an address that is in use or does not exist yet; False: raise an error.
+        on_listening: Called with the address once the server listens.
+        retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
     Raises:
         UserError: The token cannot be read.
@@ -76,17 +81,17 @@ class WebServer:
         self,
         settings: PageSettings,
         files: Mapping[str, File],
-        newest: LatestValues,
+        latest: LatestValues,
         handlers: Mapping[str, Handler],
         *,
-        opened: Callable[[str], object] = str,
-        patient: bool = True,
+        on_listening: Callable[[str], object] = str,
+        retry: bool = True,
     ) -> None:
-        self._newest, self._opened, self._patient = newest, opened, patient
+        self._latest, self._on_listening, self._retry = latest, on_listening, retry
         self._access: AccessControl = make_access_control(settings)
         self._configured_address, self._listening = settings.address, settings.address
-        self._files = {path: _read(file) for path, file in files.items()}
-        self._handlers = {**dict.fromkeys(files, self._file), "/events": self._events, **handlers}
+        self._files = {path: _load_file(file) for path, file in files.items()}
+        self._handlers = {**dict.fromkeys(files, self._file), "/events": self._stream_events, **handlers}
         self._streams: dict[Reader, _Stream] = {}
         self._runner: web.AppRunner | None = None
         self._listener: Listener | None = None
@@ -103,7 +108,7 @@ class WebServer:
         """Start to listen on the address.
 
         Raises:
-            UserError: The address cannot be listened on, and ``patient`` is False.
+            UserError: The address cannot be listened on, and ``retry`` is False.
         """
         app = web.Application(middlewares=[self._exempt_connection], client_max_size=1024)
         app.on_response_prepare.append(_protect)
@@ -114,12 +119,14 @@ class WebServer:
         try:
             await self._listen(self._runner)
         except OSError as error:
-            if not self._patient:
+            if not self._retry:
                 await self._runner.cleanup()
                 raise UserError(
-                    f"page.listen = {_text(self._configured_address)}: {error.strerror}; name another one"
+                    f"page.listen = {_address_text(self._configured_address)}: {error.strerror}; name another one"
                 ) from None
-            log.warning("the page is not served yet", listen=_text(self._configured_address), reason=error.strerror)
+            log.warning(
+                "the page is not served yet", listen=_address_text(self._configured_address), reason=error.strerror
+            )
             self._task = asyncio.create_task(self._listen_later(self._runner), name="page")
         return self
 
@@ -128,7 +135,7 @@ class WebServer:
         if self._task:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
-        self._newest.close()
+        self._latest.close()
         if self._listener:
             await self._listener.close()
         if self._runner:
@@ -145,7 +152,7 @@ class WebServer:
         self._listener = listener
         self._listening = self._configured_address._replace(port=port)
         log.info("live page", url=self.url)
-        self._opened(self.url)
+        self._on_listening(self.url)
 
     async def _listen_later(self, runner: web.AppRunner) -> None:
         while True:
@@ -183,22 +190,22 @@ class WebServer:
     def _set_cookie(self) -> web.Response:
         """Set the cookie, and redirect to the address without the token."""
         response = web.Response(status=303, headers={"Location": "/"})
-        response.set_cookie(self._cookie, self._access.cookie, max_age=31_536_000, httponly=True, samesite="Strict")
+        response.set_cookie(self._cookie, self._access.cookie, max_age=COOKIE_S, httponly=True, samesite="Strict")
         return response
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
         file = self._files[request.path]
-        headers = {"ETag": file.tag, "Cache-Control": "no-cache"}
-        if request.headers.get("If-None-Match") == file.tag:
+        headers = {"ETag": file.etag, "Cache-Control": "no-cache"}
+        if request.headers.get("If-None-Match") == file.etag:
             return web.Response(status=304, headers=headers)
-        return web.Response(body=file.body, content_type=file.kind, charset="utf-8", headers=headers)
+        return web.Response(body=file.body, content_type=file.media_type, charset="utf-8", headers=headers)
 
-    async def _events(self, request: web.Request) -> web.StreamResponse:
-        """Stream all known texts, then changes, until either side closes."""
+    async def _stream_events(self, request: web.Request) -> web.StreamResponse:
+        """Stream all present texts, then changes, until either side closes."""
         response = web.StreamResponse(
             headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         )
-        with self._newest.reading() as reader, self._streaming(reader, request):
+        with self._latest.reading() as reader, self._streaming(reader, request):
             await response.prepare(request)
             await response.write(b"retry: 1000\n\n")
             while not reader.closed:
@@ -212,20 +219,24 @@ class WebServer:
 
     @contextlib.contextmanager
     def _streaming(self, reader: Reader, request: web.Request) -> Iterator[None]:
-        """Register a stream, closing another one if there are too many."""
+        """Register a stream within the context; close another one if there are too many."""
         if len(self._streams) >= MAX_STREAMS:
-            self._close_one(request.remote)
+            self._close_stream(request.remote)
         self._streams[reader] = _Stream(request.remote, request.transport)
         try:
             yield
         finally:
             self._streams.pop(reader, None)
 
-    def _close_one(self, newcomer: str | None) -> None:
-        """Close the oldest stream of the address with most streams; the newcomer's address is preferred in a tie."""
+    def _close_stream(self, newcomer: str | None) -> None:
+        """Close the oldest stream of the address with most streams; in a tie, of the new stream's address.
+
+        Args:
+            newcomer: Address of the client that opens a stream.
+        """
         counts = Counter(stream.address for stream in self._streams.values())
-        most = max(counts, key=lambda address: (counts[address], address == newcomer))
-        reader = next(reader for reader, stream in self._streams.items() if stream.address == most)
+        busiest = max(counts, key=lambda address: (counts[address], address == newcomer))
+        reader = next(reader for reader, stream in self._streams.items() if stream.address == busiest)
         transport = self._streams.pop(reader).transport
         reader.close()
         if transport:
@@ -237,10 +248,10 @@ async def _protect(_: web.Request, response: web.StreamResponse) -> None:
     response.headers.pop("Server", None)
 
 
-def _read(file: File) -> _Read:
+def _load_file(file: File) -> _LoadedFile:
     body = file.path.read_bytes()
-    return _Read(body, file.kind, f'"{hashlib.sha256(body).hexdigest()[:16]}"')
+    return _LoadedFile(body, file.media_type, f'"{hashlib.sha256(body).hexdigest()[:16]}"')
 
 
-def _text(listen: Listen) -> str:
+def _address_text(listen: ListenAddress) -> str:
     return f"{listen.host}:{listen.port}"

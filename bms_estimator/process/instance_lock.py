@@ -32,8 +32,8 @@ def instance_lock(folder: Path, pack: str) -> Iterator[None]:
 
     The lock is an abstract socket named after folder and pack. It disappears with the process, cannot be deleted or left
     over like a file, and does not depend on a disk. Any user of the machine could bind the name first. A holder without
-    write permission for the folder is therefore ignored. An unknown holder counts as a service, because two services are
-    worse than none. A container with its own network namespace has its own names.
+    write permission for the folder is therefore ignored. An unknown holder counts as a service, because two services do
+    more harm than no service. A container with its own network namespace has its own names.
 
     Args:
         folder: Folder of the pack's state.

@@ -30,7 +30,7 @@ RETRY_S = 1.0
 log = structlog.get_logger(__name__)
 
 
-def _limit() -> int:
+def _default_limit() -> int:
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY:
         return MAX_CONNECTIONS
@@ -39,11 +39,14 @@ def _limit() -> int:
 
 @dataclass(eq=False)
 class _Connection:
-    connected: socket.socket
+    """Open connection of a client."""
+
+    client_socket: socket.socket
     transport: asyncio.Transport
     address: str
     deadline: asyncio.TimerHandle
     serving: bool = False
+    """True while a request is handled."""
     unsent: int = 0
     """Bytes of a response that waited for the client when the deadline was last set."""
 
@@ -64,7 +67,7 @@ class Connections:
     """
 
     def __init__(self, limit: int | None = None) -> None:
-        self.limit = limit or _limit()
+        self.limit = limit or _default_limit()
         self._address_limit = max(1, int(ADDRESS_FRACTION * self.limit))
         self._open: dict[asyncio.BaseTransport, _Connection] = {}
 
@@ -73,13 +76,13 @@ class Connections:
         self._prune()
         return len(self._open)
 
-    def add(self, connected: socket.socket, transport: asyncio.Transport, address: str) -> None:
+    def add(self, client_socket: socket.socket, transport: asyncio.Transport, address: str) -> None:
         """Add a connection and start the deadline of its first request; close it if the limits do not allow it."""
         if not self._make_room(address):
             transport.abort()
             return
         deadline = asyncio.get_running_loop().call_later(HEADER_S, transport.abort)
-        self._open[transport] = _Connection(connected, transport, address, deadline)
+        self._open[transport] = _Connection(client_socket, transport, address, deadline)
 
     @contextlib.contextmanager
     def serving(self, transport: asyncio.BaseTransport | None) -> Iterator[None]:
@@ -128,7 +131,7 @@ class Connections:
     def _prune(self) -> None:
         """Remove the connections whose descriptor is closed."""
         for each in list(self._open.values()):
-            if each.connected.fileno() < 0:
+            if each.client_socket.fileno() < 0:
                 self._drop(each)
 
     def _drop(self, connection: _Connection) -> None:
@@ -155,7 +158,7 @@ class Listener:
         self._sockets: list[socket.socket] = []
         self._connecting: set[asyncio.Task[None]] = set()
         self._resuming: dict[socket.socket, asyncio.TimerHandle] = {}
-        self._logged_s = -LOG_S
+        self._log_time_s = -LOG_S
 
     async def open(self, host: str, port: int) -> int:
         """Listen and return the port.
@@ -164,12 +167,12 @@ class Listener:
             OSError: The address cannot be listened on.
         """
         loop = asyncio.get_running_loop()
-        found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        infos = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         try:
-            for family, (address, *_) in dict.fromkeys((family, sockaddr) for family, *_, sockaddr in found):
-                listening = _bound(family, str(address), port)
+            for family, (address, *_) in dict.fromkeys((family, sockaddr) for family, *_, sockaddr in infos):
+                listening = _listen_on(family, str(address), port)
                 self._sockets.append(listening)
-                port = listening.getsockname()[1]
+                port = listening.getsockname()[1]  # all addresses get the port that the system chose for the first
         except OSError:
             self._close_sockets()
             raise
@@ -194,19 +197,19 @@ class Listener:
     def _accept(self, listening: socket.socket) -> None:
         """Accept one connection. The event loop calls this method again while others wait."""
         try:
-            connected, address = listening.accept()
+            client_socket, address = listening.accept()
         except (BlockingIOError, InterruptedError, ConnectionError):  # the client has closed the connection meanwhile
             return
         except OSError as error:
-            self._log(error)
+            self._log_failure(error)
             self._pause(listening)
             return
-        task = asyncio.create_task(self._serve(connected, str(address[0])), name="connection")
+        task = asyncio.create_task(self._serve(client_socket, str(address[0])), name="connection")
         self._connecting.add(task)
         task.add_done_callback(self._connecting.discard)
 
     def _pause(self, listening: socket.socket) -> None:
-        """Accept no connection for ``RETRY_S``. Otherwise the loop would report the waiting one in a busy loop."""
+        """Accept no connection for ``RETRY_S``, because the event loop would call ``_accept`` all the time."""
         loop = asyncio.get_running_loop()
         loop.remove_reader(listening)
         self._resuming[listening] = loop.call_later(RETRY_S, self._resume, listening)
@@ -215,13 +218,13 @@ class Listener:
         self._resuming.pop(listening, None)
         asyncio.get_running_loop().add_reader(listening, self._accept, listening)
 
-    async def _serve(self, connected: socket.socket, address: str) -> None:
+    async def _serve(self, client_socket: socket.socket, address: str) -> None:
         try:
-            transport, _ = await asyncio.get_running_loop().connect_accepted_socket(self._make_protocol, connected)
+            transport, _ = await asyncio.get_running_loop().connect_accepted_socket(self._make_protocol, client_socket)
         except OSError:
-            connected.close()
+            client_socket.close()
             return
-        self._connections.add(connected, transport, address)
+        self._connections.add(client_socket, transport, address)
 
     def _make_protocol(self) -> asyncio.BaseProtocol:
         protocol = self._protocol()
@@ -229,14 +232,14 @@ class Listener:
             raise ConnectionAbortedError
         return protocol
 
-    def _log(self, error: OSError) -> None:
+    def _log_failure(self, error: OSError) -> None:
         now_s = time.monotonic()
-        if now_s >= self._logged_s + LOG_S:
-            self._logged_s = now_s
+        if now_s >= self._log_time_s + LOG_S:
+            self._log_time_s = now_s
             log.warning("connections cannot be accepted", reason=error.strerror)
 
 
-def _bound(family: int, address: str, port: int) -> socket.socket:
+def _listen_on(family: int, address: str, port: int) -> socket.socket:
     listening = socket.socket(family, socket.SOCK_STREAM)
     try:
         listening.setblocking(False)

@@ -23,9 +23,11 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
         lines: List that receives the lines in place of stderr, for a live view that uses the terminal itself.
     """
     readable = lines is not None or (sys.stderr.isatty() and "JOURNAL_STREAM" not in os.environ)
-    wide = lines is None
+    to_stderr = lines is None
     renderers: list[Any] = (
-        [structlog.dev.ConsoleRenderer(30 if wide else 0, colors=wide, pad_level=wide)]
+        [
+            structlog.dev.ConsoleRenderer(30 if to_stderr else 0, colors=to_stderr, pad_level=to_stderr)
+        ]  # width of the event
         if readable
         else [structlog.processors.dict_tracebacks, structlog.processors.JSONRenderer()]
     )
@@ -34,7 +36,7 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
             structlog.contextvars.merge_contextvars,
             structlog.processors.add_log_level,
             _drop_below_level,
-            structlog.processors.TimeStamper(fmt="iso" if wide else "%H:%M:%SZ", utc=True),
+            structlog.processors.TimeStamper(fmt="iso" if to_stderr else "%H:%M:%SZ", utc=True),
             *renderers,
         ],
         logger_factory=lambda *_: _LineLogger(stderr.take if lines is None else lines.append),

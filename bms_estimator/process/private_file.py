@@ -40,16 +40,16 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
     Raises:
         OSError: The disk cannot be written. The old file is unchanged.
     """
-    new = path.with_suffix(".new")
-    new.unlink(missing_ok=True)  # a power failure may have left it, or it is an unexpected symbolic link
-    with open(new, "xb", opener=_private) as file:
+    new_path = path.with_suffix(".new")
+    new_path.unlink(missing_ok=True)  # a power failure may have left it, or it is an unexpected symbolic link
+    with open(new_path, "xb", opener=_open_private) as file:
         if os.geteuid() == 0:
             owner = path.parent.stat()
             os.fchown(file.fileno(), owner.st_uid, owner.st_gid)
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    new.replace(path)
+    new_path.replace(path)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)  # syncs the new name
@@ -57,5 +57,5 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
         os.close(folder)
 
 
-def _private(path: str, flags: int) -> int:
+def _open_private(path: str, flags: int) -> int:
     return os.open(path, flags, 0o600)

@@ -33,16 +33,16 @@ def startup_signals() -> Iterator[None]:
     An ignored SIGHUP stays ignored, as under nohup.
     """
     unignored = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
-    before = {number: signal.signal(number, _end) for number in unignored}
+    previous_handlers = {number: signal.signal(number, _end) for number in unignored}
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
 
 def _end(*_: object) -> None:
-    """End the process without an exception, because one may be lost in the compiler.
+    """End the process without an exception, because an exception may be lost in numba's compiler.
 
     The end runs in a thread, because the interrupted code may hold the lock of the log.
     """

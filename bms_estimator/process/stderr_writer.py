@@ -45,10 +45,10 @@ class Stderr:
 
     def _run(self) -> None:
         while True:
-            rest = f"{self._lines.get()}\n".encode(errors="replace")
+            unwritten = f"{self._lines.get()}\n".encode(errors="replace")
             try:
-                while rest:  # not by sys.stderr, whose buffer is flushed, and may block, when the process ends
-                    rest = rest[os.write(STDERR, rest) :]
+                while unwritten:  # not by sys.stderr, whose buffer is flushed, and may block, when the process ends
+                    unwritten = unwritten[os.write(STDERR, unwritten) :]
             except OSError:  # a full disk costs only this line
                 self.lost += 1
             self._lines.task_done()

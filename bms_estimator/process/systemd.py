@@ -30,8 +30,8 @@ class SystemdNotifier:
         self._texts = dict.fromkeys(packs, "")
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
-        for_us = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        self.watchdog_s = float(environment.get("WATCHDOG_USEC", "0")) / 1e6 if for_us else 0.0
+        is_watched = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        self.watchdog_s = float(environment.get("WATCHDOG_USEC", "0")) / 1e6 if is_watched else 0.0
         """Watchdog timeout of systemd [s]; 0: no watchdog."""
 
     def ready(self, pack: str) -> None:
@@ -56,12 +56,13 @@ class SystemdNotifier:
         packs = (f"{pack}: {text}" if text else pack for pack, text in sorted(self._texts.items()))
         return f"STATUS={self._activity} {', '.join(packs)}"
 
-    def _send_once_all_reported(self, pack: str, state: str, more: str = "") -> None:
+    def _send_once_all_reported(self, pack: str, state: str, suffix: str = "") -> None:
+        """Record that a pack has reported a state; send the state when all packs have."""
         awaited = self._awaited.setdefault(state, set(self._packs))
         awaited.discard(pack)
         if not awaited:
             del self._awaited[state]
-            self._send(f"{state}{more}")
+            self._send(f"{state}{suffix}")
 
     def _send(self, state: str) -> None:
         """Send to systemd; ignore errors, because the service works without it."""
@@ -77,8 +78,8 @@ class SystemdNotifier:
 
 def credential(name: Path) -> Path:
     """Return the path of this name in ``$CREDENTIALS_DIRECTORY`` if it exists there, else ``name`` itself."""
-    own = Path(os.environ.get("CREDENTIALS_DIRECTORY", ""), name)
-    return own if os.access(own, os.R_OK) else name
+    path = Path(os.environ.get("CREDENTIALS_DIRECTORY", ""), name)
+    return path if os.access(path, os.R_OK) else name
 
 
 def is_for_the_service(name: Path) -> bool:
@@ -86,5 +87,5 @@ def is_for_the_service(name: Path) -> bool:
 
     The service may be able to read it.
     """
-    named = not name.is_absolute() or name.is_relative_to(CREDENTIALS)
-    return named and not os.access(credential(name), os.R_OK)
+    is_credential = not name.is_absolute() or name.is_relative_to(CREDENTIALS)
+    return is_credential and not os.access(credential(name), os.R_OK)

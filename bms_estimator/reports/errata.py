@@ -64,11 +64,13 @@ def _first(s: Simulation) -> list[Erratum]:
     """Return E1 to E14."""
     true, estimated = s.cell.a, s.printed_a
     a8, inferred_a8 = printed_values.BOUNDS[8], _weights(printed_values.A8_WEIGHTS)
-    e6 = next(c for c in lemma_conditions(load_cell("chen_mora")) if not c.holds)
-    relative = {i: 100.0 * abs(row[1] / row[2] - 1.0) for i, row in printed_values.TABLE_5.items()}
-    r_s = [f"{100.0 * abs(row[1] / row[0] - 1.0):.1f}" for row in printed_values.TABLE_6.values()]
+    failing_condition = next(c for c in lemma_conditions(load_cell("chen_mora")) if not c.holds)
+    errors_percent = {i: 100.0 * abs(row[1] / row[2] - 1.0) for i, row in printed_values.TABLE_5.items()}
+    r_s_errors = [f"{100.0 * abs(row[1] / row[0] - 1.0):.1f}" for row in printed_values.TABLE_6.values()]
     products = [f"{mean_error_percent(name, estimated, true):.1f}" for name in PRODUCTS]
-    fast, slow = ([m.tracking_v for m in measure() if m.c_rate == rate] for rate in (max(C_RATES), min(C_RATES)))
+    at_1c_v, at_smallest_v = (
+        [m.tracking_v for m in measure() if m.c_rate == rate] for rate in (max(C_RATES), min(C_RATES))
+    )
     deltas = [
         f"{float(delta(p[8], p[9], p[7])):.6f}, {float(delta(p[11], p[12], p[10])):.6f}" for p in (true, estimated)
     ]
@@ -79,7 +81,7 @@ def _first(s: Simulation) -> list[Erratum]:
             "Theorem 4.1.2",
             "parameters are identified, e goes to zero",
             "parameters converge to a weighted mean of their bounds, for any data; the output is tracked: |e| at most "
-            f"{1e3 * min(fast):.2f} to {1e3 * max(fast):.2f} mV at {CURRENT_A:g} A, {1e6 * min(slow):.0f} to {1e6 * max(slow):.0f} "
+            f"{1e3 * min(at_1c_v):.2f} to {1e3 * max(at_1c_v):.2f} mV at {CURRENT_A:g} A, {1e6 * min(at_smallest_v):.0f} to {1e6 * max(at_smallest_v):.0f} "
             f"µV at {1e3 * min(C_RATES) * CURRENT_A:.2f} mA",
         ),
         Erratum(
@@ -93,14 +95,14 @@ def _first(s: Simulation) -> list[Erratum]:
         Erratum(
             "Table 5",
             "conditions of Lemma 4.1.1 followed",
-            f"the first fails: {number(e6.left, 6)} against {number(e6.right, 6)}",
+            f"the first fails: {number(failing_condition.left, 6)} against {number(failing_condition.right, 6)}",
         ),
         Erratum(
             "Table 5, errors",
             "of the estimate",
-            "of the true value: " + ", ".join(f"a{i} {relative[i]:.1f}" for i in (1, 3, 4, 6, 8, 12)) + " %",
+            "of the true value: " + ", ".join(f"a{i} {errors_percent[i]:.1f}" for i in (1, 3, 4, 6, 8, 12)) + " %",
         ),
-        Erratum("Table 6, errors", "fractions and a value", f"{r_s[0]}, {r_s[1]}, {r_s[2]} %"),
+        Erratum("Table 6, errors", "fractions and a value", f"{r_s_errors[0]}, {r_s_errors[1]}, {r_s_errors[2]} %"),
         Erratum(
             "Table 7",
             f"products right to {printed_values.TABLE_7[PRODUCTS[0]]:.2f} and {printed_values.TABLE_7[PRODUCTS[1]]:.3f} %",
@@ -120,26 +122,26 @@ def _first(s: Simulation) -> list[Erratum]:
 
 def _theory(s: Simulation) -> list[Erratum]:
     """Return E15 to E19."""
-    held, tiny = (quasi_steady(s.cell, i) for i in (CURRENT_A, SMALLEST_CURRENT_A))
-    initial = [c for c in lemma_conditions(load_cell("thunder_power_6s")) if "(0)" in c.name]
-    rate = next(c for c in lemma_conditions(pack()) if "rate of a7" in c.name)
+    at_1c, at_smallest = (quasi_steady(s.cell, i) for i in (CURRENT_A, SMALLEST_CURRENT_A))
+    initial_conditions = [c for c in lemma_conditions(load_cell("thunder_power_6s")) if "(0)" in c.name]
+    rate_condition = next(c for c in lemma_conditions(pack()) if "rate of a7" in c.name)
     r_s_errors = {load_cell(name).cell.capacity_ah: ocv_error_ohm(load_cell(name)) for name in CELLS}
-    r_s, fitted = float(s.cell.a[15]), float(s.r_s_fit.a[2])
-    excess = sum(float(s.improved.average[i] - s.cell.a[i]) for i in (3, 6))
+    true_r_s_ohm, fitted_r_s_ohm = float(s.cell.a[15]), float(s.r_s_fit.a[2])
+    excess_ohm = sum(float(s.improved.average[i] - s.cell.a[i]) for i in (3, 6))
     return [
         Erratum(
             "(3.2), (3.3)",
             "the same u drives both branches",
             "those of the cell are driven by i/C_ts and i/C_tl. Therefore x2 : x3 is tau_ts : tau_tl instead of R_ts : R_tl, "
-            f"which is equal only if C_ts = C_tl. With all parameters true, x3 is {1e3 * held.observer_v[1]:.1f} mV instead of "
-            f"the cell's {1e3 * held.cell_v[1]:.1f}, and x2 is {1e3 * held.observer_v[0]:.1f} mV instead of "
-            f"{1e3 * held.cell_v[0]:.1f} (after half an hour at {CURRENT_A:g} A)",
+            f"which is equal only if C_ts = C_tl. With all parameters true, x3 is {1e3 * at_1c.observer_v[1]:.1f} mV instead of "
+            f"the cell's {1e3 * at_1c.cell_v[1]:.1f}, and x2 is {1e3 * at_1c.observer_v[0]:.1f} mV instead of "
+            f"{1e3 * at_1c.cell_v[0]:.1f} (after half an hour at {CURRENT_A:g} A)",
         ),
         Erratum(
             "(4.64)-(4.66)",
             "e goes to zero, the products follow",
-            f"quasi-steadily u = x2/tau_ts, so e = -x2/(N tau_ts) = {1e3 * held.predicted_v:.3f} mV at {CURRENT_A:g} A, measured "
-            f"{1e3 * held.error_v:.3f}; at {1e3 * SMALLEST_CURRENT_A:g} mA {1e6 * tiny.error_v:.3f} µV. Every term of (4.66) is "
+            f"quasi-steadily u = x2/tau_ts, so e = -x2/(N tau_ts) = {1e3 * at_1c.predicted_v:.3f} mV at {CURRENT_A:g} A, measured "
+            f"{1e3 * at_1c.error_v:.3f}; at {1e3 * SMALLEST_CURRENT_A:g} mA {1e6 * at_smallest.error_v:.3f} µV. Every term of (4.66) is "
             "proportional to i, so that in the limit it reads 0 = 0",
         ),
         Erratum(
@@ -151,14 +153,14 @@ def _theory(s: Simulation) -> list[Erratum]:
             "Lemma 4.1.1",
             "conditions for C_ts, C_tl > 0",
             "circular: the condition on a8 (a11) is C_ts > 0 (C_tl > 0) rewritten, and the others only ensure that delta1 and "
-            f"delta2 are positive. Table 10's initial values violate the first two ({_sides(initial[0])}; {_sides(initial[1])}). "
-            f"With the weights of E24 the rate of a7 is too high as well ({number(rate.left)} > {number(rate.right)})",
+            f"delta2 are positive. Table 10's initial values violate the first two ({_sides(initial_conditions[0])}; {_sides(initial_conditions[1])}). "
+            f"With the weights of E24 the rate of a7 is too high as well ({number(rate_condition.left)} > {number(rate_condition.right)})",
         ),
         Erratum(
             "(4.2)",
             "sign; divided by i",
-            f"(2.4) has the opposite sign. R_s absorbs the error of R_ts + R_tl: it is {1e3 * fitted:.1f} mΩ, and {1e3 * r_s:.1f} minus "
-            f"the error {1e3 * excess:.1f} is {1e3 * (r_s - excess):.1f}. An error of E_o of {1e3 * OCV_ERROR_V:g} mV gives "
+            f"(2.4) has the opposite sign. R_s absorbs the error of R_ts + R_tl: it is {1e3 * fitted_r_s_ohm:.1f} mΩ, and {1e3 * true_r_s_ohm:.1f} minus "
+            f"the error {1e3 * excess_ohm:.1f} is {1e3 * (true_r_s_ohm - excess_ohm):.1f}. An error of E_o of {1e3 * OCV_ERROR_V:g} mV gives "
             + ", ".join(f"{1e3 * ohm:.0f} mΩ at C/20 of {ah:g} Ah" for ah, ohm in r_s_errors.items())
             + ". Step 2 requires i to 0, but step 3 a large i: weight by the current",
         ),
@@ -169,10 +171,10 @@ def _experiments(s: Simulation) -> list[Erratum]:
     """Return E20 to E26."""
     currents = printed_pack.current_errors_percent()
     ohm = " / ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in RESISTORS)
-    off = " / ".join(f"{currents[load]:.1f}" for load in RESISTORS)
-    six, small = load_cell("thunder_power_6s").cell, s.cell.cell
-    parallel = six.capacity_ah / small.capacity_ah
-    inferred = printed_values.INFERRED_WEIGHTS["10"]
+    deviations = " / ".join(f"{currents[load]:.1f}" for load in RESISTORS)
+    pack_of_thesis, cell_of_chen_mora = load_cell("thunder_power_6s").cell, s.cell.cell
+    cells_in_parallel = pack_of_thesis.capacity_ah / cell_of_chen_mora.capacity_ah
+    inferred_weights = printed_values.INFERRED_WEIGHTS["10"]
     return [
         Erratum(
             "5.1",
@@ -182,14 +184,14 @@ def _experiments(s: Simulation) -> list[Erratum]:
         Erratum(
             "5.2.1",
             "currents of the loads",
-            f"contradict Ohm's law with Tables 8 to 10 by {off} % at {ohm} Ω",
+            f"contradict Ohm's law with Tables 8 to 10 by {deviations} % at {ohm} Ω",
         ),
         Erratum(
             "Figure 29, Table 10",
             "compared with Chen and Mora",
-            f"a pack of {six.series_count} cells in series and {six.capacity_ah:g} Ah is compared with a cell of "
-            f"{1e3 * small.capacity_ah:g} mAh, and has its bounds. If it consisted of such cells, it would have "
-            f"{six.series_count / parallel:.2f} times the resistances and {parallel / six.series_count:.0f} times the "
+            f"a pack of {pack_of_thesis.series_count} cells in series and {pack_of_thesis.capacity_ah:g} Ah is compared with a cell of "
+            f"{1e3 * cell_of_chen_mora.capacity_ah:g} mAh, and has its bounds. If it consisted of such cells, it would have "
+            f"{pack_of_thesis.series_count / cells_in_parallel:.2f} times the resistances and {cells_in_parallel / pack_of_thesis.series_count:.0f} times the "
             "capacitances; only the products would be equal",
         ),
         Erratum(
@@ -200,9 +202,9 @@ def _experiments(s: Simulation) -> list[Erratum]:
         Erratum(
             "Tables 5, 10, weights",
             f"a7 {_weights(printed_values.BOUNDS[7][2:])}; Table 10 a4 {_weights(printed_values.BOUNDS[4][2:])}",
-            f"a7 in the ratio of {_weights(inferred[7])} in both, which in Table 10 gives {printed_values.mean_from_start('10', 7):.2f} "
+            f"a7 in the ratio of {_weights(inferred_weights[7])} in both, which in Table 10 gives {printed_values.mean_from_start('10', 7):.2f} "
             f"({printed_values.TABLE_10[7][1]:.2f}) and in Table 5, as {_weights(printed_values.INFERRED_WEIGHTS['5'][7])}, "
-            f"{printed_values.mean_from_start('5', 7):.4f} ({printed_values.TABLE_5[7][1]:.4f}); a4 {_weights(inferred[4])}: "
+            f"{printed_values.mean_from_start('5', 7):.4f} ({printed_values.TABLE_5[7][1]:.4f}); a4 {_weights(inferred_weights[4])}: "
             f"{printed_values.mean_from_start('10', 4):.4f} ({printed_values.TABLE_10[4][1]:.4f}); inferred, as E4",
         ),
         Erratum(
@@ -225,8 +227,8 @@ def _experiments(s: Simulation) -> list[Erratum]:
 
 def _second_audit(s: Simulation) -> list[Erratum]:
     """Return E27 to E33."""
-    held = quasi_steady(s.cell, CURRENT_A)
-    steps, largest, usual = (
+    at_1c = quasi_steady(s.cell, CURRENT_A)
+    mean_percent, largest_percent, usual_percent = (
         printed_values.TABLE_11["constant steps"],
         printed_values.MAX_CONSTANT_STEPS,
         printed_values.USUAL_STEPS,
@@ -235,23 +237,23 @@ def _second_audit(s: Simulation) -> list[Erratum]:
     bulb_v = printed_pack.mean_voltage_v(bulb_a)
     offset_a, gain = printed_pack.current_sensor()
     differences_a = printed_pack.current_differences_a()
-    off = ", ".join(f"{1e3 * differences_a[load]:.0f}" for load in RESISTORS)
+    differences_ma = ", ".join(f"{1e3 * differences_a[load]:.0f}" for load in RESISTORS)
     rates = {i: printed_values.implied_rates(i) for i in printed_values.INFERRED_WEIGHTS["5"]}
-    above = {i: printed_values.TABLE_10[i][1] - printed_values.bounds("10", i).limit for i in (10, 12)}
+    excess = {i: printed_values.TABLE_10[i][1] - printed_values.bounds("10", i).limit for i in (10, 12)}
     return [
         Erratum(
             "(3.14)",
             "u R_s in the output",
-            f"i R_s, as in (2.4): u R_s is in V Ω/s, and after half an hour at {CURRENT_A:g} A it is {1e3 * held.driven_v:.3f} mV "
-            f"instead of the ohmic drop of {1e3 * held.ohmic_v:.1f} mV. The drop is added to x2 + x3, which is "
-            f"{1e3 * sum(held.observer_v):.1f} mV instead of {1e3 * sum(held.cell_v):.1f}, so that a13 to a15 have nearly no "
+            f"i R_s, as in (2.4): u R_s is in V Ω/s, and after half an hour at {CURRENT_A:g} A it is {1e3 * at_1c.driven_v:.3f} mV "
+            f"instead of the ohmic drop of {1e3 * at_1c.ohmic_v:.1f} mV. The drop is added to x2 + x3, which is "
+            f"{1e3 * sum(at_1c.observer_v):.1f} mV instead of {1e3 * sum(at_1c.cell_v):.1f}, so that a13 to a15 have nearly no "
             "effect in schemes 1 to 3",
         ),
         Erratum(
             "5.3.2, Table 11",
-            f"error mostly close to {usual:g} %, largest {largest:g} % under constant steps",
-            f"with these the printed mean of {steps:g} % needs the largest error during at least "
-            f"{100.0 * (steps - usual) / (largest - usual):.0f} % of the time",
+            f"error mostly close to {usual_percent:g} %, largest {largest_percent:g} % under constant steps",
+            f"with these the printed mean of {mean_percent:g} % needs the largest error during at least "
+            f"{100.0 * (mean_percent - usual_percent) / (largest_percent - usual_percent):.0f} % of the time",
         ),
         Erratum(
             "5.2",
@@ -268,7 +270,7 @@ def _second_audit(s: Simulation) -> list[Erratum]:
         Erratum(
             "5.2.1",
             "currents of the loads (E21)",
-            f"their differences from Ohm's law, {off} mA at "
+            f"their differences from Ohm's law, {differences_ma} mA at "
             + ", ".join(f"{printed_values.RESISTORS_OHM[load]:g}" for load in RESISTORS)
             + f" Ω, are an offset of {1e3 * offset_a:.0f} mA and {100.0 * gain:.1f} % of the current. These are plausible errors of the "
             "sensor, which would make the counted charge too small as well",
@@ -289,8 +291,8 @@ def _second_audit(s: Simulation) -> list[Erratum]:
             "does not depend on initial conditions",
             "the printed "
             + " and ".join(
-                f"a{i} lies {by:.1f} above its limit after a start at {printed_values.initial('10', i):.1e}"
-                for i, by in above.items()
+                f"a{i} lies {excess_of_index:.1f} above its limit after a start at {printed_values.initial('10', i):.1e}"
+                for i, excess_of_index in excess.items()
             ),
         ),
     ]
@@ -323,7 +325,7 @@ def _starts(s: Simulation) -> str:
     return ", ".join(
         f"{start.start_error_v:.3f} V with λ = {start.lambda_:.2f}"
         + ("" if start.alpha == ALPHA else f" at a = {start.alpha:g}")
-        for start in (s.one_start, *s.other_starts)
+        for start in (s.fitted_start, *s.other_starts)
     )
 
 

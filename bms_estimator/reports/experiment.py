@@ -11,9 +11,9 @@ from bms_estimator.reports.report_items import Reproduction
 from bms_estimator.reports.simulated_experiment import SensorChain, captures, experiments, pack
 from bms_estimator.reports.thesis_claims import claim
 
-FINE = SensorChain(16)
+FINE = SensorChain(bits=16)
 """Sensor chain of the dSpace board of the thesis, with 16 bits."""
-COARSE = SensorChain(10)
+COARSE = SensorChain(bits=10)
 """Sensor chain of an Arduino, with 10 bits."""
 
 
@@ -43,42 +43,45 @@ class Experiment:
         self.recorded = recorded
 
     @cached_property
-    def _true(self) -> list[Capture]:
+    def _true_captures(self) -> list[Capture]:
         return experiments()
 
     @cached_property
-    def protocol(self) -> Procedure:
+    def procedure(self) -> Procedure:
         """Procedure on the real captures, or on the simulated pack measured with 16 bits."""
         if self.recorded is None:
-            return Procedure(pack(), captures(self._true, FINE), FINE.voltage_step_v)
+            return Procedure(pack(), captures(self._true_captures, FINE), FINE.voltage_step_v)
         cell = self.recorded.cell
-        recorded = [Capture(name, kind_of(name, s, cell.cell.capacity_ah), s) for name, s in self.recorded.samples]
-        return Procedure(cell, recorded, self.recorded.voltage_step_v)
+        captures_with_kind = [
+            Capture(name, kind_of(name, samples, cell.cell.capacity_ah), samples)
+            for name, samples in self.recorded.samples
+        ]
+        return Procedure(cell, captures_with_kind, self.recorded.voltage_step_v)
 
     @cached_property
-    def coarse(self) -> Procedure | None:
+    def coarse_procedure(self) -> Procedure | None:
         """Procedure on the simulated pack measured with 10 bits; None for real captures."""
         if self.recorded is not None:
             return None
-        return Procedure(pack(), captures(self._true, COARSE), COARSE.voltage_step_v)
+        return Procedure(pack(), captures(self._true_captures, COARSE), COARSE.voltage_step_v)
 
-    def tested(self, *keys: str) -> tuple[Reproduction, str]:
-        """Return the common verdict on some of ``thesis_claims.CLAIMS``, and its reason.
+    def verdict_on_claims(self, *keys: str) -> tuple[Reproduction, str]:
+        """Return the common verdict on the claims ``keys`` of ``thesis_claims.CLAIMS``, and its reason.
 
         No claim is tested on the simulated pack, because the pack has exactly the form of the model.
         """
         if self.recorded is None:
             return Reproduction.NO_DATA, ""
-        claims = [claim(key, [self.protocol]) for key in keys]
-        reason = "".join(f"{each.sentence} " for each in claims)
-        verdicts = {each.verdict for each in claims} - {Reproduction.NO_DATA}
+        claims = [claim(key, [self.procedure]) for key in keys]
+        reason = "".join(f"{tested.sentence} " for tested in claims)
+        verdicts = {tested.verdict for tested in claims} - {Reproduction.NO_DATA}
         if not verdicts:
             return Reproduction.NO_DATA, reason
         return (Reproduction.CLAIM_FAILS if Reproduction.CLAIM_FAILS in verdicts else Reproduction.CLAIM_HOLDS), reason
 
     @property
     def truth(self) -> Floats | None:
-        """a1..a21 of the simulated pack at index 1..21; None for real captures."""
+        """True a1..a21 of the simulated pack at index 1..21; None for real captures."""
         return pack().a if self.recorded is None else None
 
     @property

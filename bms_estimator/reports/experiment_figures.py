@@ -3,6 +3,7 @@
 Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +16,7 @@ from bms_estimator.reports.procedure import Kind, Procedure
 from bms_estimator.reports.report_items import Figure, Reproduction
 from bms_estimator.reports.simulation import SOC_GRID
 from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_static_plot, elements_plot, products_plot
-from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
+from bms_estimator.reports.svg_plot import COLORS, FAINT, plot, thin
 
 MAX_LOADS = 4
 """Maximum number of loads in a figure, as in Fig. 32."""
@@ -24,18 +25,18 @@ MAX_LOADS = 4
 def _figure(
     key: str, title: str, svg: str, experiment: Experiment, reason: str, *, claims: tuple[str, ...] = ()
 ) -> Figure:
-    verdict, tested = experiment.tested(*claims) if claims else (Reproduction.NO_DATA, "")
+    verdict, tested = experiment.verdict_on_claims(*claims) if claims else (Reproduction.NO_DATA, "")
     return Figure(key, title, svg, verdict, f"{experiment.unpublished} {tested}{reason}")
 
 
 def figure_26(experiment: Experiment) -> Figure:
-    """Draw E_o over SOC."""
-    p = experiment.protocol
+    """Draw the open-circuit voltage E_o over SOC."""
+    p = experiment.procedure
 
     def draw(axes: Any) -> None:
         grid = np.linspace(0.0, 1.0, 600)
-        for colour, test in zip(np.resize(COLOURS, len(p.tests)), p.tests, strict=True):
-            axes[0].errorbar(test.soc, test.ocv_v, 2.0 * test.std_v, fmt="o", ms=3, color=colour, label=test.name)
+        for color, test in zip(np.resize(COLORS, len(p.tests)), p.tests, strict=True):
+            axes[0].errorbar(test.soc, test.ocv_v, 2.0 * test.std_v, fmt="o", ms=3, color=color, label=test.name)
         if experiment.recorded is None:
             axes[0].plot(
                 grid, chen_mora(np.array(printed_values.TABLE_8), grid), ":", linewidth=2.4, label="(2.10), Table 8"
@@ -44,8 +45,8 @@ def figure_26(experiment: Experiment) -> Figure:
         axes[0].plot(grid, p.table(grid), color=FAINT, linewidth=1.0, label="table")
         axes[0].set(xlabel="SOC", ylabel="E_o [V]")
         axes[0].legend()
-        for colour, test in zip(np.resize(COLOURS, len(p.tests)), p.tests, strict=True):
-            axes[1].plot(test.soc, 1e3 * (test.ocv_v - p.joint_fit(test.soc)), "o", ms=3, color=colour)
+        for color, test in zip(np.resize(COLORS, len(p.tests)), p.tests, strict=True):
+            axes[1].plot(test.soc, 1e3 * (test.ocv_v - p.joint_fit(test.soc)), "o", ms=3, color=color)
         axes[1].axhline(0.0, color=FAINT, linewidth=0.8)
         axes[1].set(xlabel="SOC", ylabel="mV", title="points minus (2.10)")
 
@@ -61,7 +62,7 @@ def figure_26(experiment: Experiment) -> Figure:
 
 def figure_27(experiment: Experiment) -> Figure:
     """Draw the currents of the relaxation tests."""
-    tests = experiment.protocol.of(Kind.RELAXATION)
+    tests = experiment.procedure.captures_of(Kind.RELAXATION)
     return _figure("27", "Currents of the voltage relaxation tests", _currents(tests, "27"), experiment, "")
 
 
@@ -70,7 +71,7 @@ def _currents(captures: list[Any], key: str) -> str:
     if not captures:
         return ""
     columns = 2 if len(captures) > 1 else 1
-    rows = -(-len(captures) // columns)
+    rows = math.ceil(len(captures) / columns)
 
     def draw(axes: Any) -> None:
         for ax, capture in zip(np.atleast_1d(axes).flat, captures, strict=False):
@@ -84,25 +85,25 @@ def _currents(captures: list[Any], key: str) -> str:
 
 
 def figure_28(experiment: Experiment) -> Figure:
-    """Draw the crossings of the stability conditions."""
-    run = experiment.protocol.adaptive
-    found = ", ".join(f"{c.parameter} at SOC {c.soc:.5f}" for c in run.crossings)
+    """Draw a8 and a11 over SOC with their stability conditions."""
+    run = experiment.procedure.adaptive
+    crossings = ", ".join(f"{c.parameter} at SOC {c.soc:.5f}" for c in run.crossings)
     if min(c.soc for c in run.crossings) <= 0.0:
         return _figure(
-            "28", "a8 and a11 meet their stability conditions", "", experiment, f"There is no crossing: {found}."
+            "28", "a8 and a11 meet their stability conditions", "", experiment, f"There is no crossing: {crossings}."
         )
     return _figure(
         "28",
         "a8 and a11 meet their stability conditions",
         plot(lambda axes: crossing_plot(axes, run), columns=2, salt="figure-28"),
         experiment,
-        f"{found}.",
+        f"{crossings}.",
     )
 
 
 def figure_29(experiment: Experiment) -> Figure:
     """Draw the RC products."""
-    run = experiment.protocol.adaptive
+    run = experiment.procedure.adaptive
     return _figure(
         "29",
         "R_ts·C_ts and R_tl·C_tl as estimated",
@@ -115,20 +116,20 @@ def figure_29(experiment: Experiment) -> Figure:
 
 def figure_30(experiment: Experiment) -> Figure:
     """Draw the elements."""
-    run = experiment.protocol.adaptive
-    stop_at = [c.soc for c in run.crossings]
+    run = experiment.procedure.adaptive
+    crossing_socs = [c.soc for c in run.crossings]
     return _figure(
         "30",
         "R_tl, R_ts, C_tl, C_ts with the stability conditions",
-        plot(lambda axes: elements_plot(axes, None, run.average, stop_at), rows=2, columns=2, salt="figure-30"),
+        plot(lambda axes: elements_plot(axes, None, run.average, crossing_socs), rows=2, columns=2, salt="figure-30"),
         experiment,
         "",
     )
 
 
 def figure_31(experiment: Experiment) -> Figure:
-    """Draw R_s by (4.2)."""
-    p, truth = experiment.protocol, experiment.truth
+    """Draw the series resistance R_s by (4.2)."""
+    p, truth = experiment.procedure, experiment.truth
 
     def draw(axes: Any) -> None:
         for name, curve in p.r_s_curves.items():
@@ -156,7 +157,7 @@ def figure_31(experiment: Experiment) -> Figure:
 
 def _constant(p: Procedure) -> list[str]:
     """Return the names of the constant loads, at most ``MAX_LOADS``."""
-    return [c.name for c in p.of(Kind.CONSTANT)][:MAX_LOADS]
+    return [c.name for c in p.captures_of(Kind.CONSTANT)][:MAX_LOADS]
 
 
 def _steps(p: Procedure) -> list[str]:
@@ -164,23 +165,23 @@ def _steps(p: Procedure) -> list[str]:
     return [name for name in p.dynamic if name not in _constant(p)][:2]
 
 
-def _largest(p: Procedure, names: list[str]) -> str:
+def _largest_error(p: Procedure, names: list[str]) -> str:
     if not names:
         return "None of the captures is such a load."
     return f"Largest error {max(p.dynamic[name].max_percent for name in names):.2f} %."
 
 
-def _grid(names: list[str], one: Callable[[Any, str], None], key: str) -> str:
-    """Return a figure with one plot for each load in ``names``, drawn by ``one``; empty without loads."""
+def _grid(names: list[str], draw_load: Callable[[Any, str], None], key: str) -> str:
+    """Return a figure with one plot for each load in ``names``, drawn by ``draw_load``; empty without loads."""
     if not names:
         return ""
     columns = 2 if len(names) > 1 else 1
-    rows = -(-len(names) // columns)
+    rows = math.ceil(len(names) / columns)
 
     def draw(axes: Any) -> None:
         flat = np.atleast_1d(axes).flat
         for ax, name in zip(flat, names, strict=False):
-            one(ax, name)
+            draw_load(ax, name)
             ax.set_title(name)
         for ax in np.atleast_1d(axes).flat[len(names) :]:
             ax.set_axis_off()
@@ -189,52 +190,52 @@ def _grid(names: list[str], one: Callable[[Any, str], None], key: str) -> str:
 
 
 def _voltages(p: Procedure) -> Callable[[Any, str], None]:
-    def one(ax: Any, name: str) -> None:
+    def draw_load(ax: Any, name: str) -> None:
         run = p.dynamic[name]
         t, y, yhat = thin(run.time_s / 3600.0, run.voltage_v, run.predicted_v)
-        ax.plot(t, y, color=COLOURS[0], alpha=0.45, linewidth=2.4, label="actual")
-        ax.plot(t, yhat, "--", color=COLOURS[1], label="estimated", linewidth=1.0)
+        ax.plot(t, y, color=COLORS[0], alpha=0.45, linewidth=2.4, label="actual")
+        ax.plot(t, yhat, "--", color=COLORS[1], label="estimated", linewidth=1.0)
         ax.set(xlabel="time [h]", ylabel="V")
         ax.legend()
 
-    return one
+    return draw_load
 
 
 def _errors(p: Procedure) -> Callable[[Any, str], None]:
-    def one(ax: Any, name: str) -> None:
+    def draw_load(ax: Any, name: str) -> None:
         run = p.dynamic[name]
         t, e = thin(run.time_s / 3600.0, run.error_percent)
         ax.plot(t, e, linewidth=0.8)
         ax.set(xlabel="time [h]", ylabel="|e| [%]")
 
-    return one
+    return draw_load
 
 
 def figure_32(experiment: Experiment) -> Figure:
     """Draw the voltages under constant loads."""
-    p = experiment.protocol
+    p = experiment.procedure
     title = "Constant loads: actual and estimated voltage"
     return _figure("32", title, _grid(_constant(p), _voltages(p), "32"), experiment, "")
 
 
 def figure_33(experiment: Experiment) -> Figure:
     """Draw the errors under constant loads."""
-    p = experiment.protocol
+    p = experiment.procedure
     svg = _grid(_constant(p), _errors(p), "33")
-    reason = f"{_largest(p, _constant(p))} Printed: at most {printed_values.MAX_CONSTANT:g} %."
+    reason = f"{_largest_error(p, _constant(p))} Printed: at most {printed_values.MAX_CONSTANT:g} %."
     return _figure("33", "Constant loads: error", svg, experiment, reason, claims=("constant loads, largest",))
 
 
 def figure_34(experiment: Experiment) -> Figure:
     """Draw the currents of the constant loads."""
-    captures = experiment.protocol.of(Kind.CONSTANT)[:MAX_LOADS]
+    captures = experiment.procedure.captures_of(Kind.CONSTANT)[:MAX_LOADS]
     return _figure("34", "Constant loads: currents", _currents(captures, "34"), experiment, "")
 
 
 def _step_voltage(experiment: Experiment, key: str, title: str, index: int) -> Figure:
-    p = experiment.protocol
+    p = experiment.procedure
     names = _steps(p)[index : index + 1] or _steps(p)[-1:]
-    return _figure(key, title, _grid(names, _voltages(p), key), experiment, _largest(p, names))
+    return _figure(key, title, _grid(names, _voltages(p), key), experiment, _largest_error(p, names))
 
 
 def figure_35(experiment: Experiment) -> Figure:
@@ -244,7 +245,7 @@ def figure_35(experiment: Experiment) -> Figure:
 
 def figure_36(experiment: Experiment) -> Figure:
     """Draw the currents of the steps."""
-    p = experiment.protocol
+    p = experiment.procedure
     captures = [c for c in p.captures if c.name in _steps(p)]
     return _figure("36", "Steps: currents", _currents(captures, "36"), experiment, "")
 
@@ -256,15 +257,15 @@ def figure_37(experiment: Experiment) -> Figure:
 
 def figure_38(experiment: Experiment) -> Figure:
     """Draw the errors under steps."""
-    p = experiment.protocol
-    reason = f"{_largest(p, _steps(p))} Printed: at most {printed_values.MAX_STEPS:g} %."
+    p = experiment.procedure
+    reason = f"{_largest_error(p, _steps(p))} Printed: at most {printed_values.MAX_STEPS:g} %."
     svg = _grid(_steps(p), _errors(p), "38")
     return _figure("38", "Steps: error", svg, experiment, reason, claims=("steps, largest",))
 
 
 def figure_40(experiment: Experiment) -> Figure:
     """Draw the errors of the dynamic and the static model."""
-    p = experiment.protocol
+    p = experiment.procedure
     name = (_steps(p) or _constant(p))[-1]
     svg = plot(lambda axes: dynamic_static_plot(axes, p.dynamic[name], p.static[name]), columns=2, salt="figure-40")
     return _figure("40", f"Dynamic and static model on {name}", svg, experiment, "")
@@ -272,14 +273,14 @@ def figure_40(experiment: Experiment) -> Figure:
 
 def figure_41(experiment: Experiment) -> Figure:
     """Draw the SOC by interpolation."""
-    p = experiment.protocol
+    p = experiment.procedure
     run, (soc, _) = p.dynamic[p.largest], p.interpolated(p.largest)
     rms = float(np.sqrt(np.mean((soc - run.soc) ** 2)))
 
     def draw(axes: Any) -> None:
         hours, counted, interpolated = thin(run.time_s / 3600.0, run.soc, soc)
-        axes[0].plot(hours, counted, color=COLOURS[0], alpha=0.45, linewidth=2.4, label="coulomb counting")
-        axes[0].plot(hours, interpolated, "--", color=COLOURS[1], linewidth=1.0, label="interpolation in E_o")
+        axes[0].plot(hours, counted, color=COLORS[0], alpha=0.45, linewidth=2.4, label="coulomb counting")
+        axes[0].plot(hours, interpolated, "--", color=COLORS[1], linewidth=1.0, label="interpolation in E_o")
         axes[0].set(xlabel="time [h]", ylabel="SOC")
         axes[0].legend()
         hours, difference = thin(run.time_s / 3600.0, 100.0 * (soc - run.soc))
@@ -298,14 +299,14 @@ def figure_41(experiment: Experiment) -> Figure:
 
 def figure_42(experiment: Experiment) -> Figure:
     """Draw E_o over the counted and the interpolated SOC."""
-    p = experiment.protocol
+    p = experiment.procedure
     run, (soc, e_o) = p.dynamic[p.largest], p.interpolated(p.largest)
 
     def draw(axes: Any) -> None:
         x, y = thin(run.soc, e_o)
-        axes.plot(x, y, color=COLOURS[0], label="E_o = y + x2 + x3 + i R_s over counted SOC")
+        axes.plot(x, y, color=COLORS[0], label="E_o = y + x2 + x3 + i R_s over counted SOC")
         x, y = thin(soc, e_o)
-        axes.plot(x, y, "--", color=COLOURS[1], label="over interpolated SOC")
+        axes.plot(x, y, "--", color=COLORS[1], label="over interpolated SOC")
         axes.set(xlabel="SOC", ylabel="V")
         axes.legend()
 

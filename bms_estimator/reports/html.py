@@ -69,7 +69,8 @@ footer { color: var(--soft); font-size: .85rem; margin-top: 3rem; }
 """Style sheet of the page."""
 
 LONG_CELL = 40
-"""Maximum length of a cell in a table of numbers [characters]. A table with longer cells is left-aligned and wraps."""
+"""Maximum length of a cell in a table of numbers [characters]. A table with a longer cell is left-aligned and wraps its
+lines."""
 
 INTRODUCTION = """
 <p>Every table and figure of “Adaptive estimation of Li-ion battery model parameters”, recomputed and compared with the printed values.
@@ -155,23 +156,23 @@ def _article(item: Item) -> str:
 
 
 def _table(table: Table) -> str:
-    """Return a table; printed columns are faint, columns computed by this project are bold."""
+    """Return a table in which printed values are faint and values of this project bold."""
 
     def style(column: str) -> str:
-        # values of this project are emphasized: recomputed values, and the joint fit of Table 8
+        # "joint" is the joint fit of Table 8
         if column.startswith("printed"):
             return ' class="print"'
         return ' class="own"' if column.startswith(("recomputed", "joint")) else ""
 
-    heads = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
+    header_cells = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
     rows = "".join(
         "<tr>"
-        + "".join(f"<td{style(c)}>{escape(cell)}</td>" for c, cell in zip(table.columns, row, strict=True))
+        + "".join(f"<td{style(column)}>{escape(cell)}</td>" for column, cell in zip(table.columns, row, strict=True))
         + "</tr>"
         for row in table.rows
     )
     css_class = ' class="text"' if any(len(cell) > LONG_CELL for row in table.rows for cell in row) else ""
-    return f'<div class="scroll"><table{css_class}><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
+    return f'<div class="scroll"><table{css_class}><thead><tr>{header_cells}</tr></thead><tbody>{rows}</tbody></table></div>'
 
 
 def _summary(report: Report) -> str:

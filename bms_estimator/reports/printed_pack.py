@@ -21,13 +21,13 @@ from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 A = printed_values.tables_8_to_10()
 """Parameters a1..a21 of Tables 8 to 10 at index 1..21."""
 EMPTY_SOC = 0.02
-"""SOC at the end of a discharge through a resistor, above delta2."""
+"""SOC at the end of a discharge through a resistor, above delta2, the SOC below which C_tl is negative."""
 GRID = np.linspace(EMPTY_SOC, 1.0, 9801)
 """SOC over which means are computed."""
 
 
 def deltas() -> tuple[float, float]:
-    """Return delta1 and delta2 of Table 10, (2.11) and (2.12)."""
+    """Return delta1 (2.11) and delta2 (2.12) of Table 10, the SOCs below which C_ts and C_tl are negative."""
     return float(delta(A[8], A[9], A[7])), float(delta(A[11], A[12], A[10]))
 
 
@@ -40,14 +40,14 @@ def product_errors() -> tuple[float, float]:
 def mean_current_a(ohm: float) -> float:
     """Return the mean current of a slow discharge through ``ohm`` by Ohm's law with Tables 8 to 10 [A].
 
-    The mean over time is the charge Q divided by the integral of dq / i.
+    The mean over time is the charge divided by the duration, which is the integral of dq / i.
     """
     current_a = np.array([emf(x, A) for x in GRID]) / (ohm + _inner_ohm())
     return float(1.0 / np.mean(1.0 / current_a))
 
 
 def _inner_ohm() -> Floats:
-    """Return R_s + R_ts + R_tl of Tables 8 to 10 over ``GRID`` [ohm]."""
+    """Return the total resistance R_s + R_ts + R_tl of Tables 8 to 10 over ``GRID`` [ohm]."""
     ohm: Floats = element("R_ts", A, GRID) + element("R_tl", A, GRID) + np.array([r_s(x, A) for x in GRID])
     return ohm
 
@@ -87,11 +87,11 @@ def saturated_above_soc() -> float:
 
 
 def figure_28() -> Figure:
-    """Draw the crossings of the stability conditions."""
-    at = deltas()
+    """Draw a8 and a11 of Table 10 with their stability conditions over SOC."""
+    crossing_socs = deltas()
 
     def draw(axes: Any) -> None:
-        for ax, i, crossing_soc in zip(axes, (8, 11), at, strict=True):
+        for ax, i, crossing_soc in zip(axes, (8, 11), crossing_socs, strict=True):
             ax.plot((0.4 * crossing_soc, 12.0 * crossing_soc), (A[i], A[i]), label=f"$a_{{{i}}}$ of Table 10")
             condition_plot(ax, i, float(A[i]), crossing_soc)
 
@@ -100,7 +100,7 @@ def figure_28() -> Figure:
         "a8 and a11 meet their stability conditions",
         plot(draw, columns=2, salt="figure-28"),
         Reproduction.RECOMPUTED,
-        f"{NO_VALUES} From Table 10 alone: delta1 = {at[0]:.6f}, delta2 = {at[1]:.6f}.",
+        f"{NO_VALUES} From Table 10 alone: delta1 = {crossing_socs[0]:.6f}, delta2 = {crossing_socs[1]:.6f}.",
     )
 
 

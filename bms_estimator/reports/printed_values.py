@@ -12,7 +12,7 @@ CHEN_MORA_ROUNDED = (0.30, 29.0, 0.04, 6.0, 155.0, 0.04, 752.0, 13.0, 703.0, 605
 """Rounded a1..a15 of Chen and Mora, which are also the initial values of Tables 2 and 3."""
 
 TABLE_1 = (1.031, 35.0, 3.685, 0.2156, 0.1178, 0.3201)
-"""Parameters a16..a21 of the simulations."""
+"""Parameters a16..a21 of the open-circuit voltage (2.10) in the simulations."""
 
 TABLE_2 = (
     0.7607,
@@ -31,7 +31,7 @@ TABLE_2 = (
     24.4607,
     0.5307,
 )
-"""Estimates a1..a15, scheme 1."""
+"""Estimates of a1..a15, the coefficients of the elements (2.5)-(2.9), by scheme 1."""
 TABLE_2_ERROR = (153, 1.5, 1151, 7.67, 0.297, 1151.75, 0.0612, 3.54, 0.0655, 0.00761, 1.7, 0.0089, 460.7, 1.919, 658.14)
 """Errors of a1..a15, scheme 1 [%]."""
 TABLE_2_SHIFT = 0.4607
@@ -54,13 +54,14 @@ TABLE_3 = (
     24.6182,
     0.07,
 )
-"""Estimates a1..a15, scheme 2."""
+"""Estimates of a1..a15 by scheme 2."""
 TABLE_3_ERROR = (0, 2.13, 0, 10.3, 0.34, 0, 0.0822, 4.755, 0.0879, 0.00991, 2.289, 0.0134, 0, 2.575, 0)
 """Errors of a1..a15, scheme 2 [%]."""
 TABLE_3_SHIFT = 0.6182
-"""Change of each parameter outside ``SMALL`` in scheme 2. All these parameters change by one value."""
+"""Common change of all parameters outside ``SMALL`` in scheme 2."""
 SMALL = (1, 3, 6, 13, 15)
-"""Indices of the small parameters, the set q of the thesis. Scheme 2 returns them to their initial values, scheme 3 to limits."""
+"""Indices of the small parameters, the set q of the thesis. Scheme 2 returns them to their initial values, scheme 3 to
+their limits."""
 
 TABLE_4 = {
     1: (0.30, 0.25, 0.2946, 0.3208, 8.16),
@@ -87,7 +88,12 @@ BOUNDS = {
     11: (50.0, 5.0, 50.0, 50.0),
     12: (5000.0, 3000.0, 10.0, 20.0),
 }
-"""Upper bound, lower bound, lambda_x and lambda_y of Tables 5 and 10 by index, as printed (a8: erratum 4)."""
+"""Upper bound, lower bound, and their weights lambda_x and lambda_y [1/s] in Tables 5 and 10 by index, as printed (a8:
+erratum 4).
+
+The limit of a parameter is the mean of its bounds with these weights (Lemma 4.1.3), and the sum of the weights is its
+rate.
+"""
 A8_WEIGHTS = (10.0, 20.0)
 """Weights that belong to the printed estimates of a8 (erratum 4)."""
 A5 = 150.0
@@ -173,26 +179,28 @@ INFERRED_WEIGHTS = {
 }
 """Weights by table and index that give the printed estimate, if the printed weights do not (errata 4, 24, 32)."""
 START_MEAN_S = {"5": 328.3, "10": 36_000.0}
-"""Durations from the first sample over which the means (3.19) equal the printed estimates of Tables 5 and 10 [s]."""
+"""Time from the first sample, by table, over which the means (3.19) of a1..a12 equal the printed estimates [s]."""
 FREE_PARAMETERS = {"5": 8, "10": 7}
 """Number of parameters fitted to the estimates of Tables 5 and 10.
 
-The fitted parameters are the time ``START_MEAN_S``, the sum of each pair in ``INFERRED_WEIGHTS``, and the ratio of each pair
-whose ratio differs from the printed one: 1 + 5 + 2 for Table 5, 1 + 3 + 3 for Table 10.
+The fitted parameters are the time ``START_MEAN_S``, the sum of each pair in ``INFERRED_WEIGHTS``, and the ratio of each
+pair whose ratio differs from the printed one: 1 + 5 + 2 for Table 5, 1 + 3 + 3 for Table 10.
 """
 DECIMALS_5 = {1: 4, 2: 4, 3: 4, 4: 4, 5: 4, 6: 4, 7: 4, 8: 4, 9: 2, 10: 1, 11: 4, 12: 1}
 """Decimals of the estimates of Table 5."""
 
 
 def bounds(table: str, index: int) -> Bounds:
-    """Return the printed bounds of (3.18) for Table 5 or 10, with the weights of ``INFERRED_WEIGHTS``."""
-    upper, lower, x, y = BOUNDS[index]
-    x, y = INFERRED_WEIGHTS[table].get(index, (x, y))
-    return Bounds(upper=upper, lower=lower, weight_upper=x, weight_lower=y, initial=initial(table, index))
+    """Return the printed bounds of a parameter in Table 5 or 10, with the weights of ``INFERRED_WEIGHTS``."""
+    upper, lower, *printed_weights = BOUNDS[index]
+    weight_upper, weight_lower = INFERRED_WEIGHTS[table].get(index, printed_weights)
+    return Bounds(
+        upper=upper, lower=lower, weight_upper=weight_upper, weight_lower=weight_lower, initial=initial(table, index)
+    )
 
 
 def initial(table: str, index: int) -> float:
-    """Return a_i(t0) of Table 5 or 10."""
+    """Return the initial value of a_i in Table 5 or 10."""
     return TABLE_5[index][0] if table == "5" else TABLE_10[index][0]
 
 
@@ -207,11 +215,12 @@ def mean_from_start(table: str, index: int) -> float:
 
 
 def implied_rates(index: int) -> tuple[float, float]:
-    """Return minimum and maximum lambda_x + lambda_y for which ``mean_from_start`` rounds to the estimate of Table 5 [1/s]."""
-    half = 0.5 * 10.0 ** -DECIMALS_5[index]
+    """Return the range of the rate in which ``mean_from_start`` rounds to the printed estimate of Table 5 [1/s]."""
+    half_digit = 0.5 * 10.0 ** -DECIMALS_5[index]
     b, estimate = bounds("5", index), TABLE_5[index][1]
     rates = [
-        (initial("5", index) - b.limit) / (START_MEAN_S["5"] * (estimate + error - b.limit)) for error in (-half, half)
+        (initial("5", index) - b.limit) / (START_MEAN_S["5"] * (estimate + error - b.limit))
+        for error in (-half_digit, half_digit)
     ]
     return min(rates), max(rates)
 

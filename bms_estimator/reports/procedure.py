@@ -2,11 +2,13 @@
 
 Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
 
-The captures are real ones, or those of the simulated pack. Each result is computed on first use.
+Step 1 fits the open-circuit voltage (2.10) to the relaxation tests. Step 2 estimates a1..a12, the coefficients of R_ts,
+R_tl, C_ts and C_tl, by the adaptive observer. It uses the constant load of the smallest current, with bounds that do
+not depend on captures. Step 3 computes R_s by (4.2) and fits its coefficients a13..a15. It uses the constant loads up
+to 0.6C and the loads of the relaxation tests. No parameter is estimated from the capture that validates it: for the
+validation of a constant load, step 3 omits that load.
 
-No parameter is estimated from the capture that validates it. Step 1 uses only the relaxation tests. Step 2 uses the
-constant load of the smallest current, with bounds that do not depend on captures. Step 3 uses the constant loads up to
-0.6C and the loads of the relaxation tests. For the validation of a constant load, that load is excluded.
+The captures are real ones, or those of the simulated pack. Each result is computed on first use.
 """
 
 from collections.abc import Sequence
@@ -16,7 +18,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import remove_glitches, rest_current_a
+from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches, rest_current_a
 from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
 from bms_estimator.calibration.ocv.points import pooled
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, relaxation_test
@@ -39,11 +41,15 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import ObserverSettings
 
 LOWEST_SOC = 0.05
-"""SOC at which validation ends: below it the elements and the open-circuit voltage diverge (E14)."""
+"""SOC at which validation ends, because below it the elements and the open-circuit voltage diverge (E14)."""
 KNEE_SOC = 0.1
-"""SOC above which errors are given separately: below it, real cells under large currents deviate from (2.5) to (2.9)."""
+"""SOC above which errors are given separately, because below it real cells deviate from the model under large
+currents."""
 STATIC_SOC = 0.5
-"""SOC at which the static model is frozen."""
+"""SOC whose elements the static model has at every SOC."""
+FULL_TOLERANCE_V = 0.004
+"""Maximum distance of a first voltage at rest from the full voltage at which the capture counts as starting full, per
+cell [V]."""
 MAX_REST_FRACTION = 0.05
 """Maximum fraction of time at rest in a capture with a constant load."""
 MAX_STEP_3_C = 0.6
@@ -85,7 +91,8 @@ def kind_of(name: str, samples: SampleBlock, capacity_ah: float) -> Kind:
     if resting.mean() < MAX_REST_FRACTION:
         loaded = current_a[~resting]
         return Kind.CONSTANT if loaded.std() < MAX_VARIATION * abs(loaded.mean()) else Kind.STEPS
-    loaded = current_a[~resting & (np.r_[0.0, np.abs(np.diff(current_a))] < rest_a)]
+    change_a = np.r_[0.0, np.abs(np.diff(current_a))]
+    loaded = current_a[~resting & (change_a < rest_a)]
     if loaded.size and loaded.std() < MAX_VARIATION * abs(loaded.mean()):
         return Kind.RELAXATION
     return Kind.STEPS
@@ -95,8 +102,8 @@ class Procedure:
     """Procedure of chapter 5 on one pack.
 
     Args:
-        cell: Capacity, limits, and bounds of (3.18) of the cell. Without bounds those of Table 10 are used; elements and
-            OCV of the cell are not used.
+        cell: Capacity, limits, and bounds of a1..a12. Without bounds those of Table 10 are used. Elements and OCV of
+            the cell are not used.
         captures: Discharging captures: at least one relaxation test, and one constant load or steps.
         voltage_step_v: Resolution of the voltage [V].
     """
@@ -106,19 +113,19 @@ class Procedure:
         self.voltage_step_v = voltage_step_v
         self.captures = list(captures)
         for kinds in ((Kind.RELAXATION,), (Kind.CONSTANT, Kind.STEPS)):
-            if not self.of(*kinds):
+            if not self.captures_of(*kinds):
                 needed = " or ".join(kind.value for kind in kinds)
                 listed = ", ".join(f"{c.name} ({c.kind.value})" for c in self.captures)
                 raise UserError(f"the protocol needs a {needed}; given: {listed or 'nothing'}")
 
-    def of(self, *kinds: Kind) -> list[Capture]:
-        """Return the captures of given kinds."""
+    def captures_of(self, *kinds: Kind) -> list[Capture]:
+        """Return the captures of these kinds."""
         return [capture for capture in self.captures if capture.kind in kinds]
 
     @property
     def loads(self) -> list[Capture]:
         """Captures with which the model is compared: constant loads and steps. All but ``smallest`` validate."""
-        return self.of(Kind.CONSTANT, Kind.STEPS)
+        return self.captures_of(Kind.CONSTANT, Kind.STEPS)
 
     @property
     def validating(self) -> list[Capture]:
@@ -134,12 +141,12 @@ class Procedure:
             relaxation_test(
                 c.samples, self.cell.cell.capacity_ah, series_count=self.cell.cell.series_count, name=c.name
             )
-            for c in self.of(Kind.RELAXATION)
+            for c in self.captures_of(Kind.RELAXATION)
         ]
 
     @cached_property
     def single_fits(self) -> list[ChenMoraFit]:
-        """Fits of (2.10) to each test, for (5.1)-(5.2)."""
+        """Fits of (2.10) to each test, whose parameters the thesis averages by (5.1)-(5.2)."""
         return [fit_chen_mora(pooled([test])) for test in self.tests]
 
     @cached_property
@@ -161,17 +168,17 @@ class Procedure:
         return max(LOWEST_SOC, min(float(test.soc.min()) for test in self.tests))
 
     @cached_property
-    def with_ocv(self) -> CellModel:
-        """Cell with the fitted (2.10)."""
+    def cell_with_ocv(self) -> CellModel:
+        """Cell with the open-circuit voltage of ``joint_fit``."""
         return self.cell.model_copy(update={"ocv": self.joint_fit.ocv})
 
     def initial_soc(self, capture: Capture) -> float:
-        """Return the initial SOC: 1 if the capture starts full, otherwise from its first voltage at rest."""
+        """Return the initial SOC: by the first voltage if the capture starts at rest below full, otherwise 1."""
         first = remove_glitches(capture.samples, capture.name)[0]
         full_v = float(self.table.ocv_v[-1])
-        if capture.kind is Kind.RELAXATION or abs(first["current_a"]) > 0.01 * self.cell.cell.capacity_ah:
+        if capture.kind is Kind.RELAXATION or abs(first["current_a"]) > REST_C_RATE * self.cell.cell.capacity_ah:
             return 1.0
-        if first["voltage_v"] > full_v - 0.004 * self.cell.cell.series_count:
+        if first["voltage_v"] > full_v - FULL_TOLERANCE_V * self.cell.cell.series_count:
             return 1.0
         grid = np.linspace(0.0, 1.0, 2001)
         return float(np.interp(first["voltage_v"], self.table(grid), grid))
@@ -184,14 +191,14 @@ class Procedure:
 
         It is a relaxation test if there is no constant load, or if that load is the only one for validation.
         """
-        spare = len(self.loads) > 1 and self.of(Kind.CONSTANT)
-        return min(spare or self.of(Kind.RELAXATION), key=lambda c: float(np.mean(c.samples["current_a"])))
+        constant = self.captures_of(Kind.CONSTANT) if len(self.loads) > 1 else []
+        return min(constant or self.captures_of(Kind.RELAXATION), key=lambda c: float(np.mean(c.samples["current_a"])))
 
     @cached_property
     def adaptive(self) -> AdaptiveRun:
-        """Run of Algorithm 1 on ``smallest``."""
+        """Run of the adaptive observer (Algorithm 1) on ``smallest``."""
         estimator = Estimator(
-            self.with_ocv,
+            self.cell_with_ocv,
             ObserverSettings(),
             identifier=None,
             voltage_resolution_v=self.voltage_step_v,
@@ -205,14 +212,14 @@ class Procedure:
     def step_3(self) -> list[Capture]:
         """Captures of step 3: relaxation tests, and constant loads up to ``MAX_STEP_3_C``."""
         max_a = MAX_STEP_3_C * self.cell.cell.capacity_ah
-        constant = [c for c in self.of(Kind.CONSTANT) if np.median(c.samples["current_a"]) <= max_a]
-        return [*constant, *self.of(Kind.RELAXATION)]
+        constant = [c for c in self.captures_of(Kind.CONSTANT) if np.median(c.samples["current_a"]) <= max_a]
+        return [*constant, *self.captures_of(Kind.RELAXATION)]
 
     @cached_property
     def r_s_curves(self) -> dict[str, SeriesResistance]:
-        """R_s by (4.2) for each capture of ``step_3``."""
+        """R_s by (4.2) from each capture of ``step_3``."""
         a = self.adaptive.average
-        return {c.name: series_resistance(self.with_ocv, self._predict(c, a)) for c in self.step_3}
+        return {c.name: series_resistance(self.cell_with_ocv, self._predict(c, a)) for c in self.step_3}
 
     @cached_property
     def r_s_mean(self) -> SeriesResistance:
@@ -232,7 +239,7 @@ class Procedure:
         return fit_series_resistance(mean_of(others), self.lowest_soc)
 
     def a_for(self, name: str) -> Floats:
-        """Return a1..a15 for the load ``name``, with a13..a15 estimated without that load. Shape (16,)."""
+        """Return a1..a15 that validate on the load ``name``: a13..a15 are estimated without that load. Shape (16,)."""
         a = self.adaptive.average.copy()
         a[13:16] = self.r_s_without(name).a
         return a
@@ -240,11 +247,11 @@ class Procedure:
     # Validation -------------------------------------------------------------------------------------------------
 
     def _predict(self, capture: Capture, a: Floats) -> Prediction:
-        return predict(self.with_ocv, capture.samples, self.initial_soc(capture), a=a, lowest_soc=self.lowest_soc)
+        return predict(self.cell_with_ocv, capture.samples, self.initial_soc(capture), a=a, lowest_soc=self.lowest_soc)
 
     @cached_property
     def dynamic(self) -> dict[str, Prediction]:
-        """Predictions of the estimated model, with frozen parameters, for every load (5.3)."""
+        """Predictions of the estimated model with constant parameters for every load (section 5.3)."""
         return {c.name: self._predict(c, self.a_for(c.name)) for c in self.loads}
 
     @cached_property
@@ -255,10 +262,10 @@ class Procedure:
     @cached_property
     def largest(self) -> str:
         """Name of the constant load with the largest current (the bulb in Fig. 41); without one, of the first load."""
-        constant = self.of(Kind.CONSTANT) or self.loads[:1]
+        constant = self.captures_of(Kind.CONSTANT) or self.loads[:1]
         return max(constant, key=lambda c: float(np.median(c.samples["current_a"]))).name
 
     def interpolated(self, name: str) -> tuple[Floats, Floats]:
         """Return SOC and E_o by the interpolation of section 7.1 over the load ``name``."""
-        cell = self.with_ocv.model_copy(update={"r_s": self.r_s_without(name).element})
+        cell = self.cell_with_ocv.model_copy(update={"r_s": self.r_s_without(name).element})
         return soc_by_interpolation(cell, self.dynamic[name])

@@ -8,9 +8,9 @@ class Reproduction(Enum):
     """Verdict on the reproduction of a table or figure."""
 
     FITTED = "fitted"
-    """Agrees with print after corrections and after fitting free parameters that the thesis does not print."""
+    """Agrees with the printed values after corrections and a fit of parameters that the thesis does not print."""
     RECOMPUTED = "recomputed"
-    """Computed from printed values, without comparison, because the thesis prints no value of it."""
+    """Computed from printed values. The thesis prints no value to compare with."""
     NO_DATA = "no data printed"
     """The recording, load or model behind it is not published."""
     CONTRADICTED = "contradicted by the thesis's own numbers"
@@ -20,7 +20,7 @@ class Reproduction(Enum):
     CLAIM_FAILS = "claim tested on other data: fails"
     """A claim of the thesis about its recordings does not hold on other captures."""
     GIVEN = "given"
-    """Input data, a diagram or a photograph: there is nothing to compute."""
+    """Input data, a diagram or a photograph, which need no computation."""
     ADDED = "added"
     """Item that is not in the thesis."""
 
@@ -35,8 +35,8 @@ class Table:
         columns: Headings.
         rows: Cells of each row.
         verdict: Verdict on the reproduction.
-        reason: Reason for differences from print, or basis of the agreement.
-        free: Number of free parameters of a fit; 0 without one.
+        reason: Reason for differences from the printed values, or basis of the agreement.
+        free: Number of free parameters of a fit; 0 without a fit.
     """
 
     key: str
@@ -59,7 +59,7 @@ class Figure:
         title: Caption.
         svg: The plot, one ``<svg>`` element; empty for a diagram or photograph.
         verdict: Verdict on the reproduction.
-        reason: Content, and reason for differences from print.
+        reason: Content, and reason for differences from the printed figure.
     """
 
     key: str

@@ -1,10 +1,13 @@
 """Simulated 6S 22.2 V 6.6 Ah pack with the loads of chapter 5 of the thesis, measured by a simulated sensor chain.
 
-The pack has the open-circuit voltage of Table 8, the R_s of Table 9, and the R_ts, R_tl, C_ts, C_tl of Chen and Mora, with
-which Fig. 29 compares. These lie within the bounds of Table 10, but not at their Lemma 4.1.3 limits. The loads are the
-resistors of section 5.1, whose currents differ from the printed ones (erratum 21). The bulb is a resistor with the bulb's printed
-current. The voltage is measured by a divider, the current by a +-10 A sensor. Noise is uniform within half a step, before
-rounding.
+Tables, figures, sections and errata are those of the thesis. The pack has the open-circuit voltage of Table 8 and the
+R_s of Table 9. Its R_ts, R_tl, C_ts and C_tl are those of Chen and Mora's cell, because Fig. 29 compares the pack with
+that cell. These elements lie within the bounds of Table 10, but differ from the values to which the adaptation
+converges (Lemma 4.1.3).
+
+The loads are the resistors of section 5.1. Their currents differ from the printed ones (erratum 21). The bulb is a
+resistor with the bulb's printed current. The voltage is measured by a divider, the current by a +-10 A sensor. The
+noise is uniform within half a step and is added before rounding.
 """
 
 from dataclasses import dataclass
@@ -22,11 +25,13 @@ VOLTAGE_RANGE_V = 30.0
 CURRENT_RANGE_A = 20.0
 """Range of the current sensor, -10 to +10 A [A]."""
 MEAN_VOLTAGE_V = 23.0
-"""Mean voltage of the pack over a discharge [V], which converts the bulb's mean current to a resistance."""
+"""Mean voltage of the pack over a discharge [V]. Divided by the bulb's mean current it gives the bulb's resistance."""
 QUARTER_HOUR_S = 900.0
-"""Duration of a pulse and of a rest [s]."""
+"""Duration of a pulse and of a rest, a quarter of an hour [s]."""
+OBSERVER_STEP_S = 0.2
+"""Sample interval of the capture that the observer runs on [s]. The others have an interval of 1 s."""
 LOWEST_SOC = 0.012
-"""SOC at the end of a discharge, just above delta2 of the true pack."""
+"""SOC at the end of a discharge, just above delta2 of the pack, the SOC below which its C_tl is negative."""
 VARIABLE_STEPS = ((600.0, "12.5 ohm"), (300.0, "50 W bulb"), (900.0, "12.5 ohm"), (420.0, ""), (240.0, "50 W bulb"))
 """Duration [s] and load of each step of test protocol 4. The thesis does not print them."""
 
@@ -52,22 +57,22 @@ class SensorChain:
         return float(CURRENT_RANGE_A / 2**self.bits)
 
     def read(self, samples: SampleBlock, seed: int) -> SampleBlock:
-        """Return the measured values of true samples."""
-        noise = np.random.default_rng(seed)
+        """Return the values that the sensor chain measures for true samples."""
+        generator = np.random.default_rng(seed)
         measured = samples.copy()
         for name, step in (("voltage_v", self.voltage_step_v), ("current_a", self.current_step_a)):
-            jitter = noise.uniform(-0.5, 0.5, samples.size)
-            measured[name] = np.rint(samples[name] / step + jitter) * step
+            noise_steps = generator.uniform(-0.5, 0.5, samples.size)
+            measured[name] = np.rint(samples[name] / step + noise_steps) * step
         return measured
 
 
 def pack() -> CellModel:
-    """Return the true pack with the settings of (3.18) for Table 10."""
+    """Return the simulated pack with the adaptation bounds of Table 10."""
     model, chen_mora = load_cell("thunder_power_6s"), load_cell("chen_mora")
     elements = {name: getattr(chen_mora, name) for name in ("r_ts", "r_tl", "c_ts", "c_tl")}
     adaptation = {f"a{i}": printed_values.bounds("10", i) for i in printed_values.BOUNDS}
-    named = model.cell.model_copy(update={"name": "simulated 6S pack"})
-    return model.model_copy(update=elements | {"cell": named, "adaptation": adaptation})
+    renamed = model.cell.model_copy(update={"name": "simulated 6S pack"})
+    return model.model_copy(update=elements | {"cell": renamed, "adaptation": adaptation})
 
 
 def resistance_ohm(load: str) -> float:
@@ -78,17 +83,18 @@ def resistance_ohm(load: str) -> float:
 
 
 def run_down(cell: CellModel, schedule: list[tuple[float, str]], step_s: float = 1.0) -> SampleBlock:
-    """Simulate a full pack under a repeating schedule of (seconds, load) until it is empty, without the sensor."""
+    """Simulate a full pack until it is empty, under a repeating schedule of (seconds, load); return the true values."""
     a, capacity_as = cell.a, cell.cell.capacity_ah * 3600.0
     state = (1.0, 0.0, 0.0)
     time_s, currents, voltages = 0.0, [], []
-    ends = np.cumsum([seconds for seconds, _ in schedule])
-    ohms = [resistance_ohm(load) for _, load in schedule]
+    step_ends_s = np.cumsum([seconds for seconds, _ in schedule])
+    ohm_of_steps = [resistance_ohm(load) for _, load in schedule]
     voltage_v = float(terminal_voltage(state, 0.0, a))
     while True:
-        ohm = ohms[int(np.searchsorted(ends, time_s % ends[-1], side="right"))]
+        ohm = ohm_of_steps[int(np.searchsorted(step_ends_s, time_s % step_ends_s[-1], side="right"))]
         current_a = voltage_v / ohm
-        if state[0] - current_a * step_s / capacity_as < LOWEST_SOC:
+        next_soc = state[0] - current_a * step_s / capacity_as
+        if next_soc < LOWEST_SOC:
             break
         voltage_v = float(terminal_voltage(state, current_a, a))
         currents.append(current_a)
@@ -109,9 +115,11 @@ def experiments() -> list[Capture]:
         Capture(f"relaxation {load}", Kind.RELAXATION, run_down(cell, [(QUARTER_HOUR_S, load), rest]))
         for load in printed_values.CURRENTS_A
     ]
-    # the observer runs only on the smallest current, which is therefore sampled at 5 Hz
+    # the capture at the smallest current has a higher sample rate, because the observer runs only on it
     simulated += [
-        Capture(load, Kind.CONSTANT, run_down(cell, [(QUARTER_HOUR_S, load)], 0.2 if load == "50 ohm" else 1.0))
+        Capture(
+            load, Kind.CONSTANT, run_down(cell, [(QUARTER_HOUR_S, load)], OBSERVER_STEP_S if load == "50 ohm" else 1.0)
+        )
         for load in printed_values.CURRENTS_A
     ]
     simulated.append(Capture("constant steps", Kind.STEPS, run_down(cell, [rest, pulse])))
@@ -119,6 +127,6 @@ def experiments() -> list[Capture]:
     return simulated
 
 
-def captures(true: list[Capture], chain: SensorChain) -> list[Capture]:
+def captures(true_captures: list[Capture], chain: SensorChain) -> list[Capture]:
     """Return the experiments as the sensor chain reports them."""
-    return [Capture(c.name, c.kind, chain.read(c.samples, seed)) for seed, c in enumerate(true)]
+    return [Capture(c.name, c.kind, chain.read(c.samples, seed)) for seed, c in enumerate(true_captures)]

@@ -1,8 +1,14 @@
-"""Simulations of the thesis: schemes 1 to 3 (3.2.5) and the improved method (4.1.1) on the cell of Chen and Mora.
+"""Simulations of the thesis with the cell of Chen and Mora.
 
-Values that the thesis does not print are chosen as N(k) = E_2.5(-k^2.5), k0 = 0, x2(0) = x3(0) = 0, without sensor noise.
-If the printed weights contradict the printed estimates, the inferred weights are used (E4, E24, E32).
 Numbers in parentheses are equations and sections of the thesis, and E1 to E36 are its errata (``errata``).
+
+The thesis simulates schemes 1 to 3 (3.2.5) and the improved method (4.1.1). They differ in the law that adapts the
+coefficients a1..a15 of the elements: (3.16) in scheme 1, (3.17) in scheme 2, and (3.18) in scheme 3 and in the improved
+method. The observer's gain is N(k), (3.10).
+
+The thesis does not print all values. Those chosen here are N(k) = E_2.5(-k^2.5), the initial values k0 = 0 and
+x2(0) = x3(0) = 0, and no sensor noise. If the printed weights contradict the printed estimates, the inferred weights
+are used (E4, E24, E32).
 """
 
 from dataclasses import dataclass
@@ -37,7 +43,7 @@ SMALL_CURRENT_A = 0.0275
 R_S_CURRENTS_A = (0.1, 0.275, 0.55)
 """Currents for (4.2) [A]. The thesis does not print its currents."""
 LOWEST_SOC = 0.05
-"""Lower end of the SOC range of errors: below it the elements diverge (E14)."""
+"""Lower end of the SOC range of errors, because below it the elements diverge (E14)."""
 SOC_GRID = np.linspace(LOWEST_SOC, 1.0, 951)
 """SOC grid over which errors are computed."""
 PULSE_S = 600.0
@@ -45,36 +51,39 @@ PULSE_S = 600.0
 STATIC_SOC = 0.5
 """SOC whose elements the static model has. The thesis does not print this SOC."""
 FINAL_SOC = 0.02
-"""SOC at which the comparison of model and cell ends, above delta2 = 0.0179 of Table 5's estimates."""
+"""SOC at which the comparison of model and cell ends. Below delta2 = 0.0179 the C_tl of Table 5's estimates is
+negative."""
+IDEAL_RESOLUTION_V = 1e-6
+"""Voltage resolution of simulations without a sensor [V], which is negligible."""
 EPSILON_V = 1e-3
-"""eps2 of Algorithm 1 in simulation [V]."""
-START_OVER_S = 60.0
-"""t_int of (3.19) for a start with a large error, after which |e| settles late [s]."""
-START_TIMES_S = np.r_[np.arange(0.0, 10.0, 0.0002), np.arange(10.0, START_OVER_S, STEP_S)]
-"""Sample times of a start with a large error [s]. In the kernel N is constant during a step, although N decreases while k
-grows. With steps of 0.2 ms the result agrees with the differential equations to four digits; with 10 ms the fitted lambda
-is 2 % larger."""
+"""eps2 of Algorithm 1 in simulation, the maximum error of a converged observer [V]."""
+LARGE_START_T_INT_S = 60.0
+"""Start t_int of the average (3.19) for a start with a large error, which settles late [s]."""
+START_TIMES_S = np.r_[np.arange(0.0, 10.0, 0.0002), np.arange(10.0, LARGE_START_T_INT_S, STEP_S)]
+"""Sample times of a start with a large error [s]. In the kernel N is constant during a step, although N decreases while
+k grows. With steps of 0.2 ms the result agrees with the differential equations to four digits; with 10 ms the fitted
+lambda is 2 % larger."""
 AFTER_START_S = 1.0
 """Sample interval after ``START_TIMES_S`` [s]."""
 ALPHA = 2.5
-"""Default alpha of (3.10)."""
+"""Default exponent alpha of the gain N(k), (3.10)."""
 OTHER_ALPHA = 2.9
-"""Another alpha of (3.10) that fits Tables 2 and 3."""
+"""Another alpha with which Tables 2 and 3 can be fitted."""
 HIGH_CURRENT_A = 4.0 * CURRENT_A
 """Current of 4C, far above the currents of the thesis's simulations [A]."""
 
 
 @dataclass(frozen=True)
-class OneStart:
-    """Runs of schemes 1 and 2 from a start fitted to both printed tables.
+class FittedStart:
+    """Runs of schemes 1 and 2 from an initial state that is fitted to both printed tables, 2 and 3.
 
     Attributes:
-        start_v: x2(t0) + x3(t0), with x2(t0) = x3(t0) [V].
-        start_error_v: e(t0) [V].
+        start_v: Initial x2 + x3, the sum of the voltages of the RC pairs, with x2 = x3 [V].
+        start_error_v: Initial error e [V].
         lambda_: lambda of (3.10).
         alpha: Exponent alpha of (3.10), chosen and not fitted.
-        scheme_1: Run of (3.16).
-        scheme_2: Run of (3.17).
+        scheme_1: Run of scheme 1.
+        scheme_2: Run of scheme 2.
     """
 
     start_v: float
@@ -85,7 +94,7 @@ class OneStart:
     scheme_2: AdaptiveRun
 
 
-def block(time_s: Floats, current_a: Floats, voltage_v: Floats) -> SampleBlock:
+def to_samples(time_s: Floats, current_a: Floats, voltage_v: Floats) -> SampleBlock:
     """Return arrays as samples."""
     samples = np.zeros(time_s.size, dtype=SAMPLE)
     samples["time_s"], samples["current_a"], samples["voltage_v"] = time_s, current_a, voltage_v
@@ -108,22 +117,22 @@ def discharge(cell: CellModel, current_a: float, step_s: float, first_s: Floats 
         time_s = np.r_[first_s, time_s[time_s > first_s[-1]]]
     currents = np.full(time_s.size, current_a)
     voltage_v, _ = simulate_cell((1.0, 0.0, 0.0), time_s, currents, cell.cell.capacity_ah * 3600.0, cell.a)
-    return block(time_s, currents, voltage_v)
+    return to_samples(time_s, currents, voltage_v)
 
 
 def observer_settings(law: str, lambda_: float = 1.0, alpha: float = ALPHA) -> ObserverSettings:
-    """Return the printed settings, without dead zone and without reset of k; the sign of N is that of erratum 1."""
+    """Return the settings of the thesis: no dead zone and no reset of k. The sign of N is that of erratum 1."""
     printed_law = {"law": law, "dead_zone_v": 0.0, "rearm_gain": None, "epsilon_v": EPSILON_V}
     return ObserverSettings.model_validate(printed_law | {"lambda": lambda_, "alpha": alpha})
 
 
 def with_bounds(cell: CellModel, bounds: dict[int, Bounds]) -> CellModel:
-    """Return the cell with other bounds of (3.18)."""
+    """Return the cell with other bounds of a1..a12."""
     return cell.model_copy(update={"adaptation": {f"a{i}": b for i, b in bounds.items()}})
 
 
 def table_5_cell() -> CellModel:
-    """Return the cell of Chen and Mora with the settings of (3.18) for Table 5."""
+    """Return the cell of Chen and Mora with the bounds and weights of Table 5."""
     return with_bounds(load_cell("chen_mora"), {i: printed_values.bounds("5", i) for i in printed_values.BOUNDS})
 
 
@@ -139,13 +148,15 @@ class Simulation:
         return discharge(self.cell, CURRENT_A, STEP_S)
 
     def _scheme(self, law: str) -> AdaptiveRun:
-        """Run a scheme from the rounded a1..a15, with x2(0) = x3(0) = 0."""
+        """Run a scheme from the rounded a1..a15 of Tables 2 and 3, with x2(0) = x3(0) = 0."""
         return adaptive_run(self._observer(law), self.truth)
 
     def _observer(self, law: str, lambda_: float = 1.0, alpha: float = ALPHA) -> Estimator:
-        """Return an observer with the rates and targets of Tables 2 to 4."""
+        """Return an observer whose parameters start and converge as in Tables 2 to 4."""
         settings = observer_settings(law, lambda_, alpha)
-        estimator = Estimator(self.cell, settings, identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0)
+        estimator = Estimator(
+            self.cell, settings, identifier=None, voltage_resolution_v=IDEAL_RESOLUTION_V, initial_soc=1.0
+        )
         record = estimator.settings[0]
         record["a_initial"][1:] = printed_values.CHEN_MORA_ROUNDED
         record["target"][1:] = printed_values.CHEN_MORA_ROUNDED
@@ -154,9 +165,9 @@ class Simulation:
         if law == "scheme-3":
             record["rate"][1:] = 0.0
             for i, (upper, lower, *_) in printed_values.TABLE_4.items():
-                x, y = printed_values.TABLE_4_WEIGHTS
-                record["rate"][i] = x + y
-                record["target"][i] = (x * upper + y * lower) / (x + y)
+                upper_weight, lower_weight = printed_values.TABLE_4_WEIGHTS
+                record["rate"][i] = upper_weight + lower_weight
+                record["target"][i] = (upper_weight * upper + lower_weight * lower) / (upper_weight + lower_weight)
         return estimator
 
     @cached_property
@@ -169,39 +180,42 @@ class Simulation:
         estimator = self._observer(law, lambda_, alpha)
         estimator.run(self.started_truth[:1])
         estimator.state["v_ts"][0] = estimator.state["v_tl"][0] = 0.5 * start_v
-        return adaptive_run(estimator, self.started_truth[1:], t_int_s=START_OVER_S)
+        return adaptive_run(estimator, self.started_truth[1:], t_int_s=LARGE_START_T_INT_S)
 
     @cached_property
     def scheme_1(self) -> AdaptiveRun:
-        """Run of (3.16) from the rounded values of Table 2."""
+        """Run of scheme 1 from the rounded values of Table 2."""
         return self._scheme("scheme-1")
 
     @cached_property
     def scheme_2(self) -> AdaptiveRun:
-        """Run of (3.17) from the rounded values of Table 3."""
+        """Run of scheme 2 from the rounded values of Table 3."""
         return self._scheme("scheme-2")
 
     @cached_property
     def scheme_3(self) -> AdaptiveRun:
-        """Run of (3.18) for a1, a3, a6, a13, a15 with the bounds of Table 4, and of (3.16) for the others."""
+        """Run of scheme 3: (3.18) for a1, a3, a6, a13, a15 with the bounds of Table 4, and (3.16) for the others."""
         return self._scheme("scheme-3")
 
     @cached_property
-    def one_start(self) -> OneStart:
+    def fitted_start(self) -> FittedStart:
         """Schemes 1 and 2 with the start and lambda for which a2 changes as printed in Tables 2 and 3."""
-        return self._fit_start(ALPHA, 1.4, 9.0)
+        return self._fit_start(ALPHA, near_v=1.4, near_lambda=9.0)
 
     @cached_property
-    def other_starts(self) -> tuple[OneStart, OneStart]:
-        """Two other solutions for the start: one of the opposite sign, one with another alpha."""
-        return self._fit_start(ALPHA, -1.4, 9.0), self._fit_start(OTHER_ALPHA, 1.4, 17.0)
+    def other_starts(self) -> tuple[FittedStart, FittedStart]:
+        """Two other solutions for the start: one with the opposite sign, one with another alpha."""
+        return (
+            self._fit_start(ALPHA, near_v=-1.4, near_lambda=9.0),
+            self._fit_start(OTHER_ALPHA, near_v=1.4, near_lambda=17.0),
+        )
 
-    def _fit_start(self, alpha: float, near_v: float, near_lambda: float) -> OneStart:
-        """Fit start voltage and lambda to the changes of a2 in Tables 2 and 3, from ``near_v`` [V] and ``near_lambda``."""
+    def _fit_start(self, alpha: float, near_v: float, near_lambda: float) -> FittedStart:
+        """Fit start voltage and lambda to the changes of a2 in Tables 2 and 3, near ``near_v`` and ``near_lambda``."""
         shifts = {"scheme-1": printed_values.TABLE_2_SHIFT, "scheme-2": printed_values.TABLE_3_SHIFT}
 
-        def residuals(unknown: Floats) -> list[float]:
-            runs = (self._started(law, unknown[0], unknown[1], alpha) for law in shifts)
+        def residuals(start_v_and_lambda: Floats) -> list[float]:
+            runs = (self._started(law, start_v_and_lambda[0], start_v_and_lambda[1], alpha) for law in shifts)
             return [
                 float(run.average[2] - printed_values.CHEN_MORA_ROUNDED[1]) / shift - 1.0
                 for run, shift in zip(runs, shifts.values(), strict=True)
@@ -209,12 +223,14 @@ class Simulation:
 
         start_v, lambda_ = least_squares(residuals, (near_v, near_lambda), xtol=1e-3).x
         runs = [self._started(law, start_v, lambda_, alpha) for law in shifts]
-        ohmic_v, loop = CURRENT_A * r_s(1.0, self.cell.a), 1.0 + r_s(1.0, np.r_[0.0, printed_values.CHEN_MORA_ROUNDED])
-        error_v = (start_v - ohmic_v) / loop  # (3.15) with (3.14), N(0) = 1
-        return OneStart(float(start_v), float(error_v), float(lambda_), alpha, runs[0], runs[1])
+        ohmic_v = CURRENT_A * r_s(1.0, self.cell.a)
+        r_s_of_observer = r_s(1.0, np.r_[0.0, printed_values.CHEN_MORA_ROUNDED])
+        # the error (3.15) of the output (3.14), which contains u R_s with u = -N e and N(0) = 1
+        error_v = (start_v - ohmic_v) / (1.0 + r_s_of_observer)
+        return FittedStart(float(start_v), float(error_v), float(lambda_), alpha, runs[0], runs[1])
 
     def frozen(self, a: Floats, lowest_soc: float = 0.01) -> Prediction:
-        """Run a model with constant parameters ``a`` over every tenth sample of ``truth``."""
+        """Predict with constant parameters ``a`` the voltage of every tenth sample of ``truth``."""
         return predict(self.cell, self.truth[::10], 1.0, a=a, lowest_soc=lowest_soc)
 
     @cached_property
@@ -222,7 +238,11 @@ class Simulation:
         """Run of the improved method with the settings of Table 5 (a7, a8: E4, E24) at C/10."""
         samples = discharge(self.cell, SMALL_CURRENT_A, 10.0 * STEP_S)
         estimator = Estimator(
-            self.cell, observer_settings("improved"), identifier=None, voltage_resolution_v=1e-6, initial_soc=1.0
+            self.cell,
+            observer_settings("improved"),
+            identifier=None,
+            voltage_resolution_v=IDEAL_RESOLUTION_V,
+            initial_soc=1.0,
         )
         return adaptive_run(estimator, samples)
 
@@ -264,10 +284,10 @@ class Simulation:
         current_a = np.where(time_s % (2.0 * PULSE_S) < PULSE_S, CURRENT_A, 0.0)
         capacity_as = self.cell.cell.capacity_ah * 3600.0
         voltage_v, _ = simulate_cell((1.0, 0.0, 0.0), time_s, current_a, capacity_as, self.cell.a)
-        return block(time_s, current_a, voltage_v)
+        return to_samples(time_s, current_a, voltage_v)
 
     def dynamic(self, a: Floats, lowest_soc: float = FINAL_SOC) -> Prediction:
-        """Run a model on the pulsed load."""
+        """Predict with constant parameters ``a`` the voltage of the pulsed load."""
         return predict(self.cell, self.pulsed, 1.0, a=a, lowest_soc=lowest_soc)
 
     def constant_error_percent(self, current_a: float) -> float:
@@ -281,16 +301,16 @@ class Simulation:
         return float(np.interp(0.5, curve.soc, curve.r_s_ohm))
 
     def static(self, a: Floats, lowest_soc: float = FINAL_SOC) -> Prediction:
-        """Run a model on the pulsed load with its elements fixed at ``STATIC_SOC``."""
+        """Predict the voltage of the pulsed load with the elements that ``a`` gives at ``STATIC_SOC``."""
         return self.dynamic(static_elements(a, STATIC_SOC), lowest_soc)
 
 
 ELEMENTS = {"R_ts": r_ts, "C_ts": c_ts, "R_tl": r_tl, "C_tl": c_tl}
-"""Functions of SOC and parameters by element."""
+"""Function of SOC and parameters by the name of the element."""
 
 
 def element(name: str, a: Floats, soc: Floats = SOC_GRID) -> Floats:
-    """Return an element, or a product "R_ts C_ts", over SOC."""
+    """Return an element, or a product such as "R_ts C_ts", over SOC."""
     values = np.ones(soc.size)
     for part in name.split():
         values *= np.array([ELEMENTS[part](x, a) for x in soc])

@@ -22,7 +22,7 @@ from bms_estimator.reports.simulation import (
     element,
     mean_error_percent,
 )
-from bms_estimator.reports.svg_plot import COLOURS, FAINT, plot, thin
+from bms_estimator.reports.svg_plot import COLORS, FAINT, plot, thin
 from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 
 NO_VALUES = "The thesis prints no value of the figure that could be compared."
@@ -47,7 +47,7 @@ def curve(key: str, title: str, unit: str, values: Floats, limits: tuple[float, 
 
 
 def figure_3(s: Simulation) -> Figure:
-    """Draw E_o."""
+    """Draw the open-circuit voltage E_o over SOC."""
     return curve(
         "3", "Open-circuit voltage E_o over SOC, (2.10)", "V", np.array([emf(x, s.cell.a) for x in FULL_SOC_GRID])
     )
@@ -79,7 +79,7 @@ def figure_8(s: Simulation) -> Figure:
 
 
 def figure_9(_: Simulation) -> Figure:
-    """Return the entry of the block diagram."""
+    """Return the report's item of a block diagram, which has no plot."""
     return Figure(
         "9",
         "Mittag-Leffler function as a Nussbaum function: block diagram",
@@ -118,8 +118,8 @@ def tracking(run: AdaptiveRun, label: str) -> Callable[[Any], None]:
 
     def draw(axes: Any) -> None:
         t, y, yhat = thin(run.time_s / 60.0, run.voltage_v, run.voltage_estimate_v)
-        axes.plot(t, y, label="y, true cell", linewidth=2.6, color=COLOURS[0], alpha=0.45)
-        axes.plot(t, yhat, "--", label=label, color=COLOURS[1])
+        axes.plot(t, y, label="y, true cell", linewidth=2.6, color=COLORS[0], alpha=0.45)
+        axes.plot(t, yhat, "--", label=label, color=COLORS[1])
         axes.set(xlabel="time [min]", ylabel="V")
         axes.legend()
 
@@ -139,15 +139,15 @@ def error_plot(axes: Any, run: AdaptiveRun) -> None:
 def frozen_plot(axes: Any, frozen: Prediction, label: str) -> None:
     """Draw the voltages of the frozen model and of the true cell."""
     t, y, yhat = thin(frozen.time_s / 60.0, frozen.voltage_v, frozen.predicted_v)
-    axes.plot(t, y, label="y, true cell", linewidth=2.6, color=COLOURS[0], alpha=0.45)
-    axes.plot(t, yhat, "--", label=label, color=COLOURS[1])
+    axes.plot(t, y, label="y, true cell", linewidth=2.6, color=COLORS[0], alpha=0.45)
+    axes.plot(t, yhat, "--", label=label, color=COLORS[1])
     axes.set(xlabel="time [min]", ylabel="V")
     axes.legend()
 
 
 def figure_13(s: Simulation) -> Figure:
     """Draw the voltage of scheme 1 at run time."""
-    run = s.one_start.scheme_1
+    run = s.fitted_start.scheme_1
     return Figure(
         "13",
         "Scheme 1: y(t) and ŷ(t) at run time",
@@ -159,21 +159,22 @@ def figure_13(s: Simulation) -> Figure:
 
 def figure_14(s: Simulation) -> Figure:
     """Draw the error of scheme 1."""
-    run = s.one_start.scheme_1
-    largest = 1e3 * float(np.abs(run.error_v[run.time_s > 60.0][:-60]).max())
+    run = s.fitted_start.scheme_1
+    # without the last snapshots, in which the voltage collapses
+    largest_mv = 1e3 * float(np.abs(run.error_v[run.time_s > 60.0][:-60]).max())
     return Figure(
         "14",
         "Scheme 1: error e(t) at run time",
         plot(lambda axes: error_plot(axes, run), salt="figure-14"),
         Reproduction.RECOMPUTED,
-        f"{NO_VALUES} After the first minute |e| stays below {largest:.2f} mV until the voltage collapses. Both axes are "
+        f"{NO_VALUES} After the first minute |e| stays below {largest_mv:.2f} mV until the voltage collapses. Both axes are "
         "logarithmic, the error's within ±0.1 mV linear. Start and λ of E25.",
     )
 
 
 def figure_15(s: Simulation) -> Figure:
     """Draw the voltage of scheme 1 with frozen parameters."""
-    frozen = s.frozen(s.one_start.scheme_1.average)
+    frozen = s.frozen(s.fitted_start.scheme_1.average)
     return Figure(
         "15",
         "Scheme 1: the model with its averaged parameters",
@@ -196,7 +197,7 @@ def _frozen_and_error(key: str, title: str, frozen: Prediction, run: AdaptiveRun
 
 def figure_16(s: Simulation) -> Figure:
     """Draw voltage and error of scheme 2."""
-    run = s.one_start.scheme_2
+    run = s.fitted_start.scheme_2
     frozen = s.frozen(run.average)
     reason = (
         f"{NO_VALUES} The small parameters stay at their initial values, which are rounded true values. The mean error of the frozen "
@@ -214,7 +215,7 @@ def figure_17(s: Simulation) -> Figure:
 
 
 def crossing_plot(axes: Any, run: AdaptiveRun) -> None:
-    """Draw a8 and a11 over SOC with their lower bounds, for Fig. 19 and 28."""
+    """Draw a8 and a11 over SOC with the bounds of their stability conditions, for Fig. 19 and 28."""
     settled = run.time_s >= run.window.t_int_s
     for ax, crossing in zip(axes, run.crossings, strict=True):
         i = int(crossing.parameter[1:])
@@ -223,7 +224,7 @@ def crossing_plot(axes: Any, run: AdaptiveRun) -> None:
 
 
 def condition_plot(ax: Any, i: int, value: float, crossing_soc: float) -> None:
-    """Draw the bound of a8 or a11, and the SOC where ``value`` meets it."""
+    """Draw the bound above which a8 (a11) keeps C_ts (C_tl) positive, and the SOC at which ``value`` meets it."""
     low, high = 0.4 * max(crossing_soc, 1e-3), 12.0 * max(crossing_soc, 1e-3)
     soc = np.linspace(low, high, 400)
     ax.plot(soc, value * crossing_soc / soc, label=f"$-\\ln(a_{{{i + 1}}}/a_{{{i - 1}}})/x_1$")
@@ -234,7 +235,7 @@ def condition_plot(ax: Any, i: int, value: float, crossing_soc: float) -> None:
 
 
 def figure_19(s: Simulation) -> Figure:
-    """Draw the crossings."""
+    """Draw a8 and a11 over SOC with their stability conditions."""
     c8, c11 = s.improved.crossings
     return Figure(
         "19",
@@ -260,15 +261,15 @@ def figure_20(s: Simulation) -> Figure:
     )
 
 
-def elements_plot(axes: Any, true: Floats | None, estimated: Floats, stop_at: Sequence[float]) -> None:
+def elements_plot(axes: Any, true: Floats | None, estimated: Floats, crossing_socs: Sequence[float]) -> None:
     """Draw four elements over SOC, with lines at delta1 and delta2, for Fig. 21 and 30."""
     soc = np.linspace(0.03, 1.0, 800)
     for ax, (name, unit) in zip(axes.flat, (("R_tl", "Ω"), ("R_ts", "Ω"), ("C_tl", "F"), ("C_ts", "F")), strict=True):
         if true is not None:
             ax.plot(soc, element(name, true, soc), label="Chen and Mora")
         ax.plot(soc, element(name, estimated, soc), "--", label="estimated")
-        for at, style in zip(stop_at, ("--", ":"), strict=True):
-            ax.axvline(at, color=FAINT, linestyle=style, linewidth=1.0)
+        for crossing_soc, style in zip(crossing_socs, ("--", ":"), strict=True):
+            ax.axvline(crossing_soc, color=FAINT, linestyle=style, linewidth=1.0)
         ax.set(xlabel="SOC", ylabel=unit, title=name, xlim=(0.0, 1.0))
         ax.legend()
 
@@ -331,7 +332,7 @@ def figure_23(s: Simulation) -> Figure:
     def draw(axes: Any) -> None:
         frozen_plot(axes[0], as_printed, "estimated model, Tables 5 and 6")
         t, run = thin(s.improved.time_s / 600.0, s.improved.voltage_estimate_v)
-        axes[0].plot(t, run, ":", color=COLOURS[2], label="run time (C/10, time / 10)")
+        axes[0].plot(t, run, ":", color=COLORS[2], label="run time (C/10, time / 10)")
         axes[0].legend()
         for label, prediction in runs.items():
             t, e = thin(prediction.time_s / 60.0, 1e3 * prediction.error_v)
@@ -367,24 +368,24 @@ def figure_39(s: Simulation) -> Figure:
 def dynamic_static_plot(axes: Any, dynamic: Prediction, static: Prediction) -> None:
     """Draw the end of a run, and the errors over SOC, for Fig. 39 and 40."""
     late = dynamic.soc < 0.25
-    t, y, moving, frozen = thin(
+    t, y, dynamic_v, static_v = thin(
         dynamic.time_s[late] / 60.0, dynamic.voltage_v[late], dynamic.predicted_v[late], static.predicted_v[late]
     )
-    axes[0].plot(t, y, color=COLOURS[0], alpha=0.45, linewidth=2.6, label="actual")
-    axes[0].plot(t, moving, "--", color=COLOURS[1], label="dynamic")
-    axes[0].plot(t, frozen, ":", color=COLOURS[2], label="static")
+    axes[0].plot(t, y, color=COLORS[0], alpha=0.45, linewidth=2.6, label="actual")
+    axes[0].plot(t, dynamic_v, "--", color=COLORS[1], label="dynamic")
+    axes[0].plot(t, static_v, ":", color=COLORS[2], label="static")
     axes[0].set(xlabel="time [min]", ylabel="V", title="SOC below 0.25")
     axes[0].legend()
-    for run, label, colour in ((static, "static", COLOURS[2]), (dynamic, "dynamic", COLOURS[1])):
+    for run, label, color in ((static, "static", COLORS[2]), (dynamic, "dynamic", COLORS[1])):
         soc, e = thin(run.soc, 1e3 * run.error_v)
-        axes[1].plot(soc, e, color=colour, label=label, linewidth=1.0)
+        axes[1].plot(soc, e, color=color, label=label, linewidth=1.0)
     axes[1].set(xlabel="SOC", ylabel="error [mV]", title="actual minus model")
     axes[1].invert_xaxis()
     axes[1].legend()
 
 
 def figure_43(s: Simulation) -> Figure:
-    """Draw E_o of a battery bank with a fault."""
+    """Draw the open-circuit voltage E_o of a healthy and of a faulty bank of three batteries in series."""
     drawn = np.linspace(0.0, 1.0, 800)
     starts = {"healthy bank": (1.0, 1.0, 1.0), "two weak batteries": (1.0, *WEAK_BATTERY_SOC)}
 

@@ -26,7 +26,7 @@ from bms_estimator.reports.theorem_4_1_2 import measure
 
 
 def table_1(_: Simulation) -> Table:
-    """Return the parameters of the open-circuit voltage of Chen and Mora."""
+    """Return a16 to a21, the parameters of Chen and Mora's open-circuit voltage."""
     return Table(
         "1",
         "a16 to a21 for the simulations",
@@ -45,7 +45,7 @@ def table_2(simulation: Simulation) -> Table:
         "Scheme 1 (3.16): a1 to a15",
         (printed_values.TABLE_2, printed_values.TABLE_2_ERROR),
         simulation.scheme_1.average,
-        simulation.one_start.scheme_1.average,
+        simulation.fitted_start.scheme_1.average,
         "By (3.16) all fifteen parameters change by the same integral of e², here and in print.",
     )
 
@@ -59,7 +59,7 @@ def table_3(simulation: Simulation) -> Table:
         "Scheme 2 (3.17): a1 to a15",
         (printed_values.TABLE_3, printed_values.TABLE_3_ERROR),
         simulation.scheme_2.average,
-        simulation.one_start.scheme_2.average,
+        simulation.fitted_start.scheme_2.average,
         "a1, a3, a6, a13, a15 are pulled back to their initial values, and the others change by the same integral of e², here "
         "and in print. The printed 0 % of the small parameters are artefacts: they compare the initial value with itself, and it "
         f"is rounded (a13 {true[13]} %, a6 {true[6]} % from Tables 5 and 6). The printed error of a5 should be 0.399.",
@@ -70,9 +70,9 @@ def _scheme_table(
     simulation: Simulation,
     key: str,
     title: str,
-    print_: tuple[tuple[float, ...], tuple[float, ...]],
-    plain: Floats,
-    started: Floats,
+    printed_values_and_errors: tuple[tuple[float, ...], tuple[float, ...]],
+    from_zero: Floats,
+    from_fitted_start: Floats,
     reason: str,
 ) -> Table:
     """Return the table of scheme 1 or 2.
@@ -81,29 +81,31 @@ def _scheme_table(
         simulation: Runs of the schemes.
         key: Number of the table.
         title: Caption.
-        print_: Printed estimates and printed errors [%].
-        plain: Averages of the run with x2(0) = x3(0) = 0.
-        started: Averages of the run with the fitted start.
+        printed_values_and_errors: Printed estimates and printed errors [%].
+        from_zero: Averages of the run with x2(0) = x3(0) = 0.
+        from_fitted_start: Averages of the run with the fitted start.
         reason: First sentences of the reason.
     """
     rows = []
-    for i, (start, estimate, error) in enumerate(zip(printed_values.CHEN_MORA_ROUNDED, *print_, strict=True), 1):
-        recomputed, true = float(started[i]), float(simulation.cell.a[i])
+    for i, (initial, estimate, error) in enumerate(
+        zip(printed_values.CHEN_MORA_ROUNDED, *printed_values_and_errors, strict=True), 1
+    ):
+        recomputed, true = float(from_fitted_start[i]), float(simulation.cell.a[i])
         rows.append(
             (
                 f"a{i}",
-                number(start),
+                number(initial),
                 number(true),
                 number(estimate, 6),
                 number(recomputed, 6),
-                number(float(plain[i]), 6),
+                number(float(from_zero[i]), 6),
                 number(error),
-                percent(recomputed, start),
+                percent(recomputed, initial),
                 percent(recomputed, true),
             )
         )
-    change = float(plain[2]) - printed_values.CHEN_MORA_ROUNDED[1]
-    fitted = simulation.one_start
+    change = float(from_zero[2]) - printed_values.CHEN_MORA_ROUNDED[1]
+    fitted = simulation.fitted_start
     return Table(
         key,
         title,
@@ -130,10 +132,10 @@ def _scheme_table(
 
 def table_4(simulation: Simulation) -> Table:
     """Return the table of scheme 3."""
-    x, y = printed_values.TABLE_4_WEIGHTS
+    upper_weight, lower_weight = printed_values.TABLE_4_WEIGHTS
     rows = []
     for i, (upper, lower, estimate, desired, error) in printed_values.TABLE_4.items():
-        limit = (x * upper + y * lower) / (x + y)
+        limit = (upper_weight * upper + lower_weight * lower) / (upper_weight + lower_weight)
         true = float(simulation.cell.a[i])
         rows.append(
             (
@@ -179,8 +181,10 @@ def table_5(simulation: Simulation) -> Table:
     for i, (initial, estimate, desired, error) in printed_values.TABLE_5.items():
         upper, lower, x, y = printed_values.BOUNDS[i]
         recomputed = float(simulation.improved.average[i])
-        b = printed_values.bounds("5", i)
-        inferred = f" ({b.weight_upper:g}, {b.weight_lower:g})" if i in printed_values.INFERRED_WEIGHTS["5"] else ""
+        bounds = printed_values.bounds("5", i)
+        inferred = (
+            f" ({bounds.weight_upper:g}, {bounds.weight_lower:g})" if i in printed_values.INFERRED_WEIGHTS["5"] else ""
+        )
         decimals = printed_values.DECIMALS_5[i]
         rows.append(
             (
@@ -190,7 +194,7 @@ def table_5(simulation: Simulation) -> Table:
                 number(initial),
                 f"{estimate:.{decimals}f}",
                 number(recomputed, 6),
-                number(b.limit, 6),
+                number(bounds.limit, 6),
                 f"{printed_values.mean_from_start('5', i):.{decimals}f}",
                 number(desired),
                 number(error),
@@ -315,9 +319,9 @@ def table_12(simulation: Simulation) -> Table:
         (
             f"estimated {kind} model",
             number(printed_values.TABLE_12[kind]),
-            *(number(value, 3) for run in found for value in (run.mean_percent, run.max_percent)),
+            *(number(value, 3) for run in predictions for value in (run.mean_percent, run.max_percent)),
         )
-        for kind, found in runs.items()
+        for kind, predictions in runs.items()
     )
     higher = [
         number(run.mean_percent, 3)
@@ -326,7 +330,7 @@ def table_12(simulation: Simulation) -> Table:
             simulation.static(simulation.printed_a, LOWEST_SOC),
         )
     ]
-    dynamic, static = (number(found[0].mean_percent, 3) for found in runs.values())
+    dynamic, static = (number(predictions[0].mean_percent, 3) for predictions in runs.values())
     return Table(
         "12",
         "Dynamic and static model, simulation: mean |error| of the output voltage [%]",
@@ -350,16 +354,16 @@ def table_12(simulation: Simulation) -> Table:
 
 
 def theorem_4_1_2(_: Simulation) -> Table:
-    """Measure the claim of the theorem."""
+    """Return the measured errors of the RC products, which the theorem claims to vanish."""
     rows = tuple(
         (
-            m.bounds,
-            f"{m.c_rate:g}C",
-            f"{1e6 * m.tracking_v:.1f}",
-            *(number(e, 4) if e > 1e-4 else "0.0000" for e in m.error_percent),
-            *(number(e, 4) if e > 1e-4 else "0.0000" for e in m.limit_percent),
+            result.bounds,
+            f"{result.c_rate:g}C",
+            f"{1e6 * result.tracking_v:.1f}",
+            *(number(error, 4) if error > 1e-4 else "0.0000" for error in result.error_percent),
+            *(number(error, 4) if error > 1e-4 else "0.0000" for error in result.limit_percent),
         )
-        for m in measure()
+        for result in measure()
     )
     return Table(
         "Theorem 4.1.2",

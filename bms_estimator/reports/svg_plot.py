@@ -13,9 +13,9 @@ INK = "#1d2733"
 """Color of texts and ticks."""
 FAINT = "#8a97a6"
 """Color of axes and secondary lines."""
-COLOURS = ("#1f5fa8", "#d1602b", "#2f8f5b", "#8a4fa3", "#b08a1e", "#4aa3b5")
+COLORS = ("#1f5fa8", "#d1602b", "#2f8f5b", "#8a4fa3", "#b08a1e", "#4aa3b5")
 """Colors that differ in print and for color-blind readers: blue, orange, green, violet, ochre, teal."""
-POINTS = 1200
+MAX_POINTS = 1200
 """Maximum number of points on a line. More points are not visible at the width of a figure."""
 WIDTH_IN = 8.0
 """Width of a figure [inches]."""
@@ -43,7 +43,7 @@ STYLE: dict[str, Any] = {
     "legend.fontsize": 8.0,
     "lines.linewidth": 1.4,
     "figure.constrained_layout.use": True,
-    "axes.prop_cycle": f"cycler('color', {list(COLOURS)})",
+    "axes.prop_cycle": f"cycler('color', {list(COLORS)})",
 }
 
 
@@ -71,15 +71,15 @@ def plot(draw: Callable[[Any], None], *, rows: int = 1, columns: int = 1, salt: 
     return text[text.index("<svg") :]
 
 
-def thin(x: Floats, *curves: Floats, points: int = POINTS) -> tuple[Floats, ...]:
+def thin(x: Floats, *curves: Floats, points: int = MAX_POINTS) -> tuple[Floats, ...]:
     """Reduce the points of curves to the first, lowest and highest point of the first curve in each interval."""
     if x.size <= points:
         return (x, *curves)
     y = curves[0]
     edges = np.linspace(0, x.size, points // 3 + 1).astype(int)
-    kept = {x.size - 1}
+    indices = {x.size - 1}
     for first, last in itertools.pairwise(edges):
-        part = y[first:last]
-        kept |= {int(first), int(first + np.argmin(part)), int(first + np.argmax(part))}
-    index = np.array(sorted(kept))
-    return (x[index], *(curve[index] for curve in curves))
+        interval_y = y[first:last]
+        indices |= {int(first), int(first + np.argmin(interval_y)), int(first + np.argmax(interval_y))}
+    order = np.array(sorted(indices))
+    return (x[order], *(curve[order] for curve in curves))

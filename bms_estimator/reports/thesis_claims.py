@@ -1,8 +1,8 @@
 """Claims of chapters 4 to 7 about the thesis's recordings, tested on other captures.
 
-A claim holds if its printed value is reached on more than half of the captures. For SOC and RC products the thesis prints
-no value that could be a limit, so that their limits are chosen here, as is the limit 1 for the order of the dynamic and the
-static model.
+A claim holds if the error is at most the printed value on more than half of the captures. For the SOC and the RC
+products the thesis prints no value that could be a limit. Their limits, and the limit 1 of the ratio between the
+dynamic and the static model, are chosen here.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,8 +20,8 @@ from bms_estimator.reports.simulation import element
 PRODUCTS_PERCENT = 20.0
 """Maximum error of the RC products [%]: ten times the 1.9 % of Table 7. Theorem 4.1.2 claims that they are exact."""
 SOC_PERCENT = 5.0
-"""Maximum error of the interpolated SOC [%]. An initial error of this size persists in coulomb counting. Section 7.1 of the
-thesis claims that interpolation is more accurate."""
+"""Maximum error of the interpolated SOC [%]. An initial error of this size persists in coulomb counting. Section 7.1 of
+the thesis claims that interpolation is more accurate."""
 MIDDLE_SOC = 0.5
 """SOC at which the RC products are compared."""
 
@@ -41,7 +41,7 @@ class Result:
     limit: float
 
     @property
-    def met(self) -> bool:
+    def is_met(self) -> bool:
         """True if the claim holds for the capture."""
         return self.value <= self.limit
 
@@ -52,7 +52,7 @@ class Claim:
 
     Attributes:
         key: Name of the claim in the tables, such as "constant loads, mean".
-        location: Table or figure.
+        location: Table or figure of the thesis.
         criterion: Condition for more than half of the captures.
         results: Results of each capture that the claim can be tested on.
     """
@@ -63,23 +63,24 @@ class Claim:
     results: tuple[Result, ...]
 
     @property
-    def met(self) -> int:
+    def captures_met(self) -> int:
         """Number of captures on which the criterion is met."""
-        return sum(result.met for result in self.results)
+        return sum(result.is_met for result in self.results)
 
     @property
     def verdict(self) -> Reproduction:
         """Verdict on the claim; NO_DATA if no capture can test it."""
         if not self.results:
             return Reproduction.NO_DATA
-        return Reproduction.CLAIM_HOLDS if 2 * self.met > len(self.results) else Reproduction.CLAIM_FAILS
+        return Reproduction.CLAIM_HOLDS if 2 * self.captures_met > len(self.results) else Reproduction.CLAIM_FAILS
 
     @property
     def span(self) -> str:
         """Range of the measured values."""
         if not self.results:
             return "-"
-        ends = [f"{end([result.value for result in self.results]):.3g}" for end in (min, max)]
+        values = [result.value for result in self.results]
+        ends = [f"{end:.3g}" for end in (min(values), max(values))]
         return ends[0] if ends[0] == ends[1] else " to ".join(ends)
 
     @property
@@ -88,15 +89,15 @@ class Claim:
         criterion = f"{self.key[0].upper()}{self.key[1:]}: {self.criterion}"
         if not self.results:
             return f"{criterion}: none of the captures can test it."
-        return f"{criterion}: met on {self.met} of {len(self.results)} captures (values {self.span}); required: more than half."
+        return f"{criterion}: met on {self.captures_met} of {len(self.results)} captures (values {self.span}); required: more than half."
 
 
-def _constant(which: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
-    return lambda p: [Result(c.name, which(p, c.name), limit) for c in p.validating if c.kind is Kind.CONSTANT]
+def _constant(measure: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
+    return lambda p: [Result(c.name, measure(p, c.name), limit) for c in p.validating if c.kind is Kind.CONSTANT]
 
 
-def _steps(which: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
-    return lambda p: [Result(c.name, which(p, c.name), limit) for c in p.validating if c.kind is Kind.STEPS]
+def _steps(measure: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
+    return lambda p: [Result(c.name, measure(p, c.name), limit) for c in p.validating if c.kind is Kind.STEPS]
 
 
 def _mean(p: Procedure, name: str) -> float:
@@ -107,11 +108,11 @@ def _max(p: Procedure, name: str) -> float:
     return p.dynamic[name].max_percent
 
 
-def _dynamic(p: Procedure, limit: float) -> list[Result]:
+def _dynamic_over_static(p: Procedure, limit: float) -> list[Result]:
     return [Result(c.name, p.dynamic[c.name].mean_percent / p.static[c.name].mean_percent, limit) for c in p.validating]
 
 
-def _soc(p: Procedure) -> list[Result]:
+def _soc_difference(p: Procedure) -> list[Result]:
     return [
         Result(
             c.name,
@@ -123,8 +124,8 @@ def _soc(p: Procedure) -> list[Result]:
 
 
 def products(p: Procedure) -> Iterator[tuple[str, float, float]]:
-    """Yield the name of each relaxation test with its product, and the product as estimated and as measured in its rests [s]."""
-    for test, capture in zip(p.tests, p.of(Kind.RELAXATION), strict=True):
+    """Yield names of relaxation test and RC product, and the product as estimated and as measured in the rests [s]."""
+    for test, capture in zip(p.tests, p.captures_of(Kind.RELAXATION), strict=True):
         try:
             measured = initial_elements(capture.samples, test, p.cell.cell.capacity_ah)
         except UserError:  # without a rest after a discharge, there is nothing to compare with
@@ -172,17 +173,17 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Procedure], list[Result]]]] = {
     "dynamic against static, ratio": (
         "Table 13",
         f"mean error of the dynamic model divided by that of the static one at most {PRINTED_RATIO:.4f}, as printed",
-        lambda p: _dynamic(p, PRINTED_RATIO),
+        lambda p: _dynamic_over_static(p, PRINTED_RATIO),
     ),
     "dynamic against static, order": (
         "Table 13",
         "mean error of the dynamic model divided by that of the static one at most 1",
-        lambda p: _dynamic(p, 1.0),
+        lambda p: _dynamic_over_static(p, 1.0),
     ),
     "SOC by interpolation": (
         "Figure 41",
         f"SOC by interpolation in E_o within {SOC_PERCENT:g} % RMS of the cycler's count",
-        _soc,
+        _soc_difference,
     ),
     "RC products": (
         "Figure 29",
@@ -193,7 +194,7 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Procedure], list[Result]]]] = {
 """Location, criterion and test on one cell, by key of the claim."""
 
 
-def claim(key: str, protocols: Sequence[Procedure]) -> Claim:
+def claim(key: str, procedures: Sequence[Procedure]) -> Claim:
     """Test a claim on the captures of one or more cells. A relaxation test shared by two cells counts twice."""
     location, criterion, test = CLAIMS[key]
-    return Claim(key, location, criterion, tuple(result for p in protocols for result in test(p)))
+    return Claim(key, location, criterion, tuple(result for p in procedures for result in test(p)))

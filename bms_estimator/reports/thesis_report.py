@@ -33,12 +33,12 @@ DIAGRAMS = {
     "50": "Simulink diagram of the Mittag-Leffler function",
 }
 """Figures without anything to compute, by number."""
-FUEL_CELL = dict.fromkeys(
+FUEL_CELL_REASONS = dict.fromkeys(
     ("45", "46"),
     "The recording is not published, nor are the equations of its model. The project's own model of a fuel cell, after section "
     "7.3, is in docs/theory/fuel-cell.md.",
 )
-"""Reason of the figures of a fuel cell, by number."""
+"""Reason for which the figures of a fuel cell are not reproduced, by number."""
 
 CHAPTERS: dict[str, tuple[str, ...]] = {
     "2  The model and the Nussbaum gain": ("F1", "F2", "F3", "F4", "F5", "F6", "F7", "F8", "F9", "F10"),
@@ -69,7 +69,7 @@ CHAPTERS: dict[str, tuple[str, ...]] = {
     "A  Simulink models": ("F47", "F48", "F49", "F50"),
     "Errata": ("TErrata",),
 }
-"""Tables (T) and figures (F) by chapter, in the order of the thesis."""
+"""Marks of tables (T) and figures (F) by chapter, in the order of the thesis."""
 
 
 @dataclass(frozen=True)
@@ -93,27 +93,27 @@ class Report:
 def _builders(simulation: Simulation, experiment: Experiment) -> dict[str, Callable[[], Item]]:
     """Return the functions that build the items, by mark such as T5 or F19."""
 
-    def of_simulation(make: Callable[[Simulation], Item]) -> Callable[[], Item]:
+    def with_simulation(make: Callable[[Simulation], Item]) -> Callable[[], Item]:
         return lambda: make(simulation)
 
-    def of_experiment(make: Callable[[Experiment], Item]) -> Callable[[], Item]:
+    def with_experiment(make: Callable[[Experiment], Item]) -> Callable[[], Item]:
         return lambda: make(experiment)
 
     builders: dict[str, Callable[[], Item]] = {}
-    builders |= {f"T{key}": of_simulation(make) for key, make in simulation_tables.TABLES.items()}
-    builders |= {f"F{key}": of_simulation(make) for key, make in simulation_figures.FIGURES.items()}
-    builders |= {f"T{key}": of_experiment(make) for key, make in experiment_tables.TABLES.items()}
-    builders |= {f"F{key}": of_experiment(make) for key, make in experiment_figures.FIGURES.items()}
+    builders |= {f"T{key}": with_simulation(make) for key, make in simulation_tables.TABLES.items()}
+    builders |= {f"F{key}": with_simulation(make) for key, make in simulation_figures.FIGURES.items()}
+    builders |= {f"T{key}": with_experiment(make) for key, make in experiment_tables.TABLES.items()}
+    builders |= {f"F{key}": with_experiment(make) for key, make in experiment_figures.FIGURES.items()}
     if experiment.recorded is None:  # without captures these are computed from the printed values
         builders |= {f"F{key}": make for key, make in printed_pack.FIGURES.items()}
-    builders["TErrata"] = of_simulation(errata.table)
+    builders["TErrata"] = with_simulation(errata.table)
     builders |= {f"F{key}": _diagram(key) for key in DIAGRAMS}
     return builders
 
 
 def _diagram(key: str) -> Callable[[], Item]:
-    verdict = Reproduction.NO_DATA if key in FUEL_CELL else Reproduction.GIVEN
-    reason = FUEL_CELL.get(key, "A diagram or photograph: there is nothing to compute.")
+    verdict = Reproduction.NO_DATA if key in FUEL_CELL_REASONS else Reproduction.GIVEN
+    reason = FUEL_CELL_REASONS.get(key, "A diagram or photograph: there is nothing to compute.")
     return lambda: Figure(key, DIAGRAMS[key], "", verdict, reason)
 
 
@@ -137,8 +137,8 @@ def build(
     """
     experiment = Experiment(recorded)
     if recorded is not None:
-        # reject unusable captures before half a minute of simulations
-        _ = experiment.protocol.r_s_fit
+        # raises for unusable captures, before half a minute of simulations
+        _ = experiment.procedure.r_s_fit
     builders = _builders(Simulation(), experiment)
     selected = _select(builders, table, figure)
     total, done = sum(len(marks) for _, marks in selected), 0

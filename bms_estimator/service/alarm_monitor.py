@@ -11,11 +11,10 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import HookHealth
-from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.alarm_limits import charging_a, silent_limit_s, watched
+from bms_estimator.settings.alarm_limits import min_charge_current_a, monitored_alarms, silent_limit_s
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.source import Source
+from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarms import AlarmEvaluator, Change, SampleCounts
 from bms_estimator.telemetry.health import sample_counters, suspicions
@@ -37,7 +36,7 @@ class AlarmMonitor:
         settings: The pack's settings.
         cell: The pack as one object.
         estimator: Estimator; read only.
-        source: Supplies counters, cell voltages, and the reason why no samples arrive.
+        source: Supplies counters, and the reason why no samples arrive.
         clock: The clocks.
         on_alarm: Called with each change of an alarm, as soon as it occurs.
         hooks: Successes and failures of alarm hooks; None without hooks.
@@ -65,24 +64,26 @@ class AlarmMonitor:
         self._estimator, self._source, self._clock, self._on_alarm = estimator, source, clock, on_alarm
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
-        self.alarms = AlarmEvaluator(watched(settings, cell), charging_a(cell), gap_s, inputs, silent_limit_s(settings))
+        self.alarms = AlarmEvaluator(
+            monitored_alarms(settings, cell), min_charge_current_a(cell), gap_s, inputs, silent_limit_s(settings)
+        )
         self.report = self.alarms.report()
         # arrival of the last sample, accepted or not, on the monotonic clock and on the wall clock [s]
         self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
 
-    def add(self, block: SampleBlock, trace: TraceBlock, now_s: float) -> bool:
-        """Add a block of samples and its estimates; evaluate the alarms if this is due.
+    def add(self, received: ReceivedSamples, trace: TraceBlock, now_s: float) -> bool:
+        """Add received samples and their estimates; evaluate the alarms if this is due.
 
         Args:
-            block: Samples.
+            received: Samples and cell voltages.
             trace: Estimates of the accepted samples.
             now_s: Monotonic clock [s].
 
         Returns:
             True if an alarm has changed.
         """
-        self.alarms.add(block, trace, self._source.cells)
+        self.alarms.add(received.samples, trace, received.cells_v)
         self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
         is_due = now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS
         return is_due and self.evaluate(now_s)
@@ -101,7 +102,7 @@ class AlarmMonitor:
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
         self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts)
-        self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.message or "")
+        self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.silence_reason or "")
         if (hooks := self._hooks()) is not None:
             self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall())
         return self._report_changes()

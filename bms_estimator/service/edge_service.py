@@ -48,7 +48,7 @@ async def serve_edge(
     stop, name = stop_on_signal(stop), settings.pack.name
     notifier = notifier or SystemdNotifier([name], activity="sending samples of")
     set_level(name, settings.log.level)
-    source = open_line_source(settings) or SerialSource(settings.sensor, memory=KnownBoardFile(folder, name))
+    source = open_line_source(settings) or SerialSource(settings.sensor, board_file=KnownBoardFile(folder, name))
     with instance_lock(folder, name):
         async with BlockSender(settings.edge, name, folder) as sender, source:
             notifier.ready(name)
@@ -65,8 +65,8 @@ async def serve_edge(
 
 async def _send_samples(source: Source, sender: BlockSender) -> None:
     """Pass all samples of the source to the block sender."""
-    async for samples in source:
-        sender.take(samples)
+    async for received in source:
+        sender.take(received.samples)
         await asyncio.sleep(0)  # a source that always has samples must not starve the sender
 
 
@@ -78,7 +78,11 @@ async def _notify_alive(
     while True:
         if source.health().task_idle_s <= SOURCE_HUNG_S:
             notifier.alive(name)
-        status = f"no samples: {source.message}" if source.message else f"{sender.store.waiting} blocks not sent"
+        status = (
+            f"no samples: {source.silence_reason}"
+            if source.silence_reason
+            else f"{sender.store.waiting} blocks not sent"
+        )
         if status != sent_status:
             notifier.status(name, status)
             sent_status = status

@@ -157,15 +157,15 @@ async def _estimate(
         restored_s: Time since boot at which the state was restored [s].
     """
     unseen_s = estimator.record["unseen_s"].copy()
-    async for block in source:
+    async for received in source:
         if estimator.state["started"][0] and not estimator.state["samples"][0]:
             # the gap before the first sample after a restart also includes the wait for that sample
             estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s
         if edge:
-            edge.take(block)
-        trace = estimator.run(block)
+            edge.take(received.samples)
+        trace = estimator.run(received.samples)
         totals.add(trace)
-        publisher.add(block, trace)
+        publisher.add(received, trace)
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
 

@@ -22,7 +22,7 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks, PublishRaw, select_relay
 from bms_estimator.service.live_loop import run_estimation_loop
-from bms_estimator.settings.alarm_limits import out_of_range, watched
+from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.exports.influx import InfluxSink
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
@@ -71,7 +71,7 @@ async def run_pack_service(
     """
     stop = stop_on_signal(stop)
     set_level(settings.pack.name, settings.log.level)
-    for line in [*implausible_settings(settings, cell), *out_of_range(settings, cell)]:
+    for line in [*implausible_settings(settings, cell), *implausible_limits(settings, cell)]:
         log.warning("implausible setting", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = DeliveryStats(store_trouble=lambda: database.reason) if database else DeliveryStats()
@@ -80,8 +80,8 @@ async def run_pack_service(
         all_sinks.append(History(database, days=settings.store.history_days))
     requests = RequestDispatcher(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = KnownBoardFile(folder, settings.pack.name) if folder else None
-    source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, memory=memory)
-    outbox = Outbox(database, most=settings.store.outbox_messages)
+    source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, board_file=memory)
+    outbox = Outbox(database, max_messages=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     publish_raw: PublishRaw | None = None
     if settings.mqtt is not None:
@@ -93,7 +93,7 @@ async def run_pack_service(
             outbox,
             sample_period_s=settings.sensor.sample_period_s,
             home_assistant=settings.home_assistant,
-            alarms=[each.name for each in watched(settings, cell)],
+            alarms=[each.name for each in monitored_alarms(settings, cell)],
         )
         all_sinks.insert(0, mqtt)  # so that no other sink delays the messages
         publish_raw = mqtt.publish_raw

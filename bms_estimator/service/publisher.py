@@ -21,13 +21,12 @@ from bms_estimator.model.payloads import (
     RecordingHealth,
     Snapshot,
 )
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.latency import Latency
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
-from bms_estimator.sources.source import Source, SourceHealth
+from bms_estimator.sources.source import ReceivedSamples, Source, SourceHealth
 from bms_estimator.telemetry.alarms import Change
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
@@ -132,22 +131,22 @@ class Publisher:
         """Return the time until a snapshot is overdue, which shows that no samples arrive [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
-    def add(self, block: SampleBlock, trace: TraceBlock) -> None:
-        """Add a block of samples and its estimates; publish if a snapshot is due or an alarm has changed."""
+    def add(self, received: ReceivedSamples, trace: TraceBlock) -> None:
+        """Add received samples and their estimates; publish if a snapshot is due or an alarm has changed."""
         if self._source_health:
             self._latency.add(self._source_health().block_age_s)
         now_s = self._clock.monotonic()
         if trace.size:
-            self._window.add(trace, self._clock.wall(), self._source.cells)
+            self._window.add(trace, self._clock.wall(), received.cells_v)
             self._sample_s = now_s
-        if trace.size < block.size:
-            self._drop_reason = out_of_range_reason(block, self._estimator.settings[0]) or ""
+        if trace.size < received.samples.size:
+            self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
         elif self._drop_reason is not None:
             self._drop_reason, self._dropped_before = None, self._dropped()
         is_due = now_s >= self._due_s
         if is_due and self.latest:  # before the alarms, so that their evaluation does not delay the estimate
             self._publish_snapshot(now_s)
-        alarm_changed = self.alarm_monitor.add(block, trace, now_s)
+        alarm_changed = self.alarm_monitor.add(received, trace, now_s)
         if is_due and not self.latest:  # the first snapshot lists the alarms that the first samples permit
             self.publish()
         elif alarm_changed:
@@ -291,8 +290,8 @@ class Publisher:
         silent_s = now_s - self._sample_s
         if silent_s <= self._fresh_s:
             return None
-        if self._source.message:
-            return self._source.message
+        if self._source.silence_reason:
+            return self._source.silence_reason
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
         dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped().items()}

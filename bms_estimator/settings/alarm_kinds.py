@@ -17,9 +17,9 @@ class AlarmKind(NamedTuple):
     remedy: str
     """Advice to the user."""
     needs: tuple[Quantity, ...] = ()
-    """Quantities without which the alarm cannot be watched; empty for alarms about the samples themselves."""
+    """Quantities without which the alarm cannot be evaluated; empty for alarms about the samples themselves."""
     unit: str | None = None
-    """Unit of value and limit; None without one."""
+    """Unit of value and limit; None for a number without unit."""
     is_upper_limit: bool = True
     """True if the alarm is raised at or above its limit, False if at or below."""
     device_class: str = "problem"

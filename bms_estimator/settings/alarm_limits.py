@@ -1,6 +1,6 @@
 """Monitored alarms, derived from ``[alarms]`` and the cell: limits, and levels at which the alarms end.
 
-Sources are in docs/pack/alarms.md.
+The sources of the default limits are in docs/pack/alarms.md.
 """
 
 import math
@@ -14,10 +14,10 @@ from bms_estimator.settings.alarm_kinds import ALARM_KINDS, AlarmKind
 from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
 from bms_estimator.settings.pack import Settings
 
-MIN_SILENT_S = 10.0
+MIN_SILENT_LIMIT_S = 10.0
 """Minimum default limit of ``link_lost`` [s]."""
 SILENT_PERIODS = 3
-"""Default limit of ``link_lost`` as a multiple of the sample period or publish period."""
+"""Default limit of ``link_lost`` as a multiple of the sample period or the publish period, whichever is longer."""
 
 
 class AlarmDefinition(NamedTuple):
@@ -38,8 +38,8 @@ class AlarmDefinition(NamedTuple):
         return ALARM_KINDS[self.name]
 
 
-class Chemistry(NamedTuple):
-    """Voltage limits of a cell [V], and the levels at which their alarms end [V]."""
+class VoltageLimits(NamedTuple):
+    """Default voltage limits of a cell [V], and the levels at which their alarms end [V]."""
 
     over_v: float
     over_clear_v: float
@@ -47,30 +47,35 @@ class Chemistry(NamedTuple):
     under_clear_v: float
 
 
-_BY_NOMINAL_V = (
-    (2.8, Chemistry(2.85, 2.70, 1.60, 1.90)),  # LTO: charged to 2.7..2.8 V, empty at 1.5 V
-    (3.45, Chemistry(3.65, 3.40, 2.70, 3.10)),  # LFP: factory settings of the Seplos BMS 3.0
-    (math.inf, Chemistry(4.25, 4.15, 2.70, 3.00)),  # all chemistries that are charged to 4.2 V
+_VOLTAGE_LIMITS = (
+    # over_v, over_clear_v, under_v, under_clear_v
+    (2.8, VoltageLimits(2.85, 2.70, 1.60, 1.90)),  # LTO: charged to 2.7..2.8 V, empty at 1.5 V
+    (3.45, VoltageLimits(3.65, 3.40, 2.70, 3.10)),  # LFP: factory settings of the Seplos BMS 3.0
+    (math.inf, VoltageLimits(4.25, 4.15, 2.70, 3.00)),  # all chemistries that are charged to 4.2 V
 )
-"""Upper limits of a cell's nominal voltage [V], each with the voltage limits of its chemistry."""
+"""Voltage limits by chemistry, each after the upper limit of the nominal voltage of its cells [V]."""
 
 MIN_CHARGE_C = 0.02
 """Minimum charge current as a C-rate [1/h]. A smaller current may be the sensor's offset."""
-DIGITS = 9
+CLEAR_DECIMALS = 9
 """Number of decimals to which clear levels are rounded, so that 0.1 - 0.08 gives 0.02."""
 MAX_DISCHARGE_C = 5.0
-"""Default maximum discharge current as a C-rate [1/h]. The limit of valid samples in a generic cell's file is no
-default, because it lies far above the continuous limit of most such cells."""
+"""Default limit of the discharge current as a C-rate [1/h]. ``current_max_a`` of a generic cell's file is no default,
+because this limit of valid samples lies far above the continuous limit of most such cells."""
+CURRENT_CLEAR_FRACTION = 0.95
+"""Default clear level of a current as a fraction of its limit."""
 
 
 class _Default(NamedTuple):
-    """Default limit and clear level of an alarm; None: not monitored unless configured."""
+    """Default limit and clear level of an alarm."""
 
     limit: float | None
+    """None: the alarm is not monitored unless a limit is configured."""
     clear: float | None
+    """Level at which the alarm ends; None: equal to the limit."""
 
 
-def watched(settings: Settings, cell: PackModel) -> tuple[AlarmDefinition, ...]:
+def monitored_alarms(settings: Settings, cell: PackModel) -> tuple[AlarmDefinition, ...]:
     """Return the monitored alarms of a pack, in the order of ``ALARMS``.
 
     Args:
@@ -88,33 +93,36 @@ def watched(settings: Settings, cell: PackModel) -> tuple[AlarmDefinition, ...]:
 def silent_limit_s(settings: Settings) -> float:
     """Return the time without a sample after which ``link_lost`` is raised and no other alarm is monitored [s]."""
     rule = settings.alarms.link_lost
-    return (rule.limit_s or _silent_s(settings)) + rule.delay_s
+    return (rule.limit_s or _default_silent_limit_s(settings)) + rule.delay_s
 
 
-def _silent_s(settings: Settings) -> float:
+def _default_silent_limit_s(settings: Settings) -> float:
     """Return the default limit of ``link_lost`` [s]."""
-    return max(MIN_SILENT_S, SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s))
+    return max(
+        MIN_SILENT_LIMIT_S, SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s)
+    )
 
 
-def charging_a(cell: PackModel) -> float:
+def min_charge_current_a(cell: PackModel) -> float:
     """Return the minimum current that counts as charging [A]."""
-    reference = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
-    return MIN_CHARGE_C * reference
+    # a fuel cell has no capacity
+    reference_a = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
+    return MIN_CHARGE_C * reference_a
 
 
-def out_of_range(settings: Settings, cell: PackModel) -> list[str]:
-    """Return a line for each implausible limit."""
-    return list(_out_of_range(watched(settings, cell), cell))
+def implausible_limits(settings: Settings, cell: PackModel) -> list[str]:
+    """Return a warning for each limit that lies outside the range of the cell file."""
+    return list(_implausible_limits(monitored_alarms(settings, cell), cell))
 
 
-def _out_of_range(alarms: tuple[AlarmDefinition, ...], cell: PackModel) -> Iterator[str]:
+def _implausible_limits(alarms: tuple[AlarmDefinition, ...], cell: PackModel) -> Iterator[str]:
     c = cell.cell
-    n, middle_v = c.series_count, c.nominal_voltage_v
+    n, nominal_v = c.series_count, c.nominal_voltage_v
     ranges = {
-        "pack_over_voltage": (middle_v, c.voltage_max_v),
-        "pack_under_voltage": (c.voltage_min_v, middle_v),
-        "cell_over_voltage": (middle_v / n, c.voltage_max_v / n),
-        "cell_under_voltage": (c.voltage_min_v / n, middle_v / n),
+        "pack_over_voltage": (nominal_v, c.voltage_max_v),
+        "pack_under_voltage": (c.voltage_min_v, nominal_v),
+        "cell_over_voltage": (nominal_v / n, c.voltage_max_v / n),
+        "cell_under_voltage": (c.voltage_min_v / n, nominal_v / n),
         "discharge_over_current": (0.0, c.current_max_a),
         "charge_over_current": (0.0, c.current_max_a),
     }
@@ -131,20 +139,21 @@ def _out_of_range(alarms: tuple[AlarmDefinition, ...], cell: PackModel) -> Itera
 def _definition(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDefinition | None:
     """Return the monitored alarm; None if it is switched off or has no limit."""
     configured, kind = rule.model_dump(exclude_none=True), ALARM_KINDS[name]
+    # limit_v, limit_a, limit_c, limit_s or limit, depending on the rule; ``hook_failed`` has none
     key = next((key for key in type(rule).model_fields if key.startswith("limit")), "limit")
     limit = configured.get(key, default.limit)
     if not rule.enabled or limit is None:
         return None
     hysteresis = 0.0 if default.clear is None or default.limit is None else default.clear - default.limit
     clear_key = key.replace("limit", "clear")
-    clear = configured.get(clear_key, round(limit + hysteresis, DIGITS))
+    clear = configured.get(clear_key, round(limit + hysteresis, CLEAR_DECIMALS))
     if (clear > limit) if kind.is_upper_limit else (clear < limit):
         beyond = "above" if kind.is_upper_limit else "below"
         raise UserError(
             f"alarms.{name}.{clear_key} = {clear:g}: must not be {beyond} {key} = {limit:g}, which raises the alarm"
         )
     delay_s = rule.delay_s
-    if name == "link_lost":  # the value of this alarm is a time, to which the delay is added
+    if name == "link_lost":  # its value is the time without a sample, so that a delay is the same as a higher limit
         limit, clear, delay_s = limit + delay_s, clear + delay_s, 0.0
     return AlarmDefinition(name, rule.severity, limit, clear, delay_s, rule.clear_delay_s, rule.latch)
 
@@ -161,7 +170,8 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "cell_imbalance": _Default(0.05, 0.03),
         "sensor_fault": _Default(0.1, 0.02),
         "model_mismatch": _Default(0.05 * n, 0.03 * n),
-        "link_lost": _Default(_silent_s(settings), None),
+        "link_lost": _Default(_default_silent_limit_s(settings), None),
+        # the value is infinite after a failure, otherwise 0
         "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0),
     }
     return all_packs | (_battery_defaults(cell) if isinstance(cell, CellModel) else _stack_defaults(cell))
@@ -170,7 +180,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
 def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
     c, n = cell.cell, cell.cell.series_count
     nominal_v = c.nominal_voltage_v / n
-    v = next(chemistry for max_v, chemistry in _BY_NOMINAL_V if nominal_v < max_v)
+    v = next(limits for max_nominal_v, limits in _VOLTAGE_LIMITS if nominal_v < max_nominal_v)
     charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less
     discharge_a = min(MAX_DISCHARGE_C * c.capacity_ah, c.current_max_a)
     return {
@@ -178,8 +188,8 @@ def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
         "pack_under_voltage": _Default(n * v.under_v, n * v.under_clear_v),
         "cell_over_voltage": _Default(v.over_v, v.over_clear_v),
         "cell_under_voltage": _Default(v.under_v, v.under_clear_v),
-        "discharge_over_current": _Default(discharge_a, 0.95 * discharge_a),
-        "charge_over_current": _Default(charge_a, 0.95 * charge_a),
+        "discharge_over_current": _Default(discharge_a, CURRENT_CLEAR_FRACTION * discharge_a),
+        "charge_over_current": _Default(charge_a, CURRENT_CLEAR_FRACTION * charge_a),
     }
 
 
@@ -192,8 +202,8 @@ def _stack_defaults(cell: PackModel) -> dict[AlarmName, _Default]:
         "pack_under_voltage": _Default(c.voltage_min_v, 1.1 * c.voltage_min_v),
         "cell_over_voltage": unmonitored,
         "cell_under_voltage": unmonitored,
-        "discharge_over_current": _Default(c.current_max_a, 0.95 * c.current_max_a),
-        "charge_over_current": _Default(None, None),
-        "charging_below_freezing": _Default(None, None),
+        "discharge_over_current": _Default(c.current_max_a, CURRENT_CLEAR_FRACTION * c.current_max_a),
+        "charge_over_current": unmonitored,
+        "charging_below_freezing": unmonitored,
         "over_temperature": _Default(90.0, 85.0),
     }

@@ -27,6 +27,8 @@ AlarmName = Literal[
 ]
 ALARMS: tuple[AlarmName, ...] = get_args(AlarmName)
 """Names of all alarms, in the order in which they are shown."""
+PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value", "limit", "unit", "text")
+"""Fields that the payload of a hook's message may contain, such as $state. ``state`` is ``raised`` or ``cleared``."""
 
 
 class AlarmRule(Strict):
@@ -118,7 +120,7 @@ class AlarmHook(Strict):
         return self.when_silent or self.relay
 
     @model_validator(mode="after")
-    def _one_of_three(self) -> Self:
+    def _check_action_and_payload(self) -> Self:
         actions = [name for name in ("run", "topic", "relay") if getattr(self, name)]
         if len(actions) != 1:
             raise ValueError("give exactly one of run, topic and relay")
@@ -128,10 +130,6 @@ class AlarmHook(Strict):
             known = ", ".join(f"${name}" for name in PAYLOAD_FIELDS)
             raise ValueError(f"payload: {error}: must be one of {known}, or $$ for a $") from None
         return self
-
-
-PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value", "limit", "unit", "text")
-"""Fields that a message's payload may name. ``state`` is ``raised`` or ``cleared``."""
 
 
 class AlarmSettings(Strict):
@@ -160,7 +158,6 @@ class AlarmSettings(Strict):
         default=LinkRule(delay_s=0.0, clear_delay_s=5.0),
         description="limit_s: time without a sample; default: 10 s, or three sample periods if these are longer",
     )
-
     hook_failed: AlarmRule = Field(
         default=AlarmRule(clear_delay_s=10.0),
         description="raised when a hook fails, until its next run succeeds",
@@ -176,7 +173,7 @@ class AlarmSettings(Strict):
     )
 
     @model_validator(mode="after")
-    def _one_relay(self) -> Self:
+    def _only_one_relay_hook(self) -> Self:
         if sum(hook.relay is not None for hook in self.hook) > 1:
             raise ValueError("hook: the board has one relay; give one hook with all its alarms")
         return self
@@ -188,13 +185,13 @@ class AlarmSettings(Strict):
         if not isinstance(table, dict):
             return table
         return {
-            name: _merged(cls.model_fields[name].default, value) if name in ALARMS else value
+            name: _merge_rule(cls.model_fields[name].default, value) if name in ALARMS else value
             for name, value in table.items()
         }
 
 
-def _merged(default: AlarmRule, rule: Any) -> Any:
-    """Merge an alarm's settings into its defaults."""
+def _merge_rule(default: AlarmRule, rule: Any) -> Any:
+    """Return an alarm's defaults with the configured settings. A value that is no table is left to the validation."""
     if not isinstance(rule, dict):
         return rule
     return default.model_dump(exclude_none=True) | rule

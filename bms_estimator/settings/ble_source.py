@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from bms_estimator.settings.polled_source import PolledSource
+from bms_estimator.settings.base_source import BaseSource
 
 VOLTAGE_RESOLUTION_V = 0.01
 """Voltage resolution of JBD [V]; that of JK is finer."""
@@ -13,7 +13,7 @@ CURRENT_RESOLUTION_A = 0.01
 """Current resolution of JBD [A]; that of JK is finer, that of Daly is 0.1 A."""
 
 
-class BleSource(PolledSource):
+class BleSource(BaseSource):
     """BMS over Bluetooth Low Energy; requires Python 3.12."""
 
     kind: Literal["ble"] = Field(description="kind of this source")
@@ -39,12 +39,12 @@ class BleSource(PolledSource):
         return self.poll_s
 
     @property
-    def described(self) -> str:
+    def short_description(self) -> str:
         """Description in a few words."""
         return f"BMS {self.address or self.name} over Bluetooth"
 
     @property
-    def sensor(self) -> Mapping[str, object]:
+    def sensor_defaults(self) -> Mapping[str, object]:
         """Return the ``[sensor]`` defaults; aiobmsble reports charge as positive for every BMS."""
         return {
             "current_sign": "charge_positive",

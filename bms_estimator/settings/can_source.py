@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.polled_source import PolledSource, with_profile
+from bms_estimator.settings.base_source import BaseSource, merge_profile
 
 PROFILES: dict[str, dict[str, object]] = {
     "pylontech-can": {
@@ -17,13 +17,16 @@ PROFILES: dict[str, dict[str, object]] = {
         "temperature": {"signal": "PackTemperature"},
     },
 }
-"""Defaults of ``[source]`` by profile. The package has a DBC file for each profile. Charge is positive in all of them."""
+"""Defaults of ``[source]`` by profile. The package contains a DBC file for each profile. All of them report charge as
+positive."""
 RESOLUTIONS: dict[str, dict[str, object]] = {
     "pylontech-can": {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1},
 }
 """Defaults of ``[sensor]`` by profile: the scale factors of the profile's DBC file."""
 LAYOUT_KEYS = ("id", "extended", "start_bit", "bits", "byte_order", "signed")
-"""Former settings that described the place of a signal in a frame."""
+"""Settings of former versions, which described the place of a signal in a frame."""
+MAX_CELLS = 96
+"""Maximum number of cells of a pack."""
 
 
 class Signal(Strict):
@@ -59,7 +62,7 @@ class Signal(Strict):
 class CellSignals(Signal):
     """Cell voltages in numbered signals."""
 
-    count: Annotated[int, Field(ge=1, le=96)] = Field(
+    count: Annotated[int, Field(ge=1, le=MAX_CELLS)] = Field(
         default=1, description="number of cells; {} in signal stands for the cell number"
     )
     first: Annotated[int, Field(ge=0)] = Field(default=1, description="cell number of the first cell in signal")
@@ -70,14 +73,14 @@ class CellSignals(Signal):
             raise ValueError("signal: must contain {}, which stands for the cell number, because count is above 1")
         return self
 
-    def members(self) -> tuple[Signal, ...]:
+    def cell_signals(self) -> tuple[Signal, ...]:
         """Return one signal for each cell."""
-        one = Signal(**self.model_dump(exclude={"count", "first"}))
+        template = Signal(**self.model_dump(exclude={"count", "first"}))
         names = [self.signal.replace("{}", str(self.first + number)) for number in range(self.count)]
-        return tuple(one.model_copy(update={"signal": name}) for name in names)
+        return tuple(template.model_copy(update={"signal": name}) for name in names)
 
 
-class CanSource(PolledSource):
+class CanSource(BaseSource):
     """CAN bus, on which the service sends nothing."""
 
     kind: Literal["can"] = Field(description="kind of this source")
@@ -116,15 +119,15 @@ class CanSource(PolledSource):
 
     @model_validator(mode="before")
     @classmethod
-    def _profile(cls, table: object) -> object:
-        return with_profile(table, PROFILES)
+    def _merge_profile(cls, table: object) -> object:
+        return merge_profile(table, PROFILES)
 
     @model_validator(mode="after")
     def _check_dbc_and_cells(self) -> Self:
         if self.dbc is None and self.profile is None:
             raise ValueError("dbc: missing; give a DBC file that describes the signals")
-        if sum(cells.count for cells in self.cells) > 96:
-            raise ValueError("cells: must be at most 96 cells")
+        if sum(cells.count for cells in self.cells) > MAX_CELLS:
+            raise ValueError(f"cells: must be at most {MAX_CELLS} cells")
         return self
 
     @property
@@ -133,13 +136,13 @@ class CanSource(PolledSource):
         return self.interval_s
 
     @property
-    def described(self) -> str:
+    def short_description(self) -> str:
         """Description in a few words."""
         return f"CAN {self.interface} {self.channel}"
 
     @property
-    def sensor(self) -> Mapping[str, object]:
-        """Return the sign of a profile, and the resolutions of its DBC file."""
+    def sensor_defaults(self) -> Mapping[str, object]:
+        """Return the ``[sensor]`` defaults: sign of a profile, and resolutions unless another DBC file replaces its own."""
         if self.profile is None:
             return {}
         resolutions = RESOLUTIONS[self.profile] if self.dbc is None else {}

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 
 from bms_estimator.model.config_file import Strict
 from bms_estimator.settings.pack import DeviceName
-from bms_estimator.settings.page import Listen, parse_listen
+from bms_estimator.settings.page import ListenAddress, parse_listen
 
 Gigabytes = Annotated[float, Field(gt=0, le=1e6)]
 TenantName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
@@ -54,7 +54,7 @@ class ServerSettings(Strict):
     )
 
     @model_validator(mode="after")
-    def _monitor_is_local(self) -> Self:
+    def _check_that_monitor_is_local(self) -> Self:
         if not parse_listen(self.monitor).loopback:
             raise ValueError(f'monitor = "{self.monitor}": the monitor has no access control; listen on 127.0.0.1')
         return self
@@ -102,18 +102,18 @@ class FleetSettings(Strict):
     )
 
     @model_validator(mode="after")
-    def _protected(self) -> Self:
+    def _check_protection(self) -> Self:
         for name in ("listen", "mqtt"):
             address = getattr(self.server, name)
             if not parse_listen(address).loopback:
-                self.refuse_open(f'server.{name} = "{address}"')
+                self.reject_unprotected(f'server.{name} = "{address}"')
         return self
 
-    def refuse_open(self, setting: str) -> None:
+    def reject_unprotected(self, setting: str) -> None:
         """Reject a server that other machines can reach without TLS and tenants.
 
         Args:
-            setting: Setting or option that makes the server reachable, for the error.
+            setting: Setting or option that makes the server client_address, for the error.
 
         Raises:
             ValueError: TLS or tenants are missing, so that any client could read and write all data.
@@ -125,7 +125,7 @@ class FleetSettings(Strict):
             )
 
 
-def reachable(listen: str) -> Listen:
+def client_address(listen: str) -> ListenAddress:
     """Return the address at which clients on this machine connect to the listener."""
     host, port = parse_listen(listen)
-    return Listen({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), port)  # noqa: S104 - the server's address
+    return ListenAddress({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host), port)  # noqa: S104 - the server's address

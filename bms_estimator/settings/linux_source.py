@@ -6,15 +6,17 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from bms_estimator.model.config_file import Positive
-from bms_estimator.settings.polled_source import Name, PolledSource
+from bms_estimator.settings.base_source import BaseSource, Name
 
 RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
-"""Voltage resolution at the pins, by chip [V]: INA219 data sheet; ADS1015 at 4.096 V full scale."""
+"""Voltage resolution at the pins by chip [V], from the data sheet of the INA219; for the ADS1015, at 4.096 V full scale."""
 DEFAULT_RESOLUTION_V = 1.25e-3
-"""Voltage resolution of the INA226 [V], used for all other chips. hwmon reports only whole millivolts."""
+"""Voltage resolution of the INA226 [V], used for all chips that are not in ``RESOLUTION_V``."""
+DEFAULT_INTERVAL_S = 1.0
+"""Sample period of a chip without an update interval [s]. The interval of a chip is not known before it is opened."""
 
 
-class LinuxSource(PolledSource):
+class LinuxSource(BaseSource):
     """Current sensor with a driver in the kernel: INA2xx (hwmon) or ADS1x15 (iio)."""
 
     kind: Literal["linux"] = Field(description="kind of this source")
@@ -23,11 +25,11 @@ class LinuxSource(PolledSource):
     )
     voltage: Name = Field(
         default="in1_input",
-        description="file of the chip with its voltage, or channel of an iio chip, such as in_voltage0; chip/file is a file of another chip",
+        description="hwmon file with the voltage, such as in1_input, or iio channel, such as in_voltage0, of chip; write chip/file for another chip",
     )
     current: Name = Field(
         default="curr1_input",
-        description="file or channel of the current, written like voltage; a channel in volts is divided by shunt_ohm, which is then required",
+        description="file or channel of the current, written like voltage; shunt_ohm is required if it is a voltage across the shunt",
     )
     temperature: Name | None = Field(
         default=None,
@@ -53,15 +55,15 @@ class LinuxSource(PolledSource):
 
     @property
     def period_s(self) -> float:
-        """Expected time between two samples [s]."""
-        return self.interval_s or 1.0
+        """Expected time between two samples [s], before the update interval of the chip is known."""
+        return self.interval_s or DEFAULT_INTERVAL_S
 
     @property
-    def described(self) -> str:
+    def short_description(self) -> str:
         """Description in a few words."""
         return f"{self.chip} of this machine"
 
     @property
-    def sensor(self) -> Mapping[str, object]:
+    def sensor_defaults(self) -> Mapping[str, object]:
         """Return the ``[sensor]`` defaults: the chip's voltage resolution times the ratio of the divider."""
         return {"voltage_resolution_v": RESOLUTION_V.get(self.chip, DEFAULT_RESOLUTION_V) * self.voltage_scale}

@@ -6,15 +6,17 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.polled_source import PolledSource, with_profile
+from bms_estimator.settings.base_source import BaseSource, merge_profile
 
 MAX_WORDS = 125
-"""Maximum number of registers in a request (Modbus application protocol V1.1b3, section 6.3)."""
+"""Maximum number of registers, which are 16-bit words, in a request (Modbus application protocol V1.1b3, section 6.3)."""
+ADDRESS_END = 0x10000
+"""First address beyond the last register, 65535."""
 WORDS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2}
 """Number of registers of a value, by its type."""
 PROFILES: dict[str, dict[str, object]] = {
     # Victron's register list (attributes.csv of dbus_modbustcp), service com.victronenergy.battery; functions 3 and 4
-    # read equal values. The unit is shown under Settings, Services, Modbus TCP, Available services; 225 is a BMV's.
+    # read equal values. The unit is shown under Settings, Services, Modbus TCP, Available services; 225 is that of a BMV.
     # Unmeasured values read 0 (Mappings::getValue of dbus_modbustcp), also the temperature of a BMV without a sensor.
     "victron-gx": {
         "unit": 225,
@@ -56,7 +58,7 @@ class Register(Strict):
     def _check_scale_and_address(self) -> Self:
         if self.scale == 0.0:
             raise ValueError("scale: must not be 0")
-        if self.address + self.words > 0x10000:
+        if self.address + self.words > ADDRESS_END:
             raise ValueError("address: the value ends beyond the last register, 65535")
         return self
 
@@ -76,17 +78,17 @@ class CellRegisters(Register):
 
     def cell(self, number: int) -> Register:
         """Return the register of a cell; numbers start from 0."""
-        first = Register(**self.model_dump(exclude={"count", "step"}))
-        return first.model_copy(update={"address": self.address + number * (self.step or self.words)})
+        first_cell = Register(**self.model_dump(exclude={"count", "step"}))
+        return first_cell.model_copy(update={"address": self.address + number * (self.step or self.words)})
 
     @model_validator(mode="after")
     def _check_last_address(self) -> Self:
-        if self.cell(self.count - 1).address + self.words > 0x10000:
+        if self.cell(self.count - 1).address + self.words > ADDRESS_END:
             raise ValueError("count: the last cell lies beyond the last register, 65535")
         return self
 
 
-class ModbusSource(PolledSource):
+class ModbusSource(BaseSource):
     """Modbus device on the network or on a serial line."""
 
     kind: Literal["modbus"] = Field(description="kind of this source")
@@ -122,11 +124,11 @@ class ModbusSource(PolledSource):
 
     @model_validator(mode="before")
     @classmethod
-    def _profile(cls, table: object) -> object:
-        return with_profile(table, PROFILES)
+    def _merge_profile(cls, table: object) -> object:
+        return merge_profile(table, PROFILES)
 
     @model_validator(mode="after")
-    def _host_or_port(self) -> Self:
+    def _check_host_and_port(self) -> Self:
         if (self.host is None) == (self.port is None):
             raise ValueError("give either host for Modbus TCP, or port for a serial line")
         if self.port is not None and self.framing == "tcp":
@@ -139,13 +141,13 @@ class ModbusSource(PolledSource):
         return self.poll_s
 
     @property
-    def described(self) -> str:
+    def short_description(self) -> str:
         """Description in a few words."""
         address = f"{self.host}:{self.tcp_port}" if self.port is None else self.port
         return f"Modbus unit {self.unit} at {address}"
 
     @property
-    def sensor(self) -> Mapping[str, object]:
+    def sensor_defaults(self) -> Mapping[str, object]:
         """Return the ``[sensor]`` defaults: sign of a known device, and resolution of integer values."""
         sign = {"current_sign": "charge_positive"} if self.profile else {}
         volts = {} if self.voltage.type == "float32" else {"voltage_resolution_v": abs(self.voltage.scale)}

@@ -19,6 +19,7 @@ ProfileName = Literal[
     "zigbee2mqtt",
 ]
 CHARGE, DISCHARGE = "charge_positive", "discharge_positive"
+"""Direction of positive current."""
 
 
 class Profile(NamedTuple):
@@ -27,20 +28,26 @@ class Profile(NamedTuple):
     table: Mapping[str, Any]
     """Defaults of ``[source]``."""
     current_sign: str
-    """Direction of positive current, as ``sensor.current_sign``."""
+    """Direction of positive current, the default of ``sensor.current_sign``."""
     voltage_resolution_v: float
     current_resolution_a: float
-    needs: Mapping[str, str] = {}
-    """Descriptions of the required settings, by name."""
+    required_settings: Mapping[str, str] = {}
+    """Descriptions of the settings without which the profile is incomplete, by name."""
 
 
-def _esphome(voltage: str, current: str, temperature: str, cell: str) -> dict[str, Any]:
+def _esphome_defaults(voltage: str, current: str, temperature: str, cell: str) -> dict[str, Any]:
     """Return the defaults of an ESPHome node.
 
-    Its topics are ``<topic_prefix>/sensor/<object_id>/state`` with a plain number
-    (esphome/components/mqtt/mqtt_component.cpp). The object id is the sensor's name. In the examples each name begins
-    with that of the node, which is the prefix unless ``instance`` is set. Names without the node's name are accepted
-    too.
+    Its topics are ``<topic_prefix>/sensor/<object_id>/state`` with a plain number as payload
+    (esphome/components/mqtt/mqtt_component.cpp). The object id is the sensor's name. In the examples of the projects
+    this name begins with the name of the node, which is the prefix unless ``instance`` is set. Sensor names without
+    the node's name are accepted too.
+
+    Args:
+        voltage: Name of the sensor of the pack voltage.
+        current: Name of the sensor of the current.
+        temperature: Name of the sensor of the temperature.
+        cell: Name of the sensors of the cell voltages, with ``{cell}``.
     """
 
     def topics(name: str) -> dict[str, Any]:
@@ -55,7 +62,8 @@ def _esphome(voltage: str, current: str, temperature: str, cell: str) -> dict[st
     }
 
 
-def _node(example: str) -> dict[str, str]:
+def _required_prefix(example: str) -> dict[str, str]:
+    """Return the description of the required setting ``prefix`` of an ESPHome node."""
     return {"prefix": f"mqtt.topic_prefix of the node, else its name, such as {example}"}
 
 
@@ -69,35 +77,36 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "cells": {"topic": "{prefix}/cell_voltages/{cell}"},
             "interval_s": 10.0,
         },
-        DISCHARGE,
-        0.01,  # four significant digits
-        0.01,
-        {"prefix": "alias or address of the device in its options"},
+        current_sign=DISCHARGE,
+        voltage_resolution_v=0.01,  # four significant digits
+        current_resolution_a=0.01,
+        required_settings={"prefix": "alias or address of the device in its options"},
     ),
     # syssi/esphome-jk-bms, esp32-example.yaml and esp32-ble-example.yaml
     "esphome-jk": Profile(
-        _esphome("total_voltage", "current", "temperature_sensor_1", "cell_voltage_{cell}"),
-        CHARGE,
-        0.01,
-        0.01,
-        _node("jk-bms"),
+        _esphome_defaults("total_voltage", "current", "temperature_sensor_1", "cell_voltage_{cell}"),
+        current_sign=CHARGE,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
+        required_settings=_required_prefix("jk-bms"),
     ),
     # syssi/esphome-jbd-bms, esp32-ble-example.yaml
     "esphome-jbd": Profile(
-        _esphome("total_voltage", "current", "temperature_1", "cell_voltage_{cell}"),
-        CHARGE,
-        0.01,
-        0.01,
-        _node("jbd-bms-ble"),
+        _esphome_defaults("total_voltage", "current", "temperature_1", "cell_voltage_{cell}"),
+        current_sign=CHARGE,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
+        required_settings=_required_prefix("jbd-bms-ble"),
     ),
     # ESPHome's daly_bms, with the sensor names and the interval of 20 s of its documentation. The sign is that of the
     # frame (esphome/components/daly_bms/daly_bms.cpp), as in protocols/devices/daly.py
     "esphome-daly": Profile(
-        _esphome("battery_voltage", "battery_current", "max_temperature", "cell_{cell}_voltage") | {"interval_s": 20.0},
-        DISCHARGE,
-        0.1,
-        0.1,
-        _node("daly-bms"),
+        _esphome_defaults("battery_voltage", "battery_current", "max_temperature", "cell_{cell}_voltage")
+        | {"interval_s": 20.0},
+        current_sign=DISCHARGE,
+        voltage_resolution_v=0.1,
+        current_resolution_a=0.1,
+        required_settings=_required_prefix("daly-bms"),
     ),
     # victronenergy/dbus-flashmq, README: values are published on change and on request; a keep-alive lasts 60 s.
     # Cell topics are those of dbus-serialbattery with BATTERY_CELL_DATA_FORMAT = 1.
@@ -117,10 +126,10 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "ask_s": 2.0,
             "interval_s": 2.0,
         },
-        CHARGE,
-        0.01,
-        0.1,
-        {
+        current_sign=CHARGE,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.1,
+        required_settings={
             "prefix": "VRM portal ID, in Settings, VRM online portal",
             "instance": "device instance of the battery, as in the topics N/<portal>/battery/<instance>/...",
         },
@@ -135,9 +144,9 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "cells": {"topic": "{prefix}/spec_data{instance}", "path": "cell_voltages"},
             "availability_topic": "{prefix}/status",
         },
-        CHARGE,
-        0.1,
-        0.1,
+        current_sign=CHARGE,
+        voltage_resolution_v=0.1,
+        current_resolution_a=0.1,
     ),
     # hoylabs/OpenDTU-OnBattery, src/battery/Stats.cpp and src/battery/jkbms/Stats.cpp
     "opendtu": Profile(
@@ -149,9 +158,9 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "cells": {"topic": "{prefix}/battery/Cell{cell}MilliVolt", "unit": "mV"},
             "availability_topic": "{prefix}/dtu/status",
         },
-        CHARGE,
-        0.01,
-        0.01,
+        current_sign=CHARGE,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
     ),
     # arendst/Tasmota, tasmota/tasmota_xdrv_driver: {"Time":...,"INA219":{"Voltage":4.494,"Current":0.020,"Power":0.089}}
     "tasmota": Profile(
@@ -161,10 +170,10 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "current": {"topic": "tele/{prefix}/SENSOR", "path": "{instance}.Current"},
             "availability_topic": "tele/{prefix}/LWT",
         },
-        DISCHARGE,
-        0.01,
-        0.01,
-        {"prefix": "Topic of the device, Configuration, MQTT"},
+        current_sign=DISCHARGE,
+        voltage_resolution_v=0.01,
+        current_resolution_a=0.01,
+        required_settings={"prefix": "Topic of the device, Configuration, MQTT"},
     ),
     # zigbee2mqtt.io, MQTT topics and messages: {"voltage":52.1,"current":3.2,"power":167,"linkquality":34}
     "zigbee2mqtt": Profile(
@@ -174,9 +183,9 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "availability_topic": "zigbee2mqtt/{prefix}/availability",
             "interval_s": 60.0,
         },
-        DISCHARGE,
-        0.1,
-        0.01,
-        {"prefix": "friendly name of the meter"},
+        current_sign=DISCHARGE,
+        voltage_resolution_v=0.1,
+        current_resolution_a=0.01,
+        required_settings={"prefix": "friendly name of the meter"},
     ),
 }

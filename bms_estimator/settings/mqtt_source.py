@@ -7,27 +7,29 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Positive, Strict
+from bms_estimator.settings.base_source import BaseSource, Name
 from bms_estimator.settings.broker import BrokerSettings, BrokerUrls
 from bms_estimator.settings.mqtt_profiles import PROFILES, ProfileName
-from bms_estimator.settings.polled_source import Name, PolledSource
 
 Unit = Literal["V", "mV", "A", "mA", "C", "F", "K", "s", "ms", "iso"]
-UNITS: Mapping[str, tuple[Unit, ...]] = {
+ALLOWED_UNITS: Mapping[str, tuple[Unit, ...]] = {
     "voltage": ("V", "mV"),
     "current": ("A", "mA"),
     "temperature": ("C", "F", "K"),
     "cells": ("V", "mV"),
     "time": ("s", "ms", "iso"),
 }
-"""Units by quantity; the first one is the default."""
-LINEAR: Mapping[Unit, tuple[float, float]] = {
+"""Units in which a quantity may be received, by quantity; the first unit is the default."""
+CONVERSIONS: Mapping[Unit, tuple[float, float]] = {
     "mV": (1e-3, 0.0),
     "mA": (1e-3, 0.0),
     "ms": (1e-3, 0.0),
     "F": (5.0 / 9.0, -160.0 / 9.0),
     "K": (1.0, -273.15),
 }
-"""Factor and offset that convert a unit to V, A, C or s."""
+"""Factor and offset that convert a value to V, A, C or s, by unit. Values in other units are not converted."""
+DEFAULT_RESOLUTION_V = 0.01
+"""Voltage resolution of a publisher without a profile [V]."""
 
 
 class ValueLocation(Strict):
@@ -48,7 +50,7 @@ class ValueLocation(Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _path_alone(cls, table: object) -> object:
+    def _accept_path_alone(cls, table: object) -> object:
         return {"path": table} if isinstance(table, str) else table
 
     @property
@@ -56,9 +58,9 @@ class ValueLocation(Strict):
         """Topics as configured."""
         return (self.topic,) if isinstance(self.topic, str) else self.topic or ()
 
-    def si(self, number: float) -> float:
+    def to_si(self, number: float) -> float:
         """Convert a number to V, A, C or s."""
-        factor, offset = LINEAR.get(self.unit or "V", (1.0, 0.0))
+        factor, offset = (1.0, 0.0) if self.unit is None else CONVERSIONS.get(self.unit, (1.0, 0.0))
         return factor * (self.scale * number + self.offset) + offset
 
 
@@ -68,7 +70,7 @@ class SourceBroker(BrokerSettings):
     section: ClassVar[str] = "source"
 
 
-class MqttSource(PolledSource):
+class MqttSource(BaseSource):
     """Battery values that another program publishes over MQTT; see docs/pack/mqtt-source.md."""
 
     kind: Literal["mqtt"] = Field(description="kind of this source")
@@ -133,11 +135,11 @@ class MqttSource(PolledSource):
         default=None, description="certificate authority of the broker in url; default: the system's certificates"
     )
 
-    quantities: ClassVar[tuple[str, ...]] = tuple(UNITS)
+    quantities: ClassVar[tuple[str, ...]] = tuple(ALLOWED_UNITS)
 
     @property
     def broker(self) -> BrokerSettings | None:
-        """Broker of its own; None: that of ``[mqtt]``."""
+        """Connection to the broker in ``url``; None: the source uses the broker of ``[mqtt]``."""
         if self.url is None:
             return None
         return SourceBroker(
@@ -147,32 +149,36 @@ class MqttSource(PolledSource):
     @model_validator(mode="before")
     @classmethod
     def _merge_profile(cls, table: object) -> object:
-        """Merge settings into the profile, part by part for each quantity."""
+        """Merge settings into the profile. A quantity keeps those settings of the profile that are not configured."""
         profile = PROFILES.get(table.get("profile", "")) if isinstance(table, dict) else None
         if profile is None or not isinstance(table, dict):
             return table
         merged: dict[str, Any] = {**profile.table, **table}
         for name in cls.quantities:
-            own = table.get(name)
-            own = {"path": own} if isinstance(own, str) else own
-            if name in profile.table and isinstance(own, dict):
-                merged[name] = {**profile.table[name], **own}
-        missing = [f"{name}: missing ({what})" for name, what in profile.needs.items() if not merged.get(name)]
+            configured = table.get(name)
+            configured = {"path": configured} if isinstance(configured, str) else configured
+            if name in profile.table and isinstance(configured, dict):
+                merged[name] = {**profile.table[name], **configured}
+        missing = [
+            f"{name}: missing ({description})"
+            for name, description in profile.required_settings.items()
+            if not merged.get(name)
+        ]
         if missing:
             raise ValueError(f"profile {table['profile']}: {'; '.join(missing)}")
         return merged
 
     @model_validator(mode="after")
-    def _complete(self) -> "MqttSource":
+    def _check_locations_and_broker(self) -> "MqttSource":
         for name in ("voltage", "current"):
             if getattr(self, name) is None:
                 raise ValueError(f"{name}: missing; give its path, or choose a profile: {', '.join(PROFILES)}")
-        for name, place in self.places():
-            if not place.topics and not self.topic:
+        for name, location in self.locations():
+            if not location.topics and not self.topic:
                 raise ValueError(f"{name}.topic: missing, and source.topic is not set")
-            if place.unit and place.unit not in UNITS[name]:
-                raise ValueError(f"{name}.unit = {place.unit}: must be one of {', '.join(UNITS[name])}")
-            if place.scale == 0.0:
+            if location.unit and location.unit not in ALLOWED_UNITS[name]:
+                raise ValueError(f"{name}.unit = {location.unit}: must be one of {', '.join(ALLOWED_UNITS[name])}")
+            if location.scale == 0.0:
                 raise ValueError(f"{name}.scale = 0: must not be 0")
         if self.url is None and (self.username or self.password_file or self.ca_file):
             raise ValueError(
@@ -180,20 +186,20 @@ class MqttSource(PolledSource):
             )
         return self
 
-    def places(self) -> Iterator[tuple[str, ValueLocation]]:
+    def locations(self) -> Iterator[tuple[str, ValueLocation]]:
         """Yield name and location of each configured quantity."""
         for name in self.quantities:
-            place = getattr(self, name)
-            if place is not None:
-                yield name, place
+            location = getattr(self, name)
+            if location is not None:
+                yield name, location
 
     def substitute(self, text: str) -> str:
         """Substitute prefix and instance in a topic or a path."""
         return text.replace("{prefix}", self.prefix or "").replace("{instance}", self.instance)
 
-    def topics(self, place: ValueLocation) -> list[str]:
+    def topics(self, location: ValueLocation) -> list[str]:
         """Return the topics of a quantity, which may contain ``{cell}``."""
-        return [self.substitute(topic) for topic in place.topics or (self.topic or "",)]
+        return [self.substitute(topic) for topic in location.topics or (self.topic or "",)]
 
     @property
     def period_s(self) -> float:
@@ -201,16 +207,19 @@ class MqttSource(PolledSource):
         return self.interval_s
 
     @property
-    def described(self) -> str:
+    def short_description(self) -> str:
         """Description in a few words."""
         publisher = self.profile or (self.topics(self.voltage)[0] if self.voltage else "")
         return f"{publisher} {self.prefix or ''}".strip() + " by MQTT"
 
     @property
-    def sensor(self) -> Mapping[str, object]:
+    def sensor_defaults(self) -> Mapping[str, object]:
         """Return the ``[sensor]`` defaults: current sign and resolution of the profile."""
         if self.profile is None:
-            return {"voltage_resolution_v": 0.01}
+            return {"voltage_resolution_v": DEFAULT_RESOLUTION_V}
         profile = PROFILES[self.profile]
-        names = ("current_sign", "voltage_resolution_v", "current_resolution_a")
-        return {name: getattr(profile, name) for name in names}
+        return {
+            "current_sign": profile.current_sign,
+            "voltage_resolution_v": profile.voltage_resolution_v,
+            "current_resolution_a": profile.current_resolution_a,
+        }

@@ -1,4 +1,4 @@
-"""Settings of one pack, from ``pack.toml``. Keys contain the unit."""
+"""Settings of one pack, from ``pack.toml``. The name of a setting with a unit ends in the unit."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -19,11 +19,11 @@ from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.settings.sampling import Sampling
-from bms_estimator.settings.sensor import NO_DEVICE, SensorSettings
+from bms_estimator.settings.sensor import ALLOWED_WITH_SOURCE, SensorSettings
 
 SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource | BleSource, Field(discriminator="kind")]
 
-SOURCE: TypeAdapter[SourceSettings] = TypeAdapter(SourceSettings)
+_SOURCE_ADAPTER: TypeAdapter[SourceSettings] = TypeAdapter(SourceSettings)
 
 MIN_RATE_HZ = 0.1
 """Minimum publish rate [Hz]."""
@@ -126,9 +126,10 @@ class Settings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _select_law(cls, tables: object) -> object:
-        """Select the law ``learning`` by default if the identifier is off.
+        """Select the adaptation law ``learning`` by default if the identifier is off.
 
-        The thesis's law moves its parameters between bounds without identifying them (docs/theory/comparison.md).
+        The default law of the thesis moves the parameters between bounds without identifying them
+        (docs/theory/comparison.md).
         """
         if not isinstance(tables, dict):
             return tables
@@ -140,7 +141,7 @@ class Settings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _add_source_defaults(cls, tables: object) -> object:
-        """Add the ``[sensor]`` defaults of a ``[source]``, whose protocol is always text lines.
+        """Add the ``[sensor]`` defaults of a ``[source]``. The protocol is text, because sources produce text lines.
 
         Raises:
             ValueError: ``[sensor]`` describes a serial device.
@@ -150,23 +151,32 @@ class Settings(Strict):
         sensor = tables.get("sensor", {})
         configured = sensor.model_dump(exclude_unset=True) if isinstance(sensor, SensorSettings) else sensor
         try:
-            source = SOURCE.validate_python(tables["source"])
+            source = _SOURCE_ADAPTER.validate_python(tables["source"])
         except ValidationError:  # the validation of the section reports it
             return tables
         if not isinstance(configured, dict):
             return tables
-        if serial := [name for name, allowed in NO_DEVICE.items() if configured.get(name, allowed[0]) not in allowed]:
-            names = ", ".join(f"sensor.{name}" for name in serial)
+        conflicts = [
+            name for name, allowed in ALLOWED_WITH_SOURCE.items() if configured.get(name, allowed[0]) not in allowed
+        ]
+        if conflicts:
+            names = ", ".join(f"sensor.{name}" for name in conflicts)
             raise ValueError(
                 f"{names}: only for a serial device, but [source] describes another source; remove one of them"
             )
-        return tables | {"sensor": {"period_s": source.period_s, **source.sensor, **configured, "protocol": "text"}}
+        return tables | {
+            "sensor": {"period_s": source.period_s, **source.sensor_defaults, **configured, "protocol": "text"}
+        }
 
     @property
     def sampling(self) -> Sampling:
         """Sampling of the source."""
-        s = self.sensor
-        return Sampling(s.sample_period_s, s.current_resolution_a or 0.0, s.current_dead_band_a or 0.0)
+        sensor = self.sensor
+        return Sampling(
+            period_s=sensor.sample_period_s,
+            current_resolution_a=sensor.current_resolution_a or 0.0,
+            current_dead_band_a=sensor.current_dead_band_a or 0.0,
+        )
 
 
 def load_settings(path: Path) -> Settings:

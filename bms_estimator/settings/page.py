@@ -13,7 +13,7 @@ DEFAULT_LISTEN = "127.0.0.1:8765"
 """Default address of the page, host:port."""
 
 
-class Listen(NamedTuple):
+class ListenAddress(NamedTuple):
     """Address on which a server listens."""
 
     host: str
@@ -22,18 +22,18 @@ class Listen(NamedTuple):
 
     @property
     def loopback(self) -> bool:
-        """True if only programs on this machine reach it."""
+        """True if only programs on this machine can connect."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
             return self.host == "localhost"
 
 
-def parse_listen(text: str) -> Listen:
+def parse_listen(text: str) -> ListenAddress:
     """Parse ``host:port``.
 
     Raises:
-        ValueError: The text is something else.
+        ValueError: The text is not a host and a port.
     """
     try:
         url = urlsplit(f"//{text}")
@@ -43,7 +43,7 @@ def parse_listen(text: str) -> Listen:
         raise ValueError(f"must be host:port: {error}") from None
     if not host or port is None or url.netloc != text or "@" in text:
         raise ValueError('must be host:port, such as "127.0.0.1:8765" or "[::1]:8765"')
-    return Listen(host, port)
+    return ListenAddress(host, port)
 
 
 def _validate_listen(text: str) -> str:
@@ -67,12 +67,12 @@ class PageSettings(Strict):
     )
 
     @property
-    def address(self) -> Listen:
+    def address(self) -> ListenAddress:
         """Host and port of ``listen``."""
         return parse_listen(self.listen)
 
     @model_validator(mode="after")
-    def _needs_a_token(self) -> Self:
+    def _require_token_unless_local(self) -> Self:
         if self.token_file is None and not self.address.loopback:
             raise ValueError(
                 f'listen = "{self.listen}" is open to other machines: name a token_file, or listen on 127.0.0.1'

@@ -8,16 +8,17 @@ from bms_estimator.model.config_file import NotNegative, Positive, Strict
 from bms_estimator.model.one_of import OneOf
 from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS
 
-NO_DEVICE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
-"""Values of ``[sensor]`` that are allowed besides ``[source]``: those of a file that contains all defaults."""
+ALLOWED_WITH_SOURCE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
+"""Values that settings of a serial device may have if there is a ``[source]``, by setting. The first value is the
+default, so that a file that contains all defaults is valid. The protocol text is allowed, because a ``[source]`` sets it."""
 
 
-def _filled(sensor: dict[str, object]) -> dict[str, object]:
-    """Add the device's resolution to the table ``[sensor]``, unless configured."""
+def _with_device_resolution(sensor: dict[str, object]) -> dict[str, object]:
+    """Return the table ``[sensor]`` with the resolution of the device, unless configured."""
     protocol = sensor.get("protocol")
     if not isinstance(protocol, str) or protocol not in DEVICES:
         return sensor
-    declared = vars(DEVICES[protocol].resolution)
+    declared = vars(DEVICES[protocol].sensor_defaults)
     return {name: value for name, value in declared.items() if value is not None} | sensor
 
 
@@ -51,7 +52,8 @@ class SensorSettings(Strict):
         description="direction of positive current in the values of the device, or in the columns of a CSV or Parquet file; default: that of the protocol",
     )
     voltage_resolution_v: Positive = Field(
-        default=25.0 / 1024, description="voltage resolution (LSB); default: that of the device"
+        default=25.0 / 1024,  # 10-bit converter behind a common divider module for 0 to 25 V
+        description="voltage resolution (LSB); default: that of the device",
     )
     voltage_noise_v: NotNegative | None = Field(
         default=None,
@@ -72,10 +74,10 @@ class SensorSettings(Strict):
     @model_validator(mode="wrap")
     @classmethod
     def _add_device_defaults(cls, table: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """Add the protocol's defaults without counting them as set."""
+        """Add the device's defaults without marking them as set, so that ``exclude_unset`` leaves them out."""
         if not isinstance(table, dict):
             return validate(table)
-        settings = validate(_filled(table))
+        settings = validate(_with_device_resolution(table))
         settings.model_fields_set.intersection_update(table)
         return settings
 

@@ -17,8 +17,8 @@ from bms_estimator.simulation.virtual_adc import Reading
 
 INTERVAL_S = 2.0
 """Poll interval of the node [s]."""
-SPREAD_V = 0.004
-"""Standard deviation of the cell voltages from their mean [V]."""
+CELL_STD_V = 0.004
+"""Standard deviation of the cell voltages [V]."""
 
 
 class SimulatedNode:
@@ -54,8 +54,12 @@ class SimulatedNode:
         self.samples = 0
         self._end_s = 0.0
         will = Message(f"{prefix}/status", b"offline", 1, retain=True)
-        options = ConnectOptions(f"{prefix}-{secrets.token_hex(4)}", will, lambda *_: None)
-        self._link = ReconnectLoop(brokers(mqtt), options, BrokerConnector(mqtt), self._serve, DeliveryStats())
+        # the random part lets several nodes with the same name connect
+        identifier = f"{prefix}-{secrets.token_hex(4)}"
+        options = ConnectOptions(identifier, will, on_message_lost=lambda *_: None)
+        self._reconnect_loop = ReconnectLoop(
+            brokers(mqtt), options, BrokerConnector(mqtt), self._serve, DeliveryStats()
+        )
 
     def __enter__(self) -> Self:
         """Return the node. ``run`` connects it."""
@@ -67,29 +71,29 @@ class SimulatedNode:
     async def run(self, seconds: float) -> None:
         """Publish for a given simulated time."""
         self._end_s = seconds
-        await self._link.run()
+        await self._reconnect_loop.run()
 
     async def _serve(self, connection: Connection) -> None:
-        """Publish the readings while the broker is connected."""
+        """Publish the readings over an open connection; after a reconnection continue with the next reading."""
         await self._publish(connection, {"status": "online"})
         loop = asyncio.get_running_loop()
-        offset_s = loop.time() - self.time_s / self._speed
+        start_s = loop.time() - self.time_s / self._speed  # loop time at which the simulated time is 0
         while self.time_s + INTERVAL_S <= self._end_s:
-            await asyncio.sleep(max(offset_s + (self.time_s + INTERVAL_S) / self._speed - loop.time(), 0.0))
+            await asyncio.sleep(max(start_s + (self.time_s + INTERVAL_S) / self._speed - loop.time(), 0.0))
             self.time_s += INTERVAL_S
             states = {f"sensor/{self._prefix}_{name}/state": text for name, text in self._states()}
             await self._publish(connection, states)
             self.samples += 1
         await self._publish(connection, {"status": "offline"})
-        self._link.closing.set()
+        self._reconnect_loop.closing.set()
 
     async def _publish(self, connection: Connection, states: Mapping[str, str]) -> None:
-        """Publish each state on its topic, retained as by ESPHome."""
+        """Publish each state on its topic, retained, as ESPHome does."""
         for topic, text in states.items():
             await connection.publish(Message(f"{self._prefix}/{topic}", text.encode(), 0, retain=True))
 
     def _states(self) -> Iterator[tuple[str, str]]:
-        """Yield name and text of each sensor as in the examples of esphome-jk-bms; the current is positive on charge."""
+        """Yield name and text of each sensor of the examples of esphome-jk-bms; the current is positive on charge."""
         current_a, voltage_v, temperature_c = self._signal(self.time_s)
         cells_v = [voltage_v / len(self._deviations_v) + deviation_v for deviation_v in self._deviations_v]
         yield "min_cell_voltage", f"{min(cells_v):.3f}"
@@ -103,6 +107,6 @@ class SimulatedNode:
 
 def _cell_deviations(cells: int, rng: random.Random) -> Sequence[float]:
     """Return the deviation of each cell from their mean [V]."""
-    deviations_v = [rng.gauss(0.0, SPREAD_V) for _ in range(cells)]
+    deviations_v = [rng.gauss(0.0, CELL_STD_V) for _ in range(cells)]
     mean_v = sum(deviations_v) / cells
     return [v - mean_v for v in deviations_v]

@@ -14,7 +14,9 @@ MAX_REQUEST_BYTES = 64
 """Maximum length of a request [bytes]."""
 CUT_BYTES = 5
 """Number of bytes that a truncated response lacks."""
-SPREAD_V = 0.004
+NOISE_BYTES = 20
+"""Number of random bytes before a response with noise."""
+MAX_CELL_DEVIATION_V = 0.004
 """Maximum deviation of a cell from the mean [V]."""
 
 
@@ -57,15 +59,15 @@ class SimulatedBms(SimulatedMeter):
         if not 1 <= cells <= MAX_CELLS:
             raise ValueError(f"{cells} cells: a simulated BMS has 1 to {MAX_CELLS}")
         super().__init__(signal, speed=speed)
-        self._answers, self._soc, self._capacity_ah = BMS_ANSWERS[protocol], soc, capacity_ah
+        self._responses, self._soc, self._capacity_ah = BMS_ANSWERS[protocol], soc, capacity_ah
         self._random = random.Random(seed)
-        offsets_v = [self._random.uniform(-SPREAD_V, SPREAD_V) for _ in range(cells)]
-        self._offsets_v = [offset_v - math.fsum(offsets_v) / cells for offset_v in offsets_v]
+        deviations_v = [self._random.uniform(-MAX_CELL_DEVIATION_V, MAX_CELL_DEVIATION_V) for _ in range(cells)]
+        self._deviations_v = [deviation_v - math.fsum(deviations_v) / cells for deviation_v in deviations_v]
         self._faults: deque[BmsFault] = deque()
 
-    def inject(self, fault: BmsFault, answers: int = 1) -> None:
-        """Apply ``fault`` to the next ``answers`` responses without one."""
-        self._faults.extend([fault] * answers)
+    def inject(self, fault: BmsFault, responses: int = 1) -> None:
+        """Apply ``fault`` to the next ``responses`` responses that have no fault yet."""
+        self._faults.extend([fault] * responses)
 
     def clear_faults(self) -> None:
         """Discard the remaining faults."""
@@ -79,30 +81,31 @@ class SimulatedBms(SimulatedMeter):
         """Respond to each request in ``received``, in order."""
         responses, end = b"", 0
         while first := min(
-            ((at, request) for request in self._answers if (at := received.find(request, end)) >= 0), default=None
+            ((at, request) for request in self._responses if (at := received.find(request, end)) >= 0), default=None
         ):
             at, request = first
             end = at + len(request)
-            responses += self._with_fault(self._answers[request](self._measured(reading)))
+            responses += self._with_fault(self._responses[request](self._measured(reading)))
+        # the last bytes remain, because they may be the beginning of a request
         return responses, max(end, len(received) - MAX_REQUEST_BYTES)
 
     def _measured(self, reading: Reading) -> Measured:
-        cell_v = reading.voltage_v / len(self._offsets_v)
-        cells_v = [cell_v + offset_v for offset_v in self._offsets_v]
+        cell_v = reading.voltage_v / len(self._deviations_v)
+        cells_v = [cell_v + deviation_v for deviation_v in self._deviations_v]
         return Measured(
             reading.voltage_v, reading.current_a, reading.temperature_c, cells_v, self._soc(), self._capacity_ah
         )
 
-    def _with_fault(self, answer: bytes) -> bytes:
-        """Apply a fault to a response."""
+    def _with_fault(self, response: bytes) -> bytes:
+        """Apply the next fault, if there is one, to a response."""
         match self._faults.popleft() if self._faults else None:
             case BmsFault.SILENCE:
                 return b""
             case BmsFault.CORRUPT:
-                at = len(answer) // 2
-                return answer[:at] + bytes((answer[at] ^ 0x55,)) + answer[at + 1 :]
+                at = len(response) // 2
+                return response[:at] + bytes((response[at] ^ 0x55,)) + response[at + 1 :]
             case BmsFault.SHORT:
-                return answer[:-CUT_BYTES]
+                return response[:-CUT_BYTES]
             case BmsFault.NOISE:
-                return self._random.randbytes(20) + answer
-        return answer
+                return self._random.randbytes(NOISE_BYTES) + response
+        return response

@@ -1,6 +1,6 @@
 """Simulated battery monitors and batteries, with their makers' protocols on a pseudo-terminal.
 
-The values are rounded as by the device. ``virtual_board`` simulates the firmware's board.
+Values are rounded to the resolution of the device. ``virtual_board`` simulates the firmware's board.
 """
 
 import asyncio
@@ -11,10 +11,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Self
 
+from bms_estimator.protocols.devices import junctek
 from bms_estimator.simulation.virtual_adc import Reading
 
 Signal = Callable[[float], Reading]
-"""Readings as a function of time [s], which never decreases."""
+"""Readings as a function of time [s]. It is called with times that never decrease."""
 
 
 class SimulatedMeter(ABC):
@@ -55,7 +56,7 @@ class SimulatedMeter(ABC):
 
     @abstractmethod
     def message(self, reading: Reading) -> bytes:
-        """Encode a reading."""
+        """Encode a reading. A device with a finite ``period_s`` sends the message without a request."""
 
     def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:  # noqa: ARG002 - for polled devices
         """Return the response to ``received``, and the number of consumed bytes."""
@@ -83,9 +84,9 @@ class SimulatedMeter(ABC):
             while (now_s := (loop.time() - start_s) * self._speed) < seconds:
                 if now_s >= due_s:
                     due_s += self.period_s
-                    self._report(now_s)
+                    self._send_message(now_s)
                 if inbox:
-                    response, consumed = self.answer(bytes(inbox), self._read(now_s))
+                    response, consumed = self.answer(bytes(inbox), self._read_sensors(now_s))
                     del inbox[:consumed]
                     self.send(response)
                 has_input.clear()
@@ -98,12 +99,12 @@ class SimulatedMeter(ABC):
         finally:
             loop.remove_reader(self._master)
 
-    def _report(self, now_s: float) -> None:
+    def _send_message(self, now_s: float) -> None:
         if math.isfinite(self.period_s):
-            self.send(self.message(self._read(now_s)))
+            self.send(self.message(self._read_sensors(now_s)))
 
-    def _read(self, now_s: float) -> Reading:
-        """Return the present values at the sensors, and count them."""
+    def _read_sensors(self, now_s: float) -> Reading:
+        """Return the present values at the sensors; update time, number and last reading."""
         self.time_s = now_s
         self.samples += 1
         self.last = self._signal(now_s)
@@ -111,7 +112,7 @@ class SimulatedMeter(ABC):
 
 
 class SimulatedVeDirect(SimulatedMeter):
-    """Simulated SmartShunt, which sends a block and a history block each second."""
+    """Simulated Victron SmartShunt, which sends a block of values and a block of history each second."""
 
     period_s = 1.0
 
@@ -138,7 +139,7 @@ class SimulatedVeDirect(SimulatedMeter):
 
 def _block(fields: Mapping[str, str]) -> bytes:
     body = "".join(f"\r\n{label}\t{value}" for label, value in fields.items()).encode() + b"\r\nChecksum\t"
-    return body + bytes((-sum(body) & 0xFF,))
+    return body + bytes((-sum(body) & 0xFF,))  # the sum of all bytes of a block is 0 modulo 256
 
 
 class SimulatedJunctek(SimulatedMeter):
@@ -146,18 +147,20 @@ class SimulatedJunctek(SimulatedMeter):
 
     def message(self, reading: Reading) -> bytes:
         """Return the response with all measured values."""
-        temperature = 25.0 if math.isnan(reading.temperature_c) else reading.temperature_c
+        temperature_c = 25.0 if math.isnan(reading.temperature_c) else reading.temperature_c
         values = [
             round(100 * reading.voltage_v),
             round(100 * abs(reading.current_a)),
-            *(50_000, 1_000, 10_000, round(self.time_s), round(temperature) + 100, 0, 0),
-            int(reading.current_a < 0.0),
+            *(50_000, 1_000, 10_000, round(self.time_s)),  # four values that the decoder does not use
+            round(temperature_c) + junctek.ZERO_C,
+            *(0, 0),
+            int(reading.current_a < 0.0),  # direction: 1 on charge
             *(0, 0),
         ]
         return b":r50=1,%d,%s,\r\n" % (sum(values) % 255 + 1, ",".join(map(str, values)).encode())
 
     def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
-        """Respond to ``:R50=1,``."""
+        """Respond to each line that begins with ``:R50=1,``."""
         *lines, rest = received.split(b"\n")
         requests = sum(line.startswith(b":R50=1,") for line in lines)
         return requests * self.message(reading), len(received) - len(rest)
@@ -178,14 +181,14 @@ class SimulatedPylontech(SimulatedMeter):
 
     def message(self, reading: Reading) -> bytes:
         """Return the table of all batteries."""
-        each, temperature = round(1e3 * reading.voltage_v / self._cells), self._millidegrees(reading)
-        head = (
+        cell_mv, temperature_mc = round(1e3 * reading.voltage_v / self._cells), self._millidegrees(reading)
+        header = (
             "Power Volt   Curr   Tempr  Tlow   Thigh  Vlow   Vhigh  Base.St  Volt.St  Curr.St  Temp.St  Coulomb  Time"
         )
-        volt, amp = round(1e3 * reading.voltage_v), -round(1e3 * reading.current_a)
-        row = f"1     {volt:<6} {amp:<6} {temperature:<6} {temperature:<6} {temperature:<6} {each:<6} {each:<6} {_state(amp):<8} Normal"
+        pack_mv, pack_ma = round(1e3 * reading.voltage_v), -round(1e3 * reading.current_a)
+        row = f"1     {pack_mv:<6} {pack_ma:<6} {temperature_mc:<6} {temperature_mc:<6} {temperature_mc:<6} {cell_mv:<6} {cell_mv:<6} {_base_state(pack_ma):<8} Normal"
         absent = ["2     -      -      -      -      -      -      -      Absent   -"]
-        return _table("pwr", [head, row + "   Normal   Normal   50%      2026-01-01 00:00:00", *absent])
+        return _response("pwr", [header, row + "   Normal   Normal   50%      2026-01-01 00:00:00", *absent])
 
     def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
         """Respond to ``pwr`` and ``bat 1``."""
@@ -198,11 +201,13 @@ class SimulatedPylontech(SimulatedMeter):
             case ["pwr"]:
                 return self.message(reading)
             case ["bat", "1"]:
-                each, temperature = round(1e3 * reading.voltage_v / self._cells), self._millidegrees(reading)
-                amp = -round(1e3 * reading.current_a)
-                head = "Battery  Volt     Curr     Tempr    Base State   Volt. State  Curr. State  Temp. State  Coulomb"
-                tail = f"{amp:<8} {temperature:<8} {_state(amp):<12} Normal       Normal       Normal       50%"
-                return _table(line, [head, *(f"{n:<8} {each:<8} {tail}" for n in range(self._cells))])
+                cell_mv, temperature_mc = round(1e3 * reading.voltage_v / self._cells), self._millidegrees(reading)
+                pack_ma = -round(1e3 * reading.current_a)
+                header = (
+                    "Battery  Volt     Curr     Tempr    Base State   Volt. State  Curr. State  Temp. State  Coulomb"
+                )
+                tail = f"{pack_ma:<8} {temperature_mc:<8} {_base_state(pack_ma):<12} Normal       Normal       Normal       50%"
+                return _response(line, [header, *(f"{n:<8} {cell_mv:<8} {tail}" for n in range(self._cells))])
             case []:
                 return b"\n\rpylon>"
         return f"{line}\n\r@\r\r\nUnknown command '{line}' - try 'help'\r\n\r$$\r\n\rpylon>".encode()
@@ -212,11 +217,11 @@ class SimulatedPylontech(SimulatedMeter):
         return 25_000 if math.isnan(reading.temperature_c) else round(reading.temperature_c) * 1000
 
 
-def _state(milliamperes: int) -> str:
-    return "Idle" if milliamperes == 0 else "Charge" if milliamperes > 0 else "Dischg"
+def _base_state(pack_ma: int) -> str:
+    return "Idle" if pack_ma == 0 else "Charge" if pack_ma > 0 else "Dischg"
 
 
-def _table(command: str, lines: list[str]) -> bytes:
+def _response(command: str, lines: list[str]) -> bytes:
     text = f"{command}\n\r@\r\r\n" + "\r\r\n".join(lines) + "\r\n\rCommand completed successfully\r\n\r$$\r\n\rpylon>"
     return text.encode()
 

@@ -63,11 +63,11 @@ LOADS: dict[LoadName, Callable[[float, int], Load]] = {
     LoadName.PULSE: pulses,
     LoadName.RANDOM: random_steps,
 }
-"""Loads by name, made from the current [A] and a seed."""
+"""Function that creates each load from its current [A] and a seed."""
 
 
 class SimulatedPack:
-    """Simulated pack. Call it with times that never decrease.
+    """Simulated pack. Call the object with times that never decrease.
 
     Args:
         cell: Cell model of the whole pack.
@@ -80,7 +80,7 @@ class SimulatedPack:
         self._ocv = ocv_grid(cell)
         self._charge_a = -cell.cell.capacity_ah  # 1C; charging is negative
         self._load = load
-        self._left_s, self._load_a = next(load)
+        self._remaining_s, self._load_a = next(load)
         self._charging = False
         self._state = (soc, 0.0, 0.0)
         self._current_a = self._load_a
@@ -103,11 +103,12 @@ class SimulatedPack:
 
     def _next_current(self, dt_s: float) -> float:
         """Return the current ``dt_s`` later. The load pauses while the pack is charged."""
+        # hysteresis: a charge that begins at EMPTY_SOC ends at FULL_SOC
         self._charging = self.soc <= (FULL_SOC if self._charging else EMPTY_SOC)
         if self._charging:
             return self._charge_a
-        self._left_s -= dt_s
-        while self._left_s <= 0.0:
+        self._remaining_s -= dt_s
+        while self._remaining_s <= 0.0:
             seconds, self._load_a = next(self._load)
-            self._left_s += seconds
+            self._remaining_s += seconds
         return max(self._load_a, 0.0) if self.soc >= FULL_SOC else self._load_a

@@ -12,15 +12,15 @@ FULL_SCALE = 1024
 CLOCK_HZ = 16_000_000
 """Clock of the microcontroller [Hz]."""
 AUX_PER_S = 100
-"""NTC and bandgap readings of the firmware per second, if the sample rate allows."""
+"""Number of NTC and bandgap readings of the firmware per second, if the sample rate allows as many."""
 AUX_MAX = 63
 """Maximum number of NTC or bandgap readings in one window, because the firmware sends their sum in 16 bits."""
-SLOTS_PER_S = 8000
-"""Conversions of the firmware per second, alternately of voltage and current."""
+CONVERSIONS_PER_S = 8000
+"""Number of conversions of the firmware per second, alternately of voltage and current."""
 RATIOMETRIC_V = 5.0
 """Supply at which the data sheet of a ratiometric sensor gives its slope [V]."""
 _NOISE_POINTS = 1 << 16
-"""Number of noise values, which are reused in turn."""
+"""Number of noise values, which are repeated: random numbers for each conversion would be slow."""
 
 
 class Reading(NamedTuple):
@@ -48,7 +48,9 @@ class BoardParts:
     supply_v: float = 5.0
     """AVcc, the converter's reference, which the host does not know [V]."""
     bandgap_v: float = 1.1
+    """Voltage of the internal reference [V]."""
     divider: float = 6.1
+    """Ratio of the pack's voltage to the voltage at the converter."""
     volts_per_ampere: float = 0.1
     """Slope of a ratiometric sensor at 5 V of supply [V/A]."""
     ratiometric: bool = True
@@ -66,7 +68,7 @@ class BoardParts:
 
 
 class VirtualConverter:
-    """Simulated converter. As in the firmware, a window is the sum of many conversions of 10 bits.
+    """Simulated converter. As in the firmware, the conversions of 10 bits are summed over a window.
 
     Args:
         parts: The board as built.
@@ -116,13 +118,13 @@ class VirtualConverter:
 
 
 def compute_window(rate_hz: int) -> tuple[int, int]:
-    """Return the number of conversion pairs in a window and its length [ns], with the clock division of the firmware."""
-    slots = SLOTS_PER_S // rate_hz // 2 * 2
-    cycles = round(CLOCK_HZ / (rate_hz * slots))
-    return slots // 2, slots * cycles * 1_000_000_000 // CLOCK_HZ
+    """Return the number of conversion pairs in a window, and its length [ns] by the clock division of the firmware."""
+    conversions = CONVERSIONS_PER_S // rate_hz // 2 * 2  # an even number, because they come in pairs
+    cycles = round(CLOCK_HZ / (rate_hz * conversions))
+    return conversions // 2, conversions * cycles * 1_000_000_000 // CLOCK_HZ
 
 
 def compute_aux_count(rate_hz: int) -> int:
     """Return the number of NTC or bandgap readings in one window: odd, as in the firmware."""
     readings = AUX_PER_S // rate_hz
-    return 1 if readings == 0 else min((readings - 1) | 1, AUX_MAX)
+    return 1 if readings == 0 else min((readings - 1) | 1, AUX_MAX)  # the largest odd number up to ``readings``

@@ -55,7 +55,7 @@ Signal = Callable[[float], Reading] | Iterable[Reading]
 """Readings as a function of time [s], or one reading for each sample. The board stops after the last one."""
 
 FIRMWARE = (0, 2, 0)
-"""Simulated version of the firmware."""
+"""Version of the firmware that the board reports."""
 RATE_HZ_AT_RESET = 100
 """Sample rate after a reset [Hz]."""
 _MAX_UNSENT_BYTES = 2048
@@ -63,15 +63,18 @@ _MAX_UNSENT_BYTES = 2048
 _MIN_SLEEP_S = 0.002
 """Minimum sleep [s]. Samples that are due within this time are sent together, as on USB."""
 _DRAIN_TIMEOUT_S = 1.0
-"""Time for which the board waits at its end for a host to read the last bytes [s]."""
+"""Maximum time that the board waits for the host to read the last bytes before ``run`` returns [s]."""
 _HOST_POLL_S = 0.01
 """Interval of the check for a host that opens the line [s]."""
 _BOOT_S = 0.2
-"""Delay from the opening of the port to the first sample [s]. Opening resets a board, and the host discards old bytes."""
-_BURST = 256
+"""Delay from the opening of the port to the first sample [s]. Opening resets a board, and the host discards old
+bytes."""
+_MAX_SAMPLES_AT_ONCE = 256
 """Maximum number of due samples that are sent before the event loop runs again."""
 _BOOT_READINGS = 256
 """Number of bandgap conversions at a reset."""
+_GARBAGE_BYTES = 40
+"""Number of random bytes before a frame with garbage."""
 _MAX_ZERO_OFFSET = 0.1
 """Maximum deviation of the sensor's output without current from half of the supply, as a fraction of the supply."""
 
@@ -80,7 +83,7 @@ def _millionths(minimum: float, maximum: float) -> range:
     return range(round(minimum * 1e6), round(maximum * 1e6) + 1)
 
 
-_RANGES = {
+_VALID_VALUES = {
     MessageType.COMMAND_SET_SERIAL: range(MODULUS),
     MessageType.COMMAND_SET_BANDGAP: _millionths(MIN_BANDGAP_V, MAX_BANDGAP_V),
     MessageType.COMMAND_SET_DIVIDER: _millionths(MIN_DIVIDER, MAX_DIVIDER),
@@ -91,7 +94,7 @@ _RANGES = {
 
 
 class BoardFault(Enum):
-    """Fault of a sample's frame; the value describes the frame."""
+    """Fault of a sample's frame; the value of the enumeration describes the frame."""
 
     DROP = "never sent"
     CORRUPT = "one byte changed"
@@ -113,7 +116,7 @@ class VirtualBoard:
         parts: Parts of the board as built.
         noise_lsb: Noise of its converter [steps].
         serial: Serial number.
-        clock_us: Start value of the clock at each reset [us].
+        clock_us: Value of the board's clock after each reset [us].
         seed: Seed of noise and garbage.
     """
 
@@ -131,10 +134,10 @@ class VirtualBoard:
         seed: int = 0,
     ) -> None:
         self._mode, self._speed = mode, speed
-        self._readings = self._by_time(signal) if callable(signal) else iter(signal)
+        self._readings = self._readings_from(signal) if callable(signal) else iter(signal)
         self._reading = Reading(0.0, 0.0)
         self._converter = VirtualConverter(parts or BoardParts(), noise_lsb, seed)
-        self._clock_us = clock_us
+        self._reset_clock_us = clock_us
         parts = self._converter.parts
         self._zero_ppm = round(parts.current_zero * 1e6)
         self._stored: dict[int, int] = {
@@ -146,13 +149,13 @@ class VirtualBoard:
         }
         self._random = random.Random(seed)
         self._boot_id = self._random.randrange(1 << 16)
-        self._first_rate_hz = rate_hz
+        self._reset_rate_hz = rate_hz
         self._faults: deque[BoardFault] = deque()
         self._delayed_frame = b""
         self._inbox = b""
-        self._line = bytearray()
+        self._unsent = bytearray()
         self._drained = asyncio.Event()
-        self._master = self._slave = -1
+        self._board_fd = self._host_fd = -1
         self._loop: asyncio.AbstractEventLoop | None = None
         self.path = ""
         """Path of the pseudo-terminal."""
@@ -166,24 +169,24 @@ class VirtualBoard:
 
     def __enter__(self) -> Self:
         """Open the pseudo-terminal."""
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.path = os.ttyname(self._slave)
+        self._board_fd, self._host_fd = os.openpty()
+        tty.setraw(self._host_fd)
+        os.set_blocking(self._board_fd, False)
+        self.path = os.ttyname(self._host_fd)
         return self
 
     def __exit__(self, *_: object) -> None:
         """Close the pseudo-terminal, as if the board were unplugged."""
-        self._stop_watching()  # before its number is reused, because the loop would not notice the new descriptor
-        for descriptor in (self._master, self._slave):
+        self._stop_watching()  # before closing: the loop would take a reused descriptor number for the old one
+        for descriptor in (self._board_fd, self._host_fd):
             if descriptor >= 0:
                 os.close(descriptor)
-        self._master = self._slave = -1
+        self._board_fd = self._host_fd = -1
 
     async def run(self, seconds: float = math.inf) -> None:
         """Sample and send for ``seconds`` of the board's time, or until the signal ends."""
         self._loop = loop = asyncio.get_running_loop()
-        loop.add_reader(self._master, self._receive)
+        loop.add_reader(self._board_fd, self._receive)
         try:
             await self._sample_until(self.time_s + seconds, loop)
             with contextlib.suppress(TimeoutError):
@@ -194,32 +197,32 @@ class VirtualBoard:
 
     def _stop_watching(self) -> None:
         """Remove the line from the event loop, if the board runs."""
-        if self._loop is not None and self._master >= 0:
-            self._loop.remove_reader(self._master)
-            self._loop.remove_writer(self._master)
+        if self._loop is not None and self._board_fd >= 0:
+            self._loop.remove_reader(self._board_fd)
+            self._loop.remove_writer(self._board_fd)
         self._loop = None
 
     async def run_for_host(self) -> None:
         """Wait until a host opens the line, then ``run``. Earlier samples would be lost."""
-        os.close(self._slave)  # the poll reports a hangup while no process has the line open
-        self._slave, line = -1, select.poll()
-        line.register(self._master, 0)
-        while line.poll(0):  # noqa: ASYNC110 - the system does not report when a line is opened
+        os.close(self._host_fd)  # the poll reports a hangup while no process has the line open
+        self._host_fd, poller = -1, select.poll()
+        poller.register(self._board_fd, 0)
+        while poller.poll(0):  # noqa: ASYNC110 - the system does not report when a line is opened
             await asyncio.sleep(_HOST_POLL_S)
-        self._slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
-        tty.setraw(self._slave)
+        self._host_fd = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(self._host_fd)
         await asyncio.sleep(_BOOT_S)
         self.send(self._hello().encode())
         await self.run()
 
     async def _drain(self) -> None:
         """Wait until all bytes are written to the line."""
-        while self._line:
+        while self._unsent:
             self._drained.clear()
             await self._drained.wait()
 
     def inject(self, fault: BoardFault, frames: int = 1) -> None:
-        """Apply ``fault`` to the next ``frames`` samples without one."""
+        """Apply ``fault`` to the next ``frames`` frames that have no fault yet."""
         self._faults.extend(itertools.repeat(fault, frames))
 
     def reset(self, cause: ResetCause = ResetCause.EXTERNAL) -> None:
@@ -228,42 +231,42 @@ class VirtualBoard:
 
     def send(self, data: bytes) -> None:
         """Write arbitrary bytes to the line."""
-        self._line += data
+        self._unsent += data
         self._flush()
 
-    def _by_time(self, signal: Callable[[float], Reading]) -> Iterator[Reading]:
+    def _readings_from(self, signal: Callable[[float], Reading]) -> Iterator[Reading]:
         while True:
             yield signal(self.time_s)
 
     def _boot(self, cause: ResetCause) -> None:
-        self._cause = cause
+        self._reset_cause = cause
         self.relay_high, self._relay_fallback = False, RELAY_KEEP
-        self._relay_s = self._relay_word = 0
+        self._relay_delay_s = self._relay_word = 0
         self._relay_command_s = 0.0
         self._boot_id = (self._boot_id + 1) % (1 << 16)
-        self._sequence, self._ns, self._overrun, self._aux_is_ntc = 0, self._clock_us * 1000, False, False
-        self._set_rate(self._first_rate_hz)
+        self._sequence, self._clock_ns, self._overrun, self._aux_is_ntc = 0, self._reset_clock_us * 1000, False, False
+        self._set_rate(self._reset_rate_hz)
         self._boot_bandgap = self._converter.bandgap(_BOOT_READINGS)
         if self._mode == "binary":
             self.send(self._hello().encode())
 
     def _set_rate(self, rate_hz: int) -> None:
         self._rate_hz = rate_hz
-        self._count, self._period_ns = compute_window(rate_hz)
+        self._pair_count, self._period_ns = compute_window(rate_hz)
         self._aux_count = compute_aux_count(rate_hz)
 
     async def _sample_until(self, end_s: float, loop: asyncio.AbstractEventLoop) -> None:
-        offset_s = loop.time() - self.time_s / self._speed
+        start_s = loop.time() - self.time_s / self._speed  # loop time at which the pack's time is 0
         while self.time_s < end_s:
-            for _ in range(_BURST):
-                due_s = offset_s + (self.time_s + self._period_ns * 1e-9) / self._speed
+            for _ in range(_MAX_SAMPLES_AT_ONCE):
+                due_s = start_s + (self.time_s + self._period_ns * 1e-9) / self._speed
                 if due_s > loop.time() or self.time_s >= end_s:
                     break
                 if not self._take_sample():
                     return
             self._flush()
-            if math.isinf(self._speed) and self._line:
-                await self._drain()
+            if math.isinf(self._speed) and self._unsent:
+                await self._drain()  # the host's reads set the pace
             else:
                 await asyncio.sleep(max(due_s - loop.time(), 0.0 if math.isinf(self._speed) else _MIN_SLEEP_S))
 
@@ -274,28 +277,28 @@ class VirtualBoard:
         if reading is None:
             return False
         self._reading = reading
-        self._ns += self._period_ns
+        self._clock_ns += self._period_ns
         self.samples += 1
-        self._watch_relay()
+        self._apply_relay_fallback()
         message = self._message(reading)
         self._sequence = (self._sequence + 1) % MODULUS
-        if len(self._line) > _MAX_UNSENT_BYTES and not math.isinf(self._speed):
+        if len(self._unsent) > _MAX_UNSENT_BYTES and not math.isinf(self._speed):
             self._overrun = True
             return True
         self._overrun = False
-        self._line += self._text(message, reading) if self._mode == "text" else self._frame(message)
+        self._unsent += self._text(message, reading) if self._mode == "text" else self._frame(message)
         return True
 
     def _message(self, reading: Reading) -> SampleMessage:
-        sums = self._converter.window(reading, self._count)
-        status = BoardStatus.AUX_IS_NTC * self._aux_is_ntc + (self._cause << 4)
+        sums = self._converter.window(reading, self._pair_count)
+        status = BoardStatus.AUX_IS_NTC * self._aux_is_ntc + (self._reset_cause << 4)  # the upper half is the cause
         status |= BoardStatus.VOLTAGE_SATURATED * sums.voltage_saturated
         status |= BoardStatus.CURRENT_SATURATED * sums.current_saturated
         status |= BoardStatus.OVERRUN * self._overrun
         n = self._aux_count
         aux = self._converter.ntc(reading.temperature_c, n) if self._aux_is_ntc else self._converter.bandgap(n)
-        self._aux_is_ntc = not self._aux_is_ntc
-        board_us = self._ns // 1000 % MODULUS
+        self._aux_is_ntc = not self._aux_is_ntc  # NTC and bandgap alternate
+        board_us = self._clock_ns // 1000 % MODULUS
         return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, n, int(status))
 
     def _text(self, message: SampleMessage, reading: Reading) -> bytes:
@@ -311,9 +314,9 @@ class VirtualBoard:
 
     def _frame(self, message: SampleMessage) -> bytes:
         """Return the bytes of a sample, changed by the next fault if there is one."""
-        frame, late, self._delayed_frame = message.encode(), self._delayed_frame, b""
+        frame, delayed, self._delayed_frame = message.encode(), self._delayed_frame, b""
         if not self._faults:
-            return frame + late
+            return frame + delayed
         match self._faults.popleft():
             case BoardFault.DROP:
                 frame = b""
@@ -330,18 +333,18 @@ class VirtualBoard:
             case BoardFault.NEWER_VERSION:
                 frame = message.encode(PROTOCOL_VERSION + 1)
             case BoardFault.GARBAGE:
-                frame = self._random.randbytes(40) + DELIMITER + frame
-        return frame + late
+                frame = self._random.randbytes(_GARBAGE_BYTES) + DELIMITER + frame
+        return frame + delayed
 
     def _hello(self) -> Hello:
         parts = self._converter.parts
         return Hello(
             *FIRMWARE,
-            reset_cause=self._cause,
+            reset_cause=self._reset_cause,
             boot_id=self._boot_id,
             serial=self._stored[MessageType.COMMAND_SET_SERIAL],
             sequence=self._sequence,
-            board_us=self._ns // 1000 % MODULUS,
+            board_us=self._clock_ns // 1000 % MODULUS,
             rate_hz=self._rate_hz,
             period_ns=self._period_ns,
             adc_bits=10,
@@ -360,7 +363,7 @@ class VirtualBoard:
     def _receive(self) -> None:
         """Read from the host and handle complete commands."""
         with contextlib.suppress(BlockingIOError):
-            self._inbox += os.read(self._master, 4096)
+            self._inbox += os.read(self._board_fd, 4096)
         *frames, self._inbox = self._inbox.split(DELIMITER)
         if self._mode == "text":
             return
@@ -371,53 +374,53 @@ class VirtualBoard:
     def _handle_command(self, packet: bytes) -> None:
         if not packet:
             return
-        kind, body = packet[1], packet[2:]
+        command, body = packet[1], packet[2:]
         if packet[0] != PROTOCOL_VERSION:
-            self._answer(kind, AckResult.OTHER_VERSION, PROTOCOL_VERSION)
-        elif kind == MessageType.COMMAND_HELLO:
+            self._answer(command, AckResult.OTHER_VERSION, PROTOCOL_VERSION)
+        elif command == MessageType.COMMAND_HELLO:
             self.send(self._hello().encode())
-        elif kind == MessageType.COMMAND_RESTART:
-            self._answer(kind, AckResult.OK, 0)
+        elif command == MessageType.COMMAND_RESTART:
+            self._answer(command, AckResult.OK, 0)
             self.reset(ResetCause.WATCHDOG)
-        elif kind == MessageType.COMMAND_ZERO_CURRENT:
+        elif command == MessageType.COMMAND_ZERO_CURRENT:
             self._zero_current()
-        elif kind == MessageType.COMMAND_SET_RATE and len(body) == 2:
+        elif command == MessageType.COMMAND_SET_RATE and len(body) == 2:
             (rate_hz,) = struct.unpack("<H", body)
             if rate_hz in RATE_HZ:
                 self._set_rate(rate_hz)
-            self._answer(kind, AckResult.OK if rate_hz in RATE_HZ else AckResult.BAD_VALUE, self._period_ns)
-        elif kind == MessageType.COMMAND_SET_RELAY and len(body) == 4:
+            self._answer(command, AckResult.OK if rate_hz in RATE_HZ else AckResult.BAD_VALUE, self._period_ns)
+        elif command == MessageType.COMMAND_SET_RELAY and len(body) == 4:
             self._set_relay(*struct.unpack("<I", body))
-        elif kind in self._stored and len(body) == 4:
-            self._store(MessageType(kind), *struct.unpack("<I", body))
+        elif command in self._stored and len(body) == 4:
+            self._store(MessageType(command), *struct.unpack("<I", body))
         else:
-            self._answer(kind, AckResult.UNKNOWN_COMMAND, 0)
+            self._answer(command, AckResult.UNKNOWN_COMMAND, 0)
 
-    def _store(self, kind: MessageType, value: int) -> None:
+    def _store(self, command: MessageType, value: int) -> None:
         """Store the number of a command if it is valid."""
-        is_valid = value in _RANGES[kind]
+        is_valid = value in _VALID_VALUES[command]
         if is_valid:
-            self._stored[kind] = value
-        self._answer(kind, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._stored[kind])
+            self._stored[command] = value
+        self._answer(command, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._stored[command])
 
     def _set_relay(self, word: int) -> None:
         """Set the relay from the bits of ``relay_word``. A fallback level needs a delay."""
         fallback, silent_s = word >> 8 & 0xFF, word >> 16
         is_valid = (
-            word & 0xFE == 0
+            word & 0xFE == 0  # unused bits
             and fallback <= RELAY_HIGH
             and silent_s <= MAX_SILENT_S
             and (fallback == RELAY_KEEP or silent_s > 0)
         )
         if is_valid:
-            self.relay_high, self._relay_fallback, self._relay_s = bool(word & 1), fallback, silent_s
+            self.relay_high, self._relay_fallback, self._relay_delay_s = bool(word & 1), fallback, silent_s
             self._relay_command_s = self.time_s
             self._relay_word = word
         self._answer(MessageType.COMMAND_SET_RELAY, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._relay_word)
 
-    def _watch_relay(self) -> None:
+    def _apply_relay_fallback(self) -> None:
         """Set the relay to its fallback level after the delay without a relay command."""
-        if self._relay_fallback != RELAY_KEEP and self.time_s - self._relay_command_s >= self._relay_s:
+        if self._relay_fallback != RELAY_KEEP and self.time_s - self._relay_command_s >= self._relay_delay_s:
             self.relay_high, self._relay_fallback = self._relay_fallback == RELAY_HIGH, RELAY_KEEP
 
     def _zero_current(self) -> None:
@@ -434,14 +437,14 @@ class VirtualBoard:
 
     def _flush(self) -> None:
         """Write as much as the pseudo-terminal accepts; register a writer for the rest."""
-        if self._master < 0:
+        if self._board_fd < 0:
             return
         with contextlib.suppress(BlockingIOError):
-            while self._line:
-                del self._line[: os.write(self._master, self._line)]
-        if self._line:
-            asyncio.get_running_loop().add_writer(self._master, self._flush)
+            while self._unsent:
+                del self._unsent[: os.write(self._board_fd, self._unsent)]
+        if self._unsent:
+            asyncio.get_running_loop().add_writer(self._board_fd, self._flush)
         else:
             self._drained.set()
             with contextlib.suppress(RuntimeError):  # no event loop is running, so that there is no writer
-                asyncio.get_running_loop().remove_writer(self._master)
+                asyncio.get_running_loop().remove_writer(self._board_fd)

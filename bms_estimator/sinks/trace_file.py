@@ -63,7 +63,7 @@ class CsvSink:
             self._file = self._open()
             self._file.write((",".join(trace.dtype.names or ()) + "\n").encode())
         if trace.size:
-            self._file.write(_lines(trace))
+            self._file.write(_csv_rows(trace))
 
     def _open(self) -> IO[bytes]:
         file = self._files.enter_context(_create(self._path))
@@ -106,7 +106,7 @@ class ParquetSink:
         self._writer.write_batch(batch)
 
 
-WRITERS: dict[str, type[CsvSink | ParquetSink]] = {".csv": CsvSink, ".csv.gz": CsvSink, ".parquet": ParquetSink}
+SINKS: dict[str, type[CsvSink | ParquetSink]] = {".csv": CsvSink, ".csv.gz": CsvSink, ".parquet": ParquetSink}
 """Sinks by file name extension."""
 
 
@@ -116,10 +116,10 @@ def table_sink(path: Path) -> TableSink:
     Raises:
         UserError: The extension is unknown.
     """
-    for suffix, writer in WRITERS.items():
+    for suffix, sink in SINKS.items():
         if path.name.lower().endswith(suffix):
-            return writer(path)
-    raise UserError(f"{path}: the name must end in {', '.join(WRITERS)}")
+            return sink(path)
+    raise UserError(f"{path}: the name must end in {', '.join(SINKS)}")
 
 
 def _create(path: Path) -> IO[bytes]:
@@ -129,7 +129,7 @@ def _create(path: Path) -> IO[bytes]:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def _lines(trace: NDArray[np.void]) -> bytes:
+def _csv_rows(trace: NDArray[np.void]) -> bytes:
     """Return rows as CSV, with enough digits to restore each float exactly."""
     columns = [map(repr, trace[name].tolist()) for name in trace.dtype.names or ()]
     return ("\n".join(map(",".join, zip(*columns, strict=True))) + "\n").encode()

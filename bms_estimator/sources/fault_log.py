@@ -8,10 +8,10 @@ import structlog
 MIN_LOG_INTERVAL_S = 30.0
 """Minimum interval between two log lines on faults [s]."""
 _NORMAL_EVENTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello", "reconnects", "retained")
-"""Counters of normal events, which are not logged.
+"""Counters of normal events, which are not logged here.
 
 Bytes and samples before the hello are normal if opening the port does not reset the board. Retained messages are
-normal on MQTT.
+normal on MQTT. Sources log reconnects and rejected devices (``unadmitted_bytes``) themselves.
 """
 
 log = structlog.get_logger(__name__)
@@ -21,7 +21,7 @@ class FaultLog:
     """Log of a line's faults at a limited rate."""
 
     def __init__(self) -> None:
-        self._logged, self._logged_s = 0, -math.inf
+        self._logged_faults, self._log_time_s = 0, -math.inf
 
     def check(self, counters: Mapping[str, int], now_s: float) -> None:
         """Log the fault counters if they have changed and the minimum interval has passed.
@@ -32,6 +32,6 @@ class FaultLog:
         """
         nonzero = {name: n for name, n in counters.items() if name not in _NORMAL_EVENTS and n}
         faults = sum(nonzero.values())
-        if faults != self._logged and now_s - self._logged_s >= MIN_LOG_INTERVAL_S:
-            self._logged, self._logged_s = faults, now_s
+        if faults != self._logged_faults and now_s - self._log_time_s >= MIN_LOG_INTERVAL_S:
+            self._logged_faults, self._log_time_s = faults, now_s
             log.warning("faults on the line", **nonzero)

@@ -11,13 +11,13 @@ from typing import Self
 import structlog
 
 from bms_estimator.model.clock import since_boot
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.sample import SampleBlock
 from bms_estimator.process.backoff import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog
-from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
+from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
 
 CHECK_INTERVAL_S = 1.0
 """Interval between two checks for silence and faults [s]."""
@@ -37,7 +37,7 @@ class LineProducer(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """Name of the source, as a prefix of its messages."""
+        """Name of the source, the prefix of its log and error texts."""
 
     @abstractmethod
     def iter_lines(self) -> AsyncGenerator[bytes, None]:
@@ -95,18 +95,21 @@ class LineSource:
         check_interval_s: float = CHECK_INTERVAL_S,
     ) -> None:
         self._producer, self._decoder, self._tap = producer, make_protocol(sensor), tap
-        self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
-        self._check_interval_s, self._silent_s = check_interval_s, SILENT_PERIODS * max(period_s, check_interval_s)
+        self._monotonic, self._wall_offset_s = monotonic, wall() - monotonic()
+        self._check_interval_s, self._silence_limit_s = (
+            check_interval_s,
+            SILENT_PERIODS * max(period_s, check_interval_s),
+        )
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
         self._lines: asyncio.Queue[Chunk | None] = asyncio.Queue()
-        self._message: str | None = "not opened yet"
-        self._logged_message = ""
+        self._silence_reason: str | None = "not opened yet"
+        self._logged_reason = ""
         self._connections, self._connected = 0, False
         self._last_check_s = self._last_sample_s = monotonic()
         self._block_arrival_s = math.nan  # arrival time of the last block's line
-        self._faults = FaultLog()
-        self._task: asyncio.Task[None] | None = None
-        self._watcher: asyncio.Task[None] | None = None
+        self._fault_log = FaultLog()
+        self._produce_task: asyncio.Task[None] | None = None
+        self._watch_task: asyncio.Task[None] | None = None
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -115,19 +118,14 @@ class LineSource:
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
 
     @property
-    def message(self) -> str | None:
+    def silence_reason(self) -> str | None:
         """Reason why no samples arrive; None while they arrive."""
-        return self._message
+        return self._silence_reason
 
     @property
     def board(self) -> Mapping[str, str]:
         """Properties that the device reported, such as its serial number; empty without any."""
         return self._producer.board
-
-    @property
-    def cells(self) -> CellBlock:
-        """Cell voltages of the last block."""
-        return self._decoder.cells
 
     @property
     def clock_ppm(self) -> float | None:
@@ -143,34 +141,36 @@ class LineSource:
         """Return the health of the task that runs the producer."""
         now_s = self._monotonic()
         return SourceHealth(
-            now_s - self._last_check_s, self._epoch_s + now_s - self._block_arrival_s, self._lines.qsize()
+            task_idle_s=now_s - self._last_check_s,
+            block_age_s=self._wall_offset_s + now_s - self._block_arrival_s,
+            queued_reads=self._lines.qsize(),
         )
 
     async def __aenter__(self) -> Self:
         """Start producing lines; the device may still be missing."""
-        self._task = asyncio.create_task(self._produce(), name=self._producer.name)
-        self._task.add_done_callback(lambda _: self._lines.put_nowait(None))
-        self._watcher = asyncio.create_task(self._watch(), name=f"watch {self._producer.name}")
+        self._produce_task = asyncio.create_task(self._produce(), name=self._producer.name)
+        self._produce_task.add_done_callback(lambda _: self._lines.put_nowait(None))  # None ends the iteration
+        self._watch_task = asyncio.create_task(self._watch(), name=f"watch {self._producer.name}")
         return self
 
     async def __aexit__(self, *_: object) -> None:
         """Stop producing lines."""
-        tasks: set[asyncio.Task[None]] = {task for task in (self._watcher, self._task) if task is not None}
+        tasks: set[asyncio.Task[None]] = {task for task in (self._watch_task, self._produce_task) if task is not None}
         while tasks:  # a producer may call wait_for, which may swallow a cancellation in Python 3.11
             for task in tasks:
                 task.cancel()
             _done, tasks = await asyncio.wait(tasks, timeout=CHECK_INTERVAL_S)
 
-    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+    async def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks as lines arrive. A line goes to the tap when its block is requested."""
         while (chunk := await self._lines.get()) is not None:
             block = self._decode(*chunk)
             if block.size:
                 self._block_arrival_s = chunk[0]
-                self._message, self._logged_message, self._retry_s = None, "", self._first_retry_s
-                yield block
-        if self._task is not None and not self._task.cancelled():
-            self._task.result()
+                self._silence_reason, self._logged_reason, self._retry_s = None, "", self._first_retry_s
+                yield ReceivedSamples(block, self._decoder.cells)
+        if self._produce_task is not None and not self._produce_task.cancelled():
+            self._produce_task.result()
 
     def _decode(self, arrival_s: float, line: bytes) -> SampleBlock:
         if self._tap is not None:
@@ -204,25 +204,25 @@ class LineSource:
 
     def _on_line(self, line: bytes) -> None:
         if line != CONNECTED:
-            self._lines.put_nowait((self._epoch_s + self._monotonic(), line))
+            self._lines.put_nowait((self._wall_offset_s + self._monotonic(), line))
             return
         self._connections += 1
         self._connected, self._last_sample_s = True, self._monotonic()
-        self._message = f"{self._producer.name}: connected, no sample yet"
+        self._silence_reason = f"{self._producer.name}: connected, no sample yet"
         log.info("connected", source=self._producer.name)
 
     async def _watch(self) -> None:
         """Report a silent source, and log faults, at each check interval."""
         while True:
             self._last_check_s = now_s = self._monotonic()
-            if self._connected and now_s - self._last_sample_s >= self._silent_s:
+            if self._connected and now_s - self._last_sample_s >= self._silence_limit_s:
                 reason = self._producer.fault or self._decoder.fault or "connected, but silent"
                 self._report(f"{self._producer.name}: {reason}")
-            self._faults.check(self.counters, now_s)
+            self._fault_log.check(self.counters, now_s)
             await asyncio.sleep(self._check_interval_s)
 
-    def _report(self, message: str) -> None:
-        """Set the message. It is logged again only after it changed or samples arrived."""
-        if message != self._logged_message:
-            log.warning("no samples", reason=message)
-        self._message = self._logged_message = message
+    def _report(self, reason: str) -> None:
+        """Set the reason why no samples arrive. It is logged again only after it changed or samples arrived."""
+        if reason != self._logged_reason:
+            log.warning("no samples", reason=reason)
+        self._silence_reason = self._logged_reason = reason

@@ -21,18 +21,27 @@ class SourceHealth(NamedTuple):
 
 
 class ReadTap(Protocol):
-    """Receiver of a copy of each chunk that the decoder is fed, such as a recorder. It must neither block nor raise."""
+    """Receives a copy of each chunk before it is decoded, for example to record it. It must neither block nor raise."""
 
     @property
     def missed_reads(self) -> int:
-        """Number of chunks that it could not store."""
+        """Number of chunks that the receiver could not store."""
 
     def write(self, arrival_s: float, data: bytes) -> None:
         """Receive one chunk."""
 
 
+class ReceivedSamples(NamedTuple):
+    """Block of samples and the cell voltages that were measured with it."""
+
+    samples: SampleBlock
+    """Samples, shape (n,), dtype SAMPLE."""
+    cells_v: CellBlock
+    """Cell voltages of the samples, shape (n, m) [V]; ``NO_CELLS`` if none are measured."""
+
+
 class Source(Protocol):
-    """An async iterator of SAMPLE blocks with fault counters.
+    """Async iterator of samples, with fault counters.
 
     The iterator of a device never ends by itself. That of a capture or a table ends with the last sample.
     """
@@ -42,7 +51,7 @@ class Source(Protocol):
         """Counts since start: ``frames_received``, ``frames_lost``, ``crc_errors``, ``reconnects`` and faults by kind."""
 
     @property
-    def message(self) -> str | None:
+    def silence_reason(self) -> str | None:
         """Reason why no samples arrive, as text; None while they arrive."""
 
     @property
@@ -53,11 +62,7 @@ class Source(Protocol):
     def clock_ppm(self) -> float | None:
         """Rate error of the board's clock relative to the host's [1e-6]; None if unknown."""
 
-    @property
-    def cells(self) -> CellBlock:
-        """Cell voltages of the latest block; ``NO_CELLS`` where no cells are measured."""
-
-    def __aiter__(self) -> AsyncIterator[SampleBlock]:
+    def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks of samples; none of them is empty."""
 
     async def __aenter__(self) -> Self:

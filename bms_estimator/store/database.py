@@ -30,12 +30,12 @@ LOCK_TIMEOUT_S = 5.0
 LOG_BYTES = 4 << 20
 """Maximum size of the write-ahead log [bytes]."""
 FREE_PAGES = 1024
-"""Number of free pages of 4 KiB that stay in the file for later rows."""
+"""Number of free pages of 4 KiB that may always stay in the file for later rows."""
 TRIMMED_PAGES = 4096
 """Maximum number of pages moved to shrink the file after one transaction."""
-UNUSABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT)
+UNUSABLE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT)
 """SQLite error codes of a damaged file."""
-UNUSABLE_AT_OPEN = (*UNUSABLE, sqlite3.SQLITE_ERROR)
+UNUSABLE_CODES_AT_OPEN = (*UNUSABLE_CODES, sqlite3.SQLITE_ERROR)
 """SQLite error codes of an unusable file while its tables are checked and created. SQLITE_ERROR then means that the
 tables have another schema."""
 
@@ -55,7 +55,7 @@ class Database:
 
     Args:
         path: Database file, created if missing.
-        tables: Statements that create the tables, as ``MIGRATIONS``.
+        tables: Statements that create the tables, in the format of ``MIGRATIONS``.
         sync_s: Minimum interval between two fsyncs [s].
         hang_s: Timeout of a transaction [s].
         retry_s: Delay after a failure before the disk is retried [s].
@@ -76,9 +76,9 @@ class Database:
         self.path, self.reason = path, ""
         self._hang_s, self._retry_s = hang_s, retry_s
         self._thread = DiskThread("database")
-        self._stuck: asyncio.Future[Any] | None = None
-        self._failed_s = -retry_s
-        self._end_s = math.inf
+        self._hung_call: asyncio.Future[Any] | None = None
+        self._last_failure_s = -retry_s
+        self._shutdown_end_s = math.inf
         self._open_timeouts: set[asyncio.Timeout] = set()
         self._file = _File(path, tables, sync_s)
 
@@ -93,14 +93,14 @@ class Database:
 
     def begin_shutdown(self) -> None:
         """Begin the shutdown: all pending and further transactions together may take ``SHUTDOWN_TIMEOUT_S``."""
-        self._end_s = min(self._end_s, asyncio.get_running_loop().time() + SHUTDOWN_TIMEOUT_S)
+        self._shutdown_end_s = min(self._shutdown_end_s, asyncio.get_running_loop().time() + SHUTDOWN_TIMEOUT_S)
         for timeout in self._open_timeouts:
             if not timeout.expired():
-                timeout.reschedule(min(timeout.when() or self._end_s, self._end_s))
+                timeout.reschedule(min(timeout.when() or self._shutdown_end_s, self._shutdown_end_s))
 
     async def _wait(self, waiter: asyncio.Future[Any]) -> bool:
         """Return True if the disk responded in time."""
-        due_s = min(asyncio.get_running_loop().time() + self._hang_s, self._end_s)
+        due_s = min(asyncio.get_running_loop().time() + self._hang_s, self._shutdown_end_s)
         try:
             async with asyncio.timeout_at(due_s) as timeout:
                 self._open_timeouts.add(timeout)
@@ -123,21 +123,22 @@ class Database:
             StoreError: The transaction was not committed, or its result is unknown.
         """
         now_s = asyncio.get_running_loop().time()
-        if (self._stuck and not self._stuck.done()) or now_s - self._failed_s < self._retry_s:
+        if (self._hung_call and not self._hung_call.done()) or now_s - self._last_failure_s < self._retry_s:
             raise StoreError(self.reason)
         running = self._thread.submit(self._file.run, work)
         waiter = asyncio.wrap_future(running)
         began_s = asyncio.get_running_loop().time()
         if not await self._wait(waiter):
+            # reading a late exception prevents asyncio from logging it as never retrieved
             waiter.add_done_callback(lambda late: late.cancelled() or late.exception())
             if not running.cancel():
-                self._stuck = waiter
+                self._hung_call = waiter
             waited_s = asyncio.get_running_loop().time() - began_s
             raise self._failure(f"the disk has not answered for {waited_s:.2g} s")
         try:
             result = waiter.result()
         except (sqlite3.Error, OSError) as error:
-            self._failed_s = asyncio.get_running_loop().time()
+            self._last_failure_s = asyncio.get_running_loop().time()
             raise self._failure(str(error)) from error
         if self.reason:
             log.info("database is back", file=str(self.path))
@@ -175,7 +176,10 @@ class _File:
         except sqlite3.DatabaseError as error:
             code = getattr(error, "sqlite_errorcode", 0)
             # plain READONLY comes from the file's header and not from permissions: the file was just opened for writing
-            unusable = code == sqlite3.SQLITE_READONLY or code & 0xFF in (UNUSABLE if self._ready else UNUSABLE_AT_OPEN)
+            # the lowest byte of an extended code is the primary code
+            unusable = code == sqlite3.SQLITE_READONLY or code & 0xFF in (
+                UNUSABLE_CODES if self._ready else UNUSABLE_CODES_AT_OPEN
+            )
             if not unusable:
                 raise
             self._quarantine(str(error))
@@ -257,7 +261,7 @@ class _File:
 
 
 def _trim(connection: sqlite3.Connection) -> None:
-    """Release the free pages if they exceed half of the file, so that a page is moved at most once or twice."""
+    """Release the free pages if they exceed half of the file. With this limit, a page is moved at most once or twice."""
     (free,) = connection.execute("PRAGMA freelist_count").fetchone()
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
     if free > max(FREE_PAGES, pages // 2):

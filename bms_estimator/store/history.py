@@ -14,7 +14,7 @@ from typing import Self, TypeVar
 from bms_estimator.model.events import Event, events
 from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, measured_time, minute_of
+from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, measured_time, minute_start
 
 MINUTES_A_DAY = 1440
 """Number of minutes in a day."""
@@ -28,16 +28,16 @@ MAX_EVENTS = 50_000
 Row = TypeVar("Row")
 
 _COLUMNS = Minute._fields
-_MEANS = ("voltage_v", "current_a", "temperature_c")
-_LAST = ("soc", "soc_std")
+_MEAN_COLUMNS = ("voltage_v", "current_a", "temperature_c")
+_LAST_VALUE_COLUMNS = ("soc", "soc_std")
 
 
-def _merged(column: str) -> str:
-    """Return SQL that merges a column of two rows of one minute, as after a restart within it."""
+def _merge_expression(column: str) -> str:
+    """Return SQL that merges a column of two rows of one minute, which exist after a restart within the minute."""
     old, new = f"minute.{column}", f"excluded.{column}"
-    if column in _LAST:
+    if column in _LAST_VALUE_COLUMNS:
         return f"{column} = coalesce({new}, {old})"
-    if column in _MEANS:
+    if column in _MEAN_COLUMNS:
         weighted = f"({old} * minute.publications + {new} * excluded.publications)"
         return f"{column} = coalesce({weighted} / (minute.publications + excluded.publications), {new}, {old})"
     if "_min_" in column or "_max_" in column:
@@ -48,7 +48,7 @@ def _merged(column: str) -> str:
 
 _INSERT = (
     f"INSERT INTO minute ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) "  # noqa: S608 - only constant names
-    f"ON CONFLICT (time_s) DO UPDATE SET {', '.join(map(_merged, _COLUMNS[1:]))}"
+    f"ON CONFLICT (time_s) DO UPDATE SET {', '.join(map(_merge_expression, _COLUMNS[1:]))}"
 )
 
 
@@ -69,11 +69,11 @@ class History:
         # waiting rows and events with their numbers
         self._minutes: deque[tuple[int, Minute]] = deque(maxlen=WAITING_MINUTES)
         self._events: deque[tuple[int, Event]] = deque(maxlen=WAITING_EVENTS)
-        self._run_id, self._number = secrets.token_hex(8), 0
+        self._run_id, self._last_number = secrets.token_hex(8), 0
         self._due = asyncio.Event()
         self._closing = False
         # number of rows written since old rows were last removed; this value makes the first write remove them
-        self._unpruned = MINUTES_A_DAY
+        self._rows_since_prune = MINUTES_A_DAY
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -103,7 +103,7 @@ class History:
             self._add(snapshot.estimate)
 
     def _add(self, estimate: Estimate) -> None:
-        time_s = minute_of(epoch_s(estimate.time))
+        time_s = minute_start(epoch_s(estimate.time))
         if self._open is None or self._open.time_s != time_s:
             self._close_minute()
             self._open = MinuteAccumulator(time_s)
@@ -119,8 +119,8 @@ class History:
             self._due.set()
 
     def _next_number(self) -> int:
-        self._number += 1
-        return self._number
+        self._last_number += 1
+        return self._last_number
 
     async def _write_repeatedly(self) -> None:
         """Write each minute and event. After a failure, retry with the next minute or event, or after a minute."""
@@ -135,23 +135,24 @@ class History:
 
     async def _write(self) -> None:
         """Write the waiting rows. Skip rows that an earlier transaction with unknown result has written."""
-        minutes, waiting_events, last = list(self._minutes), list(self._events), self._number
+        minutes, waiting_events, last_number = list(self._minutes), list(self._events), self._last_number
         if not minutes and not waiting_events:
             return
-        prune = self._unpruned + len(minutes) > MINUTES_A_DAY
+        prune = self._rows_since_prune + len(minutes) > MINUTES_A_DAY
 
         def write(connection: sqlite3.Connection) -> None:
             query = "SELECT max(number) FROM history_mark WHERE run = ?"
             (marked,) = connection.execute(query, (self._run_id,)).fetchone()
             written = marked or 0
-            for row in [row for number, row in minutes if number > written]:
-                connection.execute(_INSERT, row._replace(time_s=_row_time(connection, row)))
+            for number, row in minutes:
+                if number > written:
+                    connection.execute(_INSERT, row._replace(time_s=_row_time(connection, row)))
             rows = [
                 (epoch_s(event.time), event.name, event.text) for number, event in waiting_events if number > written
             ]
             connection.executemany("INSERT INTO event (time_s, name, text) VALUES (?, ?, ?)", rows)
             connection.execute("DELETE FROM history_mark")
-            connection.execute("INSERT INTO history_mark VALUES (?, ?)", (self._run_id, last))
+            connection.execute("INSERT INTO history_mark VALUES (?, ?)", (self._run_id, last_number))
             if prune:
                 _prune(connection, self._max_rows)
 
@@ -159,9 +160,9 @@ class History:
             await self._database.call(write)
         except StoreError:
             return
-        _remove(self._minutes, last)
-        _remove(self._events, last)
-        self._unpruned = 0 if prune else self._unpruned + len(minutes)
+        _remove(self._minutes, last_number)
+        _remove(self._events, last_number)
+        self._rows_since_prune = 0 if prune else self._rows_since_prune + len(minutes)
 
 
 def _row_time(connection: sqlite3.Connection, row: Minute) -> int:
@@ -176,9 +177,9 @@ def _row_time(connection: sqlite3.Connection, row: Minute) -> int:
     return time_s
 
 
-def _remove(waiting: deque[tuple[int, Row]], last: int) -> None:
-    """Remove the written items up to number ``last``."""
-    while waiting and waiting[0][0] <= last:
+def _remove(waiting: deque[tuple[int, Row]], last_number: int) -> None:
+    """Remove the written items up to number ``last_number``."""
+    while waiting and waiting[0][0] <= last_number:
         waiting.popleft()
 
 

@@ -10,7 +10,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.store.migrations import MIGRATIONS
 from bms_estimator.store.minute import MINUTE_S, Minute
 
-_SUMMED = "sum(charge_out_ah), sum(charge_in_ah), sum(energy_out_wh), sum(energy_in_wh), sum(seen_s), sum(publications)"
+_QUANTITIES = ("voltage", "v"), ("current", "a"), ("temperature", "c")
+_SUMS = "sum(charge_out_ah), sum(charge_in_ah), sum(energy_out_wh), sum(energy_in_wh), sum(seen_s), sum(publications)"
 
 
 class PastEvent(NamedTuple):
@@ -45,14 +46,15 @@ class HistoryFile:
             UserError: The history cannot be read.
         """
         begin = "time_s" if step_s == MINUTE_S else "time_s / :step * :step"
-        columns = f"{begin}, {_mean('voltage', 'v')}, {_mean('current', 'a')}, {_mean('temperature', 'c')}"
+        columns = ", ".join([begin, *(_mean_and_extremes(*quantity) for quantity in _QUANTITIES)])
         grouped = (
-            f"SELECT {columns}, {_SUMMED}, max(time_s) AS last_s FROM minute "  # noqa: S608 - only constant names
+            f"SELECT {columns}, {_SUMS}, max(time_s) AS last_s FROM minute "  # noqa: S608 - only constant names
             f"WHERE time_s >= :since AND time_s < :until GROUP BY {begin}"
         )
         query = f"SELECT g.*, m.soc, m.soc_std FROM ({grouped}) AS g JOIN minute AS m ON m.time_s = g.last_s ORDER BY 1"  # noqa: S608
         with self._reading() as connection:
             rows = connection.execute(query, {"since": since_s, "until": until_s, "step": step_s}).fetchall()
+        # columns: 10 of time, means and extremes, 6 of sums, last_s, and 2 of SOC, which precede the sums in ``Minute``
         return [Minute._make((*row[:10], *row[-2:], *row[10:16])) for row in rows]
 
     def events(self, since_s: float, until_s: float) -> list[PastEvent]:
@@ -85,7 +87,7 @@ class HistoryFile:
             raise UserError(f"{self._path}: history cannot be read: {error}") from error
 
 
-def _mean(quantity: str, unit: str) -> str:
+def _mean_and_extremes(quantity: str, unit: str) -> str:
     """Return SQL of mean and extremes of a quantity over one-minute rows."""
     mean, minimum, maximum = (f"{quantity}_{part}{unit}" for part in ("", "min_", "max_"))
     weight = f"sum(CASE WHEN {mean} IS NULL THEN 0 ELSE publications END)"

@@ -33,7 +33,9 @@ MIGRATIONS = (
     """,
     "CREATE TABLE history_mark (run TEXT NOT NULL, number INTEGER NOT NULL);",
 )
-"""Statements that migrate version n to version n + 1. Released statements are never changed."""
+"""Statements that migrate version n to version n + 1. Released statements are never changed.
+
+Table ``history_mark`` has one row: all numbered rows and events up to ``number`` of the process ``run`` are written."""
 
 
 class NewerVersionError(Exception):

@@ -43,7 +43,7 @@ class Minute(NamedTuple):
 
 
 @dataclass
-class _Mean:
+class _Statistics:
     """Mean and extremes of one quantity."""
 
     count: int = 0
@@ -59,6 +59,7 @@ class _Mean:
 
     @property
     def values(self) -> tuple[float, float, float]:
+        """Mean, minimum and maximum."""
         return self.total / self.count, self.minimum, self.maximum
 
 
@@ -67,12 +68,12 @@ class MinuteAccumulator:
     """Accumulator of the open minute, which starts at ``time_s`` [s since 1970]."""
 
     time_s: int
-    _voltage: _Mean = field(default_factory=_Mean)
-    _current: _Mean = field(default_factory=_Mean)
-    _temperature: _Mean = field(default_factory=_Mean)
+    _voltage: _Statistics = field(default_factory=_Statistics)
+    _current: _Statistics = field(default_factory=_Statistics)
+    _temperature: _Statistics = field(default_factory=_Statistics)
     _last: Estimate | None = None
-    _charge_as: list[float] = field(default_factory=lambda: [0.0, 0.0])  # out, in
-    _energy_ws: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    _charge_as: list[float] = field(default_factory=lambda: [0.0, 0.0])  # out and in [A s]
+    _energy_ws: list[float] = field(default_factory=lambda: [0.0, 0.0])  # out and in [W s]
     _seen_s: float = 0.0
 
     def add(self, estimate: Estimate, seen_s: float) -> None:
@@ -89,22 +90,25 @@ class MinuteAccumulator:
         """Return the row of the minute; None if nothing was published."""
         if self._last is None:
             return None
-        charge_out, charge_in = (each / 3600.0 for each in self._charge_as)
-        energy_out, energy_in = (each / 3600.0 for each in self._energy_ws)
-        measured = *self._voltage.values, *self._current.values
+        charge_out, charge_in = (charge_as / 3600.0 for charge_as in self._charge_as)
+        energy_out, energy_in = (energy_ws / 3600.0 for energy_ws in self._energy_ws)
+        voltage_and_current = *self._voltage.values, *self._current.values
         temperature = self._temperature.values if self._temperature.count else (None, None, None)
-        sums = charge_out, charge_in, energy_out, energy_in, self._seen_s, self._voltage.count
-        return Minute._make((self.time_s, *measured, *temperature, self._last.soc, self._last.soc_std, *sums))
+        publications = self._voltage.count
+        sums = charge_out, charge_in, energy_out, energy_in, self._seen_s, publications
+        return Minute._make(
+            (self.time_s, *voltage_and_current, *temperature, self._last.soc, self._last.soc_std, *sums)
+        )
 
 
-def measured_time(interval_s: float, previous_s: float) -> float:
+def measured_time(interval_s: float, previous_interval_s: float) -> float:
     """Return the time between two publications [s], or 0 if the time is a gap or the clock went back.
 
     Args:
         interval_s: Time between the two publications on the board's clock [s].
-        previous_s: Time between the previous two publications [s].
+        previous_interval_s: Time between the previous two publications [s].
     """
-    return interval_s if 0.0 < interval_s <= max(MAX_INTERVAL_S, GAP_RATIO * previous_s) else 0.0
+    return interval_s if 0.0 < interval_s <= max(MAX_INTERVAL_S, GAP_RATIO * previous_interval_s) else 0.0
 
 
 def epoch_s(time: str) -> float:
@@ -112,6 +116,6 @@ def epoch_s(time: str) -> float:
     return datetime.fromisoformat(time).timestamp()
 
 
-def minute_of(epoch: float) -> int:
-    """Return the start of the minute [s since 1970]."""
-    return int(epoch // MINUTE_S) * MINUTE_S
+def minute_start(time_s: float) -> int:
+    """Return the start of the minute that contains a time [s since 1970]."""
+    return int(time_s // MINUTE_S) * MINUTE_S

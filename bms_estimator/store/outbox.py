@@ -29,19 +29,19 @@ class Outbox:
 
     Args:
         database: Database for messages during an outage; None: memory only.
-        most: Maximum number of queued messages; beyond it the oldest one not in flight is dropped.
+        max_messages: Maximum number of queued messages; beyond it the oldest one not in flight is dropped.
 
     Attributes:
         connected: True if a broker is connected, as set by the sender.
     """
 
-    def __init__(self, database: Database | None, *, most: int) -> None:
-        self._database, self._queue = database, OutboxQueue(most)
+    def __init__(self, database: Database | None, *, max_messages: int) -> None:
+        self._database, self._queue = database, OutboxQueue(max_messages)
         self._backlog_read = database is None
-        self._offset: int | None = None  # from queue numbers to those on disk; None until the backlog was read
+        self._offset: int | None = None  # number on disk minus number in the queue; None until the backlog was read
         self._next_numbers: deque[int] = deque(maxlen=BEHIND_INTERVALS)  # the queue's next number, at each interval
         self._open_count_at_sync = 0  # database.open_count at the last synchronization of memory and disk
-        self._filled, self._sync_requested = asyncio.Event(), asyncio.Event()
+        self._message_ready, self._sync_requested = asyncio.Event(), asyncio.Event()
         self._closing = False
         self._task: asyncio.Task[None] | None = None
         self.connected = False
@@ -53,7 +53,7 @@ class Outbox:
 
     @property
     def dropped(self) -> int:
-        """Number of messages dropped since start because the queue was full."""
+        """Number of messages lost since start, because the queue was full or the disk was damaged."""
         return self._queue.dropped
 
     async def __aenter__(self) -> Self:
@@ -79,10 +79,10 @@ class Outbox:
         self._wake_taker()
 
     async def take(self, most: int) -> list[QueuedMessage]:
-        """Wait for a message, then return up to ``most`` of the oldest that were not returned since ``rewind``."""
+        """Wait for a message, then return up to ``most`` of the oldest messages not yet returned since ``rewind``."""
         while not (self._backlog_read and self._queue.can_take):
-            self._filled.clear()
-            await self._filled.wait()
+            self._message_ready.clear()
+            await self._message_ready.wait()
         taken = self._queue.take_next(most)
         if self._queue.needs_page:
             self._sync_requested.set()
@@ -99,7 +99,7 @@ class Outbox:
 
     def _wake_taker(self) -> None:
         if self._backlog_read and self._queue.can_take:
-            self._filled.set()
+            self._message_ready.set()
 
     async def _sync_repeatedly(self) -> None:
         """Synchronize memory and disk every ``FLUSH_S``, and when the next page is needed."""
@@ -119,7 +119,7 @@ class Outbox:
 
     def _must_write(self) -> bool:
         """Return True if queued messages must be written, because the broker is disconnected or behind."""
-        self._next_numbers.append(self._queue.next)
+        self._next_numbers.append(self._queue.next_number)
         oldest = self._queue.oldest
         if oldest is None:
             return False
@@ -132,7 +132,7 @@ class Outbox:
         try:
             if self._offset is None:
                 backlog = await self._database.call(read_backlog)
-                self._offset = queue.prepend_backlog(backlog.runs)
+                self._offset = queue.prepend_backlog(backlog.ranges)
                 queue.dropped += backlog.damaged
                 self._open_count_at_sync = self._database.open_count
             transaction = self._transaction(self._offset, write=write)
@@ -150,22 +150,22 @@ class Outbox:
         self._wake_taker()
 
     def _transaction(self, offset: int, *, write: bool) -> OutboxTransaction:
-        """Return the transaction that makes the disk match memory, and mark the disk as no longer stale.
+        """Return the transaction that makes the disk match memory, and record that no stale rows will remain.
 
         The transaction deletes rows that are no longer queued, writes new messages and reads the next page. If the state
         of the disk is unknown, it also writes all messages in memory again and lists the rows on disk.
         """
         queue, stored = self._queue, self._queue.stored
-        gaps = queue.gaps() if queue.stale or not queue.disk_state_known else []
-        queue.stale = False
+        gaps = queue.gaps() if queue.has_stale_rows or not queue.disk_state_known else []
+        queue.has_stale_rows = False
         return OutboxTransaction(
             offset=offset,
-            first=stored.first if stored else queue.next,
-            end=stored.end if stored else queue.next,
+            first=stored.first if stored else queue.next_number,
+            end=stored.end if stored else queue.next_number,
             gaps=gaps,
             rows=queue.unwritten() if write or not queue.disk_state_known else [],
-            page=PAGE if queue.needs_page else 0,
-            recount=not queue.disk_state_known,
+            page_size=PAGE if queue.needs_page else 0,
+            list_stored=not queue.disk_state_known,
         )
 
     def _apply_result(self, result: OutboxResult) -> None:

@@ -18,7 +18,7 @@ megabytes, or to the states of an hour at one a second."""
 PAGE = 1000
 """Maximum number of ready messages. The next page is read from disk once fewer than half of them are left."""
 
-LOWEST = -(1 << 62)
+MIN_NUMBER = -(1 << 62)
 """Number below all others, here and on disk."""
 
 
@@ -27,21 +27,21 @@ class OutboxQueue:
     """Queue of numbered messages.
 
     Attributes:
-        most: Maximum number of queued messages. Beyond this number, the oldest message that is not in flight is dropped.
+        max_messages: Maximum number of queued messages. Beyond this number, the oldest message that is not in flight is dropped.
         dropped: Number of dropped and lost messages.
-        next: Number of the next message.
+        next_number: Number of the next message.
         in_flight: Messages that were taken and are not acknowledged yet.
-        stale: True if the disk may contain messages that are no longer queued.
+        has_stale_rows: True if the disk may contain messages that are no longer queued.
         disk_state_known: True if the content of the disk is known; if not, the messages in memory are written again.
         stored: Numbers of the messages that are on disk only.
         skip_disk: True to take messages of the tail before stored ones, because the disk cannot be read.
     """
 
-    most: int
+    max_messages: int
     dropped: int = 0
-    next: int = 0
+    next_number: int = 0
     in_flight: dict[int, QueuedMessage] = field(default_factory=dict)
-    stale: bool = False
+    has_stale_rows: bool = False
     disk_state_known: bool = True
     skip_disk: bool = False
     stored: NumberRanges = field(default_factory=NumberRanges)
@@ -59,7 +59,7 @@ class OutboxQueue:
         """Lowest number of a message that is not acknowledged; None if the queue is empty."""
         if self.stored and not self.in_flight and not self._ready:
             return self.stored.first
-        return next((waiting.number for waiting in self._in_memory()), None)
+        return next((queued.number for queued in self._in_memory()), None)
 
     @property
     def can_take(self) -> bool:
@@ -73,9 +73,9 @@ class OutboxQueue:
 
     def put(self, message: Message) -> None:
         """Append a message."""
-        self._tail.append(QueuedMessage(self.next, message))
-        self.next += 1
-        if self.waiting > self.most:
+        self._tail.append(QueuedMessage(self.next_number, message))
+        self.next_number += 1
+        if self.waiting > self.max_messages:
             self._drop_oldest()
         if len(self._tail) > MAX_TAIL:
             self._forget(self._tail.popleft().number)
@@ -86,7 +86,7 @@ class OutboxQueue:
         taken: list[QueuedMessage] = []
         while len(taken) < most and self.can_take:
             taken.append((self._ready or self._tail).popleft())
-        self.in_flight |= {waiting.number: waiting for waiting in taken}
+        self.in_flight |= {queued.number: queued for queued in taken}
         return taken
 
     def acknowledge(self, number: int) -> None:
@@ -102,12 +102,12 @@ class OutboxQueue:
     def unwritten(self) -> list[QueuedMessage]:
         """Return the messages that are in memory only."""
         return [
-            waiting for waiting in self._in_memory() if not self.disk_state_known or waiting.number not in self._written
+            queued for queued in self._in_memory() if not self.disk_state_known or queued.number not in self._written
         ]
 
     def mark_writing(self, rows: Iterable[QueuedMessage]) -> None:
         """Record that messages may be on disk from now on."""
-        self._written.update(waiting.number for waiting in rows)
+        self._written.update(queued.number for queued in rows)
 
     def mark_written(self) -> None:
         """Move the written messages out of the tail: they become ready up to a page, and stored beyond it."""
@@ -123,46 +123,47 @@ class OutboxQueue:
         """Make messages read from disk ready. Stored messages before ``end`` that are not among ``rows`` are lost."""
         wanted = self.stored.take_before(end)
         # the page may contain messages that were dropped while it was read
-        read = {waiting.number: waiting for waiting in rows if waiting.number in wanted}
+        read = {queued.number: queued for queued in rows if queued.number in wanted}
         self._ready.extend(read.values())
         self._written.update(read)
-        self._lose(len(wanted) - len(read))
+        self._count_lost(len(wanted) - len(read))
 
-    def prepend_backlog(self, runs: NumberRanges) -> int:
+    def prepend_backlog(self, ranges: NumberRanges) -> int:
         """Insert messages that an earlier run left on disk before all messages of this run.
 
         Args:
-            runs: Message numbers on disk.
+            ranges: Message numbers on disk.
 
         Returns:
-            Offset from the numbers on disk to those of the queue.
+            Number of a message on disk minus its number in the queue.
         """
-        first = self._tail[0].number if self._tail else self.next  # no message was taken before the backlog was read
-        if not runs:
-            return -first
-        span = runs.end - runs.first
-        self._tail = deque(QueuedMessage(waiting.number + span, waiting.message) for waiting in self._tail)
-        self.next += span
-        self.stored = runs.shifted(first - runs.first)
-        for _ in range(self.waiting - self.most):
+        # before the backlog is read no message is taken, so that all messages of this run are in the tail
+        first = self._tail[0].number if self._tail else self.next_number
+        if not ranges:
+            return -first  # in an empty table, numbers begin at 0
+        span = ranges.end - ranges.first
+        self._tail = deque(QueuedMessage(queued.number + span, queued.message) for queued in self._tail)
+        self.next_number += span
+        self.stored = ranges.shifted(first - ranges.first)
+        for _ in range(self.waiting - self.max_messages):
             self._drop_oldest()
-        return runs.first - first
+        return ranges.first - first
 
-    def retain_stored(self, runs: NumberRanges) -> None:
-        """Remove the stored messages that are not in ``runs``, and count them as lost."""
+    def retain_stored(self, ranges: NumberRanges) -> None:
+        """Remove the stored messages that are not in ``ranges``, and count them as lost."""
         before = len(self.stored)
-        self.stored = self.stored.intersection(runs)
-        self._lose(before - len(self.stored))
+        self.stored = self.stored.intersection(ranges)
+        self._count_lost(before - len(self.stored))
 
     def gaps(self) -> list[tuple[int, int]]:
         """Return ranges of numbers that are no longer queued, as half-open intervals."""
-        in_memory = [range(waiting.number, waiting.number + 1) for waiting in self._in_memory()]
-        gaps, begin = [], LOWEST
-        for run in sorted([*in_memory, *self.stored], key=lambda run: run.start):
-            if begin < run.start:
-                gaps.append((begin, run.start))
-            begin = run.stop
-        return [*gaps, (begin, self.next)] if begin < self.next else gaps
+        in_memory = [range(queued.number, queued.number + 1) for queued in self._in_memory()]
+        gaps, begin = [], MIN_NUMBER
+        for queued in sorted([*in_memory, *self.stored], key=lambda each: each.start):
+            if begin < queued.start:
+                gaps.append((begin, queued.start))
+            begin = queued.stop
+        return [*gaps, (begin, self.next_number)] if begin < self.next_number else gaps
 
     def _in_memory(self) -> Iterator[QueuedMessage]:
         return chain(self.in_flight.values(), self._ready, self._tail)
@@ -171,20 +172,20 @@ class OutboxQueue:
         """Record that the disk contains a message that is no longer queued, if it was written."""
         if number in self._written:
             self._written.discard(number)
-            self.stale = True
+            self.has_stale_rows = True
 
-    def _lose(self, count: int) -> None:
+    def _count_lost(self, count: int) -> None:
         """Count stored messages that cannot be read. Their rows may still exist and are deleted later."""
         if count:
             self.dropped += count
-            self.stale = True
+            self.has_stale_rows = True
 
     def _drop_oldest(self) -> None:
         if self._ready:
             self._forget(self._ready.popleft().number)
         elif self.stored:
             self.stored.pop()
-            self.stale = True
+            self.has_stale_rows = True
         elif self._tail:
             self._forget(self._tail.popleft().number)
         else:

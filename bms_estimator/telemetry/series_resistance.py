@@ -18,7 +18,11 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
     Args:
         estimator: Estimator of a battery, after a sample, with R_s by (4.2).
     """
-    from bms_estimator.calibration.thesis.series_resistance import LOWEST_SOC, fit_series_resistance, summed  # noqa: PLC0415 - most packs do not need it
+    from bms_estimator.calibration.thesis.series_resistance import (  # noqa: PLC0415 - most packs do not need it
+        LOWEST_SOC,
+        fit_series_resistance,
+        series_resistance_from_sums,
+    )
 
     record = estimator.record[0]
     sums = record["series_resistance"]
@@ -28,7 +32,7 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
         missing = f"(4.2) needs a current: none above {smallest_a:.3g} A has flowed"
         return {"r_s_ohm": Parameter(value=None, std=None, valid=False, source="identified", reason=missing)}
     try:
-        fit = fit_series_resistance(summed(record), LOWEST_SOC)
+        fit = fit_series_resistance(series_resistance_from_sums(record), LOWEST_SOC)
     except UserError:  # the swept range of SOC is too small for three parameters: use one mean value
         return {"r_s_ohm": _parameter(float(sums["product_va"].sum()) / square_a2, None)}
     parameters = {f"a{i}": _parameter(*pair) for i, *pair in zip((13, 14, 15), fit.a, fit.std, strict=True)}

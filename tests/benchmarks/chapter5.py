@@ -241,7 +241,7 @@ def outcomes(procedures: list[Procedure]) -> Iterator[tuple[str, str, str, str]]
     """Yield for each claim: key, number of cells that meet it, range of the values, verdict."""
     for key in CLAIMS:
         result = claim(key, procedures)
-        yield key, f"{result.met} of {len(result.results)}", result.span, result.verdict.value
+        yield key, f"{result.captures_met} of {len(result.results)}", result.span, result.verdict.value
 
 
 class FastInStep3(Procedure):
@@ -250,7 +250,7 @@ class FastInStep3(Procedure):
     @property
     def step_3(self) -> list[Capture]:
         """Return all constant loads and the relaxation tests."""
-        return self.of(Kind.CONSTANT, Kind.RELAXATION)
+        return self.captures_of(Kind.CONSTANT, Kind.RELAXATION)
 
 
 class OwnInStep3(FastInStep3):
@@ -315,7 +315,7 @@ def steps_met(procedures: dict[str, Procedure]) -> Iterator[tuple[str, str, str]
     for variant_name, variant in STEP_3_VARIANTS.items():
         changed = {name: variant(p.cell, p.captures, VOLTAGE_STEP_V) for name, p in procedures.items()}
         claims = (claim("steps, mean", [changed[name] for name in names]) for names in (list(changed), ROOM))
-        yield variant_name, *(f"{each_claim.met} of {len(each_claim.results)}" for each_claim in claims)
+        yield variant_name, *(f"{each_claim.captures_met} of {len(each_claim.results)}" for each_claim in claims)
 
 
 def steps_by_variant(procedures: dict[str, Procedure]) -> Table:

@@ -46,7 +46,7 @@ STORE_ID = 10**9
 
 def limits(slot_s: float = SLOT_S) -> Limits:
     """Return the limits with slots in place of hours."""
-    return replace(LIMITS, least_seen_s=MIN_SAMPLED_FRACTION * slot_s)
+    return replace(LIMITS, min_seen_s=MIN_SAMPLED_FRACTION * slot_s)
 
 
 class SlotEstimate(NamedTuple):
@@ -100,7 +100,7 @@ def judged(pack: list[SlotEstimate]) -> list[float]:
     return [
         estimate.error / std[n]
         for n, estimate in enumerate(pack)
-        if any(n + k < std.size and std[n + k] ** 2 < LIMITS.surer * std[n] ** 2 for k in LATER_SLOTS)
+        if any(n + k < std.size and std[n + k] ** 2 < LIMITS.max_variance_ratio * std[n] ** 2 for k in LATER_SLOTS)
     ]
 
 

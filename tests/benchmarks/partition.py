@@ -84,10 +84,10 @@ def _block_us(partition: Partition, blocks: list[bytes]) -> float:
 
 def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
     """Yield the time of each part, on the state before the last block [us]."""
-    work_record, pack_type = partition._work, partition._type_by_pack["pack0"]
+    unpacked, pack_type = partition._unpacked, partition._type_by_pack["pack0"]
     estimator, wall_s = pack_type.estimator, STORE_ID / 1e9 + samples.size
     packed, block, window = partition._packs["pack0"], decode(blocks[-1]), Window()
-    work_record.put(packed)
+    unpacked.load(packed)
     before, trace = estimator.record.copy(), estimator.run(block.samples).copy()
 
     def state() -> bytes:
@@ -107,15 +107,15 @@ def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) ->
 
     restore_us = _call_us(lambda: estimator.record.__setitem__(..., before))
     yield "decoding its bytes", _call_us(lambda: decode(blocks[-1]))
-    yield "unpacking the state of the pack", _call_us(lambda: work_record.put(packed))
+    yield "unpacking the state of the pack", _call_us(lambda: unpacked.load(packed))
     yield "the estimator", _call_us(step) - restore_us
-    yield "the hour's sums", _call_us(lambda: hour_summary.add(work_record.record["hour"], trace, block, estimator))
+    yield "the hour's sums", _call_us(lambda: hour_summary.add(unpacked.record["hour"], trace, block, estimator))
     yield "charge and energy", _call_us(lambda: (pack_type.meter.add(trace), pack_type.meter.update_totals()))
     yield "topic state", _call_us(state)
-    yield "packing the state of the pack", _call_us(work_record.take)
+    yield "packing the state of the pack", _call_us(unpacked.packed_bytes)
     parameters_us = _call_us(lambda: make_parameters_payload(estimator, wall_s).model_dump_json())
     row_us = _call_us(
-        lambda: hour_summary.row(pack_type.settings, HOUR, work_record.record["hour"], estimator).model_dump_json()
+        lambda: hour_summary.row(pack_type.settings, HOUR, unpacked.record["hour"], estimator).model_dump_json()
     )
     yield "topic parameters and the row of an hour, a 60th of it", (parameters_us + row_us) / 60
 

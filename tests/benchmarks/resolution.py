@@ -26,7 +26,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.sampling import Sampling
-from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, WRONG, Case, cell_file, load_a
+from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, SOC_ERRORS, Case, cell_file, load_a
 from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.truth import simulate
 
@@ -123,7 +123,7 @@ def scores(source: Source, *, is_declared: bool = True, seeds: Iterable[int] = S
     """Yield the score of each run of a kind of source."""
     for case in cases_of(source, seeds):
         samples, soc = sample_source(case, source)
-        for soc_error in WRONG:
+        for soc_error in SOC_ERRORS:
             sampling = {"sampling": source.sampling} if is_declared else {}
             estimator = Estimator(
                 cell_file(case),

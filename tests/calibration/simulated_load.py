@@ -15,7 +15,7 @@ MIN_SOC = 0.03
 
 
 def steps(seed=0, duration_s=18_000):
-    """Return a current at 1 Hz of random steps of 20 to 400 s with rests between them [A]. Its mean is about C/5."""
+    """Return a current at 1 Hz of random steps of 20 to 400 s with rests of 1 to 15 min [A]. Its mean is about C/5."""
     rng = np.random.default_rng(seed)
     pieces = [np.zeros(60)]
     while sum(map(len, pieces)) < duration_s:
@@ -29,9 +29,9 @@ def constant(current_a=0.75, duration_s=13_000):
 
 
 def capture(current_a, *, cell=TRUTH, soc=0.98, noise_v=0.5e-3, seed=0):
-    """Return the samples of ``cell`` under ``current_a`` at 1 Hz, until ``MIN_SOC``."""
+    """Return the samples of ``cell`` under ``current_a`` at 1 Hz, from rest at ``soc`` until ``MIN_SOC``."""
     time_s = np.arange(current_a.size, dtype=float)
-    elements = np.zeros(22)
+    elements = np.zeros(22)  # without a16..a21, the OCV is 0
     elements[1:16] = cell.a[1:16]
     rc_and_ohmic_v, true_soc = simulate_cell(
         (soc, 0.0, 0.0), time_s, current_a, 3600.0 * cell.cell.capacity_ah, elements
@@ -46,7 +46,11 @@ def capture(current_a, *, cell=TRUTH, soc=0.98, noise_v=0.5e-3, seed=0):
 
 
 def wrong_start(factor_ohm=1.7, factor_farad=0.6):
-    """Return the true cell with wrong elements: amplitudes and offsets times a factor, exponents times 1.3."""
+    """Return the true cell with wrong elements.
+
+    Amplitudes and offsets of resistances are multiplied by ``factor_ohm`` and those of capacitances by
+    ``factor_farad``. Exponents are multiplied by 1.3.
+    """
     table = TRUTH.model_dump()
     for name, (_, amplitude, offset) in ELEMENTS.items():
         factor = factor_farad if name.startswith("c_") else factor_ohm
@@ -70,19 +74,19 @@ LADDER = Ladder(
 
 
 def ladder_capture(current_a, temperature_c, *, soc=0.98, noise_v=0.5e-3, seed=0, reported_c=None):
-    """Return a capture of ``TRUTH`` with ``LADDER`` as its elements, at a constant temperature.
+    """Return a capture at 1 Hz of ``TRUTH`` with ``LADDER`` as its elements, at a constant temperature.
 
-    The sensor reports ``reported_c`` if given.
+    The temperature sensor reports ``reported_c`` if it is given, and ``temperature_c`` otherwise.
     """
     time_s = np.arange(current_a.size, dtype=float)
     discharged_as = np.r_[0.0, np.cumsum(current_a[:-1])]
     true_soc = soc - discharged_as / (3600.0 * TRUTH.cell.capacity_ah)
     inverse_kelvin_difference = 1.0 / (temperature_c + 273.15) - 1.0 / 298.15
-    # weak and strong dependence on temperature: activation energies of 12 and 45 kJ/mol
+    # Activation energies of the weak and the strong dependence on temperature [J/mol].
     factors = [np.exp(energy_j / GAS_J * inverse_kelvin_difference) for energy_j in (12e3, 45e3)]
     mean_a = 0.5 * (current_a[1:] + current_a[:-1])
     drop_v = np.zeros(time_s.size)
-    for k, tau_s in enumerate((0.0, 1.0, 6.0, 30.0, 120.0, 500.0, 2000.0)):
+    for k, tau_s in enumerate((0.0, 1.0, 6.0, 30.0, 120.0, 500.0, 2000.0)):  # the first is the series resistance
         decay = np.exp(-1.0 / tau_s) if k else 0.0
         filtered_a = np.r_[0.0, lfilter([1.0 - decay], [1.0, -decay], mean_a)] if k else current_a
         for factor, rows in zip(factors, (LADDER.weak_ohm, LADDER.strong_ohm), strict=True):

@@ -1,4 +1,4 @@
-"""Simulated captures of voltage relaxation tests, valid and invalid."""
+"""Simulated captures of voltage relaxation tests, of which some are invalid."""
 
 import numpy as np
 
@@ -20,16 +20,21 @@ def schedule(*, load_a=LOAD_A, load_s=LOAD_S, rest_s=REST_S, rounds=30):
 
 
 def relaxation(**options):
-    """Return samples of a relaxation test of a full cell at 1 Hz, by default with 0.5 mV of noise."""
+    """Return samples of a relaxation test of a full cell at 1 Hz, by default with 0.5 mV of noise.
+
+    ``options`` are those of ``schedule``, and ``noise_v`` and ``seed`` of ``capture``.
+    """
     noise = {key: options.pop(key) for key in ("noise_v", "seed") if key in options}
     return capture(schedule(**options), soc=1.0, **noise)
 
 
 def without_rests():
+    """Return two hours of a constant load."""
     return capture(np.full(7200, LOAD_A), soc=1.0)
 
 
 def rests_too_short():
+    """Return a relaxation test with rests of 20 s."""
     return relaxation(rest_s=20)
 
 
@@ -42,24 +47,28 @@ def glitched(share, seed=5):
 
 
 def mostly_zero():
+    """Return a relaxation test in which 70 % of the voltages are 0 V."""
     return glitched(0.7)
 
 
 def wrong_sign():
+    """Return a relaxation test whose current has the wrong sign."""
     samples = relaxation()
     samples["current_a"] *= -1.0
     return samples
 
 
 def too_few_rests():
+    """Return a relaxation test with five rests."""
     return relaxation(rounds=4)
 
 
 def small_span():
+    """Return a relaxation test over 7 % of the charge."""
     return relaxation(load_s=60, rounds=8)
 
 
-BAD = {
+INVALID_CAPTURES = {
     "no rests": (without_rests, 3.0, "no rests in 1.94 h: the current never falls below 1.500 A"),
     "short rests": (rests_too_short, 3.0, "1 usable rests, at least 6 are needed; 19 others were too short"),
     "wrong sign": (wrong_sign, 3.0, "current has the wrong sign or the capture charges: 0.000 Ah out, 2.9"),

@@ -31,14 +31,15 @@ def simulate_capture(
     rows = np.zeros(current_a.size, dtype=SAMPLE)
     rows["time_s"], rows["temperature_c"] = STEP_S * np.arange(current_a.size), 25.0
     curves = truth.ocv_v, truth.per_kelvin_v, truth.hysteresis_v, truth.ohm
-    voltage_v, _ = simulate(STEP_S, current_a, rows["temperature_c"], soc, 1.0, truth.capacity_ah, *curves)
+    branch = 1.0  # the cell was charged
+    voltage_v, _ = simulate(STEP_S, current_a, rows["temperature_c"], soc, branch, truth.capacity_ah, *curves)
     rows["voltage_v"], rows["current_a"] = np.round(voltage_v, 3), current_a + offset_a
     return rows
 
 
-def load_and_rests_a(swing: float, rests: int = 6, rest_s: float = 2400.0) -> np.ndarray:
-    """Return a current of rests with discharges at C/2 between them, over ``swing`` of SOC in total [A]."""
-    discharge = np.full(round(swing / (rests - 1) * DISCHARGE_S / STEP_S), 0.5 * OXIDE.capacity_ah)
+def load_and_rests_a(soc_span: float, rests: int = 6, rest_s: float = 2400.0) -> np.ndarray:
+    """Return a current of rests with discharges at C/2 between them, which draw ``soc_span`` in total [A]."""
+    discharge = np.full(round(soc_span / (rests - 1) * DISCHARGE_S / STEP_S), 0.5 * OXIDE.capacity_ah)
     rest = np.zeros(round(rest_s / STEP_S))
     return np.concatenate([rest, *(rests - 1) * [discharge, rest]])
 
@@ -49,32 +50,33 @@ def wrong_cell(seed: int = 1) -> CellModel:
 
 
 def capacity_from(rows: SampleBlock, model: CellModel, offset_std_a: float | None = None) -> Capacity:
+    """Return the capacity measured from one capture."""
     return measure_capacity([Columns(rows, "drive")], model, offset_std_a=offset_std_a)
 
 
 def test_the_error_of_the_capacity_matches_its_std() -> None:
     """Twelve cell files and sensors are drawn at random. At mid SOC the error of the OCV dominates."""
-    errors = []
+    errors_over_std = []
     for seed in range(12):
         offset_a = SENSOR_A * np.random.default_rng(seed).standard_normal()
         result = capacity_from(
             simulate_capture(load_and_rests_a(0.8), offset_a=offset_a), wrong_cell(seed), offset_std_a=SENSOR_A
         )
         assert result.std_ah < 0.03 * OXIDE.capacity_ah
-        errors.append((result.capacity_ah - OXIDE.capacity_ah) / result.std_ah)
-    assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.3
-    assert np.abs(errors).max() < 2.6
+        errors_over_std.append((result.capacity_ah - OXIDE.capacity_ah) / result.std_ah)
+    assert 0.4 < np.sqrt(np.mean(np.square(errors_over_std))) < 1.3
+    assert np.abs(errors_over_std).max() < 2.6
 
 
 def test_a_wider_soc_span_gives_a_smaller_std() -> None:
     narrow, wide = (
-        capacity_from(simulate_capture(load_and_rests_a(swing)), wrong_cell()).std_ah for swing in (0.3, 0.8)
+        capacity_from(simulate_capture(load_and_rests_a(soc_span)), wrong_cell()).std_ah for soc_span in (0.3, 0.8)
     )
     assert wide < 0.6 * narrow
 
 
-def test_repeated_socs_determine_the_offset() -> None:
-    """The error of the OCV is equal in discharge and charge, so that a difference is due to the sensor's offset."""
+def test_a_return_to_the_same_socs_determines_the_offset_of_the_current_sensor() -> None:
+    """At one SOC the error of the OCV is the same each time. A difference is therefore due to the offset."""
     down = load_and_rests_a(0.6)
     result = capacity_from(simulate_capture(np.concatenate([down, -down, down]), offset_a=0.02), wrong_cell())
     assert result.offset_std_a < 0.003
@@ -91,11 +93,11 @@ def test_two_captures_give_a_smaller_std_than_one() -> None:
     assert abs(both.capacity_ah - OXIDE.capacity_ah) < 2.5 * both.std_ah
 
 
-def test_a_gap_splits_a_capture() -> None:
+def test_a_gap_splits_a_capture_into_two_parts() -> None:
     """The unmeasured charge in the gap does not change the capacity."""
     rows = simulate_capture(load_and_rests_a(0.8))
-    middle = int(np.flatnonzero(np.abs(rows["current_a"]) > 0.0)[rows.size // 5])
-    with_gap = np.concatenate([rows[:middle], rows[middle + 40 :]])
+    gap_start = int(np.flatnonzero(np.abs(rows["current_a"]) > 0.0)[rows.size // 5])  # during a load
+    with_gap = np.concatenate([rows[:gap_start], rows[gap_start + 40 :]])
     result = capacity_from(with_gap, wrong_cell())
     assert len({a.part for a in result.anchors}) == 2
     assert abs(result.capacity_ah - OXIDE.capacity_ah) < 2.5 * result.std_ah

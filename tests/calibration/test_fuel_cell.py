@@ -1,4 +1,4 @@
-"""Identification of a fuel cell: determined parameters are within their errors, others are rejected."""
+"""Identification of a fuel cell: determined parameters are within their errors, and others are not changed."""
 
 from pathlib import Path
 
@@ -15,28 +15,28 @@ from tests.mann_stack import CURVE_A
 
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
-TRUTH = np.array([1.0, 1.3, 0.9, 1.05, 1.6, 0.8, 1.1, 1.4, *[1.0] * 8])
-"""True parameters relative to those of the file."""
+TRUE_FACTORS = np.array([1.0, 1.3, 0.9, 1.05, 1.6, 0.8, 1.1, 1.4, *[1.0] * 8])
+"""True parameters relative to those of the file, at index 1 to 7."""
 IMPEDANCE_OHM = 0.061
-"""High-frequency resistance of the cell of ``nafion112_oxygen``, 1 cm2, by impedance, from the paper of the data set."""
+"""High-frequency resistance of the cell of ``nafion112_oxygen``, by impedance, from the paper of the data set."""
 
 
 def simulate_sources(truth: FuelCellModel, *, seed: int, highest_a: float = 8.0) -> list[Source]:
-    """Return a curve and a record of 10 s at 500 Hz, simulated by the model with 3 mV of noise."""
+    """Return a polarisation curve and a record of current steps (10 s at 500 Hz) of the model with 3 mV of noise."""
     rng, theta = np.random.default_rng(seed), np.zeros(8)
     time_s, current_a = mann_stack.random_steps(10.0, 500.0, seed=seed, highest_a=highest_a)
-    no_temperature = np.full(CURVE_A.size, np.nan), np.full(time_s.size, np.nan)
-    curve_v, _ = polarisation(truth.a, theta, CURVE_A, no_temperature[0])
-    record_v, _ = open_loop(truth.a, theta, time_s, current_a, no_temperature[1])
+    no_curve_c, no_record_c = np.full(CURVE_A.size, np.nan), np.full(time_s.size, np.nan)  # no temperature
+    curve_v, _ = polarisation(truth.a, theta, CURVE_A, no_curve_c)
+    record_v, _ = open_loop(truth.a, theta, time_s, current_a, no_record_c)
     return [
-        Source("curve", None, CURVE_A, curve_v + rng.normal(0.0, 0.003, CURVE_A.size), no_temperature[0]),
-        Source("steps", time_s, current_a, record_v + rng.normal(0.0, 0.003, time_s.size), no_temperature[1]),
+        Source("curve", None, CURVE_A, curve_v + rng.normal(0.0, 0.003, CURVE_A.size), no_curve_c),
+        Source("steps", time_s, current_a, record_v + rng.normal(0.0, 0.003, time_s.size), no_record_c),
     ]
 
 
 def test_identified_parameters_are_within_their_errors() -> None:
     """Seven parameters of five stacks are identified. Their errors match their std on average and for each parameter."""
-    truth = PEM.identified(PEM.a * TRUTH, {})
+    truth = PEM.identified(PEM.a * TRUE_FACTORS, {})
     errors_over_std = []
     for seed in range(5):
         fit = fit_fuel_cell(simulate_sources(truth, seed=seed), PEM)
@@ -65,7 +65,7 @@ def test_steps_far_from_the_limit_do_not_determine_the_concentration_loss() -> N
 
 
 def test_a_single_current_determines_only_the_total_loss() -> None:
-    """At a single current the losses cannot be separated."""
+    """The losses cannot be separated."""
     record = simulate_sources(PEM, seed=3)[1]
     constant = np.full(record.current_a.size, 3.0)
     voltage_v = np.random.default_rng(0).normal(9.4, 0.003, constant.size)
@@ -80,15 +80,16 @@ def test_data_without_information_are_rejected() -> None:
 
 
 def test_a_stack_with_unmodelled_effects_is_predicted_to_some_millivolts() -> None:
-    """The stack has a drying membrane, delayed oxygen and self-heating.
+    """The stack of ``mann_stack`` has a drying membrane, delayed oxygen and self-heating.
 
-    Parameters from a curve and a minute of steps predict another minute.
+    Parameters fitted to a polarisation curve and a minute of current steps predict another minute.
     """
     curve = mann_stack.curve(CURVE_A)
     sources = [Source("curve", None, curve.current_a, curve.voltage_v, curve.temperature_c)]
     for seed in (1, 5):
-        r = mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=seed), seed=seed).every(5)
-        sources.append(Source(f"steps {seed}", r.time_s, r.current_a, r.voltage_v, r.temperature_c))
+        record = mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=seed), seed=seed).every(5)
+        columns = record.time_s, record.current_a, record.voltage_v, record.temperature_c
+        sources.append(Source(f"steps {seed}", *columns))
     *fitted_sources, other_source = sources
     fit = fit_fuel_cell(fitted_sources, PEM)
     before_v, after_v = (
@@ -98,14 +99,15 @@ def test_a_stack_with_unmodelled_effects_is_predicted_to_some_millivolts() -> No
     assert after_v < 0.016
     assert after_v < before_v
     # The resistance includes other losses than that of the membrane (docs/theory/fuel-cell.md).
-    assert fit.model.fuel_cell.r_ohm > 1.1 * r.r_ohm.mean()
-    assert fit.model.fuel_cell.r_ohm < 1.35 * r.r_ohm.mean()
+    assert fit.model.fuel_cell.r_ohm > 1.1 * record.r_ohm.mean()
+    assert fit.model.fuel_cell.r_ohm < 1.35 * record.r_ohm.mean()
 
 
-def test_a_real_polarisation_curve_gives_the_resistance_of_impedance() -> None:
-    """The cell has H2/O2, Nafion 112, 25 psig and 100 % RH.
+def test_a_real_polarisation_curve_gives_the_resistance_measured_by_impedance() -> None:
+    """The cell of 1 cm2 has hydrogen and oxygen, Nafion 112, 25 psig and 100 % relative humidity.
 
-    Below 0.1 A/cm2 the voltage falls by 50 mV within 34 mA, which does not follow Tafel's equation.
+    Points below 0.1 A/cm2 are not used: there the voltage falls by 50 mV within 34 mA, which does not follow Tafel's
+    equation.
     """
     columns = read_polarisation(DATA / "nafion112_oxygen.csv")
     assert columns is not None

@@ -17,12 +17,13 @@ END_OF_CHARGE_S = 10_085.5
 
 
 def with_series_resistance(extra_ohm):
+    """Return the true cell with an additional series resistance."""
     table = TRUTH.model_dump()
     table["r_s"]["offset_ohm"] += extra_ohm
     return CellModel.model_validate(table)
 
 
-def test_the_true_cell_has_the_noise_as_error():
+def test_the_error_of_the_true_cell_is_the_noise_of_the_voltage():
     result = validate(Columns(capture(steps(), noise_v=1e-3), "steps"), TRUTH)
     assert result.initial_soc == pytest.approx(0.98, abs=1e-3)
     assert result.initial_soc_from == "first rest"
@@ -34,13 +35,14 @@ def test_the_true_cell_has_the_noise_as_error():
 def test_an_additional_series_resistance_is_measured():
     result = validate(Columns(capture(steps(), cell=with_series_resistance(0.005)), "steps"), TRUTH)
     assert result.extra_ohm == pytest.approx(0.005, abs=1e-4)
-    assert result.without_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < result.above.voltage_rms_v
+    assert result.with_extra_ohm.voltage_rms_v < 1e-3 < 3e-3 < result.above.voltage_rms_v
     assert result.resting.voltage_rms_v < 1e-3 < result.loaded.voltage_rms_v
 
 
-def test_temperature_and_hysteresis_are_subtracted_once():
+def test_effects_of_temperature_and_hysteresis_on_the_ocv_are_subtracted_once():
     """A discharge at -15 C is validated with a file that contains hysteresis and temperature coefficient."""
     samples = ladder_capture(steps(), -15.0)
+    # 40 K below 25 C, and the branch after discharge.
     samples["voltage_v"] -= 40.0 * 2e-4 + 0.01 * arrhenius(HYSTERESIS_J, -15.0)
     grid_v = ocv_grid(TRUTH)[0]
     soc = np.linspace(0.0, 1.0, grid_v.size)
@@ -54,7 +56,7 @@ def test_temperature_and_hysteresis_are_subtracted_once():
     result = validate(
         Columns(samples, "cold"), TRUTH.model_copy(update={"ocv": ocv, "ladder": LADDER}), initial_soc=0.98
     )
-    after_transition = (result.soc < 0.7) & (result.soc > 0.35)
+    after_transition = (result.soc < 0.7) & (result.soc > 0.35)  # of the hysteresis
     assert np.sqrt(np.mean(result.error_v[after_transition] ** 2)) < 1.5e-3
 
 
@@ -65,13 +67,13 @@ def test_a_given_initial_soc_is_used():
     assert result.above.voltage_rms_v > 10e-3
 
 
-def test_a_capture_that_starts_under_load_starts_at_its_voltage_with_the_ohmic_drop():
+def test_the_initial_soc_of_a_capture_that_starts_under_load_considers_the_ohmic_drop():
     result = validate(Columns(capture(constant(), soc=0.8), "constant"), TRUTH)
     assert result.initial_soc_from == "first sample under load"
     assert result.initial_soc == pytest.approx(0.8, abs=0.005)
 
 
-def test_samples_below_soc_0_1_are_only_in_the_total_error():
+def test_samples_below_soc_0_1_count_only_in_the_error_over_all_samples():
     result = validate(Columns(capture(steps()), "steps"), TRUTH)
     assert result.all.samples == result.time_s.size == result.error_v.size
     assert result.above.samples == int((result.soc > 0.1).sum()) < result.all.samples
@@ -110,6 +112,7 @@ def test_a_wrong_sign_causes_a_warning_with_its_size():
 
 
 def test_simulation_continues_below_delta2_and_below_empty():
+    """Below delta2, the lowest SOC of the observer, the capacitance C_tl of the formula is negative."""
     current_a = np.r_[np.zeros(10), np.full(9000, 1.3)]
     samples = capture(current_a, soc=0.98)
     with_discharge_below_empty = np.concatenate([samples, samples[-600:]])
@@ -134,9 +137,9 @@ def test_errors_of_the_leaf_cell_on_its_own_pulses(data):
     result = validate(load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz"), load_cell("leaf"))
     assert (result.initial_soc, result.final_soc) == pytest.approx((1.0, 0.001), abs=0.0005)
     assert (result.above.samples, result.all.samples) == (11715, 13000)
-    above, all_soc = (
-        (1e3 * errors.voltage_rms_v, errors.mean_abs_percent, errors.max_abs_percent)
+    above_soc_0_1, all_samples = (
+        (1e3 * errors.voltage_rms_v, errors.mean_abs_percent, errors.max_abs_percent)  # [mV], [%], [%]
         for errors in (result.above, result.all)
     )
-    assert above == pytest.approx((6.45, 0.0999, 0.915), rel=0.005)
-    assert all_soc == pytest.approx((16.14, 0.1996, 4.644), rel=0.005)
+    assert above_soc_0_1 == pytest.approx((6.45, 0.0999, 0.915), rel=0.005)
+    assert all_samples == pytest.approx((16.14, 0.1996, 4.644), rel=0.005)

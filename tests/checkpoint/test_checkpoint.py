@@ -1,6 +1,7 @@
-"""Checkpoints: restored for their pack, after any change of settings or version."""
+"""Checkpoints: a pack's state is saved, and restored after changes of settings or version."""
 
 import asyncio
+import errno
 import itertools
 import os
 import stat
@@ -38,12 +39,13 @@ NEW_COUNTERS = RunCounters(0, new_totals(0.0))
 
 
 def edit_settings(section: str, **values: Any) -> Settings:
+    """Return ``SETTINGS`` with these values in one section."""
     tables = SETTINGS.model_dump(by_alias=True, exclude_none=True)
     return Settings.model_validate(tables | {section: tables[section] | values})
 
 
 def learned_estimator() -> Estimator:
-    """Return an estimator with a learned state."""
+    """Return an estimator after ten minutes of load, with a map of elements."""
     estimator = new_estimator(SETTINGS, CELL)
     for i in range(600):
         estimator.step(float(i), 0.3 * (i // 60 % 2), 3.8)
@@ -57,13 +59,13 @@ class RunResult:
 
     estimator: Estimator
     health: Health
-    """The first publication, with the result of reading the checkpoint."""
+    """First published health message, which contains the result of reading the checkpoint."""
 
 
 async def run_samples(
     folder: Path, settings: Settings = SETTINGS, cell: CellModel = CELL, current_a: float = 0.275, samples: int = 361
 ) -> RunResult:
-    """Run the service over samples at 1 Hz and ``current_a``; the default discharges a tenth of the capacity."""
+    """Run the service over samples at 1 Hz with ``current_a``. By default they draw a tenth of the capacity."""
     source, sink = ScriptedSource(), Collector()
     source.give(*((float(i), current_a, 3.8 * cell.cell.series_count) for i in range(samples)))
     source.finish()
@@ -75,11 +77,12 @@ async def run_samples(
     return RunResult(estimator, sink.snapshots[0].health)
 
 
-async def test_restart_continues_from_the_checkpoint(tmp_path: Path) -> None:
+async def test_a_restart_continues_from_the_checkpoint(tmp_path: Path) -> None:
     first = await run_samples(tmp_path)
     assert first.estimator.state["soc_coulomb"][0] == pytest.approx(0.4)
     second = await run_samples(tmp_path, samples=2)  # the board's clock starts from zero again
-    unseen_s = second.estimator.record["unseen_s"][0]  # the load counts as continued over the gap
+    # The load is assumed to continue during the gap, which lasts ``unseen_s``.
+    unseen_s = second.estimator.record["unseen_s"][0]
     assert 0.0 < unseen_s < LONG_S
     assert second.estimator.state["soc_coulomb"][0] == pytest.approx(0.4 - (unseen_s + 1.0) / 3600.0, abs=1e-9)
     assert second.estimator.state["samples"][0] == 2
@@ -87,7 +90,7 @@ async def test_restart_continues_from_the_checkpoint(tmp_path: Path) -> None:
     assert second.health.checkpoint == f"restored: SOC {first.estimator.state['soc'][0]:.4f}"
 
 
-async def test_restart_continues_without_the_identifier(tmp_path: Path) -> None:
+async def test_a_restart_continues_from_the_checkpoint_without_the_identifier(tmp_path: Path) -> None:
     without_identifier = edit_settings("identifier", enabled=False)
     await run_samples(tmp_path, without_identifier)
     second = await run_samples(tmp_path, without_identifier, samples=2)
@@ -96,12 +99,14 @@ async def test_restart_continues_without_the_identifier(tmp_path: Path) -> None:
     assert second.estimator.state["soc"][0] == pytest.approx(0.4 - (unseen_s + 1.0) / 3600.0, abs=1e-9)
 
 
-async def test_gap_lasts_until_the_first_valid_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_gap_of_a_restart_lasts_until_the_first_valid_sample(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     await run_samples(tmp_path)
     monkeypatch.setattr(live_loop, "since_boot", itertools.count().__next__)  # each call advances by a second
     source = ScriptedSource()
     for i in range(40):
-        source.give((0.1 * i, 0.0, 9.9))
+        source.give((0.1 * i, 0.0, 9.9))  # an implausible voltage
     source.give((5.0, 0.275, 3.8))
     source.finish()
     checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
@@ -126,7 +131,7 @@ async def test_gap_lasts_until_the_first_valid_sample(tmp_path: Path, monkeypatc
     ],
     ids=lambda settings: str(settings.model_dump(exclude_defaults=True)),
 )
-async def test_learned_state_is_restored_under_edited_settings(tmp_path: Path, settings: Settings) -> None:
+async def test_a_learned_state_is_restored_after_a_change_of_settings(tmp_path: Path, settings: Settings) -> None:
     learned = learned_estimator()
     CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW_COUNTERS)
     run = await run_samples(tmp_path, settings, samples=1)
@@ -134,7 +139,9 @@ async def test_learned_state_is_restored_under_edited_settings(tmp_path: Path, s
     assert run.estimator.record["map"].tobytes() == learned.record["map"].tobytes()
 
 
-async def test_adaptive_law_is_restored_only_under_its_own_settings(tmp_path: Path) -> None:
+async def test_parameters_of_the_learning_law_are_restored_only_under_the_same_settings_of_the_observer(
+    tmp_path: Path,
+) -> None:
     settings = edit_settings("observer", law="learning")
     learned = new_estimator(settings, CELL)
     for i in range(3600):
@@ -149,19 +156,21 @@ async def test_adaptive_law_is_restored_only_under_its_own_settings(tmp_path: Pa
     assert not relearned.estimator.record[0]["learning"]["theta"].any()
 
 
-async def test_checkpoint_without_the_fields_of_the_adaptive_law_is_restored(tmp_path: Path) -> None:
+async def test_a_checkpoint_without_the_fields_of_the_learning_law_is_restored(tmp_path: Path) -> None:
     learned = learned_estimator()
     file = CheckpointFile(tmp_path, SETTINGS, CELL)
     file.save(learned.record, NEW_COUNTERS)
     with np.load(file.path) as saved:
         state = saved["state"]
-        before = dict(saved) | {"state": repack_fields(state[[n for n in state.dtype.names if n != "learning"]])}
-    np.savez(file.path, **before)
+        without_learning = dict(saved) | {
+            "state": repack_fields(state[[n for n in state.dtype.names if n != "learning"]])
+        }
+    np.savez(file.path, **without_learning)
     run = await run_samples(tmp_path, edit_settings("observer", law="learning"), samples=1)
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
 
 
-async def test_learned_state_is_restored_under_an_edited_description(tmp_path: Path) -> None:
+async def test_a_learned_state_is_restored_after_a_change_of_the_cells_name_and_description(tmp_path: Path) -> None:
     learned = learned_estimator()
     CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW_COUNTERS)
     described = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"name": "mine", "description": "new"})})
@@ -169,21 +178,23 @@ async def test_learned_state_is_restored_under_an_edited_description(tmp_path: P
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
 
 
-def test_identity_depends_on_cell_layout_capacity_curve_and_sign() -> None:
+def test_the_identity_of_a_pack_depends_on_number_of_cells_capacity_ocv_and_sign_of_the_current() -> None:
     original = pack_identity(SETTINGS, CELL)
     larger = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"capacity_ah": 3.0})})
-    curve = CELL.model_copy(update={"ocv": CELL.ocv.model_copy(update={"constant_v": 3.7})})
+    other_ocv = CELL.model_copy(update={"ocv": CELL.ocv.model_copy(update={"constant_v": 3.7})})
     reversed_sign = edit_settings("sensor", current_sign="charge_positive")
-    others = [pack_identity(SETTINGS, cell) for cell in (larger, curve, CELL.pack(2, 1), CELL.pack(1, 2))]
+    others = [pack_identity(SETTINGS, cell) for cell in (larger, other_ocv, CELL.pack(2, 1), CELL.pack(1, 2))]
     assert len({original, *others, pack_identity(reversed_sign, CELL)}) == 6
 
 
-def test_known_fields_of_another_version_are_restored() -> None:
+def test_known_fields_of_a_checkpoint_of_another_version_are_restored() -> None:
+    """The other version lacks two fields, has another shape of one, and has one that this version does not know."""
     saved, fresh, estimator = learned_estimator(), new_estimator(SETTINGS, CELL), new_estimator(SETTINGS, CELL)
     fresh.step(0.0, 0.0, CELL.cell.nominal_voltage_v)
-    later = {name: field for name, field in fields(saved.record) if name not in ("checks.good_soc", "map.dwell_s")}
-    later |= {"filter.ohm": np.zeros((1, 99)), "map.of_a_later_version": np.ones(3)}
-    assert restore_state(estimator, later, 0.0) == ""
+    of_other_version = dict(fields(saved.record))
+    del of_other_version["checks.good_soc"], of_other_version["map.dwell_s"]
+    of_other_version |= {"filter.ohm": np.zeros((1, 99)), "map.of_a_later_version": np.ones(3)}
+    assert restore_state(estimator, of_other_version, 0.0) == ""
     assert estimator.state["soc"][0] == saved.state["soc"][0]
     assert (estimator.record["map"]["weight"] == saved.record["map"]["weight"]).all()
     assert estimator.record["checks"]["good_soc"] == fresh.record["checks"]["good_soc"]
@@ -191,12 +202,10 @@ def test_known_fields_of_another_version_are_restored() -> None:
     assert estimator.record["filter"]["ohm"].shape == fresh.record["filter"]["ohm"].shape
 
 
-def test_filter_states_of_an_earlier_version_are_restored() -> None:
-    """Restore filter states without the OCV states, which a later version added.
-
-    The OCV states start with their prior; capacity and offset have the restored covariance.
-    """
+def test_filter_states_of_a_version_without_ocv_states_are_restored() -> None:
+    """The OCV states start with their prior. All other states have the restored mean and covariance."""
     learned = learned_estimator()
+    # Number of last axes whose size is the number of states.
     truncated_axes = {"filter.mean": 1, "filter.covariance": 2, "checks.good_mean": 1, "checks.good_covariance": 2}
     saved = dict(fields(learned.record.copy()))
     for name, axes in truncated_axes.items():
@@ -204,16 +213,16 @@ def test_filter_states_of_an_earlier_version_are_restored() -> None:
     estimator = new_estimator(SETTINGS, CELL)
     assert restore_state(estimator, saved, 1.0) == ""
     learned.resume(1.0)
-    restored, expected = (each.record[0]["filter"] for each in (estimator, learned))
+    restored, expected = estimator.record[0]["filter"], learned.record[0]["filter"]
     assert np.array_equal(restored["covariance"][:, :NODE, :NODE], expected["covariance"][:, :NODE, :NODE])
     assert np.array_equal(restored["mean"][:, :NODE], expected["mean"][:, :NODE])
     for q in range(restored["count"]):
         assert (restored["mean"][q, NODE:] == 0.0).all()
         assert (np.diag(restored["covariance"][q])[NODE:] == 1.0).all()
     assert np.linalg.eigvalsh(restored["covariance"][0]).min() > -1e-12
-    good = estimator.record[0]["checks"]["good_mean"]
-    assert np.array_equal(good[:NODE], saved["filter.mean"][0, restored["best"]])
-    assert (good[NODE:] == 0.0).all()
+    good_mean = estimator.record[0]["checks"]["good_mean"]
+    assert np.array_equal(good_mean[:NODE], saved["filter.mean"][0, restored["best"]])
+    assert (good_mean[NODE:] == 0.0).all()
 
 
 def save_as(
@@ -223,14 +232,14 @@ def save_as(
     monkeypatch: pytest.MonkeyPatch,
     counters: RunCounters = NEW_COUNTERS,
 ) -> None:
-    """Save a checkpoint of another format."""
+    """Save a checkpoint with the number ``version`` of its format."""
     with monkeypatch.context() as patch:
         patch.setattr("bms_estimator.checkpoint.checkpoint_file.FORMAT", version)
         file.save(estimator.record, counters)
 
 
 @pytest.mark.parametrize("damage", ["other cell", "nan", "range", "truncated", "garbage", "earlier", "pipe"])
-async def test_invalid_checkpoint_is_rejected_with_the_reason(
+async def test_an_invalid_checkpoint_is_set_aside_with_the_reason(
     tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL)
@@ -273,7 +282,8 @@ async def test_each_cell_has_its_own_checkpoint(tmp_path: Path) -> None:
     assert last.state["soc_coulomb"][0] == pytest.approx(0.3 - last.record["unseen_s"][0] / 3600.0, abs=1e-6)
 
 
-def test_number_of_checkpoints_of_a_pack_is_bounded(tmp_path: Path) -> None:
+def test_the_oldest_checkpoints_of_a_pack_name_are_removed_above_the_maximum_number(tmp_path: Path) -> None:
+    """A pack has one checkpoint for each cell model. Those of another pack are not removed."""
     estimator = new_estimator(SETTINGS, CELL)
     (tmp_path / "pack-2-0123abcd.npz").write_bytes(b"of another pack")
     for series in range(1, MAX_FILES + 4):
@@ -286,7 +296,7 @@ def test_number_of_checkpoints_of_a_pack_is_bounded(tmp_path: Path) -> None:
     assert CheckpointFile(tmp_path, SETTINGS, CELL).path.name not in names
 
 
-def test_file_is_private_and_symlinks_are_not_followed(tmp_path: Path) -> None:
+def test_a_checkpoint_is_private_and_a_symlink_at_its_temporary_name_is_not_followed(tmp_path: Path) -> None:
     file, victim = CheckpointFile(tmp_path, SETTINGS, CELL), tmp_path / "victim"
     victim.write_text("precious")
     file.path.with_suffix(".new").symlink_to(victim)
@@ -296,11 +306,12 @@ def test_file_is_private_and_symlinks_are_not_followed(tmp_path: Path) -> None:
 
 
 def offset_covariance(estimator: Estimator) -> np.ndarray:
+    """Return the covariance of the current sensor's offset with each state."""
     f = estimator.record[0]["filter"]
     return np.asarray(f["covariance"][f["best"], OFFSET])
 
 
-def test_offset_that_becomes_a_state_starts_as_configured() -> None:
+def test_an_offset_that_was_disabled_starts_with_the_configured_std_and_vice_versa() -> None:
     before = new_estimator(edit_settings("identifier", current_offset_std_a=0.0), CELL)
     before.step(0.0, 0.1, 3.8)
     after = new_estimator(edit_settings("identifier", current_offset_std_a=0.1), CELL)
@@ -311,7 +322,7 @@ def test_offset_that_becomes_a_state_starts_as_configured() -> None:
     assert not offset_covariance(before).any()
 
 
-def test_identifier_that_is_switched_on_starts_at_the_counted_soc() -> None:
+def test_an_identifier_that_was_disabled_starts_at_the_counted_soc() -> None:
     counted = new_estimator(edit_settings("identifier", enabled=False), CELL)
     counted.step(0.0, 0.1, 3.8)
     identifying = new_estimator(SETTINGS, CELL)
@@ -324,7 +335,7 @@ def test_identifier_that_is_switched_on_starts_at_the_counted_soc() -> None:
 
 @asynccontextmanager
 async def run_with_frequent_saves(checkpoint: CheckpointFile) -> AsyncIterator[tuple[ScriptedSource, Collector, Any]]:
-    """Run the service with a save every 20 ms."""
+    """Run the service with a save every 20 ms; yield its source, its sink and its task."""
     settings = SETTINGS.model_copy(update={"state": SETTINGS.state.model_copy(update={"checkpoint_s": 0.02})})
     source, sink = ScriptedSource(), Collector()
     task = asyncio.create_task(
@@ -335,17 +346,17 @@ async def run_with_frequent_saves(checkpoint: CheckpointFile) -> AsyncIterator[t
     await asyncio.wait_for(task, LONG_S)
 
 
-async def test_final_save_waits_for_a_running_save(tmp_path: Path) -> None:
-    slow, began, release, saves = threading.Lock(), threading.Event(), threading.Event(), []
+async def test_the_final_save_waits_for_a_running_save(tmp_path: Path) -> None:
+    saving, began, release, saved_samples = threading.Lock(), threading.Event(), threading.Event(), []
 
     class SlowDisk(CheckpointFile):
         def save(self, state: Any, counters: RunCounters) -> None:
-            assert slow.acquire(blocking=False), "two saves at once"
+            assert saving.acquire(blocking=False), "two saves at once"
             began.set()
             assert release.wait(LONG_S)
             super().save(state, counters)
-            saves.append(int(state["observer"]["samples"][0]))
-            slow.release()
+            saved_samples.append(int(state["observer"]["samples"][0]))
+            saving.release()
 
     file = SlowDisk(tmp_path, SETTINGS, CELL)
     async with run_with_frequent_saves(file) as (source, sink, task):
@@ -358,16 +369,16 @@ async def test_final_save_waits_for_a_running_save(tmp_path: Path) -> None:
         assert not task.done()
         release.set()
         last = await asyncio.wait_for(task, LONG_S)
-    assert saves == [1, 2]
+    assert saved_samples == [1, 2]
     state = file.load().state
     for name, field in fields(last.record):
         assert state[name].tobytes() == field.tobytes()
 
 
-async def test_changes_of_soc_are_saved_for_any_checkpoint_interval(
+async def test_changes_of_the_soc_are_saved_before_a_long_checkpoint_interval_has_passed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Expect a save at the first sample, and at each SOC change of 0.28 %."""
+    """The first sample and each SOC change of 0.28 % cause a save. The checkpoint interval is 1e6 s."""
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     saved: asyncio.Queue[float] = asyncio.Queue()
     loop = asyncio.get_running_loop()
@@ -397,7 +408,7 @@ async def test_changes_of_soc_are_saved_for_any_checkpoint_interval(
             checkpoint=ReportingFile(tmp_path, settings, CELL),
         )
     )
-    # otherwise the first sample may arrive before the first call of _save
+    # Otherwise, the first sample may arrive before the first call of _save.
     await asyncio.wait_for(first_call.wait(), LONG_S)
     for i in range(4):
         source.give((i * 10.0, 0.275, 3.8))  # 0.28 % of the capacity in 10 s
@@ -407,8 +418,8 @@ async def test_changes_of_soc_are_saved_for_any_checkpoint_interval(
     await asyncio.wait_for(task, LONG_S)
 
 
-async def test_failed_save_is_reported_and_does_not_end_the_loop(tmp_path: Path) -> None:
-    (tmp_path / "state").write_text("no folder")
+async def test_a_failed_save_is_reported_and_does_not_end_the_loop(tmp_path: Path) -> None:
+    (tmp_path / "state").write_text("a file instead of the folder")
     file = CheckpointFile(tmp_path / "state", SETTINGS, CELL)
     async with run_with_frequent_saves(file) as (source, sink, _):
         source.give((0.0, 0.1, 3.8))
@@ -417,14 +428,16 @@ async def test_failed_save_is_reported_and_does_not_end_the_loop(tmp_path: Path)
         await sink.until(lambda s: s.health.samples["samples"] == 2)
 
 
-async def test_full_disk_is_not_retried_repeatedly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_save_on_a_full_disk_is_not_retried_at_each_change_of_the_soc(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     attempts = []
 
     class FullDiskFile(CheckpointFile):
         def save(self, state: Any, counters: RunCounters) -> None:
             attempts.append((state, counters))
-            raise OSError(28, "No space left on device")
+            raise OSError(errno.ENOSPC, "No space left on device")
 
     settings = Settings.model_validate(
         SETTINGS.model_dump(by_alias=True, exclude_none=True) | {"state": {"checkpoint_s": 1e6}}
@@ -442,33 +455,33 @@ async def test_full_disk_is_not_retried_repeatedly(tmp_path: Path, monkeypatch: 
     assert len(attempts) <= 2  # the first attempt, and one at shutdown
 
 
-async def test_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bms_estimator.service.publisher.SLOW_S", 0.05)
-    states = []
+    saved_samples = []
 
     class CountingFile(CheckpointFile):
         def save(self, state: Any, counters: RunCounters) -> None:
             super().save(state, counters)
-            states.append(state["observer"]["samples"][0])
+            saved_samples.append(state["observer"]["samples"][0])
 
     async with run_with_frequent_saves(CountingFile(tmp_path, SETTINGS, CELL)) as (source, sink, _):
         for second in range(2):
             source.give((float(second), 0.1, 3.8))
             source.give((float(second), 0.1, 9.9))  # dropped, because its voltage is implausible
-            await sink.until(lambda s, n=second + 1: s.health.checkpoint == "saved" and n in states)
-            at_s = sink.snapshots[-1].health.uptime_s
-            await sink.until(lambda s, at_s=at_s: s.health.uptime_s > at_s + 0.2)
-    assert states == [1, 2]
+            await sink.until(lambda s, n=second + 1: s.health.checkpoint == "saved" and n in saved_samples)
+            saved_s = sink.snapshots[-1].health.uptime_s
+            await sink.until(lambda s, saved_s=saved_s: s.health.uptime_s > saved_s + 0.2)  # ten intervals
+    assert saved_samples == [1, 2]
 
 
-async def test_state_is_saved_when_an_error_ends_the_loop(tmp_path: Path) -> None:
-    class Broken(ScriptedSource):
+async def test_the_state_is_saved_when_an_error_ends_the_loop(tmp_path: Path) -> None:
+    class FailingSource(ScriptedSource):
         async def __aiter__(self) -> AsyncIterator[Any]:
             async for block in super().__aiter__():
                 yield block
             raise ZeroDivisionError
 
-    source, file = Broken(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    source, file = FailingSource(), CheckpointFile(tmp_path, SETTINGS, CELL)
     source.give((0.0, 0.1, 3.8))
     source.finish()
     with pytest.raises(ZeroDivisionError):
@@ -478,12 +491,13 @@ async def test_state_is_saved_when_an_error_ends_the_loop(tmp_path: Path) -> Non
     assert content.counters.total.crashes == 1
 
 
-async def test_final_save_does_not_wait_for_a_slow_broker(tmp_path: Path) -> None:
-    saved = []
+async def test_the_final_save_does_not_wait_for_a_slow_broker(tmp_path: Path) -> None:
+    """The checkpoint exists when the sink is closed, which may take long."""
+    is_saved_at_close = []
 
     class SlowBroker(Collector):
         async def __aexit__(self, *_: object) -> None:
-            saved.append(file.path.exists())
+            is_saved_at_close.append(file.path.exists())
 
     source, sink = ScriptedSource(), SlowBroker()
     source.give((0.0, 0.1, 3.8))
@@ -491,5 +505,5 @@ async def test_final_save_does_not_wait_for_a_slow_broker(tmp_path: Path) -> Non
     file = CheckpointFile(tmp_path, SETTINGS, CELL)
     running = run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=file)
     await asyncio.wait_for(running, LONG_S)
-    assert saved == [True]
+    assert is_saved_at_close == [True]
     assert sink.snapshots[-1].health.checkpoint == "saved"

@@ -1,4 +1,4 @@
-"""Identities of saved files. A refactoring that changes an identity would discard every pack's state."""
+"""Identities of saved files. A change of the code that changes an identity would discard every pack's state."""
 
 from pathlib import Path
 from typing import Any
@@ -17,33 +17,35 @@ from bms_estimator.settings.pack import Settings
 
 CHECKPOINT_FILE = Path(__file__).with_name("checkpoint_format_7.npz")
 """State after 30 min of a simulated ``chen_mora`` cell under current steps; SOC 0.3710."""
-IDENTIFYING = {"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}}
+WITH_IDENTIFIER = {"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}}
 COULOMB_COUNTING = {"sensor": {"current_sign": "charge_positive"}, "identifier": {"enabled": False}}
 
 
 @pytest.mark.parametrize(
-    ("settings", "cell", "pack", "observer", "fleet"),
+    ("settings", "cell", "pack_id", "observer_id", "fleet_digest"),
     [
-        (IDENTIFYING, load_any("chen_mora"), "5613cbc091ec7ec4", "77ac24e88a0d1f8b", 7982649347889426607),
+        (WITH_IDENTIFIER, load_any("chen_mora"), "5613cbc091ec7ec4", "77ac24e88a0d1f8b", 7982649347889426607),
         (COULOMB_COUNTING, load_cell("leaf").pack(2, 3), "1f291d5895e57362", "06eca6aa573c6d46", 18356988707096645357),
         ({}, load_any("pem_30w"), "c5d3c64ecb5da3be", "443c82b27a91fe8c", 7478971766825826181),
     ],
     ids=["chen_mora", "leaf", "pem_30w"],
 )
-def test_identity_is_unchanged(settings: dict[str, Any], cell: PackModel, pack: str, observer: str, fleet: int) -> None:
-    checked = Settings.model_validate(settings)
-    assert pack_identity(checked, cell).startswith(pack)
-    assert observer_identity(checked, cell).startswith(observer)
-    assert config_digest(checked, cell)[0] == fleet
+def test_identities_and_digest_are_those_of_released_versions(
+    settings: dict[str, Any], cell: PackModel, pack_id: str, observer_id: str, fleet_digest: int
+) -> None:
+    validated = Settings.model_validate(settings)
+    assert pack_identity(validated, cell).startswith(pack_id)
+    assert observer_identity(validated, cell).startswith(observer_id)
+    assert config_digest(validated, cell)[0] == fleet_digest
 
 
-def test_state_has_the_fields_of_format_7() -> None:
+def test_the_state_has_the_fields_of_checkpoint_format_7() -> None:
     with np.load(CHECKPOINT_FILE) as file:
         assert file["state"].dtype == ESTIMATOR_STATE
 
 
-def test_checkpoint_of_format_7_is_restored(tmp_path: Path) -> None:
-    settings, cell = Settings.model_validate(IDENTIFYING), load_any("chen_mora")
+def test_a_checkpoint_of_format_7_is_restored(tmp_path: Path) -> None:
+    settings, cell = Settings.model_validate(WITH_IDENTIFIER), load_any("chen_mora")
     with np.load(CHECKPOINT_FILE) as file:
         minute_later = BootTimestamp(float(file["wall_s"]) + 60.0, True, 0.0, "another boot")
     checkpoint = CheckpointFile(tmp_path, settings, cell, lambda: minute_later)

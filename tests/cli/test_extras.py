@@ -1,4 +1,4 @@
-"""Sources with optional libraries: errors for missing ones name the extra."""
+"""Sources that need an optional library: the error about a missing library names the extra to install."""
 
 import sys
 from pathlib import Path
@@ -7,8 +7,6 @@ import pytest
 
 from bms_estimator.sources.factory import KINDS
 from tests.command_line import run
-
-V, I = "voltage = { id = 1 }", "current = { id = 2 }"  # noqa: E741
 
 
 @pytest.mark.parametrize(
@@ -27,9 +25,9 @@ def test_missing_package_is_reported_with_its_extra(
     package: str,
     extra: str,
 ) -> None:
-    for module in [*KINDS.values(), "fieldbus.can_signals"]:
+    for module in [*KINDS.values(), "fieldbus.can_signals"]:  # they are imported again
         monkeypatch.delitem(sys.modules, f"bms_estimator.sources.{module}", raising=False)
-    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setitem(sys.modules, package, None)  # its import fails
     pack = tmp_path / "pack.toml"
     pack.write_text(f"[source]\n{source}\n")
     code, _, err = run(capsys, "record", "--pack", pack, tmp_path / "out.bmsraw")

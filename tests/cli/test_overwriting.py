@@ -12,6 +12,7 @@ from tests.calibration.simulated_relaxation import relaxation
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
+    """Write a capture of a simulated cell with rests."""
     path = tmp_path_factory.mktemp("capture") / "rests.csv"
     rows = relaxation()[["time_s", "current_a", "voltage_v"]]
     np.savetxt(path, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
@@ -19,15 +20,15 @@ def capture(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("command", "options", "name"),
+    ("command", "options", "out_name"),
     [
         ("replay", ("--cell", "ncr18650"), "out.csv"),
         ("ocv", ("--capacity-ah", "3"), "out.toml"),
         ("identify", ("--cell", "ncr18650", "--keep-ocv"), "out.toml"),
     ],
 )
-def test_existing_file_is_replaced_only_with_force(command, options, name, capture, tmp_path, capsys):
-    out = tmp_path / name
+def test_existing_file_is_replaced_only_with_force(command, options, out_name, capture, tmp_path, capsys):
+    out = tmp_path / out_name
     out.write_text("# measured in May\n")
     arguments = [command, str(capture), *options, "--out", str(out)]
     with pytest.raises(SystemExit) as ended:

@@ -129,9 +129,8 @@ async def test_the_printed_mosquitto_sub_command_shows_all_topics_of_the_packs(f
         pytest.skip("mosquitto_sub is not installed (apt install mosquitto-clients)")
     async with DemoBroker(free_port) as broker, aiomqtt.Client("127.0.0.1", free_port) as service:
         await publish_all(service)
-        process = await asyncio.create_subprocess_shell(
-            f"{broker.look_command} -C 3", stdout=asyncio.subprocess.PIPE
-        )  # -C: exit after three messages
+        command = f"{broker.subscribe_command} -C 3"  # -C: exit after three messages
+        process = await asyncio.create_subprocess_shell(command, stdout=asyncio.subprocess.PIPE)
         async with asyncio.timeout(LONG_S):
             shown, _ = await process.communicate()
         words = shown.decode().split()  # topic and payload in turn

@@ -11,8 +11,11 @@ DEPLOY = Path(__file__).parents[2] / "deploy"
 
 
 @pytest.fixture
-def program() -> Callable[[str], str]:
-    """Return a function that returns the path of a program. Without the program it skips the test and names the Debian package."""
+def find_program() -> Callable[[str], str]:
+    """Return a function that takes the names of a program and of its Debian package, and returns the program's path.
+
+    It skips the test if the program is not installed.
+    """
 
     def find(name: str, package: str) -> str:
         path = shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin:/sbin")
@@ -25,4 +28,5 @@ def program() -> Callable[[str], str]:
 
 @pytest.fixture
 def deploy() -> Path:
+    """Return the folder with the files to deploy."""
     return DEPLOY

@@ -1,5 +1,6 @@
 #!/bin/sh
-# Runs inside the container: exposes the service to faults, and reports each part under a name.
+# Runs inside the container as root: installs the service, exposes it to faults, and uninstalls it. The report has a
+# headline with the name of each part. test_boot.py checks the report.
 part() { echo "== $1"; }
 until_true() { # reports a timeout, which the tests detect
     for _ in $(seq 300); do eval "$1" >/dev/null 2>&1 && return; sleep 0.1; done
@@ -7,6 +8,7 @@ until_true() { # reports a timeout, which the tests detect
 }
 show() { systemctl show bms-estimator -p ActiveState,NRestarts,Result,StatusText,User; }
 main_pid() { systemctl show "${1:-bms-estimator}" -P MainPID; }
+# runs commands of the documentation, with the replaced programs of boot.py first in the path
 run_page() { PATH="/root/bin:$PATH" bash -ex "$1"; }
 lines() { journalctl --no-pager -o cat -u "${1:-bms-estimator}"; }
 cache=/var/cache/private/bms-estimator
@@ -16,6 +18,7 @@ mosquitto_passwd -b /root/bms.passwd pack "$(cat /root/mqtt-password)"
 mosquitto_passwd -b /root/bms.passwd second "$(cat /root/mqtt-password)"
 mosquitto_passwd -b /root/bms.passwd dashboard two
 systemd-run --quiet --unit=broker mosquitto -c /root/bms.conf
+# a simulated board, which prints the path of its line
 systemd-run --quiet --unit=board --setenv=NUMBA_CACHE_DIR=/root/cache sh -c \
     '/opt/bms-estimator/bin/bms-estimator simulate --cell chen_mora --rate-hz 10 >/run/board'
 until_true 'grep -q /dev/pts/ /run/board'
@@ -31,8 +34,10 @@ systemctl show bms-estimator -p WatchdogUSec
 grep -E "^(Uid|NoNewPrivs|Seccomp|CapEff):" "/proc/$(main_pid)/status"
 tr '\0' '\n' <"/proc/$(main_pid)/environ" | grep BMS_BOOT_ID
 find $cache -name "step.run-*.nbi" -printf "cached %f\n"
+# in the mount namespace of the service
 nsenter -t "$(main_pid)" -m sh -c 'ls -A /home /root; touch /root/x /etc/x' 2>&1
 
+# each of the next four counts must be 0
 part secret
 secret=$(cat /root/mqtt-password)
 lines | grep -c "$secret"
@@ -43,7 +48,9 @@ timeout 5 mosquitto_sub -C 2 -u dashboard -P two -t bms/pack/health -t bms/pack/
 part watchdog
 for name in $(find $cache -name "*.nbi" | sort | tail -n 1); do : >"$name"; done # as a power cut leaves them
 for name in $(find $cache -name "*.nbc" | sort | head -n 1); do : >"$name"; done
+# by this file systemd-timesyncd reports a synchronized clock, which the restarted service must see
 mkdir -p /run/systemd/timesync && touch /run/systemd/timesync/synchronized
+# a stopped process does not notify the watchdog
 kill -STOP "$(main_pid)"
 until_true 'systemctl show bms-estimator -P NRestarts | grep -qx 1 && systemctl is-active bms-estimator'
 show
@@ -57,6 +64,7 @@ systemctl show bms-estimator@second -p StatusText
 ls -d $cache/* | wc -l
 systemctl stop bms-estimator@second
 
+# the state folder becomes a full file system
 part full
 mount -t tmpfs -o size=4k,mode=700 none /var/lib/private/bms-estimator
 dd if=/dev/zero of=/var/lib/private/bms-estimator/full bs=4k count=1 status=none

@@ -16,15 +16,15 @@ OMITTED = "step.run-"
 
 
 def fill(cache: Path, package: Path = PACKAGE) -> None:
-    """Fill a cache for a package at ``package``."""
+    """Copy the tests' compiled kernels to ``cache``, for a process that imports the package from ``package``."""
     load_kernels()
     compiled = Path(numba.config.CACHE_DIR)
-    named = _CacheLocator.get_suitable_cache_subpath  # by the folder of a source
+    subfolder_of = _CacheLocator.get_suitable_cache_subpath  # numba's name for the folder of a source file
     for folder in {source.parent.relative_to(PACKAGE) for source in COMPILED_IN}:
-        cached = compiled / named(str(PACKAGE / folder / "any.py"))
+        cached = compiled / subfolder_of(str(PACKAGE / folder / "any.py"))
         if cached.is_dir():
             shutil.copytree(
                 cached,
-                cache / compiled.name / named(str(package / folder / "any.py")),
+                cache / compiled.name / subfolder_of(str(package / folder / "any.py")),
                 ignore=shutil.ignore_patterns(f"{OMITTED}*", "*.tmp.*"),
             )

@@ -58,11 +58,11 @@ def test_service_sees_no_home_and_writes_only_its_folders(report):
     assert "'/etc/x': Read-only file system" in report["first"]
 
 
-def test_service_gets_the_boot_id(report):
+def test_unit_passes_the_boot_id_to_the_service(report):
     assert re.search(r"^BMS_BOOT_ID=[0-9a-f]{32}$", report["first"], re.MULTILINE), report
 
 
-def test_kernels_are_compiled_into_the_cache_folder(report):
+def test_missing_kernel_is_compiled_into_the_cache_folder_of_the_unit(report):
     assert f"cached {OMITTED}" in report["first"], report
 
 
@@ -83,13 +83,14 @@ def test_watchdog_restarts_a_hung_service_and_truncated_kernels_are_recompiled(r
 
 
 def test_service_detects_a_synchronized_clock(report):
-    """systemd-timesyncd's state before and after, because the kernel may not be queried; with clock.conf it may."""
+    """The first two starts read systemd-timesyncd's file, because the unit forbids to query the kernel. The third has clock.conf."""
     clock_states = re.findall(r"^clock (-?\d) (\w+)$", report["journal"], re.MULTILINE)
+    # before and after the file exists; -1: the call is forbidden
     assert clock_states[:2] == [("-1", "False"), ("-1", "True")], report
     assert re.fullmatch("[0-5]", clock_states[2][0]), report
 
 
-def test_second_unit_shares_the_kernels(report):
+def test_unit_of_a_second_pack_uses_the_same_cached_kernels(report):
     assert re.search(r"^StatusText=estimating second.*\n1$", report["second"], re.MULTILINE), report
     assert "/dev/bms/absent" in report["journal"], report
 

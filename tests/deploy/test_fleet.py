@@ -13,9 +13,9 @@ from bms_estimator.fleet.server.nats_config import Accounts, configuration
 from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec, node_of
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.settings.fleet import FleetSettings
-from tests.deploy.test_unit import HIGHEST_EXPOSURE, verify
+from tests.deploy.test_unit import MAX_EXPOSURE, verify
 
-Program = Callable[[str, str], str]
+FindProgram = Callable[[str, str], str]
 NODES = "a.example,b.example,c.example"
 
 
@@ -28,20 +28,20 @@ def unit(request: pytest.FixtureRequest, deploy: Path, tmp_path: Path) -> Path:
     return path
 
 
-def test_systemd_accepts_the_units(program: Program, unit: Path) -> None:
-    assert verify(program("systemd-analyze", "systemd"), unit) == ""
+def test_systemd_reports_no_error_in_the_units(find_program: FindProgram, unit: Path) -> None:
+    assert verify(find_program("systemd-analyze", "systemd"), unit) == ""
 
 
-def test_exposure_is_at_most_1_5(program: Program, unit: Path) -> None:
-    command = [program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
+def test_exposure_is_at_most_1_5(find_program: FindProgram, unit: Path) -> None:
+    command = [find_program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     exposure = re.search(r"Overall exposure level for \S+: ([0-9.]+)", text)
     assert exposure, text
-    assert float(exposure[1]) <= HIGHEST_EXPOSURE
+    assert float(exposure[1]) <= MAX_EXPOSURE
 
 
-def example(deploy: Path, number: int) -> str:
-    """Return the configuration of a node of three, with placeholders for the claims."""
+def example_configuration(deploy: Path, number: int) -> str:
+    """Return the configuration of node ``number`` of three, with placeholders for the claims of the accounts."""
     settings = read_toml(deploy / "fleet" / "fleet.toml", FleetSettings)
     place = NodeLocation(Path("/var/lib/bms-estimator-fleet"), number, _nodes(settings, number, NODES))
     accounts = Accounts(
@@ -52,5 +52,5 @@ def example(deploy: Path, number: int) -> str:
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_example_configurations_are_current(deploy: Path, number: int) -> None:
-    assert (deploy / f"fleet/three-nodes/n{number}.conf").read_text() == example(deploy, number)
+def test_example_configurations_are_those_that_the_server_generates(deploy: Path, number: int) -> None:
+    assert (deploy / f"fleet/three-nodes/n{number}.conf").read_text() == example_configuration(deploy, number)

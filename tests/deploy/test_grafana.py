@@ -1,4 +1,4 @@
-"""Queries of the dashboard on a real InfluxDB with a state and an alarm."""
+"""Grafana dashboard: its layout, and its queries on a real InfluxDB with a state and an alarm."""
 
 import itertools
 import json
@@ -12,18 +12,19 @@ import pytest
 from bms_estimator.model.payloads import Alarm, Estimate
 from bms_estimator.sinks.exports.line_protocol import ALARM, STATE, lines
 from tests.influxdb import INFLUXD, InfluxDB
-from tests.sinks.snapshots import ONE, SOC_LOW
+from tests.sinks.snapshots import CELL_SNAPSHOT, SOC_LOW_ALARM
 
 DASHBOARD = json.loads((Path(__file__).parents[2] / "deploy/grafana/bms.json").read_text(encoding="utf-8"))
 TARGETS = [(panel["title"], target) for panel in DASHBOARD["panels"] for target in panel["targets"]]
-MODELS = {STATE: Estimate, ALARM: Alarm}
+MODEL_OF_MEASUREMENT = {STATE: Estimate, ALARM: Alarm}
 GRID_COLUMNS = 24
 """Width of a dashboard of Grafana [columns]."""
 TAGS = {"device", "name", "severity"}
+"""Tags of the measurements; all other columns are fields."""
 
 
 def fields(query: str) -> set[str]:
-    """Return the fields between SELECT and FROM."""
+    """Return the names between SELECT and FROM, without those after AS."""
     selection = re.search(r"SELECT (.*) FROM", query)
     assert selection
     return set(re.findall(r'(?<!AS )"(\w+)"', selection[1]))
@@ -31,16 +32,22 @@ def fields(query: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
+    """Start a server that contains an alarm, and a state in which each number has a value."""
     if INFLUXD is None:
         pytest.skip("influxd is not installed (apt-get install influxdb)")
     server = InfluxDB(tmp_path_factory.mktemp("influxdb")).start()
-    assert ONE.estimate
+    assert CELL_SNAPSHOT.estimate
     numbers = {
         name: 1.0
         for name, field in Estimate.model_fields.items()
         if "float" in str(field.annotation) and "list" not in str(field.annotation)
     }
-    server.write(lines(None, ONE._replace(estimate=ONE.estimate.model_copy(update=numbers), alarms=(SOC_LOW,))))
+    server.write(
+        lines(
+            None,
+            CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=numbers), alarms=(SOC_LOW_ALARM,)),
+        )
+    )
     yield server
     server.stop()
 
@@ -49,12 +56,14 @@ def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
 def test_every_queried_field_is_published(title: str, target: dict[str, Any]) -> None:
     measurement = re.search(r'FROM "(\w+)"', target["query"])
     assert measurement
-    assert fields(target["query"]) - TAGS <= set(MODELS[measurement[1]].model_fields)
+    assert fields(target["query"]) - TAGS <= set(MODEL_OF_MEASUREMENT[measurement[1]].model_fields)
 
 
 def test_every_query_returns_a_value_from_a_real_influxdb(influxdb: InfluxDB) -> None:
-    assert influxdb.ask(DASHBOARD["templating"]["list"][1]["query"]) == [{"key": "device", "value": "pack"}]
+    [device] = [variable for variable in DASHBOARD["templating"]["list"] if variable["name"] == "device"]
+    assert influxdb.ask(device["query"]) == [{"key": "device", "value": "pack"}]
     for title, target in TARGETS:
+        # Grafana replaces these variables; a hundred years contain the snapshot of 2023
         query = target["query"].replace("$device", "pack").replace("$timeFilter", "time > now() - 36500d")
         rows = influxdb.ask(query.replace("$__interval", "3650d"))
         values = [value for row in rows for name, value in row.items() if name not in {"time", *TAGS}]
@@ -64,10 +73,12 @@ def test_every_query_returns_a_value_from_a_real_influxdb(influxdb: InfluxDB) ->
 def test_panels_do_not_overlap_and_use_the_selected_source() -> None:
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
     for first, second in itertools.combinations([panel["gridPos"] for panel in DASHBOARD["panels"]], 2):
-        separate = [
-            a[k] + a[s] <= b[k] for a, b in ((first, second), (second, first)) for k, s in (("x", "w"), ("y", "h"))
+        is_separate = [
+            a[position] + a[size] <= b[position]
+            for a, b in ((first, second), (second, first))
+            for position, size in (("x", "w"), ("y", "h"))
         ]
-        assert any(separate)
+        assert any(is_separate)
         assert first["x"] + first["w"] <= GRID_COLUMNS
     for _, target in TARGETS:
         assert target["datasource"]["uid"] == "${source}"

@@ -26,14 +26,14 @@ END_MESSAGES = {
     "bms/pack/request/+": ("homeassistant", "bms/pack/request/last"),
     "homeassistant/status": ("homeassistant", "homeassistant/status"),
 }
-"""Sender and topic of the last message of each subscription. When it arrives, all earlier ones have arrived or were denied."""
+"""Sender and topic of the last message for each subscription. When it arrives, earlier ones have arrived or were denied."""
 
 
 @pytest.fixture
-def broker(program, deploy, tmp_path) -> Iterator[int]:
+def broker(find_program, deploy, tmp_path) -> Iterator[int]:
     """Yield the port of a Mosquitto with the example's files."""
     port = free_port()
-    mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
+    mosquitto, passwd = find_program("mosquitto", "mosquitto"), find_program("mosquitto_passwd", "mosquitto")
     write_users(tmp_path, deploy, passwd)
     text = (deploy / "mosquitto/bms.conf").read_text()
     assert "listener 1883 127.0.0.1" in text
@@ -48,13 +48,14 @@ def write_users(folder: Path, deploy: Path, passwd: str) -> None:
     passwords.touch(mode=0o600)
     for user, password in PASSWORDS.items():
         subprocess.run([passwd, "-b", passwords, user, password], check=True, capture_output=True)
-    part = (deploy / "mosquitto/pack.acl").read_text()
-    packs = [part.replace("PACK", name) for name in PACKS]
+    template = (deploy / "mosquitto/pack.acl").read_text()
+    packs = [template.replace("PACK", name) for name in PACKS]
     (folder / "bms.acl").write_text("".join([(deploy / "mosquitto/bms.acl").read_text(), *packs]))
 
 
 @contextlib.contextmanager
 def running(mosquitto: str, path: Path, text: str, port: int) -> Iterator[None]:
+    """Run Mosquitto with the configuration ``text``, which is written to ``path``."""
     path.write_text(text + ("user root\n" if os.geteuid() == 0 else ""))  # the folder belongs to root
     with subprocess.Popen([mosquitto, "-c", path], stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -65,8 +66,8 @@ def running(mosquitto: str, path: Path, text: str, port: int) -> Iterator[None]:
 
 
 def wait_for_port(process: "subprocess.Popen[str]", port: int) -> None:
-    until = time.monotonic() + LONG_S
-    while time.monotonic() < until:
+    deadline = time.monotonic() + LONG_S
+    while time.monotonic() < deadline:
         assert process.poll() is None, process.stderr.read() if process.stderr else ""
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
@@ -80,8 +81,8 @@ def client(port: int, user: str) -> aiomqtt.Client:
 
 
 async def received_by(port: int, sender: str, topics: list[str], *, reader: str, subscription: str) -> list[str]:
-    """Return the messages of ``sender`` that reach ``reader``."""
-    end_sender_name, last = END_MESSAGES[subscription]
+    """Publish to the topics as ``sender``. Return the topics whose messages reach the subscription of ``reader``."""
+    end_sender_name, last_topic = END_MESSAGES[subscription]
     async with (
         client(port, reader) as subscriber,
         client(port, sender) as sender_client,
@@ -90,11 +91,11 @@ async def received_by(port: int, sender: str, topics: list[str], *, reader: str,
         await subscriber.subscribe(subscription, qos=1)
         for topic in topics:
             await sender_client.publish(topic, b"x", qos=1)
-        await end_sender.publish(last, b"x", qos=1)
+        await end_sender.publish(last_topic, b"x", qos=1)
         received_topics: list[str] = []
         async with asyncio.timeout(LONG_S):
             async for message in subscriber.messages:
-                if message.topic.value == last:
+                if message.topic.value == last_topic:
                     break
                 received_topics.append(message.topic.value)
     return received_topics
@@ -112,18 +113,18 @@ async def test_wrong_password_is_rejected(broker):
             pass
 
 
-async def test_dashboard_receives_the_estimator_s_topics(broker):
+async def test_dashboard_receives_the_topics_of_a_pack(broker):
     topics = ["bms/pack/state", "bms/pack/sensor/availability", "bms/pack/availability"]
     assert await received_by(broker, "pack", topics, reader="dashboard", subscription="bms/#") == topics
 
 
-async def test_estimator_publishes_only_its_own_topics(broker):
+async def test_pack_may_publish_only_its_own_discovery_under_homeassistant(broker):
     topics = ["homeassistant/light/x/set", "other/topic", "homeassistant/device/bms_pack/config"]
     received_topics = await received_by(broker, "pack", topics, reader="homeassistant", subscription="homeassistant/#")
     assert received_topics == ["homeassistant/device/bms_pack/config"]
 
 
-async def test_pack_cannot_publish_another_pack_s_topics(broker):
+async def test_pack_may_not_publish_the_topics_of_another_pack(broker):
     topics = ["bms/pack/state", "bms/pack/event", "bms/pack/availability", "bms/pack/response/soc", "bms/shed/state"]
     assert await received_by(broker, "shed", topics, reader="dashboard", subscription="bms/#") == ["bms/shed/state"]
     discovery = ["homeassistant/device/bms_pack/config", "homeassistant/device/bms_shed/config"]
@@ -145,11 +146,11 @@ async def test_pack_receives_only_its_own_requests(broker):
 
 
 @pytest.fixture
-def tls_port(program, deploy, tmp_path) -> Iterator[int]:
+def tls_port(find_program, deploy, tmp_path) -> Iterator[int]:
     """Yield the port of the listener for other machines, with certificates made by the commands of docs/pack/mosquitto.md."""
     port = free_port()
-    mosquitto, passwd = program("mosquitto", "mosquitto"), program("mosquitto_passwd", "mosquitto")
-    program("openssl", "openssl")
+    mosquitto, passwd = find_program("mosquitto", "mosquitto"), find_program("mosquitto_passwd", "mosquitto")
+    find_program("openssl", "openssl")
     commands = (
         commands_of_page("Certificates", page="mosquitto").replace("broker.lan", "localhost").replace("house", "pack")
     )
@@ -166,6 +167,7 @@ def tls_port(program, deploy, tmp_path) -> Iterator[int]:
 
 
 def with_certificate(port: int, folder: Path, name: str) -> aiomqtt.Client:
+    """Return a client that identifies itself by the certificate ``name``."""
     files = {"certfile": str(folder / f"{name}.crt"), "keyfile": str(folder / f"{name}.key")}
     parameters = aiomqtt.TLSParameters(ca_certs=str(folder / "ca.crt"), cert_reqs=ssl.CERT_REQUIRED, **files)
     return aiomqtt.Client("localhost", port, tls_params=parameters, timeout=LONG_S)
@@ -191,38 +193,36 @@ def test_clients_without_a_valid_certificate_are_rejected(tls_port, tmp_path):
             secured.recv(1)  # an accepting broker would wait for a first message
 
 
-async def test_home_assistant_may_send_requests_but_the_dashboard_may_not(broker):
+async def test_home_assistant_may_send_requests_and_the_dashboard_may_not(broker):
     topics = ["bms/pack/request/soc"]
-    as_estimator = {"reader": "pack", "subscription": "bms/pack/request/+"}
-    assert await received_by(broker, "dashboard", topics, **as_estimator) == []
-    assert await received_by(broker, "homeassistant", topics, **as_estimator) == topics
+    as_pack = {"reader": "pack", "subscription": "bms/pack/request/+"}
+    assert await received_by(broker, "dashboard", topics, **as_pack) == []
+    assert await received_by(broker, "homeassistant", topics, **as_pack) == topics
 
 
-async def test_only_the_estimator_may_publish_state(broker):
+async def test_only_the_pack_may_publish_its_state(broker):
     for user in ("dashboard", "homeassistant"):
         assert await received_by(broker, user, ["bms/pack/state"], reader="dashboard", subscription="bms/#") == []
 
 
-async def test_estimator_receives_the_birth_message(broker):
+async def test_pack_receives_the_birth_message_of_home_assistant(broker):
     received_topics = await received_by(broker, "homeassistant", [], reader="pack", subscription="homeassistant/status")
     assert received_topics == []  # apart from the last message, which ends the reception
 
 
-async def test_estimator_receives_its_availability_topics(broker):
+async def test_pack_receives_its_own_availability_topics_and_no_forged_ones(broker):
     topics = ["bms/pack/availability", "bms/pack/sensor/availability", "bms/pack/request/last"]
-    async with client(broker, "pack") as estimator:
+    async with client(broker, "pack") as pack:
         for topic in topics[:2]:
-            await estimator.subscribe(topic)
-        await estimator.subscribe("bms/pack/request/+")
-        async with client(
-            broker, "homeassistant"
-        ) as other:  # may not write the first two topics, but the estimator may
+            await pack.subscribe(topic)
+        await pack.subscribe("bms/pack/request/+")
+        async with client(broker, "homeassistant") as other:  # it may not write the first two topics; the pack may
             for topic in topics[:2]:
                 await other.publish(topic, b"forged", qos=1)
-                await estimator.publish(topic, b"online", qos=1)
+                await pack.publish(topic, b"online", qos=1)
             await other.publish(topics[2], b"", qos=1)
         async with asyncio.timeout(LONG_S):
-            received = [await anext(estimator.messages) for _ in topics]
+            received = [await anext(pack.messages) for _ in topics]
     assert [(m.topic.value, m.payload) for m in received] == [
         (topics[0], b"online"),
         (topics[1], b"online"),
@@ -230,9 +230,9 @@ async def test_estimator_receives_its_availability_topics(broker):
     ]
 
 
-async def test_too_large_message_is_not_forwarded(broker):
-    async with client(broker, "pack") as estimator:
-        await estimator.subscribe("bms/pack/request/+")
+async def test_message_of_5_mb_ends_its_connection_and_is_not_forwarded(broker):
+    async with client(broker, "pack") as pack:
+        await pack.subscribe("bms/pack/request/+")
         with contextlib.suppress(aiomqtt.MqttError):
             async with client(broker, "homeassistant") as flooder, asyncio.timeout(LONG_S):
                 publication = asyncio.create_task(
@@ -244,4 +244,4 @@ async def test_too_large_message_is_not_forwarded(broker):
         async with client(broker, "homeassistant") as other:
             await other.publish("bms/pack/request/last", b"{}", qos=1)
         async with asyncio.timeout(LONG_S):
-            assert (await anext(estimator.messages)).topic.value == "bms/pack/request/last"
+            assert (await anext(pack.messages)).topic.value == "bms/pack/request/last"

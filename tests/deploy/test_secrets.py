@@ -36,6 +36,7 @@ folder = "{folder}/state"
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:
+    """Start a broker that requires a client certificate."""
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     authority = Authority(tmp_path)
@@ -53,7 +54,7 @@ async def test_password_and_key_are_never_shown(tmp_path: Path, line: Line, brok
     (credentials / "mqtt-password").write_text(PASSWORD)
     key = (tmp_path / "pack.key").rename(credentials / "pack.key").read_text()
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(credentials))
-    secrets = [PASSWORD.encode(), key.splitlines()[1].encode()]
+    secrets = [PASSWORD.encode(), key.splitlines()[1].encode()]  # line 0 of the key is a headline
     pack, capture = tmp_path / "pack.toml", tmp_path / "capture"
     pack.write_text(PACK.format(folder=tmp_path, port=broker.port))
     line.plug()
@@ -71,22 +72,22 @@ async def test_password_and_key_are_never_shown(tmp_path: Path, line: Line, brok
             board.cancel()
             service.terminate()
             assert service.stderr
-            outputs.append(await asyncio.wait_for(service.stderr.read(), LONG_S))
+            log = await asyncio.wait_for(service.stderr.read(), LONG_S)
             assert await service.wait() == 0
         finally:
             if service.returncode is None:
                 service.kill()
-    outputs += [payload for _, payload, _ in live.messages]
+    outputs += [log, *(payload for _, payload, _ in live.messages)]
     written = files_of(tmp_path)
-    assert len(written) >= 2
+    assert len(written) >= 2  # capture and checkpoint
     outputs += [path.read_bytes() for path in written]
-    assert b"broker connected" in outputs[2]
+    assert b"broker connected" in log
     assert [secret for secret in secrets if any(secret in output for output in outputs)] == []
     assert {oct(path.stat().st_mode & 0o777) for path in written if path.parent.name == "state"} == {"0o600"}
 
 
 def files_of(folder: Path) -> list[Path]:
-    """Return the files that the service has written."""
+    """Return the capture and the files of the state folder, which the service has written."""
     return [*folder.glob("capture*"), *(folder / "state").iterdir()]
 
 

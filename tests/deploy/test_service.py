@@ -1,4 +1,4 @@
-"""Service started as by systemd: notify messages, and cache of compiled kernels."""
+"""Service that is started as by systemd: notices to systemd, and cache of compiled kernels."""
 
 import contextlib
 import os
@@ -16,8 +16,14 @@ from tests.patience import LONG_S
 PACK = '[pack]\ncell = "chen_mora"\n[sensor]\nport = "/dev/bms/absent"\n'
 
 
-class Systemd:
-    """Service with a notify socket and the directories of the unit, but without a home directory."""
+class StartedService:
+    """Service that is started as by systemd, with a notify socket and the folders of the unit, but without a home folder.
+
+    Attributes:
+        cache: Folder of the compiled kernels.
+        state: Folder of the checkpoints.
+        process: Process of the service.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -29,7 +35,7 @@ class Systemd:
             "PATH": os.environ["PATH"],
             "HOME": "/proc/self/fdinfo",  # not even root can write there
             "NOTIFY_SOCKET": str(folder / "notify"),
-            "WATCHDOG_USEC": "1500000",
+            "WATCHDOG_USEC": "1500000",  # 1.5 s
             "NUMBA_CACHE_DIR": str(self.cache),
             "STATE_DIRECTORY": str(self.state),
         }
@@ -43,6 +49,7 @@ class Systemd:
         )
 
     def next_notice(self) -> str:
+        """Wait for a notice to systemd. Return it."""
         return self._socket.recv(4096).decode()
 
     def until(self, notice: str) -> None:
@@ -65,13 +72,13 @@ class Systemd:
 
 
 @contextlib.contextmanager
-def start(folder: Path) -> Iterator[Systemd]:
+def start(folder: Path) -> Iterator[StartedService]:
     (folder / "notify").unlink(missing_ok=True)
-    systemd = Systemd(folder)
+    service = StartedService(folder)
     try:
-        yield systemd
+        yield service
     finally:
-        systemd.close()
+        service.close()
 
 
 def compiled_kernels(cache: Path) -> dict[str, int]:
@@ -79,15 +86,15 @@ def compiled_kernels(cache: Path) -> dict[str, int]:
     return {str(path.relative_to(cache)): path.stat().st_mtime_ns for path in cache.rglob("*.nb?")}
 
 
-def test_ready_watchdog_and_stopping_arrive(tmp_path):
+def test_systemd_is_notified_of_ready_watchdog_and_stopping(tmp_path):
     kernel_cache.fill(tmp_path / "cache")
-    with start(tmp_path) as systemd:
-        assert systemd.next_notice().startswith("READY=1\n")
+    with start(tmp_path) as service:
+        assert service.next_notice().startswith("READY=1\n")
         for _ in range(3):
-            systemd.until("WATCHDOG=1")
-        code, log = systemd.stop()
+            service.until("WATCHDOG=1")
+        code, log = service.stop()
         assert code == 0, log
-        systemd.until("STOPPING=1")
+        service.until("STOPPING=1")
         assert "Traceback" not in log
         assert "/dev/bms/absent" in log
 
@@ -95,13 +102,13 @@ def test_ready_watchdog_and_stopping_arrive(tmp_path):
 def test_missing_kernel_is_compiled_into_the_cache_once(tmp_path):
     cache = tmp_path / "cache"
     kernel_cache.fill(cache)
-    seen = [compiled_kernels(cache)]
+    kernels_after_starts = [compiled_kernels(cache)]
     for _ in range(2):
-        with start(tmp_path) as systemd:
-            systemd.until("READY=1")
-            assert systemd.stop()[0] == 0
-        seen.append(compiled_kernels(cache))
-    before, first, second = seen
+        with start(tmp_path) as service:
+            service.until("READY=1")
+            assert service.stop()[0] == 0
+        kernels_after_starts.append(compiled_kernels(cache))
+    before, first, second = kernels_after_starts
     written = {Path(name).name for name, at_ns in first.items() if before.get(name) != at_ns}
     assert written
     assert all(name.startswith(kernel_cache.OMITTED) for name in written)

@@ -6,15 +6,16 @@ from pathlib import Path
 
 import pytest
 
-# mounts a separate /run/udev in a mount namespace, which ends with the shell
+# Mounts an empty /run/udev, copies the rules ($1) there, and lets udevadm ($2) test a device ($3). It runs in a mount
+# namespace of its own, which ends with the shell.
 READ_RULES_SCRIPT = (
     'mount -t tmpfs none /run/udev && mkdir /run/udev/rules.d && cp "$1" /run/udev/rules.d/ && exec "$2" test "$3"'
 )
 
 
-def read_rules(program, rules: Path) -> list[str]:
-    """Return udev's messages about the rules."""
-    udevadm, unshare = program("udevadm", "udev"), program("unshare", "util-linux")
+def messages_about(find_program, rules: Path) -> list[str]:
+    """Return udev's messages about a file of rules."""
+    udevadm, unshare = find_program("udevadm", "udev"), find_program("unshare", "util-linux")
     if os.geteuid() != 0:
         pytest.skip("only root can give udev a folder of rules for a test")
     device = next(Path("/sys/class/tty").iterdir(), None)
@@ -29,11 +30,11 @@ def read_rules(program, rules: Path) -> list[str]:
     return [line for line in messages if not line.startswith("Reading rules file")]
 
 
-def test_udev_reports_no_error_in_the_rule(program, deploy):
-    assert read_rules(program, deploy / "99-bms-estimator.rules") == []
+def test_udev_reports_no_error_in_the_rule(find_program, deploy):
+    assert messages_about(find_program, deploy / "99-bms-estimator.rules") == []
 
 
-def test_udev_reports_a_misspelled_key(program, tmp_path):
+def test_udev_reports_a_misspelled_key(find_program, tmp_path):
     rules = tmp_path / "99-wrong.rules"
     rules.write_text('SUBSISTEM=="tty", SYMLINK+="bms"\n')
-    assert any("SUBSISTEM" in line for line in read_rules(program, rules))
+    assert any("SUBSISTEM" in line for line in messages_about(find_program, rules))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-HIGHEST_EXPOSURE = 1.5
+MAX_EXPOSURE = 1.5
 """Maximum exposure by `systemd-analyze security`, of 0 to 10."""
 
 
@@ -16,7 +16,7 @@ def unit(request, deploy, tmp_path) -> Path:
     """Return the unit of one pack, or an instance of the template, with a program that exists on this machine."""
     template = request.param.replace("house", "")
     files = [deploy / template, *deploy.glob(f"{template}.d/*.conf")]
-    assert len(files) == (2 if "@" in template else 1)
+    assert len(files) == (2 if "@" in template else 1)  # the template has a drop-in
     for file in files:
         text, changed = re.subn(r"(?m)^ExecStart=/\S+", f"ExecStart={sys.executable}", file.read_text())
         assert changed == 1
@@ -31,30 +31,30 @@ def verify(systemd_analyze: str, unit: Path) -> str:
     return subprocess.run([systemd_analyze, "verify", unit], capture_output=True, text=True, check=False).stderr
 
 
-def test_systemd_reports_no_error_in_the_unit(program, unit):
-    assert verify(program("systemd-analyze", "systemd"), unit) == ""
+def test_systemd_reports_no_error_in_the_unit(find_program, unit):
+    assert verify(find_program("systemd-analyze", "systemd"), unit) == ""
 
 
-def test_systemd_reports_a_misspelled_key(program, unit):
+def test_systemd_reports_a_misspelled_key(find_program, unit):
     file = unit.with_name(unit.name.replace("house", ""))
     file.write_text(file.read_text().replace("ProtectHome=", "ProtectHomes="))
-    assert "ProtectHomes" in verify(program("systemd-analyze", "systemd"), unit)
+    assert "ProtectHomes" in verify(find_program("systemd-analyze", "systemd"), unit)
 
 
-@pytest.mark.parametrize(("kind", "driver"), [("char-ttyACM", "cdc_acm"), ("char-ttyUSB", "usbserial")])
-def test_usb_serial_driver_is_loaded_before_its_device_is_allowed(deploy, kind, driver):
+@pytest.mark.parametrize(("device_group", "driver"), [("char-ttyACM", "cdc_acm"), ("char-ttyUSB", "usbserial")])
+def test_usb_serial_driver_is_loaded_before_its_device_is_allowed(deploy, device_group, driver):
     settings = [line.partition("=")[::2] for line in (deploy / "bms-estimator.service").read_text().splitlines()]
-    assert f"{kind} rw" in [value for key, value in settings if key == "DeviceAllow"]
+    assert f"{device_group} rw" in [value for key, value in settings if key == "DeviceAllow"]
     for relation in ("Wants", "After"):
         assert f"modprobe@{driver}.service" in " ".join(value for key, value in settings if key == relation).split()
 
 
-def test_exposure_is_at_most_1_5(program, unit):
-    command = [program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
+def test_exposure_is_at_most_1_5(find_program, unit):
+    command = [find_program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
     text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     exposure = re.search(r"Overall exposure level for \S+: ([0-9.]+)", text)
     assert exposure, text
-    assert float(exposure[1]) <= HIGHEST_EXPOSURE
+    assert float(exposure[1]) <= MAX_EXPOSURE
 
 
 def test_memory_deny_write_execute_is_not_set(deploy):

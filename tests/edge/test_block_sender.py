@@ -1,4 +1,4 @@
-"""Block sender with a real server: under all faults the received samples equal those sent, in order."""
+"""Block sender with a real server. After each kind of fault the received samples equal those sent, in order."""
 
 import asyncio
 import contextlib
@@ -37,16 +37,16 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsCluster]:
 
 @pytest.fixture
 async def receiver(engine: NatsCluster, request: pytest.FixtureRequest) -> AsyncIterator[Receiver]:
-    """Return the receiver of a pack for each test."""
+    """Return the receiver of a pack that has the name of the test."""
     async with Receiver(engine.url, request.node.name.replace("[", "_").rstrip("]")[:64]) as receiver:
         yield receiver
 
 
 class SimulatedEdge:
-    """Block sender with one sample a second, by clocks that the test advances."""
+    """Block sender that gets one sample a second. ``add`` advances its clocks."""
 
     def __init__(self, receiver: Receiver, folder: Path, url: str, **settings: float) -> None:
-        self.now_s, self._count, self._reads = 0.0, 0, list[SampleBlock]()
+        self.now_s, self._count, self._sent = 0.0, 0, list[SampleBlock]()
         self.receiver, self._random = receiver, np.random.default_rng(1)
         self.edge = BlockSender(
             EdgeSettings(url=url, **SETTINGS | settings),
@@ -60,13 +60,14 @@ class SimulatedEdge:
         )
 
     def add(self, minutes: float) -> None:
+        """Add the samples of a time, with voltages that differ from each other."""
         for _ in range(round(60 * minutes)):
             sample = np.zeros(1, dtype=SAMPLE)
             sample["time_s"], sample["voltage_v"] = self.now_s, 3.0 + 1e-6 * self._count
             sample["current_a"], sample["temperature_c"] = self._random.normal(), np.nan
             self.edge.take(sample)
             sample["time_s"] += WALL_S
-            self._reads.append(sample)
+            self._sent.append(sample)
             self._count, self.now_s = self._count + 1, self.now_s + 1.0
 
     @property
@@ -75,9 +76,9 @@ class SimulatedEdge:
 
     async def assert_all_received(self) -> None:
         """Check that all samples of completed blocks have arrived bit for bit, once and in order."""
-        completed = self._count - len(self.edge._batcher)
-        await self.receiver.until(completed)
-        assert equal(self.receiver.samples, np.concatenate(self._reads[:completed]))
+        completed = self._count - len(self.edge._batcher)  # the batcher holds the samples of the open block
+        await self.receiver.wait_for_samples(completed)
+        assert equal(self.receiver.samples, np.concatenate(self._sent[:completed]))
 
 
 def equal(first: SampleBlock, second: SampleBlock) -> bool:
@@ -95,13 +96,13 @@ async def until(condition) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_samples_arrive_in_blocks_and_the_open_block_at_shutdown(
+async def test_samples_arrive_in_blocks_of_a_minute_and_the_rest_arrives_at_shutdown(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     simulated = SimulatedEdge(receiver, tmp_path, url(engine))
     async with simulated.edge:
         simulated.add(30.5)
-        await receiver.until(30 * 60)
+        await receiver.wait_for_samples(30 * 60)
         await until(lambda: simulated.edge.store.oldest > 20)  # the worker has confirmed 20 blocks
     await simulated.assert_all_received()
     assert [block.number for block in receiver.blocks] == list(range(1, 32))
@@ -110,7 +111,9 @@ async def test_samples_arrive_in_blocks_and_the_open_block_at_shutdown(
     assert (receiver.resends, receiver.gaps, simulated.edge.store.dropped) == (0, 0, 0)
 
 
-async def test_no_sample_is_lost_by_a_cut_connection(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
+async def test_no_sample_is_lost_when_the_connection_is_cut(
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
+) -> None:
     async with Proxy(engine.mqtt_port) as network:
         simulated = SimulatedEdge(receiver, tmp_path, network.url)
         async with simulated.edge:
@@ -126,14 +129,15 @@ async def test_no_sample_is_lost_by_a_cut_connection(receiver: Receiver, engine:
         assert simulated.edge.delivery.losses == 3
 
 
-async def test_samples_keep_their_period_in_a_store_later_than_the_clock(
+async def test_samples_keep_their_period_if_a_new_store_begins_later_than_the_wall_clock(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
     simulated = SimulatedEdge(receiver, tmp_path, "mqtt://127.0.0.1:9")  # no server listens at this port
     async with simulated.edge:
         simulated.add(2)
+        # a worker that has received blocks of a later store makes the edge begin a store that is later still
         later = BlockRequest(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
-        await until(lambda: simulated.edge.store._on_disk.state.next == 2)  # the blocks are on disk
+        await until(lambda: simulated.edge.store._on_disk.state.next_number == 2)  # the first block is on disk
         simulated.edge.store.on_request(later)
         await until(lambda: simulated.edge.store.last_s > WALL_S + 1e8)
         simulated.add(4)
@@ -145,14 +149,14 @@ async def test_samples_keep_their_period_in_a_store_later_than_the_clock(
     assert third.samples["time_s"].tolist() == [*np.arange(60.0, 120.0)]
 
 
-async def test_no_sample_is_lost_by_a_killed_server(tmp_path: Path) -> None:
+async def test_no_sample_is_lost_when_the_server_is_killed(tmp_path: Path) -> None:
     with running(tmp_path, partitions=4) as engine:
         async with Receiver(engine.url, "pack") as receiver:
             simulated = SimulatedEdge(receiver, tmp_path, url(engine))
             async with simulated.edge:
                 for kill in range(2):
                     simulated.add(200)
-                    await receiver.until((205 * kill + 1) * 60)
+                    await receiver.wait_for_samples((205 * kill + 1) * 60)  # others are still on their way
                     await asyncio.to_thread(engine.kill, 0)
                     simulated.add(5)
                     await asyncio.to_thread(engine.start, 0)
@@ -163,12 +167,11 @@ async def test_no_sample_is_lost_by_a_killed_server(tmp_path: Path) -> None:
 async def test_restarted_edge_sends_unconfirmed_blocks_first(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:
-    simulated = SimulatedEdge(receiver, tmp_path, "mqtt://127.0.0.1:1")
+    simulated = SimulatedEdge(receiver, tmp_path, "mqtt://127.0.0.1:1")  # no server listens at this port
     async with simulated.edge:
         simulated.add(50)
-    earlier = simulated._reads
     restarted = SimulatedEdge(receiver, tmp_path, url(engine))
-    restarted.now_s, restarted._count, restarted._reads = simulated.now_s, simulated.count, earlier
+    restarted.now_s, restarted._count, restarted._sent = simulated.now_s, simulated.count, simulated._sent
     async with restarted.edge:
         restarted.add(10)
         await restarted.assert_all_received()
@@ -185,11 +188,13 @@ async def test_blocks_lost_by_the_stream_are_sent_again(
     async with simulated.edge:
         simulated.add(40)
         await simulated.assert_all_received()
-    assert receiver.dropped_once == set()
+    assert receiver.dropped_once == set()  # each of the four was dropped
     assert receiver.gaps > 0
 
 
-async def test_full_edge_announces_its_oldest_block(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
+async def test_edge_whose_store_is_full_announces_its_oldest_block(
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
+) -> None:
     async with Proxy(engine.mqtt_port) as network:
         network.rejects_connections = True
         simulated = SimulatedEdge(receiver, tmp_path, network.url, store_mib=0.1)
@@ -199,15 +204,17 @@ async def test_full_edge_announces_its_oldest_block(receiver: Receiver, engine: 
                 await until(lambda: not simulated.edge.store._waiting)
             dropped = simulated.edge.store.dropped
             network.rejects_connections = False
-            await receiver.until(180 * 60 - 60 - 60 * dropped)
-    await receiver.until(simulated.count - 60 * dropped)
+            await receiver.wait_for_samples(180 * 60 - 60 - 60 * dropped)  # the last block is still open
+    await receiver.wait_for_samples(simulated.count - 60 * dropped)
     assert dropped > 0
     assert receiver.gaps == 0
     assert receiver.blocks[0].oldest == receiver.blocks[0].number == dropped + 1
-    assert equal(receiver.samples, np.concatenate(simulated._reads[60 * dropped :]))
+    assert equal(receiver.samples, np.concatenate(simulated._sent[60 * dropped :]))
 
 
-async def test_invalid_requests_are_ignored(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
+async def test_invalid_block_requests_are_counted_and_ignored(
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
+) -> None:
     simulated = SimulatedEdge(receiver, tmp_path, url(engine))
     async with simulated.edge:
         simulated.add(3)
@@ -219,7 +226,7 @@ async def test_invalid_requests_are_ignored(receiver: Receiver, engine: NatsClus
             await receiver.reply(payload)
         await receiver.reply(BlockRequest(store=1, number=1, resend=True))
         await receiver.reply(BlockRequest(store=store, number=1, resend=False))
-        await until(lambda: simulated.edge.unread == len(garbage))
+        await until(lambda: simulated.edge.invalid_messages == len(garbage))
         simulated.add(3)
         await simulated.assert_all_received()
 
@@ -233,12 +240,12 @@ async def test_blocks_are_sent_to_any_mqtt_broker(broker: Broker, tmp_path: Path
         edge.take(samples)
         await listener.wait("raw/pack", lambda data: decode(data).number == 9)
         store = decode(listener.all("raw/pack")[0]).store
-        before = len(listener.messages)
+        message_count = len(listener.messages)
         await listener.publish(
             "edge/pack/awaits", BlockRequest(store=store, number=7, resend=True).model_dump_json(), qos=1
         )
-        resent = decode(await listener.wait("raw/pack", skip=before))
-        await listener.wait("raw/pack", lambda data: decode(data).number == 9, skip=before)
+        resent = decode(await listener.wait("raw/pack", skip=message_count))
+        await listener.wait("raw/pack", lambda data: decode(data).number == 9, skip=message_count)
         assert (resent.number, resent.oldest) == (7, 7)
         await until(lambda: not edge.store.waiting)  # the broker's acknowledgement may arrive later
         assert edge.health() == EdgeHealth(blocks_kept=3, blocks_unsent=0, blocks_dropped=0, trouble=None)
@@ -249,25 +256,28 @@ async def test_open_block_is_sent_if_the_source_falls_silent(
 ) -> None:
     simulated = SimulatedEdge(receiver, tmp_path, url(engine), block_s=1.0)
     async with simulated.edge:
-        simulated.add(1 / 60)
-        await receiver.until(1)
+        simulated.add(1 / 60)  # one sample
+        await receiver.wait_for_samples(1)
 
 
-async def test_unreadable_password_file_raises_an_error(engine: NatsCluster, tmp_path: Path) -> None:
+async def test_unreadable_password_file_is_a_user_error(engine: NatsCluster, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^edge.password_file = /none: cannot be read"):
         BlockSender(EdgeSettings(username="a", password_file=Path("/none")), "pack", tmp_path)
 
 
-async def test_stream_stores_blocks_by_pack(receiver: Receiver, engine: NatsCluster, tmp_path: Path) -> None:
+async def test_stream_stores_blocks_under_a_subject_of_the_pack(
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path
+) -> None:
     simulated = SimulatedEdge(receiver, tmp_path, url(engine))
     async with simulated.edge:
         simulated.add(2)
-        await receiver.until(60)
+        await receiver.wait_for_samples(60)
     async with contextlib.AsyncExitStack() as stack:
         nc = await nats.connect(engine.url)
         stack.push_async_callback(nc.close)
         stream = await nc.jetstream().stream_info(
-            subjects.RAW_STREAM, subjects_filter=subjects.stored_raw(0).replace("0", "*", 1)
+            subjects.RAW_STREAM,
+            subjects_filter=subjects.stored_raw(0).replace("0", "*", 1),  # all partitions
         )
         assert stream.state.subjects
         assert sum(name.endswith(f".raw.{receiver.pack}") for name in stream.state.subjects) == 1

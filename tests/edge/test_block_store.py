@@ -29,7 +29,7 @@ UNLIMITED_BYTES = 1 << 30
 
 
 def block_at(at_s: float, count: int = 5) -> ReadyBlock:
-    """Return a block of samples that differ from each other."""
+    """Return a block of ``count`` samples at 1 Hz from ``at_s`` on [s since 1970], with different voltages."""
     samples = np.zeros(count, dtype=SAMPLE)
     samples["time_s"] = at_s + np.arange(count)
     samples["voltage_v"] = samples["time_s"] - WALL_S
@@ -37,11 +37,10 @@ def block_at(at_s: float, count: int = 5) -> ReadyBlock:
 
 
 @contextlib.asynccontextmanager
-async def open_store(
-    path: Path, most_bytes: int = UNLIMITED_BYTES, wall_s: float = WALL_S
-) -> AsyncIterator[BlockStore]:
+async def open_store(path: Path, max_bytes: int = UNLIMITED_BYTES, wall_s: float = WALL_S) -> AsyncIterator[BlockStore]:
+    """Open the store of blocks at ``path``, with a wall clock that stands at ``wall_s``."""
     database = Database(path, tables=EDGE_TABLES, sync_s=0.0, retry_s=0.0)
-    store = BlockStore(database, "raw/pack", most_bytes, wall=lambda: wall_s, resend_s=0.0)
+    store = BlockStore(database, "raw/pack", max_bytes, wall=lambda: wall_s, resend_s=0.0)
     async with database, store:
         yield store
 
@@ -53,13 +52,14 @@ async def until(condition) -> None:
 
 
 async def write_blocks(store: BlockStore, *blocks: ReadyBlock) -> None:
+    """Put blocks into the store and wait until they are on disk."""
     for block in blocks:
         store.put(block)
     await until(lambda: not store._waiting)
 
 
 async def take(store: BlockStore, count: int) -> list[Block]:
-    """Take ``count`` blocks, and check topic and numbers of their messages."""
+    """Return the next ``count`` blocks to be sent, after a check of topic and numbers of their messages."""
     blocks = list[Block]()
     async with asyncio.timeout(LONG_S):
         while len(blocks) < count:
@@ -74,14 +74,14 @@ def numbers(blocks: list[Block]) -> list[int]:
     return [block.number for block in blocks]
 
 
-def minutes(count: int, first: int = 0) -> list[ReadyBlock]:
+def minute_blocks(count: int, first: int = 0) -> list[ReadyBlock]:
     """Return blocks at intervals of one minute, beginning ``first`` minutes after ``WALL_S``."""
     return [block_at(WALL_S + 60.0 * i) for i in range(first, first + count)]
 
 
 async def test_blocks_are_taken_in_order_with_times_relative_to_the_store(tmp_path: Path) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
-        ready = minutes(4)
+        ready = minute_blocks(4)
         await write_blocks(store, *ready)
         blocks = await take(store, 4)
         assert numbers(blocks) == [1, 2, 3, 4]
@@ -92,15 +92,17 @@ async def test_blocks_are_taken_in_order_with_times_relative_to_the_store(tmp_pa
             assert (block.samples["voltage_v"] == original.samples["voltage_v"]).all()
 
 
-async def test_restart_continues_store_numbers_and_time_and_sends_unconfirmed_blocks(tmp_path: Path) -> None:
+async def test_restarted_edge_continues_numbers_and_time_of_the_store_and_sends_unconfirmed_blocks(
+    tmp_path: Path,
+) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
-        await write_blocks(store, *minutes(6))
+        await write_blocks(store, *minute_blocks(6))
         for block in await take(store, 6):
             store.acknowledge(block.number)
         store.on_request(BlockRequest(store=int(WALL_S) * NS, number=4, resend=False))
         assert (store.waiting, store.unconfirmed) == (0, 3)
     async with open_store(tmp_path / "s.sqlite", wall_s=WALL_S - 1e8) as store:
-        assert store.last_s == WALL_S + 304.0
+        assert store.last_s == WALL_S + 304.0  # five samples from 300 s on
         await write_blocks(store, block_at(WALL_S))  # a clock set back does not set back the time of the store
         blocks = await take(store, 4)
     assert numbers(blocks) == [4, 5, 6, 7]
@@ -109,27 +111,27 @@ async def test_restart_continues_store_numbers_and_time_and_sends_unconfirmed_bl
     assert blocks[-1].samples["time_s"].tolist() == [304.0] * 5
 
 
-async def test_full_store_drops_the_oldest_blocks_and_updates_oldest(tmp_path: Path) -> None:
+async def test_full_store_drops_its_oldest_blocks_and_announces_the_oldest_remaining_one(tmp_path: Path) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
-        await write_blocks(store, *minutes(1))
-        size = store._on_disk.state.bytes
-    async with open_store(tmp_path / "s.sqlite", most_bytes=10 * size + size // 2) as store:
+        await write_blocks(store, *minute_blocks(1))
+        max_bytes = int(10.5 * store._on_disk.state.bytes)  # ten blocks and a half
+    async with open_store(tmp_path / "s.sqlite", max_bytes=max_bytes) as store:
         with capture_logs() as lines:
-            for block in minutes(60, 1):
+            for block in minute_blocks(60, first=1):
                 await write_blocks(store, block)
         assert [line["reason"] for line in lines if "lost" in line["event"]] == ["the store is full"]
-        assert store._on_disk.state.bytes <= 10 * size + size // 2
-        remaining = store.unconfirmed
+        assert store._on_disk.state.bytes <= max_bytes
+        remaining = store.unconfirmed  # of the blocks 1 to 61
         assert store.dropped == 61 - remaining
         blocks = await take(store, remaining)
         assert numbers(blocks) == list(range(62 - remaining, 62))
         assert {block.oldest for block in blocks} == {62 - remaining}
-        assert 8 <= remaining <= 11
+        assert 8 <= remaining <= 11  # the sizes of compressed blocks differ
 
 
-async def test_unacknowledged_blocks_are_taken_again_after_a_rewind(tmp_path: Path) -> None:
+async def test_blocks_that_the_broker_has_not_acknowledged_are_taken_again_after_a_rewind(tmp_path: Path) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
-        await write_blocks(store, *minutes(6))
+        await write_blocks(store, *minute_blocks(6))
         await take(store, 5)
         for number in (1, 2, 4):
             store.acknowledge(number)
@@ -137,25 +139,25 @@ async def test_unacknowledged_blocks_are_taken_again_after_a_rewind(tmp_path: Pa
         assert numbers(await take(store, 4)) == [3, 4, 5, 6]
 
 
-async def test_resend_request_repeats_all_later_blocks(tmp_path: Path) -> None:
+async def test_resend_request_repeats_the_requested_block_and_all_later_ones(tmp_path: Path) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
-        await write_blocks(store, *minutes(8))
+        await write_blocks(store, *minute_blocks(8))
         await take(store, 8)
         store.on_request(BlockRequest(store=int(WALL_S) * NS, number=3, resend=True))
         blocks = await take(store, 6)
         assert (numbers(blocks), {block.oldest for block in blocks}) == ([3, 4, 5, 6, 7, 8], {3})
 
 
-async def test_repeated_resend_request_is_ignored_for_a_while(tmp_path: Path) -> None:
+async def test_repeated_resend_request_is_ignored_within_the_resend_interval(tmp_path: Path) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
         store._resend_s = LONG_S
-        await write_blocks(store, *minutes(8))
+        await write_blocks(store, *minute_blocks(8))
         await take(store, 8)
         request = BlockRequest(store=int(WALL_S) * NS, number=3, resend=True)
         store.on_request(request)
         await take(store, 6)
         store.on_request(request)
-        await write_blocks(store, *minutes(1, 8))
+        await write_blocks(store, *minute_blocks(1, first=8))
         assert numbers(await take(store, 1)) == [9]
 
 
@@ -165,14 +167,17 @@ async def test_repeated_resend_request_is_ignored_for_a_while(tmp_path: Path) ->
         BlockRequest(store=(int(WALL_S) + 77) * NS + 1, number=1, resend=False),
         BlockRequest(store=int(WALL_S) * NS, number=100, resend=True),
     ],
-    ids=["a later store", "a later number"],
+    ids=["of a later store", "of a later number"],
 )
-async def test_restored_disk_begins_a_later_store(tmp_path: Path, block_request: BlockRequest) -> None:
+async def test_request_for_blocks_later_than_those_on_disk_begins_a_new_store(
+    tmp_path: Path, block_request: BlockRequest
+) -> None:
+    """A disk restored from a backup has fewer blocks than the worker has received."""
     async with open_store(tmp_path / "s.sqlite") as store:
-        await write_blocks(store, *minutes(3))
+        await write_blocks(store, *minute_blocks(3))
         await take(store, 3)
         store.on_request(block_request)
-        await until(lambda: store._on_disk.state.made_s * NS > block_request.store)
+        await until(lambda: store._on_disk.state.created_s * NS > block_request.store)
         await write_blocks(store, block_at(WALL_S + 1000.0))
         (block,) = await take(store, 1)
         assert (block.number, block.oldest) == (1, 1)
@@ -184,20 +189,20 @@ async def test_restored_disk_begins_a_later_store(tmp_path: Path, block_request:
 @pytest.mark.parametrize("store_ns", [0, 5, (1 << 63) - 1])
 async def test_request_with_an_implausible_store_is_ignored(tmp_path: Path, store_ns: int) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
-        await write_blocks(store, *minutes(3))
+        await write_blocks(store, *minute_blocks(3))
         store.on_request(BlockRequest(store=store_ns, number=1 << 63, resend=True))
-        await write_blocks(store, *minutes(1, 3))
+        await write_blocks(store, *minute_blocks(1, first=3))
         assert numbers(await take(store, 4)) == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("damage", ["no database", "deleted", "other tables", "row"])
-async def test_damaged_database_is_replaced_by_a_later_store(tmp_path: Path, damage: str) -> None:
+async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "s.sqlite"
     async with open_store(path) as store:
-        await write_blocks(store, *minutes(3))
-        before = store._on_disk.state.made_s
+        await write_blocks(store, *minute_blocks(3))
+        created_s = store._on_disk.state.created_s
     if damage == "no database":
-        path.write_bytes(b"nothing of the kind" * 1000)
+        path.write_bytes(b"not an SQLite file" * 1000)
     elif damage == "deleted":
         path.unlink()
     else:
@@ -208,28 +213,28 @@ async def test_damaged_database_is_replaced_by_a_later_store(tmp_path: Path, dam
         async with open_store(path, wall_s=WALL_S + 500.0) as store:
             await write_blocks(store, block_at(WALL_S + 500.0))
             (block,) = await take(store, 1)
-    assert block.store > before * NS
+    assert block.store > created_s * NS
     assert block.number == 1
     quarantined = [line for line in lines if line["event"] == "database set aside, a new one is begun"]
     assert bool(quarantined) == (damage in ("no database", "other tables"))
     assert path.with_name("s.refused.sqlite").exists() == bool(quarantined)
 
 
-async def test_deleted_file_loses_only_its_blocks(tmp_path: Path) -> None:
+async def test_file_deleted_while_in_use_loses_only_the_blocks_written_before(tmp_path: Path) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
-        await write_blocks(store, *minutes(3))
+        await write_blocks(store, *minute_blocks(3))
         (tmp_path / "s.sqlite").unlink()
-        await write_blocks(store, *minutes(2, 3))
+        await write_blocks(store, *minute_blocks(2, first=3))
         blocks = await take(store, 2)
         assert numbers(blocks) == [1, 2]
-        assert blocks[0].store == (int(WALL_S) + 180) * NS
+        assert blocks[0].store == (int(WALL_S) + 180) * NS  # created at the first block after the deletion
         assert blocks[0].samples["time_s"][0] == 0.0
 
 
 async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
     path = tmp_path / "s.sqlite"
     async with open_store(path) as store:
-        await write_blocks(store, *minutes(6))
+        await write_blocks(store, *minute_blocks(6))
     with contextlib.closing(sqlite3.connect(path)) as connection:
         connection.execute("UPDATE block SET data = zeroblob(200) WHERE number IN (1, 4)")
         connection.execute("DELETE FROM block WHERE number = 5")
@@ -237,17 +242,17 @@ async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
     async with open_store(path) as store:
         blocks = await take(store, 3)
         assert numbers(blocks) == [2, 3, 6]
-        assert {block.oldest for block in blocks} == {2}  # no worker has confirmed them
+        assert {block.oldest for block in blocks} == {2}  # block 2 is not yet confirmed and can be sent again
         store.on_request(BlockRequest(store=blocks[0].store, number=2, resend=True))
         assert numbers(await take(store, 3)) == [2, 3, 6]
         store.on_request(BlockRequest(store=blocks[0].store, number=4, resend=True))
         (block,) = await take(store, 1)
-        assert (block.number, block.oldest, store.dropped) == (6, 6, 3)
+        assert (block.number, block.oldest, store.dropped) == (6, 6, 3)  # 1, 4 and 5 are lost
 
 
 async def test_blocks_wait_in_memory_without_a_number_while_the_disk_is_full(full_disk: Path) -> None:
     async with open_store(full_disk / "s.sqlite") as store:
-        for block in minutes(3):
+        for block in minute_blocks(3):
             store.put(block)
         await until(lambda: store._database.reason)
         assert (store.unconfirmed, store.waiting) == (3, 3)
@@ -258,34 +263,31 @@ async def test_blocks_wait_in_memory_without_a_number_while_the_disk_is_full(ful
 
 
 async def test_memory_is_bounded_while_the_disk_fails(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("no folder")
+    (tmp_path / "file").write_text("a file in place of the folder")
     async with open_store(tmp_path / "file" / "s.sqlite") as store:
-        store._database.path.parent.touch()
         for i in range(60):
-            store.put(block_at(WALL_S + 60.0 * i, 20_000))
-        assert store.unconfirmed == 25
+            store.put(block_at(WALL_S + 60.0 * i, count=20_000))
+        assert store.unconfirmed == 25  # 500,000 samples, the limit of memory
         assert store.dropped == 35
 
 
 WRITER_SCRIPT = """
 import asyncio, sys
 from pathlib import Path
-from tests.edge.test_block_store import UNLIMITED_BYTES, minutes, open_store, write_blocks
+from tests.edge.test_block_store import minute_blocks, open_store, write_blocks
 async def main():
     async with open_store(Path(sys.argv[1])) as store:
-        for block in minutes(10_000):
+        for block in minute_blocks(10_000):
             await write_blocks(store, block)
-            print(store._on_disk.state.next, file=sys.stderr, flush=True)
+            print(store._on_disk.state.next_number, file=sys.stderr, flush=True)
 asyncio.run(main())
 """
 
 
 def kill_while_writing(path: Path) -> int:
-    """Kill a writing process and return the last next block number that the process reported."""
-    command, folder = [sys.executable, "-c", WRITER_SCRIPT, str(path)], {"PYTHONPATH": "."}
-    with subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=os.environ | folder
-    ) as process:
+    """Kill a process that writes blocks. Return the next block number by the last complete line of its output."""
+    command, environment = [sys.executable, "-c", WRITER_SCRIPT, str(path)], os.environ | {"PYTHONPATH": "."}
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment) as process:
         assert process.stderr
         lines = [process.stderr.readline() for _ in range(20)]
         process.kill()
@@ -293,12 +295,12 @@ def kill_while_writing(path: Path) -> int:
     return int(lines[-1] if lines[-1].endswith(b"\n") else lines[-2])
 
 
-async def test_block_numbers_are_unique_over_kills(tmp_path: Path) -> None:
+async def test_killed_edge_never_uses_a_block_number_twice(tmp_path: Path) -> None:
     path, next_number = tmp_path / "s.sqlite", 0
     for _ in range(3):
         reported = await asyncio.to_thread(kill_while_writing, path)
         assert reported >= next_number + 20
         async with open_store(path) as store:
-            next_number = store._on_disk.state.next
+            next_number = store._on_disk.state.next_number
             assert next_number >= reported
             assert numbers(await take(store, store.unconfirmed)) == list(range(1, next_number))

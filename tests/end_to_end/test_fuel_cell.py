@@ -16,10 +16,11 @@ from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.captures.replay import RawCapture
 from tests import mann_stack
-from tests.end_to_end.test_whole_way import program
+from tests.end_to_end.test_whole_way import run_program
 from tests.mosquitto import Broker, Listener
 
 MIN_SAMPLES = 500
+"""Number of samples after which the service is stopped."""
 LSB_V = 25.0 / 1024.0
 """Resolution of the board's voltage [V]."""
 
@@ -32,7 +33,9 @@ def simulate_stack() -> list[Reading]:
     return [Reading(*map(float, row)) for row in zip(*columns, strict=True)]
 
 
-async def test_a_fuel_cell_is_served_and_resumes_after_a_restart(tmp_path: Path, broker: Broker) -> None:
+async def test_a_fuel_cell_is_estimated_and_its_checkpoint_equals_a_replay_and_can_be_restored(
+    tmp_path: Path, broker: Broker
+) -> None:
     readings, pack, capture = simulate_stack(), tmp_path / "pack.toml", tmp_path / "line.bms"
     with VirtualBoard(lambda at_s: readings[min(int(100.0 * at_s), len(readings) - 1)]) as board:
         pack.write_text(f"""
@@ -48,16 +51,15 @@ url = "{broker.url}"
 folder = "{tmp_path / "state"}"
 """)
         running = asyncio.create_task(board.run())
-        async with Listener(broker, "bms/#") as listener, program(pack, "--record", str(capture)):
+        async with Listener(broker, "bms/#") as listener, run_program(pack, "--record", str(capture)):
             await listener.wait_json("bms/pack/health", lambda h: h["samples"]["samples"] > MIN_SAMPLES)
             parameters = await listener.wait_json("bms/pack/parameters", lambda p: p["elements"])
         running.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await running
     state = json.loads(listener.all("bms/pack/state")[-1])
-    assert [state[name] for name in ("soc", "soc_percent", "remaining_capacity_ah", "delta_1", "time_to_empty_s")] == [
-        None
-    ] * 5
+    for name in ("soc", "soc_percent", "remaining_capacity_ah", "delta_1", "time_to_empty_s"):
+        assert state[name] is None
     assert 8.0 < state["voltage_v"] < 13.0
     assert state["lock"]
     assert state["frames_lost"] == 0
@@ -75,7 +77,9 @@ folder = "{tmp_path / "state"}"
     for block in RawCapture(capture):
         replayed.run(block)
     assert saved.state["learning.theta"].tobytes() == replayed.record["learning"]["theta"].tobytes(), "to the last bit"
-    assert restore_state(resumed, saved.state, 10.0) == ""
+    assert restore_state(resumed, saved.state, unseen_s=10.0) == ""
     np.testing.assert_array_equal(resumed.record["learning"]["theta"], replayed.record["learning"]["theta"])
     not_finite = {**saved.state, "learning.theta": np.full_like(saved.state["learning.theta"], np.nan)}
-    assert restore_state(new_estimator(settings, cell), not_finite, 10.0) == "theta of the learning is not finite"
+    assert (
+        restore_state(new_estimator(settings, cell), not_finite, unseen_s=10.0) == "theta of the learning is not finite"
+    )

@@ -1,6 +1,7 @@
-"""End-to-end test of delta1, delta2 and N of Algorithm 1 of the thesis, from the serial line to the topic.
+"""End-to-end test of Algorithm 1 of the thesis, the adaptive observer, from the serial line to the topic.
 
-Numbers in parentheses are equations of the thesis.
+The test checks delta1 and delta2, below which SOC the capacitances of the RC pairs are negative, and N, the observer's
+gain. Numbers in parentheses are equations of the thesis.
 """
 
 import asyncio
@@ -25,11 +26,12 @@ STEP_S = 0.1
 """Sample period [s]."""
 START_SOC = 0.5
 LAMBDA = 50_000.0
-"""lambda of (3.10). With this large value, N falls within seconds."""
+"""Parameter lambda of the gain N (3.10). With this large value, N falls within seconds."""
 N_ERROR = 0.005
 """Tolerance of N.
 
-The program uses one decay rate of e over a sample, which causes an error of 0.5 % of k. N falls by 0.5 in this test.
+The program uses one decay rate of the error e over a sample, so that k, the integral of its square, has an error of 0.5 %.
+N falls by 0.5 in this test.
 """
 REPEAT_S = 0.05
 """Interval at which the first line is repeated until the program reads the port [s]."""
@@ -51,7 +53,7 @@ def format_line(row: tuple[float, float, float]) -> bytes:
 
 
 def element_at(a: np.ndarray, first: int, soc: float, sign: float) -> float:
-    """Return an element by (2.5) to (2.8)."""
+    """Return a resistance (sign 1) or capacitance (sign -1) at an SOC by (2.5) to (2.8), from its three parameters."""
     return float(sign * a[first] * math.exp(-a[first + 1] * soc) + a[first + 2])
 
 
@@ -66,12 +68,13 @@ def algorithm_1(samples: list[tuple[float, float, float]]) -> Iterator[tuple[flo
     (3.1) to (3.3), (3.12), (3.13), (3.15), (3.18) and (4.1) are solved in small steps. N and y are constant over a sample, as
     in the program.
     """
-    bounds = [CELL.bounds(i) for i in range(1, 13)]
+    bounds = [CELL.bounds(i) for i in range(1, 13)]  # of a1 to a12; index 0 of the arrays is unused
     limit = np.array([0.0, *(b.limit for b in bounds)])
     rate = np.array([1.0, *(b.rate for b in bounds)])
     a = np.array([0.0, *(b.limit if b.initial is None else b.initial for b in bounds)])
+    # x2 and x3 are the voltages of the RC pairs, k is the integral of the squared error
     soc, x2, x3, k, previous_a = START_SOC, 0.0, 0.0, 0.0, samples[0][1]
-    a16, a17, a18, a19, a20, a21 = CELL.a[16:22]
+    a16, a17, a18, a19, a20, a21 = CELL.a[16:22]  # of the OCV (2.10)
     substeps = 4000
     dt_s = STEP_S / substeps
     for n, (_, current_a, voltage_v) in enumerate(samples):

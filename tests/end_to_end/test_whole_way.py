@@ -30,17 +30,20 @@ LSB_V, LSB_A = 25.0 / 1024.0, 5.0 / 1024.0 / 0.1
 """Resolution of the board's voltage [V] and current [A]."""
 START_SOC = 0.9
 LOAD_A = 0.3
+PERIOD_S = 0.02
+"""Period of the readings of the simulated cell [s]."""
 RUN_S = 14.0
+"""Time of the board until which states are compared [s]. It contains a pulse and a rest."""
 EDGE_S = 0.3
 """Difference between the clocks of board and cell, plus a publish window [s]."""
 
 
-class Truth:
-    """Simulated cell under pulses of 10 s, sampled at 50 Hz."""
+class SimulatedCell:
+    """A minute of a simulated cell under pulses of 10 s, sampled at 50 Hz: true SOC [1], current [A] and voltage [V]."""
 
     def __init__(self) -> None:
         pack = SimulatedPack(load_cell("chen_mora"), pulses(LOAD_A), soc=START_SOC)
-        self.time_s = np.arange(0.0, 60.0, 0.02)
+        self.time_s = np.arange(0.0, 60.0, PERIOD_S)
         self.readings: list[Reading] = []
         socs = []
         for at_s in self.time_s:
@@ -50,33 +53,33 @@ class Truth:
         self.current_a = np.array([r.current_a for r in self.readings])
         self.voltage_v = np.array([r.voltage_v for r in self.readings])
 
-    def signal(self, at_s: float) -> Reading:
+    def reading(self, at_s: float) -> Reading:
         """Return the reading at a time [s]."""
-        return self.readings[min(round(at_s / 0.02), len(self.readings) - 1)]
+        return self.readings[min(round(at_s / PERIOD_S), len(self.readings) - 1)]
 
     def at(self, values: np.ndarray, at_s: float) -> float:
-        """Return a true value at a time [s]."""
+        """Return the true value at a time [s]. ``values`` is one of the arrays of this object."""
         return float(np.interp(at_s, self.time_s, values))
 
-    def steady(self, at_s: float) -> bool:
+    def is_steady(self, at_s: float) -> bool:
         """Return True if the current is constant within ``EDGE_S`` of a time [s]."""
-        near = np.abs(self.time_s - at_s) < EDGE_S
-        return bool(np.ptp(self.current_a[near]) == 0.0)
+        is_near = np.abs(self.time_s - at_s) < EDGE_S
+        return bool(np.ptp(self.current_a[is_near]) == 0.0)
 
 
 @pytest.fixture(scope="module")
-def truth() -> Truth:
-    return Truth()
+def simulated() -> SimulatedCell:
+    return SimulatedCell()
 
 
 class Plug:
-    """Path of the serial port, at which a board can be unplugged and another plugged in."""
+    """Path of the serial port, to which one board after another can be connected."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def into(self, pseudo_terminal: str) -> None:
-        """Connect the board of a pseudo-terminal to the port."""
+    def connect(self, pseudo_terminal: str) -> None:
+        """Connect the board at a pseudo-terminal, in place of the last one."""
         self.path.unlink(missing_ok=True)
         self.path.symlink_to(pseudo_terminal)
 
@@ -105,7 +108,8 @@ folder = "{folder / "state"}"
 
 
 @contextlib.asynccontextmanager
-async def program(pack: Path, *options: str) -> AsyncIterator[asyncio.subprocess.Process]:
+async def run_program(pack: Path, *options: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run the service of a pack file, and end it by SIGTERM."""
     process = await asyncio.create_subprocess_exec(
         str(PROGRAM), "run", str(pack), *options, stdout=asyncio.subprocess.DEVNULL, stderr=None
     )
@@ -125,44 +129,45 @@ class Board(NamedTuple):
 
 
 @contextlib.asynccontextmanager
-async def run_board(kind: str, truth: Truth, folder: Path) -> AsyncIterator[Board]:
-    if kind == "python":
-        with VirtualBoard(truth.signal) as board, contextlib.ExitStack() as stack:
+async def run_board(board_kind: str, simulated: SimulatedCell, folder: Path) -> AsyncIterator[Board]:
+    """Yield a board that runs in Python, or whose firmware runs in simavr."""
+    if board_kind == "python":
+        with VirtualBoard(simulated.reading) as board, contextlib.ExitStack() as stack:
             yield Board(board.path, lambda: stack.callback(asyncio.create_task(board.run()).cancel))
     else:
-        rows = [(t, *r) for t, r in zip(truth.time_s, truth.readings, strict=True)]
-        with SimavrBoard(write_readings(folder / "readings.csv", rows)) as simulated:
-            yield Board(simulated.path, lambda: None)  # the simulated board starts when its line is opened
+        rows = [(t, *r) for t, r in zip(simulated.time_s, simulated.readings, strict=True)]
+        with SimavrBoard(write_readings(folder / "readings.csv", rows)) as simavr_board:
+            yield Board(simavr_board.path, power_up=lambda: None)  # it starts when its line is opened
 
 
 @pytest.fixture(params=["simavr", pytest.param("python", marks=pytest.mark.thorough)])
-def kind(request: pytest.FixtureRequest) -> str:
+def board_kind(request: pytest.FixtureRequest) -> str:
     if request.param == "simavr":
         request.getfixturevalue("firmware")
     return str(request.param)
 
 
 async def test_published_values_equal_the_simulated_ones_within_the_resolution_of_the_adc(
-    kind: str, truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
+    board_kind: str, simulated: SimulatedCell, tmp_path: Path, plug: Plug, broker: Broker
 ) -> None:
-    async with run_board(kind, truth, tmp_path) as board, Listener(broker, "bms/#") as listener:
-        plug.into(board.path)
-        async with program(pack_file(tmp_path, plug, broker)):
+    async with run_board(board_kind, simulated, tmp_path) as board, Listener(broker, "bms/#") as listener:
+        plug.connect(board.path)
+        async with run_program(pack_file(tmp_path, plug, broker)):
             await listener.wait("bms/pack/availability", lambda p: p == b"online")
             board.power_up()
             await listener.wait_json("bms/pack/state")
             await listener.wait_json("bms/pack/state", lambda s: s["board_time_s"] > RUN_S)
     published = [json.loads(payload) for payload in listener.all("bms/pack/state")]
-    states = [s for s in published if truth.steady(s["board_time_s"])]
+    states = [s for s in published if simulated.is_steady(s["board_time_s"])]
     assert len(states) > 50
     for state in states:
         at_s = state["board_time_s"]
-        assert abs(state["voltage_v"] - truth.at(truth.voltage_v, at_s)) < LSB_V
-        assert abs(state["current_a"] - truth.at(truth.current_a, at_s)) < LSB_A
-        assert abs(state["soc_coulomb"] - truth.at(truth.soc, at_s)) < 0.001
-        assert abs(state["soc"] - truth.at(truth.soc, at_s)) < max(3.0 * state["soc_std"], 0.01)
-        assert abs(state["voltage_estimate_v"] - truth.at(truth.voltage_v, at_s)) < 2.0 * LSB_V
-    errors_v = [s["voltage_v"] - truth.at(truth.voltage_v, s["board_time_s"]) for s in states]
+        assert abs(state["voltage_v"] - simulated.at(simulated.voltage_v, at_s)) < LSB_V
+        assert abs(state["current_a"] - simulated.at(simulated.current_a, at_s)) < LSB_A
+        assert abs(state["soc_coulomb"] - simulated.at(simulated.soc, at_s)) < 0.001
+        assert abs(state["soc"] - simulated.at(simulated.soc, at_s)) < max(3.0 * state["soc_std"], 0.01)
+        assert abs(state["voltage_estimate_v"] - simulated.at(simulated.voltage_v, at_s)) < 2.0 * LSB_V
+    errors_v = [s["voltage_v"] - simulated.at(simulated.voltage_v, s["board_time_s"]) for s in states]
     assert abs(np.mean(errors_v)) < 0.25 * LSB_V
     last = states[-1]
     assert last["lock"]
@@ -173,18 +178,18 @@ async def test_published_values_equal_the_simulated_ones_within_the_resolution_o
     assert info["board"]["firmware"]
 
 
-async def test_the_service_continues_without_board_and_without_broker(
-    kind: str, truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
+async def test_the_service_continues_after_losses_of_its_board_and_of_its_broker(
+    board_kind: str, simulated: SimulatedCell, tmp_path: Path, plug: Plug, broker: Broker
 ) -> None:
     async with Listener(broker, "bms/#") as listener, contextlib.AsyncExitStack() as stack:
-        async with run_board(kind, truth, tmp_path) as board:
-            plug.into(board.path)
+        async with run_board(board_kind, simulated, tmp_path) as board:
+            plug.connect(board.path)
             board.power_up()
-            await stack.enter_async_context(program(pack_file(tmp_path, plug, broker)))
+            await stack.enter_async_context(run_program(pack_file(tmp_path, plug, broker)))
             before = await listener.wait_json("bms/pack/state", lambda s: s["frames_received"] > 100)
         await listener.wait("bms/pack/sensor/availability", lambda p: p == b"offline")
-        async with run_board(kind, truth, tmp_path) as board:
-            plug.into(board.path)
+        async with run_board(board_kind, simulated, tmp_path) as board:
+            plug.connect(board.path)
             board.power_up()
             await listener.wait_json("bms/pack/health", lambda h: h["sensor_online"] and h["reconnects"] >= 1)
             after_reconnection = await listener.wait_json(
@@ -204,13 +209,13 @@ async def test_the_service_continues_without_board_and_without_broker(
 
 
 async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
-    truth: Truth, tmp_path: Path, plug: Plug, broker: Broker
+    simulated: SimulatedCell, tmp_path: Path, plug: Plug, broker: Broker
 ) -> None:
     pack, capture = pack_file(tmp_path, plug, broker), tmp_path / "line.bms"
-    with VirtualBoard(truth.signal) as board:
-        plug.into(board.path)
+    with VirtualBoard(simulated.reading) as board:
+        plug.connect(board.path)
         running = asyncio.create_task(board.run())
-        async with Listener(broker, "bms/#") as listener, program(pack, "--record", str(capture)):
+        async with Listener(broker, "bms/#") as listener, run_program(pack, "--record", str(capture)):
             for number, event in enumerate(line_events(board), start=1):
                 await listener.wait_json("bms/pack/health", has_frames(60 * number))
                 event()
@@ -232,10 +237,11 @@ async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
 
 
 def line_events(board: VirtualBoard) -> list[Callable[[], None]]:
-    """Return functions that cause each fault of the line and, last, a reset of the board."""
-    faults = [lambda f=f: board.inject(f, 3) for f in BoardFault]  # type: ignore[misc]
+    """Return functions, each of which causes a fault of the line in three frames; the last resets the board."""
+    faults = [lambda fault=fault: board.inject(fault, 3) for fault in BoardFault]  # type: ignore[misc]
     return [*faults, lambda: board.reset(ResetCause.BROWN_OUT)]
 
 
 def has_frames(frames: int) -> Callable[[Any], bool]:
+    """Return a condition for a health message: at least ``frames`` frames were received."""
     return lambda health: health["line"]["frames_received"] >= frames

@@ -16,11 +16,15 @@ TRUTH = load_cell("chen_mora").model_copy(update={"adaptation": {}})
 RATED_A = 0.275
 """Current of 1 C [A]."""
 STEPS_C = (-1.0, -0.5, 0.0, 0.0, 0.5, 1.0)
+"""Currents of the steps [C]. A rest is twice as frequent as any other current."""
 HOLD_S = (20, 400)
 """Range of the duration of a step [s]."""
 MIN_SOC, MAX_SOC = 0.3, 0.85
+"""Range of the SOC during the steps. A step that would leave the range has the opposite sign."""
 FIRST_SOC = 0.6
 RESOLUTION_V = 5e-4
+"""Configured voltage resolution of the estimators [V]."""
+HALF_SECONDS_PER_HOUR = 7200
 
 
 def file_off_by(*factors: float) -> CellModel:
@@ -36,31 +40,32 @@ def file_off_by(*factors: float) -> CellModel:
 
 
 def held_currents(hours: float, rng: np.random.Generator) -> np.ndarray:
-    """Return random currents held for a random time, one for each half second [A].
+    """Return a random current that is held for random times, one value for each half second [A].
 
-    Steps are midway between whole seconds, because the first half second has no current.
+    The first half second has no current, so that the current changes midway between the samples of ``measured``.
     """
-    n, soc = int(hours * 7200), FIRST_SOC
+    n, soc = int(hours * HALF_SECONDS_PER_HOUR), FIRST_SOC
     current_a, i = np.zeros(n), 1
     while i < n:
         half_seconds = 2 * int(rng.integers(*HOLD_S))
-        c = rng.choice(STEPS_C)
-        drop = c * half_seconds / 7200
-        if not MIN_SOC < soc - drop < MAX_SOC:
-            c, drop = -c, -drop
-        current_a[i : i + half_seconds] = c * RATED_A
-        soc, i = soc - drop, i + half_seconds
+        step_c = rng.choice(STEPS_C)
+        soc_drop = step_c * half_seconds / HALF_SECONDS_PER_HOUR
+        if not MIN_SOC < soc - soc_drop < MAX_SOC:
+            step_c, soc_drop = -step_c, -soc_drop
+        current_a[i : i + half_seconds] = step_c * RATED_A
+        soc, i = soc - soc_drop, i + half_seconds
     return current_a
 
 
 def random_steps(hours: float, noise_v: float = 0.0, seed: int = 1, cell: CellModel = TRUTH) -> SampleBlock:
-    """Return samples of ``cell`` at 1 Hz with ``noise_v`` of voltage noise [V]."""
+    """Return samples of ``cell`` at 1 Hz under random current steps; ``noise_v`` is the std of the voltage noise
+    [V]."""
     rng = np.random.default_rng(seed)
     return measured(held_currents(hours, rng), noise_v, rng, cell)
 
 
 def measured(current_a: np.ndarray, noise_v: float, rng: np.random.Generator, cell: CellModel = TRUTH) -> SampleBlock:
-    """Return a sensor's samples of ``cell`` each second, under a current for each half second [A]."""
+    """Return a sensor's samples of ``cell`` at 1 Hz; ``current_a`` has one value for each half second [A]."""
     time_s = 0.5 * np.arange(len(current_a))
     voltage_v, _ = simulate_cell((FIRST_SOC, 0.0, 0.0), time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
     block = np.zeros(len(current_a[::2]), dtype=SAMPLE)
@@ -70,7 +75,8 @@ def measured(current_a: np.ndarray, noise_v: float, rng: np.random.Generator, ce
 
 
 def learner(file: CellModel, soc: float = FIRST_SOC, **observer: float) -> Estimator:
-    """Return an estimator with the learning law and without the filter, starting at ``soc``."""
+    """Return an estimator without the filter that starts at ``soc``, with the learning law and other settings
+    ``observer``."""
     settings = ObserverSettings.model_validate({"law": "learning", **observer})
     return Estimator(file, settings, identifier=None, initial_soc=soc, voltage_resolution_v=RESOLUTION_V)
 

@@ -8,15 +8,19 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 TRUTH = load_cell("ncr18650").model_copy(update={"ladder": None})
+"""True cell. It has no RC ladder, because it is simulated with the two RC pairs of its file."""
 NOISE_V = 3e-4
+"""Std of the noise of a measured voltage [V]."""
 RESOLUTION_V = 1e-3
+"""Resolution of a measured voltage [V]."""
 LEVELS_A = [0.0, 0.0, 0.75, 1.5, 3.0, -0.5]
 """Currents of the pulses. Rests are twice as frequent as any other level."""
 LEVEL_S = 60
+"""Duration of each current level [s]."""
 
 
 def wrong_cell(factor: float) -> CellModel:
-    """Return the true cell with all resistances multiplied by ``factor``."""
+    """Return the file of a cell whose resistances are ``factor`` times the true ones."""
     parts = {}
     for name in ("r_s", "r_ts", "r_tl"):
         part = getattr(TRUTH, name)
@@ -27,7 +31,7 @@ def wrong_cell(factor: float) -> CellModel:
 
 
 def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleBlock, np.ndarray]:
-    """Return samples of random pulses and rests at 1 Hz that empty the true cell, and its true SOC."""
+    """Return samples at 1 Hz of random pulses and rests, which empty the true cell from ``soc``, and its true SOC."""
     rng = np.random.default_rng(seed)
     levels_a = rng.choice(LEVELS_A, int(3600 * hours) // LEVEL_S)
     return measured(np.repeat(levels_a, LEVEL_S), soc, rng)
@@ -46,11 +50,11 @@ def measured(
     block["current_a"] = current_a
     ocv_v, slope_v = ocv_grid(TRUTH)
     a, capacity_as = TRUTH.a, TRUTH.cell.capacity_ah * 3600.0
-    x, true_soc = (soc, 0.0, 0.0), np.empty(block.size)
-    for n, i in enumerate(current_a):
-        block["voltage_v"][n] = chen_mora.ocv(x[0], ocv_v, slope_v) - x[1] - x[2] - i * chen_mora.r_s(x[0], a)
+    x, true_soc = (soc, 0.0, 0.0), np.empty(block.size)  # x is SOC and the voltages of both RC pairs
+    for n, i_a in enumerate(current_a):
+        block["voltage_v"][n] = chen_mora.ocv(x[0], ocv_v, slope_v) - x[1] - x[2] - i_a * chen_mora.r_s(x[0], a)
         true_soc[n] = x[0]
-        x = chen_mora.cell_step(x, i, step_s, capacity_as, a)
+        x = chen_mora.cell_step(x, i_a, step_s, capacity_as, a)
     noisy_v = block["voltage_v"] + rng.normal(0, NOISE_V, block.size)
     block["voltage_v"] = np.round(noisy_v / RESOLUTION_V) * RESOLUTION_V
     return block, true_soc

@@ -16,6 +16,7 @@ from tests.estimator.anywhere.use import DAY_S, cycles, days
 
 SEEDS = range(1, 9)
 OWN_CURVE = {"curve_error": 0.5, "unseen_h": 0.0}
+"""Half of the typical OCV error, and no load before the estimator starts."""
 MAX_CAPACITY_ERROR = 0.025
 """Limit of the relative error of the capacity of each cell."""
 MAX_RMS_CAPACITY_ERROR = 0.015
@@ -34,9 +35,9 @@ def nees_limit(cells: int) -> float:
     return float(chi2.ppf(0.999, cells)) / cells
 
 
-def error_over_std(learned: IdentifiedValue, true: float) -> float:
-    """Return the error over the std."""
-    return (learned.value - true) / learned.std
+def error_over_std(learned: IdentifiedValue, true_value: float) -> float:
+    """Return the error of a learned value divided by its std."""
+    return (learned.value - true_value) / learned.std
 
 
 def estimate_cycles(case: Case, initial_soc_error: float) -> Estimator:
@@ -60,6 +61,7 @@ def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(initial_
     for seed in SEEDS:
         for capacity in (0.8, 1.2):
             case = Case("cycles", capacity=capacity, seed=seed, **OWN_CURVE)
+            # ``capacity`` is that of the cell file over the true one, so that 1 / capacity is to be learned.
             learned = relative_capacity(estimate_cycles(case, initial_soc_error).record[0])
             errors.append(capacity * learned.value - 1.0)
             errors_over_std.append(error_over_std(learned, 1.0 / capacity))
@@ -69,7 +71,7 @@ def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(initial_
     assert np.mean(np.square(errors_over_std)) < nees_limit(len(SEEDS))
 
 
-def test_a_gain_error_of_the_current_sensor_is_equivalent_to_a_capacity() -> None:
+def test_a_gain_error_of_the_current_sensor_is_learned_as_a_capacity() -> None:
     """A current sensor with a gain of 1.05 leads to a capacity that is 1.05 times as large.
 
     Currents and capacity 1.05 times as large, with resistances divided by 1.05, give equal voltages. Therefore data cannot
@@ -100,17 +102,17 @@ def test_an_offset_of_20_ma_is_identified_within_a_day(temperature_c: float) -> 
 
 def test_an_offset_that_changes_after_days_is_identified_again() -> None:
     recording = simulate_use(Case("step", soc=0.8, **OWN_CURVE), count=6)
-    change, offset_a = 4 * DAY_S, 0.03
-    recording.samples["current_a"][change:] += offset_a
+    first_with_offset, offset_a = 4 * DAY_S, 0.03
+    recording.samples["current_a"][first_with_offset:] += offset_a
     estimator = Estimator(recording.cell, initial_soc=0.8)
-    estimator.run(recording.samples[:change])
+    estimator.run(recording.samples[:first_with_offset])
     before = current_offset(estimator.record[0])
-    trace = estimator.run(recording.samples[change:])
+    trace = estimator.run(recording.samples[first_with_offset:])
     after = current_offset(estimator.record[0])
     assert abs(before.value) < MAX_OFFSET_ERROR_A
     assert abs(after.value - offset_a) < MAX_OFFSET_ERROR_A
-    inside = np.abs(trace["soc"] - recording.soc[change:]) < 2.0 * trace["soc_std"]
-    assert inside[DAY_S:].mean() > 0.95
+    inside = np.abs(trace["soc"] - recording.soc[first_with_offset:]) < 2.0 * trace["soc_std"]
+    assert inside[DAY_S:].mean() > 0.95  # a day after the change
 
 
 def test_self_discharge_is_identified_as_an_offset() -> None:
@@ -126,7 +128,7 @@ def test_self_discharge_is_identified_as_an_offset() -> None:
     assert abs(error_over_std(learned, -drain_a)) < 1.0
 
 
-def test_the_std_of_a_learned_value_is_that_of_the_mixture() -> None:
+def test_the_std_of_a_learned_value_includes_the_spread_of_the_hypotheses() -> None:
     case = Case("start", **OWN_CURVE)
     recording = capture(case, np.zeros(60))
     estimator = Estimator(recording.cell, initial_soc=0.5)

@@ -10,6 +10,9 @@ from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.cell import load_cell, shipped_cells
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 
+CAPACITY_AS = 3.0 * 3600
+"""Capacity of the cell ncr18650 [A s]."""
+
 
 def noisy_load(n: int = 5000) -> SampleBlock:
     """Return random samples with irregular times, of which some have no voltage or a voltage of 0."""
@@ -83,7 +86,8 @@ def test_a_clock_set_back_is_counted_and_loses_a_single_step() -> None:
     for time_s in (0.0, 1.0, 2.0, -500.0, -499.0):
         assert estimator.step(time_s, 3.0, 3.7) is SampleOutcome.ACCEPTED
     assert estimator.state["time_steps_back"][0] == 1
-    assert estimator.state["soc"][0] == pytest.approx(0.5 - 3.0 * 3.0 / (3.0 * 3600))
+    # Three of the four steps count: 3 A for 3 s.
+    assert estimator.state["soc"][0] == pytest.approx(0.5 - 3.0 * 3.0 / CAPACITY_AS)
 
 
 def test_charge_is_counted_over_a_gap() -> None:
@@ -91,7 +95,7 @@ def test_charge_is_counted_over_a_gap() -> None:
     estimator.step(0.0, 1.0, 3.7)
     estimator.step(10.0, 1.0, 3.7)
     assert estimator.state["gaps"][0] == 1
-    assert estimator.state["soc"][0] == pytest.approx(0.5 - 10.0 / (3.0 * 3600))
+    assert estimator.state["soc"][0] == pytest.approx(0.5 - 1.0 * 10.0 / CAPACITY_AS)
 
 
 def test_slow_sampling_does_not_count_as_gaps() -> None:
@@ -106,7 +110,7 @@ def test_the_smaller_current_of_both_ends_is_counted_over_a_gap() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.5, identifier=None)
     for time_s, current_a in ((0.0, 1.0), (1800.0, 0.2), (3600.0, -1.0)):
         estimator.step(time_s, current_a, 3.7)
-    assert estimator.state["soc"][0] == pytest.approx(0.5 - 0.2 * 0.5 / 3.0)
+    assert estimator.state["soc"][0] == pytest.approx(0.5 - 0.2 * 1800.0 / CAPACITY_AS)
 
 
 def test_one_wrong_time_stamp_does_not_empty_the_cell() -> None:
@@ -120,9 +124,9 @@ def test_one_wrong_time_stamp_does_not_empty_the_cell() -> None:
 def test_soc_starts_from_the_open_circuit_voltage_when_not_given() -> None:
     cell = load_cell("chen_mora")
     estimator = Estimator(cell, identifier=None)
-    estimator.step(0.0, 0.0, 3.85)
+    estimator.step(0.0, 0.0, 3.85)  # no current: the voltage is the OCV
     soc = float(estimator.state["soc"][0])
-    a = cell.a
+    a = cell.a  # a16..a21 are the coefficients of the OCV by Chen and Mora
     assert -a[16] * np.exp(-a[17] * soc) + a[18] + a[19] * soc - a[20] * soc**2 + a[21] * soc**3 == pytest.approx(3.85)
 
 
@@ -133,7 +137,7 @@ def test_shipped_cells_load_and_step(name: str) -> None:
 
 
 def test_settings_of_table_5_violate_condition_1_of_lemma_4_1_1() -> None:
-    """Erratum 6 of the thesis: P9.l9 = 89000 is not below P7.l7 = 87500."""
+    """Erratum 6 of the thesis. P7.l7 is the sum of the bounds of a7, each times its weight. P9.l9 should be smaller."""
     cell = load_cell("chen_mora")
     assert [(c.name, c.left, c.right) for c in failed_conditions(cell)] == [("1: P9.l9 < P7.l7", 89000.0, 87500.0)]
     assert sum(c.holds for c in lemma_conditions(cell)) == 5

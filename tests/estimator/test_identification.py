@@ -15,10 +15,13 @@ from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
 
 IDENTIFIER = IdentifierSettings()
+AFTER_HALF_AN_HOUR = slice(1800, None)
+"""Samples at 1 Hz from half an hour on."""
 
 
 @pytest.fixture(scope="module")
 def load_and_soc() -> tuple[SampleBlock, np.ndarray]:
+    """Return three hours of samples of the true cell from full at 1 Hz, and the true SOC."""
     return pulses()
 
 
@@ -40,10 +43,10 @@ def test_a_wrong_soc_and_wrong_resistances_are_corrected(load_and_soc) -> None:
     block, true_soc = load_and_soc
     estimator = Estimator(wrong_cell(2.0), identifier=IDENTIFIER, initial_soc=0.8)
     trace = estimator.run(block)
-    late = slice(1800, None)
-    error = trace["soc"] - true_soc
-    assert np.abs(error[late]).max() < 0.04
-    assert np.mean(np.abs(error[late]) < 2.0 * trace["soc_std"][late]) > 0.95
+    error = (trace["soc"] - true_soc)[AFTER_HALF_AN_HOUR]
+    assert np.abs(error).max() < 0.04
+    assert np.mean(np.abs(error) < 2.0 * trace["soc_std"][AFTER_HALF_AN_HOUR]) > 0.95
+    # The counted SOC keeps the initial error.
     assert trace["soc_coulomb"][5000] == pytest.approx(true_soc[5000] - 0.2, abs=1e-3)
     elements, soc, a = present_elements(estimator.record[0]), true_soc[-1], TRUTH.a
     assert elements["r_s_ohm"].value == pytest.approx(chen_mora.r_s(soc, a), rel=0.05)
@@ -59,7 +62,7 @@ def test_parameters_of_the_adaptive_law_converge_to_the_identified_values(load_a
     for soc in (0.3, 0.6, 0.9):
         assert chen_mora.r_s(soc, a) == pytest.approx(chen_mora.r_s(soc, TRUTH.a), rel=0.03)
         assert chen_mora.r_ts(soc, a) == pytest.approx(chen_mora.r_ts(soc, TRUTH.a), rel=0.5)
-    for i in (1, 2, 3):
+    for i in (1, 2, 3):  # a1..a3 of R_ts
         fit = fitted_parameter(record, i)
         assert fit is not None
         bounds = estimator.cell.bounds(i)
@@ -67,16 +70,16 @@ def test_parameters_of_the_adaptive_law_converge_to_the_identified_values(load_a
 
 
 def test_identified_values_are_limited_by_the_configured_bounds(load_and_soc) -> None:
-    cell = wrong_cell(1.0).model_copy(
-        update={"adaptation": {"a3": TRUTH.bounds(3).model_copy(update={"upper": 0.01, "lower": 0.009})}}
+    bounds = TRUTH.bounds(3).model_copy(update={"lower": 0.009, "upper": 0.01})
+    estimator = Estimator(
+        TRUTH.model_copy(update={"adaptation": {"a3": bounds}}), identifier=IDENTIFIER, initial_soc=1.0
     )
-    estimator = Estimator(cell, identifier=IDENTIFIER, initial_soc=1.0)
     estimator.run(load_and_soc[0])
     assert fitted_parameter(estimator.record[0], 3).value > 0.01
     assert estimator.state[0]["a"][3] == pytest.approx(0.01, rel=1e-3)
 
 
-def test_a_bound_on_one_parameter_does_not_change_the_element_at_visited_soc(load_and_soc) -> None:
+def test_a_bound_on_one_parameter_does_not_change_the_element_at_visited_socs(load_and_soc) -> None:
     """The bound on a15 is far below its true value. The other parameters of R_s compensate for it at visited SOCs."""
     bound = TRUTH.bounds(15).model_copy(update={"upper": 0.08, "lower": 0.07})
     estimator = Estimator(
@@ -88,36 +91,37 @@ def test_a_bound_on_one_parameter_does_not_change_the_element_at_visited_soc(loa
     assert chen_mora.r_s(soc, a) > 0.08
 
 
-def test_a_fit_with_negative_capacitances_at_the_present_soc_is_not_used_by_the_law(load_and_soc) -> None:
+def test_the_law_ignores_a_fit_with_negative_capacitances_at_the_present_soc(load_and_soc) -> None:
     estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
     estimator.run(load_and_soc[0])
     record, soc = estimator.record[0], float(estimator.state["soc"][0])
     targets = record["observer"]["target"].copy()
     estimator.settings_record["lower"][0, 7:13], estimator.settings_record["upper"][0, 7:13] = 0.0, np.inf
-    record["fit"]["a"][7:13] = [2e5, 1.0, 1e3, 1e6, 1.0, 1e4]  # delta1 = 5.3, delta2 = 4.6
-    for e in CAPACITANCES:
-        set_adaptation_targets(record, estimator.settings_record[0], e)
+    # a7..a9 of C_ts and a10..a12 of C_tl. The capacitances are negative below SOC 5.3 and 4.6 (delta1 and delta2).
+    record["fit"]["a"][7:13] = [2e5, 1.0, 1e3, 1e6, 1.0, 1e4]
+    for element in CAPACITANCES:
+        set_adaptation_targets(record, estimator.settings_record[0], element)
     assert soc < 4.6
     assert np.array_equal(record["observer"]["target"], targets)
 
 
-def test_an_unmeasured_gap_adds_nothing_to_the_map(load_and_soc) -> None:
+def test_an_unmeasured_gap_adds_no_weight_to_the_map_of_elements(load_and_soc) -> None:
     estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
     estimator.run(load_and_soc[0][:5000])
-    before, gap_s = estimator.record[0]["map"]["weight"].copy(), 36000.0
+    weight_before, gap_s = estimator.record[0]["map"]["weight"].copy(), 36000.0
     unlearned_s = estimator.record[0]["unlearned_s"].copy()
     later = load_and_soc[0][5000:5300].copy()
     later["time_s"] += gap_s
     later["current_a"] = 0.0
     estimator.run(later[:1])
-    assert estimator.record[0]["map"]["weight"] == pytest.approx(before)
+    assert estimator.record[0]["map"]["weight"] == pytest.approx(weight_before)
     assert estimator.record[0]["unlearned_s"] - unlearned_s == pytest.approx(gap_s, abs=2.0)
-    # At the present SOC, learning continues, which the median of the bins disregards.
+    # Learning continues in the bin of the present SOC. The median over the bins is not affected by it.
     estimator.run(later[1:])
-    remaining = np.exp(-gap_s / estimator.settings_record["map_memory_s"][0])
-    visited = before > 0.0
-    remaining_weight = estimator.record[0]["map"]["weight"][visited] / before[visited]
-    assert np.median(remaining_weight) == pytest.approx(remaining, rel=2e-3)
+    expected_fraction = np.exp(-gap_s / estimator.settings_record["map_memory_s"][0])
+    visited = weight_before > 0.0
+    remaining_fraction = estimator.record[0]["map"]["weight"][visited] / weight_before[visited]
+    assert np.median(remaining_fraction) == pytest.approx(expected_fraction, rel=2e-3)
 
 
 def test_a_long_gap_preserves_the_capacity_and_the_constant_part_of_the_offset(load_and_soc) -> None:
@@ -126,7 +130,7 @@ def test_a_long_gap_preserves_the_capacity_and_the_constant_part_of_the_offset(l
     f = estimator.record[0]["filter"]
     (offset_a, ln_q), first = f["mean"][f["best"], [OFFSET, LN_Q]], f["covariance"][f["best"]].copy()
     p = estimator.settings_record[0]["filter"]
-    estimator.resume(0.1 * p["offset_s"])
+    estimator.resume(0.1 * p["offset_s"])  # a tenth of the time constant of the offset
     estimator.run(load_and_soc[0][-1:])
     mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]]
     assert mean[LN_Q] == pytest.approx(ln_q, rel=0.2)
@@ -134,12 +138,12 @@ def test_a_long_gap_preserves_the_capacity_and_the_constant_part_of_the_offset(l
     assert covariance[LN_Q, LN_Q] < p["capacity_std"] ** 2
     assert abs(mean[OFFSET] - np.exp(-0.1) * offset_a) < 0.1 * np.sqrt(first[OFFSET, OFFSET])
     prior_variance = offset_variance(p)
-    remaining = prior_variance - np.exp(-0.2) * (prior_variance - first[OFFSET, OFFSET])
-    assert covariance[OFFSET, OFFSET] == pytest.approx(remaining, rel=0.05)
+    expected_variance = prior_variance - np.exp(-0.2) * (prior_variance - first[OFFSET, OFFSET])
+    assert covariance[OFFSET, OFFSET] == pytest.approx(expected_variance, rel=0.05)
 
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2"])
-def test_laws_without_limits_receive_no_identified_limits(load_and_soc, law: str) -> None:
+def test_identified_values_do_not_limit_laws_without_limits(load_and_soc, law: str) -> None:
     estimator = Estimator(TRUTH, ObserverSettings(law=law), identifier=IDENTIFIER, initial_soc=1.0)
     targets = estimator.settings[0]["target"].copy()
     estimator.run(load_and_soc[0])
@@ -164,18 +168,18 @@ def test_a_saved_record_resumes_identically(load_and_soc) -> None:
     assert uninterrupted.record.tobytes() == second.record.tobytes()
 
 
-def test_the_soc_is_less_certain_after_a_gap_and_converges_again(load_and_soc) -> None:
+def test_the_soc_is_less_certain_after_a_gap_and_then_converges(load_and_soc) -> None:
     block, true_soc = load_and_soc
     estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
     before = estimator.run(block[:5000])["soc_std"][-1]
     estimator.resume(1800.0)
-    after = estimator.run(block[6800:])
+    after = estimator.run(block[6800:])  # half an hour later
     assert after["soc_std"][1] > before
-    assert np.abs(after["soc"][1800:] - true_soc[8600:]).max() < 0.015
+    assert np.abs(after["soc"] - true_soc[6800:])[AFTER_HALF_AN_HOUR].max() < 0.015
 
 
 def test_gaps_do_not_accumulate_the_cell_imbalance_of_a_pack(load_and_soc) -> None:
-    """The imbalance adds to the std once, for any number of restarts."""
+    """The imbalance adds to the std only once, however many restarts follow each other."""
     stds = []
     for series in (1, 6):
         block = load_and_soc[0][:5000].copy()
@@ -189,7 +193,7 @@ def test_gaps_do_not_accumulate_the_cell_imbalance_of_a_pack(load_and_soc) -> No
     assert stds[1] < 1.1 * stds[0]
 
 
-def test_a_soc_set_by_the_user_is_used_unless_the_voltage_contradicts(load_and_soc) -> None:
+def test_a_soc_set_by_the_user_is_used_if_the_voltage_agrees(load_and_soc) -> None:
     block, true_soc = load_and_soc
     estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=0.8)
     estimator.run(block[:10])
@@ -212,7 +216,8 @@ def test_a_clock_set_back_and_repeated_stamps_do_not_change_the_result(load_and_
 
 def test_the_map_is_empty_before_its_first_sample() -> None:
     estimator = Estimator(TRUTH, identifier=IDENTIFIER)
-    assert [fitted_parameter(estimator.record[0], 3 * e + 1) for e in range(ELEMENTS)] == [None] * ELEMENTS
+    first_parameters = [fitted_parameter(estimator.record[0], 3 * element + 1) for element in range(ELEMENTS)]
+    assert first_parameters == [None] * ELEMENTS
 
 
 @pytest.mark.parametrize("soc", [-0.1, 1.5, float("nan")])
@@ -221,7 +226,7 @@ def test_a_soc_outside_0_to_1_is_rejected(soc: float) -> None:
         Estimator(TRUTH, identifier=IDENTIFIER).set_soc(soc)
 
 
-def test_a_reset_after_a_gap_restores_the_soc_of_the_gap(load_and_soc) -> None:
+def test_a_reset_restores_a_soc_that_was_set_by_the_user(load_and_soc) -> None:
     estimator = Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=1.0)
     estimator.run(load_and_soc[0][:5000])
     estimator.set_soc(0.7)

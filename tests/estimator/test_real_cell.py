@@ -1,21 +1,30 @@
-"""Estimator on captures of a Nissan Leaf cell, with a wrong initial SOC."""
+"""Estimator on captures of a Nissan Leaf cell, with a wrong initial SOC.
+
+The captures start full, so that the true SOC is counted.
+"""
 
 import numpy as np
 import pytest
 
 from bms_estimator import Estimator, estimate, load_capture, load_cell
+from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
+from bms_estimator.model.sample import SampleBlock
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import score
 
 
-@pytest.mark.parametrize("first", [0, 3000, 6000], ids=["from full", "under 10 A", "mid way"])
+def discharged_fraction(samples: SampleBlock, cell: CellModel) -> np.ndarray:
+    """Return the charge drawn before each sample, as a fraction of the capacity."""
+    charge_as = np.r_[0.0, np.cumsum(samples["current_a"][:-1] * np.diff(samples["time_s"]))]
+    return charge_as / (3600.0 * cell.cell.capacity_ah)
+
+
+@pytest.mark.parametrize("first", [0, 3000, 6000], ids=["from full", "under 10 A", "half way"])
 def test_an_initial_soc_wrong_by_0_2_is_corrected_within_an_hour(data, first):
-    """The true SOC is counted from full."""
-    cell, whole = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
-    discharged_as = np.r_[0.0, np.cumsum(whole["current_a"][:-1] * np.diff(whole["time_s"]))]
-    soc = (1.0 - discharged_as / (3600.0 * cell.cell.capacity_ah))[first:]
-    trace = estimate(Columns(whole.rows[first:]), cell, initial_soc=soc[0] - 0.2)
+    cell, samples = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz").rows
+    soc = 1.0 - discharged_fraction(samples, cell)[first:]
+    trace = estimate(Columns(samples[first:]), cell, initial_soc=soc[0] - 0.2)
     compared = (trace["time_s"] > trace["time_s"][0] + 3600.0) & (soc > 0.05)
     error = trace["soc"][compared] - soc[compared]
     assert np.abs(error).max() < 0.02
@@ -24,16 +33,13 @@ def test_an_initial_soc_wrong_by_0_2_is_corrected_within_an_hour(data, first):
 
 @pytest.mark.parametrize("soc_error", [-0.2, 0.2])
 def test_nees_and_nis_in_mid_load_match_the_std(data, soc_error):
-    """The estimator starts after 35 % of the charge. NIS over blocks of ten minutes and NEES are near 1.
+    """The estimator starts after 35 % of the discharge.
 
     The first 15 min are not scored. Coverage and std are in percent.
     """
     cell, samples = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz").rows
-    discharged_as = np.r_[0.0, np.cumsum(samples["current_a"][:-1] * np.diff(samples["time_s"]))]
-    soc, first = (
-        1.0 - discharged_as / (3600.0 * cell.cell.capacity_ah),
-        int(np.argmax(discharged_as >= 0.35 * discharged_as[-1])),
-    )
+    discharged = discharged_fraction(samples, cell)
+    soc, first = 1.0 - discharged, int(np.argmax(discharged >= 0.35 * discharged[-1]))
     run = run_of(Estimator(cell, initial_soc=soc[first] + soc_error), samples[first:])
     result = score(samples["time_s"][first:], run.soc, run.soc_std, soc[first:])
     assert 0.3 < run.nis(after_s=900.0) < 2.0

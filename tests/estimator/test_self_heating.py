@@ -14,10 +14,14 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.replay import load_capture
 
 HALF_C_CAPTURE = Path(__file__).parents[1] / "data" / "lgm50" / "rate_0p5c_25c.csv.gz"
+"""Discharge of an LG M50 (5 Ah) at C/2, with its measured temperature."""
 
 
 def temperature_rise_k(samples, cell=None):
-    """Return the estimator's temperature rise, by default of an LG M50 of which only chemistry and capacity are known [K]."""
+    """Run an estimator over the samples; return the rise of the temperature that it uses above 25 C [K].
+
+    Without ``cell``, the estimator has the generic cell file of an LG M50.
+    """
     estimator = Estimator(cell or load_cell("nmc", 5.0), initial_soc=1.0)
     rise_k = np.zeros(samples.size)
     for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):
@@ -43,7 +47,7 @@ def test_the_modelled_temperature_matches_a_measured_one() -> None:
     measured_k = samples["temperature_c"] - samples["temperature_c"][0]
     samples["temperature_c"] = np.nan
     error_k = temperature_rise_k(samples) - measured_k
-    assert np.sqrt(np.mean(measured_k**2)) > 1.5
+    assert np.sqrt(np.mean(measured_k**2)) > 1.5  # the cell warms enough for the comparison
     assert np.sqrt(np.mean(error_k**2)) < 0.6
 
 
@@ -53,12 +57,12 @@ def test_a_pack_has_the_temperature_of_its_cells() -> None:
     samples["current_a"], samples["voltage_v"] = 5.0, 3.9
     cell = load_cell("nmc", 5.0)
     cell_rise_k = temperature_rise_k(samples, cell)
-    samples["current_a"], samples["voltage_v"] = 2 * 5.0, 4 * 3.9
+    samples["current_a"], samples["voltage_v"] = 2 * 5.0, 4 * 3.9  # two cells in parallel, four in series
     assert cell_rise_k[-1] > 2.0
     assert temperature_rise_k(samples, cell.pack(4, 2)) == pytest.approx(cell_rise_k, rel=0.02)
 
 
-def test_a_measured_temperature_replaces_the_model() -> None:
+def test_a_measured_temperature_replaces_the_modelled_one() -> None:
     samples = load_capture(HALF_C_CAPTURE).rows
     samples["temperature_c"] = 10.0
     assert np.all(temperature_rise_k(samples) == 10.0 - REFERENCE_C)
@@ -78,6 +82,6 @@ def test_a_cell_cools_in_a_gap(gap_s: float) -> None:
 def test_the_modelled_temperature_is_limited() -> None:
     estimator = Estimator(load_cell("nmc", 5.0), initial_soc=0.9)
     for second in range(300):
-        estimator.step(float(second), 99.0, 3.9)
+        estimator.step(float(second), 99.0, 3.9)  # 20 C
     assert REFERENCE_C < used_temperature_c(estimator) <= MAX_MODELLED_C
     assert np.isfinite(estimator.record["filter"]["soc"][0])

@@ -17,10 +17,10 @@ pytestmark = pytest.mark.usefixtures("firmware")
 
 def mean_values(host: Host) -> tuple[float, float]:
     """Return the mean voltage [V] and current [A] of the next fifty samples."""
-    host.take(1)  # another reader may have taken the beginning of this frame
+    host.next_samples(1)  # another reader may have taken the beginning of this frame
     host.send(hello_command())
-    hello = host.hello()
-    block = FrameDecoder().feed(0.0, b"".join([hello.encode(), *(s.encode() for s in host.take(50))]))
+    hello = host.next_hello()
+    block = FrameDecoder().feed(0.0, b"".join([hello.encode(), *(s.encode() for s in host.next_samples(50))]))
     return block["voltage_v"].mean(), block["current_a"].mean()
 
 
@@ -31,10 +31,9 @@ def test_board_with_a_wrong_bandgap_is_calibrated_by_the_voltage_at_aref(
     monkeypatch.setattr(device_detection, "REFERENCE_TIMEOUT_S", LONG_S)
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 2.5, 22.2, 25.0)])
     with SimavrBoard(readings, avcc_mv=4750) as board, Host(board.path) as host:
-        assert host.ask(set_bandgap_command(1.02)).value == 1_020_000
-        assert mean_values(host) == pytest.approx(
-            (22.2 * 1.02 / 1.1, 2.5), rel=5e-3
-        )  # a ratiometric sensor needs no bandgap
+        assert host.send_command(set_bandgap_command(1.02)).value == 1_020_000
+        # the voltage has the error of the bandgap, whose true value is 1.1 V; a ratiometric current sensor needs no bandgap
+        assert mean_values(host) == pytest.approx((22.2 * 1.02 / 1.1, 2.5), rel=5e-3)
         with pytest.raises(SystemExit) as exit_info:
             main(["board", board.path, "--aref-v", "4.75", "--serial", "77"])
         out, err = capsys.readouterr()
@@ -59,4 +58,5 @@ def test_configured_divider_and_slope_are_stored_and_used(
         assert (exit_info.value.code or 0, err) == (0, "")
         assert "divider: was 6.1, now 5\n" in out
         assert "current: was 0.1 V/A at 5 V, ratiometric, now 0.05 V/A\n" in out
+        # the simulated board still has a divider of 6.1 and a slope of 0.1 V/A
         assert mean_values(host) == pytest.approx((20.0 * 5.0 / 6.1, 5.0), rel=5e-3)

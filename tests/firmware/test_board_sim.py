@@ -18,6 +18,7 @@ LSB_PER_V = 1024 / 6.1 / 5.0
 
 
 def run(*arguments: str | Path, text: str = "") -> subprocess.CompletedProcess[str]:
+    """Run the simulator until it ends, with ``text`` on its standard input."""
     command = [SIMULATOR, *arguments]
     return subprocess.run(command, input=text, capture_output=True, text=True, timeout=LONG_S, check=False)
 
@@ -51,12 +52,12 @@ def test_signal_ends_the_simulator_without_a_host(tmp_path: Path) -> None:
         assert board.path  # SimavrBoard asserts a clean end
 
 
-def test_looped_file_is_repeated(tmp_path: Path) -> None:
+def test_file_is_repeated_with_the_option_loop(tmp_path: Path) -> None:
     readings = write_readings(tmp_path / "readings.csv", [(0.0, 0.0, 10.0), (0.5, 0.0, 20.0), (1.0, 0.0, 10.0)])
     with SimavrBoard(readings, speed=math.inf, loop=True) as board, Host(board.path) as host:
-        host.take(300)
+        host.next_samples(300)
         means = [s.voltage_sum / s.count for s in host.samples]
-    low, high = 10.0 * LSB_PER_V, 20.0 * LSB_PER_V
+    low, high = 10.0 * LSB_PER_V, 20.0 * LSB_PER_V  # first and second half of each second
     for second in range(3):
         assert means[100 * second + 20] == pytest.approx(low, abs=1.0)
         assert means[100 * second + 70] == pytest.approx(high, abs=1.0)
@@ -70,11 +71,12 @@ def test_readings_are_read_from_a_pipe_and_stop_at_end_ends_the_simulator() -> N
         board.stdin.write("0,0,10\n1,0,20\n2,0,20\n")
         board.stdin.flush()
         with Host(board.stdout.readline().strip()) as host:
-            host.take(150)
+            host.next_samples(150)
             board.stdin.close()
             host.until(lambda: board.poll() is not None)
             means = [s.voltage_sum / s.count for s in host.samples]
         assert board.returncode == 0
+    # at 100 Hz the samples are those of 0.5 s and 1.4 s
     assert means[50] == pytest.approx(10.0 * LSB_PER_V, abs=1.0)
     assert means[140] == pytest.approx(20.0 * LSB_PER_V, abs=1.0)
 
@@ -87,6 +89,6 @@ def test_signal_ends_the_simulator_while_it_waits_for_readings() -> None:
         board.stdin.write("0,0,10\n1,0,20\n")
         board.stdin.flush()
         with Host(board.stdout.readline().strip()) as host:
-            host.take(50)  # then the simulator waits for a third line
+            host.next_samples(50)  # then the simulator waits for a third line
             board.terminate()
             assert board.wait(LONG_S) == 0

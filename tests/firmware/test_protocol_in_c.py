@@ -13,13 +13,15 @@ from bms_estimator.simulation.virtual_adc import compute_aux_count, compute_wind
 from tests.simavr_board import FIRMWARE
 
 VECTORS = json.loads((FIRMWARE / "test_vectors.json").read_text())
+DELIMITER_DIGITS, CRC_DIGITS = 2, 4
+"""Numbers of hexadecimal digits at the end of a frame and of a packet."""
 
 InC = Callable[[Sequence[str]], list[str]]
 
 
 @pytest.fixture(scope="session")
 def in_c(tmp_path_factory: pytest.TempPathFactory) -> InC:
-    """Return a function that sends lines to protocol_on_host.c and returns its output lines."""
+    """Return a function that sends lines to the program of protocol_on_host.c and returns its output lines."""
     compiler = shutil.which("gcc")
     if compiler is None:
         pytest.skip("no gcc here: make apt")
@@ -46,15 +48,17 @@ def test_messages_are_encoded_byte_for_byte(in_c: InC) -> None:
 @pytest.mark.parametrize("kind", ["messages", "commands"])
 def test_valid_frames_are_decoded(in_c: InC, kind: str) -> None:
     vectors = VECTORS[kind]
-    assert in_c([f"unframe {v['frame'][:-2]}" for v in vectors]) == [v["packet"][:-4] for v in vectors]
+    lines = [f"unframe {v['frame'][:-DELIMITER_DIGITS]}" for v in vectors]
+    assert in_c(lines) == [v["packet"][:-CRC_DIGITS] for v in vectors]
 
 
 def test_invalid_frames_are_rejected(in_c: InC) -> None:
     vectors = VECTORS["bad_frames"]
-    assert in_c([f"unframe {v['frame'][:-2]}" for v in vectors]) == ["bad"] * len(vectors)
+    lines = [f"unframe {v['frame'][:-DELIMITER_DIGITS]}" for v in vectors]
+    assert in_c(lines) == ["bad"] * len(vectors)
 
 
 def test_timing_of_each_rate_equals_that_of_the_virtual_board(in_c: InC) -> None:
     rates = range(1, 1001)
-    divided = ["{} {} {}".format(*compute_window(rate), compute_aux_count(rate)) for rate in rates]
-    assert in_c([f"timing {rate}" for rate in rates]) == divided
+    expected = ["{} {} {}".format(*compute_window(rate), compute_aux_count(rate)) for rate in rates]
+    assert in_c([f"timing {rate}" for rate in rates]) == expected

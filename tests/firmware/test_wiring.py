@@ -1,4 +1,4 @@
-"""Consistency of the wiring diagram and its table with each other, the firmware and a full pack."""
+"""Wiring diagram and table of parts: they agree with each other, with the firmware, and with the voltage of a full pack."""
 
 import math
 import re
@@ -15,6 +15,7 @@ DRAWING = " ".join(ET.parse(ROOT / "docs" / "images" / "wiring.svg").getroot().i
 MIN_AVCC_V = 4.5
 """Minimum supply behind a USB port and the Nano's diode (docs/pack/board.md) [V]."""
 FULL_PACK_V = 6 * 4.2
+"""Voltage of the six full cells of the documented pack [V]."""
 RANGE_MARGIN = 1.05
 """Minimum ratio of the measuring range to the voltage of a full pack."""
 RESISTOR_TOLERANCE = 0.01
@@ -24,7 +25,7 @@ SI_UNITS = {"kΩ": 1e3, "nF": 1e-9, "Ω": 1.0}
 
 
 def part_value(part: str) -> float:
-    """Return the value of a part in the table of board.md [SI units]."""
+    """Return the value of a part in the table of docs/pack/board.md, in SI units."""
     row = re.search(rf"^\| [^|]*\b{part}\b[^|]*\| (\S+) (\S+?)[, ]", TABLE, re.MULTILINE)
     assert row, part
     return float(row[1]) * SI_UNITS[row[2]]
@@ -54,7 +55,7 @@ def test_firmware_and_virtual_board_have_the_divider_and_slope_of_the_drawing() 
     assert f"{divider:g} : 1" in DRAWING
 
 
-def test_documented_step_matches_the_default_resolution() -> None:
+def test_documented_voltage_steps_are_those_of_the_board_and_of_the_default_setting() -> None:
     assert f"{5.0 * (R1 + R2) / R2 / FULL_SCALE * 1e3:.1f} mV" in TABLE
     assert f"{SensorSettings().voltage_resolution_v * 1e3:.1f} mV unless set" in TABLE
 
@@ -70,7 +71,7 @@ def test_corner_and_delay_of_the_filters_match_the_documentation(resistance_ohm:
     assert resistance_ohm < 10e3, "the source resistance is above the maximum in the converter's data sheet"
 
 
-def test_measuring_resistor_of_the_thesis_sensor_gives_the_documented_slope() -> None:
+def test_measuring_resistor_of_the_thesis_s_current_sensor_gives_the_documented_slope() -> None:
     assert part_value("RM") / TURNS_RATIO == pytest.approx(0.1)
     assert "`--volts-per-ampere 0.1 --absolute`" in TABLE
 

@@ -1,4 +1,4 @@
-"""Simulated hourly rows of packs with known true values."""
+"""Hour rows of simulated packs, as the collector stores them, with known true values."""
 
 from pathlib import Path
 from typing import Any
@@ -23,12 +23,12 @@ EMPTY_ROW = dict.fromkeys(Hour.model_fields) | {
 
 
 def make_hour(pack: str, hour: int, **values: Any) -> Hour:
-    """Return a row in which only ``values`` are known."""
+    """Return a pack's row of an hour, with no values but ``values`` and those of ``EMPTY_ROW``."""
     return Hour.model_validate(EMPTY_ROW | {"pack": pack, "hour": hour} | values)
 
 
 def write_fleet(folder: Path, hours: np.ndarray, names: list[str] | None = None, **columns: Any) -> None:
-    """Write rows of packs by hours to one file.
+    """Write one row for each pack and hour, all to one Parquet file.
 
     Args:
         folder: Folder that the queries read.
@@ -38,23 +38,23 @@ def write_fleet(folder: Path, hours: np.ndarray, names: list[str] | None = None,
     """
     packs = len(names) if names else max(np.shape(column)[0] for column in columns.values() if np.ndim(column) == 2)
     names = names or [f"p{n}" for n in range(packs)]
-    spread = EMPTY_ROW | columns | {"pack": np.array(names)[:, None], "hour": hours}
+    values = EMPTY_ROW | columns | {"pack": np.array(names)[:, None], "hour": hours}
     arrays = {
         name: None if value is None else np.broadcast_to(value, (packs, hours.size)).ravel()
-        for name, value in spread.items()
+        for name, value in values.items()
     }
-    size = packs * hours.size
-    rows = [
-        pa.nulls(size, field.type) if arrays[field.name] is None else pa.array(arrays[field.name], field.type)
+    row_count = packs * hours.size
+    table_columns = [
+        pa.nulls(row_count, field.type) if arrays[field.name] is None else pa.array(arrays[field.name], field.type)
         for field in SCHEMA
     ]
     file = folder / "date=2025-11-24" / "day-made-up.parquet"
     file.parent.mkdir(parents=True)
-    pq.write_table(pa.table(rows, schema=SCHEMA), file)
+    pq.write_table(pa.table(table_columns, schema=SCHEMA), file)
 
 
-def capacities(
-    rng: np.random.Generator, truth: np.ndarray, std: float, through: float
+def estimate_capacities(
+    rng: np.random.Generator, truth: np.ndarray, std: float, daily_throughput: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the capacity as the filter does, from one measurement of ln(capacity) a day.
 
@@ -62,16 +62,16 @@ def capacities(
         rng: Random generator of the measurements.
         truth: True ln(capacity), shape (packs, days).
         std: Standard deviation of one measurement.
-        through: Charge moved each day [capacities].
+        daily_throughput: Charge moved each day [capacities].
 
     Returns:
         Estimate of ln(capacity) and its variance, shape (packs, days).
     """
-    retained = np.exp(-through / AGED_SOC)
+    retained = np.exp(-daily_throughput / AGED_SOC)
     x, p = np.zeros(truth.shape[0]), np.full(truth.shape[0], FIRST_STD**2)
     estimates, variance = np.empty(truth.shape), np.empty(truth.shape)
     for day in range(truth.shape[1]):
-        if day:
+        if day:  # aging since the day before
             x, p = retained * x, retained**2 * p + (1.0 - retained**2) * FIRST_STD**2
         gain = p / (p + std**2)
         x = x + gain * (truth[:, day] + std * rng.standard_normal(x.size) - x)
@@ -80,8 +80,10 @@ def capacities(
     return estimates, variance
 
 
-def states_of_charge(rng: np.random.Generator, packs: int, hours: int) -> dict[str, np.ndarray]:
-    """Estimate SOC with a consistent filter: charge counted with ``CHARGE_ERROR``, and a voltage that is informative near the ends.
+def estimate_soc(rng: np.random.Generator, packs: int, hours: int) -> dict[str, np.ndarray]:
+    """Estimate SOC with a consistent filter. The voltage tells little of the SOC in the middle, and more near the ends.
+
+    The charge of each hour is counted with the random error ``CHARGE_ERROR``.
 
     Returns:
         Columns of shape (packs, hours), for a capacity of 3 Ah.
@@ -91,16 +93,15 @@ def states_of_charge(rng: np.random.Generator, packs: int, hours: int) -> dict[s
     counted_soc = 0.5 - np.cumsum(moved, axis=1)
     truth = counted_soc + np.cumsum(CHARGE_ERROR * np.sqrt(np.abs(moved)) * rng.standard_normal(moved.shape), axis=1)
     x, p = 0.5 + 0.2 * rng.standard_normal(packs), np.full(packs, 0.2**2)
-    error0 = truth[:, 0] + moved[:, 0] - 0.5  # true initial SOC minus 0.5
-    x = x + error0
+    initial_soc = truth[:, 0] + moved[:, 0]
+    x = x + (initial_soc - 0.5)
     soc, std = np.empty(moved.shape), np.empty(moved.shape)
     for hour in range(hours):
         x, p = x - moved[:, hour], p + CHARGE_ERROR**2 * np.abs(moved[:, hour])
-        voltage_std = 0.001 + 0.5 * np.exp(
-            -(((counted_soc[:, hour] - 0.5) / 0.08) ** 2)
-        )  # standard deviation of the SOC from the voltage
-        gain = p / (p + voltage_std**2)
-        x = x + gain * (truth[:, hour] + voltage_std * rng.standard_normal(packs) - x)
+        # standard deviation of an SOC that is measured by the voltage
+        measured_std = 0.001 + 0.5 * np.exp(-(((counted_soc[:, hour] - 0.5) / 0.08) ** 2))
+        gain = p / (p + measured_std**2)
+        x = x + gain * (truth[:, hour] + measured_std * rng.standard_normal(packs) - x)
         p = p - gain * p
         soc[:, hour], std[:, hour] = x, np.sqrt(p)
     return {

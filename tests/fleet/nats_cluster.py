@@ -1,4 +1,4 @@
-"""Real nats-server for tests, configured as by ``fleet serve``: one node, or a cluster of three."""
+"""Real nats-server for tests with the configuration of ``fleet serve``: one node, or a cluster of three."""
 
 import contextlib
 import json
@@ -68,6 +68,7 @@ class NatsCluster:
 
     @property
     def urls(self) -> list[str]:
+        """URLs of all nodes."""
         return [f"nats://{node.nats}" for node in self.nodes]
 
     @property
@@ -77,15 +78,17 @@ class NatsCluster:
 
     @property
     def mqtt_ports(self) -> list[int]:
+        """MQTT ports of all nodes."""
         return [int(node.mqtt.rpartition(":")[2]) for node in self.nodes]
 
     def pid(self, i: int) -> int:
+        """Return the process id of node ``i``."""
         process = self._processes[i]
         assert process
         return process.pid
 
     def start(self, i: int, *, wait: bool = True) -> None:
-        """Start node ``i`` with its stored streams; return when it is ready."""
+        """Start node ``i`` with its stored streams; return when it is ready, or at once if not ``wait``."""
         self.conf(i).write_text(configuration(self.nodes[i]))
         with self.log(i).open("ab") as log:
             self._processes[i] = subprocess.Popen([BINARY, "-c", self.conf(i)], stderr=log)
@@ -104,9 +107,11 @@ class NatsCluster:
         self.nodes = [replace(node, accounts=accounts) for node in self.nodes]
 
     def conf(self, i: int) -> Path:
+        """Return the path of node ``i``'s configuration."""
         return self._folder / f"n{i}.conf"
 
     def log(self, i: int) -> Path:
+        """Return the path of node ``i``'s log."""
         return self._folder / f"n{i}.log"
 
     def wait_ready(self, i: int) -> None:
@@ -120,41 +125,40 @@ class NatsCluster:
             time.sleep(0.02)
 
     def leader(self, stream: str, account: str = "") -> int:
-        """Return the number of the node that leads a stream of ``account`` (empty: of any account); -1 without a leader."""
+        """Return the number of the node that leads a stream, or -1 without a leader. An empty ``account`` is any account."""
         for i, process in enumerate(self._processes):
             if process is None:
                 continue
             with contextlib.suppress(OSError):
-                for found in self.ask(i, "jsz?accounts=true&streams=true").get("account_details", []):
-                    for detail in found.get("stream_detail", []):
-                        if detail["name"] == stream and account in ("", found["name"]):
-                            name = detail.get("cluster", {}).get("leader", "n0" if len(self.nodes) == 1 else "")
-                            if name:
-                                return int(name[1:])
+                for account_details in self.ask(i, "jsz?accounts=true&streams=true").get("account_details", []):
+                    for details in account_details.get("stream_detail", []):
+                        if details["name"] == stream and account in ("", account_details["name"]):
+                            leader = details.get("cluster", {}).get("leader", "n0" if len(self.nodes) == 1 else "")
+                            if leader:
+                                return int(leader[1:])  # the nodes are named n0, n1, n2
         return -1
 
-    def ask(self, i: int, what: str) -> Any:
+    def ask(self, i: int, request: str) -> Any:
         """Return the response of node ``i``'s monitor to a request such as ``varz``."""
-        with urllib.request.urlopen(f"http://{self.nodes[i].monitor}/{what}", timeout=LONG_S) as answer:
+        with urllib.request.urlopen(f"http://{self.nodes[i].monitor}/{request}", timeout=LONG_S) as answer:
             return json.load(answer)
 
     def _is_ready(self, i: int) -> bool:
         with contextlib.suppress(OSError):
-            alone = len(self.nodes) == 1
-            return self.ask(i, "healthz")["status"] == "ok" and (
-                alone or "leader" in self.ask(i, "jsz")["meta_cluster"]
-            )
+            is_healthy = self.ask(i, "healthz")["status"] == "ok"
+            # a cluster accepts no requests for streams before it has elected a leader
+            return is_healthy and (len(self.nodes) == 1 or "leader" in self.ask(i, "jsz")["meta_cluster"])
         return False
 
 
 async def connected(urls: str | list[str]) -> Client:
     """Return a connection that reconnects without limit and notices a silent break within seconds."""
 
-    async def expected(_error: Exception) -> None:
-        pass
+    async def ignore(_error: Exception) -> None:
+        """Ignore an error, because the tests kill servers."""
 
     return await nats.connect(
-        urls, max_reconnect_attempts=-1, reconnect_time_wait=0.1, ping_interval=2, error_cb=expected
+        urls, max_reconnect_attempts=-1, reconnect_time_wait=0.1, ping_interval=2, error_cb=ignore
     )
 
 

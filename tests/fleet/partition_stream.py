@@ -1,4 +1,4 @@
-"""Blocks of an edge, the stream of a partition, and an edge that resends as the partition requests."""
+"""Blocks of an edge, the stream of a partition, and an edge that resends blocks on request."""
 
 import numpy as np
 
@@ -17,39 +17,41 @@ SAMPLES = 20
 
 
 def table(pack: str):
-    """Return settings and cell of a pack; None for an unknown pack."""
+    """Return settings and cell of a pack; None if the name begins with ``unknown``."""
     return None if pack.startswith("unknown") else (SETTINGS, CELL)
 
 
 def one_block(samples: SampleBlock, number: int, store: int = STORE_ID_NS, oldest: int = 1) -> bytes:
+    """Return the samples as one encoded block, which arrives at the time of its last sample."""
     # some tests send samples without a finite time
     arrival_s = store / 1e9 + float(np.nan_to_num(samples["time_s"][-1]))
     return encode(Block(store=store, number=number, oldest=oldest, arrival_s=arrival_s, samples=samples))
 
 
 def blocks_of(samples: SampleBlock, store: int = STORE_ID_NS, oldest: int = 1, size: int = SAMPLES) -> list[bytes]:
-    """Return the samples as blocks, numbered from ``oldest`` on."""
+    """Return the samples as encoded blocks of ``size`` samples, numbered from ``oldest`` on."""
     parts = [samples[first : first + size] for first in range(0, samples.size, size)]
     return [one_block(part, number, store, oldest) for number, part in enumerate(parts, oldest)]
 
 
 class Stream:
-    """Messages of a partition with their stream sequence numbers."""
+    """Partition, and the messages of its stream, whose sequence numbers begin with 1."""
 
     def __init__(self, partition: Partition) -> None:
         self.partition = partition
         self.messages: list[tuple[str, bytes]] = []
 
     def send(self, pack: str, data: bytes, *, defer: bool = False) -> BlockResult:
+        """Store a block in the stream, and let the partition process or defer it."""
         self.messages.append((pack, data))
         if defer:
             return self.partition.defer(pack, len(self.messages))
         return self.partition.take(pack, data, len(self.messages))
 
-    def take_deferred(self, most: int = 10_000) -> list[BlockResult]:
+    def take_deferred(self, max_messages: int = 10_000) -> list[BlockResult]:
         """Process deferred messages of known packs, one message of each pack in turn."""
         results: list[BlockResult] = []
-        while len(results) < most and (entry := self.partition.deferred.next(self.partition.is_known)):
+        while len(results) < max_messages and (entry := self.partition.deferred.next(self.partition.is_known)):
             pack, span = entry
             messages = enumerate(self.messages, 1)
             data, sequence = next((data, n) for n, (sender, data) in messages if sender == pack and n >= span.first)
@@ -64,7 +66,7 @@ class Stream:
 
 
 def deliver(stream: Stream, pack: str, blocks: list[bytes], first: int = 1) -> None:
-    """Send all blocks, resending as requested, until the last one is processed."""
+    """Send blocks, numbered from ``first`` on, and resend requested ones as an edge does, until all are processed."""
     number, last = first, first + len(blocks) - 1
     while number <= last:
         reply = stream.send(pack, blocks[number - first]).reply

@@ -1,4 +1,4 @@
-"""States of many packs as workers publish them, with a realistic distribution that depends only on the seed."""
+"""States of many packs as workers publish them. Values are distributed realistically and depend only on a seed."""
 
 from typing import Any, NamedTuple
 
@@ -9,14 +9,15 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 HOME, VAN, PLANT = (
     PackSpec(cell="lfp", capacity_ah=280.0, series=16),
     PackSpec(cell="ncr18650", series=14, parallel=10),
     PackSpec(cell="nmc", capacity_ah=50.0, series=96),
 )
-SHARES = {"home": (HOME, 0.7), "van": (VAN, 0.25), "plant": (PLANT, 0.05)}
+KINDS = {"home": (HOME, 0.7), "van": (VAN, 0.25), "plant": (PLANT, 0.05)}
+"""Kinds of packs by the beginning of their names, and their fractions of all packs."""
 MEASURED_VALUES = {
     "home": {
         "voltage_v": 52.81,
@@ -41,6 +42,7 @@ MEASURED_VALUES = {
     },
 }
 _PLACEHOLDER = 0.123456789012345
+"""Value that is replaced in the encoded state of a kind, so that a state is encoded only once for each kind."""
 
 
 class Pack(NamedTuple):
@@ -52,30 +54,31 @@ class Pack(NamedTuple):
 
 
 def state(**values: Any) -> bytes:
-    """Return a published state with these values."""
-    assert ONE.estimate
-    return ONE.estimate.model_copy(update=values).model_dump_json().encode()
+    """Return an encoded state with these values, and otherwise those of an example."""
+    assert CELL_SNAPSHOT.estimate
+    return CELL_SNAPSHOT.estimate.model_copy(update=values).model_dump_json().encode()
 
 
 def make_packs(count: int, seed: int = 1) -> list[Pack]:
-    """Return ``count`` packs."""
+    """Return ``count`` packs with their states."""
     rng = np.random.default_rng(seed)
-    names = rng.choice(list(SHARES), count, p=[share for _, share in SHARES.values()])
+    names = rng.choice(list(KINDS), count, p=[share for _, share in KINDS.values()])
     soc = np.where(names == "plant", rng.beta(9, 7, count), rng.beta(3.2, 1.9, count))
     std = rng.lognormal(np.where(names == "home", -4.1, -4.6), 0.45)
     soc_minus_margin = rng.uniform(0.01, 0.09, count)
     placeholders = {"soc": _PLACEHOLDER, "soc_std": _PLACEHOLDER + 1.0, "stability_margin": _PLACEHOLDER + 2.0}
-    parts = {name: _parts(state(**placeholders, **MEASURED_VALUES[name]), *placeholders.values()) for name in SHARES}
+    parts = {name: _split_at(state(**placeholders, **MEASURED_VALUES[name]), *placeholders.values()) for name in KINDS}
     packs = []
     for i, name in enumerate(names):
         begin, after_soc, after_std, end = parts[name]
         values = (f"{soc[i]:.6f}", f"{std[i]:.6f}", f"{soc[i] - soc_minus_margin[i]:.6f}")
         data = begin + values[0].encode() + after_soc + values[1].encode() + after_std + values[2].encode() + end
-        packs.append(Pack(f"{name}-{i:06d}", SHARES[name][0], data))
+        packs.append(Pack(f"{name}-{i:06d}", KINDS[name][0], data))
     return packs
 
 
-def _parts(data: bytes, *placeholders: float) -> list[bytes]:
+def _split_at(data: bytes, *placeholders: float) -> list[bytes]:
+    """Return the bytes before, between and after the placeholders."""
     parts = []
     for placeholder in placeholders:
         before, _, data = data.partition(str(placeholder).encode())
@@ -95,6 +98,6 @@ async def publish_heartbeat(nc: Client, worker: str, partitions: range, **values
 
 
 async def load(nc: Client, packs: list[Pack]) -> None:
-    """Write the packs to the table."""
+    """Write the rows of the packs to the table of packs."""
     rows = {kind: encode_row(kind) for kind in (HOME, VAN, PLANT)}
     await write_bucket(nc, subjects.PACKS_BUCKET, {pack.name: rows[pack.kind] for pack in packs})

@@ -1,4 +1,4 @@
-"""Receiver that reads an edge's blocks from the stream as a worker does, and stores the samples."""
+"""Receiver of an edge's blocks. It reads them from the stream and requests missing ones, as a worker does."""
 
 import asyncio
 import contextlib
@@ -19,13 +19,13 @@ from tests.patience import LONG_S, end
 POLL_S = 0.01
 """Poll interval of the stream [s]."""
 REQUEST_EVERY = 5
-"""Number of early blocks after which a missing block is requested again."""
+"""Number of blocks after a missing one at which the missing block is requested again."""
 CONFIRM_EVERY = 10
 """Number of accepted blocks after which they are confirmed."""
 
 
 class Receiver:
-    """Reader of the stream. It accepts blocks in the order of their numbers and requests missing ones.
+    """Reader of the blocks of one pack. It accepts them in the order of their numbers and requests missing ones.
 
     Args:
         url: URL of the server.
@@ -34,8 +34,8 @@ class Receiver:
     Attributes:
         dropped_once: Numbers of blocks whose first arrival is dropped.
         blocks: Accepted blocks.
-        resends: Number of repeated blocks.
-        gaps: Number of blocks that arrived before a missing one.
+        resends: Number of blocks that arrived again after they had been accepted.
+        gaps: Number of blocks that arrived while an earlier one was missing.
         lost: Number of blocks that the edge no longer has.
     """
 
@@ -60,15 +60,15 @@ class Receiver:
     @property
     def samples(self) -> SampleBlock:
         """Return the samples with their times since 1970."""
-        parts = []
+        blocks = []
         for block in self.blocks:
-            part = block.samples.copy()
-            part["time_s"] += block.store / 1e9
-            parts.append(part)
-        return np.concatenate(parts)
+            samples = block.samples.copy()
+            samples["time_s"] += block.store / 1e9  # the store's creation time [ns since 1970]
+            blocks.append(samples)
+        return np.concatenate(blocks)
 
-    async def until(self, count: int) -> None:
-        """Wait for a number of samples."""
+    async def wait_for_samples(self, count: int) -> None:
+        """Wait until ``count`` samples have been accepted."""
         async with asyncio.timeout(LONG_S):
             while sum(block.samples.size for block in self.blocks) < count:
                 if self._task.done():
@@ -76,14 +76,15 @@ class Receiver:
                 await asyncio.sleep(POLL_S)
 
     async def reply(self, request: BlockRequest | bytes) -> None:
+        """Send a request to the edge, as a worker does."""
         payload = request if isinstance(request, bytes) else request.model_dump_json().encode()
-        await self.nc.publish(subjects.awaits(self.pack), payload)
+        await self.nc.publish(subjects.block_request(self.pack), payload)
         await self.nc.flush()
 
     async def _read(self) -> None:
-        js, sequence = self.nc.jetstream(timeout=1.0), 1
+        js, sequence = self.nc.jetstream(timeout=1.0), 1  # the stream's sequence numbers begin with 1
         while True:
-            with contextlib.suppress(nats.errors.Error, asyncio.TimeoutError):
+            with contextlib.suppress(nats.errors.Error, asyncio.TimeoutError):  # the tests kill the server
                 state = (await js.stream_info(subjects.RAW_STREAM)).state
                 while sequence <= state.last_seq:
                     with contextlib.suppress(NotFoundError):
@@ -99,7 +100,7 @@ class Receiver:
             return
         if block.store > self._store:
             self._store, self._next = block.store, block.oldest
-        if block.oldest > self._next:
+        if block.oldest > self._next:  # the edge has dropped blocks
             self.lost += block.oldest - self._next
             self._next = block.oldest
         if block.number < self._next:
@@ -112,5 +113,5 @@ class Receiver:
         else:
             self._next += 1
             self.blocks.append(block)
-            if self._next % CONFIRM_EVERY == 2:
+            if (self._next - 1) % CONFIRM_EVERY == 1:
                 await self.reply(BlockRequest(store=self._store, number=self._next, resend=False))

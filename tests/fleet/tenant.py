@@ -21,16 +21,16 @@ from tests.patience import LONG_S
 
 NAME = "acme"
 """Name of the tenant."""
-NUMBER_OFFSET = 16
-"""Offset of the number in an encoded block [bytes]."""
+NUMBER_OFFSET, NUMBER_BYTES = 16, 8
+"""Offset and size of the number in an encoded block [bytes]."""
 
 
 class Tenant:
     """Tenant with its server.
 
     Args:
-        cluster: A running node.
-        keys: Folder of the keys.
+        cluster: Running server.
+        keys: Folder of the tenant's keys.
     """
 
     def __init__(self, cluster: NatsCluster, keys: Path) -> None:
@@ -41,7 +41,7 @@ class Tenant:
         return credentials.credentials_file(self._keys, NAME, role)
 
     async def program(self, role: Role) -> Client:
-        """Connect a program."""
+        """Return a connection with the permissions of a program."""
         return await nats.connect(self.cluster.url, user_credentials=self.file(role), connect_timeout=LONG_S)
 
     def token(self, pack: str) -> str:
@@ -53,14 +53,14 @@ class Tenant:
         return mqtt_client(self.cluster.mqtt_port, self.token(pack))
 
     async def make_streams(self, partitions: int, raw_bytes: int) -> None:
-        """Create the streams, or change the size of ``RAW``."""
+        """Create the streams, or change the size limit of the stream of blocks, ``RAW``, to ``raw_bytes``."""
         nc = await self.program(Role.ADMIN)
         await make_streams(nc, partitions=partitions, raw_bytes=raw_bytes)
         await nc.close()
 
 
 def mqtt_client(port: int, token: str) -> aiomqtt.Client:
-    """Return an MQTT client with a token."""
+    """Return an MQTT client that authenticates with a token."""
     return aiomqtt.Client("127.0.0.1", port, username="any", password=token, timeout=LONG_S)
 
 
@@ -83,4 +83,5 @@ def heavy_block(samples: int, period_s: float, store: int = 1) -> bytes:
 
 def numbered(data: bytes, number: int) -> bytes:
     """Return a block with another number."""
-    return data[:NUMBER_OFFSET] + number.to_bytes(8, "little") + data[NUMBER_OFFSET + 8 :]
+    field = number.to_bytes(NUMBER_BYTES, "little")
+    return data[:NUMBER_OFFSET] + field + data[NUMBER_OFFSET + NUMBER_BYTES :]

@@ -38,7 +38,7 @@ SAMPLES = 60
 
 
 def samples(pack: str, number: int) -> np.ndarray:
-    """Return the samples of a pack's block, computed from its number: a load with steps at the pack's own rate."""
+    """Return the samples of block ``number``. The load steps at a rate that depends on the pack's name, such as p1."""
     time_s = PERIOD_S * (SAMPLES * (number - 1.0) + np.arange(SAMPLES))
     rows = np.zeros(SAMPLES, SAMPLE)
     rows["time_s"] = time_s
@@ -49,11 +49,12 @@ def samples(pack: str, number: int) -> np.ndarray:
 
 
 def block(pack: str, number: int, arrival_s: float = 1.79e9) -> bytes:
+    """Return block ``number`` of a pack, encoded."""
     return encode(Block(store=STORE_ID_NS, number=number, oldest=1, arrival_s=arrival_s, samples=samples(pack, number)))
 
 
 async def load_packs(nc: Client, packs: list[str]) -> PackRegistry:
-    """Write packs to the table, and return a registry with them."""
+    """Write packs to the table of packs, and return a registry with them."""
     await write_bucket(nc, subjects.PACKS_BUCKET, dict.fromkeys(packs, PACK_ROW))
     registry = PackRegistry()
     for pack in packs:
@@ -74,7 +75,7 @@ async def send(nc: Client, pack: str, data: bytes) -> None:
 
 
 class Process:
-    """Worker process."""
+    """Worker process, which starts at once and logs to a file."""
 
     def __init__(self, folder: Path, url: str, name: str, *options: object) -> None:
         self.name, self._log = name, folder / f"{name}.log"
@@ -84,15 +85,15 @@ class Process:
 
     @property
     def lines(self) -> list[dict[str, Any]]:
-        """Lines of its log, without other stderr output."""
+        """Complete lines of its log, without other output on stderr."""
         lines = self._log.read_text().splitlines(keepends=True)
         return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("\n")]
 
     async def logged(self, text: str) -> dict[str, Any]:
-        """Return the first line with this event."""
+        """Wait for a log line whose event contains ``text``, and return it."""
 
         def find_line() -> dict[str, Any] | None:
-            assert self._process.poll() is None, f"it has ended: {self._log.read_text()}"
+            assert self._process.poll() is None, f"the worker has ended: {self._log.read_text()}"
             return next((line for line in self.lines if text in line["event"]), None)
 
         return await until(find_line, self._log.read_text)
@@ -111,7 +112,7 @@ class Process:
 
 
 class Heartbeats:
-    """Subscriber to heartbeats; ``last`` has the last heartbeat of each worker."""
+    """Subscriber to heartbeats. ``last`` is the last heartbeat of each worker."""
 
     def __init__(self, nc: Client) -> None:
         self._nc, self.last = nc, dict[str, Heartbeat]()
@@ -131,14 +132,15 @@ class Heartbeats:
         self.last.clear()
 
     async def until(self, condition: Callable[[Mapping[str, Heartbeat]], object]) -> None:
+        """Wait until the last heartbeats fulfill a condition."""
         await until(lambda: condition(self.last), lambda: self.last)
 
     async def until_held(self, partitions: int, *workers: str) -> None:
         """Wait until these workers together hold all partitions, and each holds at least one."""
 
         def are_held(last: Mapping[str, Heartbeat]) -> bool:
-            parts = [last[worker].partitions if worker in last else () for worker in workers]
-            return all(parts) and sorted(number for part in parts for number in part) == list(range(partitions))
+            held = [last[worker].partitions if worker in last else () for worker in workers]
+            return all(held) and sorted(number for numbers in held for number in numbers) == list(range(partitions))
 
         self.clear()
         await self.until(are_held)
@@ -155,7 +157,7 @@ async def until(condition: Callable[[], Any], description: Callable[[], object])
 
 
 async def end_states(nc: Client, registry: PackRegistry, partitions: int) -> dict[int, Partition]:
-    """Return the partitions of the last checkpoints."""
+    """Return each partition by its number, restored from its last checkpoint."""
     js = nc.jetstream(timeout=LONG_S)
     checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
     store = CheckpointStore(nc, "test", checkpoints, await js.object_store(subjects.STATES_BUCKET))
@@ -169,7 +171,7 @@ async def end_states(nc: Client, registry: PackRegistry, partitions: int) -> dic
 
 
 def estimated(registry: PackRegistry, pack: str, blocks: int) -> bytes:
-    """Return the estimator's record after one run over a pack's blocks."""
+    """Return the record of an estimator that has processed blocks 1 to ``blocks`` of a pack in one run."""
     settings, cell = registry(pack) or (None, None)
     assert settings
     assert cell

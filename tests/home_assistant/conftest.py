@@ -14,6 +14,7 @@ DASHBOARD = Path(__file__).parents[2] / "deploy/home-assistant/dashboard.yaml"
 
 @pytest.fixture(scope="module")
 def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    """Start a broker, or skip the tests if Home Assistant is not installed."""
     if not (ENVIRONMENT / "ready").exists():
         pytest.skip(MISSING)
     if MOSQUITTO is None:
@@ -33,13 +34,13 @@ def packs(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(scope="module")
 def home(packs: Packs, broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[HomeAssistant]:
-    """Return Home Assistant with all entities of both packs."""
+    """Start Home Assistant and wait until it has all entities of both packs."""
     home = HomeAssistant(tmp_path_factory.mktemp("home"), DASHBOARD)
     try:
         home.start()
         home.add_mqtt(broker.port)
         home.until(lambda states: {"sensor.bms_pack_cell_lowest", "sensor.bms_bench_voltage_v"} <= set(states))
-        home.until(lambda states: states["sensor.bms_pack_cell_lowest"]["state"] == "3")
+        home.until(lambda states: states["sensor.bms_pack_cell_lowest"]["state"] == "3")  # as in ``Packs``
         yield home
     finally:
         home.stop()

@@ -50,10 +50,11 @@ lovelace:
       filename: dashboard.yaml
 """
 CLIENT_ID = "http://127.0.0.1/"
+"""Name of the tests at Home Assistant's login."""
 
 
 class HomeAssistant:
-    """Running Home Assistant with an owner.
+    """Home Assistant with an owner, as whom the tests use its APIs.
 
     Args:
         folder: Folder of its configuration.
@@ -77,11 +78,11 @@ class HomeAssistant:
             assert self._process.poll() is None, self.log
             assert time.monotonic() < deadline, self.log
             try:
-                steps = self.ask("/api/onboarding", authorized=False)
+                onboarding_steps = self.request("/api/onboarding", authorized=False)
                 break
             except OSError:
                 time.sleep(0.1)
-        if not steps[0]["done"]:
+        if not onboarding_steps[0]["done"]:
             self._onboard()
 
     def stop(self) -> None:
@@ -91,17 +92,18 @@ class HomeAssistant:
             self._process = None
 
     def _onboard(self) -> None:
+        """Create the owner and log in as the owner."""
         owner = {"client_id": CLIENT_ID, "name": "Owner", "username": "owner", "password": "secret", "language": "en"}
-        code = self.ask("/api/onboarding/users", owner, authorized=False)["auth_code"]
+        code = self.request("/api/onboarding/users", owner, authorized=False)["auth_code"]
         form = f"grant_type=authorization_code&code={code}&client_id={CLIENT_ID}".encode()
-        self._token = self._call("/auth/token", form)["access_token"]
+        self._token = self._send("/auth/token", form)["access_token"]
 
-    def ask(self, path: str, body: Mapping[str, Any] | None = None, *, authorized: bool = True) -> Any:
+    def request(self, path: str, body: Mapping[str, Any] | None = None, *, authorized: bool = True) -> Any:
         """Return the response of the REST API to a GET, or to a POST of ``body``."""
         content = None if body is None else json.dumps(body).encode()
-        return self._call(path, content, {"Authorization": f"Bearer {self._token}"} if authorized else {})
+        return self._send(path, content, {"Authorization": f"Bearer {self._token}"} if authorized else {})
 
-    def _call(self, path: str, content: bytes | None, headers: Mapping[str, str] | None = None) -> Any:
+    def _send(self, path: str, content: bytes | None, headers: Mapping[str, str] | None = None) -> Any:
         request = urllib.request.Request(f"http://127.0.0.1:{self._port}{path}", content, dict(headers or {}))
         if content is not None and content.startswith(b"{"):
             request.add_header("Content-Type", "application/json")
@@ -110,18 +112,18 @@ class HomeAssistant:
 
     def add_mqtt(self, port: int) -> None:
         """Set up the MQTT integration by the forms of its configuration flow."""
-        flow = self.ask("/api/config/config_entries/flow", {"handler": "mqtt"})
+        flow = self.request("/api/config/config_entries/flow", {"handler": "mqtt"})
         broker = {"broker": "127.0.0.1", "port": port}
-        done = self.ask(f"/api/config/config_entries/flow/{flow['flow_id']}", broker)
+        done = self.request(f"/api/config/config_entries/flow/{flow['flow_id']}", broker)
         assert done["type"] == "create_entry", done
 
     def states(self) -> dict[str, Any]:
         """Return the states by entity."""
-        return {state["entity_id"]: state for state in self.ask("/api/states")}
+        return {state["entity_id"]: state for state in self.request("/api/states")}
 
-    def call(self, service: str, **data: Any) -> None:
+    def call_service(self, service: str, **data: Any) -> None:
         """Call a service, such as ``number.set_value``."""
-        self.ask(f"/api/services/{service.replace('.', '/')}", data)
+        self.request(f"/api/services/{service.replace('.', '/')}", data)
 
     def until(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """Wait until a condition holds for the states, and return them."""
@@ -131,13 +133,13 @@ class HomeAssistant:
             time.sleep(0.1)
         return states
 
-    def command(self, kind: str, **arguments: Any) -> Any:
+    def websocket_command(self, command_type: str, **arguments: Any) -> Any:
         """Return the result of a command of the WebSocket API."""
         with connect(f"ws://127.0.0.1:{self._port}/api/websocket", max_size=None) as connection:
-            connection.recv()
+            connection.recv()  # the request to authenticate
             connection.send(json.dumps({"type": "auth", "access_token": self._token}))
             assert json.loads(connection.recv())["type"] == "auth_ok"
-            connection.send(json.dumps({"id": 1, "type": kind, **arguments}))
+            connection.send(json.dumps({"id": 1, "type": command_type, **arguments}))
             response = json.loads(connection.recv())
             assert response["success"], response
             return response["result"]
@@ -148,8 +150,8 @@ class HomeAssistant:
         file = self.folder / "home-assistant.log"
         return file.read_text() if file.exists() else (self.folder / "console.log").read_text()
 
-    def rows(self, entities: str) -> list[tuple[str, str | None]]:
-        """Return entity and state of its recorder's rows, for entities ``LIKE`` the pattern, in order."""
+    def recorder_rows(self, entities: str) -> list[tuple[str, str | None]]:
+        """Return entity and state of the recorder's rows in order, for entities ``LIKE`` an SQL pattern."""
         query = (
             "SELECT states_meta.entity_id, state FROM states JOIN states_meta USING (metadata_id)"
             " WHERE states_meta.entity_id LIKE ? ORDER BY state_id"

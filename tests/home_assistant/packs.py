@@ -16,7 +16,7 @@ from tests.patience import LONG_S
 from tests.serial_line import Line
 
 COMMANDS = ("set_soc", "current_zero", "acknowledge_alarm", "publish_rate")
-SETTINGS = """
+PACK_FILE = """
 [pack]
 name = "{name}"
 {cell}
@@ -30,18 +30,18 @@ rate_hz = 5
 url = "{url}"
 commands = {commands}
 """
-LFP = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4'
-SOC_LOW = "[alarms]\nsoc_low = {limit = 0.1, clear = 0.2, delay_s = 0, clear_delay_s = 0}\n"
+LFP_PACK = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4'
+SOC_LOW_SECTION = "[alarms]\nsoc_low = {limit = 0.1, clear = 0.2, delay_s = 0, clear_delay_s = 0}\n"
 PRINT_INTERVAL_S = 0.1
 """Interval of the printed lines [s]."""
 
 
 class Packs:
-    """Service with two boards.
+    """Service of the packs ``pack`` (text board) and ``bench`` (board with the firmware's protocol), and their boards.
 
     Attributes:
         printed: Values that the text board prints.
-        silent: Event; while set, the text board prints nothing.
+        silent: While this event is set, the text board prints nothing.
     """
 
     def __init__(self, folder: Path, broker: Broker) -> None:
@@ -57,9 +57,11 @@ class Packs:
         self._line.plug()
         self._board.__enter__()
         texts = {
-            "pack": SETTINGS.format(name="pack", cell=LFP, port=self._line.path, protocol="text", **shared_settings)
-            + SOC_LOW,
-            "bench": SETTINGS.format(
+            "pack": PACK_FILE.format(
+                name="pack", cell=LFP_PACK, port=self._line.path, protocol="text", **shared_settings
+            )
+            + SOC_LOW_SECTION,
+            "bench": PACK_FILE.format(
                 name="bench", cell='cell = "chen_mora"', port=self._board.path, protocol="binary", **shared_settings
             ),
         }
@@ -71,6 +73,7 @@ class Packs:
             thread.start()
 
     def start(self) -> None:
+        """Start the service. The boards run already."""
         environment = os.environ | {"XDG_STATE_HOME": str(self._folder)}
         with (self._folder / "service.log").open("ab") as log:
             command = [str(PROGRAM), "run", *map(str, self._files)]
@@ -95,6 +98,7 @@ class Packs:
         return (self._folder / "service.log").read_text()
 
     def _print(self) -> None:
+        """Print the lines of the text board until the end."""
         with contextlib.suppress(OSError):  # no process has opened the line yet
             self._line.received()  # makes writes to a full line fail instead of block
         while not self._ended.wait(PRINT_INTERVAL_S):
@@ -103,6 +107,8 @@ class Packs:
                     self._line.write(json.dumps(self.printed).encode() + b"\r\n")
 
     def _sample(self) -> None:
+        """Run the virtual board until the end."""
+
         async def sample() -> None:
             running = asyncio.create_task(self._board.run())
             while not self._ended.is_set():  # noqa: ASYNC110 - an event of another thread

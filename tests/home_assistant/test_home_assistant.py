@@ -24,28 +24,35 @@ from tests.home_assistant.packs import Packs
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.sinks.home_assistant.test_discovery import (
-    CELLS,
+    CELL_COUNT,
     MAX_ROWS_PER_MIN,
-    all_changing,
+    all_values_changing,
     components_of,
     noisy_cell,
-    rows,
+    row_times,
 )
 
-SOC, SET_SOC, SOC_LOW = "sensor.bms_pack_soc_percent", "number.bms_pack_set_soc", "binary_sensor.bms_pack_alarm_soc_low"
+SOC_ENTITY, SET_SOC_ENTITY, SOC_LOW_ENTITY = (
+    "sensor.bms_pack_soc_percent",
+    "number.bms_pack_set_soc",
+    "binary_sensor.bms_pack_alarm_soc_low",
+)
 NOT_GRANTED = '"event": "request not granted", "pack": "bench"'
+"""Part of a line of the service's log."""
 UNRELATED_WARNINGS = ("Skipping pip installation", "zlib_ng and isal are not available")
 """Warnings of Home Assistant about its own installation."""
 CARDS = {"conditional", "entities", "entity-filter", "gauge", "history-graph", "statistics-graph", "tile"}
+"""Types of the cards in the dashboard."""
 
 
-def number(states: dict[str, Any], entity: str) -> float:
+def number_state(states: dict[str, Any], entity: str) -> float:
+    """Return the state of an entity as a number; NaN for ``unknown`` and ``unavailable``."""
     state = states[entity]["state"]
     return float(state) if re.fullmatch(r"-?[0-9.]+", state) else float("nan")
 
 
-def received(broker: Broker, topic: str, condition: Callable[[Any], bool] = bool) -> Any:
-    """Return the first message on a topic that fulfils a condition."""
+def first_message(broker: Broker, topic: str, condition: Callable[[Any], bool] = bool) -> Any:
+    """Return the decoded payload of the first message on a topic that fulfils a condition."""
 
     async def read() -> Any:
         async with Listener(broker, topic) as live:
@@ -55,9 +62,9 @@ def received(broker: Broker, topic: str, condition: Callable[[Any], bool] = bool
 
 
 def test_entity_registry_agrees_with_the_discovery_message(home: HomeAssistant, broker: Broker) -> None:
-    registry = {entry["entity_id"]: entry for entry in home.command("config/entity_registry/list")}
+    registry = {entry["entity_id"]: entry for entry in home.websocket_command("config/entity_registry/list")}
     states = home.states()
-    components = components_of(received(broker, "homeassistant/device/bms_pack/config"))
+    components = components_of(first_message(broker, "homeassistant/device/bms_pack/config"))
     for component in components.values():
         entity = component["default_entity_id"]
         assert registry[entity]["entity_category"] == component.get("entity_category")
@@ -72,13 +79,14 @@ def test_entity_registry_agrees_with_the_discovery_message(home: HomeAssistant, 
 
 def test_states_equal_the_measured_values(home: HomeAssistant, packs: Packs) -> None:
     states = home.states()
+    # the values that the text board prints; the power is rounded
     measured = {"voltage_v": 13.19, "current_a": 2.0, "power_w": 26.4, "temperature_c": 21.5, "cell_lowest_v": 3.28}
-    assert {name: number(states, f"sensor.bms_pack_{name}") for name in measured} == measured
+    assert {name: number_state(states, f"sensor.bms_pack_{name}") for name in measured} == measured
     assert states["sensor.bms_pack_current_a"]["attributes"]["positive"] == "discharge"
-    assert number(states, "sensor.bms_pack_time_to_empty_h") > 1.0
-    assert number(states, "sensor.bms_pack_soc_std_percent") > 0.0
+    assert number_state(states, "sensor.bms_pack_time_to_empty_h") > 1.0
+    assert number_state(states, "sensor.bms_pack_soc_std_percent") > 0.0
     assert states["sensor.bms_pack_time_to_full_h"]["state"] == "unknown"
-    assert number(states, "sensor.bms_pack_energy_out_kwh") >= 0.0
+    assert number_state(states, "sensor.bms_pack_energy_out_kwh") >= 0.0
 
 
 def test_names_by_device_class_are_in_the_configured_language(home: HomeAssistant) -> None:
@@ -88,40 +96,43 @@ def test_names_by_device_class_are_in_the_configured_language(home: HomeAssistan
     assert names["sensor.bms_pack_energy_in_kwh"] == "pack Energy in"
 
 
-def test_set_soc_raises_the_alarm_with_a_reason(home: HomeAssistant) -> None:
-    home.call("number.set_value", entity_id=SET_SOC, value=5)
-    states = home.until(lambda states: states[SOC_LOW]["state"] == "on" and number(states, SOC) < 10.0)
-    attributes = states[SOC_LOW]["attributes"]
+def test_set_soc_raises_and_clears_the_soc_alarm(home: HomeAssistant) -> None:
+    home.call_service("number.set_value", entity_id=SET_SOC_ENTITY, value=5)
+    states = home.until(
+        lambda states: states[SOC_LOW_ENTITY]["state"] == "on" and number_state(states, SOC_ENTITY) < 10.0
+    )
+    attributes = states[SOC_LOW_ENTITY]["attributes"]
     assert (attributes["severity"], attributes["device_class"]) == ("warning", "battery")
     assert "0.1" in attributes["reason"] or "10" in attributes["reason"]
-    home.call("number.set_value", entity_id=SET_SOC, value=50)
-    states = home.until(lambda states: states[SOC_LOW]["state"] == "off" and number(states, SOC) > 30.0)
-    assert states[SOC_LOW]["attributes"]["reason"] == ""
+    home.call_service("number.set_value", entity_id=SET_SOC_ENTITY, value=50)
+    states = home.until(
+        lambda states: states[SOC_LOW_ENTITY]["state"] == "off" and number_state(states, SOC_ENTITY) > 30.0
+    )
+    assert states[SOC_LOW_ENTITY]["attributes"]["reason"] == ""
 
 
 def test_publish_rate_is_set_by_its_number_entity(home: HomeAssistant) -> None:
-    home.call("number.set_value", entity_id="number.bms_pack_publish_rate", value=2.5)
+    home.call_service("number.set_value", entity_id="number.bms_pack_publish_rate", value=2.5)
     home.until(lambda states: states["number.bms_pack_publish_rate"]["state"] == "2.5")
 
 
 def test_statistics_are_valid_and_the_energy_dashboard_accepts_the_pack(home: HomeAssistant) -> None:
-    statistics = {each["statistic_id"]: each for each in home.command("recorder/list_statistic_ids")}
+    statistics = {each["statistic_id"]: each for each in home.websocket_command("recorder/list_statistic_ids")}
     for name in ("energy_in_kwh", "energy_out_kwh"):
         statistic = statistics[f"sensor.bms_pack_{name}"]
         assert (statistic["has_sum"], statistic["unit_class"]) == (True, "energy")
     means = {"voltage_v", "current_a", "power_w", "temperature_c", "soc_percent", "soh_percent", "remaining_energy_wh"}
     assert all(statistics[f"sensor.bms_pack_{name}"]["has_mean"] for name in means)
-    assert home.command("recorder/validate_statistics") == {}
+    assert home.websocket_command("recorder/validate_statistics") == {}
     battery = {
         "type": "battery",
         "stat_energy_from": "sensor.bms_pack_energy_out_kwh",
         "stat_energy_to": "sensor.bms_pack_energy_in_kwh",
     }
-    home.command("energy/save_prefs", energy_sources=[battery])
-    issues = chain.from_iterable(home.command("energy/validate")["energy_sources"])
-    assert {issue["type"] for issue in issues} <= {
-        "statistics_not_defined"
-    }  # statistics are computed every five minutes
+    home.websocket_command("energy/save_prefs", energy_sources=[battery])
+    issues = chain.from_iterable(home.websocket_command("energy/validate")["energy_sources"])
+    # statistics are computed every five minutes, and may not exist yet
+    assert {issue["type"] for issue in issues} <= {"statistics_not_defined"}
 
 
 def cards(part: Any) -> Iterator[dict[str, Any]]:
@@ -136,7 +147,7 @@ def cards(part: Any) -> Iterator[dict[str, Any]]:
 
 
 def test_dashboard_contains_only_existing_cards_and_entities(home: HomeAssistant) -> None:
-    dashboard = home.command("lovelace/config", url_path="the-pack")
+    dashboard = home.websocket_command("lovelace/config", url_path="the-pack")
     assert [view["title"] for view in dashboard["views"]] == ["Battery"]
     assert {card["type"] for card in cards(dashboard["views"])} == CARDS
     frontend = ENVIRONMENT / "venv/lib/python3.13/site-packages/hass_frontend/frontend_latest"
@@ -147,8 +158,11 @@ def test_dashboard_contains_only_existing_cards_and_entities(home: HomeAssistant
     assert entities - set(home.states()) == set()
 
 
-def play(broker: Broker, device: str, stream: Iterator[tuple[float, Snapshot]], home: HomeAssistant) -> None:
-    """Publish a pack's messages as fast as the broker accepts them, once Home Assistant has its entities."""
+def publish_fast(broker: Broker, device: str, stream: Iterator[tuple[float, Snapshot]], home: HomeAssistant) -> None:
+    """Publish the messages of a stream of snapshots as fast as the broker accepts them.
+
+    The stream begins once Home Assistant has the entities of the device. Return once it has the last voltage.
+    """
     builder, published, messages = MessageBuilder("bms", device), PublishedState(), list[Message]()
     for now_s, each in stream:
         info = each.info.model_copy(update={"device": device})
@@ -163,11 +177,11 @@ def play(broker: Broker, device: str, stream: Iterator[tuple[float, Snapshot]], 
                 await client.publish(message.topic, message.payload, 1, message.retain)
 
     asyncio.run(publish(retained))
-    last = json.loads(values[-1].payload)
+    last_values = json.loads(values[-1].payload)
     voltage = f"sensor.bms_{device}_voltage_v"
 
     def is_available(states: dict[str, Any]) -> bool:
-        """Publish the first value again, because Home Assistant subscribes some time after the discovery message."""
+        """Publish the first values again, because Home Assistant subscribes some time after the discovery message."""
         asyncio.run(publish(values[:1]))
         device_states = [
             state["state"] for entity, state in states.items() if entity.startswith(f"sensor.bms_{device}_")
@@ -176,7 +190,7 @@ def play(broker: Broker, device: str, stream: Iterator[tuple[float, Snapshot]], 
 
     home.until(is_available)
     asyncio.run(publish(values))
-    home.until(lambda states: number(states, voltage) == last["voltage_v"])
+    home.until(lambda states: number_state(states, voltage) == last_values["voltage_v"])
 
 
 def test_entity_of_a_withdrawn_command_is_removed(home: HomeAssistant, broker: Broker) -> None:
@@ -192,19 +206,19 @@ def test_entity_of_a_withdrawn_command_is_removed(home: HomeAssistant, broker: B
     home.until(lambda states: entity in states)
     asyncio.run(publish_discovery(DiscoveryInputs(info)))
     home.until(lambda states: entity not in states and "sensor.bms_changed_voltage_v" in states)
-    assert entity not in {entry["entity_id"] for entry in home.command("config/entity_registry/list")}
+    assert entity not in {entry["entity_id"] for entry in home.websocket_command("config/entity_registry/list")}
 
 
-@pytest.mark.parametrize(("device", "stream"), [("noisy", noisy_cell), ("restless", all_changing)])
+@pytest.mark.parametrize(("device", "stream"), [("noisy", noisy_cell), ("restless", all_values_changing)])
 def test_recorder_writes_at_most_20_rows_a_minute(
     home: HomeAssistant, broker: Broker, device: str, stream: Callable[[float], Iterator[tuple[float, Snapshot]]]
 ) -> None:
     minutes = 10
-    play(broker, device, stream(60.0 * minutes), home)
+    publish_fast(broker, device, stream(60.0 * minutes), home)
     info = next(stream(1.0))[1].info
-    inputs = DiscoveryInputs(info, CELLS if stream is all_changing else 0)
+    inputs = DiscoveryInputs(info, CELL_COUNT if stream is all_values_changing else 0)
     expected = len(
-        rows(stream(60.0 * minutes), components_of(discovery(HomeAssistantSettings(), inputs, "bms/pack", 0.0)))
+        row_times(stream(60.0 * minutes), components_of(discovery(HomeAssistantSettings(), inputs, "bms/pack", 0.0)))
     )
     assert 100 < expected <= MAX_ROWS_PER_MIN * minutes
     deadline = time.monotonic() + LONG_S
@@ -216,23 +230,29 @@ def test_recorder_writes_at_most_20_rows_a_minute(
 
 def count_changes(home: HomeAssistant, device: str) -> int:
     """Return the number of rows of the device's sensors, without the first row of each sensor."""
-    rows_by_entity = Counter(entity for entity, state in home.rows(f"sensor.bms_{device}_%") if state != "unavailable")
+    rows_by_entity = Counter(
+        entity for entity, state in home.recorder_rows(f"sensor.bms_{device}_%") if state != "unavailable"
+    )
     return sum(count - 1 for count in rows_by_entity.values())
 
 
-def test_button_sets_the_current_zero(home: HomeAssistant, packs: Packs, broker: Broker) -> None:
-    received(broker, "bms/bench/health", lambda health: health["uptime_s"] > REST_S + 5.0)
+def test_button_sets_the_current_zero_once_the_pack_has_rested(
+    home: HomeAssistant, packs: Packs, broker: Broker
+) -> None:
+    first_message(broker, "bms/bench/health", lambda health: health["uptime_s"] > REST_S + 5.0)
     deadline, granted = time.monotonic() + LONG_S, '"present current taken as zero on request", "pack": "bench"'
     rejections = -1
     while granted not in packs.log:
         assert time.monotonic() < deadline, packs.log[-2000:]
         if packs.log.count(NOT_GRANTED) > rejections:  # lost frames on a busy machine restart the required rest
             rejections = packs.log.count(NOT_GRANTED)
-            home.call("button.press", entity_id="button.bms_bench_current_zero")
+            home.call_service("button.press", entity_id="button.bms_bench_current_zero")
         time.sleep(1.0)
 
 
-def test_pack_is_unavailable_from_the_kill_of_its_service_until_the_restart(home: HomeAssistant, packs: Packs) -> None:
+def test_entities_are_unavailable_from_the_kill_of_the_service_until_its_restart(
+    home: HomeAssistant, packs: Packs
+) -> None:
     def pack_states(states: dict[str, Any]) -> set[str]:
         return {state["state"] for entity, state in states.items() if ".bms_pack_" in entity}
 
@@ -240,15 +260,17 @@ def test_pack_is_unavailable_from_the_kill_of_its_service_until_the_restart(home
     home.until(lambda states: pack_states(states) == {"unavailable"})
     packs.start()
     states = home.until(lambda states: "unavailable" not in pack_states(states))
-    assert number(states, SOC) == pytest.approx(50.0, abs=20.0)
+    assert number_state(states, SOC_ENTITY) == pytest.approx(50.0, abs=20.0)
 
 
 def test_silent_board_makes_alarms_unavailable_and_not_off(home: HomeAssistant, packs: Packs) -> None:
     packs.silent.set()
-    home.until(lambda states: {states[SOC]["state"], states[SOC_LOW]["state"]} == {"unavailable"})
+    home.until(lambda states: {states[SOC_ENTITY]["state"], states[SOC_LOW_ENTITY]["state"]} == {"unavailable"})
     packs.silent.clear()
-    states = home.until(lambda states: "unavailable" not in (states[SOC]["state"], states[SOC_LOW]["state"]))
-    assert states[SOC_LOW]["state"] == "off"
+    states = home.until(
+        lambda states: "unavailable" not in (states[SOC_ENTITY]["state"], states[SOC_LOW_ENTITY]["state"])
+    )
+    assert states[SOC_LOW_ENTITY]["state"] == "off"
 
 
 def test_home_assistant_logs_no_warning_about_the_pack(home: HomeAssistant) -> None:

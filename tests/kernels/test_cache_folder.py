@@ -1,4 +1,4 @@
-"""Cache folder of compiled kernels, named by a hash of all their sources, and operation without a cache."""
+"""Cache of compiled kernels: its folder is named by a hash of all their sources. Kernels also run without a cache."""
 
 import ast
 import os
@@ -17,9 +17,9 @@ from tests.patience import LONG_S
 
 PACKAGE = Path(bms_estimator.__file__).parent
 ELF = b"\x7fELF"
-"""First bytes of a kernel's object file."""
+"""First bytes of the object file that contains a kernel's machine code."""
 HEADER_BYTES = 64
-"""Size of the header of a 64-bit object file, which machine code follows [bytes]."""
+"""Size of the header of a 64-bit object file, before the machine code [bytes]."""
 
 
 def imported_files(source: Path) -> set[Path]:
@@ -29,13 +29,13 @@ def imported_files(source: Path) -> set[Path]:
     return {path for path in paths if path.is_relative_to(PACKAGE) and path.is_file()}
 
 
-def test_the_cache_name_covers_every_file_with_compiled_code() -> None:
+def test_the_hash_of_the_cache_name_covers_every_file_with_compiled_code() -> None:
     compiled = {path for path in PACKAGE.rglob("*.py") if re.search(r"^@njit\b", path.read_text(), re.MULTILINE)}
     assert PACKAGE / "protocols" / "firmware" / "framing.py" in compiled
     assert compiled <= set(numba_cache.COMPILED_IN)
 
 
-def test_the_cache_name_covers_every_file_that_a_kernel_imports() -> None:
+def test_the_hash_of_the_cache_name_covers_every_file_that_a_kernel_imports() -> None:
     dependencies = set().union(*(imported_files(source) for source in numba_cache.COMPILED_IN)) - {
         PACKAGE / "numba_cache.py"
     }
@@ -51,10 +51,11 @@ def test_only_numba_cache_imports_njit_from_numba() -> None:
 
 
 CRC16_OF_FOUR_ZEROS = "33984\n"
+"""Output of the kernel that the tests run."""
 
 
 def run_crc16_with_cache_in(folder: Path) -> str:
-    """Run a kernel in another process with all cache folders at ``folder``, check its result, and return stderr."""
+    """Run a kernel in another process whose cache folders are all ``folder``; check its result and return stderr."""
     cache_variables = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"), str(folder))
     script = "import numpy; from bms_estimator.protocols.firmware.framing import crc16; print(crc16(numpy.zeros(4, 'u1'), 0, 4))"
     command = [sys.executable, "-c", script]
@@ -83,19 +84,19 @@ def test_a_kernel_runs_for_a_user_without_a_home() -> None:
 
 @pytest.fixture(scope="module")
 def cached_kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a compiled kernel."""
+    """Return a cache folder with a compiled kernel."""
     folder = tmp_path_factory.mktemp("kernel")
     assert run_crc16_with_cache_in(folder) == ""
     return folder
 
 
 def truncate(content: bytes) -> bytes:
-    """Return the start of a file, which ends within its header."""
+    """Return only the first 20 bytes, which end within the header."""
     return content[:20]
 
 
 def empty(_: bytes) -> bytes:
-    """Return no bytes, as of a file that was created but not written."""
+    """Return no bytes, as in a file that was created but not written."""
     return b""
 
 
@@ -110,7 +111,7 @@ def erase_machine_code(content: bytes) -> bytes:
 
 @pytest.mark.parametrize(
     ("suffix", "damage"),
-    [
+    [  # numba writes an index (nbi) and the compiled code (nbc)
         ("nbi", truncate),
         pytest.param("nbi", empty, marks=pytest.mark.thorough),
         pytest.param("nbc", truncate, marks=pytest.mark.thorough),

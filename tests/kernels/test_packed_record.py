@@ -23,9 +23,11 @@ LAYOUT = np.dtype(
 )
 """Record with two symmetric matrices between other fields, longer than one word of the bitmap covers."""
 SYMMETRIC_WORDS = symmetry_map(LAYOUT)
+"""For each word of a record, index of the word that is equal by symmetry, or -1."""
 RECORD_WORDS = SYMMETRIC_WORDS.size
 WORDS_BELOW_DIAGONALS = MATRICES * MATRIX_SIZE * (MATRIX_SIZE - 1) // 2
 BITMAP_WORDS = -(-RECORD_WORDS // WORD_BITS)
+"""Number of words of the bitmap at the start of packed data, rounded up."""
 record_words = hnp.arrays(np.uint64, RECORD_WORDS, elements=st.sampled_from([0, 1, 2**63, 2**64 - 1]))
 
 
@@ -35,7 +37,7 @@ def pack_words(words, symmetric_words=SYMMETRIC_WORDS):
     return out[: pack(words, symmetric_words, out)].copy()
 
 
-def test_words_below_a_diagonal_map_to_words_above() -> None:
+def test_each_word_below_a_diagonal_maps_to_its_mirror_image_above() -> None:
     record = np.zeros(1, LAYOUT)
     words = record.view(np.uint64)
     words[:] = np.arange(RECORD_WORDS)
@@ -48,13 +50,13 @@ def test_words_below_a_diagonal_map_to_words_above() -> None:
 
 @given(record_words)
 def test_packing_is_lossless(words) -> None:
-    unpacked = np.full_like(words, 77)  # unpacking must also write zeros
+    unpacked = np.full_like(words, 77)  # any value: unpacking must also write zeros
     assert unpack(pack_words(words), SYMMETRIC_WORDS, unpacked)
     assert (unpacked == words).all()
 
 
 @given(record_words)
-def test_a_symmetric_matrix_is_stored_once(words) -> None:
+def test_only_one_half_of_a_symmetric_matrix_is_stored(words) -> None:
     record = words.view(LAYOUT)
     for matrix in record["part"]["matrix"][0]:
         matrix[...] = np.triu(matrix) + np.triu(matrix, 1).T
@@ -77,8 +79,7 @@ def test_a_flipped_bit_of_the_bitmap_is_rejected(words, bit: int) -> None:
 
 
 @given(hnp.arrays(np.uint64, st.integers(0, RECORD_WORDS + 9)))
-def test_random_bytes_are_rejected_or_canonical(noise) -> None:
-    """Accepted bytes are the only encoding of their record."""
+def test_random_words_are_rejected_or_are_the_only_encoding_of_their_record(noise) -> None:
     unpacked = np.zeros(RECORD_WORDS, np.uint64)
     if unpack(noise, SYMMETRIC_WORDS, unpacked):
         assert (pack_words(unpacked) == noise).all()
@@ -87,7 +88,7 @@ def test_random_bytes_are_rejected_or_canonical(noise) -> None:
 @pytest.mark.parametrize(
     "dtype", [np.dtype([("a", "f8"), ("b", "i4")]), np.dtype([("a", "i1"), ("b", "f8")], align=True)]
 )
-def test_a_record_without_whole_words_is_rejected(dtype) -> None:
+def test_a_record_with_fields_smaller_than_a_word_is_rejected(dtype) -> None:
     with pytest.raises(ValueError, match="word"):
         symmetry_map(dtype)
 
@@ -95,7 +96,7 @@ def test_a_record_without_whole_words_is_rejected(dtype) -> None:
 def test_a_converged_estimator_packs_to_a_fifth_of_its_record() -> None:
     estimator = Estimator(load_cell("ncr18650"))
     estimator.run(pulses(hours=1.0)[0])
-    assert estimator.record["filter"]["count"] == 1
+    assert estimator.record["filter"]["count"] == 1  # one hypothesis is left
     words, symmetric_words = estimator.record.view(np.uint64), symmetry_map(ESTIMATOR_STATE)
     packed = pack_words(words, symmetric_words)
     assert packed.nbytes < ESTIMATOR_STATE.itemsize / 5

@@ -6,7 +6,7 @@ from typing import Any
 from bms_estimator.model.events import events
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads import Snapshot
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 AT_41_C = f"no data at 41 C, the cell file knows 25 C: {InputFault.TEMPERATURE.text}"
 AT_42_C = f"no data at 42 C, the cell file knows 25 C: {InputFault.TEMPERATURE.text}"
@@ -14,16 +14,17 @@ AT_42_C = f"no data at 42 C, the cell file knows 25 C: {InputFault.TEMPERATURE.t
 
 def with_health(**changes: Any) -> Snapshot:
     """Return a snapshot with changed fields of its health message."""
-    return ONE._replace(health=ONE.health.model_copy(update=changes))
+    return CELL_SNAPSHOT._replace(health=CELL_SNAPSHOT.health.model_copy(update=changes))
 
 
 def event_names(before: Snapshot | None, after: Snapshot) -> list[str]:
+    """Return the names of the events between two snapshots."""
     return [event.name for event in events(before, after)]
 
 
 def with_gap_total(seconds: float) -> Snapshot:
     """Return a snapshot with a total duration of gaps [s]."""
-    return with_health(total=ONE.health.total.model_copy(update={"unseen_s": seconds}))
+    return with_health(total=CELL_SNAPSHOT.health.total.model_copy(update={"unseen_s": seconds}))
 
 
 def test_a_start_event_contains_the_outcome_of_the_checkpoint():
@@ -37,14 +38,14 @@ def test_a_start_without_a_sensor_causes_no_offline_event():
     assert event_names(without_sensor, with_health(sensor_online=True)) == ["sensor_online"]
 
 
-def test_a_lost_sensor_causes_one_event_with_its_reason():
+def test_a_lost_sensor_causes_one_event_with_the_reason():
     sensor_lost = with_health(sensor_online=False, sensor_message="no board")
-    [event] = events(ONE, sensor_lost)
+    [event] = events(CELL_SNAPSHOT, sensor_lost)
     assert (event.name, event.text, event.time) == ("sensor_offline", "no board", sensor_lost.health.publish_time)
     assert event_names(sensor_lost, with_health(sensor_online=False, sensor_message="silent for 9 s")) == []
 
 
-def test_diagnostics_cause_events_at_start_and_end_but_not_for_changed_numbers():
+def test_a_diagnostic_causes_an_event_at_its_start_and_end_but_not_if_its_numbers_change():
     states = [with_health(suspects=suspects) for suspects in ([], [AT_41_C], [AT_42_C], [AT_42_C, "x"], ["x"], [])]
     events_of_changes = [events(*pair) for pair in itertools.pairwise(states)]
     assert [[(event.name, event.text) for event in changes] for changes in events_of_changes] == [
@@ -73,7 +74,7 @@ def test_a_gap_causes_an_event_with_its_duration():
 def test_a_gap_before_the_start_causes_one_event():
     after_gap = with_health(unseen_s=3600.0, total=with_gap_total(3600.0).health.total)
     assert [(event.name, event.text) for event in events(None, after_gap)][:2] == [
-        ("start", f"checkpoint: {ONE.health.checkpoint}"),
+        ("start", f"checkpoint: {CELL_SNAPSHOT.health.checkpoint}"),
         ("unseen", "no measurements for 3600.0 s"),
     ]
     assert events(after_gap, with_gap_total(3600.0)) == []
@@ -82,5 +83,5 @@ def test_a_gap_before_the_start_causes_one_event():
 
 
 def test_equal_snapshots_cause_no_events():
-    assert events(ONE, ONE) == []
-    assert events(ONE, with_health()) == []
+    assert events(CELL_SNAPSHOT, CELL_SNAPSHOT) == []
+    assert events(CELL_SNAPSHOT, with_health()) == []

@@ -14,6 +14,8 @@ from bms_estimator.model.fuel_cell import FuelCellModel, load_any, load_fuel_cel
 from tests import mann_stack
 
 PEM = load_fuel_cell("pem_30w")
+RATED_A = 3.25
+"""Rated current of the stack [A]."""
 
 
 def voltage_v(model: FuelCellModel, current_a: float) -> float:
@@ -23,17 +25,18 @@ def voltage_v(model: FuelCellModel, current_a: float) -> float:
 
 def test_the_shipped_stack_delivers_30_w() -> None:
     assert shipped_fuel_cells() == ["pem_30w"]
-    assert 3.25 * voltage_v(PEM, 3.25) == pytest.approx(30.3, abs=0.1)
-    assert voltage_v(PEM, 3.25) == pytest.approx(PEM.cell.nominal_voltage_v, abs=0.05)
+    assert RATED_A * voltage_v(PEM, RATED_A) == pytest.approx(30.3, abs=0.1)
+    assert voltage_v(PEM, RATED_A) == pytest.approx(PEM.cell.nominal_voltage_v, abs=0.05)
 
 
 def test_the_shipped_stack_has_the_published_coefficients() -> None:
+    """The resistance is that at the rated current and a water content of the membrane of 14."""
     kelvin = 273.15 + PEM.fuel_cell.temperature_c
     f, n = PEM.fuel_cell, mann_stack.CELLS
     assert f.tafel_slope_v == pytest.approx(-mann_stack.XI_4 * kelvin * n, rel=1e-3)
     assert PEM.activation_v == pytest.approx(n * mann_stack._activation_v(kelvin), rel=1e-3)
     assert f.c_dl_farad == pytest.approx(mann_stack.C_FARAD / n, rel=1e-3)
-    assert f.r_ohm == pytest.approx(n * mann_stack._cell_ohm(3.25, kelvin, 14.0), rel=1e-3)
+    assert f.r_ohm == pytest.approx(n * mann_stack._cell_ohm(RATED_A, kelvin, 14.0), rel=1e-3)
     assert f.concentration_v == pytest.approx(n * mann_stack.B_V)
     assert (f.limiting_current_a, f.internal_current_a) == pytest.approx((mann_stack.LIMIT_A, mann_stack.INTERNAL_A))
 
@@ -54,13 +57,13 @@ def test_stacks_in_parallel_with_too_large_an_exchange_current_are_rejected() ->
 def test_a_written_file_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     a = PEM.a
-    a[1 : 1 + len(NAMES)] *= 1.25
+    a[1 : 1 + len(NAMES)] *= 1.25  # all identified parameters
     identified = PEM.identified(a, {"r_ohm": 0.0123456})
     write_cell(path, identified, ["a remark"])
     read_back = load_any(path)
     assert read_back == identified
     assert read_back.a == pytest.approx(a, rel=1e-4)
-    assert read_back.std == {"r_ohm": 0.012}
+    assert read_back.std == {"r_ohm": 0.012}  # rounded
     assert is_fuel_cell(path)
 
 
@@ -75,7 +78,7 @@ def test_a_written_file_is_read_back(tmp_path: Path) -> None:
         ("voltage_min_v = 2.0", "voltage_min_v = 20.0", r"must increase in this order"),
     ],
 )
-def test_an_invalid_value_is_named(tmp_path: Path, text: str, edit: str, message: str) -> None:
+def test_the_error_on_an_invalid_value_names_the_key(tmp_path: Path, text: str, edit: str, message: str) -> None:
     shipped = Path(mann_stack.__file__).parents[1] / "bms_estimator/model/cells/fuel_cell/pem_30w.toml"
     path = tmp_path / "mine.toml"
     path.write_text(shipped.read_text().replace(text, edit, 1))

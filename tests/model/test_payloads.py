@@ -1,4 +1,4 @@
-"""JSON of payloads, which is built once for each object."""
+"""JSON of payloads: each object builds its JSON once."""
 
 from bms_estimator.model.payloads import Alarm
 
@@ -7,7 +7,7 @@ RAISED = Alarm(
 )
 
 
-def test_json_is_built_once() -> None:
+def test_the_json_of_a_payload_is_built_once() -> None:
     assert RAISED.json_bytes is RAISED.json_bytes
 
 
@@ -16,6 +16,6 @@ def test_a_changed_copy_has_its_own_json() -> None:
     assert b'"value":0.2' in RAISED.model_copy(update={"value": 0.2}).json_bytes
 
 
-def test_payloads_with_and_without_json_are_equal() -> None:
+def test_a_payload_whose_json_has_been_built_equals_one_without_json() -> None:
     assert RAISED.json_bytes
     assert RAISED.model_copy() == RAISED

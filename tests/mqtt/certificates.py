@@ -8,11 +8,16 @@ SUBJECT_ALT_NAMES = "subjectAltName=IP:127.0.0.1,DNS:localhost"
 
 
 def openssl(*arguments: str | Path) -> None:
+    """Run openssl. Raise an exception if it fails."""
     subprocess.run(["openssl", *arguments], check=True, capture_output=True)
 
 
 class Authority:
-    """Certificate authority with the certificate ``certificate``."""
+    """Certificate authority whose files are in a folder.
+
+    Attributes:
+        certificate: Path of the authority's own certificate.
+    """
 
     def __init__(self, folder: Path, name: str = "ca") -> None:
         self._folder = folder
@@ -22,12 +27,12 @@ class Authority:
         )
 
     def sign(self, name: str) -> tuple[Path, Path]:
-        """Create certificate and key for a name on this machine."""
-        certificate, key, request = (self._folder / f"{name}.{kind}" for kind in ("crt", "key", "csr"))
-        names = self._folder / "names"
-        names.write_text(SUBJECT_ALT_NAMES)
+        """Create a certificate and a key for a server or client on this machine. Return the paths of both."""
+        certificate, key, request = (self._folder / f"{name}.{suffix}" for suffix in ("crt", "key", "csr"))
+        extensions = self._folder / "extensions"
+        extensions.write_text(SUBJECT_ALT_NAMES)
         openssl("req", *EC_KEY, "-keyout", key, "-out", request, "-subj", f"/CN={name}")
         openssl("x509", "-req", "-in", request, "-CA", self.certificate, "-CAkey", self._key, "-CAcreateserial",
-                "-out", certificate, "-days", "2", "-extfile", names)  # fmt: skip
+                "-out", certificate, "-days", "2", "-extfile", extensions)  # fmt: skip
         key.chmod(0o600)
         return certificate, key

@@ -19,13 +19,13 @@ from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.certificates import Authority, openssl
-from tests.sinks.service import STATE, until
-from tests.sinks.snapshots import ONE
+from tests.sinks.sink_helpers import STATE_TOPIC, until
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the certificates of the authority, the server, a pack and of another authority."""
+    """Return a folder with certificates of an authority, a server and a pack, and of a client of another authority."""
     folder = tmp_path_factory.mktemp("certificates")
     authority = Authority(folder)
     authority.sign("server")
@@ -36,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def strict_broker(folder: Path, tmp_path: Path) -> Iterator[Broker]:
-    """Start a broker that requires a certificate of its authority and uses its name as user name."""
+    """Start a broker that requires client certificates, and takes the user name from the certificate."""
     if MOSQUITTO is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     broker = Broker(
@@ -49,13 +49,16 @@ def strict_broker(folder: Path, tmp_path: Path) -> Iterator[Broker]:
 
 
 def settings(broker: Broker, folder: Path, name: str | None) -> MqttSettings:
+    """Return the settings of a client with the certificate ``name``; None: without a certificate."""
     client_files = {"cert_file": folder / f"{name}.crt", "key_file": folder / f"{name}.key"} if name else {}
     return MqttSettings(url=f"mqtts://127.0.0.1:{broker.port}", ca_file=folder / "ca.crt", **client_files)
 
 
 def sink(settings: MqttSettings) -> MqttSink:
     delivery = DeliveryStats()
-    return MqttSink(settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, most=4), first_delay_s=0.1)
+    return MqttSink(
+        settings, "pack", RequestDispatcher(delivery), delivery, Outbox(None, max_messages=4), first_delay_s=0.1
+    )
 
 
 async def test_client_certificate_is_accepted(strict_broker: Broker, folder: Path) -> None:
@@ -64,8 +67,8 @@ async def test_client_certificate_is_accepted(strict_broker: Broker, folder: Pat
         Listener(strict_broker, tls_params=tls) as live,
         sink(settings(strict_broker, folder, "pack")) as mqtt,
     ):
-        mqtt.publish(ONE)
-        await live.wait(STATE)
+        mqtt.publish(CELL_SNAPSHOT)
+        await live.wait(STATE_TOPIC)
 
 
 @pytest.mark.parametrize(("name", "reason"), [(None, "certificate required"), ("foreign", "unknown ca")])
@@ -82,20 +85,20 @@ async def test_rejected_certificate_is_logged_with_the_reason(
 async def test_replaced_certificate_is_used_without_restart(
     strict_broker: Broker, folder: Path, tmp_path: Path
 ) -> None:
-    own = tmp_path / "own"
-    own.mkdir()
-    for kind in ("crt", "key"):
-        shutil.copy(folder / f"foreign.{kind}", own / f"pack.{kind}")
-    shutil.copy(folder / "ca.crt", own)
+    pack_folder = tmp_path / "pack"
+    pack_folder.mkdir()
+    for suffix in ("crt", "key"):
+        shutil.copy(folder / f"foreign.{suffix}", pack_folder / f"pack.{suffix}")
+    shutil.copy(folder / "ca.crt", pack_folder)
     with structlog.testing.capture_logs() as logs:
-        async with sink(settings(strict_broker, own, "pack")):
+        async with sink(settings(strict_broker, pack_folder, "pack")):
             await until(lambda: [line for line in logs if line["event"] == "broker not reachable"])
-            for kind in ("crt", "key"):
-                shutil.copy(folder / f"pack.{kind}", own / f"pack.{kind}")
+            for suffix in ("crt", "key"):
+                shutil.copy(folder / f"pack.{suffix}", pack_folder / f"pack.{suffix}")
             await until(lambda: [line for line in logs if line["event"] == "broker connected"])
 
 
-def test_minimum_version_is_tls_1_2(folder: Path) -> None:
+def test_tls_below_version_1_2_is_not_offered(folder: Path) -> None:
     assert tls_context(MqttSettings(url="mqtts://host")).minimum_version is ssl.TLSVersion.TLSv1_2
 
 
@@ -109,7 +112,9 @@ def test_key_readable_by_every_user_causes_a_warning(folder: Path, tmp_path: Pat
     assert f"mqtt.key_file = {key}: every user" in warning
 
 
-def test_key_is_found_in_the_credentials_directory(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_relative_paths_are_found_in_the_credentials_directory_of_systemd(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(folder))
     assert check(MqttSettings(url="mqtts://host", cert_file=Path("pack.crt"), key_file=Path("pack.key"))) == []
 

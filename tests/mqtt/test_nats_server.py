@@ -10,15 +10,15 @@ import aiomqtt
 import pytest
 
 from tests.fleet.nats_cluster import NatsCluster, running
-from tests.sinks.service import STATE, Sink, assert_all_in_order, state, until
+from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state, until
 
-COUNT = 400
-"""Number of published states, whose ``frames_received`` are 0 to ``COUNT`` - 1."""
+STATE_COUNT = 400
+"""Number of published states, with the numbers 0 to ``STATE_COUNT`` - 1."""
 MESSAGE_STREAM = "$MQTT_msgs"
 """Stream in which the server stores QoS 1 messages until all subscribers have them."""
 
 
-class Collector:
+class StateCollector:
     """Subscriber to the pack's messages at any live node. It loses none, because the cluster stores its session.
 
     Attributes:
@@ -46,7 +46,7 @@ class Collector:
             for port in self._ports:
                 try:
                     async with aiomqtt.Client("127.0.0.1", port, identifier="collector", clean_session=False) as client:
-                        await client.subscribe([(STATE, 1), ("bms/pack/availability", 1)])
+                        await client.subscribe([(STATE_TOPIC, 1), ("bms/pack/availability", 1)])
                         self._listening.set()
                         async for message in client.messages:
                             self._record(message)
@@ -55,8 +55,8 @@ class Collector:
 
     def _record(self, message: aiomqtt.Message) -> None:
         assert isinstance(message.payload, bytes)
-        if message.topic.value == STATE:
-            # ``state(number)`` stores its number in this field
+        if message.topic.value == STATE_TOPIC:
+            # the field in which ``numbered_state`` stores the number
             self.states.append(json.loads(message.payload)["frames_received"])
         else:
             self.availability.append(message.payload)
@@ -65,47 +65,50 @@ class Collector:
 async def publish(sink: Sink, first: int, end: int) -> None:
     """Publish the states ``first`` to ``end`` - 1 at 200 Hz."""
     for number in range(first, end):
-        sink.mqtt.publish(state(number))
+        sink.mqtt.publish(numbered_state(number))
         await asyncio.sleep(0.005)
 
 
 def mqtt_url(server: NatsCluster, node: int) -> str:
+    """Return the URL of the node with this index."""
     return f"mqtt://127.0.0.1:{server.mqtt_ports[node]}"
 
 
-async def test_restarted_node_receives_all_states(tmp_path: Path) -> None:
+async def test_all_states_arrive_although_the_only_node_is_killed_and_restarted(tmp_path: Path) -> None:
     with running(tmp_path) as server:
-        async with Collector(server) as live, Sink(mqtt_url(server, 0), max_queued=10_000) as sink:
-            await publish(sink, 0, COUNT // 2)
+        async with StateCollector(server) as live, Sink(mqtt_url(server, 0), max_queued=10_000) as sink:
+            await publish(sink, first=0, end=STATE_COUNT // 2)
             await until(lambda: live.states)
             server.kill(0)
-            await publish(sink, COUNT // 2, COUNT)
+            await publish(sink, first=STATE_COUNT // 2, end=STATE_COUNT)
             server.start(0)
-            await until(lambda: live.states and live.states[-1] == COUNT - 1)
+            await until(lambda: live.states and live.states[-1] == STATE_COUNT - 1)
             assert live.availability[-1] == b"online"
-    assert_all_in_order(live.states, COUNT)
+    assert_all_in_order(live.states, STATE_COUNT)
 
 
-@pytest.mark.parametrize("serves_client", [pytest.param(True, id="serves us"), pytest.param(False, id="serves others")])
+@pytest.mark.parametrize(
+    "serves_client", [pytest.param(True, id="serves the sink"), pytest.param(False, id="serves others")]
+)
 @pytest.mark.parametrize("is_leader", [pytest.param(True, id="leads"), pytest.param(False, id="follows")])
 async def test_killed_cluster_node_loses_no_state(tmp_path: Path, *, serves_client: bool, is_leader: bool) -> None:
     if "CLUSTER" not in os.environ:
         pytest.skip("takes 6 to 30 s: part of `make nats`")
-    with running(tmp_path, 3) as server:
-        async with Collector(server) as live:
+    with running(tmp_path, nodes=3) as server:
+        async with StateCollector(server) as live:
             await until(lambda: server.leader(MESSAGE_STREAM) >= 0)
             leader = server.leader(MESSAGE_STREAM)
             victim = leader if is_leader else (leader + 1) % 3
-            first = victim if serves_client else (victim + 1) % 3
-            urls = tuple(mqtt_url(server, (first + i) % 3) for i in range(3))
+            first_node = victim if serves_client else (victim + 1) % 3  # the sink connects to its first URL
+            urls = tuple(mqtt_url(server, (first_node + i) % 3) for i in range(3))
             async with Sink(urls, max_queued=10_000) as sink:
                 await until(lambda: live.availability == [b"online"])
-                await publish(sink, 0, COUNT // 2)
-                await until(lambda: len(live.states) > COUNT // 4)
+                await publish(sink, first=0, end=STATE_COUNT // 2)
+                await until(lambda: len(live.states) > STATE_COUNT // 4)
                 server.kill(victim)
-                await publish(sink, COUNT // 2, COUNT)
-                await until(lambda: live.states[-1] == COUNT - 1)
+                await publish(sink, first=STATE_COUNT // 2, end=STATE_COUNT)
+                await until(lambda: live.states[-1] == STATE_COUNT - 1)
                 await until(lambda: sink.delivery.waiting == 0)
                 await until(lambda: live.availability[-1] == b"online")
-    assert_all_in_order(live.states, COUNT)
+    assert_all_in_order(live.states, STATE_COUNT)
     assert sink.delivery.drops == 0

@@ -12,7 +12,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from tests.command_line import run
 
 SECRET = "s3cret"
-URLS = [
+URLS_WITH_PASSWORD = [
     f"mqtt://me:{SECRET}@host:1883",
     f"mqtts://me:{SECRET}@host",
     f"mqtt://me:{SECRET}#more@host",
@@ -27,11 +27,11 @@ URLS = [
 ]
 
 
-@pytest.mark.parametrize("form", ['"{}"', '["mqtt://host", "{}"]', '["{}", "mqtt://host"]', '["{}", 5]'])
-def test_error_on_a_url_hides_the_password(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
+@pytest.mark.parametrize("toml_value", ['"{}"', '["mqtt://host", "{}"]', '["{}", "mqtt://host"]', '["{}", 5]'])
+def test_error_on_a_url_hides_the_password(tmp_path: Path, capsys: pytest.CaptureFixture[str], toml_value: str) -> None:
     pack = tmp_path / "pack.toml"
-    for url in URLS:
-        pack.write_text(f"[mqtt]\nurl = {form.format(url)}\n")
+    for url in URLS_WITH_PASSWORD:
+        pack.write_text(f"[mqtt]\nurl = {toml_value.format(url)}\n")
         for command in ("check", "show"):
             code, out, err = run(capsys, "config", command, pack)
             assert (code, "mqtt.url" in err, SECRET in out + err) == (2, True, False), url
@@ -40,12 +40,12 @@ def test_error_on_a_url_hides_the_password(tmp_path: Path, capsys: pytest.Captur
 def test_error_on_a_command_line_url_hides_the_password(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pack = tmp_path / "pack.toml"
     pack.write_text("")
-    for url in URLS:
+    for url in URLS_WITH_PASSWORD:
         code, out, err = run(capsys, "run", pack, "--mqtt", url)
         assert (code, "--mqtt" in err, SECRET in out + err) == (2, True, False), url
 
 
-@pytest.mark.parametrize("url", [*URLS, ("mqtt://host", URLS[0])])
+@pytest.mark.parametrize("url", [*URLS_WITH_PASSWORD, ("mqtt://host", URLS_WITH_PASSWORD[0])])
 def test_validation_error_hides_the_password(url: Any) -> None:
     with pytest.raises(ValidationError) as error:
         MqttSettings(url=url)

@@ -15,8 +15,8 @@ from bms_estimator.settings.mqtt import MqttSettings
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S
-from tests.sinks.service import Sink, until
-from tests.sinks.snapshots import ONE
+from tests.sinks.sink_helpers import Sink, until
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 
 class WatchedSubscriber:
@@ -43,12 +43,14 @@ class WatchedSubscriber:
         self._changed.set()
 
     async def until(self, condition: Any) -> None:
+        """Wait until the condition is true. It is checked after each callback."""
         async with asyncio.timeout(LONG_S):
             while not condition():
                 self._changed.clear()
                 await self._changed.wait()
 
     def stored(self, device: str, topic: str) -> Any:
+        """Return the stored payload of a topic, or None."""
         entry = self.subscriber.devices.get(device)
         return entry.topics.get(topic) if entry else None
 
@@ -56,15 +58,15 @@ class WatchedSubscriber:
 @pytest.mark.parametrize("supports_5", [True, False], ids=["MQTT 5", "MQTT 3.1.1"])
 async def test_published_messages_are_stored_and_passed_to_the_callback(broker: Broker, *, supports_5: bool) -> None:
     async with Proxy(broker.port, supports_5=supports_5) as proxy, Sink(broker.url) as sink:
-        sink.mqtt.publish(ONE)
+        sink.mqtt.publish(CELL_SNAPSHOT)
         watched = WatchedSubscriber(proxy.url)
         async with watched.subscriber:
             await watched.until(lambda: watched.stored("pack", "health") and watched.stored("pack", "schema"))
             assert watched.subscriber.lost_since is None
-            sink.mqtt.publish(ONE)
+            sink.mqtt.publish(CELL_SNAPSHOT)
             await watched.until(lambda: watched.stored("pack", "state"))
-            assert ONE.estimate
-            assert watched.stored("pack", "state") == ONE.estimate.model_dump(mode="json")
+            assert CELL_SNAPSHOT.estimate
+            assert watched.stored("pack", "state") == CELL_SNAPSHOT.estimate.model_dump(mode="json")
             assert watched.stored("pack", "availability") == "online"
             assert DeviceMessage("pack", "availability", "online") in watched.received
             await sink.mqtt.__aexit__(None, None, None)
@@ -76,12 +78,12 @@ async def test_published_messages_are_stored_and_passed_to_the_callback(broker: 
 
 async def test_invalid_messages_do_not_end_the_subscriber(broker: Broker) -> None:
     watched = WatchedSubscriber(broker.url)
-    async with watched.subscriber, Listener(broker) as other:
+    async with watched.subscriber, Listener(broker) as client:
         await watched.until(lambda: watched.lost_since_changes)
-        await other.publish("bms/pack/state", b"\xff\xfe no json", qos=1)
-        await other.publish("bms/no device/state", b"1", qos=1)
-        await other.publish("bms/pack/info", bytes(2 * MAX_BYTES), qos=1)
-        await other.publish("bms/pack/health", json.dumps({"uptime_s": 1}), qos=1)
+        await client.publish("bms/pack/state", b"\xff\xfe no json", qos=1)
+        await client.publish("bms/no device/state", b"1", qos=1)
+        await client.publish("bms/pack/info", bytes(2 * MAX_BYTES), qos=1)
+        await client.publish("bms/pack/health", json.dumps({"uptime_s": 1}), qos=1)
         await watched.until(lambda: watched.stored("pack", "health"))
         assert "no json" in watched.stored("pack", "state")
         assert list(watched.subscriber.devices) == ["pack"]
@@ -91,9 +93,9 @@ async def test_invalid_messages_do_not_end_the_subscriber(broker: Broker) -> Non
 async def test_subscriber_reconnects_to_a_restarted_broker(broker: Broker) -> None:
     watched = WatchedSubscriber(broker.url)
     async with watched.subscriber:
-        await watched.until(lambda: watched.lost_since_changes == [None])
-        async with Listener(broker) as other:
-            await other.publish("bms/pack/state", b"1", qos=1)
+        await watched.until(lambda: watched.lost_since_changes == [None])  # it is connected
+        async with Listener(broker) as client:
+            await client.publish("bms/pack/state", b"1", qos=1)
         await watched.until(lambda: watched.stored("pack", "state") == 1)
         broker.stop()
         await watched.until(lambda: len(watched.lost_since_changes) == 2)
@@ -105,8 +107,8 @@ async def test_subscriber_reconnects_to_a_restarted_broker(broker: Broker) -> No
         broker.start()
         await watched.until(lambda: len(watched.lost_since_changes) == 3)
         assert watched.subscriber.lost_since is None
-        async with Listener(broker) as other:
-            await other.publish("bms/pack/state", b"2", qos=1)
+        async with Listener(broker) as client:
+            await client.publish("bms/pack/state", b"2", qos=1)
         await watched.until(lambda: watched.stored("pack", "state") == 2)
 
 
@@ -122,15 +124,15 @@ async def test_connection_counts_as_lost_from_the_start_until_the_first_connecti
         await watched.until(lambda: watched.lost_since_changes == [None])
 
 
-async def test_exception_of_the_callback_is_raised(broker: Broker) -> None:
+async def test_exception_of_the_message_callback_ends_the_subscriber(broker: Broker) -> None:
     def fail(_: DeviceMessage) -> None:
         raise ZeroDivisionError
 
     subscriber = Subscriber(MqttSettings(url=broker.url), fail)
     with pytest.RaisesGroup(ZeroDivisionError, flatten_subgroups=True):
-        async with subscriber, Listener(broker) as other:
+        async with subscriber, Listener(broker) as client:
             await until(lambda: subscriber.lost_since is None)
-            await other.publish("bms/pack/state", b"1", qos=1)
+            await client.publish("bms/pack/state", b"1", qos=1)
             await until(lambda: subscriber.lost_since is not None)
 
 
@@ -152,7 +154,7 @@ async def test_rejected_connection_is_reported_with_the_reason(broker_with_passw
 
 
 async def test_long_messages_are_dropped_with_one_log_line(broker: Broker) -> None:
-    """An MQTT 5 broker withholds long messages; an MQTT 3.1.1 broker cannot."""
+    """By MQTT 3.1.1, a client cannot ask the broker to withhold long messages, and must drop them itself."""
     with structlog.testing.capture_logs() as lines:
         async with Proxy(broker.port, supports_5=False) as proxy, Listener(broker) as live:
             watched = WatchedSubscriber(proxy.url)
@@ -166,8 +168,8 @@ async def test_long_messages_are_dropped_with_one_log_line(broker: Broker) -> No
     assert [line["reason"] for line in lines if line["event"] == "messages are dropped"] == ["longer than 65536 bytes"]
 
 
-async def test_retained_payload_of_16_mib_is_withheld(broker: Broker) -> None:
-    async with Listener(broker, "other/#") as live:
+async def test_retained_payload_of_16_mib_neither_is_stored_nor_ends_the_connection(broker: Broker) -> None:
+    async with Listener(broker, "other/#") as live:  # it does not receive its own messages
         await live.publish("bms/pack/info", bytes(16 * 2**20), qos=1, retain=True)
         await live.publish("bms/pack/state", b"1", qos=1, retain=True)
         watched = WatchedSubscriber(broker.url)

@@ -16,7 +16,7 @@ from bms_estimator.mqtt.topic_cache import (
     parse_payload,
 )
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
-from tests.sinks.snapshots import NOW, ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT, NOW
 
 
 def test_all_published_messages_are_stored_by_device_and_topic():
@@ -24,18 +24,18 @@ def test_all_published_messages_are_stored_by_device_and_topic():
     messages = MessageBuilder("site/bms", "pack")
     for message in (
         *messages.birth_messages(),
-        *messages.must_deliver(None, ONE),
-        *messages.live_messages(PublishedState(), ONE, NOW)[0],
+        *messages.guaranteed_messages(None, CELL_SNAPSHOT),
+        *messages.live_messages(PublishedState(), CELL_SNAPSHOT, NOW)[0],
     ):
         cache.take(message.topic, message.payload, NOW)
     [(name, device)] = cache.devices.items()
     assert name == "pack"
-    assert ONE.estimate
-    assert device.topics["state"] == ONE.estimate.model_dump(mode="json")
+    assert CELL_SNAPSHOT.estimate
+    assert device.topics["state"] == CELL_SNAPSHOT.estimate.model_dump(mode="json")
     assert device.topics["availability"] == "online"
     assert {"health", "info", "parameters", "event", "sensor/availability", "schema"} <= set(device.topics)
     assert not any("homeassistant/" in topic for topic in device.topics)
-    assert set(device.heard_s.values()) == {NOW}
+    assert set(device.received_s.values()) == {NOW}
 
 
 def test_invalid_json_is_returned_as_text():
@@ -47,7 +47,7 @@ def test_invalid_json_is_returned_as_text():
     assert parse_payload(b'{"a": 1.5}') == {"a": 1.5}
 
 
-def test_cleared_topics_are_removed_and_with_the_last_one_the_device():
+def test_cleared_topic_is_removed_and_its_device_with_the_last_topic():
     cache = TopicCache("bms")
     cache.take("bms/pack/state", b"1", NOW)
     cache.take("bms/pack/info", b"2", NOW)
@@ -75,6 +75,7 @@ def test_devices_topics_and_bytes_are_bounded_and_stored_devices_are_updated() -
     for number in range(2 * MAX_TOPICS):
         cache.take(f"bms/d0/t{number}", b"1", NOW)
     assert len(cache.devices["d0"].topics) == MAX_TOPICS
+    # more than a quarter of a device's capacity, because JSON adds quotes: three of them fit
     quarter = json.dumps("x" * (MAX_DEVICE_BYTES // 4)).encode()
     stored = [cache.take(f"bms/d1/t{number}", quarter, NOW) for number in range(10)]
     assert sum(message is not None for message in stored) == 3
@@ -88,7 +89,7 @@ def test_new_device_replaces_the_device_that_has_been_silent_longest() -> None:
     cache = TopicCache("bms", rejected.append)
     for number in range(MAX_DEVICES):
         cache.take(f"bms/d{number}/state", b"1", NOW + number)
-    cache.take("bms/d0/state", b"1", NOW + MAX_DEVICES)
+    cache.take("bms/d0/state", b"1", NOW + MAX_DEVICES)  # d1, last received at NOW + 1 s, is now silent longest
     assert cache.take("bms/new/state", b"1", NOW + SILENT_S) is None
     assert rejected == ["new"]
     assert cache.take("bms/new/state", b"1", NOW + SILENT_S + MAX_DEVICES) == DeviceMessage("new", "state", 1)
@@ -112,7 +113,7 @@ def test_device_with_a_raised_alarm_is_stored_at_once_and_not_replaced() -> None
     assert "new" not in cache.devices
 
 
-def test_raised_alarms_of_new_devices_do_not_replace_a_device_with_a_raised_alarm() -> None:
+def test_new_device_with_a_raised_alarm_does_not_replace_one_with_a_raised_alarm() -> None:
     cache = TopicCache("bms")
     for number in range(2 * MAX_DEVICES):
         cache.take(f"bms/d{number}/alarm/over_temperature", b'{"active": true}', NOW)

@@ -23,11 +23,12 @@ FLAGS = (
     "--disable-sync",
 )
 DESKTOP, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+"""Sizes of the viewport [px]."""
 
 
 @contextlib.asynccontextmanager
 async def chromium() -> AsyncIterator[Browser]:
-    """Start Chromium in an empty folder."""
+    """Start Chromium with an empty profile."""
     if CHROMIUM is None:
         pytest.skip("chromium is not installed (apt-get install chromium)")
     async with async_playwright() as playwright:
@@ -38,14 +39,20 @@ async def chromium() -> AsyncIterator[Browser]:
 
 @dataclass
 class Tab:
-    """A page, with its console errors and requests."""
+    """Tab with a page.
+
+    Attributes:
+        page: Page in Playwright.
+        errors: Errors on its console.
+        requests: URLs that it has requested.
+    """
 
     page: Page
     errors: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)
 
     async def text(self, quantity: str) -> str:
-        """Return the shown text of a quantity; empty if it is hidden."""
+        """Return the text that is shown for a quantity (its attribute ``data-q``); empty if the quantity is hidden."""
         element = self.page.locator(f'[data-q="{quantity}"]')
         return await element.inner_text() if await element.is_visible() else ""
 
@@ -54,6 +61,7 @@ class Tab:
         await self.page.wait_for_function(condition, arg=argument)
 
     async def until_status(self, text: str) -> None:
+        """Wait until the status line contains this text."""
         await self.until("text => document.getElementById('status').innerText.includes(text)", text)
 
     async def until_text(self, quantity: str, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Service of a simulated pack whose board prints lines with cell voltages, and start of programs that serve pages."""
+"""Programs that serve pages: start of any of them, and the service of a simulated pack whose board prints JSON lines."""
 
 import asyncio
 import contextlib
@@ -15,17 +15,17 @@ from tests.patience import LONG_S
 from tests.serial_line import Line
 
 Values = dict[str, Any]
-"""Values of a line of the board."""
+"""Values in one line of the board, by name."""
 CELL, SERIES, PARALLEL = "ncr18650", 14, 10
 PACK = f'cell = "{CELL}"\nseries = {SERIES}\nparallel = {PARALLEL}\ninitial_soc = 0.6'
-"""Section ``[pack]`` of the simulated pack."""
+"""Section ``[pack]`` of the simulated pack, without its name."""
 CELL_DEVIATIONS_V = [1e-3 * d for d in (2, -1, 3, 0, -4, 1, 5, -2, 1, 2, -17, 1, 4, 5)]
-"""Deviations of the simulated cells from their mean [V]."""
+"""Deviations of the simulated cells from their mean [V]. The eleventh cell has a low voltage."""
 
 
 def simulated(load_a: float = 24.0, soc: float = 0.66) -> Callable[[float], Values]:
-    """Return the values of an e-bike pack under changing loads, by time [s]. The eleventh cell has a low voltage."""
-    pack = SimulatedPack(load_cell(CELL).pack(SERIES, PARALLEL), random_steps(load_a, 4), soc=soc)
+    """Return a function of the time [s] that returns the values of an e-bike pack under changing loads."""
+    pack = SimulatedPack(load_cell(CELL).pack(SERIES, PARALLEL), random_steps(load_a, seed=4), soc=soc)
 
     def values_at(time_s: float) -> Values:
         reading = pack(time_s)
@@ -42,7 +42,7 @@ def simulated(load_a: float = 24.0, soc: float = 0.66) -> Callable[[float], Valu
 
 
 async def start_program(folder: Path, *arguments: object, port: int) -> asyncio.subprocess.Process:
-    """Start a program that serves a page, and wait until its port is open."""
+    """Start ``bms-estimator`` with arguments by which it serves a page on ``port``. Wait until the port is open."""
     log = folder / f"{port}.log"
     with log.open("ab") as file:
         process = await asyncio.create_subprocess_exec(
@@ -69,7 +69,7 @@ class Service:
         folder: Folder of its files and its state.
         broker: Broker to which the service publishes.
         port: Port of its page.
-        board: Function of the time since its start [s] that returns the values of the board's line.
+        board: Function of the time since the board's start [s] that returns the values of its next line.
         pack: Section ``[pack]`` without the name, TOML.
         name: Name of the pack.
         more: Further settings, TOML; the first ones belong to ``[state]``.
@@ -132,6 +132,7 @@ folder = "{folder}"
         await self.process.wait()
 
     async def _print(self) -> None:
+        """Print the board's lines. Lines are lost while the service does not read them."""
         begin_s = asyncio.get_running_loop().time()
         while True:
             time_s = asyncio.get_running_loop().time() - begin_s

@@ -1,6 +1,6 @@
-"""Screenshots of the page for the documentation: service of a simulated pack in Chromium (``make screenshots``).
+"""Screenshots of the page for the documentation (``make screenshots``).
 
-The history of the day before is simulated, too.
+The page is that of a service of a simulated pack. Its history of the day before is simulated, too.
 """
 
 import asyncio
@@ -22,17 +22,19 @@ from tests.free_port import free_port
 from tests.mosquitto import Broker
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import SERIES, Service, simulated
-from tests.sinks.snapshots import ONE
-from tests.store.test_history import record
+from tests.sinks.snapshots import CELL_SNAPSHOT
+from tests.store.test_history import record_history
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
 LEARN_S = 60.0
 """Time before the first screenshot in which the estimator identifies the pack [s]."""
 TOP_PX = 500
-"""Height of the part of the page with alarms or stale values [px]."""
-SOC = 0.66
+"""Height of the upper part of the page, with alarms or the note about stale values [px]."""
+END_SOC = 0.66
 """Approximate SOC at the end of the simulated day."""
 CAPACITY_AH = 30.0
+"""Capacity of the pack in ``tests.page.house``."""
+# limits at which the simulated pack raises both alarms
 ALARMS = """
 [alarms]
 cell_imbalance = {limit_v = 0.02, delay_s = 1, severity = "critical"}
@@ -42,14 +44,14 @@ soc_low = {limit = 0.9, delay_s = 1}
 
 def make_day_before() -> list[Snapshot]:
     """Return the snapshots of the last 24 hours, one per minute. The pack is charged by day and discharged at night."""
-    assert ONE.estimate
+    assert CELL_SNAPSHOT.estimate
     times = [time.time() - 60.0 * minute for minute in range(24 * 60, 0, -1)]
     currents = [_current_a(time_s) for time_s in times]
     soc_changes = [-charge_a_min / 60.0 / CAPACITY_AH for charge_a_min in itertools.accumulate(currents)]
     snapshots = []
     for time_s, current_a, soc_change in zip(times, currents, soc_changes, strict=True):
-        soc = SOC + soc_change - soc_changes[-1]
-        voltage_v = SERIES * (3.35 + 0.75 * soc - 5e-3 * current_a)
+        soc = END_SOC + soc_change - soc_changes[-1]
+        voltage_v = SERIES * (3.35 + 0.75 * soc - 5e-3 * current_a)  # roughly an NMC cell
         values = {
             "time": iso_utc(time_s),
             "board_time_s": time_s,
@@ -60,7 +62,7 @@ def make_day_before() -> list[Snapshot]:
             "soc_std": 0.012,
             "temperature_c": 24.0 - 0.5 * current_a,
         }
-        snapshots.append(ONE._replace(estimate=ONE.estimate.model_copy(update=values)))
+        snapshots.append(CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=values)))
     return snapshots
 
 
@@ -71,6 +73,7 @@ def _current_a(time_s: float) -> float:
 
 
 async def shoot(page_tab: Tab, name: str, part: str = "", *, top: bool = False) -> None:
+    """Write a screenshot of the page, of its upper part (``top``), or of one element (``part``, a CSS selector)."""
     path = DOCS / f"page-{name}.png"
     if part:
         await page_tab.page.locator(part).screenshot(path=path)
@@ -91,6 +94,7 @@ async def open_page(browser: Browser, service: Service, **options: Any) -> Async
 
 
 async def shoot_all(service: Service, browser: Browser) -> None:
+    """Write all screenshots. The service is killed for one of them, and restarted with alarms."""
     async with open_page(browser, service) as page_tab:
         await asyncio.sleep(LEARN_S)
         await shoot(page_tab, "desktop")
@@ -115,10 +119,10 @@ async def shoot_all(service: Service, browser: Browser) -> None:
 async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        await record(folder / "attic.sqlite", make_day_before())
+        await record_history(folder / "attic.sqlite", make_day_before())
         broker = Broker(folder).start()
         try:
-            async with Service(folder, broker, free_port(), simulated(soc=SOC)) as service, chromium() as browser:
+            async with Service(folder, broker, free_port(), simulated(soc=END_SOC)) as service, chromium() as browser:
                 await shoot_all(service, browser)
         finally:
             broker.stop()

@@ -1,4 +1,4 @@
-"""Access to the page: settings, names, token."""
+"""Access to the page: listen address, token, and host names of requests."""
 
 import pytest
 
@@ -32,7 +32,7 @@ def test_invalid_address_is_rejected(text):
         PageSettings(listen=text)
 
 
-def test_token_is_required_beyond_this_machine():
+def test_page_for_other_machines_requires_a_token_file():
     with pytest.raises(ValueError, match=r'listen = "0\.0\.0\.0:8765" is open to other machines: name a token_file'):
         PageSettings(listen="0.0.0.0:8765")
 
@@ -49,20 +49,20 @@ def test_invalid_token_is_reported(tmp_path, text, message):
         make_access_control(PageSettings(listen="0.0.0.0:8765", token_file=file))
 
 
-def test_newline_after_the_token_is_ignored(tmp_path):
+def test_only_the_token_and_its_cookie_are_accepted_and_a_newline_in_the_file_is_ignored(tmp_path):
     (tmp_path / "token").write_text(f"{TOKEN}\n")
-    guard = make_access_control(PageSettings(listen="0.0.0.0:8765", token_file=tmp_path / "token"))
-    assert guard.is_valid_token(TOKEN)
-    assert not any(guard.is_valid_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
-    assert not guard.is_valid_token("\udcff" * 16)  # aiohttp decodes a header that is not UTF-8 like this
-    assert not guard.is_valid_cookie("\udcff" * 64)
-    assert guard.is_valid_cookie(guard.cookie)
-    assert not guard.is_valid_cookie(TOKEN)
-    assert TOKEN not in guard.cookie
+    access = make_access_control(PageSettings(listen="0.0.0.0:8765", token_file=tmp_path / "token"))
+    assert access.is_valid_token(TOKEN)
+    assert not any(access.is_valid_token(other) for other in ("", TOKEN[:-1], TOKEN + "0", "é" * 16))
+    assert not access.is_valid_token("\udcff" * 16)  # aiohttp decodes a header that is not UTF-8 like this
+    assert not access.is_valid_cookie("\udcff" * 64)
+    assert access.is_valid_cookie(access.cookie)
+    assert not access.is_valid_cookie(TOKEN)
+    assert TOKEN not in access.cookie
 
 
 @pytest.mark.parametrize(
-    ("host", "known"),
+    ("host", "accepted"),
     [
         ("127.0.0.1:8765", True),
         ("[::1]:8765", True),
@@ -76,5 +76,5 @@ def test_newline_after_the_token_is_ignored(tmp_path):
         ("[", False),
     ],
 )
-def test_only_own_host_names_are_accepted(host, known):
-    assert AccessControl(["bms.example.org"]).is_own_host(host) is known
+def test_only_ip_addresses_localhost_and_configured_host_names_are_accepted(host, accepted):
+    assert AccessControl(["bms.example.org"]).is_own_host(host) is accepted

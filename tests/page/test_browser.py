@@ -26,17 +26,17 @@ from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, start_program
-from tests.sinks.snapshots import ONE, STACK
-from tests.store.test_history import at, record
+from tests.sinks.snapshots import CELL_SNAPSHOT, STACK_SNAPSHOT
+from tests.store.test_history import record_history, snapshot_at
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 
 MINUS = "\N{MINUS SIGN}"
-PACK = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
-CELLS = (3.311, 3.325, 3.318, 3.322)
-CELLAR = "bms/cellar"
-STATE_VALUES = {
+PACK_SECTION = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
+CELLS_V = (3.311, 3.325, 3.318, 3.322)
+CELLAR_TOPIC = "bms/cellar"
+STATE_VALUES = {  # as published in ``state``
     "soc": 0.4321,
     "soc_percent": 43.21,
     "soc_std": 0.0123,
@@ -57,9 +57,9 @@ STATE_VALUES = {
     "stability_margin": 0.3532,
     "cells_v": [3.271, 3.2755, None, 3.2688],
 }
-SHOWN_TEXTS = {
+SHOWN_TEXTS = {  # by quantity (attribute ``data-q``)
     "soc": "43.2",
-    "soc_std": "2.5",
+    "soc_std": "2.5",  # two std in percent
     "voltage_v": "52.35 V",
     "voltage_estimate_v": "52.40 V",
     "current_a": f"{MINUS}12.35 A",
@@ -84,8 +84,8 @@ SHOWN_TEXTS = {
 }
 
 
-class House(NamedTuple):
-    """Running programs, and a client of the broker.
+class RunningPrograms(NamedTuple):
+    """Running broker, service and dashboard, and a client of the broker.
 
     Attributes:
         broker: The broker.
@@ -122,39 +122,42 @@ async def browser() -> AsyncIterator[Browser]:
 
 def board(_time_s: float) -> dict[str, Any]:
     """Return the constant values that the board prints."""
-    return {"voltage": sum(CELLS), "current": 2.5, "temperature": 21.5, "cells": CELLS}
+    return {"voltage": sum(CELLS_V), "current": 2.5, "temperature": 21.5, "cells": CELLS_V}
 
 
 @module_fixture
-async def house(folder: Path, broker: Broker) -> AsyncIterator[House]:
-    await record(folder / "cellar.sqlite", [])
+async def programs(folder: Path, broker: Broker) -> AsyncIterator[RunningPrograms]:
+    await record_history(folder / "cellar.sqlite", [])
     port = free_port()
-    async with Service(folder, broker, free_port(), board, pack=PACK) as service, Listener(broker) as live:
+    async with Service(folder, broker, free_port(), board, pack=PACK_SECTION) as service, Listener(broker) as live:
         arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
         process = await start_program(folder, "dashboard", *arguments, port=port)
         await publish(live, "availability", b"online")
         await publish(live, "sensor/availability", b"online")
-        await publish(live, "info", ONE.info.model_copy(update={"device": "cellar"}).model_dump_json())
-        await publish(live, "health", ONE.health.model_dump_json())
-        yield House(broker, service, f"http://127.0.0.1:{port}/", live)
+        await publish(live, "info", CELL_SNAPSHOT.info.model_copy(update={"device": "cellar"}).model_dump_json())
+        await publish(live, "health", CELL_SNAPSHOT.health.model_dump_json())
+        yield RunningPrograms(broker, service, f"http://127.0.0.1:{port}/", live)
         process.terminate()
         assert await process.wait() == 0
 
 
 async def publish(live: Listener, topic: str, payload: str | bytes, *, retain: bool = True) -> None:
-    await live.publish(f"{CELLAR}/{topic}", payload, qos=1, retain=retain)
+    """Publish a message of the pack ``cellar``."""
+    await live.publish(f"{CELLAR_TOPIC}/{topic}", payload, qos=1, retain=retain)
 
 
 async def publish_state(live: Listener, **values: Any) -> dict[str, Any]:
-    assert ONE.estimate
-    state = ONE.estimate.model_dump() | {"time": "2026-11-22T16:04:05.000Z"} | values
+    """Publish a state of the pack ``cellar`` with changed values. Return the state."""
+    assert CELL_SNAPSHOT.estimate
+    state = CELL_SNAPSHOT.estimate.model_dump() | {"time": "2026-11-22T16:04:05.000Z"} | values
     await publish(live, "state", json.dumps(state), retain=False)
     return state
 
 
 @contextlib.asynccontextmanager
-async def dashboard_of(browser: Browser, house: House, pack: str, **options: Any) -> AsyncIterator[Tab]:
-    async with tab(browser, f"{house.dashboard}#{pack}", **options) as page_tab:
+async def dashboard_of(browser: Browser, programs: RunningPrograms, pack: str, **options: Any) -> AsyncIterator[Tab]:
+    """Open the dashboard at a pack."""
+    async with tab(browser, f"{programs.dashboard}#{pack}", **options) as page_tab:
         await page_tab.until("name => document.getElementById('name').textContent === name", pack)
         yield page_tab
 
@@ -164,9 +167,9 @@ def format_time(time: str) -> str:
     return datetime.fromisoformat(time).astimezone().strftime("%H:%M:%S")
 
 
-async def test_page_shows_the_published_values_with_units(browser: Browser, house: House) -> None:
-    async with dashboard_of(browser, house, "cellar") as page_tab:
-        await publish_state(house.live, **STATE_VALUES)
+async def test_page_shows_the_published_values_with_units(browser: Browser, programs: RunningPrograms) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        await publish_state(programs.live, **STATE_VALUES)
         await page_tab.until_text("soc", SHOWN_TEXTS["soc"])
         assert {name: await page_tab.text(name) for name in SHOWN_TEXTS} == SHOWN_TEXTS
         meter = page_tab.page.get_by_role("meter", name="State of charge")
@@ -179,19 +182,19 @@ async def test_page_shows_the_published_values_with_units(browser: Browser, hous
         assert page_tab.errors == []
 
 
-async def test_unknown_values_are_hidden(browser: Browser, house: House) -> None:
-    async with dashboard_of(browser, house, "cellar") as page_tab:
-        state = await publish_state(house.live, soc_std=None, temperature_c=None, innovation_v=None, voltage_v=3.21)
+async def test_unknown_values_are_hidden(browser: Browser, programs: RunningPrograms) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        state = await publish_state(programs.live, soc_std=None, temperature_c=None, innovation_v=None, voltage_v=3.21)
         await page_tab.until_text("voltage_v", "3.210 V")
         for name in ("soc_std", "temperature_c", "innovation_v", "time_left", "celllow"):
             assert await page_tab.text(name) == "", name
-        assert STACK.estimate
-        await publish_state(house.live, **STACK.estimate.model_dump(exclude={"time"}))
+        assert STACK_SNAPSHOT.estimate
+        await publish_state(programs.live, **STACK_SNAPSHOT.estimate.model_dump(exclude={"time"}))
         await page_tab.until_text("voltage_v", "13.00 V")
         assert not await page_tab.page.locator(".hero").is_visible()  # a fuel cell has no state of charge
         for key in set(state) - {"time", "voltage_v"}:
             state.pop(key)
-        await publish_state(house.live, **dict.fromkeys(STATE_VALUES))
+        await publish_state(programs.live, **dict.fromkeys(STATE_VALUES))
         await page_tab.until_text("voltage_v", "")
         body = await page_tab.page.inner_text("body")
         assert not re.search("NaN|undefined|null|Infinity", body)
@@ -199,19 +202,19 @@ async def test_unknown_values_are_hidden(browser: Browser, house: House) -> None
 
 
 async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_nothing_from_elsewhere(
-    browser: Browser, house: House
+    browser: Browser, programs: RunningPrograms
 ) -> None:
-    parameters = await house.live.wait_json("bms/attic/parameters")
-    async with tab(browser, house.service.url) as own, dashboard_of(browser, house, "attic") as other:
+    parameters = await programs.live.wait_json("bms/attic/parameters")
+    async with tab(browser, programs.service.url) as own, dashboard_of(browser, programs, "attic") as other:
         for page_tab in (own, other):
-            await page_tab.until_text("voltage_v", f"{sum(CELLS):.2f} V")
+            await page_tab.until_text("voltage_v", f"{sum(CELLS_V):.2f} V")
             assert await page_tab.text("current_a") == "2.500 A"
-            assert await page_tab.text("power_w") == f"{2.5 * sum(CELLS):.1f} W"
+            assert await page_tab.text("power_w") == f"{2.5 * sum(CELLS_V):.1f} W"
             assert await page_tab.text("temperature_c") == "21.5 °C"
             assert await page_tab.text("way") == "discharging"
             for name, published, factor in (("soc", "soc", 100.0), ("soc_std", "soc_std", 200.0)):
                 text = await page_tab.text(name)
-                await house.live.wait_json("bms/attic/state", lambda s: f"{factor * s[published]:.1f}" == text)  # noqa: B023
+                await programs.live.wait_json("bms/attic/state", lambda s: f"{factor * s[published]:.1f}" == text)  # noqa: B023
             assert re.fullmatch(r"\d+ h \d\d min", await page_tab.text("time_left"))
             assert await page_tab.text("celllow") == "3.311 V · cell 1"
             assert "in series" in await page_tab.page.inner_text("#what")
@@ -220,7 +223,7 @@ async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_noth
             )
             row = page_tab.page.locator('[data-p="a a1"]')
             text = (await row.locator("td").nth(0).inner_text()).replace(MINUS, "-")
-            await house.live.wait_json("bms/attic/parameters", lambda p: format_parameter(p["a"]["a1"]) == text)  # noqa: B023
+            await programs.live.wait_json("bms/attic/parameters", lambda p: format_parameter(p["a"]["a1"]) == text)  # noqa: B023
             await page_tab.until_status("live")
             assert page_tab.errors == []
             origin = "/".join(page_tab.page.url.split("/")[:3])
@@ -241,8 +244,8 @@ def count_parameters(parameters: dict[str, Any]) -> int:
     return sum(len(parameters[group]) for group in ("a", "elements", "state_of_health"))
 
 
-async def test_pack_is_selected_by_keyboard(browser: Browser, house: House) -> None:
-    async with dashboard_of(browser, house, "attic") as page_tab:
+async def test_packs_spans_and_elements_are_selected_by_keyboard(browser: Browser, programs: RunningPrograms) -> None:
+    async with dashboard_of(browser, programs, "attic") as page_tab:
         page = page_tab.page
         await page.keyboard.press("Tab")
         assert await page.evaluate("document.activeElement.textContent") == "attic"
@@ -261,7 +264,7 @@ async def test_pack_is_selected_by_keyboard(browser: Browser, house: House) -> N
         assert await page.evaluate("document.activeElement.id") == "element"
 
 
-async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: House) -> None:
+async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, programs: RunningPrograms) -> None:
     alarm = Alarm(
         name="cell_under_voltage",
         severity="critical",
@@ -273,8 +276,8 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
         unit="V",
         text="cell 3 has 2.412 V: stop discharging",
     )
-    async with dashboard_of(browser, house, "cellar") as page_tab:
-        await publish(house.live, "alarm/cell_under_voltage", alarm.model_dump_json())
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        await publish(programs.live, "alarm/cell_under_voltage", alarm.model_dump_json())
         element = page_tab.page.get_by_role("alert").locator(".alarm")
         await element.wait_for()
         text = await element.inner_text()
@@ -287,40 +290,42 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, house: Hou
             "latched",
         ):
             assert part in text
-        quiet = alarm.model_copy(update={"active": False, "latched": False, "since": None, "value": None, "text": ""})
-        await publish(house.live, "alarm/cell_under_voltage", quiet.model_dump_json())
+        cleared = alarm.model_copy(update={"active": False, "latched": False, "since": None, "value": None, "text": ""})
+        await publish(programs.live, "alarm/cell_under_voltage", cleared.model_dump_json())
         await element.wait_for(state="detached")
-        unwatched = quiet.model_copy(update={"watched": False, "unwatched_reason": "cell voltages are missing"})
-        await publish(house.live, "alarm/cell_under_voltage", unwatched.model_dump_json())
+        unwatched = cleared.model_copy(update={"watched": False, "unwatched_reason": "cell voltages are missing"})
+        await publish(programs.live, "alarm/cell_under_voltage", unwatched.model_dump_json())
         await element.wait_for()
         text = await element.inner_text()
         assert "cell voltages are missing" in text
         assert "cannot be watched" in text
-        await publish(house.live, "alarm/cell_under_voltage", b"")
+        await publish(programs.live, "alarm/cell_under_voltage", b"")
         assert page_tab.errors == []
 
 
-async def test_a_state_dated_far_in_the_future_does_not_stop_the_live_curves(browser: Browser, house: House) -> None:
-    assert ONE.estimate
+async def test_a_state_dated_far_in_the_future_does_not_stop_the_live_curves(
+    browser: Browser, programs: RunningPrograms
+) -> None:
+    assert CELL_SNAPSHOT.estimate
     states = (
         (50.0, "2026-11-22T17:00:00.000Z"),
         (99.0, "9999-01-01T00:00:00.000Z"),
         (52.0, "2026-11-22T17:00:05.000Z"),
     )
 
-    async def put(voltage_v: float, time: str) -> None:
-        state = ONE.estimate.model_dump() | {"voltage_v": voltage_v, "time": time}
-        await house.live.publish("bms/shed/state", json.dumps(state), qos=1)
+    async def publish_at(voltage_v: float, time: str) -> None:
+        state = CELL_SNAPSHOT.estimate.model_dump() | {"voltage_v": voltage_v, "time": time}
+        await programs.live.publish("bms/shed/state", json.dumps(state), qos=1)
 
-    await put(*states[0])
-    async with dashboard_of(browser, house, "shed") as page_tab:
+    await publish_at(*states[0])
+    async with dashboard_of(browser, programs, "shed") as page_tab:
         for voltage_v, time in states:
-            await put(voltage_v, time)
+            await publish_at(voltage_v, time)
             await page_tab.until_text("voltage_v", f"{voltage_v:.2f} V")
         await page_tab.until(
             "() => [...document.querySelectorAll('.curve [role=img]')].some((e) => e.ariaLabel?.endsWith('last 52.000 V'))"
         )
-        await house.live.publish("bms/shed/state", b"", qos=1)
+        await programs.live.publish("bms/shed/state", b"", qos=1)
         await page_tab.until(
             "() => ![...document.querySelectorAll('#packs button')].some((t) => t.textContent === 'shed')"
         )
@@ -330,7 +335,7 @@ async def test_a_state_dated_far_in_the_future_does_not_stop_the_live_curves(bro
 async def test_pack_with_an_alarm_is_listed_first_among_too_many_packs(
     browser: Browser, broker: Broker, folder: Path
 ) -> None:
-    """The test has a dashboard of its own, because the many packs would remain on the other one."""
+    """The test has a dashboard of its own, because its packs would remain on the other one, which shows at most 64."""
     settings = MqttSettings(url=broker.url, base_topic="crowd")
     alarm = Alarm(
         name="over_temperature",
@@ -366,11 +371,14 @@ async def test_pack_with_an_alarm_is_listed_first_among_too_many_packs(
         assert page_tab.errors == []
 
 
-async def test_history_is_drawn_for_each_span(browser: Browser, house: House, folder: Path) -> None:
+async def test_history_is_drawn_for_each_span(browser: Browser, programs: RunningPrograms, folder: Path) -> None:
+    """The history has one publication each 30 s, until now."""
     now_s = datetime.now(UTC).timestamp()
-    begin_s = datetime.fromisoformat(at(0.0).estimate.time).timestamp()
-    await record(folder / "cellar.sqlite", [at(now_s - begin_s - 30.0 * s, 3.0, 3.9) for s in range(100, 0, -1)])
-    async with dashboard_of(browser, house, "cellar") as page_tab:
+    begin_s = datetime.fromisoformat(snapshot_at(0.0).estimate.time).timestamp()
+    await record_history(
+        folder / "cellar.sqlite", [snapshot_at(now_s - begin_s - 30.0 * s, 3.0, 3.9) for s in range(100, 0, -1)]
+    )
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
         for span in ("Hour", "Day", "Month"):
             await page_tab.page.get_by_text(span, exact=True).click()
             chart = page_tab.page.get_by_role("img", name=f"Voltage, last {span.lower()}: from 3.900 to 3.900 V")
@@ -379,60 +387,64 @@ async def test_history_is_drawn_for_each_span(browser: Browser, house: House, fo
         assert page_tab.errors == []
 
 
-async def test_missing_history_is_reported(browser: Browser, house: House) -> None:
-    await house.live.publish("bms/guest/availability", b"online", qos=1)
-    async with dashboard_of(browser, house, "guest") as page_tab:
+async def test_missing_history_is_reported(browser: Browser, programs: RunningPrograms) -> None:
+    await programs.live.publish("bms/guest/availability", b"online", qos=1)
+    async with dashboard_of(browser, programs, "guest") as page_tab:
         await page_tab.page.get_by_text("Day", exact=True).click()
         await page_tab.page.get_by_text("No history is kept here").wait_for()
 
 
-async def test_page_is_stale_while_the_sensor_or_the_service_is_offline(browser: Browser, house: House) -> None:
-    async with dashboard_of(browser, house, "cellar") as page_tab:
-        state = await publish_state(house.live)
+async def test_page_is_stale_while_the_sensor_or_the_service_is_offline(
+    browser: Browser, programs: RunningPrograms
+) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        state = await publish_state(programs.live)
         await page_tab.until_status("live")
-        offline = ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "the board is silent"})
-        await publish(house.live, "health", offline.model_dump_json())
-        await publish(house.live, "sensor/availability", b"offline")
+        offline = CELL_SNAPSHOT.health.model_copy(
+            update={"sensor_online": False, "sensor_message": "the board is silent"}
+        )
+        await publish(programs.live, "health", offline.model_dump_json())
+        await publish(programs.live, "sensor/availability", b"offline")
         await page_tab.until_status(f"stale since {format_time(state['time'])}")
         assert "the board is silent" in await page_tab.page.inner_text("#why")
-        await publish(house.live, "sensor/availability", b"online")
-        await publish(house.live, "health", ONE.health.model_dump_json())
+        await publish(programs.live, "sensor/availability", b"online")
+        await publish(programs.live, "health", CELL_SNAPSHOT.health.model_dump_json())
         await page_tab.until_status("live")
-        await publish(house.live, "availability", b"offline")
+        await publish(programs.live, "availability", b"offline")
         await page_tab.until_status("stale since")
         assert await page_tab.page.inner_text("#why") == "the service is offline"
-        await publish(house.live, "availability", b"online")
+        await publish(programs.live, "availability", b"online")
         await page_tab.until_status("live")
 
 
 async def test_page_is_stale_after_a_kill_of_the_service_and_live_after_its_restart(
-    browser: Browser, house: House
+    browser: Browser, programs: RunningPrograms
 ) -> None:
     async with (
-        tab(browser, house.service.url) as own,
-        dashboard_of(browser, house, "attic") as other,
+        tab(browser, programs.service.url) as own,
+        dashboard_of(browser, programs, "attic") as other,
     ):
         await own.until_status("live")
         await other.until_status("live")
-        await house.service.kill()
+        await programs.service.kill()
         await own.until_status("stale since")
         assert await own.page.inner_text("#why") == "the page's server does not answer"
         await other.until_status("stale since")
         assert await other.page.inner_text("#why") == "the service is offline"
-        await house.service.start()
+        await programs.service.start()
         await own.until_status("live")
         await other.until_status("live")
 
 
 async def test_page_is_stale_from_the_loss_of_the_broker_until_new_values_arrive(
-    browser: Browser, house: House
+    browser: Browser, programs: RunningPrograms
 ) -> None:
-    async with dashboard_of(browser, house, "attic") as page_tab:
+    async with dashboard_of(browser, programs, "attic") as page_tab:
         await page_tab.until_status("live")
-        house.broker.stop()
+        programs.broker.stop()
         await page_tab.until_status("stale since")
         assert await page_tab.page.inner_text("#why")
-        house.broker.start()
+        programs.broker.start()
         await page_tab.until_status("live")
 
 
@@ -451,9 +463,11 @@ async def test_page_for_other_machines_requires_the_token(browser: Browser, fold
 
 
 @pytest.mark.parametrize("size", [PHONE, {"width": 320, "height": 600}, {"width": 1920, "height": 1080}], ids=str)
-async def test_no_element_is_wider_than_the_screen(browser: Browser, house: House, size: dict[str, int]) -> None:
-    async with dashboard_of(browser, house, "attic", size=size) as page_tab:
+async def test_no_element_is_wider_than_the_screen(
+    browser: Browser, programs: RunningPrograms, size: dict[str, int]
+) -> None:
+    async with dashboard_of(browser, programs, "attic", size=size) as page_tab:
         await page_tab.until_text("celllow", "3.311 V · cell 1")
-        wider = """width => [...document.querySelectorAll("body, header *, #pack, .card, .card :not(.scroll *)")]
+        find_wider = """width => [...document.querySelectorAll("body, header *, #pack, .card, .card :not(.scroll *)")]
             .filter((e) => e.getBoundingClientRect().right > width + 0.5).map((e) => e.outerHTML.slice(0, 80))"""
-        assert await page_tab.page.evaluate(wider, size["width"]) == []
+        assert await page_tab.page.evaluate(find_wider, size["width"]) == []

@@ -1,4 +1,4 @@
-"""Hub of the page: newest payload of each topic, for fast and slow readers."""
+"""``PackTopics``, the hub of the page: the newest payload of each topic, for fast and slow readers."""
 
 import json
 import sys
@@ -14,10 +14,12 @@ TIME = "2026-11-22T16:00:{:06.3f}Z"
 
 
 def state(second: float, **fields: object) -> dict[str, object]:
+    """Return a state ``second`` seconds after 16:00, whose voltage is 13 V plus 1 V for each second."""
     return {"time": TIME.format(second), "voltage_v": 13.0 + second} | fields
 
 
-async def read(reader: Reader) -> dict[str, Any]:
+async def read_message(reader: Reader) -> dict[str, Any]:
+    """Return the next message to a reader, decoded."""
     return json.loads(await reader.next(1.0))
 
 
@@ -27,7 +29,7 @@ async def test_new_reader_gets_the_last_values_of_all_packs():
     hub.put("attic", "state", state(1.0))
     hub.put("cellar", "availability", "online")
     with hub.reading() as reader:
-        messages = await read(reader)
+        messages = await read_message(reader)
     assert hub.packs == ["attic", "cellar"]
     assert messages["attic/state"] == state(1.0)
     assert messages["cellar/availability"] == "online"
@@ -40,8 +42,8 @@ async def test_slow_reader_gets_only_the_newest_values():
         for number in range(10_000):
             hub.put("attic", "state", state(number % 60, frames_received=number))
             hub.put("attic", "health", {"uptime_s": number})
-        assert len(reader._waiting) == 3
-        assert await read(reader) == {
+        assert len(reader._waiting) == 3  # state, health and the list of packs
+        assert await read_message(reader) == {
             "attic/state": state(39, frames_received=9999),
             "attic/health": {"uptime_s": 9999},
             "packs": {"names": ["attic"], "hidden": 0},
@@ -61,7 +63,7 @@ async def test_pack_with_cleared_topics_is_removed():
     assert hub.packs == []
     hub.put("attic", "availability", "online")
     with hub.reading() as reader:
-        messages = await read(reader)
+        messages = await read_message(reader)
     assert messages["attic/recent"]["time_s"] == []
     assert messages["attic/elements"] == {}
 
@@ -83,7 +85,7 @@ async def test_a_reader_ends_when_the_hub_closes():
 
 
 @pytest.mark.parametrize("topic", ["schema", "home_assistant", "home_assistant/problems", "response/state", "x"])
-async def test_topics_not_shown_are_not_stored(topic):
+async def test_topics_that_the_page_does_not_show_are_not_stored(topic):
     hub = PackTopics()
     hub.put("attic", topic, {"a": 1})
     assert hub.packs == []
@@ -94,34 +96,34 @@ async def test_cleared_topic_is_removed_and_readers_are_notified():
     hub.put("attic", "availability", "online")
     hub.put("attic", "alarm/soc_low", {"active": True})
     with hub.reading() as reader:
-        await read(reader)
+        await read_message(reader)
         hub.put("attic", "alarm/soc_low", None)
-        assert await read(reader) == {"attic/alarm/soc_low": None}
+        assert await read_message(reader) == {"attic/alarm/soc_low": None}
     with hub.reading() as reader:
-        assert "attic/alarm/soc_low" not in await read(reader)
+        assert "attic/alarm/soc_low" not in await read_message(reader)
 
 
-async def test_curves_have_a_point_each_second_and_a_bounded_number():
+async def test_curves_have_one_point_a_second_and_a_bounded_number_of_points():
     hub = PackTopics()
     for tenth in range(100):
         hub.put("attic", "state", state(tenth / 10.0))
     with hub.reading() as reader:
-        assert (await read(reader))["attic/recent"]["voltage_v"] == [13.0 + s for s in range(10)]
+        assert (await read_message(reader))["attic/recent"]["voltage_v"] == [13.0 + s for s in range(10)]
     for number in range(2 * RECENT_STATES):
         hub.put("attic", "state", {"time": f"2026-11-23T{number // 3600:02}:{number // 60 % 60:02}:{number % 60:02}Z"})
     with hub.reading() as reader:
-        assert len((await read(reader))["attic/recent"]["time_s"]) == RECENT_STATES
+        assert len((await read_message(reader))["attic/recent"]["time_s"]) == RECENT_STATES
 
 
 @pytest.mark.parametrize(
     "payload", ["text", 3, [], {}, {"time": 3}, {"time": "x"}, {"time": TIME.format(1), "soc": "x"}]
 )
 @pytest.mark.parametrize("topic", ["state", "parameters", "health", "alarm/x"])
-async def test_invalid_payloads_are_ignored(topic, payload):
+async def test_invalid_payloads_are_passed_on_and_not_evaluated(topic, payload):
     hub = PackTopics()
     hub.put("attic", topic, payload)
     with hub.reading() as reader:
-        assert (await read(reader))[f"attic/{topic}"] == payload
+        assert (await read_message(reader))[f"attic/{topic}"] == payload
 
 
 async def test_valid_elements_are_stored_by_percent_of_soc():
@@ -134,21 +136,21 @@ async def test_valid_elements_are_stored_by_percent_of_soc():
         hub.put("attic", "parameters", report(soc, value, valid=valid))
     hub.put("attic", "parameters", {"soc": 7.0, "elements": {}})
     with hub.reading() as reader:
-        learned = (await read(reader))["attic/elements"]
-    assert learned == {"r_s_ohm": {"50": [0.02, 0.001], "70": [0.03, 0.001]}}
+        elements = (await read_message(reader))["attic/elements"]
+    assert elements == {"r_s_ohm": {"50": [0.02, 0.001], "70": [0.03, 0.001]}}
 
 
-@pytest.mark.parametrize("ahead", ["9999-01-01T00:00:00.000Z", "2026-11-23T23:00:00.000Z"])
-async def test_a_state_dated_in_the_future_does_not_stop_the_curves(ahead: str) -> None:
+@pytest.mark.parametrize("future_time", ["9999-01-01T00:00:00.000Z", "2026-11-23T23:00:00.000Z"])
+async def test_a_state_dated_in_the_future_does_not_stop_the_curves(future_time: str) -> None:
     hub = PackTopics(lambda: epoch_s(TIME.format(0.0)))
     hub.put("attic", "state", state(0.0))
-    hub.put("attic", "state", state(1.0) | {"time": ahead})
+    hub.put("attic", "state", state(1.0) | {"time": future_time})
     hub.put("attic", "state", state(2.0))
     with hub.reading() as reader:
-        assert (await read(reader))["attic/recent"]["voltage_v"] == [13.0, 15.0]
+        assert (await read_message(reader))["attic/recent"]["voltage_v"] == [13.0, 15.0]
 
 
-async def test_message_size_is_limited_and_the_rest_follows() -> None:
+async def test_message_size_is_limited_and_further_topics_follow_in_the_next_messages() -> None:
     hub = PackTopics()
     for number in range(100):
         hub.put("attic", f"alarm/{number}", "x" * 10_000)
@@ -167,19 +169,19 @@ async def test_dropped_pack_is_removed_from_the_list() -> None:
     for pack in ("attic", "cellar"):
         hub.put(pack, "availability", "online")
     with hub.reading() as reader:
-        assert (await read(reader))["packs"] == {"names": ["attic", "cellar"], "hidden": 0}
+        assert (await read_message(reader))["packs"] == {"names": ["attic", "cellar"], "hidden": 0}
         hub.put("attic", "state", state(0.0))
         hub.drop("attic")
-        hub.hide(7)
-        assert await read(reader) == {"packs": {"names": ["cellar"], "hidden": 7}}
+        hub.set_hidden_count(7)
+        assert await read_message(reader) == {"packs": {"names": ["cellar"], "hidden": 7}}
 
 
 async def test_link_state_is_sent_once_for_each_change():
     hub = PackTopics()
     hub.set_link_state("no broker")
     with hub.reading() as reader:
-        assert (await read(reader))["link"] == {"up": False, "reason": "no broker"}
+        assert (await read_message(reader))["link"] == {"up": False, "reason": "no broker"}
         hub.set_link_state("no broker")
         assert await reader.next(0.0) == ""
         hub.set_link_state(None)
-        assert (await read(reader))["link"] == {"up": True, "reason": None}
+        assert (await read_message(reader))["link"] == {"up": True, "reason": None}

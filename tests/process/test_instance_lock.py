@@ -1,4 +1,4 @@
-"""Instance lock: one service for each pack, whatever happens to its folder and whichever users there are."""
+"""Instance lock: only one service runs for each pack, even if its folder is deleted or another user holds the lock."""
 
 import os
 import shutil
@@ -15,7 +15,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.instance_lock import _name, instance_lock
 
 NOBODY = 65534
-HOLD_NAME_SCRIPT = """
+"""User and group id of ``nobody``, who may not write to the folders of the tests."""
+HOLD_LOCK_SCRIPT = """
 import os, socket, sys
 os.setuid(int(sys.argv[2]))
 held = socket.socket(socket.AF_UNIX)
@@ -24,12 +25,12 @@ held.listen(1)
 print(flush=True)
 sys.stdin.read()
 """
-"""Program that binds the socket name of its first argument, as the user of its second, until its input ends."""
+"""Program that holds a lock until its stdin ends. Arguments: name of the lock, user id."""
 
 
-def test_second_service_of_a_pack_is_rejected(tmp_path: Path) -> None:
+def test_second_service_of_a_pack_is_rejected_but_not_of_another_name_or_folder(tmp_path: Path) -> None:
     served = "^pack: this pack is served already, by "
-    for _ in range(2):
+    for _ in range(2):  # a released lock can be taken again
         with instance_lock(tmp_path, "pack"):
             with pytest.raises(UserError, match=f"{served}process {os.getpid()}$"), instance_lock(tmp_path, "pack"):
                 pass
@@ -44,20 +45,21 @@ def test_second_service_of_a_pack_is_rejected(tmp_path: Path) -> None:
         pass
 
 
-def test_starting_service_holds_the_lock_and_an_ended_one_does_not(
+def test_service_that_does_not_listen_yet_holds_the_lock_until_it_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with socket.socket(socket.AF_UNIX) as starting:
-        starting.bind(_name(tmp_path, "pack"))
+        starting.bind(_name(tmp_path, "pack"))  # without listen, as in a process that is just starting
         with pytest.raises(UserError, match=r"served already, by another process$"), instance_lock(tmp_path, "pack"):
             pass
+        # the starting process ends while the lock waits between two attempts
         monkeypatch.setattr(time, "sleep", lambda _: starting.close())
         with capture_logs() as lines, instance_lock(tmp_path, "pack"):
             pass
         assert not lines
 
 
-def test_recreated_folder_admits_no_second_service(tmp_path: Path) -> None:
+def test_second_service_is_rejected_after_its_folder_was_deleted_or_recreated(tmp_path: Path) -> None:
     folder = tmp_path / "state"
     folder.mkdir()
     (tmp_path / "link").symlink_to(folder)
@@ -82,19 +84,19 @@ def test_symlink_in_place_of_a_lock_file_is_ignored(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can start a process of another user")
-def test_lock_held_by_another_user_is_ignored(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", HOLD_NAME_SCRIPT, _name(tmp_path, "pack")[1:], str(NOBODY)]
+def test_lock_held_by_a_user_who_may_not_write_to_the_folder_is_ignored(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLD_LOCK_SCRIPT, _name(tmp_path, "pack").lstrip("\0"), str(NOBODY)]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe) as stranger:
-        assert stranger.stdout
-        assert stranger.stdout.readline()
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe) as holder:
+        assert holder.stdout
+        assert holder.stdout.readline()
         with capture_logs() as lines, instance_lock(tmp_path, "pack"):
             pass
         assert [line["user"] for line in lines] == [NOBODY]
         os.chown(tmp_path, NOBODY, NOBODY)  # a process of the folder's owner counts as a service
-        with pytest.raises(UserError, match=f"by process {stranger.pid}"), instance_lock(tmp_path, "pack"):
+        with pytest.raises(UserError, match=f"by process {holder.pid}"), instance_lock(tmp_path, "pack"):
             pass
         with pytest.raises(UserError, match="served already"), instance_lock(tmp_path, "pack"):
-            pass  # the owner is no longer reported, and the lock then prefers no service to two services
-        assert stranger.stdin
-        stranger.stdin.close()
+            pass  # the holder's user is reported only to the first client; a holder of unknown user counts as a service
+        assert holder.stdin
+        holder.stdin.close()

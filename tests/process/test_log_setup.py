@@ -15,6 +15,7 @@ from tests.patience import LONG_S
 
 @pytest.fixture
 def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Return the list that receives the log lines, with no level set by an earlier test."""
     monkeypatch.setattr(log_setup, "_levels", {})
     lines: list[str] = []
     configure_logs(lines)
@@ -22,27 +23,32 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     structlog.reset_defaults()
 
 
-def test_level_is_the_lowest_of_all_packs_and_can_change(lines: list[str]) -> None:
+def test_lowest_level_of_all_packs_applies_and_can_change(lines: list[str]) -> None:
     log = structlog.get_logger()
-    log.info("1")
+    log.info("written-without-level")
     set_level("a", "error")
     for level in ("info", "warning", "error"):
-        getattr(log, level)("2")
+        getattr(log, level)(level)
     set_level("b", "warning")
-    log.warning("3")
-    log.info("4")
+    log.warning("written-for-b")
+    log.info("below-both-levels")
     set_level("a", "info")
-    log.info("5")
-    assert [line.split()[-1] for line in lines] == ["1", "2", "3", "5"]
+    log.info("written-for-a")
+    assert [line.split()[-1] for line in lines] == [
+        "written-without-level",
+        "error",
+        "written-for-b",
+        "written-for-a",
+    ]
 
 
-def test_unread_lines_are_counted_and_queued_ones_keep_their_order(
+def test_lines_beyond_the_queue_are_counted_as_lost_and_queued_lines_keep_their_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    release, written = threading.Event(), []
+    reader_resumes, written = threading.Event(), []
 
     def write(_: int, data: bytes) -> int:
-        assert release.wait(LONG_S)
+        assert reader_resumes.wait(LONG_S)
         written.append(data[:3])
         return min(len(data), 3)  # like a pipe, this accepts a part of the data
 
@@ -53,8 +59,8 @@ def test_unread_lines_are_counted_and_queued_ones_keep_their_order(
         out.take(f"line {i}")
     out.drain()  # returns after its timeout
     lost = out.lost
-    assert 15 <= lost <= 16  # the writer may already have removed one line from the queue of four
-    release.set()
+    assert 15 <= lost <= 16  # of 20 lines, 4 wait in the queue; the writer may have removed one more from it
+    reader_resumes.set()
     while out._lines.unfinished_tasks:
         out.drain()
     assert b"".join(written).decode().splitlines() == [f"line {i}" for i in (*range(4), *([4] if lost == 15 else []))]

@@ -1,4 +1,4 @@
-"""Notify messages of a process with several packs."""
+"""Notifications to systemd from a process that serves several packs."""
 
 import os
 import socket
@@ -12,6 +12,7 @@ from bms_estimator.process.systemd import SystemdNotifier
 
 @pytest.fixture
 def systemd(tmp_path: Path) -> Iterator[socket.socket]:
+    """Return a socket that receives the notifications, in place of systemd's."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.setblocking(False)
@@ -28,7 +29,7 @@ def receive_states(systemd: socket.socket) -> list[str]:
             return states
 
 
-def test_process_is_ready_with_its_last_pack_and_alive_while_all_packs_are(
+def test_process_is_ready_once_all_packs_are_and_alive_when_all_packs_have_reported_since(
     tmp_path: Path, systemd: socket.socket
 ) -> None:
     notifier = SystemdNotifier(["a", "b"], {"NOTIFY_SOCKET": str(tmp_path / "notify")})

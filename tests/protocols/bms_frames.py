@@ -1,9 +1,9 @@
-"""Frames of real BMS from public repositories, with the values that their authors decoded."""
+"""Frames of real BMS from public repositories, with the values that the authors of the repositories decoded."""
 
 from typing import NamedTuple
 
 
-class Published(NamedTuple):
+class PublishedCycle(NamedTuple):
     """Responses of one poll cycle, and their values. The current is positive on discharge."""
 
     protocol: str
@@ -19,11 +19,11 @@ JBD_NAME = bytes.fromhex("dd050019 4a42442d53503034533033342d4c34532d323030412d4
 JBD_CELLS = bytes.fromhex("dd040008 0f450f3d0f370f3d fec677")
 JBD_BASIC = bytes.fromhex("dd03001d 0618000001f201f400002c7c00000000000080640304030b8b0b8a0b84 fa8d77")
 
-JBD = Published("jbd", JBD_NAME + JBD_CELLS + JBD_BASIC, 15.6, 0.0, 22.133, [3.909, 3.901, 3.895, 3.901],
+JBD = PublishedCycle("jbd", JBD_NAME + JBD_CELLS + JBD_BASIC, 15.6, 0.0, 22.133, [3.909, 3.901, 3.895, 3.901],
                 "JBD BMS JBD-SP04S034-L4S-200A-B-U, 4 cells")  # fmt: skip
 """syssi/esphome-jbd-bms, docs/pdus/JBD-SP04S034-L4S-200A-B-U.txt."""
 
-JBD_DISCHARGING = Published(
+JBD_DISCHARGING = PublishedCycle(
     "jbd",
     bytes.fromhex("dd040008 0d660d610d680d59 fe3c77")
     + bytes.fromhex("dd03001d 0618fee101f201f4002a2c7c00000000000080640304030b8b0b8a0b84 f88477"),
@@ -43,14 +43,14 @@ DALY_CELLS = bytes.fromhex(
 DALY_PROBES = bytes.fromhex("a5019608 013d000000000000 82 a5019608 0200000000000000 46")
 DALY_PACK = bytes.fromhex("a5019008 0212000074f5039a 58")
 
-DALY = Published(
+DALY = PublishedCycle(
     "daly", DALY_STATUS + DALY_CELLS + DALY_PROBES + DALY_PACK, 53.0, -5.9, 21.0,
     [3.383, 3.382, 3.380, 3.381, 3.381, 3.381, 3.380, 3.390, 3.382, 3.383, 3.382, 3.383, 3.380, 3.381, 3.380, 3.383],
     "Daly BMS, 16 cells",
 )  # fmt: skip
 """dreadnought/python-daly-bms, tests/test_bluetooth.py: "negative=charging, positive=discharging"."""
 
-JK_OLD = Published(
+JK_OLD = PublishedCycle(
     "jk",
     bytes.fromhex(
         "4e57011b00000000060001 792a 010eed 020efa 030ef7 040eec 050ef8 060efa 070ef1 080ef8 090ee3 0a0efa 0b0ef1"
@@ -82,7 +82,7 @@ The frames on Bluetooth and on RS485 are equal.
 JK_RECORD_OF_PACK_2 = bytes.fromhex("0210162000010478")
 """Record that follows the newer frame on RS485: eggcho/jk-bms-passive-bridge, README."""
 
-JK_NEWER = Published(
+JK_NEWER = PublishedCycle(
     "jk", JK_NEWER_FRAME + JK_RECORD_OF_PACK_2, 51.689, 0.0, 17.7,
     [3.246, 3.230, 3.226, 3.231, 3.233, 3.231, 3.232, 3.232, 3.225, 3.232, 3.216, 3.225, 3.237, 3.231, 3.225, 3.242],
     "JK-BMS, 16 cells, pack 2",

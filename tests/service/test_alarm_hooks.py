@@ -39,13 +39,15 @@ RAISED = Alarm(
     unit=None,
     text="little charge is left",
 )
-TOPIC = "bms/pack/alarm/discharge_over_current"
+STANDARD_DESCRIPTORS = 3
+"""Number of file descriptors that are open in any case: stdin, stdout and stderr."""
+ALARM_TOPIC = "bms/pack/alarm/discharge_over_current"
 CLEARED = RAISED.model_copy(update={"active": False, "since": None, "value": None, "text": ""})
 
 
 @asynccontextmanager
-async def hooks(*tables: dict[str, Any], **changes: Any) -> AsyncIterator[AlarmHooks]:
-    """Run the hooks with these settings."""
+async def run_hooks(*tables: dict[str, Any], **changes: Any) -> AsyncIterator[AlarmHooks]:
+    """Run the hooks of these tables ``[[alarms.hook]]``. ``changes`` are arguments of ``AlarmHooks``."""
     options = {"publish": None, "set_relay": None} | changes
     async with AlarmHooks([AlarmHook.model_validate(table) for table in tables], "pack", **options) as running:
         yield running
@@ -66,9 +68,9 @@ async def wait_for_relay(board: VirtualBoard, *, high: bool) -> None:
 
 
 async def wait_for_lines(path: Path, lines: int) -> list[str]:
-    """Wait until a file has this number of lines. Return them."""
+    """Wait until a file has at least this number of lines. Return all of them."""
     async with asyncio.timeout(LONG_S):
-        while len(output := _lines(path)) < lines:  # noqa: ASYNC110 - a program has no event
+        while len(output := lines_of(path)) < lines:  # noqa: ASYNC110 - a program has no event
             await asyncio.sleep(0.01)
     return output
 
@@ -87,7 +89,8 @@ def _is_running(process: int) -> bool:
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-def _lines(path: Path) -> list[str]:
+def lines_of(path: Path) -> list[str]:
+    """Return the lines of a file; none if it does not exist."""
     return path.read_text().splitlines() if path.exists() else []
 
 
@@ -96,32 +99,32 @@ async def test_programs_get_the_alarm_on_stdin_and_in_the_environment_and_run_in
     script = write_program(
         tmp_path / "script", f'json=$(cat); echo "$1 $BMS_NAME $BMS_STATE $BMS_VALUE $BMS_DEVICE $json" >> {out}'
     )
-    async with hooks({"run": [script, "a b;c"]}) as running:
+    async with run_hooks({"run": [script, "a b;c"]}) as running:
         for alarm in (RAISED, CLEARED):
-            running.on_alarm_change(Change(0.0, alarm))
+            running.on_alarm_change(Change(at_s=0.0, alarm=alarm))
         output = await wait_for_lines(out, 2)
     assert output[0].startswith("a b;c soc_low raised 0.09 pack {")
     assert json.loads(output[0][output[0].index("{") :]) == RAISED.model_dump()
     assert output[1].startswith("a b;c soc_low cleared  pack {")
 
 
-async def test_a_program_that_could_not_be_started_before_a_restart_is_started_after_it(tmp_path: Path) -> None:
+async def test_alarms_whose_hook_failed_before_a_restart_are_reported_after_it(tmp_path: Path) -> None:
     out = tmp_path / "out"
     script = write_program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
     failed = RAISED.model_copy(update={"name": "hook_failed"})
-    async with hooks({"run": [script]}) as running:
+    async with run_hooks({"run": [script]}) as running:
         running.restore_active([RAISED, failed, CLEARED.model_copy(update={"name": "soc_high"})])
         assert await wait_for_lines(out, 1) == ["soc_low raised"]
-        running.on_alarm_change(Change(0.0, CLEARED))
+        running.on_alarm_change(Change(at_s=0.0, alarm=CLEARED))
         assert await wait_for_lines(out, 2) == ["soc_low raised", "soc_low cleared"]
 
 
-async def test_an_alarm_raised_in_an_earlier_run_is_not_reported_again(tmp_path: Path) -> None:
+async def test_an_alarm_reported_in_an_earlier_run_is_not_reported_again_and_its_end_is(tmp_path: Path) -> None:
     out = tmp_path / "out"
     script = write_program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
-    async with hooks({"run": [script]}) as running:
+    async with run_hooks({"run": [script]}) as running:
         running.restore_active([RAISED])
-        running.on_alarm_change(Change(0.0, CLEARED))
+        running.on_alarm_change(Change(at_s=0.0, alarm=CLEARED))
         assert await wait_for_lines(out, 1) == ["soc_low cleared"]
 
 
@@ -129,9 +132,9 @@ async def test_a_hook_runs_only_for_its_alarms_and_states(tmp_path: Path) -> Non
     out = tmp_path / "out"
     script = write_program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
     other = RAISED.model_copy(update={"name": "link_lost"})
-    async with hooks({"run": [script], "alarms": ["soc_low"], "on": ["raised"]}) as running:
+    async with run_hooks({"run": [script], "alarms": ["soc_low"], "on": ["raised"]}) as running:
         for alarm in (other, CLEARED, RAISED):
-            running.on_alarm_change(Change(0.0, alarm))
+            running.on_alarm_change(Change(at_s=0.0, alarm=alarm))
         assert await wait_for_lines(out, 1) == ["soc_low raised"]
 
 
@@ -139,60 +142,64 @@ async def test_after_a_program_that_hangs_the_next_alarm_is_reported(tmp_path: P
     out = tmp_path / "out"
     hang = write_program(tmp_path / "hang", f"[ $BMS_STATE = raised ] && sleep 1000; echo $BMS_STATE > {out}")
     with capture_logs() as lines:
-        async with hooks({"run": [hang], "timeout_s": 2.0}) as running:
+        async with run_hooks({"run": [hang], "timeout_s": 2.0}) as running:
             for alarm in (RAISED, CLEARED):
-                running.on_alarm_change(Change(0.0, alarm))
+                running.on_alarm_change(Change(at_s=0.0, alarm=alarm))
             assert await wait_for_lines(out, 1) == ["cleared"]
     assert [line["event"] for line in lines] == ["alarm hook: the program takes too long and is killed"]
 
 
-ESCAPES = (
+FOUND_AFTER_THEIR_PARENT = (
     "{daemon} &",
     "setsid {daemon} &",
     "(setsid {daemon} &)",
     "env -i {daemon} &",
 )
-"""Commands that start a daemon which is found also after the end of its parent."""
-CHILD = "env -i setsid {daemon} &"
-"""Command that starts a daemon which is found only while its parent runs."""
+"""Commands that start a daemon, which the hook also finds after the end of the script that started it."""
+FOUND_DURING_ITS_PARENT = "env -i setsid {daemon} &"
+"""Command that starts a daemon, which the hook finds only while the script runs."""
 
 
 @pytest.mark.parametrize(
-    ("starts", "then"), [pytest.param(ESCAPES, "exit", marks=pytest.mark.thorough), ((*ESCAPES, CHILD), "sleep 1000")]
+    ("starts", "last_line"),
+    [
+        pytest.param(FOUND_AFTER_THEIR_PARENT, "exit", marks=pytest.mark.thorough),
+        ((*FOUND_AFTER_THEIR_PARENT, FOUND_DURING_ITS_PARENT), "sleep 1000"),
+    ],
 )
 async def test_all_descendants_of_a_program_are_killed_after_the_time_limit(
-    tmp_path: Path, starts: tuple[str, ...], then: str
+    tmp_path: Path, starts: tuple[str, ...], last_line: str
 ) -> None:
-    started = tmp_path / "started"
+    started = tmp_path / "started"  # has the process number of each daemon
     started.touch()
     daemon = write_program(tmp_path / "daemon", f"echo $$ >> {started}; exec /bin/sleep 1000")
     lines = [start.format(daemon=daemon) for start in starts]
-    lines += [f"until [ $(wc -l < {started}) = {len(starts)} ]; do :; done", then]
+    lines += [f"until [ $(wc -l < {started}) = {len(starts)} ]; do :; done", last_line]
     script = write_program(tmp_path / "script", "\n".join(lines))
-    async with hooks({"run": [script], "timeout_s": 10.0}) as running:
-        running.on_alarm_change(Change(0.0, RAISED))
+    async with run_hooks({"run": [script], "timeout_s": 10.0}) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         failed = await wait_for_health(running, lambda health: health.failures == 1)
     assert failed.failing == [f"run {script}: took longer than 10 s"]
-    assert [_is_running(int(line)) for line in _lines(started)] == [False] * len(starts)
+    assert [_is_running(int(line)) for line in lines_of(started)] == [False] * len(starts)
 
 
 async def test_a_child_that_outlives_its_program_runs_until_the_time_limit(tmp_path: Path) -> None:
     out, go = tmp_path / "out", tmp_path / "go"
     child = write_program(tmp_path / "child", f"until [ -e {go} ]; do sleep 0.01; done; echo sent > {out}")
-    async with hooks(
+    async with run_hooks(
         {"run": [write_program(tmp_path / "script", f"{child} & : > {go}")], "timeout_s": LONG_S}
     ) as running:
-        running.on_alarm_change(Change(0.0, RAISED))
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         assert (await wait_for_health(running, lambda health: health.done == 1)).failing == []
-    assert _lines(out) == ["sent"]
+    assert lines_of(out) == ["sent"]
 
 
 async def test_a_program_that_cannot_be_started_is_tried_again_until_its_alarm_has_ended(tmp_path: Path) -> None:
     out, path = tmp_path / "out", tmp_path / "script"
-    async with hooks({"run": [str(path)]}) as running:
-        running.on_alarm_change(Change(0.0, RAISED))
+    async with run_hooks({"run": [str(path)]}) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         await wait_for_health(running, lambda health: health.failures >= 2)
-        running.on_alarm_change(Change(0.0, CLEARED))
+        running.on_alarm_change(Change(at_s=0.0, alarm=CLEARED))
         write_program(path, f"echo $BMS_STATE >> {out}")
         assert await wait_for_lines(out, 1) == ["cleared"]
         assert (await wait_for_health(running, lambda health: health.done == 1)).failing == []
@@ -200,25 +207,25 @@ async def test_a_program_that_cannot_be_started_is_tried_again_until_its_alarm_h
 
 async def test_another_alarm_does_not_shorten_the_retry_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alarm_hooks, "FIRST_RETRY_S", LONG_S)
-    async with hooks({"run": [str(tmp_path / "none")]}) as running:
-        running.on_alarm_change(Change(0.0, RAISED))
+    async with run_hooks({"run": [str(tmp_path / "none")]}) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         await wait_for_health(running, lambda health: health.failures == 1)
-        running.on_alarm_change(Change(0.0, RAISED.model_copy(update={"name": "link_lost"})))
-        running.on_alarm_change(Change(0.0, CLEARED.model_copy(update={"name": "link_lost"})))
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED.model_copy(update={"name": "link_lost"})))
+        running.on_alarm_change(Change(at_s=0.0, alarm=CLEARED.model_copy(update={"name": "link_lost"})))
         for _ in range(100):  # without the delay, the hook would retry in the next cycles of the loop
             await asyncio.sleep(0)
         assert running.health is not None
         assert running.health.failures == 1
 
 
-async def test_a_program_without_a_free_descriptor_is_started_once_one_is_free(tmp_path: Path) -> None:
+async def test_a_program_that_finds_no_free_file_descriptor_is_started_once_one_is_free(tmp_path: Path) -> None:
     out = tmp_path / "out"
     script = write_program(tmp_path / "script", f"echo $BMS_STATE >> {out}")
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    async with hooks({"run": [script]}) as running:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+    async with run_hooks({"run": [script]}) as running:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (STANDARD_DESCRIPTORS, limits[1]))
         try:
-            running.on_alarm_change(Change(0.0, RAISED))
+            running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
             failed = await wait_for_health(running, lambda health: health.failures >= 2)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
@@ -226,37 +233,39 @@ async def test_a_program_without_a_free_descriptor_is_started_once_one_is_free(t
         assert await wait_for_lines(out, 1) == ["raised"]
 
 
-async def test_a_lack_of_descriptors_neither_keeps_a_program_alive_nor_runs_it_twice(tmp_path: Path) -> None:
+async def test_a_program_is_killed_at_the_time_limit_and_not_run_again_without_free_file_descriptors(
+    tmp_path: Path,
+) -> None:
     child = tmp_path / "child"
     script = write_program(tmp_path / "script", f"sleep 1000 & echo $! >> {child}; echo $$ >> {child}; exec sleep 1000")
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    async with hooks({"run": [script], "timeout_s": 10.0}) as running:
-        running.on_alarm_change(Change(0.0, RAISED))
+    async with run_hooks({"run": [script], "timeout_s": 10.0}) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         await wait_for_lines(child, 2)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (STANDARD_DESCRIPTORS, limits[1]))
         try:
             failed = await wait_for_health(running, lambda health: health.failures == 1)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert failed.failing == [f"run {script}: took longer than 10 s"]
-    assert [_is_running(int(line)) for line in _lines(child)] == [False, False]
+    assert [_is_running(int(line)) for line in lines_of(child)] == [False, False]
 
 
 @pytest.mark.parametrize("error", [RuntimeError("can't start new thread"), MemoryError()])
-async def test_a_program_without_a_free_thread_or_memory_is_tried_again(
+async def test_a_program_that_finds_no_free_thread_or_memory_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     out = tmp_path / "out"
-    start, errors = asyncio.create_subprocess_exec, [error]
+    create_subprocess, errors = asyncio.create_subprocess_exec, [error]
 
     async def fail_first(*command: str, **options: Any) -> asyncio.subprocess.Process:
         if errors:
             raise errors.pop()
-        return await start(*command, **options)
+        return await create_subprocess(*command, **options)
 
     monkeypatch.setattr(asyncio, "create_subprocess_exec", fail_first)
-    async with hooks({"run": [write_program(tmp_path / "script", f"echo $BMS_STATE >> {out}")]}) as running:
-        running.on_alarm_change(Change(0.0, RAISED))
+    async with run_hooks({"run": [write_program(tmp_path / "script", f"echo $BMS_STATE >> {out}")]}) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         assert await wait_for_lines(out, 1) == ["raised"]
         assert (await wait_for_health(running, lambda health: health.done == 1)).failures == 1
 
@@ -265,8 +274,10 @@ async def test_a_null_character_in_a_text_does_not_prevent_the_start_of_a_progra
     """A publisher's last will becomes the reason of ``link_lost``; no environment can hold a null character."""
     out = tmp_path / "out"
     script = write_program(tmp_path / "script", f'echo "$BMS_TEXT" > {out}')
-    async with hooks({"run": [script]}) as running:
-        running.on_alarm_change(Change(0.0, RAISED.model_copy(update={"text": "the publisher says offline\0"})))
+    async with run_hooks({"run": [script]}) as running:
+        running.on_alarm_change(
+            Change(at_s=0.0, alarm=RAISED.model_copy(update={"text": "the publisher says offline\0"}))
+        )
         assert await wait_for_lines(out, 1) == ["the publisher says offline "]
 
 
@@ -278,11 +289,11 @@ async def test_an_internal_error_does_not_end_a_hook() -> None:
             raise RuntimeError("a fault of ours")
         output.append(payload)
 
-    async with hooks({"topic": "load/set", "payload": "$state"}, publish=publish) as running:
-        running.on_alarm_change(Change(0.0, RAISED))
+    async with run_hooks({"topic": "load/set", "payload": "$state"}, publish=publish) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         failed = await wait_for_health(running, lambda health: health.failures == 1)
         assert failed.failing == ["publish on load/set: internal error: RuntimeError('a fault of ours')"]
-        running.on_alarm_change(Change(0.0, CLEARED))
+        running.on_alarm_change(Change(at_s=0.0, alarm=CLEARED))
         await wait_for_health(running, lambda health: health.done == 1)
     assert output == [b"cleared"]
 
@@ -294,21 +305,21 @@ async def test_a_program_inherits_only_listed_and_configured_variables(
         monkeypatch.setenv(name, "here")
     out = tmp_path / "out"
     show = write_program(tmp_path / "show", f"env > {out}.part; mv {out}.part {out}")
-    async with hooks({"run": [show], "pass_environment": ["GATEWAY", "NOT_SET"]}) as running:
-        running.on_alarm_change(Change(0.0, RAISED))
+    async with run_hooks({"run": [show], "pass_environment": ["GATEWAY", "NOT_SET"]}) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         names = {line.partition("=")[0] for line in await wait_for_lines(out, 1)}
     assert {"PATH", "LC_TIME", "GATEWAY", "BMS_NAME"} <= names
     assert names.isdisjoint({"MQTT_PASSWORD", "NOTIFY_SOCKET", "NOT_SET", "PYTHONPATH"})
 
 
 async def test_a_critical_alarm_that_cannot_be_watched_counts_as_raised() -> None:
-    """The hook runs once although the alarm is raised meanwhile. It runs again when the alarm is watched and cleared."""
+    """While the alarm is unwatched, the hook runs once, also if it is raised. It runs again once it is watched and cleared."""
     hot = RAISED.model_copy(update={"name": "over_temperature", "severity": "critical", "text": "hot"})
     unwatched = {"watched": False, "unwatched_reason": "no temperature"}
     cold = hot.model_copy(update={"active": False, "since": None, "text": ""})
     output: list[bytes] = []
     tables = {"topic": "load/set", "payload": "$name $state $text"}
-    async with hooks(tables, publish=lambda _, payload: output.append(payload)) as running:
+    async with run_hooks(tables, publish=lambda _, payload: output.append(payload)) as running:
         for alarm in (
             cold.model_copy(update=unwatched),
             hot.model_copy(update=unwatched),
@@ -317,8 +328,8 @@ async def test_a_critical_alarm_that_cannot_be_watched_counts_as_raised() -> Non
             cold.model_copy(update=unwatched | {"severity": "warning"}),
             cold.model_copy(update={"severity": "warning"}),
         ):
-            running.on_alarm_change(Change(0.0, alarm))
-        running.on_alarm_change(Change(0.0, RAISED))
+            running.on_alarm_change(Change(at_s=0.0, alarm=alarm))
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         await wait_for_health(running, lambda health: health.done == 3)
     assert output == [
         b"over_temperature raised no temperature",
@@ -327,32 +338,32 @@ async def test_a_critical_alarm_that_cannot_be_watched_counts_as_raised() -> Non
     ]
 
 
-async def test_a_failed_hook_raises_hook_failed_until_a_run_succeeds(
+async def test_a_failed_hook_is_reported_until_its_next_run_succeeds(
     tmp_path: Path,
 ) -> None:
     failed = RAISED.model_copy(update={"name": "hook_failed"})
     script = write_program(tmp_path / "script", '[ "$BMS_NAME" = hook_failed ]')
     output: list[bytes] = []
     tables = {"run": [script], "alarms": ["soc_low", "hook_failed"]}, {"topic": "all", "payload": "$name"}
-    async with hooks(*tables, publish=lambda _, payload: output.append(payload)) as running:
-        running.on_alarm_change(Change(0.0, RAISED))
+    async with run_hooks(*tables, publish=lambda _, payload: output.append(payload)) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         await wait_for_health(running, lambda health: health.failing == [f"run {script}: exit code 1"])
-        running.on_alarm_change(Change(0.0, failed))
+        running.on_alarm_change(Change(at_s=0.0, alarm=failed))
         await wait_for_health(running, lambda health: health.failing == [])
     assert output == [b"soc_low"]
 
 
 async def test_the_arguments_of_a_program_are_neither_published_nor_logged(tmp_path: Path) -> None:
     with capture_logs() as lines:
-        async with hooks({"run": [str(tmp_path / "none"), "token=secret"]}) as running:
-            running.on_alarm_change(Change(0.0, RAISED))
+        async with run_hooks({"run": [str(tmp_path / "none"), "token=secret"]}) as running:
+            running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
             await wait_for_health(running, lambda health: health.failures >= 1)
             assert "secret" not in str(running.health)
     assert "secret" not in str(lines)
 
 
-def test_a_relay_hook_sends_the_level_for_a_silent_service() -> None:
-    """Without ``when_silent`` the pin takes the level of an alarm, and `config check` warns about it."""
+def test_a_relay_hook_without_when_silent_causes_a_warning() -> None:
+    """After a silence of the service the pin then has the level of an alarm."""
     settings = Settings.model_validate({"sensor": {"port": "/dev/none"}, "alarms": {"hook": [{"relay": "low"}]}})
     (line,) = hook_warnings(settings)
     assert line.startswith(
@@ -360,17 +371,17 @@ def test_a_relay_hook_sends_the_level_for_a_silent_service() -> None:
     )
 
 
-async def test_without_when_silent_the_board_gets_the_alarm_level_for_silence() -> None:
+async def test_a_relay_hook_without_when_silent_sets_the_alarm_level_as_the_fallback_of_the_pin() -> None:
     switched: asyncio.Queue[Relay] = asyncio.Queue()
-    async with hooks({"relay": "low"}, set_relay=switched.put):
+    async with run_hooks({"relay": "low"}, set_relay=switched.put):
         assert await asyncio.wait_for(switched.get(), LONG_S) == Relay(high=True, high_when_silent=False, silent_s=30)
 
 
-async def test_a_missing_or_failing_program_is_logged_and_the_hook_continues(tmp_path: Path) -> None:
+async def test_programs_that_are_missing_or_fail_are_logged(tmp_path: Path) -> None:
     tables = {"run": [str(tmp_path / "none")]}, {"run": [write_program(tmp_path / "fail", "exit 3")]}
     with capture_logs() as lines:
-        async with hooks(*tables) as running:
-            running.on_alarm_change(Change(0.0, RAISED))
+        async with run_hooks(*tables) as running:
+            running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
     output = {line["event"]: line for line in lines}
     assert set(output) == {
         "alarm hook: the program cannot be started",
@@ -386,10 +397,10 @@ async def test_a_dry_run_logs_the_action_and_does_nothing(tmp_path: Path) -> Non
     output: list[object] = []
     tables: tuple[dict[str, Any], ...] = {"run": [script]}, {"topic": "load/set", "payload": "OFF"}, {"relay": "high"}
     with capture_logs() as lines:
-        async with hooks(
+        async with run_hooks(
             *({**table, "dry_run": True} for table in tables), publish=output.append, set_relay=output.append
         ) as running:
-            running.on_alarm_change(Change(0.0, RAISED))
+            running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
     assert [line.get("would") or line.get("hook") for line in lines] == [
         "relay pin high",
         f"run {script}",
@@ -412,7 +423,7 @@ def test_a_hook_without_its_broker_or_relay_is_rejected_at_the_start(tables: dic
 
 
 async def test_an_over_current_switches_the_relay_is_published_and_acknowledged(broker: Broker, tmp_path: Path) -> None:
-    """The relay of a virtual board disconnects the load. The latched alarm survives a restart."""
+    """The relay of a virtual board disconnects the load. The latched alarm survives a restart of service and board."""
     load_a = 8.0
     board = VirtualBoard(lambda _: Reading(0.0 if board.relay_high else load_a, 22.0, 25.0))
     tables: dict[str, Any] = {
@@ -443,7 +454,7 @@ async def test_an_over_current_switches_the_relay_is_published_and_acknowledged(
         running = asyncio.create_task(board.run())
         async with Listener(broker) as live:
             async with run_service():
-                alarm = await live.wait_json(TOPIC, lambda alarm: alarm["latched"])
+                alarm = await live.wait_json(ALARM_TOPIC, lambda alarm: alarm["latched"])
                 assert board.relay_high
                 assert (alarm["active"], alarm["limit"], alarm["severity"]) == (True, 5.0, "critical")
                 assert alarm["value"] == pytest.approx(load_a, abs=0.1)
@@ -461,20 +472,20 @@ async def test_an_over_current_switches_the_relay_is_published_and_acknowledged(
                     "error": None,
                     "transaction": None,
                 }
-                await live.wait_json(TOPIC, lambda alarm: not alarm["active"], skip=messages_before)
+                await live.wait_json(ALARM_TOPIC, lambda alarm: not alarm["active"], skip=messages_before)
                 await wait_for_relay(board, high=False)
                 await live.wait("load/set", lambda payload: b"cleared" in payload)
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
 
 
-async def test_a_lost_temperature_sensor_switches_the_relay_and_a_hook_that_cannot_start_raises_an_alarm(
+async def test_a_lost_temperature_sensor_switches_the_relay_and_a_missing_program_raises_hook_failed(
     broker: Broker, tmp_path: Path
 ) -> None:
     """The NTC of a virtual board breaks while the pack is charged."""
     temperature_c, out, missing = 25.0, tmp_path / "out", tmp_path / "later"
     board = VirtualBoard(lambda _: Reading(-8.0, 22.0, temperature_c))
-    of_over_temperature = {"alarms": ["over_temperature"]}
+    over_temperature_only = {"alarms": ["over_temperature"]}
     tables: dict[str, Any] = {
         "publish": {"rate_hz": 10.0},
         "mqtt": {"url": broker.url},
@@ -482,9 +493,9 @@ async def test_a_lost_temperature_sensor_switches_the_relay_and_a_hook_that_cann
             "lost_s": 0.5,
             "hook_failed": {"delay_s": 0.0, "clear_delay_s": 0.0},
             "hook": [
-                of_over_temperature | {"relay": "high", "when_silent": "high"},
-                of_over_temperature | {"topic": "load/set", "payload": "$name $state"},
-                of_over_temperature | {"run": [str(missing)], "on": ["raised"]},
+                over_temperature_only | {"relay": "high", "when_silent": "high"},
+                over_temperature_only | {"topic": "load/set", "payload": "$name $state"},
+                over_temperature_only | {"run": [str(missing)], "on": ["raised"]},
             ],
         },
     }

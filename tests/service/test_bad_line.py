@@ -1,4 +1,4 @@
-"""Running service with faults on its serial line: bytes on a PTY, decoder, estimator, published values."""
+"""Service whose serial line has faults: from bytes on a pseudo-terminal over decoder and estimator to published values."""
 
 import asyncio
 import itertools
@@ -13,7 +13,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads import Health, Snapshot
-from bms_estimator.protocols.firmware.messages import MODULUS, Hello, SampleMessage
+from bms_estimator.protocols.firmware.messages import MODULUS, BoardStatus, Hello, ResetCause, SampleMessage
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
@@ -25,8 +25,14 @@ from tests.serial_line import Line
 CELL = load_cell("chen_mora")
 RATE_HZ = 100
 PERIOD_US = 1_000_000 // RATE_HZ
+PAIRS = 100
+"""Number of conversions of voltage and of current in a sample."""
+VOLTAGE_SUM = round(PAIRS * 3.8 / 5.0 / 5.0 * 1024)
+"""Sum for 3.8 V, with a divider of 5, a reference of 5.0 V and 10 bits [LSB]."""
+CURRENT_SUM = PAIRS * 512
+"""Sum for 0 A, the middle of the range [LSB]."""
 HELLO = Hello(
-    firmware_major=1, firmware_minor=2, firmware_patch=3, reset_cause=1, boot_id=7, serial=0xBEEF,
+    firmware_major=1, firmware_minor=2, firmware_patch=3, reset_cause=ResetCause.POWER_ON, boot_id=7, serial=0xBEEF,
     sequence=0, board_us=0, rate_hz=RATE_HZ, period_ns=1000 * PERIOD_US, adc_bits=10, channels=0,
     divider_ppm=5_000_000, current_uv_per_a=100_000, current_zero_ppm=500_000,
     bandgap_uv=1_100_000, bandgap_sum=56_320, bandgap_count=250,  # a reference of 5.0 V
@@ -34,15 +40,17 @@ HELLO = Hello(
 )  # fmt: skip
 
 
-def sample(sequence: int, *, board_us: int | None = None, voltage_sum: int = 15_565, status: int = 0) -> SampleMessage:
-    """Return a sample of 3.8 V and 0 A, unless its sums are changed."""
+def sample(
+    sequence: int, *, board_us: int | None = None, voltage_sum: int = VOLTAGE_SUM, status: int = 0
+) -> SampleMessage:
+    """Return a sample of 100 pairs of conversions; unless changed, of 3.8 V and 0 A, and at its regular time."""
     at_us = (sequence + 1) * PERIOD_US if board_us is None else board_us
     return SampleMessage(
         sequence=sequence % MODULUS,
         board_us=at_us % MODULUS,
         voltage_sum=voltage_sum,
-        current_sum=51_200,
-        count=100,
+        current_sum=CURRENT_SUM,
+        count=PAIRS,
         aux_sum=0,
         aux_count=0,
         status=status,
@@ -65,6 +73,8 @@ class SkippingClock:
 
 
 class Service:
+    """Running service with the board's end of its line, its sink, its task and its clock."""
+
     def __init__(
         self, line: Line, sink: Collector, task: asyncio.Task[Estimator], stop: asyncio.Event, clock: SkippingClock
     ) -> None:
@@ -74,9 +84,11 @@ class Service:
         return await self.sink.until(condition)
 
     async def wait_for_frames(self, frames: int) -> None:
+        """Wait until this number of valid frames was received."""
         await self.until(lambda s: s.health.line["frames_received"] >= frames)
 
     async def end(self) -> tuple[Estimator, Health]:
+        """Stop the service. Return its estimator and its last health message."""
         self._stop.set()
         estimator = await asyncio.wait_for(self.task, LONG_S)
         return estimator, self.sink.snapshots[-1].health
@@ -84,7 +96,7 @@ class Service:
 
 @asynccontextmanager
 async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -> AsyncIterator[Service]:
-    """Run a service with a board that has sent its hello message."""
+    """Run a service, to which the board has sent ``hello``. ``sensor`` are settings of ``[sensor]``."""
     line.plug()
     settings = Settings(
         pack=PackSettings(initial_soc=0.5),
@@ -96,7 +108,7 @@ async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -
     sink, stop = Collector(), asyncio.Event()
     task = asyncio.create_task(run_estimation_loop(settings, CELL, source=board, sinks=[sink], stop=stop))
     async with asyncio.timeout(LONG_S):
-        while "no frame yet" not in (board.message or ""):  # noqa: ASYNC110 - the board has no event for it
+        while "no frame yet" not in (board.silence_reason or ""):  # noqa: ASYNC110 - the board has no event for it
             await asyncio.sleep(0.01)
     line.write(hello)
     try:
@@ -106,7 +118,7 @@ async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -
         await asyncio.wait_for(task, LONG_S)
 
 
-async def test_samples_have_the_scaling_of_the_hello_and_info_has_its_serial_number(line: Line) -> None:
+async def test_samples_are_scaled_by_the_hello_and_info_has_its_serial_number(line: Line) -> None:
     async with service(line) as live:
         live.line.write(frames(0, 20))
         first_estimate = await live.until(lambda s: s.estimate is not None)
@@ -135,7 +147,7 @@ async def test_frames_after_garbage_and_a_truncated_frame_are_decoded(line: Line
 async def test_a_frame_with_a_wrong_checksum_is_counted_and_dropped(line: Line) -> None:
     async with service(line) as live:
         damaged_frame = bytearray(sample(1).encode())
-        damaged_frame[7] ^= 0x10
+        damaged_frame[7] ^= 0x10  # any bit
         live.line.write(frames(0, 1) + bytes(damaged_frame) + frames(2, 8))
         await live.wait_for_frames(9)
         _, health = await live.end()
@@ -182,7 +194,7 @@ async def test_time_continues_after_a_reset_of_the_board(line: Line) -> None:
     async with service(line) as live:
         live.line.write(frames(0, 50))
         await live.wait_for_frames(50)
-        live.line.write(replace(HELLO, boot_id=9, reset_cause=8).encode() + frames(0, 20))
+        live.line.write(replace(HELLO, boot_id=9, reset_cause=ResetCause.WATCHDOG).encode() + frames(0, 20))
         await live.wait_for_frames(70)
         estimator, health = await live.end()
     assert estimator.state["samples"][0] == 70
@@ -191,7 +203,7 @@ async def test_time_continues_after_a_reset_of_the_board(line: Line) -> None:
     assert health.line["resets"] == 1
 
 
-async def test_ten_seconds_without_frames_are_one_gap_and_the_lock_holds(line: Line) -> None:
+async def test_ten_seconds_without_frames_are_one_gap_and_do_not_end_the_lock(line: Line) -> None:
     async with service(line) as live:
         live.line.write(frames(0, 50))
         await live.wait_for_frames(50)
@@ -207,7 +219,9 @@ async def test_ten_seconds_without_frames_are_one_gap_and_the_lock_holds(line: L
 
 async def test_saturated_and_implausible_voltages_are_dropped_and_the_sensor_counts_as_offline(line: Line) -> None:
     async with service(line) as live:
-        live.line.write(frames(0, 5) + frames(5, 5, status=1) + frames(10, 5, voltage_sum=0))
+        live.line.write(
+            frames(0, 5) + frames(5, 5, status=BoardStatus.VOLTAGE_SATURATED) + frames(10, 5, voltage_sum=0)
+        )
         stale = await live.until(lambda s: s.health.samples["samples"] == 5 and not s.health.sensor_online)
         _, health = await live.end()
     assert health.samples["dropped_saturated"] == 5
@@ -219,7 +233,7 @@ async def test_a_wrong_baud_rate_reaches_the_published_health(line: Line) -> Non
     async with service(line, baud=9600) as live:
         snapshot = asyncio.create_task(live.until(lambda s: "wrong baud rate" in (s.health.sensor_message or "")))
         for n in itertools.count():
-            live.line.write(bytes((17 * n + k) % 255 + 1 for k in range(64)))
+            live.line.write(bytes((17 * n + k) % 255 + 1 for k in range(64)))  # no delimiter of frames
             if (await asyncio.wait({snapshot}, timeout=0.02))[0]:
                 break
     assert "9600 baud" in (snapshot.result().health.sensor_message or "")
@@ -262,7 +276,7 @@ async def test_the_state_names_the_lowest_and_highest_cell(line: Line) -> None:
     assert (snapshot.estimate.cell_lowest_v, snapshot.estimate.cell_highest_v) == (3.79, 3.81)
 
 
-async def test_new_reason_replaces_an_earlier_one(line: Line) -> None:
+async def test_the_published_reason_for_dropped_samples_is_the_latest_one(line: Line) -> None:
     """The voltage is out of range at first. Then a hello with a slope of zero makes the current NaN."""
     async with service(line) as live:
         live.line.write(frames(0, 5, voltage_sum=16_000_000))

@@ -36,23 +36,28 @@ from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
 
 
-def at(hours: float) -> BootTimestamp:
+def clock_at(hours: float) -> BootTimestamp:
+    """Return the clocks of one boot of the machine at a time [h]. At 0 h it is 2023-11-14T22:13:20Z."""
     return BootTimestamp(1.7e9 + 3600.0 * hours, synchronised=True, boot_s=5000.0 + 3600.0 * hours, boot="one")
 
 
 async def run_at(hours: float, folder: Path, *rows: tuple[float, float, float], settings: Settings = SETTINGS) -> Any:
-    """Run a service over ``rows``, starting at this time [h]. Return its estimator and its last snapshot."""
+    """Run a service that starts at a time [h] and gets samples of time [s], current [A] and voltage [V].
+
+    Return its estimator and its last snapshot.
+    """
     source, sink = ScriptedSource(), Collector()
     source.give(*rows)
     source.finish()
-    checkpoint = CheckpointFile(folder, settings, CELL, lambda: at(hours))
+    checkpoint = CheckpointFile(folder, settings, CELL, lambda: clock_at(hours))
     running = run_estimation_loop(
         settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint
     )
     return await asyncio.wait_for(running, LONG_S), sink.snapshots[-1]
 
 
-async def test_counters_survive_restarts_and_gaps_are_added_up(tmp_path: Path) -> None:
+async def test_total_counters_and_gaps_add_up_the_values_of_all_runs(tmp_path: Path) -> None:
+    # one sample is out of the voltage range, and a minute is without samples
     await run_at(0.0, tmp_path, (0.0, 0.1, 3.8), (1.0, 0.1, 3.8), (1.5, 0.1, 9.9), (61.0, 0.1, 3.8), (62.0, 0.1, 3.8))
     _, last = await run_at(1.0, tmp_path, (7.0, 0.1, 3.8), (8.0, 0.1, 3.8))
     health = last.health
@@ -68,10 +73,14 @@ async def test_counters_survive_restarts_and_gaps_are_added_up(tmp_path: Path) -
 
 
 async def test_charge_and_energy_survive_restarts(tmp_path: Path) -> None:
-    hour = [(float(s), 2.0, 3.8) for s in range(3601)]
+    hour = [(float(s), 2.0, 3.8) for s in range(3601)]  # 2 Ah and 7.6 Wh
     _, discharged = await run_at(0.0, tmp_path, *hour)
     _, charged = await run_at(2.0, tmp_path, *((s, -1.0, v) for s, _, v in hour))
-    async with run_with_frequent_saves(CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(4.0))) as (source, sink, _):
+    async with run_with_frequent_saves(CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(4.0))) as (
+        source,
+        sink,
+        _,
+    ):
         source.give(hour[0])
         estimate = (await sink.until(lambda s: s.estimate is not None)).estimate
     assert ChargeEnergy.from_totals(discharged.health.total) == pytest.approx((2.0, 0.0, 7.6e-3, 0.0))
@@ -83,7 +92,9 @@ async def test_charge_and_energy_survive_restarts(tmp_path: Path) -> None:
     assert estimate.equivalent_cycles == pytest.approx(2.0 / CELL.cell.capacity_ah)
 
 
-async def test_charge_and_energy_are_published_once_saved_so_that_a_kill_does_not_decrease_them(tmp_path: Path) -> None:
+async def test_charge_and_energy_are_published_only_once_saved_so_that_a_kill_does_not_decrease_them(
+    tmp_path: Path,
+) -> None:
     release = threading.Event()
 
     class SlowDisk(CheckpointFile):
@@ -103,17 +114,17 @@ async def test_charge_and_energy_are_published_once_saved_so_that_a_kill_does_no
     assert file.load().counters.total.charge_out_ah == pytest.approx(1.0)
 
 
-async def test_a_run_without_samples_changes_neither_counters_nor_the_age_of_the_state(tmp_path: Path) -> None:
+async def test_a_run_without_usable_samples_does_not_change_the_age_of_the_saved_state(tmp_path: Path) -> None:
     await run_at(0.0, tmp_path, (0.0, 0.1, 3.8))
-    await run_at(1.0, tmp_path, (0.0, 0.1, 9.9))
-    loaded = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(2.0)).load()
+    await run_at(1.0, tmp_path, (0.0, 0.1, 9.9))  # out of range
+    loaded = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(2.0)).load()
     assert loaded.unseen_s == pytest.approx(7200.0)
     assert loaded.counters.restarts == 2
     assert loaded.counters.total.samples["dropped_range"] == 1
 
 
 async def run_and_kill(folder: Path, *, with_a_sample: bool) -> None:
-    """Run a service that ends without its final save."""
+    """Run a service that ends without its final save, as after a kill."""
 
     class Killed(CheckpointFile):
         def _write(self, content: dict[str, Any], ledger: RunCounters) -> None:
@@ -140,22 +151,24 @@ async def test_a_start_after_an_unclean_end_counts_as_a_crash(tmp_path: Path) ->
 
 
 async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: Path) -> None:
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(learned_estimator().record, NEW_COUNTERS)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0)).save(learned_estimator().record, NEW_COUNTERS)
     for hours, settings, reason in (
-        (24 * 400.0, SETTINGS, ""),
+        (24 * 400.0, SETTINGS, ""),  # without a limit
         (47.0, edit_settings("state", longest_days=2.0), ""),
         (49.0, edit_settings("state", longest_days=2.0), "refused: it is 2.0 days old, state.longest_days is 2"),
     ):
-        assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: at(hours)).load().reason == reason
+        assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: clock_at(hours)).load().reason == reason
 
 
 COUNTERS = RunCounters(
-    6, Totals(since="2023-11-14T22:13:20Z", crashes=2, samples={"samples": 70}, unseen_s=30.0), clean=True
+    restarts=6,
+    total=Totals(since="2023-11-14T22:13:20Z", crashes=2, samples={"samples": 70}, unseen_s=30.0),
+    clean=True,
 )
 
 
 async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
-    file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0))
+    file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0))
     file.save(learned_estimator().record, COUNTERS)
     _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edit_settings("state", longest_days=2.0))
     assert (last.health.restarts, last.health.total.crashes, last.health.total.samples["samples"]) == (7, 2, 71)
@@ -164,7 +177,7 @@ async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Pat
 async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_continue(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The later version runs once more than there are preserved files. The oldest files remain, and the last is replaced."""
+    """The later version runs once more than files are preserved. The oldest files remain, and the last one is replaced."""
     file, inodes = CheckpointFile(tmp_path, SETTINGS, CELL), []
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
     for attempt in range(MAX_LATER_FILES + 1):
@@ -198,7 +211,7 @@ async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "implausible",
     [
         {"crashes": -3},
         {"samples": {"samples": 10**30}},
@@ -208,9 +221,11 @@ async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after
     ],
     ids=str,
 )
-async def test_implausible_counters_are_reset_and_the_state_is_restored(tmp_path: Path, wrong: dict[str, Any]) -> None:
+async def test_implausible_counters_are_reset_and_the_state_is_restored(
+    tmp_path: Path, implausible: dict[str, Any]
+) -> None:
     learned = learned_estimator()
-    total = COUNTERS.total.model_copy(update=wrong)
+    total = COUNTERS.total.model_copy(update=implausible)
     CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTERS, total=total))
     with capture_logs() as lines:
         health = (await run_samples(tmp_path, samples=1)).health
@@ -245,19 +260,19 @@ async def test_a_hanging_disk_delays_neither_estimates_nor_shutdown(
     monkeypatch.setattr(checkpoint_writer, "FINAL_SAVE_S", 0.01)
     release = threading.Event()
 
-    class Hung(CheckpointFile):
+    class HungFile(CheckpointFile):
         def save(self, *_: Any) -> None:
             release.wait()
 
     with capture_logs() as lines:
-        await run_with_hanging_disk(Hung(tmp_path, SETTINGS, CELL))
+        await run_with_hanging_disk(HungFile(tmp_path, SETTINGS, CELL))
     assert "the disk hangs: the last checkpoint is not written" in {line["event"] for line in lines}
     release.set()
 
 
-async def run_with_hanging_disk(hung: CheckpointFile) -> None:
-    """Run a service on a disk that hangs until its source ends."""
-    async with run_with_frequent_saves(hung) as (source, sink, task):
+async def run_with_hanging_disk(hung_file: CheckpointFile) -> None:
+    """Check that a service with a checkpoint on a hanging disk publishes samples and ends."""
+    async with run_with_frequent_saves(hung_file) as (source, sink, task):
         source.give((0.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs")
         source.give((1.0, 0.1, 3.8))
@@ -266,12 +281,12 @@ async def run_with_hanging_disk(hung: CheckpointFile) -> None:
         await asyncio.wait_for(task, LONG_S)
 
 
-async def test_after_a_long_gap_the_soc_follows_from_the_voltage(tmp_path: Path) -> None:
+async def test_after_a_gap_of_a_week_the_soc_is_estimated_from_the_voltage(tmp_path: Path) -> None:
     """The pack was charged while the service was off for a week."""
     estimator = new_estimator(SETTINGS, CELL)
     for second in range(600):
         estimator.step(float(second), 0.0, 3.75)
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: at(0.0)).save(estimator.record, NEW_COUNTERS)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0)).save(estimator.record, NEW_COUNTERS)
     restored, _ = await run_at(24.0 * 7.0, tmp_path, *((float(i), 0.0, 3.95) for i in range(60)))
     fresh = new_estimator(Settings(), CELL)  # its SOC is that of its first voltage
     fresh.step(0.0, 0.0, 3.95)
@@ -280,18 +295,19 @@ async def test_after_a_long_gap_the_soc_follows_from_the_voltage(tmp_path: Path)
     assert abs(restored.state["soc"][0] - fresh.state["soc"][0]) < 2.0 * restored.record["filter"]["soc_std"][0]
 
 
-def test_gap_lengths_agree_with_the_kernel() -> None:
+def test_gap_lengths_are_those_that_the_kernel_counts_as_gaps() -> None:
+    """Steps of the time are regular, twice the limit of a gap, long, or backward, in random order."""
     estimator, rng = new_estimator(SETTINGS, CELL), np.random.default_rng(5)
     gap_s = float(estimator.settings["gap_s"][0])
     steps = rng.choice([0.1, 1.0, 2.0 * gap_s, 100.0, -50.0], 400)
     times = np.cumsum(steps)
     lengths = []
     for time_s in times:
-        gaps, before_s, step_s = (float(estimator.state[n][0]) for n in ("gaps", "time_s", "step_s"))
+        gaps_before, before_s, step_s = (float(estimator.state[n][0]) for n in ("gaps", "time_s", "step_s"))
         started = estimator.state["started"][0]
         estimator.step(float(time_s), 0.0, 3.8)
         if started:
             new_lengths = gap_lengths(np.array([time_s]), before_s, step_s, gap_s, np.inf)
-            assert len(new_lengths) == estimator.state["gaps"][0] - gaps
+            assert len(new_lengths) == estimator.state["gaps"][0] - gaps_before
             lengths += new_lengths
     assert gap_lengths(times[1:], float(times[0]), 0.0, gap_s, np.inf) == pytest.approx(lengths)

@@ -1,3 +1,5 @@
+"""Estimation loop with a scripted source: publications, health, requests, notices to systemd, and errors."""
+
 import asyncio
 import json
 import socket
@@ -55,12 +57,14 @@ class Run:
         return answer["data"]
 
     async def end(self) -> Estimator:
+        """End the source. Return the estimator once the loop has ended."""
         self.source.finish()
         return await asyncio.wait_for(self.task, LONG_S)
 
 
 @asynccontextmanager
-async def running(settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any) -> AsyncIterator[Run]:
+async def run_loop(settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any) -> AsyncIterator[Run]:
+    """Run the loop, and stop it at the end. ``options`` are arguments of ``run_estimation_loop``."""
     source, sink, stop, delivery = ScriptedSource(), Collector(), asyncio.Event(), DeliveryStats()
     requests = RequestDispatcher(delivery, ("set_soc", "current_zero", "publish_rate"))
     arguments = {"requests": requests, "delivery": delivery}
@@ -75,11 +79,12 @@ async def running(settings: Settings = SETTINGS, cell: CellModel = CELL, **optio
 
 
 def estimates(sink: Collector) -> list[Estimate]:
+    """Return the published estimates, in order."""
     return [s.estimate for s in sink.snapshots if s.estimate]
 
 
 async def test_voltage_current_and_power_are_means_of_the_publish_window() -> None:
-    async with running() as run:
+    async with run_loop() as run:
         run.source.give(*((0.01 * i, float(i % 2), 3.8 + 0.1 * (i % 2)) for i in range(100)))
         await run.end()
     (window,) = estimates(run.sink)
@@ -90,10 +95,10 @@ async def test_voltage_current_and_power_are_means_of_the_publish_window() -> No
     assert window.frames_received == 100
 
 
-async def test_blocks_and_single_steps_give_equal_states() -> None:
+async def test_state_after_blocks_equals_that_after_single_steps() -> None:
     rng = np.random.default_rng(3)
     rows = [(0.01 * i, float(rng.normal(0.1, 0.05)), float(rng.normal(3.8, 0.01))) for i in range(500)]
-    async with running() as run:
+    async with run_loop() as run:
         for i in range(0, 500, 7):
             run.source.give(*rows[i : i + 7])
         live = await run.end()
@@ -104,16 +109,16 @@ async def test_blocks_and_single_steps_give_equal_states() -> None:
 
 
 async def test_unusable_samples_are_dropped_and_counted() -> None:
-    async with running() as run:
+    async with run_loop() as run:
         run.source.give((0.0, 0.1, 3.8))
         run.source.give(
             (0.1, np.nan, 3.8),
             (0.2, 0.1, np.inf),
             (0.3, 0.1, 0.0),  # a glitch
-            (0.4, 400.0, 3.8),
+            (0.4, 400.0, 3.8),  # current out of range
             (0.5, 0.1, 3.8, np.nan, int(SampleStatus.VOLTAGE_SATURATED)),
             (0.6, 0.1, 3.8),
-            (0.6, 0.1, 3.8),
+            (0.6, 0.1, 3.8),  # repeated
             (20.0, 0.1, 3.8, np.nan, int(SampleStatus.GAP)),
         )
         await run.sink.until(lambda s: s.health.samples["gaps"] == 1)
@@ -129,12 +134,12 @@ async def test_unusable_samples_are_dropped_and_counted() -> None:
         "gaps": 1,
     }
     for snapshot in run.sink.snapshots:
-        for part in (*snapshot[:4], *snapshot.alarms):
-            assert part is None or "NaN" not in part.model_dump_json()
+        for payload in (*snapshot[:4], *snapshot.alarms):
+            assert payload is None or "NaN" not in payload.model_dump_json()
 
 
-async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> None:
-    async with running() as run:
+async def test_the_sensor_is_offline_while_no_usable_samples_arrive() -> None:
+    async with run_loop() as run:
         run.source.give((0.0, 0.1, 3.8))
         await run.sink.until(lambda s: s.health.sensor_online)
         silent = await run.sink.until(lambda s: s.health.samples["samples"] == 1 and not s.health.sensor_online)
@@ -151,14 +156,14 @@ async def test_the_sensor_goes_offline_when_samples_stop_and_comes_back() -> Non
 
 
 @pytest.mark.parametrize("sensor", [SensorSettings(sample_rate_hz=1), SensorSettings(protocol="text")])
-async def test_a_board_slower_than_the_publications_stays_online(sensor: SensorSettings) -> None:
+async def test_a_board_slower_than_the_publish_rate_stays_online(sensor: SensorSettings) -> None:
     slow = SETTINGS.model_copy(update={"sensor": sensor})
     now_s = 0.0
-    async with running(slow, clock=Clock(monotonic=lambda: now_s)) as run:
-        for tick in range(20):
+    async with run_loop(slow, clock=Clock(monotonic=lambda: now_s)) as run:
+        for tick in range(20):  # of 0.2 s, in which two publications are due
             if tick % 5 == 0:  # once a second
                 run.source.give((now_s, 0.1, 3.8))
-            now_s += 0.2  # the next publication is due, also without a sample
+            now_s += 0.2
             await run.sink.until(lambda _: True, skip=len(run.sink.snapshots))
         online = [s.health.sensor_online for s in run.sink.snapshots]
         assert all(online[online.index(True) :])
@@ -166,8 +171,8 @@ async def test_a_board_slower_than_the_publications_stays_online(sensor: SensorS
         await run.sink.until(lambda s: not s.health.sensor_online, skip=len(online))
 
 
-async def test_frames_whose_samples_are_all_dropped_do_not_count_as_fresh() -> None:
-    async with running() as run:
+async def test_the_sensor_is_offline_while_all_samples_are_dropped() -> None:
+    async with run_loop() as run:
         for second in range(3):
             run.source.give(*((second + 0.01 * i, 0.1, 0.0) for i in range(100)))
             await run.sink.until(lambda s: s.health.samples["dropped_range"] == 100 * (second + 1))  # noqa: B023
@@ -178,41 +183,41 @@ async def test_frames_whose_samples_are_all_dropped_do_not_count_as_fresh() -> N
 
 
 async def test_the_drift_of_the_board_s_clock_is_published_once_it_is_measured() -> None:
-    async with running() as run:
+    async with run_loop() as run:
         assert (await run.sink.until(lambda _: True)).health.clock_ppm is None
         run.source.clock_ppm = 3012.5
         await run.sink.until(lambda s: s.health.clock_ppm == 3012.5)
 
 
 async def test_the_reason_for_missing_samples_is_published() -> None:
-    async with running() as run:
-        run.source.message = "waiting for /dev/ttyUSB0: it does not exist"
-        snapshot = await run.sink.until(lambda s: s.health.sensor_message == run.source.message)
+    async with run_loop() as run:
+        run.source.silence_reason = "waiting for /dev/ttyUSB0: it does not exist"
+        snapshot = await run.sink.until(lambda s: s.health.sensor_message == run.source.silence_reason)
     assert snapshot.estimate is None
 
 
-async def test_a_step_of_the_wall_clock_changes_time_stamps_only() -> None:
+async def test_a_step_of_the_wall_clock_changes_only_time_stamps() -> None:
     offset = 0.0
 
     def wall() -> float:
         return 1_700_000_000.0 + offset
 
-    async with running(clock=Clock(wall=wall)) as run:
+    async with run_loop(clock=Clock(wall=wall)) as run:
         run.source.give((0.0, 0.1, 3.8))
         await run.sink.until(lambda s: s.estimate is not None)
         offset = -7200.0
         snapshots_before = len(run.sink.snapshots)
         run.source.give((0.1, 0.1, 3.8))
         after = await run.sink.until(lambda s: s.estimate is not None, skip=snapshots_before)
-        state = await run.end()
+        estimator = await run.end()
     assert after.estimate
     assert after.estimate.publish_time.startswith("2023-11-14T20:13:20")
     assert after.health.sensor_online
-    assert state.state["time_steps_back"][0] == 0
+    assert estimator.state["time_steps_back"][0] == 0
 
 
-async def test_requests_reach_the_running_estimator() -> None:
-    async with running() as run:
+async def test_set_soc_needs_a_sample_and_a_valid_value() -> None:
+    async with run_loop() as run:
         await run.sink.until(lambda _: True)
         with pytest.raises(UserError, match="no sample"):
             await run.ask("set_soc", soc=0.8)
@@ -222,12 +227,12 @@ async def test_requests_reach_the_running_estimator() -> None:
         for wrong in ({}, {"soc": 1.5}, {"soc": "0.5"}, {"soc": True}):
             with pytest.raises(UserError, match=r"soc = .*must be a number from 0 to 1"):
                 await run.ask("set_soc", **wrong)
-        state = await run.end()
-    assert state.state["soc"][0] == 0.8
+        estimator = await run.end()
+    assert estimator.state["soc"][0] == 0.8
 
 
 async def test_health_counts_dropped_messages_and_requests() -> None:
-    async with running() as run:
+    async with run_loop() as run:
         await run.sink.until(lambda _: True)
         run.delivery.drops = 7
         run.delivery.refused_topics = ["bms/pack/request/+"]
@@ -241,7 +246,7 @@ async def test_health_counts_dropped_messages_and_requests() -> None:
 
 @pytest.mark.parametrize("later_board", [{}, {"serial": "A1", "firmware": "1.1"}])
 async def test_the_properties_of_a_silent_board_stay_published(later_board: dict[str, str]) -> None:
-    async with running() as run:
+    async with run_loop() as run:
         run.source.board = {"serial": "A1", "firmware": "1.0"}
         run.source.give((0.0, 0.1, 3.8))
         await run.sink.until(lambda s: bool(s.info.board))
@@ -257,7 +262,12 @@ async def test_the_properties_of_a_silent_board_stay_published(later_board: dict
 
 
 class ZeroRecorder:
-    """Counter of the commands that set the board's current zero, with a clock that the test sets."""
+    """Handler that counts the commands to set the board's current zero, with a clock that the test sets.
+
+    Attributes:
+        calls: Number of commands.
+        now_s: Time of the clock [s].
+    """
 
     def __init__(self) -> None:
         self.calls, self.now_s = 0, 0.0
@@ -279,18 +289,19 @@ class ZeroRecorder:
 
 
 AT_REST = [(0.03, 3.8)] * (round(REST_S) + 2)
+"""Currents [A] and voltages [V] of a rest that suffices, one a second. 0.03 A may be the offset."""
 
 
 async def test_current_zero_is_accepted_at_rest() -> None:
     zero = ZeroRecorder()
-    async with running(current_zero=zero, clock=zero.clock) as run:
+    async with run_loop(current_zero=zero, clock=zero.clock) as run:
         await zero.feed(run, AT_REST)
         assert await run.ask("current_zero") == {}
     assert zero.calls == 1
 
 
 @pytest.mark.parametrize(
-    ("rows", "why"),
+    ("rows", "reason"),
     [
         ([], "no usable sample"),
         (AT_REST[:5], "watched for"),
@@ -299,18 +310,18 @@ async def test_current_zero_is_accepted_at_rest() -> None:
         ([*AT_REST, (0.03, 3.7), (0.03, 3.7)], "the voltage moved by 0.1 V"),
     ],
 )
-async def test_current_zero_is_rejected_while_current_flows(rows: list[tuple[float, float]], why: str) -> None:
+async def test_current_zero_is_rejected_without_a_sufficient_rest(rows: list[tuple[float, float]], reason: str) -> None:
     zero = ZeroRecorder()
-    async with running(current_zero=zero, clock=zero.clock) as run:
+    async with run_loop(current_zero=zero, clock=zero.clock) as run:
         await zero.feed(run, rows)
-        with pytest.raises(UserError, match=why):
+        with pytest.raises(UserError, match=reason):
             await run.ask("current_zero")
     assert zero.calls == 0
 
 
-async def test_rest_before_a_silence_does_not_count() -> None:
+async def test_current_zero_is_rejected_after_a_silence_of_the_board_that_follows_a_rest() -> None:
     zero = ZeroRecorder()
-    async with running(current_zero=zero, clock=zero.clock) as run:
+    async with run_loop(current_zero=zero, clock=zero.clock) as run:
         await zero.feed(run, AT_REST)
         zero.now_s += REST_S
         await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))
@@ -321,16 +332,16 @@ async def test_rest_before_a_silence_does_not_count() -> None:
 
 
 async def test_current_zero_is_rejected_by_a_source_without_it() -> None:
-    async with running() as run:
+    async with run_loop() as run:
         await run.sink.until(lambda _: True)
         with pytest.raises(UserError, match="no zero"):
             await run.ask("current_zero")
 
 
-async def test_a_parameter_has_its_source_and_a_missing_capacitance_its_reason() -> None:
+async def test_published_parameters_have_their_source_and_a_missing_capacitance_its_reason() -> None:
     changes = {"pack": PackSettings(initial_soc=0.001), "identifier": IdentifierSettings(soc_std=0.005)}
     nearly_empty = SETTINGS.model_copy(update=changes)
-    async with running(nearly_empty) as run:
+    async with run_loop(nearly_empty) as run:
         run.source.give((0.0, 0.0, 2.5))
         run.source.finish()
         await run.task
@@ -349,20 +360,20 @@ async def test_systemd_is_notified_of_ready_watchdog_and_stopping(tmp_path: Path
         environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "300000"}
         received: list[str] = []
 
-        async def hear(wanted: str, times: int) -> None:
+        async def wait_for_notices(wanted: str, times: int) -> None:
             while received.count(wanted) < times:
                 received.append((await asyncio.get_running_loop().sock_recv(systemd, 4096)).decode())
 
         async with asyncio.timeout(LONG_S):
-            async with running(notifier=SystemdNotifier([SETTINGS.pack.name], environment)) as run:
-                await hear("WATCHDOG=1", times=3)
+            async with run_loop(notifier=SystemdNotifier([SETTINGS.pack.name], environment)) as run:
+                await wait_for_notices("WATCHDOG=1", times=3)
                 await run.end()
-            await hear("STOPPING=1", times=1)
+            await wait_for_notices("STOPPING=1", times=1)
     assert received[0].startswith("READY=1\nSTATUS=")
 
 
 async def test_a_source_that_never_waits_does_not_starve_the_sinks() -> None:
-    class Endless(ScriptedSource):
+    class EndlessSource(ScriptedSource):
         async def __aiter__(self) -> AsyncIterator[Any]:
             block = np.zeros(10, dtype=SAMPLE)
             block["voltage_v"] = 3.8
@@ -371,24 +382,24 @@ async def test_a_source_that_never_waits_does_not_starve_the_sinks() -> None:
                 yield block
 
     stop, sink = asyncio.Event(), Collector()
-    running = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, source=Endless(), sinks=[sink], stop=stop))
+    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, source=EndlessSource(), sinks=[sink], stop=stop))
     await sink.until(lambda _: len(estimates(sink)) >= 3)
     stop.set()
-    await asyncio.wait_for(running, LONG_S)
+    await asyncio.wait_for(task, LONG_S)
 
 
 async def test_an_exception_of_the_source_is_raised() -> None:
-    class Broken(ScriptedSource):
+    class BrokenSource(ScriptedSource):
         async def __aiter__(self) -> AsyncIterator[Any]:
             raise ZeroDivisionError
             yield
 
     with pytest.raises(ZeroDivisionError):
-        await run_estimation_loop(SETTINGS, CELL, source=Broken(), sinks=[], stop=asyncio.Event())
+        await run_estimation_loop(SETTINGS, CELL, source=BrokenSource(), sinks=[], stop=asyncio.Event())
 
 
 async def test_the_lag_of_the_event_loop_is_published() -> None:
-    async with running() as run:
+    async with run_loop() as run:
         await run.sink.until(lambda _: True)
         time.sleep(0.4)  # noqa: ASYNC251 - blocks the loop, as a slow disk or terminal would
         await run.sink.until(lambda s: s.health.loop_lag_s > 0.4 - LAG_STEP_S)

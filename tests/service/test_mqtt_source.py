@@ -21,12 +21,12 @@ from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S, end
 
-STATE, HEALTH, AVAILABILITY = "bms/pack/state", "bms/pack/health", "bms/pack/sensor/availability"
-ONLINE = AVAILABILITY, b"online"
+STATE_TOPIC, HEALTH_TOPIC, AVAILABILITY_TOPIC = "bms/pack/state", "bms/pack/health", "bms/pack/sensor/availability"
+ONLINE_MESSAGE = AVAILABILITY_TOPIC, b"online"
 
 
-def settings(broker: Broker, **source: object) -> Settings:
-    """Return the settings of a pack whose JK-BMS is published by an ESPHome node."""
+def esphome_settings(broker: Broker, **source: object) -> Settings:
+    """Return the settings of a pack whose JK-BMS is published by an ESPHome node, with changes of ``[source]``."""
     jk = {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms", "interval_s": 0.2}
     return Settings.model_validate(
         {
@@ -39,7 +39,7 @@ def settings(broker: Broker, **source: object) -> Settings:
 
 
 async def publish(broker: Broker, voltage: str, current: str) -> None:
-    """Publish each value as a retained message, the default of ESPHome."""
+    """Publish the four values of the node as retained messages, the default of ESPHome. Charge current is positive."""
     values = {"cell_voltage_1": "3.301", "temperature_sensor_1": "21.5", "total_voltage": voltage, "current": current}
     async with aiomqtt.Client("127.0.0.1", broker.port) as client:
         for name, value in values.items():
@@ -64,9 +64,12 @@ async def publishing(broker: Broker, voltage: str, current: str) -> AsyncIterato
 
 
 @contextlib.asynccontextmanager
-async def serving(settings_: Settings, tap: CaptureRecorder | None = None) -> AsyncIterator[None]:
+async def serving(pack_settings: Settings, tap: CaptureRecorder | None = None) -> AsyncIterator[None]:
+    """Run a service, whose messages ``tap`` records."""
     stop = asyncio.Event()
-    service = asyncio.create_task(run_pack_service(settings_, load_cell("lfp", 100.0).pack(16, 1), stop=stop, tap=tap))
+    service = asyncio.create_task(
+        run_pack_service(pack_settings, load_cell("lfp", 100.0).pack(16, 1), stop=stop, tap=tap)
+    )
     try:
         yield
     finally:
@@ -74,13 +77,13 @@ async def serving(settings_: Settings, tap: CaptureRecorder | None = None) -> As
         await asyncio.wait_for(service, LONG_S)
 
 
-async def test_readings_over_mqtt_are_estimated_through_disconnections_and_restarts(
+async def test_only_live_and_valid_values_are_estimated_also_after_a_restart_of_the_broker(
     broker: Broker, tmp_path: Path
 ) -> None:
     await publish(broker, "40.00", "99.0")  # retained messages of an earlier run
-    settings_, path = settings(broker), tmp_path / "lines.raw"
-    with CaptureRecorder(path, make_header(settings_.sensor, settings_.source)) as recording:
-        async with serving(settings_, recording):
+    pack_settings, path = esphome_settings(broker), tmp_path / "lines.raw"
+    with CaptureRecorder(path, make_header(pack_settings.sensor, pack_settings.source)) as recording:
+        async with serving(pack_settings, recording):
             async with Listener(broker, "bms/#") as listener:
                 await check_live_and_retained(broker, listener)
                 await check_silence(listener)
@@ -88,27 +91,27 @@ async def test_readings_over_mqtt_are_estimated_through_disconnections_and_resta
             broker.stop()
             broker.start()
             async with Listener(broker, "bms/#") as listener, publishing(broker, "52.00", "3.5"):
-                state = await listener.wait_json(STATE, lambda s: s["voltage_v"] == 52.0)
+                state = await listener.wait_json(STATE_TOPIC, lambda s: s["voltage_v"] == 52.0)
                 assert state["current_a"] == -3.5
-                await listener.wait_json(HEALTH, lambda h: h["reconnects"] >= 1)
+                await listener.wait_json(HEALTH_TOPIC, lambda h: h["reconnects"] >= 1)
     assert min(block["voltage_v"].min() for block in RawCapture(path)) == 52.0
 
 
 async def check_live_and_retained(broker: Broker, listener: Listener) -> None:
     """Check that live messages are used and retained ones are ignored."""
-    await listener.wait_json(HEALTH, lambda h: h["line"]["retained"] == 4)
+    await listener.wait_json(HEALTH_TOPIC, lambda h: h["line"]["retained"] == 4)
     async with publishing(broker, "53.00", "-12.5"):
-        state = await listener.wait_json(STATE)
+        state = await listener.wait_json(STATE_TOPIC)
         assert (state["voltage_v"], state["current_a"], state["temperature_c"]) == (53.0, 12.5, 21.5)
         assert state["cell_lowest_v"] == 3.301
-        await listener.wait_json(HEALTH, lambda h: h["sensor_online"])
+        await listener.wait_json(HEALTH_TOPIC, lambda h: h["sensor_online"])
 
 
 async def check_silence(listener: Listener) -> None:
     """Check that the sensor goes offline after the last message."""
-    online = max(i for i, (topic, payload, _) in enumerate(listener.messages) if (topic, payload) == ONLINE)
-    await listener.wait(AVAILABILITY, lambda payload: payload == b"offline", skip=online)
-    health = await listener.wait_json(HEALTH, lambda h: not h["sensor_online"], skip=online)
+    online = max(i for i, (topic, payload, _) in enumerate(listener.messages) if (topic, payload) == ONLINE_MESSAGE)
+    await listener.wait(AVAILABILITY_TOPIC, lambda payload: payload == b"offline", skip=online)
+    health = await listener.wait_json(HEALTH_TOPIC, lambda h: not h["sensor_online"], skip=online)
     assert health["sensor_message"]
 
 
@@ -117,16 +120,16 @@ async def check_invalid_payloads(broker: Broker, listener: Listener) -> None:
     skip = len(listener.messages)
     await publish(broker, "unavailable", "nan")
     reason = f"esphome-jk jk-bms by MQTT, {broker.url}: voltage: jk-bms/sensor/jk-bms_total_voltage/state: no number: "
-    health = await listener.wait_json(HEALTH, lambda h: (h["sensor_message"] or "").startswith(reason), skip=skip)
+    health = await listener.wait_json(HEALTH_TOPIC, lambda h: (h["sensor_message"] or "").startswith(reason), skip=skip)
     assert health["line"]["no_number"] >= 2
     assert not health["sensor_online"]
 
 
 async def test_a_publisher_that_needs_requests_is_polled(broker: Broker) -> None:
-    settings_ = settings(broker, profile="venus", prefix="c0619ab", instance="1", ask_s=0.1)
+    pack_settings = esphome_settings(broker, profile="venus", prefix="c0619ab", instance="1", ask_s=0.1)
 
-    async def answer() -> None:
-        """Answer requests only, as the device does."""
+    async def answer_requests() -> None:
+        """Publish values only on request, as the device does."""
         async with aiomqtt.Client("127.0.0.1", broker.port) as client:
             await client.subscribe("R/c0619ab/#")
             async for message in client.messages:
@@ -135,10 +138,10 @@ async def test_a_publisher_that_needs_requests_is_polled(broker: Broker) -> None
                         payload = '{"value":%s}' % ("null" if value is None else value)
                         await client.publish(f"N/c0619ab/battery/1/{name}", payload)
 
-    async with Listener(broker) as listener, serving(settings_):
-        device = asyncio.create_task(answer())
+    async with Listener(broker) as listener, serving(pack_settings):
+        device = asyncio.create_task(answer_requests())
         try:
-            state = await listener.wait_json(STATE)
+            state = await listener.wait_json(STATE_TOPIC)
             assert (state["voltage_v"], state["current_a"], state["temperature_c"]) == (52.5, 4.0, None)
             keepalive = await listener.wait("R/c0619ab/keepalive")
             assert keepalive == b'{"keepalive-options":["suppress-republish"]}'
@@ -147,29 +150,31 @@ async def test_a_publisher_that_needs_requests_is_polled(broker: Broker) -> None
 
 
 async def test_the_next_broker_is_tried_and_the_unreachable_one_is_named(broker: Broker) -> None:
-    dead = f"mqtt://127.0.0.1:{free_port()}"
-    source = open_line_source(settings(broker, url=[dead, broker.url]))
+    unreachable = f"mqtt://127.0.0.1:{free_port()}"
+    source = open_line_source(esphome_settings(broker, url=[unreachable, broker.url]))
     assert source
     with capture_logs() as lines:
         async with asyncio.timeout(LONG_S), source, publishing(broker, "53.00", "-12.5"):
-            async for block in source:
+            async for block, _ in source:
                 assert block["voltage_v"][0] == 53.0
                 break
     reasons = [line["reason"] for line in lines if line["event"] == "no samples"]
     assert len(reasons) == 1
-    assert reasons[0].startswith(f"esphome-jk jk-bms by MQTT, {dead}: ")
+    assert reasons[0].startswith(f"esphome-jk jk-bms by MQTT, {unreachable}: ")
     assert reasons[0].endswith("; trying again")
 
 
 async def test_a_second_publisher_raises_sensor_fault(broker: Broker) -> None:
     """The real node publishes 5 A. A second one answers each of its messages with -80 A."""
-    settings_ = settings(broker, profile=None, prefix=None, topic="home/pack", voltage="u", current="i", interval_s=2.0)
-    settings_ = settings_.model_copy(
+    pack_settings = esphome_settings(
+        broker, profile=None, prefix=None, topic="home/pack", voltage="u", current="i", interval_s=2.0
+    )
+    pack_settings = pack_settings.model_copy(
         update={"alarms": AlarmSettings.model_validate({"sensor_fault": {"delay_s": 0.5}})}
     )
     attacked = asyncio.Event()
 
-    async def nodes() -> None:
+    async def run_nodes() -> None:
         async with aiomqtt.Client("127.0.0.1", broker.port) as client:
             while True:
                 await client.publish("home/pack", b'{"u": 53.0, "i": 5.0}')
@@ -177,13 +182,13 @@ async def test_a_second_publisher_raises_sensor_fault(broker: Broker) -> None:
                     await client.publish("home/pack", b'{"u": 53.0, "i": -80.0}')
                 await asyncio.sleep(0.05)
 
-    async with Listener(broker, "bms/#") as listener, serving(settings_):
-        publishers = asyncio.create_task(nodes())
+    async with Listener(broker, "bms/#") as listener, serving(pack_settings):
+        publishers = asyncio.create_task(run_nodes())
         try:
-            await listener.wait_json(STATE, lambda s: s["frames_received"] > 20)
+            await listener.wait_json(STATE_TOPIC, lambda s: s["frames_received"] > 20)
             assert not json.loads(await listener.wait("bms/pack/alarm/sensor_fault"))["active"]
             attacked.set()
             await listener.wait_json("bms/pack/alarm/sensor_fault", lambda alarm: alarm["active"])
-            await listener.wait_json(HEALTH, lambda h: h["line"]["publisher_errors"] > 0)
+            await listener.wait_json(HEALTH_TOPIC, lambda h: h["line"]["publisher_errors"] > 0)
         finally:
             await end(publishers)

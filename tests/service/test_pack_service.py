@@ -20,13 +20,13 @@ from tests.patience import LONG_S
 async def test_implausible_settings_are_logged():
     settings = Settings(pack=PackSettings(series=14), sensor=SensorSettings(port="/dev/none"))
     stop = asyncio.Event()
-    stop.set()
+    stop.set()  # the service ends at once
     with capture_logs() as lines:
         await run_pack_service(settings, load_cell("ncr18650").pack(14, 1), stop=stop)
-    text = [line["reason"] for line in lines if line["event"] == "implausible setting"]
-    assert len(text) == 2
-    assert "14 in series of 3 Ah" in text[0]
-    assert "the board's range ends at 25.0 V" in text[1]
+    reasons = [line["reason"] for line in lines if line["event"] == "implausible setting"]
+    assert len(reasons) == 2
+    assert "14 in series of 3 Ah" in reasons[0]
+    assert "the board's range ends at 25.0 V" in reasons[1]
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,8 @@ async def test_the_error_names_the_pack_that_cannot_be_served(
         await asyncio.wait_for(run_pack_services(packs), LONG_S)
 
 
-async def test_packs_without_a_serial_line_may_share_the_port_setting(state_home: Path) -> None:
+async def test_packs_without_a_serial_line_may_have_equal_port_settings(state_home: Path) -> None:
+    """Both packs pass the check of the ports. The error about pack b is a later one, which ends the test."""
     source = {"kind": "mqtt", "profile": "opendtu", "url": "mqtt://localhost"}
     sources = {"a": source, "b": source | {"password_file": "/none"}}
     tables = [{"pack": {"name": name}, "source": table} for name, table in sources.items()]
@@ -66,7 +67,7 @@ def test_without_a_home_folder_the_service_runs_and_logs_that_state_is_not_saved
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("XDG_STATE_HOME")
-    monkeypatch.setenv("HOME", "~")
+    monkeypatch.setenv("HOME", "~")  # the state folder then cannot be found, as for a user without a home folder
     with capture_logs() as lines:
         state_folder(Settings())
     assert [line["event"] for line in lines] == ["the state will be lost at a restart"]

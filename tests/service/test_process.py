@@ -1,4 +1,4 @@
-"""Service as a process: signals, kills, last wills at the broker, full and hanging disks, and errors at the start."""
+"""Service as a process: signals, kills, last wills at the broker, full and hanging disks, and signals at the start."""
 
 import asyncio
 import contextlib
@@ -21,6 +21,7 @@ from tests.serial_line import Line
 
 
 def pack_file(folder: Path, line: Line, broker: Broker, name: str = "pack", state: str = "") -> Path:
+    """Write a pack file. ``state`` is its section ``[state]``. Return its path."""
     path = folder / f"{name}.toml"
     path.write_text(
         f"""
@@ -60,7 +61,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 from bms_estimator.cli.main import main
 main()
 """
-"""Program with the default SIGHUP, which the tests themselves may ignore, as under nohup."""
+"""Program with the default action of SIGHUP. Under nohup it would inherit from the tests that SIGHUP is ignored."""
 
 
 SIGNAL_DURING_START = """
@@ -74,13 +75,14 @@ def load_kernels():
 run.load_kernels = load_kernels
 main()
 """
-"""Program that gets SIGTERM before it serves."""
+"""Program that gets SIGTERM while it loads its kernels."""
 
 
 @contextlib.asynccontextmanager
 async def service(
     *packs: Path, stderr: int | IO[str] = asyncio.subprocess.PIPE, program: Sequence[str] = (str(PROGRAM),)
 ) -> AsyncIterator[Process]:
+    """Run a service as a process, which is killed at the end. ``program`` replaces ``bms-estimator``."""
     process = await asyncio.create_subprocess_exec(
         *program,
         "run",
@@ -98,11 +100,12 @@ async def service(
 
 
 def checkpoints(state_home: Path) -> list[Path]:
+    """Return the checkpoints in the default state folder."""
     return list((state_home / "bms-estimator").glob("*.npz"))
 
 
 async def stop_service(process: Process) -> list[Any]:
-    """Stop the service by SIGTERM. Return its log."""
+    """Stop the service by SIGTERM. Return the decoded lines of its log."""
     process.send_signal(signal.SIGTERM)
     assert process.stderr
     log = await asyncio.wait_for(process.stderr.read(), LONG_S)
@@ -110,10 +113,10 @@ async def stop_service(process: Process) -> list[Any]:
     return [json.loads(line) for line in log.decode().splitlines()]  # a pipe gets JSON
 
 
-async def feed(line: Line) -> None:
-    """Print text like a board at 50 Hz, also while the line is not read."""
+async def print_samples(line: Line) -> None:
+    """Print lines like a board at 50 Hz. Lines are lost while the line is full, as with a board."""
     with contextlib.suppress(OSError):  # not opened yet
-        line.received()  # the board continues while the line is full
+        line.received()  # from now on, writing to a full line fails instead of blocking
     while True:
         with contextlib.suppress(BlockingIOError):
             line.write(b"3.80,0.10,25.0\r\n")
@@ -124,7 +127,7 @@ async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     line.plug()
-    board = asyncio.create_task(feed(line))
+    board = asyncio.create_task(print_samples(line))
     pack = pack_file(tmp_path, line, broker)
     async with Listener(broker) as live:
         async with service(pack) as process:
@@ -140,6 +143,7 @@ async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_
         await live.wait("bms/pack/availability", lambda p: p == b"offline", skip=before)
     board.cancel()
     (checkpoint,) = checkpoints(state_home)  # no folder is configured
+    # only the owner may access the folder and its files
     assert {path.stat().st_mode & 0o077 for path in (checkpoint.parent, *checkpoint.parent.iterdir())} == {0}
     assert str(checkpoint) in {line.get("file") for line in lines}
 
@@ -149,13 +153,13 @@ async def test_a_full_disk_does_not_end_the_service(
 ) -> None:
     """Neither checkpoints nor the log can be written, and the estimates continue."""
     line.plug()
-    board = asyncio.create_task(feed(line))
+    board = asyncio.create_task(print_samples(line))
     pack = pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{full_disk}"\ncheckpoint_s = 1\n')
     async with Listener(broker) as live:
         with (full_disk / "log").open("w") as log:
             async with service(pack, stderr=log) as process:
-                output = "cannot be saved: [Errno 28] No space left on device"
-                await live.wait_json("bms/pack/health", lambda h: h["checkpoint"] == output)
+                checkpoint_status = "cannot be saved: [Errno 28] No space left on device"
+                await live.wait_json("bms/pack/health", lambda h: h["checkpoint"] == checkpoint_status)
                 before = len(live.messages)
                 state = await live.wait_json("bms/pack/state", skip=before)
                 frames = state["frames_received"] + 20
@@ -167,7 +171,7 @@ async def test_a_full_disk_does_not_end_the_service(
 
 @contextlib.contextmanager
 def unread_pipe() -> Iterator[int]:
-    """Yield the write end of a full pipe that is not read."""
+    """Yield the write end of a pipe that is full and is not read."""
     read, write = os.pipe()
     os.set_blocking(write, False)
     with contextlib.suppress(BlockingIOError):
@@ -181,11 +185,11 @@ def unread_pipe() -> Iterator[int]:
         os.close(write)
 
 
-async def test_a_stopping_service_saves_first_although_its_broker_hangs(
+async def test_a_stopping_service_saves_its_checkpoint_although_its_broker_hangs(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     line.plug()
-    board = asyncio.create_task(feed(line))
+    board = asyncio.create_task(print_samples(line))
     async with Listener(broker) as live, service(pack_file(tmp_path, line, broker)) as process:
         state = await live.wait_json("bms/pack/state", lambda s: s["frames_received"] > 50)
         broker.freeze()
@@ -205,7 +209,7 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
 ) -> None:
     """The log is not read, as if it were on the hanging disk, too."""
     line.plug()
-    board = asyncio.create_task(feed(line))
+    board = asyncio.create_task(print_samples(line))
     program, pack = [sys.executable, "-c", HUNG_DISK], pack_file(tmp_path, line, broker)
     with unread_pipe() as log:
         async with Listener(broker) as live, service(pack, program=program, stderr=log) as process:
@@ -218,7 +222,7 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
 
 
 @pytest.mark.parametrize(
-    "number",
+    "signal_number",
     [
         signal.SIGHUP,
         pytest.param(signal.SIGTERM, marks=pytest.mark.thorough),  # ends the service of most tests in this file
@@ -226,13 +230,13 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
     ],
     ids=lambda number: number.name,
 )
-async def test_hangup_ends_the_service_cleanly(
-    tmp_path: Path, line: Line, broker: Broker, number: signal.Signals
+async def test_hangup_termination_and_interrupt_end_the_service_cleanly(
+    tmp_path: Path, line: Line, broker: Broker, signal_number: signal.Signals
 ) -> None:
     pack, program = pack_file(tmp_path, line, broker, "house"), [sys.executable, "-c", DEFAULT_HANGUP]
     async with Listener(broker) as live, service(pack, program=program) as process:
         await live.wait("bms/house/health")
-        process.send_signal(number)
+        process.send_signal(signal_number)
         await live.wait("bms/house/availability", lambda payload: payload == b"offline")
         assert await asyncio.wait_for(process.wait(), LONG_S) == 0
 
@@ -248,7 +252,7 @@ async def test_a_service_that_is_still_starting_ends_cleanly_on_a_signal(
     assert json.loads(log)["event"] == "asked to end before samples were taken"
 
 
-async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_restarts(
+async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_restarts_the_service(
     tmp_path: Path, line: Line, broker: Broker, disk_without_files: Path
 ) -> None:
     folder = disk_without_files / "state"
@@ -259,19 +263,19 @@ async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_r
     assert output == f"error: state.folder = {folder}: No space left on device\n"
 
 
-async def test_two_packs_in_one_process_have_their_own_board_topics_log_and_checkpoint(
+async def test_two_packs_in_one_process_have_boards_topics_log_lines_and_checkpoints_of_their_own(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
     other = Line(tmp_path / "other board")
     packs = [pack_file(tmp_path, line, broker, "house"), pack_file(tmp_path, other, broker, "shed")]
     line.plug()
-    boards = [asyncio.create_task(feed(line))]
+    boards = [asyncio.create_task(print_samples(line))]
     async with Listener(broker) as live, service(*packs) as process:
         house = await live.wait_json("bms/house/health", lambda h: h["sensor_online"])
         shed = await live.wait_json("bms/shed/health", lambda h: "does not exist" in (h["sensor_message"] or ""))
         assert house["samples"]["samples"] > 0 == shed["samples"]["samples"]
         other.plug()
-        boards.append(asyncio.create_task(feed(other)))
+        boards.append(asyncio.create_task(print_samples(other)))
         await live.wait_json("bms/shed/state")
         lines = await stop_service(process)
         for name in ("house", "shed"):

@@ -25,29 +25,34 @@ from tests.scripted_source import ScriptedSource
 
 
 class Systemd:
-    """Receiver of the notifications of one pack's service."""
+    """Receiver of a pack's notifications to systemd.
+
+    Attributes:
+        notifier: Sender of the notifications, for the service under test.
+    """
 
     def __init__(self, path: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(path))
         self._socket.setblocking(False)
+        # a watchdog of 30 ms, so that tests do not wait
         self.notifier = SystemdNotifier([SETTINGS.pack.name], {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": "30000"})
 
     async def wait_for(self, prefix: str) -> str:
-        """Wait for a notification that begins with ``prefix``."""
+        """Wait for a notification that begins with ``prefix``. Return it."""
         async with asyncio.timeout(LONG_S):
             while True:
-                state = (await asyncio.get_running_loop().sock_recv(self._socket, 4096)).decode()
-                if state.startswith(prefix):
-                    return state
+                notification = (await asyncio.get_running_loop().sock_recv(self._socket, 4096)).decode()
+                if notification.startswith(prefix):
+                    return notification
 
     def received(self) -> list[str]:
         """Return the notifications that have arrived since the last call."""
-        states = []
+        notifications = []
         with contextlib.suppress(BlockingIOError):
             while True:
-                states.append(self._socket.recv(4096).decode())
-        return states
+                notifications.append(self._socket.recv(4096).decode())
+        return notifications
 
     def close(self) -> None:
         self._socket.close()
@@ -61,15 +66,15 @@ def systemd(tmp_path: Path):
 
 
 async def test_a_hanging_source_stops_the_watchdog_notifications(systemd: Systemd) -> None:
-    health = SourceHealth(0.0, 0.0, 0)
+    health = SourceHealth(task_idle_s=0.0, block_age_s=0.0, queued_reads=0)
     source, sink = ScriptedSource(), Collector()
     arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
     task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **arguments, source_health=lambda: health))
     await systemd.wait_for("WATCHDOG=1")  # no sample arrives, but the source still tries
-    health = SourceHealth(publisher.SOURCE_HUNG_S + 1.0, 0.0, 0)
+    health = health._replace(task_idle_s=publisher.SOURCE_HUNG_S + 1.0)
     for _ in range(3):
         await sink.until(lambda _: True, skip=len(sink.snapshots))
-    systemd.received()
+    systemd.received()  # removes notifications from before
     for _ in range(3):
         await sink.until(lambda _: True, skip=len(sink.snapshots))
     assert "WATCHDOG=1" not in systemd.received()
@@ -94,6 +99,7 @@ async def test_the_idle_time_of_a_source_s_task_grows_while_it_hangs(
         for _ in range(3):
             now_s += 10.0
             async with asyncio.timeout(LONG_S):
+                # the next attempt to open the missing port ends the idle time
                 while board.health().task_idle_s > 0.0:  # noqa: ASYNC110 - the idle time has no event
                     await asyncio.sleep(0.001)
     monkeypatch.setattr(SerialPort, "open", hang)
@@ -108,7 +114,7 @@ async def test_systemctl_status_shows_the_soc_or_the_reason_for_missing_samples(
     arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
     task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **arguments))
     assert await systemd.wait_for("READY=1") == "READY=1\nSTATUS=estimating pack"
-    source.message = "waiting for /dev/none: it does not exist"
+    source.silence_reason = "waiting for /dev/none: it does not exist"
     await systemd.wait_for("STATUS=estimating pack: no samples: ")
     source.give((0.0, 0.1, 3.8))
     assert (await systemd.wait_for("STATUS=estimating pack: SOC 0.")).startswith("STATUS=estimating pack: SOC 0.5")
@@ -116,11 +122,11 @@ async def test_systemctl_status_shows_the_soc_or_the_reason_for_missing_samples(
     await asyncio.wait_for(task, LONG_S)
 
 
-async def test_health_contains_latency_and_waiting_reads() -> None:
+async def test_health_contains_the_latency_of_samples_and_the_number_of_waiting_reads() -> None:
     source, sink = ScriptedSource(), Collector()
-    latency_s = [0.3]
+    health = SourceHealth(task_idle_s=0.0, block_age_s=0.3, queued_reads=7)
     arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
-    live = run_estimation_loop(SETTINGS, CELL, **arguments, source_health=lambda: SourceHealth(0.0, latency_s[0], 7))
+    live = run_estimation_loop(SETTINGS, CELL, **arguments, source_health=lambda: health)
     task = asyncio.create_task(live)
     first = await sink.until(lambda _: True)
     assert first.health.loop.latency_p50_s is None
@@ -133,7 +139,7 @@ async def test_health_contains_latency_and_waiting_reads() -> None:
     assert (loop_health.latency_p50_s, loop_health.latency_p99_s) == (0.3, 0.3)
 
 
-def test_latency_percentiles_are_accurate_to_a_fifth() -> None:
+def test_latency_percentiles_are_at_most_a_fifth_too_high() -> None:
     latency = Latency()
     assert latency.take() is None
     for latency_s in [0.002] * 97 + [0.05, 0.05, 0.7]:
@@ -142,7 +148,7 @@ def test_latency_percentiles_are_accurate_to_a_fifth() -> None:
     assert 0.002 <= p50_s < 0.0024
     assert 0.05 <= p99_s < 0.06
     assert max_s == 0.7
-    for latency_s in (-1.0, 0.0, 1e6):
+    for latency_s in (-1.0, 0.0, 1e6):  # beyond the range of the percentiles
         latency.add(latency_s)
     assert latency.take() == pytest.approx((1e-5, 284.0, 1e6), rel=0.5)
 
@@ -151,9 +157,9 @@ def test_health_contains_the_state_of_a_recording(tmp_path: Path) -> None:
     assert recording_health(None) is None
     with CaptureRecorder(tmp_path / "raw", make_header(SensorSettings())) as recording:
         recording.write(0.0, b"12345")
-        on = recording_health(recording)
-        assert on
-        assert (on.on, on.bytes, on.missed_reads) == (True, 5, 0)
-    ended = recording_health(recording)
-    assert ended
-    assert not ended.on
+        during = recording_health(recording)
+        assert during
+        assert (during.on, during.bytes, during.missed_reads) == (True, 5, 0)
+    after = recording_health(recording)
+    assert after
+    assert not after.on

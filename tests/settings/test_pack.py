@@ -12,6 +12,7 @@ CHEN_MORA = Path(__file__).parents[2] / "bms_estimator" / "model" / "cells" / "c
 
 
 def write_edited_cell(tmp_path: Path, old: str, new: str) -> Path:
+    """Write the file of the shipped cell ``chen_mora`` with ``old`` replaced by ``new``; return its path."""
     text = CHEN_MORA.read_text()
     assert old in text
     path = tmp_path / "cell.toml"
@@ -41,7 +42,7 @@ def write_edited_cell(tmp_path: Path, old: str, new: str) -> Path:
         ("[cell]", "[cell", r"cell\.toml: not valid TOML: .*line 5"),
     ],
 )
-def test_error_in_a_cell_file_names_key_value_and_allowed_values(
+def test_the_error_on_an_invalid_cell_file_names_key_value_and_allowed_values(
     tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     with pytest.raises(UserError, match=message):
@@ -57,7 +58,7 @@ def test_all_invalid_keys_are_reported_together(tmp_path: Path) -> None:
     assert len(str(error.value).splitlines()) >= 2
 
 
-def test_error_on_an_unknown_cell_lists_the_shipped_cells() -> None:
+def test_the_error_on_an_unknown_cell_lists_the_shipped_cells() -> None:
     with pytest.raises(UserError, match=r"no such cell file, nor a shipped cell \(chen_mora, .*thunder_power_6s\)"):
         load_cell("lifepo5")
 
@@ -75,11 +76,12 @@ def test_error_on_an_unknown_cell_lists_the_shipped_cells() -> None:
         ),
     ],
 )
-def test_table_ocv_must_increase_from_empty_to_full(tmp_path: Path, table: str, message: str) -> None:
+def test_an_ocv_table_must_increase_from_empty_to_full(tmp_path: Path, table: str, message: str) -> None:
     text = CHEN_MORA.read_text()
-    head, rest = text.split("[ocv]", 1)
+    before_ocv, ocv_and_rest = text.split("[ocv]", 1)
+    _, after_ocv = ocv_and_rest.split("[adaptation]", 1)
     path = tmp_path / "cell.toml"
-    path.write_text(head + f'[ocv]\nform = "table"\n{table}\n' + "[adaptation]" + rest.split("[adaptation]", 1)[1])
+    path.write_text(f'{before_ocv}[ocv]\nform = "table"\n{table}\n[adaptation]{after_ocv}')
     with pytest.raises(UserError, match=message):
         load_cell(path)
 
@@ -99,7 +101,9 @@ def test_table_ocv_must_increase_from_empty_to_full(tmp_path: Path, table: str, 
         ("[sensor]\nsample_rate_hz = 5000", r"sensor\.sample_rate_hz = 5000: .*1000"),
     ],
 )
-def test_error_names_the_invalid_setting(tmp_path: Path, text: str, message: str) -> None:
+def test_the_error_on_an_invalid_setting_names_key_value_and_allowed_values(
+    tmp_path: Path, text: str, message: str
+) -> None:
     path = tmp_path / "pack.toml"
     path.write_text(text)
     with pytest.raises(UserError, match=message):
@@ -112,7 +116,7 @@ def test_empty_settings_are_the_defaults(tmp_path: Path) -> None:
     assert load_settings(path) == Settings()
 
 
-def test_printed_gain_law_is_configurable(tmp_path: Path) -> None:
+def test_the_gain_law_of_the_thesis_is_configurable(tmp_path: Path) -> None:
     path = tmp_path / "pack.toml"
     path.write_text('[observer]\nrearm_gain = "never"\ndead_zone_v = 0.0\nlambda = 2.0\n')
     observer = load_settings(path).observer
@@ -128,26 +132,28 @@ def test_printed_gain_law_is_configurable(tmp_path: Path) -> None:
         ('[identifier]\nenabled = false\n[observer]\nlaw = "improved"', "improved"),
     ],
 )
-def test_default_law_without_the_identifier_is_learning(tmp_path: Path, text: str, law: str) -> None:
+def test_the_default_law_without_the_identifier_is_learning(tmp_path: Path, text: str, law: str) -> None:
     path = tmp_path / "pack.toml"
     path.write_text(text)
     assert load_settings(path).observer.law == law
 
 
-def test_pack_scales_the_cell() -> None:
+def test_a_pack_has_the_values_of_its_cell_times_cells_in_series_and_parallel() -> None:
+    """Three cells in series and two in parallel have 3 / 2 of a cell's resistance, and 2 / 3 of its capacitance."""
     cell = load_cell("chen_mora")
     pack = cell.pack(series=3, parallel=2)
+    resistance, exponent_of_c_ts, capacitance, exponent_of_r_s, voltage = 1, 8, 9, 14, 18  # indices in a1..a21
     assert pack.cell.capacity_ah == pytest.approx(0.55)
     assert pack.cell.nominal_voltage_v == pytest.approx(11.1)
     assert pack.cell.current_max_a == pytest.approx(10.0)
     assert pack.cell.series_count == 3
-    assert pack.a[1] == pytest.approx(cell.a[1] * 1.5)
-    assert pack.a[9] == pytest.approx(cell.a[9] / 1.5)
-    assert pack.a[14] == cell.a[14]
-    assert pack.a[18] == pytest.approx(cell.a[18] * 3)
-    assert pack.bounds(1).limit == pytest.approx(cell.bounds(1).limit * 1.5)
-    assert pack.bounds(9).limit == pytest.approx(cell.bounds(9).limit / 1.5)
-    assert pack.bounds(8).limit == cell.bounds(8).limit
+    assert pack.a[resistance] == pytest.approx(cell.a[resistance] * 1.5)
+    assert pack.a[capacitance] == pytest.approx(cell.a[capacitance] / 1.5)
+    assert pack.a[exponent_of_r_s] == cell.a[exponent_of_r_s]
+    assert pack.a[voltage] == pytest.approx(cell.a[voltage] * 3)
+    assert pack.bounds(resistance).limit == pytest.approx(cell.bounds(resistance).limit * 1.5)
+    assert pack.bounds(capacitance).limit == pytest.approx(cell.bounds(capacitance).limit / 1.5)
+    assert pack.bounds(exponent_of_c_ts).limit == cell.bounds(exponent_of_c_ts).limit
 
 
 @pytest.mark.parametrize(
@@ -162,7 +168,7 @@ def test_pack_scales_the_cell() -> None:
         ("a = " + 3000 * "[", "not valid TOML: nested too deeply"),
     ],
 )
-def test_numbers_and_booleans_are_not_converted(tmp_path: Path, text: str, expected: str) -> None:
+def test_values_of_another_type_are_rejected_and_not_converted(tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "pack.toml"
     path.write_text(text)
     with pytest.raises(UserError) as error:
@@ -170,7 +176,7 @@ def test_numbers_and_booleans_are_not_converted(tmp_path: Path, text: str, expec
     assert str(error.value).startswith(f"{path}: {expected}")
 
 
-def test_integer_may_be_written_with_a_decimal_point(tmp_path: Path) -> None:
+def test_an_integer_may_be_written_with_a_decimal_point(tmp_path: Path) -> None:
     path = tmp_path / "pack.toml"
     path.write_text("[pack]\nseries = 4.0\ncapacity_ah = 3\n")
     assert load_settings(path).pack.series == 4

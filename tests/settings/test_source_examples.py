@@ -1,4 +1,4 @@
-"""Settings in the documentation of sources are valid."""
+"""Examples of settings in the documentation of sources: all are valid."""
 
 import re
 import tomllib
@@ -19,14 +19,15 @@ EXAMPLES = [
 
 
 @pytest.mark.parametrize(("document", "text"), EXAMPLES, ids=lambda value: value[:30])
-def test_documented_example_is_accepted(document: str, text: str) -> None:
+def test_a_documented_example_is_accepted(document: str, text: str) -> None:
     tables = tomllib.loads(text)
     settings = Settings.model_validate(tables)
+    # Each example configures a source or a sensor.
     assert settings.model_dump(include={"source"}) or settings.sensor.model_fields_set
     if settings.source is not None and settings.source.kind in ("mqtt", "linux"):
         assert make_line_producer(Settings.model_validate({"mqtt": {}} | tables))
 
 
-def test_every_profile_is_documented() -> None:
+def test_every_mqtt_profile_is_documented() -> None:
     text = (DOCS / "mqtt-source.md").read_text(encoding="utf-8")
     assert [name for name in PROFILES if f"| `{name}` |" not in text] == []

@@ -29,15 +29,15 @@ async def test_the_mqtt_source_receives_current_with_its_sign_voltage_temperatur
     async with asyncio.timeout(LONG_S), Listener(broker, "bms7/status") as listener, source:
         node_task = asyncio.create_task(node.run(1e9))  # longer than the test
         received_samples = 0
-        async for block in source:
+        async for block, cells_v in source:
             assert (block["voltage_v"] == 53.0).all()
             assert (block["current_a"] == 12.5).all()
+            assert cells_v.shape == (block.size, 16)
+            assert cells_v.mean() == pytest.approx(53.0 / 16, abs=1e-3)
             received_samples += block.size
             if received_samples >= 3:
                 break
         assert block["temperature_c"][-1] == 21.5
-        assert source.cells.shape == (1, 16)
-        assert source.cells.mean() == pytest.approx(53.0 / 16, abs=1e-3)
         node_task.cancel()  # as Ctrl-C does; then the broker publishes the will
         await asyncio.gather(node_task, return_exceptions=True)
         await listener.wait("bms7/status", lambda payload: payload == b"offline")

@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
-from bms_estimator.simulation.simulated_bms import SPREAD_V, BmsFault, SimulatedBms
+from bms_estimator.simulation.simulated_bms import MAX_CELL_DEVIATION_V, BmsFault, SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
@@ -58,9 +58,9 @@ class SampleRecord:
         return sum(block.size for block in self.blocks)
 
     async def collect(self, source: SerialSource) -> None:
-        async for block in source:
+        async for block, cells_v in source:
             self.blocks.append(block.copy())
-            self.cells += source.cells.tolist()
+            self.cells += cells_v.tolist()
 
     async def wait_for_more(self, samples: int) -> None:
         """Wait until this number of further samples has arrived."""
@@ -105,18 +105,18 @@ async def test_replay_of_a_bms_with_faults_is_bit_identical_to_the_live_samples(
     with CaptureRecorder(path, header) as recording:
         async with read_bms(bms, protocol, recording) as (board, record):
             await record.wait_for_more(2)
-            assert (board.message, board.counters["crc_errors"], board.counters["noise_bytes"]) == (None, 0, 0)
+            assert (board.silence_reason, board.counters["crc_errors"], board.counters["noise_bytes"]) == (None, 0, 0)
             for fault, names in FAULT_COUNTERS.items():
                 before = sum(board.counters[counter] for counter in names)
                 bms.inject(fault)
                 await until(lambda: sum(board.counters[c] for c in names) > before)  # noqa: B023 - awaited here
                 await record.wait_for_more(1)
             bms.inject(BmsFault.SILENCE, 1_000_000)  # until ``clear_faults``
-            await until(lambda: board.message)
-            assert "open, but silent" in (board.message or "")
+            await until(lambda: board.silence_reason)
+            assert "open, but silent" in (board.silence_reason or "")
             bms.clear_faults()
             await record.wait_for_more(1)
-            assert board.message is None
+            assert board.silence_reason is None
             counters = board.counters
     live = np.concatenate(record.blocks)
     step_v, step_a, step_k = RESOLUTIONS[name]
@@ -129,7 +129,7 @@ async def test_replay_of_a_bms_with_faults_is_bit_identical_to_the_live_samples(
     complete_rows = [row for row in record.cells if not any(math.isnan(v) for v in row)]
     assert len(complete_rows) >= 3
     assert {len(row) for row in complete_rows} == {CELLS}
-    assert max(abs(v - sum(row) / CELLS) for row in complete_rows for v in row) < 2 * SPREAD_V + 1e-3
+    assert max(abs(v - sum(row) / CELLS) for row in complete_rows for v in row) < 2 * MAX_CELL_DEVIATION_V + 1e-3
     replay = RawCapture(path)
     replayed = np.concatenate(list(replay))
     for column in ("time_s", "voltage_v", "current_a", "temperature_c", "status"):

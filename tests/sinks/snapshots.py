@@ -1,4 +1,4 @@
-"""Snapshots for tests, composed as by the service."""
+"""Snapshots for tests, built by the functions that the service uses."""
 
 import numpy as np
 
@@ -32,8 +32,10 @@ IDLE_LOOP = LoopHealth(
 
 
 def snapshot(sensor_message: str | None = None, delivery: DeliveryStats | None = None) -> Snapshot:
+    """Return a new snapshot of a cell at SOC 0.5. ``sensor_message`` is the reason why the sensor is offline."""
     cell = load_cell("chen_mora")
-    return _make_snapshot(cell, Estimator(cell, identifier=None, initial_soc=0.5), 3.8, sensor_message, delivery)
+    estimator = Estimator(cell, identifier=None, initial_soc=0.5)
+    return _make_snapshot(cell, estimator, voltage_v=3.8, sensor_message=sensor_message, delivery=delivery)
 
 
 def _capacity_ah(cell: PackModel) -> float | None:
@@ -42,7 +44,7 @@ def _capacity_ah(cell: PackModel) -> float | None:
 
 def fuel_cell_snapshot() -> Snapshot:
     stack = load_fuel_cell("pem_30w")
-    return _make_snapshot(stack, Estimator(stack), 13.0)
+    return _make_snapshot(stack, Estimator(stack), voltage_v=13.0)
 
 
 def _make_snapshot(
@@ -85,16 +87,16 @@ def _make_snapshot(
     )
 
 
-ONE = snapshot()
+CELL_SNAPSHOT = snapshot()
 """Snapshot of a cell at SOC 0.5."""
-STACK = fuel_cell_snapshot()
+STACK_SNAPSHOT = fuel_cell_snapshot()
 """Snapshot of a fuel cell stack."""
-NOTHING_YET = ONE._replace(
+SNAPSHOT_WITHOUT_SAMPLES = CELL_SNAPSHOT._replace(
     estimate=None, parameters=make_parameters_payload(Estimator(load_cell("chen_mora"), identifier=None), NOW)
 )
 """Snapshot before the first sample."""
 
-SOC_LOW = Alarm(
+SOC_LOW_ALARM = Alarm(
     name="soc_low",
     severity="warning",
     active=True,
@@ -105,4 +107,4 @@ SOC_LOW = Alarm(
     unit="%",
     text="charge",
 )
-"""Raised alarm."""
+"""Raised alarm of a low SOC."""

@@ -1,4 +1,4 @@
-"""Line sources: lines become samples, are recorded, and replay bit-identically."""
+"""Line sources: lines are decoded to samples and recorded, and the recording replays bit-identically."""
 
 import asyncio
 from collections.abc import AsyncGenerator, Sequence
@@ -16,13 +16,14 @@ from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
 from bms_estimator.sources.line_source import LineProducer, LineSource, SourceUnavailableError
+from bms_estimator.sources.source import ReceivedSamples
 from tests.patience import LONG_S
 
 TEXT = SensorSettings(protocol="text")
 
 
 class ScriptedProducer(LineProducer):
-    """Producer that yields the lines of the next script at each start, and nothing after the last script."""
+    """Producer that yields or raises the items of the next script at each start. After the last script it waits."""
 
     name = "a device"
 
@@ -32,47 +33,55 @@ class ScriptedProducer(LineProducer):
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         self.starts += 1
-        for line in self._scripts.pop(0) if self._scripts else ():
-            if isinstance(line, Exception):
-                raise line
-            yield line
+        for item in self._scripts.pop(0) if self._scripts else ():
+            if isinstance(item, Exception):
+                raise item
+            yield item
         if not self._scripts:
             await asyncio.Event().wait()
 
 
-async def take(source: LineSource, samples: int) -> SampleBlock:
-    """Return the next samples."""
-    blocks: list[SampleBlock] = []
+async def take_received(source: LineSource, min_samples: int) -> list[ReceivedSamples]:
+    """Return the next samples as received, at least ``min_samples``."""
+    taken: list[ReceivedSamples] = []
     async with asyncio.timeout(LONG_S):
-        async for block in source:
-            blocks.append(block)
-            if sum(b.size for b in blocks) >= samples:
+        async for received in source:
+            taken.append(received)
+            if sum(each.samples.size for each in taken) >= min_samples:
                 break
-    return np.concatenate(blocks)
+    return taken
+
+
+async def take(source: LineSource, min_samples: int) -> SampleBlock:
+    """Return the next samples, at least ``min_samples``."""
+    return np.concatenate([received.samples for received in await take_received(source, min_samples)])
 
 
 async def wait_for_message(source: LineSource, expected: str) -> None:
     """Wait until the source reports this message."""
     async with asyncio.timeout(LONG_S):
-        while source.message != expected:  # noqa: ASYNC110 - it has no event for it
+        while source.silence_reason != expected:  # noqa: ASYNC110 - it has no event for it
             await asyncio.sleep(0.001)
 
 
-def lines(*volts: float) -> list[bytes]:
-    return [CONNECTED, *(sample_json_line(v, -2.0, temperature_c=21.5, cells_v=[v / 16, None]) for v in volts)]
+def lines(*voltages_v: float) -> list[bytes]:
+    """Return the lines of a producer after it has connected: one for each voltage, with a current of -2 A."""
+    samples = [sample_json_line(v, -2.0, temperature_c=21.5, cells_v=[v / 16, None]) for v in voltages_v]
+    return [CONNECTED, *samples]
 
 
-async def test_lost_source_is_reopened_with_reason_and_counter():
-    script = [SourceUnavailableError("no answer")], [*lines(52.1), OSError(5, "Input/output error")], lines(52.2)
-    source = LineSource(ScriptedProducer(*script), TEXT, first_retry_s=0.001)
+async def test_lost_source_is_reopened_and_the_loss_is_logged_and_counted():
+    scripts = [SourceUnavailableError("no answer")], [*lines(52.1), OSError(5, "Input/output error")], lines(52.2)
+    source = LineSource(ScriptedProducer(*scripts), TEXT, first_retry_s=0.001)
     with capture_logs() as logged:
         async with source:
-            block = await take(source, 2)
+            taken = await take_received(source, 2)
+    block = np.concatenate([received.samples for received in taken])
     assert block["voltage_v"].tolist() == [52.1, 52.2]
     assert block["current_a"].tolist() == [-2.0, -2.0]
     assert block["temperature_c"].tolist() == [21.5, 21.5]
-    assert np.array_equal(source.cells, [[3.2625, np.nan]], equal_nan=True)
-    assert source.message is None
+    assert np.array_equal(taken[-1].cells_v, [[52.2 / 16, np.nan]], equal_nan=True)
+    assert source.silence_reason is None
     assert source.counters["frames_received"] == 2
     assert source.counters["reconnects"] == 1
     reasons = [line["reason"] for line in logged if line["event"] == "no samples"]
@@ -82,9 +91,10 @@ async def test_lost_source_is_reopened_with_reason_and_counter():
 async def test_capture_of_lines_replays_bit_identically(tmp_path: Path):
     path = tmp_path / "lines.raw"
     sensor = SensorSettings(protocol="text", current_sign="charge_positive")
-    sent_lines = [*lines(50.0, 51.0), b"junk\n", *lines(52.0)[1:], sample_json_line(53.0, 1.25, time_s=7.5)]
-    with CaptureRecorder(path, make_header(sensor)) as recording:
-        source = LineSource(ScriptedProducer(sent_lines), sensor, tap=recording)
+    _connected, third_sample = lines(52.0)
+    sent_lines = [*lines(50.0, 51.0), b"junk\n", third_sample, sample_json_line(53.0, 1.25, time_s=7.5)]
+    with CaptureRecorder(path, make_header(sensor)) as recorder:
+        source = LineSource(ScriptedProducer(sent_lines), sensor, tap=recorder)
         async with source:
             live = await take(source, 4)
     capture = RawCapture(path)
@@ -108,20 +118,20 @@ async def test_missing_and_invalid_lines_are_reported():
             taking.cancel()
 
 
-async def test_internal_error_is_raised():
-    source = LineSource(ScriptedProducer([*lines(50.0), KeyError("ours")]), TEXT)
+async def test_error_that_is_a_bug_of_the_producer_is_raised():
+    source = LineSource(ScriptedProducer([*lines(50.0), KeyError("bug")]), TEXT)
     async with source:
-        with pytest.raises(KeyError, match="ours"):
+        with pytest.raises(KeyError, match="bug"):
             await take(source, 2)
 
 
 @pytest.mark.parametrize("values", [(float("nan"), 1.0), (50.0, float("inf"))])
-def test_line_of_a_value_that_is_not_finite_is_rejected(values: tuple[float, float]):
+def test_json_line_of_a_value_that_is_not_finite_is_rejected(values: tuple[float, float]):
     with pytest.raises(ValueError, match="no sample"):
         sample_json_line(*values)
 
 
-def test_source_sets_sensor_defaults():
+def test_source_sets_defaults_of_the_sensor_which_settings_override():
     settings = Settings.model_validate({"source": {"kind": "linux", "voltage_scale": 4.0}})
     assert (settings.sensor.protocol, settings.sensor.voltage_resolution_v) == ("text", 5e-3)
     sensor = SensorSettings(voltage_resolution_v=0.1, current_sign="charge_positive")

@@ -1,4 +1,4 @@
-"""One-minute rows: content, restart within a minute, reading while the service writes."""
+"""Rows of one minute in the history: their content, restarts within a minute, reading while the service writes."""
 
 import asyncio
 import sqlite3
@@ -19,15 +19,15 @@ from bms_estimator.store.history import History
 from bms_estimator.store.history_reader import HistoryFile, PastEvent
 from bms_estimator.store.minute import Minute
 from tests.patience import LONG_S
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 BEGIN_S = 1_700_000_040
 """Start of a minute [s since 1970]."""
 
 
-def at(second: float, current_a: float = 2.0, voltage_v: float = 4.0, **changes: object) -> Snapshot:
-    """Return a snapshot published ``second`` seconds after ``BEGIN_S``."""
-    assert ONE.estimate
+def snapshot_at(second: float, current_a: float = 2.0, voltage_v: float = 4.0, **changes: object) -> Snapshot:
+    """Return a snapshot that is published ``second`` seconds after ``BEGIN_S``."""
+    assert CELL_SNAPSHOT.estimate
     measured = {
         "time": iso_utc(BEGIN_S + second),
         "board_time_s": second,
@@ -35,10 +35,11 @@ def at(second: float, current_a: float = 2.0, voltage_v: float = 4.0, **changes:
         "voltage_v": voltage_v,
         "power_w": current_a * voltage_v,
     }
-    return ONE._replace(estimate=ONE.estimate.model_copy(update=measured | changes))
+    return CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=measured | changes))
 
 
-async def record(path: Path, snapshots: list[Snapshot], days: int = 366) -> None:
+async def record_history(path: Path, snapshots: list[Snapshot], days: int = 366) -> None:
+    """Write the snapshots to a history as one run of a service does. ``days`` is the length of the history."""
     async with Database(path) as database, History(database, days=days) as history:
         for each in snapshots:
             history.publish(each)
@@ -49,7 +50,8 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "pack.sqlite"
 
 
-def rows(path: Path, step_s: int = 60) -> list[Minute]:
+def read_rows(path: Path, step_s: int = 60) -> list[Minute]:
+    """Return all rows, aggregated to steps of ``step_s``."""
     return HistoryFile(path).rows(0.0, 2e10, step_s)
 
 
@@ -58,39 +60,41 @@ def past_events(path: Path) -> list[PastEvent]:
 
 
 async def test_row_has_means_extremes_and_sums_of_the_publications(path):
-    currents_a = [3.6] * 30 + [-7.2] * 30
-    await record(path, [at(float(s), a, soc=0.5 + s / 1000, temperature_c=None) for s, a in enumerate(currents_a)])
-    [row] = rows(path)
+    currents_a = [3.6] * 30 + [-7.2] * 30  # at 4 V, once a second
+    await record_history(
+        path, [snapshot_at(float(s), a, soc=0.5 + s / 1000, temperature_c=None) for s, a in enumerate(currents_a)]
+    )
+    [row] = read_rows(path)
     assert (row.time_s, row.publications, row.seen_s) == (BEGIN_S, 60, 59.0)
     assert (row.current_a, row.current_min_a, row.current_max_a) == (pytest.approx(-1.8), -7.2, 3.6)
+    # the charge of the second before the first publication is unknown
     assert (row.charge_out_ah, row.charge_in_ah) == (pytest.approx(0.029), pytest.approx(0.06))
     assert (row.energy_out_wh, row.energy_in_wh) == (pytest.approx(0.116), pytest.approx(0.24))
     assert (row.soc, row.temperature_c) == (pytest.approx(0.559), None)
 
 
 async def test_no_charge_is_counted_over_a_gap(path):
-    await record(path, [at(0.0), at(1.0), at(3000.0), at(3001.0)])
-    assert sum(row.seen_s for row in rows(path)) == 2.0
+    await record_history(path, [snapshot_at(0.0), snapshot_at(1.0), snapshot_at(3000.0), snapshot_at(3001.0)])
+    assert sum(row.seen_s for row in read_rows(path)) == 2.0
 
 
-async def test_source_with_a_period_of_one_minute_has_no_gaps_after_the_first_interval(path):
-    await record(path, [at(60.0 * i, 6.0) for i in range(11)])
-    assert sum(row.charge_out_ah for row in rows(path)) == pytest.approx(
-        0.9
-    )  # the first interval counts as a gap: no previous interval shows the period
+async def test_intervals_of_one_minute_are_no_gaps_if_that_is_the_period_of_the_source(path):
+    await record_history(path, [snapshot_at(60.0 * i, 6.0) for i in range(11)])
+    # ten intervals of 0.1 Ah; the first counts as a gap, because no interval before it shows the period
+    assert sum(row.charge_out_ah for row in read_rows(path)) == pytest.approx(0.9)
 
 
-async def test_restarted_service_merges_rows_of_one_minute(path):
+async def test_two_runs_within_a_minute_give_one_row(path):
     snapshots = [
-        at(float(s), s / 10, 3.0 + s / 100, soc_std=s / 1e3, temperature_c=20.0 + s if s % 2 else None)
+        snapshot_at(float(s), s / 10, 3.0 + s / 100, soc_std=s / 1e3, temperature_c=20.0 + s if s % 2 else None)
         for s in range(60)
     ]
-    await record(path.with_name("whole.sqlite"), snapshots)
-    await record(path, snapshots[:25])
-    await record(path, snapshots[25:])
-    [row], [expected] = rows(path), rows(path.with_name("whole.sqlite"))
-    lost_ah = 2.5 / 3600  # charge of the second between the two runs
-    # The mean of each run has its number of publications as weight, although half of them have no temperature
+    await record_history(path.with_name("whole.sqlite"), snapshots)
+    await record_history(path, snapshots[:25])
+    await record_history(path, snapshots[25:])
+    [row], [expected] = read_rows(path), read_rows(path.with_name("whole.sqlite"))
+    lost_ah = 2.5 / 3600  # charge of the second between the two runs, in which the voltage is 3.25 V
+    # the mean of each run is weighted with all its publications, although half of them have no temperature
     assert row.temperature_c == pytest.approx(expected.temperature_c, abs=0.5)
     assert row._replace(temperature_c=None) == pytest.approx(
         expected._replace(
@@ -103,20 +107,21 @@ async def test_restarted_service_merges_rows_of_one_minute(path):
 
 
 async def test_minutes_repeated_by_a_clock_set_back_are_not_merged(path):
-    before = [at(float(s), 10.0) for s in range(300)]
-    after = [at(float(s), -10.0, board_time_s=300.0 + s) for s in range(300)]
-    await record(path, before + after)
-    stored = rows(path)
+    before = [snapshot_at(float(s), 10.0) for s in range(300)]
+    after = [snapshot_at(float(s), -10.0, board_time_s=300.0 + s) for s in range(300)]
+    await record_history(path, before + after)
+    stored = read_rows(path)
     assert len(stored) == 10
     assert max(row.seen_s for row in stored) <= 60.0
     assert [row.current_a for row in stored] == [10.0, -10.0] * 5
-    [day] = rows(path, 86400)
+    [day] = read_rows(path, 86400)  # 10 A for 299 s and -10 A for 300 s
     assert (day.charge_out_ah, day.charge_in_ah) == (pytest.approx(299 / 360), pytest.approx(300 / 360))
 
 
-async def test_longer_steps_aggregate_minutes(path):
-    await record(path, [at(float(s), s / 60, 3.0, soc=1.0 - s / 7200) for s in range(0, 7200, 10)])
-    minutes, [first, second, last] = rows(path), rows(path, 3600)
+async def test_rows_of_longer_steps_aggregate_minutes(path):
+    """Two hours that begin within an hour of the clock are three rows of an hour."""
+    await record_history(path, [snapshot_at(float(s), s / 60, 3.0, soc=1.0 - s / 7200) for s in range(0, 7200, 10)])
+    minutes, [first, second, last] = read_rows(path), read_rows(path, 3600)
     assert len(minutes) == 120
     assert sum(row.charge_out_ah for row in (first, second, last)) == pytest.approx(
         sum(row.charge_out_ah for row in minutes)
@@ -126,61 +131,64 @@ async def test_longer_steps_aggregate_minutes(path):
     assert first.time_s % 3600 == 0
 
 
-async def test_newest_rows_are_kept_even_if_the_clock_jumps_ahead(path):
-    await record(path, [at(60.0 * minute) for minute in range(1500)])
-    await record(path, [at(1e9)], days=1)
-    stored = rows(path)
-    assert len(stored) == 1440
+async def test_a_full_history_keeps_the_rows_with_the_newest_times_also_after_a_jump_of_the_clock(path):
+    await record_history(path, [snapshot_at(60.0 * minute) for minute in range(1500)])
+    await record_history(path, [snapshot_at(1e9)], days=1)
+    stored = read_rows(path)
+    assert len(stored) == 1440  # minutes of a day: the future row, and the last 1439 of the rows 0 to 1499
     assert [row.time_s for row in stored[:2]] == [BEGIN_S + 60 * 61, BEGIN_S + 60 * 62]
 
 
 async def test_events_are_stored_in_order(path):
-    lost = at(1.0)._replace(health=ONE.health.model_copy(update={"sensor_online": False, "sensor_message": "no board"}))
-    await record(path, [at(0.0), lost])
+    lost = snapshot_at(1.0)._replace(
+        health=CELL_SNAPSHOT.health.model_copy(update={"sensor_online": False, "sensor_message": "no board"})
+    )
+    await record_history(path, [snapshot_at(0.0), lost])
     names = [event.name for event in past_events(path)]
     assert names == ["start", "sensor_online", "sensor_offline"]
 
 
-async def test_event_is_written_immediately(path, monkeypatch):
+async def test_event_is_written_before_its_minute_ends(path, monkeypatch):
     monkeypatch.setattr(history_module, "MINUTE_S", 3600)  # no minute ends
     async with Database(path) as database, History(database, days=366) as history:
-        history.publish(at(0.0))
+        history.publish(snapshot_at(0.0))
         async with asyncio.timeout(LONG_S):
             while not await asyncio.to_thread(read_or_nothing, lambda: past_events(path)):  # noqa: ASYNC110 - a file
                 await asyncio.sleep(0.01)
-        assert rows(path) == []
+        assert read_rows(path) == []
 
 
 async def test_history_is_read_while_the_service_writes_it(path):
     async with Database(path) as database, History(database, days=366) as history:
-        history.publish(at(0.0))
-        history.publish(at(60.0))  # ends the minute
+        history.publish(snapshot_at(0.0))
+        history.publish(snapshot_at(60.0))  # ends the minute
         async with asyncio.timeout(LONG_S):
-            while not path.exists() or not await asyncio.to_thread(read_or_nothing, lambda: rows(path)):  # noqa: ASYNC110
+            while not path.exists() or not await asyncio.to_thread(read_or_nothing, lambda: read_rows(path)):  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
 
 
 def read_or_nothing(read: Callable[[], list[Any]]) -> list[Any]:
+    """Return what ``read`` returns; an empty list while there is no history."""
     try:
         return read()
     except UserError:
         return []  # the table does not exist yet
 
 
-async def test_rows_wait_while_the_disk_fails(path):
+async def test_rows_wait_in_memory_while_the_disk_fails(path):
     path.mkdir()
     (path / "file").touch()
     async with Database(path, retry_s=0.0) as database, History(database, days=366) as history:
         # otherwise the folder at the path would be renamed
         database._file._quarantine_symlink = leave_in_place  # type: ignore[method-assign]
-        history.publish(at(0.0))
-        history.publish(at(60.0))
+        history.publish(snapshot_at(0.0))
+        history.publish(snapshot_at(60.0))
         async with asyncio.timeout(LONG_S):
             while not database.reason:  # noqa: ASYNC110 - it has no event
                 await asyncio.sleep(0.01)
         (path / "file").unlink()
         path.rmdir()
-    assert [row.time_s for row in rows(path)] == [BEGIN_S, BEGIN_S + 60]
+    assert [row.time_s for row in read_rows(path)] == [BEGIN_S, BEGIN_S + 60]
 
 
 def leave_in_place(_: Path) -> None:
@@ -189,15 +197,15 @@ def leave_in_place(_: Path) -> None:
 
 def test_unreadable_history_raises_an_error(path):
     with pytest.raises(UserError, match="no history there"):
-        rows(path)
+        read_rows(path)
     with sqlite3.connect(path) as connection:
         connection.execute("PRAGMA user_version = 99")
     connection.close()
     with pytest.raises(UserError, match="later version"):
-        rows(path)
+        read_rows(path)
     path.write_bytes(b"x" * 5000)
     with pytest.raises(UserError, match="cannot be read: file is not a database"):
-        rows(path)
+        read_rows(path)
 
 
 class DatabaseWithLostResults(Database):
@@ -217,27 +225,27 @@ async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path):
     async with DatabaseWithLostResults(path, retry_s=0.0) as database, History(database, days=366) as history:
         database.remaining = 2
         for second in range(0, 190, 10):
-            history.publish(at(float(second)))
+            history.publish(snapshot_at(float(second)))
             # each ended minute is one transaction, and two of them report a failure
             async with asyncio.timeout(LONG_S):
                 while database.remaining > max(2 - second // 60, 0):  # noqa: ASYNC110 - it has no event
                     await asyncio.sleep(0.001)
-    assert [(row.publications, row.seen_s) for row in rows(path)] == [(6, 50.0), (6, 60.0), (6, 60.0), (1, 10.0)]
+    assert [(row.publications, row.seen_s) for row in read_rows(path)] == [(6, 50.0), (6, 60.0), (6, 60.0), (1, 10.0)]
     assert len(past_events(path)) == 2
 
 
 async def test_shutdown_during_a_write_writes_each_row_once(path):
     may_return = threading.Event()
     async with Database(path) as database, History(database, days=366) as history:
-        history.publish(at(0.0))
+        history.publish(snapshot_at(0.0))
         busy = asyncio.create_task(database.call(lambda _: may_return.wait(LONG_S)))
         await asyncio.sleep(0)
-        history.publish(at(60.0))
+        history.publish(snapshot_at(60.0))
         await asyncio.sleep(0)
         await asyncio.sleep(0)  # the write waits for the blocked transaction
         asyncio.get_running_loop().call_soon(may_return.set)
     await busy
-    assert [row.publications for row in rows(path)] == [1, 1]
+    assert [row.publications for row in read_rows(path)] == [1, 1]
 
 
 async def test_failed_vacuum_does_not_undo_a_transaction(path, monkeypatch):
@@ -261,8 +269,8 @@ class BrokenDatabase(Database):
 async def publish_forever(history: History) -> None:
     async with asyncio.timeout(LONG_S):
         while True:
-            history.publish(at(0.0))
-            history.publish(at(60.0))
+            history.publish(snapshot_at(0.0))
+            history.publish(snapshot_at(60.0))
             await asyncio.sleep(0)
 
 

@@ -1,4 +1,4 @@
-"""Service during a broker outage: its states arrive later, in order and once, even after a kill."""
+"""Service during a broker outage: its states arrive later, in order and once, even if the service was killed."""
 
 import asyncio
 import json
@@ -9,13 +9,14 @@ from pathlib import Path
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.serial_line import Line
-from tests.service.test_process import feed, pack_file, service, stop_service
+from tests.service.test_process import pack_file, print_samples, service, stop_service
 
-TOPICS = ("bms/pack/state", "bms/pack/event")
+QUEUED_TOPICS = ("bms/pack/state", "bms/pack/event")
+"""Topics whose messages wait during an outage."""
 
 
-def on_disk(path: Path) -> list[tuple[str, str]]:
-    """Return topic and time of the messages in the database."""
+def messages_on_disk(path: Path) -> list[tuple[str, str]]:
+    """Return topic and time of each queued message in the database, in order."""
     try:
         with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
             rows = connection.execute("SELECT topic, payload FROM outbox ORDER BY number").fetchall()
@@ -24,27 +25,29 @@ def on_disk(path: Path) -> list[tuple[str, str]]:
     return [(topic, json.loads(payload)["time"]) for topic, payload in rows]
 
 
-async def test_states_of_an_outage_survive_a_kill_and_arrive_first_in_order_and_once(
+async def test_states_of_an_outage_survive_a_kill_and_arrive_before_newer_ones_in_order_and_once(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
     broker.stop()
     line.plug()
-    board = asyncio.create_task(feed(line))
+    board = asyncio.create_task(print_samples(line))
     pack = pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{tmp_path}"\n')
     async with service(pack) as process:
         async with asyncio.timeout(LONG_S):
-            while len(on_disk(tmp_path / "pack.sqlite")) < 25:  # noqa: ASYNC110 - a file has no event
+            while len(messages_on_disk(tmp_path / "pack.sqlite")) < 25:  # noqa: ASYNC110 - a file has no event
                 await asyncio.sleep(0.05)
         process.kill()
-    stored = on_disk(tmp_path / "pack.sqlite")
+    stored = messages_on_disk(tmp_path / "pack.sqlite")
     await asyncio.to_thread(broker.start)
     async with Listener(broker) as live, service(pack) as process:
         await live.wait_json("bms/pack/state", lambda state: state["time"] > stored[-1][1])
         await live.wait_json("bms/pack/event", lambda event: event["name"] == "unseen")
         await stop_service(process)
-        received = [(topic, json.loads(payload)["time"]) for topic, payload, _ in live.messages if topic in TOPICS]
+        received = [
+            (topic, json.loads(payload)["time"]) for topic, payload, _ in live.messages if topic in QUEUED_TOPICS
+        ]
     board.cancel()
     assert received[: len(stored)] == stored
-    states = [time for topic, time in received if topic == TOPICS[0]]
+    states = [time for topic, time in received if topic == QUEUED_TOPICS[0]]
     assert states == sorted(set(states))
-    assert on_disk(tmp_path / "pack.sqlite") == []
+    assert messages_on_disk(tmp_path / "pack.sqlite") == []

@@ -1,4 +1,4 @@
-"""Outbox against a list as model: under all operations and disk faults nothing is lost, reordered or repeated."""
+"""Outbox compared with a list: operations and disk faults in any order lose, reorder and repeat no message."""
 
 import asyncio
 import random
@@ -22,7 +22,7 @@ from bms_estimator.store.outbox import Outbox
 
 PAGE = 4
 """Size of a page of the queue [messages]; small, so that the tests read many pages."""
-OPERATIONS = st.lists(st.sampled_from(["put", "take", "first", "last", "rewind"]), max_size=5)
+OPERATIONS = st.lists(st.sampled_from(["put", "take", "acknowledge first", "acknowledge last", "rewind"]), max_size=5)
 
 
 class FaultyDatabase(Database):
@@ -30,6 +30,8 @@ class FaultyDatabase(Database):
 
     Attributes:
         failure: "before" or "after" the commit; None: no failure.
+        before: Callback before a transaction.
+        after: Callback after the commit.
     """
 
     failure: str | None = None
@@ -48,12 +50,13 @@ class FaultyDatabase(Database):
 
 
 class OutboxMachine(RuleBasedStateMachine):
-    """Outbox whose messages are numbers.
+    """Outbox whose payloads are numbers, and a list of the numbers that it must contain.
 
     Attributes:
-        pending: Numbers that the broker must still receive.
+        pending: Numbers that the broker must still receive, in order.
         in_flight: Numbers in flight, with their queue numbers.
-        on_disk: Numbers on disk after the last write.
+        on_disk: Numbers that must be on disk since the last write.
+        strict: True while order and counts are checked. A disk fault ends it until the next restart.
     """
 
     def __init__(self) -> None:
@@ -61,10 +64,10 @@ class OutboxMachine(RuleBasedStateMachine):
         self.patch = pytest.MonkeyPatch()
         self.patch.setattr(queue_module, "PAGE", PAGE)
         self.patch.setattr(outbox_module, "PAGE", PAGE)
-        self.patch.setattr(outbox_module, "FLUSH_S", 1e6)  # the rules decide when it is written
+        self.patch.setattr(outbox_module, "FLUSH_S", 1e6)  # only the rules write
         self.loop = asyncio.new_event_loop()
         self.folder = tempfile.TemporaryDirectory(prefix="store-")
-        self.next, self.dropped = 0, 0
+        self.next_number, self.dropped_count = 0, 0
         self.pending: list[int] = []
         self.in_flight: dict[int, int] = {}
         self.on_disk: set[int] = set()
@@ -78,22 +81,23 @@ class OutboxMachine(RuleBasedStateMachine):
 
     def open(self) -> None:
         self.database = FaultyDatabase(Path(self.folder.name) / "pack.sqlite", retry_s=0.0)
-        self.outbox = Outbox(self.database, most=self.most)
-        self.dropped = 0
+        self.outbox = Outbox(self.database, max_messages=self.max_messages)
+        self.dropped_count = 0
         self.sync(write=False)
 
     def sync(self, *, write: bool) -> None:
+        """Exchange messages with the disk: read a missing page, and write if ``write`` is True."""
         self.loop.run_until_complete(self.outbox._sync(write=write))
 
     @rule(count=st.integers(1, 9))
     def put(self, count: int) -> None:
         for _ in range(count):
-            self.outbox.put(Message("t", str(self.next).encode(), 1, retain=False))
-            self.pending.append(self.next)
-            self.next += 1
+            self.outbox.put(Message("t", str(self.next_number).encode(), 1, retain=False))
+            self.pending.append(self.next_number)
+            self.next_number += 1
             if len(self.pending) > self.most:
                 self.pending.remove(next(number for number in self.pending if number not in self.in_flight))
-                self.dropped += 1
+                self.dropped_count += 1
 
     @precondition(lambda self: len(self.pending) > len(self.in_flight) and len(self.in_flight) < 5)
     @rule(most=st.integers(1, 3))
@@ -116,7 +120,7 @@ class OutboxMachine(RuleBasedStateMachine):
 
     @precondition(lambda self: self.in_flight)
     @rule(data=st.data())
-    def sent(self, data: st.DataObject) -> None:
+    def acknowledge_any(self, data: st.DataObject) -> None:
         self.acknowledge(data.draw(st.sampled_from(sorted(self.in_flight))))
 
     def acknowledge(self, number: int) -> None:
@@ -137,8 +141,8 @@ class OutboxMachine(RuleBasedStateMachine):
 
     @rule(before=OPERATIONS, after=OPERATIONS, write=st.booleans())
     def operate_during_transaction(self, before: list[str], after: list[str], *, write: bool) -> None:
-        """Operate on the queue during a transaction."""
-        on_disk = set(self.pending)
+        """Operate on the queue before and after the transaction of a write or a read."""
+        on_disk = set(self.pending)  # messages of the operations come too late for this write
         self.database.before, self.database.after = partial(self.operate, before), partial(self.operate, after)
         self.sync(write=write)
         del self.database.before, self.database.after
@@ -146,30 +150,31 @@ class OutboxMachine(RuleBasedStateMachine):
             self.on_disk = on_disk
 
     def operate(self, steps: list[str]) -> None:
+        """Run operations, and check the counts after each."""
         for step in steps:
             if step == "put":
                 self.put(3)
             elif step == "take" and len(self.in_flight) < 5:
                 self.take_from_queue(2)
-            elif step in ("first", "last") and self.in_flight:
-                self.acknowledge(min(self.in_flight) if step == "first" else max(self.in_flight))
+            elif step in ("acknowledge first", "acknowledge last") and self.in_flight:
+                self.acknowledge(min(self.in_flight) if step == "acknowledge first" else max(self.in_flight))
             elif step == "rewind":
                 self.rewind()
             self.counts_agree()
 
     @precondition(lambda self: self.most == 10_000)
     @rule(failure=st.sampled_from(["before", "after"]))
-    def fail(self, failure: str) -> None:
-        """Fail the disk; newer messages then overtake those that cannot be read."""
+    def fail_disk(self, failure: str) -> None:
+        """Let all transactions fail. Newer messages then overtake those that cannot be read."""
         self.database.failure, self.strict = failure, False
 
     @rule()
-    def heal(self) -> None:
+    def repair_disk(self) -> None:
         self.database.failure = None
 
     @rule(clean=st.booleans())
     def reopen(self, clean: bool) -> None:
-        """Restart after a clean shutdown or a kill: only numbers that were not on disk may be missing."""
+        """Restart after a clean shutdown or a kill. After a kill, only numbers that were not on disk may be missing."""
         if clean and self.database.failure is None:
             self.outbox.rewind()
             self.sync(write=True)
@@ -191,15 +196,16 @@ class OutboxMachine(RuleBasedStateMachine):
     def counts_agree(self) -> None:
         if hasattr(self, "outbox") and self.strict:
             assert self.outbox.waiting == len(self.pending)
-            assert self.outbox.dropped == self.dropped
+            assert self.outbox.dropped == self.dropped_count
 
     def teardown(self) -> None:
+        """Deliver all messages on a working disk. Check that they are the pending ones."""
         if hasattr(self, "outbox"):
             self.database.failure = None
             self.outbox.rewind()
             self.in_flight.clear()
             received: list[int] = []
-            reads_left = self.outbox.waiting + 10
+            reads_left = self.outbox.waiting + 10  # so that a fault of the queue does not loop forever
             while self.outbox.waiting and (reads_left := reads_left - 1):
                 self.sync(write=False)
                 for waiting in self.outbox._queue.take_next(PAGE):
@@ -222,16 +228,20 @@ TestOutbox.settings = settings(max_examples=15, stateful_step_count=40, deadline
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_invariants_hold_for_a_full_outbox_with_a_slow_disk(seed: int) -> None:
-    """Read pages while their oldest messages are dropped, which hypothesis rarely generates."""
-    random_, machine = random.Random(seed), OutboxMachine()
-    machine.begin(12)
+def test_invariants_hold_while_a_full_outbox_drops_messages_of_the_page_that_is_read(seed: int) -> None:
+    """Hypothesis rarely generates this case."""
+    generator, machine = random.Random(seed), OutboxMachine()
+    machine.begin(most=12)
 
     def steps() -> list[str]:
-        return random_.choices(["put", "take", "first", "last", "rewind"], [5, 2, 1, 1, 1], k=random_.randint(0, 3))
+        return generator.choices(
+            ["put", "take", "acknowledge first", "acknowledge last", "rewind"],
+            [5, 2, 1, 1, 1],
+            k=generator.randint(0, 3),
+        )
 
     for _ in range(60):
         machine.operate(steps())
-        machine.operate_during_transaction(steps(), steps(), write=random_.random() < 0.6)
+        machine.operate_during_transaction(steps(), steps(), write=generator.random() < 0.6)
     machine.reopen(clean=True)
     machine.teardown()

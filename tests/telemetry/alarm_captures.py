@@ -1,4 +1,4 @@
-"""Captures of a board that prints one JSON line per second, replayed through estimator and publisher."""
+"""Captures of a board that prints JSON lines, and their replay through estimator and publisher."""
 
 import json
 import math
@@ -19,21 +19,25 @@ from bms_estimator.telemetry.alarms import Change
 from tests.collector import Collector
 
 WALL_S = 1_700_000_000.0
+"""Wall clock at the start of a capture [s since 1970]."""
 PACK = load_cell("nmc", 10.0).pack(2, 1)
-"""Pack of two cells with limits of 5.4 and 8.5 V, 10 A of charge and 50 A of discharge."""
+"""Pack of two cells in series. Its alarms have limits of 5.4 and 8.5 V, 10 A of charge and 50 A of discharge."""
 
 
 class Line(NamedTuple):
-    """Constant readings that the board prints once per period for a number of seconds."""
+    """Part of a capture: a constant reading that the board prints once per period for a number of seconds."""
 
     seconds: float
+    """Duration of the part [s]."""
     voltage_v: float = 7.4
     current_a: float = 0.0
     temperature_c: float | None = 25.0
     cells_v: tuple[float, ...] = ()
     silent: bool = False
+    """True: the board prints nothing."""
 
     def text(self) -> bytes:
+        """Return the printed line."""
         reading: dict[str, Any] = {"voltage": self.voltage_v, "current": self.current_a}
         reading |= {} if self.temperature_c is None else {"temperature": self.temperature_c}
         reading |= {"cells": self.cells_v} if self.cells_v else {}
@@ -42,7 +46,7 @@ class Line(NamedTuple):
 
 @dataclass
 class ReplayResult:
-    """Changes of alarms, snapshots and saved alarms of a replay."""
+    """Results of a replay: changes of alarms, published snapshots, and saved alarms at the end."""
 
     changes: list[Change] = field(default_factory=list)
     snapshots: list[Snapshot] = field(default_factory=list)
@@ -60,10 +64,9 @@ class ReplayResult:
 
 
 def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
-    """Write a raw capture of these lines."""
-    arrival_s = 100.0
-    header = make_header(settings().sensor)
-    writer = CaptureWriter(path, header)
+    """Write a raw capture of these parts; return its path. ``period_s`` is the time between two printed lines [s]."""
+    arrival_s = 100.0  # any time
+    writer = CaptureWriter(path, make_header(settings().sensor))
     writer.write(arrival_s, b"\n")  # the decoder skips all bytes up to the first end of a line
     for line in lines:
         for _ in range(round(line.seconds / period_s)):
@@ -75,7 +78,7 @@ def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
 
 
 def settings(alarms: dict[str, Any] | None = None, **sections: Any) -> Settings:
-    """Return settings of a board that prints text."""
+    """Return settings of a board that prints text, with these alarms and other sections."""
     tables = {"sensor": {"protocol": "text"}, "pack": {"initial_soc": 0.5}, "alarms": alarms or {}}
     return Settings.model_validate(tables | sections)
 
@@ -92,24 +95,24 @@ async def replayed(
     """Replay a capture through estimator and publisher with the clock of the capture.
 
     Args:
-        path: The capture.
-        settings_: The pack's settings.
-        cell: The pack.
-        saved_state: Alarms of a run before.
+        path: Path of the capture.
+        settings_: Settings of the pack.
+        cell: Model of the pack.
+        saved_state: Saved alarms of an earlier run.
+        at_once: True: the blocks are as long as the capture allows. False: each block has one sample.
         begin_s: Wall clock at the start of the capture [s since 1970].
-        at_once: True: the blocks are as long as the capture allows. False: one sample a block.
     """
     now_s, result, sink = 0.0, ReplayResult(), Collector()
-    source = Replay(open_capture(path, settings_.sensor), longest_s=math.inf if at_once else 0.05)
+    source = Replay(open_capture(path, settings_.sensor), max_block_s=math.inf if at_once else 0.05)
     estimator = new_estimator(settings_, cell)
     clock = Clock(wall=lambda: begin_s + now_s, monotonic=lambda: now_s)
     publisher = Publisher(
         settings_, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
     )
     publisher.alarm_monitor.restore(saved_state)
-    async for block in source:
-        now_s = float(block["time_s"][-1])
-        publisher.add(block, estimator.run(block))
+    async for received in source:
+        now_s = float(received.samples["time_s"][-1])
+        publisher.add(received, estimator.run(received.samples))
     publisher.publish_last()
     result.snapshots, result.saved_state = sink.snapshots, publisher.alarm_monitor.alarms.saved_state
     return result

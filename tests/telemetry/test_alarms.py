@@ -1,4 +1,4 @@
-"""Alarms: each one is raised and cleared on a capture; limits, delays, latches, restarts and lost quantities."""
+"""Alarms: a capture for each of them, and limits, delays, latches, restarts and lost quantities."""
 
 import itertools
 import json
@@ -17,7 +17,7 @@ from bms_estimator.model.events import events
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
-from bms_estimator.settings.alarm_limits import AlarmDefinition, out_of_range, watched
+from bms_estimator.settings.alarm_limits import AlarmDefinition, implausible_limits, monitored_alarms
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarm_state import AlarmState
@@ -26,6 +26,7 @@ from tests.telemetry.alarm_captures import PACK, WALL_S, Line, ReplayResult, rec
 
 NAN = math.nan
 GOOD_CELLS = (3.70, 3.70)
+"""Cell voltages that raise no alarm [V]."""
 WITHOUT_IDENTIFIER: dict[str, Any] = {"identifier": {"enabled": False}}
 """Settings by which the SOC is that of coulomb counting, without an uncertainty."""
 
@@ -74,7 +75,12 @@ CAPTURES: dict[str, tuple[list[Line], dict[str, Any], list[tuple[float, bool]]]]
     ),
     "link_lost": ([Line(30), Line(30, silent=True), Line(30)], {}, [(60.0, True), (66.0, False)]),
 }
-"""Lines of a capture, sections of the settings, and expected times of raising and clearing, by alarm. 0: any time."""
+"""For each alarm: parts of a capture, sections of the settings, and expected transitions.
+
+A transition is the time since the start of the capture [s], and True if the alarm is raised or False if it is cleared
+then. At a time of 0, the transition may be at any time. An alarm without a second transition is latched. The time of
+raising contains the delay of the alarm.
+"""
 
 
 def test_each_alarm_has_a_capture() -> None:
@@ -82,9 +88,9 @@ def test_each_alarm_has_a_capture() -> None:
 
 
 @pytest.mark.parametrize("name", CAPTURES)
-async def test_each_alarm_is_raised_and_ends_on_a_capture(name: str, tmp_path: Path) -> None:
+async def test_each_alarm_is_raised_and_cleared_or_latched_on_its_capture(name: str, tmp_path: Path) -> None:
     lines, sections, expected = CAPTURES[name]
-    latched = len(expected) == 1
+    latched = len(expected) == 1  # such an alarm stays raised
     result = await replayed(record(tmp_path / "capture.bms", lines), settings(**sections))
     transitions = result.transitions(name)
     assert [active for _, active in transitions] == [active for _, active in expected]
@@ -99,14 +105,14 @@ async def test_each_alarm_is_raised_and_ends_on_a_capture(name: str, tmp_path: P
     assert (last.active, last.latched, bool(last.text)) == (latched, latched, latched)
 
 
-async def test_healthy_pack_raises_no_alarm_and_alarms_of_unmeasured_quantities_are_not_reported(
+async def test_a_healthy_pack_raises_no_alarm_and_alarms_of_unmeasured_quantities_are_not_reported(
     tmp_path: Path,
 ) -> None:
     lines = [Line(60, current_a=5.0, temperature_c=None), Line(60, current_a=-5.0, temperature_c=None)]
     result = await replayed(record(tmp_path / "capture.bms", lines), settings())
     assert result.changes == []
-    shown = {alarm.name for alarm in result.snapshots[-1].alarms}
-    assert set(ALARMS) - shown == {
+    reported = {alarm.name for alarm in result.snapshots[-1].alarms}
+    assert set(ALARMS) - reported == {
         "hook_failed",
         "cell_over_voltage",
         "cell_under_voltage",
@@ -123,14 +129,14 @@ async def test_an_over_current_of_200_ms_is_published_once_after_it_has_ended(tm
     result = await replayed(path, settings({"discharge_over_current": rule}))
     transitions = result.transitions("discharge_over_current")
     assert [active for _, active in transitions] == [True, False]
-    shown = [a.active for s in result.snapshots for a in s.alarms if a.name == "discharge_over_current"]
-    assert True in shown
-    assert not shown[-1]
+    published = [a.active for s in result.snapshots for a in s.alarms if a.name == "discharge_over_current"]
+    assert True in published
+    assert not published[-1]
     names = [event.name for before, after in itertools.pairwise(result.snapshots) for event in events(before, after)]
     assert [name for name in names if name.startswith("alarm")] == ["alarm_raised", "alarm_cleared"]
 
 
-async def test_alarms_do_not_depend_on_the_size_of_blocks(tmp_path: Path) -> None:
+async def test_transitions_of_a_replay_do_not_depend_on_the_size_of_blocks(tmp_path: Path) -> None:
     path = record(tmp_path / "capture.bms", CAPTURES["pack_under_voltage"][0])
     result = await replayed(path, settings())
     result_of_long_blocks = await replayed(path, settings(), at_once=True)
@@ -138,14 +144,14 @@ async def test_alarms_do_not_depend_on_the_size_of_blocks(tmp_path: Path) -> Non
 
 
 def _transitions(result: ReplayResult) -> list[tuple[float, str, bool]]:
-    """Return time, name and new state of each change."""
+    """Return time [s], name and new state of each change of an alarm."""
     return [(change.at_s, change.alarm.name, change.alarm.active) for change in result.changes]
 
 
 def _take_values(
     state: AlarmState, *values: float, step_s: float = 1.0, begin_s: float = 0.0
 ) -> list[tuple[float, bool]]:
-    """Return the times at which values at intervals of ``step_s`` raise (True) and clear (False) the alarm."""
+    """Update the alarm with values every ``step_s``; return the times at which it is raised (True) or cleared."""
     times_s = begin_s + step_s * np.arange(len(values))
     steps_s = np.full(len(values), step_s)
     return [
@@ -154,7 +160,7 @@ def _take_values(
 
 
 def _make_state(**changes: Any) -> AlarmState:
-    """Return the state of an alarm with a limit of 10 and a clear level of 8, unless changed."""
+    """Return the state of an alarm with limit 10, clear level 8, and delays of 2 s and 3 s, except for ``changes``."""
     rule = {"severity": "warning", "limit": 10.0, "clear": 8.0, "delay_s": 2.0, "clear_delay_s": 3.0, "latch": False}
     return AlarmState(AlarmDefinition(**{"name": "pack_over_voltage", **rule, **changes}))
 
@@ -171,12 +177,13 @@ def _make_state(**changes: Any) -> AlarmState:
         ([NAN] * 5, []),
     ],
 )
-def test_limit_clear_level_and_delays_at_their_bounds(
+def test_an_alarm_is_raised_at_its_limit_and_cleared_below_its_clear_level_after_delays(
     values: list[float], transitions: list[tuple[float, bool]]
 ) -> None:
+    """Values are one second apart. An alarm of a lower limit has the same transitions with negative values."""
     assert _take_values(_make_state(), *values) == transitions
-    below = _make_state(name="pack_under_voltage", limit=-10.0, clear=-8.0)
-    assert _take_values(below, *(-value for value in values)) == transitions
+    lower_limit = _make_state(name="pack_under_voltage", limit=-10.0, clear=-8.0)
+    assert _take_values(lower_limit, *(-value for value in values)) == transitions
 
 
 def test_transitions_do_not_depend_on_how_values_are_split_into_blocks() -> None:
@@ -195,7 +202,7 @@ def test_a_latched_alarm_ends_only_after_it_was_acknowledged() -> None:
     state = _make_state(latch=True, delay_s=0.0, clear_delay_s=0.0)
     assert _take_values(state, 11.0, 7.0) == [(0.0, True)]
     assert state.cause_cleared
-    assert _take_values(state, 11.0) == []  # the alarm has not ended
+    assert _take_values(state, 11.0) == []  # it is still raised
     assert not state.cause_cleared
     assert not state.acknowledge(), "the cause is still there"
     assert _take_values(state, 7.0) == [(0.0, False)]
@@ -205,7 +212,7 @@ def test_a_latched_alarm_ends_only_after_it_was_acknowledged() -> None:
     assert state.raised is None
 
 
-async def test_a_gap_does_not_count_toward_a_delay_and_slow_sampling_is_no_gap(tmp_path: Path) -> None:
+async def test_a_gap_does_not_count_toward_a_delay_but_time_between_slow_samples_does(tmp_path: Path) -> None:
     rule = {"over_temperature": {"delay_s": 25.0}, "link_lost": {"enabled": False}}
     hot = Line(20, temperature_c=70.0)
     lines = [Line(5), hot, hot._replace(silent=True), hot._replace(seconds=10)]
@@ -222,7 +229,8 @@ async def test_a_latched_alarm_survives_a_restart(tmp_path: Path) -> None:
     healthy = record(tmp_path / "two.bms", [Line(30)])
     after = await replayed(healthy, settings(), saved_state=before.saved_state, begin_s=WALL_S + 1000.0)
     first, last = (next(a for a in s.alarms if a.active) for s in (after.snapshots[0], after.snapshots[-1]))
-    assert (first, last.since, last.latched) == (last, first.since, True)
+    assert first == last
+    assert last.latched
     assert after.changes == []
     names = [event.name for event in events(None, after.snapshots[0])]
     assert "alarm_raised" not in names, "the run before the restart has reported the alarm"
@@ -232,8 +240,8 @@ async def test_a_latched_alarm_survives_a_restart(tmp_path: Path) -> None:
 
 
 async def test_a_raised_alarm_survives_a_restart_and_ends_with_its_cause(tmp_path: Path) -> None:
-    low = record(tmp_path / "one.bms", [Line(30), Line(20, voltage_v=5.3)])
-    before = await replayed(low, settings())
+    under_voltage = record(tmp_path / "one.bms", [Line(30), Line(20, voltage_v=5.3)])
+    before = await replayed(under_voltage, settings())
     # 5.7 V is above the limit and below the clear level.
     recovering = record(tmp_path / "two.bms", [Line(30, voltage_v=5.7), Line(60)])
     after = await replayed(recovering, settings(), saved_state=before.saved_state, begin_s=WALL_S + 1000.0)
@@ -243,9 +251,9 @@ async def test_a_raised_alarm_survives_a_restart_and_ends_with_its_cause(tmp_pat
 
 
 def make_evaluator(alarms: dict[str, Any] | None = None) -> AlarmEvaluator:
-    """Return an evaluator for ``PACK`` with these settings of the alarms."""
+    """Return an evaluator for ``PACK`` with these settings of the alarms. A silence of 10 s raises link_lost."""
     return AlarmEvaluator(
-        watched(settings(alarms), PACK),
+        monitored_alarms(settings(alarms), PACK),
         charging_a=0.2,
         gap_s=5.0,
         inputs=Inputs(lost_s=10.0, series=2),
@@ -293,91 +301,91 @@ def test_a_saved_alarm_with_an_invalid_value_is_rejected() -> None:
 )
 def test_a_clear_level_beyond_the_limit_is_rejected(alarms: dict[str, Any], reason: str) -> None:
     with pytest.raises(UserError, match=reason):
-        watched(settings(alarms), PACK)
+        monitored_alarms(settings(alarms), PACK)
 
 
 def test_a_limit_out_of_the_pack_s_range_is_reported() -> None:
-    assert out_of_range(settings(), PACK) == []
-    (line,) = out_of_range(settings({"cell_over_voltage": {"limit_v": 8.4}}), PACK)
-    assert line.startswith("alarms.cell_over_voltage.limit_v = 8.4: outside 3.65 to 4.5 V")
+    assert implausible_limits(settings(), PACK) == []
+    (warning,) = implausible_limits(settings({"cell_over_voltage": {"limit_v": 8.4}}), PACK)
+    assert warning.startswith("alarms.cell_over_voltage.limit_v = 8.4: outside 3.65 to 4.5 V")
 
 
-def test_limits_follow_from_chemistry_size_and_settings() -> None:
-    lfp_pack = load_cell("lfp", 100.0).pack(16, 2)
-    lfp = {alarm.name: alarm for alarm in watched(settings(), lfp_pack)}
+def test_limits_depend_on_chemistry_size_and_settings() -> None:
+    lfp_pack = load_cell("lfp", 100.0).pack(16, 2)  # 3.65 V, 3.4 V, 5 C and 1 C for each cell
+    lfp = {alarm.name: alarm for alarm in monitored_alarms(settings(), lfp_pack)}
     assert (lfp["pack_over_voltage"].limit, lfp["pack_over_voltage"].clear) == pytest.approx((58.4, 54.4))
     assert (lfp["discharge_over_current"].limit, lfp["charge_over_current"].limit) == (1000.0, 200.0)
     limits = {"pack_over_voltage": {"limit_v": 57.6}, "cell_imbalance": {"enabled": False}}
-    configured = {alarm.name: alarm for alarm in watched(settings(limits), lfp_pack)}
+    configured = {alarm.name: alarm for alarm in monitored_alarms(settings(limits), lfp_pack)}
     assert configured["pack_over_voltage"].clear == pytest.approx(53.6)
     assert configured["pack_over_voltage"].latch
     assert "cell_imbalance" not in configured
-    stack = {alarm.name for alarm in watched(settings(), load_fuel_cell("pem_30w"))}
+    stack = {alarm.name for alarm in monitored_alarms(settings(), load_fuel_cell("pem_30w"))}
     assert not stack & {"cell_over_voltage", "cell_under_voltage", "charge_over_current", "charging_below_freezing"}
 
 
-CHARGED = Line(30, voltage_v=7.6, current_a=-5.0, cells_v=(3.8, 3.8))
+CHARGING = Line(30, voltage_v=7.6, current_a=-5.0, cells_v=(3.8, 3.8))
 LOSSES = [
-    (CHARGED._replace(temperature_c=None), "temperature", ("charging_below_freezing", "over_temperature")),
-    (CHARGED._replace(cells_v=()), "cell voltages", ("cell_over_voltage", "cell_under_voltage")),
-    (CHARGED._replace(cells_v=(3.8,)), "cell voltages", ("cell_over_voltage", "cell_under_voltage")),
+    (CHARGING._replace(temperature_c=None), "temperature", ("charging_below_freezing", "over_temperature")),
+    (CHARGING._replace(cells_v=()), "cell voltages", ("cell_over_voltage", "cell_under_voltage")),
+    (CHARGING._replace(cells_v=(3.8,)), "cell voltages", ("cell_over_voltage", "cell_under_voltage")),
 ]
-"""Lines without a quantity, the quantity's name in messages, and the critical alarms that need the quantity."""
+"""Readings without a quantity, the quantity's name in messages, and critical alarms that need the quantity."""
 
 
 @pytest.mark.parametrize(("lost", "word", "unwatched_alarms"), LOSSES)
 async def test_a_lost_quantity_raises_sensor_fault_after_ten_seconds_and_its_alarms_are_unwatched(
     lost: Line, word: str, unwatched_alarms: tuple[str, ...], tmp_path: Path
 ) -> None:
-    lines = [CHARGED, lost, CHARGED._replace(seconds=60)]
+    lines = [CHARGING, lost, CHARGING._replace(seconds=60)]
     result = await replayed(record(tmp_path / "capture.bms", lines), settings())
-    assert result.transitions("sensor_fault") == [
-        (40.0, True),
-        (100.0, False),
-    ]  # the quantity counts as measured after 10 s, and the alarm's clear delay is 30 s
+    # The quantity counts as lost or measured after 10 s. The clear delay of the alarm is 30 s.
+    assert result.transitions("sensor_fault") == [(40.0, True), (100.0, False)]
     for name in unwatched_alarms:
         assert result.watched(name) == [(40.0, False), (70.0, True)]
     assert result.watched("pack_over_voltage") == []
-    shown = [{a.name: a for a in s.alarms} for s in result.snapshots]
-    unwatched = [alarms[name] for alarms in shown for name in unwatched_alarms if not alarms[name].watched]
+    published = [{a.name: a for a in s.alarms} for s in result.snapshots]
+    unwatched = [alarms[name] for alarms in published for name in unwatched_alarms if not alarms[name].watched]
     assert {alarm.active for alarm in unwatched} == {False}
     assert all(word in (alarm.unwatched_reason or "") for alarm in unwatched)
-    fault = next(alarms["sensor_fault"] for alarms in shown if alarms["sensor_fault"].active)
+    fault = next(alarms["sensor_fault"] for alarms in published if alarms["sensor_fault"].active)
     assert all(name in fault.text for name in (word, *unwatched_alarms))
     names = {e.name for before, after in itertools.pairwise(result.snapshots) for e in events(before, after)}
     assert {"alarm_raised", "alarm_unwatched", "alarm_watched", "alarm_cleared"} <= names
 
 
-async def test_a_short_loss_and_a_loss_that_no_critical_alarm_needs_raise_nothing(tmp_path: Path) -> None:
-    short = [CHARGED, CHARGED._replace(seconds=10, temperature_c=None), CHARGED]
+async def test_a_short_loss_or_the_loss_of_a_quantity_that_no_critical_alarm_needs_raises_no_alarm(
+    tmp_path: Path,
+) -> None:
+    short = [CHARGING, CHARGING._replace(seconds=10, temperature_c=None), CHARGING]
     path = record(tmp_path / "short.bms", short)
     assert (await replayed(path, settings())).changes == []
     result = await replayed(path, settings({"lost_s": 5.0}))
     assert result.transitions("sensor_fault")[:1] == [(35.0, True)]
     warnings = {name: {"severity": "warning"} for name in ("over_temperature", "charging_below_freezing")}
-    lines = [CHARGED, CHARGED._replace(temperature_c=None)]
+    lines = [CHARGING, CHARGING._replace(temperature_c=None)]
     result = await replayed(record(tmp_path / "warning.bms", lines), settings(warnings))
     assert result.transitions("sensor_fault") == []
     assert result.watched("over_temperature") == [(40.0, False)]
 
 
 async def test_a_rarely_measured_quantity_is_watched_again_after_a_loss(tmp_path: Path) -> None:
-    rare = [CHARGED._replace(seconds=1), CHARGED._replace(seconds=4, temperature_c=None)]
-    lines = [*rare * 6, CHARGED._replace(temperature_c=None), *rare * 8]
+    rare = [CHARGING._replace(seconds=1), CHARGING._replace(seconds=4, temperature_c=None)]
+    lines = [*rare * 6, CHARGING._replace(temperature_c=None), *rare * 8]
     result = await replayed(record(tmp_path / "capture.bms", lines), settings())
     assert result.watched("over_temperature") == [(36.0, False), (70.0, True)]
 
 
 async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None:
-    lines = [CHARGED, CHARGED._replace(temperature_c=None)]
+    lines = [CHARGING, CHARGING._replace(temperature_c=None)]
     before = await replayed(record(tmp_path / "one.bms", lines), settings())
-    without = record(tmp_path / "two.bms", [CHARGED._replace(temperature_c=None)])
+    without = record(tmp_path / "two.bms", [CHARGING._replace(temperature_c=None)])
     after = await replayed(without, settings(), saved_state=before.saved_state, begin_s=WALL_S + 1000.0)
     first = {alarm.name: alarm for alarm in after.snapshots[0].alarms}
     assert (first["sensor_fault"].active, first["over_temperature"].watched) == (True, False)
     assert (after.transitions("sensor_fault"), after.watched("over_temperature")) == ([], [])
-    lost_meanwhile = await replayed(record(tmp_path / "three.bms", [CHARGED]), settings())
-    after = await replayed(without, settings(), saved_state=lost_meanwhile.saved_state, begin_s=WALL_S + 1000.0)
+    measured_before = await replayed(record(tmp_path / "three.bms", [CHARGING]), settings())
+    after = await replayed(without, settings(), saved_state=measured_before.saved_state, begin_s=WALL_S + 1000.0)
     assert after.transitions("sensor_fault") == [(10.0, True)]
 
 
@@ -387,13 +395,15 @@ def test_alarms_are_unwatched_during_silence() -> None:
     block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
     alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    # Duration of the silence [s], and the expected state of an alarm.
     silences = [(9.9, True, None), (10.0, False, "no cable"), (0.1, True, None)]
     for silent_s, is_watched, reason in silences:
         alarms.on_silence(silent_s, WALL_S, "no cable")
-        shown = {alarm.name: alarm for alarm in alarms.report()}
-        assert (shown["pack_over_voltage"].watched, shown["pack_over_voltage"].unwatched_reason) == (is_watched, reason)
-        assert shown["link_lost"].watched
-        assert "over_temperature" not in shown, "it was never measured"
+        reported = {alarm.name: alarm for alarm in alarms.report()}
+        over_voltage = reported["pack_over_voltage"]
+        assert (over_voltage.watched, over_voltage.unwatched_reason) == (is_watched, reason)
+        assert reported["link_lost"].watched
+        assert "over_temperature" not in reported, "it was never measured"
 
 
 def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_a_sample_arrives() -> None:
@@ -423,9 +433,11 @@ def test_damaged_saved_quantities_are_rejected() -> None:
 
 @pytest.mark.parametrize("spacing_s", [0.0, 0.1, 1.0])
 def test_the_time_between_bursts_of_samples_counts_toward_a_delay(spacing_s: float) -> None:
-    """Two samples arrive together, twice a minute. The voltage is above the limit from the fifth burst on."""
-    rule = {"pack_over_voltage": {"delay_s": 10.0}}
-    alarms = make_evaluator(rule)
+    """A burst is two samples, and there are two bursts a minute.
+
+    The voltage is above the limit from the fifth burst on.
+    """
+    alarms = make_evaluator({"pack_over_voltage": {"delay_s": 10.0}})
     for burst in range(12):
         block = np.zeros(2, dtype=SAMPLE)
         block["time_s"], block["voltage_v"] = 30.0 * burst + np.array([0.0, spacing_s]), 8.6 if burst >= 4 else 7.4
@@ -436,9 +448,8 @@ def test_the_time_between_bursts_of_samples_counts_toward_a_delay(spacing_s: flo
 
 
 def test_a_single_gap_does_not_count_toward_a_delay() -> None:
-    rule = {"pack_over_voltage": {"delay_s": 25.0}}
-    alarms = make_evaluator(rule)
-    times_s = [*range(5), *range(25, 200), *range(220, 300)]
+    alarms = make_evaluator({"pack_over_voltage": {"delay_s": 25.0}})
+    times_s = [*range(5), *range(25, 200), *range(220, 300)]  # two gaps of about 20 s
     block = np.zeros(len(times_s), dtype=SAMPLE)
     block["time_s"] = times_s
     block["voltage_v"] = np.where((block["time_s"] < 180.0) & (block["time_s"] > 10.0), 7.4, 8.6)
@@ -448,7 +459,7 @@ def test_a_single_gap_does_not_count_toward_a_delay() -> None:
     assert transitions == [226.0]  # 19 s before the gap of 20 s, and 6 s after it
 
 
-async def test_an_intermittent_sensor_does_not_prolong_the_delay(tmp_path: Path) -> None:
+async def test_an_intermittent_temperature_does_not_prolong_the_delay_of_its_alarm(tmp_path: Path) -> None:
     """A loose wire gives one value in five seconds, which does not yet count as a lost sensor."""
     hot = [Line(1, temperature_c=61.0), Line(4, temperature_c=None)] * 4
     result = await replayed(record(tmp_path / "capture.bms", [Line(30), *hot]), settings())

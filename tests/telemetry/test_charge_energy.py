@@ -9,9 +9,11 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 
 GAP_S = 5.0
+"""Time between samples above which they have a gap [s]."""
 
 
 def make_trace(time_s: np.ndarray, current_a: float | np.ndarray, voltage_v: float | np.ndarray = 4.0) -> np.ndarray:
+    """Return rows of the estimator's trace with these values."""
     rows = np.zeros(len(time_s), dtype=TRACE)
     rows["time_s"], rows["current_a"], rows["voltage_v"] = time_s, current_a, voltage_v
     return rows
@@ -30,7 +32,7 @@ def test_each_direction_is_added_to_its_own_earlier_total() -> None:
     earlier = ChargeEnergy(charge_out_ah=1.0, charge_in_ah=2.0, energy_out_kwh=3.0, energy_in_kwh=4.0)
     meter = ChargeEnergyMeter(earlier, GAP_S)
     meter.add(make_trace(np.arange(0.0, 3601.0), 2.0))
-    assert meter.update_totals() == pytest.approx((3.0, 2.0, 3.008, 4.0))
+    assert meter.update_totals() == pytest.approx((3.0, 2.0, 3.008, 4.0))  # 2 Ah and 8 Wh more
     meter.add(make_trace(np.arange(3601.0, 5401.0), -2.0))
     # By the trapezoidal rule, the second between the two currents has a mean current of 0.
     assert meter.update_totals() == pytest.approx((3.0, 2.0 + 1799 / 1800, 3.008, 4.0 + 0.004 * 1799 / 1800))
@@ -46,12 +48,13 @@ def test_totals_do_not_depend_on_the_size_of_blocks() -> None:
         assert meter_blocks(*(whole[i : i + size] for i in range(0, time_s.size, size))) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("until_s", [4.9, 5.1, 4000.0, -3.0])
-def test_gap_and_backward_step_of_the_clock_add_nothing(until_s: float) -> None:
-    """``until_s`` is the time between the blocks. A time of up to ``GAP_S`` is no gap."""
-    first = np.arange(0.0, 3.0)
-    flow = meter_blocks(make_trace(first, 1.0), make_trace(until_s + 2.0 + first, 1.0))
-    assert flow.charge_out_ah == pytest.approx((4.0 + (until_s if 0.0 < until_s <= GAP_S else 0.0)) / 3600.0)
+@pytest.mark.parametrize("between_s", [4.9, 5.1, 4000.0, -3.0])
+def test_a_gap_and_a_backward_step_of_the_clock_add_nothing(between_s: float) -> None:
+    """``between_s`` is the time between two blocks of 2 s, with 1 A."""
+    time_s = np.arange(0.0, 3.0)
+    totals = meter_blocks(make_trace(time_s, 1.0), make_trace(time_s[-1] + between_s + time_s, 1.0))
+    counted_s = between_s if 0.0 < between_s <= GAP_S else 0.0
+    assert totals.charge_out_ah == pytest.approx((4.0 + counted_s) / 3600.0)
 
 
 def test_slow_samples_do_not_count_as_gaps() -> None:
@@ -74,10 +77,10 @@ def test_noise_around_zero_current_adds_less_than_1_mah_an_hour() -> None:
 def test_totals_never_decrease_and_their_difference_is_the_net_charge() -> None:
     rng, meter = np.random.default_rng(3), ChargeEnergyMeter(ChargeEnergy(), GAP_S)
     time_s, current_a = 0.1 * np.arange(5000), np.cumsum(rng.normal(0.0, 0.2, 5000))
-    flows = [meter.update_totals()]
+    totals = [meter.update_totals()]
     for i in range(0, 5000, 10):
         meter.add(make_trace(time_s[i : i + 10], current_a[i : i + 10]))
-        flows.append(meter.update_totals())
-    assert all(b >= a >= 0.0 for before, flow in pairwise(flows) for a, b in zip(before, flow, strict=True))
-    last = flows[-1]
+        totals.append(meter.update_totals())
+    assert all(b >= a >= 0.0 for before, after in pairwise(totals) for a, b in zip(before, after, strict=True))
+    last = totals[-1]
     assert last.charge_out_ah - last.charge_in_ah == pytest.approx(np.trapezoid(current_a, time_s) / 3600.0)

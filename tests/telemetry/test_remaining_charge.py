@@ -1,4 +1,4 @@
-"""Published values: remaining charge, identified parameters, state of health and suspected input faults."""
+"""Published values: remaining charge, identified parameters, state of health, and suspected input faults."""
 
 import math
 
@@ -18,9 +18,13 @@ from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 from tests.estimator.anywhere.cases import Case, capture
 
-CELL = load_cell("chen_mora").model_copy(update={"adaptation": {}})  # starts at its own values
-Q_AH = CELL.cell.capacity_ah
+CELL = load_cell("chen_mora").model_copy(update={"adaptation": {}})
+"""Cell without bounds of the adaptation, so that parameters start at the values of the file."""
+CAPACITY_AH = CELL.cell.capacity_ah
 NOW_S = 1.7e9
+"""Wall clock of the publications [s since 1970]."""
+C_5_A = 0.055
+"""Current of C/5 [A]."""
 
 
 def estimator_at(soc: float) -> Estimator:
@@ -37,30 +41,29 @@ def pulses(current_a: float, hours: float) -> np.ndarray:
     block["time_s"] = 0.1 * np.arange(block.size)
     block["current_a"] = np.where(np.arange(block.size) // 600 % 2 == 0, current_a, 0.0)
     block["voltage_v"], _ = chen_mora.simulate_cell(
-        (1.0, 0.0, 0.0), block["time_s"].copy(), block["current_a"].copy(), Q_AH * 3600.0, CELL.a
+        (1.0, 0.0, 0.0), block["time_s"].copy(), block["current_a"].copy(), CAPACITY_AH * 3600.0, CELL.a
     )
     return block
 
 
-def test_charge_energy_and_time_at_a_load() -> None:
-    left = remaining_charge(estimator_at(0.5), 0.055)
-    assert left.capacity_ah == pytest.approx(0.5 * Q_AH)
-    assert left.time_to_empty_s == pytest.approx(0.5 * Q_AH / 0.055 * 3600.0)
-    energy_wh = Q_AH * quad(chen_mora.emf, 0.0, 0.5, args=(CELL.a,))[0]
+def test_remaining_charge_energy_and_time_to_empty_under_a_load() -> None:
+    left = remaining_charge(estimator_at(0.5), C_5_A)
+    assert left.capacity_ah == pytest.approx(0.5 * CAPACITY_AH)
+    assert left.time_to_empty_s == pytest.approx(0.5 * CAPACITY_AH / C_5_A * 3600.0)
+    energy_wh = CAPACITY_AH * quad(chen_mora.emf, 0.0, 0.5, args=(CELL.a,))[0]
     assert remaining_charge(estimator_at(0.5), 0.0).energy_wh == pytest.approx(energy_wh, rel=1e-4)
-    assert remaining_charge(estimator_at(0.5), 0.0).energy_wh - left.energy_wh == pytest.approx(
-        0.055
-        * 0.5
-        * Q_AH
-        * sum(f(0.5, estimator_at(0.5).state[0]["a"]) for f in (chen_mora.r_s, chen_mora.r_ts, chen_mora.r_tl))
-    )
+    a = estimator_at(0.5).state[0]["a"]
+    total_ohm = chen_mora.r_s(0.5, a) + chen_mora.r_ts(0.5, a) + chen_mora.r_tl(0.5, a)
+    lost_wh = remaining_charge(estimator_at(0.5), 0.0).energy_wh - left.energy_wh
+    assert lost_wh == pytest.approx(C_5_A * total_ohm * 0.5 * CAPACITY_AH)
 
 
-def test_usable_charge_ends_at_the_margins() -> None:
+def test_usable_charge_ends_at_the_larger_of_delta1_and_delta2() -> None:
+    """Below these SOCs the capacitances C_ts and C_tl of the model are negative."""
     estimator = estimator_at(0.5)
     state = estimator.state[0]
     usable_ah = remaining_charge(estimator, 0.0).usable_ah
-    assert usable_ah == pytest.approx((0.5 - max(state["delta_1"], state["delta_2"])) * Q_AH)
+    assert usable_ah == pytest.approx((0.5 - max(state["delta_1"], state["delta_2"])) * CAPACITY_AH)
     assert remaining_charge(estimator_at(0.001), 0.0).usable_ah == 0.0
 
 
@@ -70,12 +73,14 @@ def test_time_to_empty_is_nan_unless_the_pack_is_discharged(current_a: float) ->
 
 
 def test_time_to_full_is_nan_unless_the_pack_is_charged() -> None:
-    assert remaining_charge(estimator_at(0.4), -0.055).time_to_full_s == pytest.approx(0.6 * Q_AH / 0.055 * 3600.0)
-    assert remaining_charge(estimator_at(1.0), -0.055).time_to_full_s == 0.0
+    assert remaining_charge(estimator_at(0.4), -C_5_A).time_to_full_s == pytest.approx(
+        0.6 * CAPACITY_AH / C_5_A * 3600.0
+    )
+    assert remaining_charge(estimator_at(1.0), -C_5_A).time_to_full_s == 0.0
     assert all(math.isnan(remaining_charge(estimator_at(0.5), a).time_to_full_s) for a in (0.0, 1.0, -1e-5))
 
 
-def test_values_are_missing_before_the_first_sample() -> None:
+def test_no_values_are_published_before_the_first_sample() -> None:
     estimator = Estimator(CELL, initial_soc=0.5, identifier=None)
     assert math.isnan(remaining_charge(estimator, 1.0).capacity_ah)
     assert make_parameters_payload(estimator, NOW_S).elements == {}
@@ -83,8 +88,7 @@ def test_values_are_missing_before_the_first_sample() -> None:
 
 def test_identified_elements_and_state_of_health_are_published_with_their_errors() -> None:
     estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
-    before = estimator.run(pulses(0.2, 0.01)).copy()
-    assert before["soc_std"][-1] > 0.0
+    assert estimator.run(pulses(0.2, 0.01))["soc_std"][-1] > 0.0
     estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     estimator.run(pulses(0.2, 2.5))
     report = make_parameters_payload(estimator, NOW_S)
@@ -102,7 +106,7 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     assert (capacity.source, capacity.valid) == ("identified", False)
     assert 0.005 < capacity.std < estimator.settings_record["filter"]["capacity_std"][0]
     assert "valid below 0.02" in (capacity.reason or "")
-    assert abs(offset_a.value) < 2.0 * offset_a.std <= 2.0 * 0.007 * Q_AH
+    assert abs(offset_a.value) < 2.0 * offset_a.std <= 2.0 * 0.007 * CAPACITY_AH  # the initial std is 0.007 C
     assert report.a["a15"].std is not None
     assert report.elements["e_o_v"].source == "configured"
     a1, target = report.a["a1"], float(estimator.state["target"][0, 1])
@@ -110,8 +114,8 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
     # The parameter is not valid, because the SOC changed little.
     assert (a1.value, a1.source, a1.valid) == (pytest.approx(target, rel=1e-3), "identified", False)
     assert abs(a1.value - CELL.a[1]) < 3.0 * a1.std
-    unsure = [p for p in (*report.a.values(), *report.elements.values()) if p.source == "identified" and not p.valid]
-    assert all(p.std is not None for p in unsure)
+    uncertain = [p for p in (*report.a.values(), *report.elements.values()) if p.source == "identified" and not p.valid]
+    assert all(p.std is not None for p in uncertain)
     assert "identified to" in (a1.reason or "")
     assert "configured" not in (a1.reason or "")
 
@@ -119,7 +123,7 @@ def test_identified_elements_and_state_of_health_are_published_with_their_errors
 def test_samples_rejected_by_the_identifier_are_counted_since_the_start() -> None:
     estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     block = pulses(0.2, 0.1)
-    block["voltage_v"][3000:3003] = 2.6
+    block["voltage_v"][3000:3003] = 2.6  # three glitches
     estimator.run(block)
     assert identifier_counters(estimator.record[0])["gated"] == 3
     restore_state(estimator, dict(fields(estimator.record.copy())), 1.0)
@@ -136,20 +140,20 @@ def test_parameters_are_the_configured_ones_before_the_first_load() -> None:
     assert {p.valid for p in report.state_of_health.values()} == {False}
 
 
-def test_published_ocv_curve_contains_the_learned_correction() -> None:
+def test_the_published_ocv_curve_contains_the_learned_correction() -> None:
     """The true curve lies 20 mV above the generic one. A rest at SOC 0.9 corrects the curve and its std only there."""
     estimator = Estimator(load_cell("nmc", 3.0), initial_soc=0.9, identifier=IdentifierSettings(soc_std=0.005))
     p = estimator.settings_record[0]["filter"]
-    truth_v = chen_mora.ocv(0.9, p["ocv_v"], p["ocv_slope_v"]) + 0.020
-    estimator.step(0.0, 0.0, truth_v)
+    true_v = chen_mora.ocv(0.9, p["ocv_v"], p["ocv_slope_v"]) + 0.020
+    estimator.step(0.0, 0.0, true_v)
     first = make_parameters_payload(estimator, NOW_S).ocv
     for i in range(1, 3600):
-        estimator.step(float(i), 0.0, truth_v)
+        estimator.step(float(i), 0.0, true_v)
     curve = make_parameters_payload(estimator, NOW_S).ocv
     assert first is not None
     assert curve is not None
     near, far = curve.soc.index(0.9), curve.soc.index(0.2)
-    assert abs(curve.ocv_v[near] - truth_v) < 0.3 * 0.020
+    assert abs(curve.ocv_v[near] - true_v) < 0.3 * 0.020
     assert curve.std_v[near] < 0.5 * float(np.interp(0.9, np.linspace(0.0, 1.0, 41), p["curve_error_v"]))
     assert curve.std_v[far] > 0.8 * float(np.interp(0.2, np.linspace(0.0, 1.0, 41), p["curve_error_v"]))
     assert abs(curve.ocv_v[far] - chen_mora.ocv(0.2, p["ocv_v"], p["ocv_slope_v"])) < curve.std_v[far]
@@ -161,7 +165,7 @@ def test_parameters_of_a_tabulated_curve_are_those_of_the_fitted_formula(name: s
     for cells in (1, 6):
         estimator = Estimator(load_cell(name, 3.0).pack(cells, 1))
         a = make_parameters_payload(estimator, NOW_S).a
-        values = np.array([math.nan] * 16 + [a[f"a{i}"].value for i in range(16, 22)])
+        values = np.array([math.nan] * 16 + [a[f"a{i}"].value for i in range(16, 22)])  # a16..a21 of the OCV
         curve_v = estimator.settings[0]["ocv_v"][::4]
         error_v = np.array([chen_mora.emf(soc, values) for soc in np.linspace(0.0, 1.0, curve_v.size)]) - curve_v
         rms_mv = 1e3 * np.sqrt(np.mean(error_v**2))
@@ -193,7 +197,7 @@ def test_a_temperature_outside_the_cell_file_s_range_is_reported(temperature_c: 
     assert bool(texts) == bool(expected)
 
 
-def test_current_of_the_wrong_sign_is_suspected() -> None:
+def test_a_current_with_the_wrong_sign_is_suspected() -> None:
     estimator = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
     block = pulses(0.2, 1.0)
     block["current_a"] *= -1.0
@@ -202,9 +206,9 @@ def test_current_of_the_wrong_sign_is_suspected() -> None:
         "check the sign of the current" in text
         for text in suspicions(estimator.record[0], estimator.settings_record[0])
     )
-    good = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
-    good.run(pulses(0.2, 1.0))
-    assert suspicions(good.record[0], good.settings_record[0]) == []
+    with_right_sign = Estimator(CELL, identifier=IdentifierSettings(), initial_soc=1.0)
+    with_right_sign.run(pulses(0.2, 1.0))
+    assert suspicions(with_right_sign.record[0], with_right_sign.settings_record[0]) == []
 
 
 def test_series_resistance_is_compared_with_that_of_the_cell_file_at_the_same_temperature() -> None:

@@ -73,7 +73,7 @@ def no_check_of_board_clock() -> Iterator[None]:
     original = FrameDecoder._decode
 
     def decode(self: FrameDecoder, *arguments: Any) -> Any:
-        self._state["least_late_s"] = -math.inf  # no sample counts as early
+        self._state["min_delay_s"] = -math.inf  # no sample counts as early
         self._state["period_us"] = 1e12  # any step of the clock agrees with the sequence number
         return original(self, *arguments)
 

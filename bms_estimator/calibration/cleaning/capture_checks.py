@@ -9,18 +9,20 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.cell import CellModel
 
 MIN_PEAK_C_RATE = 0.1
-"""Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with a smaller one is useful only to `ocv`."""
+"""Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with a smaller one is useful only to
+`ocv`."""
 STEP_FRACTION = 0.1
 """Minimum change of current between two samples of a current step, as a fraction of the capture's largest current."""
 MAX_STEP_S = 3.0
-"""Maximum time between the two samples of a current step [s]. Later samples include relaxation beside the ohmic step."""
+"""Maximum time between the two samples of a current step [s]. Later samples include relaxation beside the ohmic
+step."""
 MIN_STEPS = 5
 """Minimum number of current steps whose median determines the sign of the current."""
 LONG_REST_S = 300.0
 """Duration of a rest after which the voltage is near the OCV [s]."""
 MAX_SOC_DEVIATION = 0.1
-"""Maximum deviation of the SOC of a rested voltage from the counted SOC. A deviation beyond both limits is larger than
-errors of the model."""
+"""Maximum deviation of the SOC by a rested voltage from the counted SOC. It is an error only if
+``MAX_VOLTAGE_DEVIATION_V`` is exceeded as well; both together are more than errors of the model explain."""
 MAX_VOLTAGE_DEVIATION_V = 0.1
 """Maximum deviation of a rested voltage from the OCV at the counted SOC, per cell [V]."""
 MIN_GAP_PERIODS = 10.0
@@ -35,7 +37,7 @@ MIN_SOC_CHANGE = 0.05
 """Minimum change of SOC over which the trend of the voltage shows the sign of the current."""
 
 
-def capture_contradictions(load: CleanCapture, cell: CellModel, start: float) -> list[str]:
+def capture_contradictions(load: CleanCapture, cell: CellModel, initial_soc: float) -> list[str]:
     """Return one line on the first contradiction, with a remedy, or an empty list.
 
     Later contradictions are usually consequences of the first.
@@ -43,17 +45,17 @@ def capture_contradictions(load: CleanCapture, cell: CellModel, start: float) ->
     Args:
         load: The capture.
         cell: Cell of the cell file.
-        start: SOC at the first sample, 0..1.
+        initial_soc: SOC at the first sample, 0..1.
     """
-    found = (
+    contradiction = (
         _too_short(load)
         or _no_excitation(load, cell)
         or _wrong_sign(load, cell)
         or _unresponsive_voltage(load, cell)
         or _gap_with_charge(load, cell)
+        or _wrong_capacity(load, cell, initial_soc)
     )
-    found = found or _wrong_capacity(load, cell, start)
-    return [f"{load.name}: {found}"] if found else []
+    return [f"{load.name}: {contradiction}"] if contradiction else []
 
 
 def without_excitation(load: CleanCapture, cell: CellModel) -> bool:
@@ -62,7 +64,7 @@ def without_excitation(load: CleanCapture, cell: CellModel) -> bool:
 
 
 def step_resistance(load: CleanCapture) -> float | None:
-    """Return the median of -dV/dI over the current steps [ohm]. It is negative for a wrong sign; None: too few steps."""
+    """Return the median of -dV/dI over the current steps [ohm]; negative for a wrong sign, None for too few steps."""
     change_a = np.diff(load.current_a)
     largest_a = float(np.abs(load.current_a).max(initial=0.0))
     steps = (np.abs(change_a) > STEP_FRACTION * largest_a) & (np.diff(load.time_s) <= MAX_STEP_S)
@@ -71,13 +73,14 @@ def step_resistance(load: CleanCapture) -> float | None:
     return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))
 
 
-def soc_outside(load: CleanCapture, capacity_ah: float, start: float) -> str | None:
-    """Return a message if SOC, counted from ``start``, leaves 0..1; None if it stays within."""
-    soc = start - load.discharged_ah / capacity_ah
-    if soc.min() >= -2.0 * SOC_SLACK and soc.max() <= 1.0 + 2.0 * SOC_SLACK:
+def soc_outside(load: CleanCapture, capacity_ah: float, initial_soc: float) -> str | None:
+    """Return a message if SOC, counted from ``initial_soc``, leaves 0..1; None if it stays within."""
+    soc = initial_soc - load.discharged_ah / capacity_ah
+    slack = 2.0 * SOC_SLACK
+    if soc.min() >= -slack and soc.max() <= 1.0 + slack:
         return None
     return (
-        f"SOC runs from {soc.min():.3f} to {soc.max():.3f}, outside 0..1: from {start:.3f} at the start "
+        f"SOC runs from {soc.min():.3f} to {soc.max():.3f}, outside 0..1: from {initial_soc:.3f} at the start "
         f"({load.start_v:.3f} V), {np.ptp(load.discharged_ah):.3f} Ah were moved with a capacity of "
         f"{capacity_ah:g} Ah; give the right capacity, or the OCV of this cell"
     )
@@ -93,12 +96,12 @@ def _too_short(load: CleanCapture) -> str | None:
 
 def _no_excitation(load: CleanCapture, cell: CellModel) -> str | None:
     largest_a = float(np.abs(load.current_a).max())
-    least_a = MIN_PEAK_C_RATE * cell.cell.capacity_ah
-    if largest_a >= least_a:
+    min_a = MIN_PEAK_C_RATE * cell.cell.capacity_ah
+    if largest_a >= min_a:
         return None
     return (
         f"no excitation: the current never exceeds {largest_a:.4f} A in {load.time_s[-1] / 3600.0:.2f} h, and at least "
-        f"{least_a:.4f} A ({MIN_PEAK_C_RATE:g} C) is needed; record a load with steps and rests"
+        f"{min_a:.4f} A ({MIN_PEAK_C_RATE:g} C) is needed; record a load with steps and rests"
     )
 
 
@@ -120,14 +123,14 @@ def _wrong_sign(load: CleanCapture, cell: CellModel) -> str | None:
 
 
 def _unresponsive_voltage(load: CleanCapture, cell: CellModel) -> str | None:
-    ohm, least_ohm = step_resistance(load), MIN_RESPONSE_V * cell.cell.series_count / cell.cell.capacity_ah
+    ohm, min_ohm = step_resistance(load), MIN_RESPONSE_V * cell.cell.series_count / cell.cell.capacity_ah
     if np.ptp(load.voltage_v) == 0.0:
-        moves = "is constant"
-    elif ohm is not None and ohm < least_ohm:
-        moves = f"changes by {1e3 * ohm:.3f} mV per ampere at the current's steps (median)"
+        response = "is constant"
+    elif ohm is not None and ohm < min_ohm:
+        response = f"changes by {1e3 * ohm:.3f} mV per ampere at the current's steps (median)"
     else:
         return None
-    return f"the voltage {moves}, so it does not belong to this current; check the column for repeated old values"
+    return f"the voltage {response}, so it does not belong to this current; check the column for repeated old values"
 
 
 def _gap_with_charge(load: CleanCapture, cell: CellModel) -> str | None:
@@ -144,23 +147,23 @@ def _gap_with_charge(load: CleanCapture, cell: CellModel) -> str | None:
     )
 
 
-def _wrong_capacity(load: CleanCapture, cell: CellModel, start: float) -> str | None:
+def _wrong_capacity(load: CleanCapture, cell: CellModel, initial_soc: float) -> str | None:
     """Return a message if the counted SOC leaves 0..1 or contradicts the voltage of a long rest."""
     capacity_ah, grid = cell.cell.capacity_ah, ocv_grid(cell)
-    outside = soc_outside(load, capacity_ah, start)
+    outside = soc_outside(load, capacity_ah, initial_soc)
     if outside:
         return outside
-    soc = start - load.discharged_ah / capacity_ah
+    soc = initial_soc - load.discharged_ah / capacity_ah
     for j in _ends_of_long_rests(load, capacity_ah):
         rested_v = float(load.voltage_v[j])
-        expected_v, seen = ocv(soc[j], *grid), soc_from_ocv(rested_v, *grid)
+        expected_v, rested_soc = ocv(soc[j], *grid), soc_from_ocv(rested_v, *grid)
         if (
             abs(rested_v - expected_v) > MAX_VOLTAGE_DEVIATION_V * cell.cell.series_count
-            and abs(seen - soc[j]) > MAX_SOC_DEVIATION
+            and abs(rested_soc - soc[j]) > MAX_SOC_DEVIATION
         ):
             return (
                 f"charge and voltage disagree: after {load.discharged_ah[j]:.3f} Ah, at rest at {load.time_s[j]:.0f} s, "
-                f"SOC is {soc[j]:.3f} by the charge and a capacity of {capacity_ah:g} Ah, but {seen:.3f} by "
+                f"SOC is {soc[j]:.3f} by the charge and a capacity of {capacity_ah:g} Ah, but {rested_soc:.3f} by "
                 f"{rested_v:.3f} V; give the right capacity, or find this cell's OCV with `ocv`"
             )
     return None

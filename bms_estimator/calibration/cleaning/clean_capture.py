@@ -10,22 +10,22 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-NEIGHBOURS = 2
-"""Number of neighbours on each side of a sample. A sample is compared with the median of itself and its neighbours."""
-MIN_SAMPLES = 2 * NEIGHBOURS + 1
+NEIGHBORS = 2
+"""Number of neighbors on each side of a sample. A sample is compared with the median of itself and its neighbors."""
+MIN_SAMPLES = 2 * NEIGHBORS + 1
 """Minimum number of good samples of a capture."""
 SPIKE_V = 0.03
-"""Maximum deviation of a voltage from its neighbours' median per cell, beyond the part that the current explains [V]."""
+"""Maximum deviation of a voltage from its neighbors' median that the current does not explain, per cell [V]."""
 SPIKE_C = 0.1
-"""Maximum deviation of a current from its neighbours' median while the voltage stays constant, as C-rate [1/h]."""
+"""Maximum deviation of a current from its neighbors' median while the voltage stays constant, as C-rate [1/h]."""
 RESISTANCE_FACTOR = 3.0
 """Largest plausible voltage change per ampere, in multiples of the series resistance at SOC 0.5."""
-
-
 UNCHANGED_FRACTION = 0.01
-"""Maximum change of the voltage at a current spike, as a fraction of the change that the largest resistance explains."""
+"""Maximum change of the voltage at a current spike, as a fraction of the change that the largest resistance
+explains."""
 MIN_GOOD_FRACTION = 0.5
-"""Minimum fraction of samples within the limits of the cell. With fewer, the cell file is that of another cell."""
+"""Minimum fraction of samples within the limits of the cell. A smaller fraction means that the cell file is of another
+cell."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class CleanCapture:
         voltage_v: Shape (n,), measured [V].
         temperature_c: Shape (n,), temperature of the cell [C]; NaN where it was not measured.
         discharged_ah: Shape (n,), charge drawn since the first sample [Ah].
-        resting_samples: Number of samples at rest before the first load.
+        resting_samples: Number of samples at rest before the first load; 0 if the capture starts under load.
         samples: Number of samples in the capture.
         glitches: Number of dropped glitches.
     """
@@ -56,7 +56,7 @@ class CleanCapture:
 
     @property
     def start_v(self) -> float:
-        """Voltage of the first rest [V]; the first sample's if the capture starts under load."""
+        """Median voltage of the first rest [V]; the voltage of the first sample if the capture starts under load."""
         return float(np.median(self.voltage_v[: max(self.resting_samples, 1)]))
 
 
@@ -109,20 +109,21 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
 
 def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
     """Remove voltage spikes that the current does not explain, and current spikes without a change of voltage."""
+    a13, a14, a15 = cell.a[13:16]  # coefficients of R_s(SOC) = a13 e^(-a14 SOC) + a15
+    max_ohm = RESISTANCE_FACTOR * (a13 * np.exp(-0.5 * a14) + a15)
     deviation_v = np.abs(_deviation_from_median(samples["voltage_v"]))
     deviation_a = np.abs(_deviation_from_median(samples["current_a"]))
-    ohm = RESISTANCE_FACTOR * (cell.a[13] * np.exp(-0.5 * cell.a[14]) + cell.a[15])
-    voltage_spike = deviation_v > SPIKE_V * cell.cell.series_count + ohm * deviation_a
+    voltage_spike = deviation_v > SPIKE_V * cell.cell.series_count + max_ohm * deviation_a
     current_spike = (deviation_a > SPIKE_C * cell.cell.capacity_ah) & (
-        deviation_v < UNCHANGED_FRACTION * ohm * deviation_a
+        deviation_v < UNCHANGED_FRACTION * max_ohm * deviation_a
     )
     good: SampleBlock = samples[~(voltage_spike | current_spike)]
     return good
 
 
 def _deviation_from_median(values: Floats) -> Floats:
-    """Return each value less the median of the value and its neighbours; 0 at the ends."""
-    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBOURS + 1)
+    """Return each value less the median of the value and its neighbors; 0 at the ends."""
+    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBORS + 1)
     deviation = np.zeros(values.size)
-    deviation[NEIGHBOURS:-NEIGHBOURS] = values[NEIGHBOURS:-NEIGHBOURS] - np.median(windows, axis=1)
+    deviation[NEIGHBORS:-NEIGHBORS] = values[NEIGHBORS:-NEIGHBORS] - np.median(windows, axis=1)
     return deviation

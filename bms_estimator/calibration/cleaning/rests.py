@@ -11,15 +11,17 @@ GLITCH_FRACTION = 0.5
 """Maximum deviation of a voltage from the median, as a fraction of the median. A larger one is a fault of the
 instrument, because no Li-ion cell has such a range."""
 MAX_BACKWARD_FRACTION = 0.1
-"""Maximum fraction of samples with a time before that of an earlier sample, as after a small correction of a clock."""
+"""Maximum fraction of samples with a time before that of an earlier sample. A small correction of a clock causes few of
+them."""
 MIN_GOOD_FRACTION = 0.5
-"""Minimum fraction of good voltages; below it the faulty ones cannot be recognized."""
+"""Minimum fraction of good voltages. With fewer, the median is not that of good voltages, so that glitches are not
+recognized."""
 REST_C_RATE = 0.01
 """Maximum C-rate of a rest [1/h]. A hundredth of 1 C changes SOC by 0.25 % in a quarter of an hour."""
 NOISE_STDS = 6.0
 """Maximum current of a rest, in standard deviations of the current's noise."""
 NOISE_STEP_C_RATE = 0.1
-"""Maximum change of the current between two samples that counts as noise, as a C-rate [1/h]."""
+"""Limit of the change of the current between two samples, below which it counts as noise, as a C-rate [1/h]."""
 MIN_LOAD_CHARGE = 2e-5
 """Minimum charge of a load that interrupts a rest, as a fraction of the capacity. Less is a glitch of the sensor."""
 SOC_SLACK = 0.03
@@ -44,26 +46,26 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
             f"{name}: none of {samples.size} samples has a voltage above 0 V, the largest is {good['voltage_v'].max():g} V"
         )
     median_v = float(np.median(positive_v))
-    glitch = np.abs(good["voltage_v"] - median_v) > GLITCH_FRACTION * median_v
-    if glitch.mean() > 1.0 - MIN_GOOD_FRACTION:
-        first = good[int(np.argmax(glitch))]
+    is_glitch = np.abs(good["voltage_v"] - median_v) > GLITCH_FRACTION * median_v
+    if is_glitch.mean() > 1.0 - MIN_GOOD_FRACTION:
+        first = good[int(np.argmax(is_glitch))]
         raise UserError(
-            f"{name}: {glitch.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
+            f"{name}: {is_glitch.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
             f"{first['voltage_v']:.3f} V where the median is {median_v:.3f} V: check the sensor's wiring"
         )
-    good = good[~glitch]
+    good = good[~is_glitch]
     latest = np.maximum.accumulate(good["time_s"])
-    back = good["time_s"] < latest
-    if back.mean() > MAX_BACKWARD_FRACTION:
-        first = int(np.argmax(back))
+    is_earlier = good["time_s"] < latest
+    if is_earlier.mean() > MAX_BACKWARD_FRACTION:
+        first = int(np.argmax(is_earlier))
         raise UserError(
             f"{name}: time goes back {(np.diff(good['time_s']) < 0.0).sum()} times, first from {latest[first]:g} to "
-            f"{good['time_s'][first]:g} s, and {back.sum()} of {samples.size} samples lie before earlier ones: the file "
+            f"{good['time_s'][first]:g} s, and {is_earlier.sum()} of {samples.size} samples lie before earlier ones: the file "
             "contains several captures, or a clock was set; give each stretch as a file of its own"
         )
-    later = np.r_[True, good["time_s"][1:] > latest[:-1]]
-    kept: SampleBlock = good[later]
-    return kept
+    is_later = np.r_[True, good["time_s"][1:] > latest[:-1]]
+    increasing: SampleBlock = good[is_later]
+    return increasing
 
 
 def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float = 1.0) -> Floats:
@@ -92,7 +94,7 @@ def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
     """Return the maximum current of a rest [A]: a small C-rate or the sensor's noise, limited to half of the load."""
     change_a = np.diff(current_a)
     small_a = change_a[np.abs(change_a) < NOISE_STEP_C_RATE * capacity_ah]
-    noise_a = float(np.sqrt(np.mean(small_a**2) / 2.0)) if small_a.size else 0.0
+    noise_a = float(np.sqrt(np.mean(small_a**2) / 2.0)) if small_a.size else 0.0  # a difference has twice the variance
     # a periodic load must not count as noise: the limit is below half of the 95th percentile of the current
     half_load_a = 0.5 * float(np.quantile(np.abs(current_a), 0.95))
     return max(REST_C_RATE * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))

@@ -8,9 +8,11 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, generic_cells, load_cell
 
 COMPARED_SOC = 0.1, 0.95
-"""Lower and upper end of the SOC range in which OCV curves are compared. Their steep ends would dominate the difference."""
+"""Lower and upper end of the SOC range in which OCV curves are compared. Outside, the steep ends would dominate the
+difference."""
 RESTS_STD = 0.35
-"""Relative standard deviation of resistances from rests, distributed over RC pairs as in typical cells."""
+"""Relative standard deviation of a ladder with the total resistance from rests and the distribution of a typical
+cell."""
 
 
 def nearest_generic_cell(soc: Floats, ocv_v: Floats, capacity_ah: float, series_count: int) -> CellModel:
@@ -43,9 +45,10 @@ def curve(cell: CellModel, column: str) -> tuple[Floats, Floats]:
 def scaled_generic_ladder(
     generic: CellModel, rests: InitialElements | None, temperature_c: float = REFERENCE_C
 ) -> Ladder:
-    """Return the generic resistances over SOC, scaled to those of the rests.
+    """Return the generic resistances over SOC, scaled to the resistances from rests.
 
-    Rests do not show how resistances grow in the cold and near empty, so that growth stays generic.
+    Rests do not show the growth of resistances in the cold and near empty. Therefore the growth remains that of the
+    generic cell.
 
     Args:
         generic: Result of ``nearest_generic_cell``.
@@ -60,6 +63,7 @@ def scaled_generic_ladder(
     weak_ohm, strong_ohm = np.array(ladder.weak_ohm), np.array(ladder.strong_ohm)
     total_ohm = arrhenius(WEAK_J, temperature_c) * weak_ohm + arrhenius(STRONG_J, temperature_c) * strong_ohm
     mid_soc_ohm = np.array([np.interp(0.5, ladder.soc, row) for row in total_ohm])
+    # index 0 is the series resistance, the others are the RC pairs
     scale = np.full(mid_soc_ohm.size, (rests.r_ts_ohm + rests.r_tl_ohm) / mid_soc_ohm[1:].sum())
     scale[0] = rests.r_s_ohm / mid_soc_ohm[0]
     rows = {

@@ -29,13 +29,13 @@ from bms_estimator.calibration.elements.ladder_fit import (
     TYPICAL_DROP_V,
     ZERO_FRACTION,
     LadderFit,
-    Moments,
+    NormalEquations,
     Prior,
     correction_at,
     fit_ladder,
-    moments,
+    normal_equations,
 )
-from bms_estimator.calibration.elements.replay_score import interval_score
+from bms_estimator.calibration.elements.replay_score import MAX_STEP_S, interval_score
 from bms_estimator.calibration.ocv.overpotential import (
     arrhenius,
     linear_interpolation_matrix,
@@ -54,7 +54,7 @@ from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 
-SHOWN_SOC = (0.2, 0.5, 0.8)
+REPORTED_SOC = (0.2, 0.5, 0.8)
 """SOCs at which the resistances are reported."""
 OCV_STEP = 0.01
 """SOC step between the nodes of the corrected OCV table."""
@@ -64,7 +64,7 @@ MIN_SPAN_K = 10.0
 """Minimum temperature difference that gives activation energies and dE/dT [K]."""
 FULL_TOLERANCE_V = 0.03
 """Maximum distance of a first rest's voltage from that of a full cell at which the capture counts as starting full, per
-cell [V]. Cold rests are not relaxed, so that their voltage gives a wrong SOC."""
+cell [V]. It applies only away from 25 C, because cold rests are not relaxed and their voltage gives a wrong SOC."""
 COLD_K = 5.0
 """Minimum deviation from 25 C at which ``FULL_TOLERANCE_V`` applies [K]."""
 MIN_CELL_C = -45.0
@@ -76,15 +76,19 @@ PERCENTILES = (2.0, 98.0)
 LADDER_STD = 0.1
 """Relative std of resistances between cells of one make: two NCR18650 differ by 5 to 8 %, and cells age."""
 GENERIC_STD = 0.3
-"""Minimum relative std of a generic ladder. A ladder with a smaller std is identified, and its temperature range is known."""
+"""Minimum relative std of a generic ladder. A ladder with a smaller std was identified, so that its temperature range
+is that of captures."""
 SHAPE_MIN_SOC = 0.4
 """SOC above which a resistance is averaged to normalize its shape."""
 SHAPE_LIMITS = (0.2, 20.0)
 """Limits of a resistance relative to its mean above ``SHAPE_MIN_SOC``."""
 MIN_RMS_SOC = 0.1
-"""Lower SOC limit of the reported RMS errors."""
+"""Lower SOC limit of the reported RMS errors and of the RMS change of the OCV."""
+MIN_ERROR_V = 1e-5
+"""Minimum model error written to a cell file [V]. A cell file requires a value above 0."""
 COUNT_PASSES = 3
-"""Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a knee."""
+"""Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a
+knee."""
 EQUAL_SCORE_RATIO = 1.05
 """Ratio up to which two scores count as equal. Four replays do not resolve a smaller difference."""
 
@@ -99,11 +103,11 @@ class CaptureFit:
         glitches: Number of dropped glitches.
         initial_soc: SOC at the first sample, 0..1.
         temperature_c: Lowest and highest temperature [C]; None without a sensor.
-        miscount: Relative error of the counted charge, corrected in the SOC of the fit.
+        miscount: Relative error of the counted charge. The SOC of the fit is corrected by it.
         voltage_rms_v: RMS residual of the voltage, weighted by time, at SOC above 0.1 [V].
         score_before: Interval score of replays with the given cell [%]; NaN when the capture is too short.
         score_after: Interval score with the identified cell [%].
-        held_back: True if ``score_after`` is of a fit without this capture.
+        held_back: True if ``score_after`` is of a cell that was fitted without this capture.
     """
 
     name: str
@@ -127,8 +131,9 @@ class Identification:
         elements: Value and standard error of ``r_s``, ``r_ts`` and ``r_tl`` at 25 C by SOC and name [ohm].
         captures: Fit of each capture, in the order given.
         left_out: Names of captures without excitation.
-        ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0: the OCV is the given one.
-        score_before: Geometric mean of the captures' interval scores with the given cell [%]; NaN when none has a score.
+        ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0 if the given OCV is used.
+        score_before: Geometric mean of the captures' interval scores with the given cell [%]; NaN when none has a
+            score.
         score_after: Geometric mean of the interval scores with the identified cell [%].
     """
 
@@ -143,7 +148,7 @@ class Identification:
 
 @dataclass(frozen=True)
 class Run:
-    """Capture with its SOC and temperature at each sample."""
+    """Cleaned capture with the SOC (0..1) and the temperature [C] at each sample."""
 
     load: CleanCapture
     soc: Floats
@@ -151,11 +156,11 @@ class Run:
     miscount: float = 0.0
     """Relative correction of the counted charge. ``soc`` includes the correction."""
 
-    def recounted(self, more: float) -> "Run":
-        """Return a copy with ``miscount`` increased by ``more`` and ``soc`` rescaled."""
-        miscount = self.miscount + more
-        moved = (self.soc - self.soc[0]) / (1.0 + self.miscount)
-        return replace(self, soc=self.soc[0] + (1.0 + miscount) * moved, miscount=miscount)
+    def recounted(self, added: float) -> "Run":
+        """Return a copy with ``miscount`` increased by ``added`` and the changes of ``soc`` rescaled accordingly."""
+        miscount = self.miscount + added
+        uncorrected_change = (self.soc - self.soc[0]) / (1.0 + self.miscount)
+        return replace(self, soc=self.soc[0] + (1.0 + miscount) * uncorrected_change, miscount=miscount)
 
     @property
     def load_with_temperature(self) -> CleanCapture:
@@ -192,23 +197,27 @@ def identify(
     """
     cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
     loads = [load for load in cleaned if not without_excitation(load, cell)]
+    # without any load, the checks below report the missing excitation
     runs = [_run(load, cell, initial_soc, temperature_c) for load in loads or cleaned]
-    found = [line for run in runs for line in capture_contradictions(run.load, cell, float(run.soc[0]))]
-    found += [line for load in loads for line in _wrong_temperature(load, temperature_c)]
-    if found:
-        raise UserError("\n".join(found))
+    contradictions = [line for run in runs for line in capture_contradictions(run.load, cell, float(run.soc[0]))]
+    contradictions += [line for load in loads for line in _wrong_temperature(load, temperature_c)]
+    if contradictions:
+        raise UserError("\n".join(contradictions))
     runs = _recounted(runs, cell, refine_ocv=refine_ocv)
     left_out = tuple(load.name for load in cleaned if without_excitation(load, cell))
-    moments_of_runs = _moments(runs, cell)
-    variants = (False, True) if refine_ocv else (False,)
-    candidates = [_Candidate(runs, moments_of_runs, cell, refine_ocv=refine) for refine in variants]
+    equations = _equations_of(runs, cell)
+    variants = (False, True) if refine_ocv else (False,)  # with the given OCV, with a corrected OCV
+    candidates = [_Candidate(runs, equations, cell, refine_ocv=refine) for refine in variants]
     before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
     after = [candidate.scores() for candidate in candidates]
     best = len(after) - 1  # the last candidate, if no capture has a score
     if np.isfinite(before).any():
-        judged = [j for j in range(len(runs)) if candidates[0].held_back(j)]
-        given, refined = (_geometric_mean(scores[judged] if judged else scores) for scores in (after[0], after[-1]))
-        best = int((EQUAL_SCORE_RATIO if judged else 1.0) * refined < given)
+        # scores of captures that are not held back favor the variant with more unknowns
+        held_back = [j for j in range(len(runs)) if candidates[0].is_held_back(j)]
+        given, refined = (
+            _geometric_mean(scores[held_back] if held_back else scores) for scores in (after[0], after[-1])
+        )
+        best = int((EQUAL_SCORE_RATIO if held_back else 1.0) * refined < given)  # index in ``candidates``
     outcome = candidates[best].outcome(before, after[best], left_out)
     if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before:
         raise UserError(_worse_replays(outcome))
@@ -216,7 +225,7 @@ def identify(
 
 
 def initial_soc(load: CleanCapture, cell: CellModel) -> float:
-    """Return SOC at the first sample by the voltage of the first rest, or by the loaded voltage plus i R_s."""
+    """Return SOC at the first sample by the voltage of the first rest; without a rest, by the voltage plus i R_s."""
     current_a = 0.0 if load.resting_samples else float(load.current_a[0])
     return soc_from_ocv(load.start_v + current_a * r_s(0.5, cell.a), *ocv_grid(cell))
 
@@ -224,8 +233,8 @@ def initial_soc(load: CleanCapture, cell: CellModel) -> float:
 class _Candidate:
     """Variant of the fit, with a corrected or with the given OCV."""
 
-    def __init__(self, runs: list[Run], moments_of_runs: list[Moments], cell: CellModel, *, refine_ocv: bool) -> None:
-        self._runs, self._moments, self._cell, self._refine = runs, moments_of_runs, cell, refine_ocv
+    def __init__(self, runs: list[Run], equations: list[NormalEquations], cell: CellModel, *, refine_ocv: bool) -> None:
+        self._runs, self._equations, self._cell, self._refine = runs, equations, cell, refine_ocv
         self._scale_ohm = _resistance_scale(runs, cell)
         self.fit = self._fit(range(len(runs)))
 
@@ -235,14 +244,14 @@ class _Candidate:
         return self._cell_from(self.fit, range(len(self._runs)))
 
     def miscounts(self) -> list[float]:
-        """Return the additional miscount of each capture at which its voltage matches the fit."""
-        return [one.miscount(self.fit) for one in self._moments]
+        """Return the additional relative error of each capture's charge count at which its voltage matches the fit."""
+        return [equations_of_run.miscount(self.fit) for equations_of_run in self._equations]
 
     def scores(self) -> Floats:
         """Return the score of each capture's replays [%], by a fit without the capture if it is held back."""
         return np.array([interval_score(self._cell_for(j), run.load, run.soc) for j, run in enumerate(self._runs)])
 
-    def held_back(self, j: int) -> bool:
+    def is_held_back(self, j: int) -> bool:
         """Return True if another capture within ``MIN_SPAN_K`` of the temperature of capture ``j`` was given."""
         mean_c = [run.mean_c for run in self._runs]
         return any(k != j and abs(mean_c[k] - mean_c[j]) < MIN_SPAN_K for k in range(len(mean_c)))
@@ -266,16 +275,16 @@ class _Candidate:
                 voltage_rms_v=_rms(self.cell, run),
                 score_before=float(before[j]),
                 score_after=float(after[j]),
-                held_back=self.held_back(j),
+                held_back=self.is_held_back(j),
             )
             for j, run in enumerate(self._runs)
         )
-        change_v = correction_at(np.linspace(0.1, 1.0, 181)) @ self.fit.correction
+        change_v = correction_at(np.linspace(MIN_RMS_SOC, 1.0, 181)) @ self.fit.correction
         return Identification(
             cell=self.cell,
             elements={
-                soc: {name: self.fit.branches(soc, *which) for name, which in two_branch_fit.SECTIONS.items()}
-                for soc in SHOWN_SOC
+                soc: {name: self.fit.branches(soc, *indices) for name, indices in two_branch_fit.SECTIONS.items()}
+                for soc in REPORTED_SOC
             },
             captures=fits,
             left_out=left_out,
@@ -285,7 +294,7 @@ class _Candidate:
         )
 
     def _cell_for(self, j: int) -> CellModel:
-        if not self.held_back(j):
+        if not self.is_held_back(j):
             return self.cell
         others = [k for k in range(len(self._runs)) if k != j]
         return self._cell_from(self._fit(others), others)
@@ -305,7 +314,7 @@ class _Candidate:
             shapes=self._shapes(),
             weak_share=None if spans_temperature else weak_share(SOC_NODES) if given is None else _weak_share_of(given),
         )
-        return fit_ladder([self._moments[k] for k in which], prior)
+        return fit_ladder([self._equations[k] for k in which], prior)
 
     def _cell_from(self, fit: LadderFit, which: Sequence[int]) -> CellModel:
         """Return the cell with the fit to the captures ``which``."""
@@ -321,30 +330,30 @@ class _Candidate:
             weak_ohm=tuple(map(_tuple, fit.weak_ohm)),
             strong_ohm=tuple(map(_tuple, fit.strong_ohm)),
             std=round(float(np.hypot(LADDER_STD, ohm_std / max(ohm, 1e-9 * self._scale_ohm))), 3),
-            error_v=1.0,
+            error_v=1.0,  # replaced below
             temperature_c=(low_c, high_c),
         )
         update: dict[str, object] = {"ladder": ladder, "adaptation": {}, **two_branch_fit.cell_file_sections(ladder)}
         if self._refine:
             update["ocv"] = _corrected_ocv(self._cell, fit, entropy=spans_temperature)
         new = self._cell.model_copy(update=update)
-        error_v = max(float(np.sqrt(np.mean([_rms(new, run) ** 2 for run in runs]))), 1e-5)
+        error_v = max(float(np.sqrt(np.mean([_rms(new, run) ** 2 for run in runs]))), MIN_ERROR_V)
         return new.model_copy(update={"ladder": ladder.model_copy(update={"error_v": error_v})})
 
     def _shapes(self) -> Floats:
         """Return the prior shape of the weak and strong part of each resistance over SOC, at ``SOC_NODES``.
 
-        The shape of an identified ladder is used in full. A generic ladder gives the square root of its shape, because
-        cells differ. The shape is constant for a cell with a plateau, because the generic shape did not fit the captures
-        of an LFP cell.
+        The shape of an identified ladder is used unchanged. Of a generic ladder the square root of the shape is used,
+        because cells differ. The shape is constant for a cell with a voltage plateau, because the generic shape did not
+        fit the captures of an LFP cell.
         """
         given, grid_v = self._cell.ladder, ocv_grid(self._cell)[0]
         if given is None or has_plateau(np.linspace(0.0, 1.0, grid_v.size), grid_v, self._cell.cell.series_count):
             return np.ones((2, RESISTANCES, SOC_NODES.size))
         rows = _at_nodes(given)
         mean_ohm = rows[:, :, SOC_NODES > SHAPE_MIN_SOC].mean(axis=2, keepdims=True)
-        zero = mean_ohm < ZERO_FRACTION * self._scale_ohm
-        shapes = np.clip(np.where(zero, 1.0, rows / np.where(zero, 1.0, mean_ohm)), *SHAPE_LIMITS)
+        is_zero = mean_ohm < ZERO_FRACTION * self._scale_ohm  # has no shape
+        shapes = np.clip(np.where(is_zero, 1.0, rows / np.where(is_zero, 1.0, mean_ohm)), *SHAPE_LIMITS)
         return np.asarray(np.sqrt(shapes) if given.std >= GENERIC_STD else shapes)
 
 
@@ -353,12 +362,12 @@ def _run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: 
     if temperature_c is not None:
         load = replace(load, temperature_c=temperature_of(load, temperature_c))
     temperature = temperature_of(load)
-    start = initial_soc(load, cell) if soc is None else soc
+    first_soc = initial_soc(load, cell) if soc is None else soc
     full_v = ocv_grid(cell)[0][-1]
-    cold = abs(float(temperature[0]) - REFERENCE_C) > COLD_K
-    if soc is None and cold and abs(full_v - load.start_v) < FULL_TOLERANCE_V * cell.cell.series_count:
-        start = 1.0
-    return Run(load, start - load.discharged_ah / cell.cell.capacity_ah, temperature)
+    is_cold = abs(float(temperature[0]) - REFERENCE_C) > COLD_K
+    if soc is None and is_cold and abs(full_v - load.start_v) < FULL_TOLERANCE_V * cell.cell.series_count:
+        first_soc = 1.0
+    return Run(load, first_soc - load.discharged_ah / cell.cell.capacity_ah, temperature)
 
 
 def _resistance_scale(runs: list[Run], cell: CellModel) -> float:
@@ -367,13 +376,13 @@ def _resistance_scale(runs: list[Run], cell: CellModel) -> float:
     return float(np.median(steps)) if steps else TYPICAL_DROP_V * cell.cell.series_count / cell.cell.capacity_ah
 
 
-def _moments(runs: list[Run], cell: CellModel) -> list[Moments]:
+def _equations_of(runs: list[Run], cell: CellModel) -> list[NormalEquations]:
     """Return the normal equations of the regression over each capture."""
     scale_ohm = _resistance_scale(runs, cell)
     grid_v, grid_slope_v = ocv_grid(cell)
     grid = np.linspace(0.0, 1.0, grid_v.size)
     return [
-        moments(
+        normal_equations(
             run.load,
             run.soc,
             np.interp(run.soc, grid, grid_v) + ocv_offset(cell, run.load_with_temperature, run.soc),
@@ -388,9 +397,9 @@ def _moments(runs: list[Run], cell: CellModel) -> list[Moments]:
 
 
 def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Run]:
-    """Return the captures with their charge corrected so that the knees of the OCV fit."""
+    """Return the captures with their counted charge rescaled so that knees of voltage and OCV coincide."""
     for _ in range(COUNT_PASSES):
-        miscounts = _Candidate(runs, _moments(runs, cell), cell, refine_ocv=refine_ocv).miscounts()
+        miscounts = _Candidate(runs, _equations_of(runs, cell), cell, refine_ocv=refine_ocv).miscounts()
         runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
     return runs
 
@@ -432,8 +441,8 @@ def _ocv_error(cell: CellModel) -> Floats:
 def _curve_error(cell: CellModel) -> Floats:
     """Return the std of the OCV curve at ``EVEN_SOC`` [V], without the error of the hysteresis.
 
-    Captures of drives are discharges. With the error of the hysteresis in the prior, the fit would attribute that error
-    to the curve, where it has the wrong sign in charges.
+    Captures of drives are discharges. With the error of the hysteresis in the prior, the fit would correct the curve by
+    that error, and the correction would have the wrong sign in charges.
     """
     error_v = _ocv_error(cell)
     if not isinstance(cell.ocv, TableOcv) or cell.ocv.hysteresis_v is None:
@@ -473,13 +482,13 @@ def _rms(cell: CellModel, run: Run) -> float:
     grid_v = ocv_grid(cell)[0]
     e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
     error_v = run.load.voltage_v - e_o + overpotential(cell, run.load_with_temperature, run.soc)
-    weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, 60.0)
+    weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, MAX_STEP_S)
     weight *= (run.soc > MIN_RMS_SOC) / arrhenius(0.5 * STRONG_J, run.temperature_c) ** 2
     return float(np.sqrt((weight * error_v**2).sum() / max(weight.sum(), 1e-12)))
 
 
 def _geometric_mean(scores: Floats) -> float:
-    """Return the geometric mean, so that a capture with a high score for every cell file does not dominate."""
+    """Return the geometric mean, in which a capture with a high score for every cell does not dominate."""
     finite = scores[np.isfinite(scores)]
     return float(np.exp(np.log(finite).mean())) if finite.size else float("nan")
 

@@ -21,6 +21,8 @@ LONG_TAUS = np.geomspace(0.08, 0.7, 10)
 """Candidate time constants of the long RC pair, as fractions of the rest's duration."""
 NEGLIGIBLE = 1e-6
 """Relative amplitude of the SOC dependence of an element. A cell file requires an amplitude above 0."""
+ANY_EXPONENT = 10.0
+"""Exponent of the SOC dependence, which has no effect with a negligible amplitude."""
 MIN_SOC = 0.1
 """Minimum SOC of a rest that is used. The elements rise steeply below."""
 MAX_SAMPLES = 1000
@@ -71,53 +73,63 @@ def initial_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: fl
         UserError: No rest follows a load.
     """
     good = remove_glitches(samples, test.name)
-    found = []
+    elements_of_rests = []
     soc = test.start_soc
     for rest in test.rests:
-        drawn_as = (soc - rest.soc) * capacity_ah * 3600.0
+        discharged_as = (soc - rest.soc) * capacity_ah * 3600.0
         soc = rest.soc
         first = int(np.searchsorted(good["time_s"], rest.start_s))
         last = int(np.searchsorted(good["time_s"], rest.start_s + rest.duration_s, side="right"))
         current_a = float(good["current_a"][first - 1]) if first else 0.0
-        if drawn_as > 0.0 and current_a > 0.0 and rest.soc > MIN_SOC:
-            found.append(
-                _elements_from_rest(good[first:last], float(good["voltage_v"][first - 1]), current_a, drawn_as)
+        if discharged_as > 0.0 and current_a > 0.0 and rest.soc > MIN_SOC:
+            elements_of_rests.append(
+                _elements_from_rest(good[first:last], float(good["voltage_v"][first - 1]), current_a, discharged_as)
             )
-    if not found:
+    if not elements_of_rests:
         raise UserError(f"{test.name}: none of its {len(test.rests)} rests follows a discharge above SOC {MIN_SOC}")
-    return InitialElements(*(float(x) for x in np.median(np.array(found), axis=0)))
+    return InitialElements(*(float(x) for x in np.median(np.array(elements_of_rests), axis=0)))
 
 
-def _elements_from_rest(rest: SampleBlock, loaded_v: float, current_a: float, drawn_as: float) -> tuple[float, ...]:
-    """Fit R_s, R_ts, tau_ts, R_tl and tau_tl to one rest after a load of ``current_a``."""
-    rest = rest[:: -(-rest.size // MAX_SAMPLES)]
+def _elements_from_rest(
+    rest: SampleBlock, last_loaded_v: float, current_a: float, discharged_as: float
+) -> tuple[float, ...]:
+    """Fit R_s, R_ts, tau_ts, R_tl and tau_tl to one rest.
+
+    Args:
+        rest: Samples of the rest.
+        last_loaded_v: Last voltage before the rest [V].
+        current_a: Current before the rest [A].
+        discharged_as: Charge drawn since the previous rest [As].
+    """
+    rest = rest[:: -(-rest.size // MAX_SAMPLES)]  # rounded up
     time_s = rest["time_s"] - rest["time_s"][0]
     duration_s = float(time_s[-1])
     fits = []
-    for fast in SHORT_TAUS * duration_s:
-        for slow in LONG_TAUS * duration_s:
-            basis = np.column_stack([np.ones_like(time_s), -np.exp(-time_s / fast), -np.exp(-time_s / slow)])
+    for tau_ts_s in SHORT_TAUS * duration_s:
+        for tau_tl_s in LONG_TAUS * duration_s:
+            basis = np.column_stack([np.ones_like(time_s), -np.exp(-time_s / tau_ts_s), -np.exp(-time_s / tau_tl_s)])
             coefficients, norm = nnls(basis, rest["voltage_v"])
-            fits.append((float(norm), fast, slow, coefficients))
-    _, fast, slow, (end_v, short_v, long_v) = min(fits, key=lambda fit: fit[0])
-    load_s = drawn_as / current_a
+            fits.append((float(norm), tau_ts_s, tau_tl_s, coefficients))
+    _, tau_ts_s, tau_tl_s, (ocv_v, short_v, long_v) = min(fits, key=lambda fit: fit[0])
+    load_s = discharged_as / current_a
     return (
-        max((end_v - short_v - long_v - loaded_v) / current_a, MIN_OHM),
-        _rc_resistance(short_v, current_a, load_s, fast),
-        fast,
-        _rc_resistance(long_v, current_a, load_s, slow),
-        slow,
+        max((ocv_v - short_v - long_v - last_loaded_v) / current_a, MIN_OHM),
+        _rc_resistance(short_v, current_a, load_s, tau_ts_s),
+        tau_ts_s,
+        _rc_resistance(long_v, current_a, load_s, tau_tl_s),
+        tau_tl_s,
     )
 
 
 def _rc_resistance(voltage_v: float, current_a: float, load_s: float, tau_s: float) -> float:
-    """Return the resistance of an RC pair that a load of ``load_s`` charged to ``voltage_v`` [ohm]: (2.2) solved for R."""
-    return max(voltage_v / (current_a * -float(np.expm1(-load_s / tau_s))), MIN_OHM)
+    """Return the resistance [ohm] of an RC pair that a load of ``load_s`` charged to ``voltage_v``, by (2.2)."""
+    charged_fraction = -float(np.expm1(-load_s / tau_s))
+    return max(voltage_v / (current_a * charged_fraction), MIN_OHM)
 
 
 def _resistance(ohm: float) -> Resistance:
-    return Resistance(amplitude_ohm=NEGLIGIBLE * ohm, exponent=10.0, offset_ohm=ohm)
+    return Resistance(amplitude_ohm=NEGLIGIBLE * ohm, exponent=ANY_EXPONENT, offset_ohm=ohm)
 
 
 def _capacitance(farad: float) -> Capacitance:
-    return Capacitance(amplitude_farad=NEGLIGIBLE * farad, exponent=10.0, offset_farad=farad)
+    return Capacitance(amplitude_farad=NEGLIGIBLE * farad, exponent=ANY_EXPONENT, offset_farad=farad)

@@ -1,4 +1,4 @@
-"""Fit of an RC ladder's resistances to captures by regularised linear least squares with all resistances positive.
+"""Fit of an RC ladder's resistances to captures by regularized linear least squares with all resistances positive.
 
     v = E_o(SOC) + d(SOC) + (T - 25 C) u(SOC) - sum_k [w_k(SOC) g_w(T) + s_k(SOC) g_s(T)] x_k
 
@@ -9,10 +9,10 @@ unknowns. u also absorbs the voltage that a cold cell has not relaxed after half
 absorb that voltage, and the predicted drop of a cold drive is twice too large.
 
 The weight of a capture does not depend on its number of rows. The weight of a row is the time since the previous row,
-divided by the time since the last change of current, so that each decade of time in a rest has equal weight. The ends of
-long rests together have as much weight again. Each capture counts as ``ROWS_PER_CAPTURE`` rows. Large voltage drops have
-an error relative to their size. All constants of this module were chosen by the score of replays on drive cycles that
-were not part of the fit.
+divided by the time since the last change of current, so that each decade of time in a rest has equal weight. The ends
+of long rests have additional weight: together as much as all other rows. Each capture counts as ``ROWS_PER_CAPTURE``
+rows. Large voltage drops have an error relative to their size. All constants of this module were chosen by the score of
+replays on drive cycles that were not part of the fit.
 """
 
 from dataclasses import dataclass
@@ -43,16 +43,18 @@ capture has no current steps."""
 ZERO_FRACTION = 1e-6
 """Fraction of the scale below which a fitted resistance counts as 0."""
 ROUGHNESS_STD = 0.1
-"""Prior std of the difference of a resistance between two SOC nodes, and between two neighbouring RC pairs, relative to
+"""Prior std of the difference of a resistance between two SOC nodes, and between two neighboring RC pairs, relative to
 the scale. The resistance per decade of time is about constant from a second to an hour."""
 LOW_SOC = 0.15
 """SOC below which ``ROUGHNESS_STD`` is larger."""
 LOW_SOC_ROUGHNESS = 4.0
 """Factor on ``ROUGHNESS_STD`` below ``LOW_SOC``."""
+LEVEL_PRECISION = 1e-6
+"""Inverse prior variance of a resistance relative to the scale. It only makes the information matrix regular."""
 BEND_V = 10.0
 """Prior std of d2d/dSOC2 per cell [V]."""
 LOW_BEND_SOC = 0.12
-"""SOC below which that prior std is larger."""
+"""SOC below which the prior std is ``LOW_BEND_FACTOR`` times ``BEND_V``."""
 LOW_BEND_FACTOR = 20.0
 """Factor on ``BEND_V`` below ``LOW_BEND_SOC``."""
 OCV_INTERVALS = 20
@@ -73,14 +75,15 @@ ERROR_V = 4e-3
 ERROR_J = 22e3
 """Activation energy of the growth of ``ERROR_V`` in the cold [J/mol]."""
 SOC_STD = 0.01
-"""Std of the SOC after a change of 1; the variance grows with the change. At a knee far from the start a cell
-deviates from its curve, and that voltage error must not become a resistance."""
+"""Std of the SOC after a change of 1. The variance grows with the change: at a knee far from the start a cell deviates
+from its curve, and this voltage error must not appear as a resistance."""
 RELATIVE_STD = 0.1
-"""Std of a row relative to its voltage drop, which is the largest current of x_0..x_3 times the scale of the resistances."""
+"""Std of a row relative to its voltage drop. The drop is the largest of the currents x_0 to x_3 times the scale of the
+resistances."""
 STEP_ROWS = 30.0
 """Weight of all voltage jumps of a capture at clean current steps, in rows. Jumps determine R_0 and do not drift."""
 STEP_V = 1e-3
-"""Std of these voltage jumps per cell [V]."""
+"""Std of a voltage jump at a clean current step, per cell [V]."""
 STEADY_FRACTION = 0.01
 """Maximum variation of the current before and after a clean step, as a fraction of the largest current. With a varying
 current, a delay between voltage and current samples would change R_0."""
@@ -109,14 +112,14 @@ MAX_SOC = 1.01
 
 
 @dataclass(frozen=True)
-class Moments:
+class NormalEquations:
     """Normal equations of one capture, with y the measured voltage less the given OCV.
 
     X are the rows of the model, W their weights. The miscount is the relative error of the counted charge.
 
     Attributes:
-        information: X'WX with the miscount of the charge marginalised.
-        information_vector: X'Wy with the miscount marginalised.
+        information: X'WX with the miscount of the charge marginalized.
+        information_vector: X'Wy with the miscount marginalized.
         miscount_cross: X'Wc, where c is the voltage change by a miscount of 1.
         miscount_information: c'Wc plus the inverse prior variance of the miscount.
         miscount_vector: c'Wy plus the part of the miscount's prior.
@@ -142,7 +145,8 @@ class LadderFit:
         per_kelvin_v: u at ``KELVIN_NODES`` [V/K].
         weak_ohm: Shape (RESISTANCES, SOC_NODES.size), part with the weak temperature dependence [ohm].
         strong_ohm: Shape as of ``weak_ohm``, part with the strong temperature dependence [ohm].
-        covariance: Covariance of the weak and the strong resistances in this order, each by rows, without the bounds.
+        covariance: Covariance of the weak and then the strong resistances, each row by row. It neglects the bounds at
+            0.
     """
 
     correction: Floats
@@ -175,8 +179,8 @@ class Prior:
         per_kelvin_v: Std of u [V/K]; ``FIXED_PER_KELVIN_STD_V`` if u is not fitted.
         scale_ohm: Scale of the resistances [ohm].
         series: Cells in series.
-        shapes: Shape (2, RESISTANCES, SOC_NODES.size), typical course of the weak and strong part of each resistance over
-            SOC, relative to a mean.
+        shapes: Shape (2, RESISTANCES, SOC_NODES.size), typical course of the weak and strong part of each resistance
+            over SOC, relative to a mean.
         weak_share: Shape (RESISTANCES, SOC_NODES.size), given fraction of each resistance that is the weak part; None:
             the captures determine it.
     """
@@ -205,7 +209,7 @@ def correction_at(soc: Floats) -> Floats:
     return np.asarray(BSpline.design_matrix(np.clip(soc, 0.0, 1.0), knots, 3).toarray())
 
 
-def moments(
+def normal_equations(
     load: CleanCapture,
     soc: Floats,
     given_v: Floats,
@@ -214,7 +218,7 @@ def moments(
     scale_ohm: float,
     series: int,
     miscount: float,
-) -> Moments:
+) -> NormalEquations:
     """Return the normal equations of the regression over ``load``.
 
     Args:
@@ -230,45 +234,45 @@ def moments(
     Raises:
         UserError: No sample lies within ``MIN_SOC`` to ``MAX_SOC``.
     """
-    currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
-    weight, last = _weights(load)
+    currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])  # x_0, x_1, ...
+    weight, is_rest_end = _weights(load)
     inside = (soc > MIN_SOC) & (soc < MAX_SOC)
-    selected = (_first_of_each_slot(load.time_s) | last) & inside
+    selected = (_first_of_each_slot(load.time_s) | is_rest_end) & inside
     if not selected.any():
         raise UserError(
             f"{load.name}: no sample between SOC {MIN_SOC:g} and {MAX_SOC:g} [--soc], so that resistances are undetermined"
         )
-    load_a = np.abs(currents[:, :4]).max(axis=1)
-    std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE_STD * scale_ohm * load_a)
+    max_current_a = np.abs(currents[:, :4]).max(axis=1)  # of x_0 to x_3, see RELATIVE_STD
+    std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE_STD * scale_ohm * max_current_a)
     std_v = np.hypot(std_v, SOC_STD * np.sqrt(np.abs(soc - soc[0])) * slope_v)
     weight = np.where(selected, weight, 0.0)
-    root = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[selected, None]
-    first_root = root[:, 0]
+    root_weight = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[selected]
     residual_v = load.voltage_v - given_v
-    rows = _rows(soc[selected], temperature_c[selected], currents[selected]) * root
-    target = residual_v[selected] * root[:, 0]
-    after = _clean_steps(load) & inside
-    before = np.r_[after[1:], False]
-    if after.any():
-        change_a = np.abs(load.current_a[after] - load.current_a[before])
-        std_v = np.hypot(STEP_V * series, RELATIVE_STD * scale_ohm * change_a) * arrhenius(
-            ERROR_J, temperature_c[after]
+    rows = _rows(soc[selected], temperature_c[selected], currents[selected]) * root_weight[:, None]
+    target = residual_v[selected] * root_weight
+    # the rows of voltage jumps: each is the difference between the samples after and before a clean step
+    is_after_step = _clean_steps(load) & inside
+    is_before_step = np.r_[is_after_step[1:], False]
+    if is_after_step.any():
+        change_a = np.abs(load.current_a[is_after_step] - load.current_a[is_before_step])
+        step_std_v = np.hypot(STEP_V * series, RELATIVE_STD * scale_ohm * change_a) * arrhenius(
+            ERROR_J, temperature_c[is_after_step]
         )
-        root = (np.sqrt(STEP_ROWS / after.sum()) / std_v)[:, None]
-        jump = _rows(soc[after], temperature_c[after], currents[after])
-        jump -= _rows(soc[before], temperature_c[before], currents[before])
-        rows = np.vstack([rows, jump * root])
-        target = np.r_[target, (residual_v[after] - residual_v[before]) * root[:, 0]]
-    by_miscount = np.zeros(target.size)  # weighted voltage change by a relative miscount of 1
-    by_miscount[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * first_root
-    cross, own = rows.T @ by_miscount, float(by_miscount @ by_miscount + 1.0 / COUNT_STD**2)
-    vector = float(by_miscount @ target - miscount / COUNT_STD**2)
-    return Moments(
-        information=rows.T @ rows - np.outer(cross, cross) / own,
-        information_vector=rows.T @ target - cross * vector / own,
-        miscount_cross=cross,
-        miscount_information=own,
-        miscount_vector=vector,
+        step_root_weight = np.sqrt(STEP_ROWS / is_after_step.sum()) / step_std_v
+        jump = _rows(soc[is_after_step], temperature_c[is_after_step], currents[is_after_step])
+        jump -= _rows(soc[is_before_step], temperature_c[is_before_step], currents[is_before_step])
+        rows = np.vstack([rows, jump * step_root_weight[:, None]])
+        target = np.r_[target, (residual_v[is_after_step] - residual_v[is_before_step]) * step_root_weight]
+    by_miscount = np.zeros(target.size)  # weighted voltage change by a relative miscount of 1; 0 for jumps
+    by_miscount[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * root_weight
+    miscount_cross, miscount_information = rows.T @ by_miscount, float(by_miscount @ by_miscount + 1.0 / COUNT_STD**2)
+    miscount_vector = float(by_miscount @ target - miscount / COUNT_STD**2)
+    return NormalEquations(
+        information=rows.T @ rows - np.outer(miscount_cross, miscount_cross) / miscount_information,
+        information_vector=rows.T @ target - miscount_cross * miscount_vector / miscount_information,
+        miscount_cross=miscount_cross,
+        miscount_information=miscount_information,
+        miscount_vector=miscount_vector,
     )
 
 
@@ -286,25 +290,25 @@ def _rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:
     )
 
 
-def fit_ladder(captures: list[Moments], prior: Prior) -> LadderFit:
+def fit_ladder(captures: list[NormalEquations], prior: Prior) -> LadderFit:
     """Fit the resistances to all ``captures`` by least squares."""
-    information = _prior_information(prior) + sum(one.information for one in captures)
-    information_vector = np.asarray(sum(one.information_vector for one in captures))
-    expand = np.eye(UNBOUNDED + 2 * PART_SIZE)
+    information = _prior_information(prior) + sum(capture.information for capture in captures)
+    information_vector = np.asarray(sum(capture.information_vector for capture in captures))
+    # matrix that gives all unknowns from the free ones; with a given weak fraction, only the sums of both parts are free
+    from_free = np.eye(UNBOUNDED + 2 * PART_SIZE)
     if prior.weak_share is not None:
-        share = prior.weak_share.ravel()
-        expand = np.zeros((UNBOUNDED + 2 * PART_SIZE, UNBOUNDED + PART_SIZE))
-        expand[:UNBOUNDED, :UNBOUNDED] = np.eye(UNBOUNDED)
-        expand[UNBOUNDED : UNBOUNDED + PART_SIZE, UNBOUNDED:], expand[UNBOUNDED + PART_SIZE :, UNBOUNDED:] = (
-            np.diag(share),
-            np.diag(1.0 - share),
-        )
-    information = expand.T @ information @ expand
-    root = np.linalg.cholesky(information)
-    lowest = np.r_[np.full(UNBOUNDED, -np.inf), np.zeros(root.shape[0] - UNBOUNDED)]
-    target = np.linalg.solve(root, expand.T @ information_vector)
-    unknowns = expand @ lsq_linear(root.T, target, bounds=(lowest, np.inf), tol=1e-12, max_iter=500).x
-    covariance = expand @ np.linalg.inv(information) @ expand.T
+        weak_fraction = prior.weak_share.ravel()
+        from_free = np.zeros((UNBOUNDED + 2 * PART_SIZE, UNBOUNDED + PART_SIZE))
+        from_free[:UNBOUNDED, :UNBOUNDED] = np.eye(UNBOUNDED)
+        from_free[UNBOUNDED : UNBOUNDED + PART_SIZE, UNBOUNDED:] = np.diag(weak_fraction)
+        from_free[UNBOUNDED + PART_SIZE :, UNBOUNDED:] = np.diag(1.0 - weak_fraction)
+    information = from_free.T @ information @ from_free
+    # least squares with the Cholesky factor as rows has these normal equations
+    cholesky = np.linalg.cholesky(information)
+    lower_bounds = np.r_[np.full(UNBOUNDED, -np.inf), np.zeros(cholesky.shape[0] - UNBOUNDED)]
+    target = np.linalg.solve(cholesky, from_free.T @ information_vector)
+    unknowns = from_free @ lsq_linear(cholesky.T, target, bounds=(lower_bounds, np.inf), tol=1e-12, max_iter=500).x
+    covariance = from_free @ np.linalg.inv(information) @ from_free.T
     ohm = np.where(unknowns[UNBOUNDED:] > ZERO_FRACTION * prior.scale_ohm, unknowns[UNBOUNDED:], 0.0)
     weak, strong = ohm.reshape(2, RESISTANCES, SOC_NODES.size)
     return LadderFit(unknowns[:SPLINES], unknowns[SPLINES:UNBOUNDED], weak, strong, covariance[UNBOUNDED:, UNBOUNDED:])
@@ -314,24 +318,24 @@ def _prior_information(prior: Prior) -> Floats:
     """Return the information matrix of the prior of all unknowns."""
     table = np.zeros((UNBOUNDED + 2 * PART_SIZE, UNBOUNDED + 2 * PART_SIZE))
     spline = correction_at(EVEN_SOC)
-    near = spline / prior.ocv_error_v[:, None] * np.sqrt(OCV_INTERVALS / EVEN_SOC.size)
+    deviation = spline / prior.ocv_error_v[:, None] * np.sqrt(OCV_INTERVALS / EVEN_SOC.size)
     bend = np.diff(spline, 2, axis=0) * (EVEN_SOC.size - 1) ** 2 / (BEND_V * prior.series)
     bend[EVEN_SOC[1:-1] < LOW_BEND_SOC] /= LOW_BEND_FACTOR
-    table[:SPLINES, :SPLINES] = near.T @ near + bend.T @ bend / OCV_INTERVALS
+    table[:SPLINES, :SPLINES] = deviation.T @ deviation + bend.T @ bend / OCV_INTERVALS
     table[SPLINES:UNBOUNDED, SPLINES:UNBOUNDED] = np.eye(KELVIN_NODES.size) / prior.per_kelvin_v**2
     for first, shape in zip((UNBOUNDED, UNBOUNDED + PART_SIZE), prior.shapes, strict=True):
         rough = _rough_rows() / (ROUGHNESS_STD * prior.scale_ohm) / shape.ravel()
-        part = rough.T @ rough + 1e-6 * np.eye(PART_SIZE) / prior.scale_ohm**2
+        part = rough.T @ rough + LEVEL_PRECISION * np.eye(PART_SIZE) / prior.scale_ohm**2
         table[first : first + PART_SIZE, first : first + PART_SIZE] = part
     return table
 
 
 def _rough_rows() -> Floats:
-    """Return the differences of one part's resistances along SOC and between neighbouring RC pairs, as rows."""
-    one = np.eye(PART_SIZE).reshape(RESISTANCES, SOC_NODES.size, PART_SIZE)
-    wide = np.where(SOC_NODES < LOW_SOC, LOW_SOC_ROUGHNESS, 1.0)
-    along = (one[:, 1:] - one[:, :-1]) / wide[None, :-1, None]
-    across = (one[2:] - one[1:-1]) / wide[None, :, None]
+    """Return the differences of one part's resistances along SOC and between neighboring RC pairs, as rows."""
+    unknowns = np.eye(PART_SIZE).reshape(RESISTANCES, SOC_NODES.size, PART_SIZE)  # index 0 is R_0, which is no RC pair
+    std_factor = np.where(SOC_NODES < LOW_SOC, LOW_SOC_ROUGHNESS, 1.0)
+    along = (unknowns[:, 1:] - unknowns[:, :-1]) / std_factor[None, :-1, None]
+    across = (unknowns[2:] - unknowns[1:-1]) / std_factor[None, :, None]
     return np.vstack([along.reshape(-1, PART_SIZE), across.reshape(-1, PART_SIZE)])
 
 

@@ -1,7 +1,8 @@
-"""Score of an estimator with a cell: replays that start in mid-load, with an SOC too low and too high.
+"""Score of an estimator with a cell. Replays start in mid-load with an initial SOC that is too low or too high.
 
-The measure is the interval score of SOC +- 2 std (Gneiting and Raftery, JASA 102 (2007) 359): the width of the interval
-plus 40 times the distance of the true SOC outside it. The score is proper: it is smallest for the true interval.
+The measure is the interval score of SOC +- 2 std (Gneiting and Raftery, JASA 102 (2007) 359). It is the width of the
+interval plus 40 times the distance of the true SOC outside the interval. The score is proper: its expected value is
+smallest for the true interval.
 """
 
 import numpy as np
@@ -22,8 +23,10 @@ MIN_SCORED_S = 900.0
 """Minimum scored time [s]."""
 MIN_SOC = 0.05
 """Minimum scored SOC."""
+MAX_STEP_S = 60.0
+"""Maximum weight of a sample in a mean over time [s], so that a gap in the capture does not dominate."""
 PENALTY = 40.0
-"""Weight of the distance outside the interval: 2 / 0.05 for an interval of 95 %."""
+"""Weight of the distance outside the interval, 2 / alpha, with alpha = 0.05 for an interval of 95 %."""
 
 
 def interval_score(cell: CellModel, load: CleanCapture, soc: Floats) -> float:
@@ -34,9 +37,9 @@ def interval_score(cell: CellModel, load: CleanCapture, soc: Floats) -> float:
         load: The capture.
         soc: Shape (n,), true SOC.
     """
-    moved = np.cumsum(np.abs(load.current_a) * np.diff(load.time_s, append=load.time_s[-1]))
-    starts = [int(np.argmax(moved >= cut * moved[-1])) for cut in START_FRACTIONS]
-    scores = [_replay_score(cell, load, soc, start, error) for start in starts for error in WRONG_SOC]
+    throughput_as = np.cumsum(np.abs(load.current_a) * np.diff(load.time_s, append=load.time_s[-1]))
+    start_indices = [int(np.argmax(throughput_as >= fraction * throughput_as[-1])) for fraction in START_FRACTIONS]
+    scores = [_replay_score(cell, load, soc, start, error) for start in start_indices for error in WRONG_SOC]
     finite = [score for score in scores if np.isfinite(score)]
     return float(np.mean(finite)) if finite else float("nan")
 
@@ -49,7 +52,7 @@ def _replay_score(cell: CellModel, load: CleanCapture, soc: Floats, start: int, 
     trace = Estimator(cell, initial_soc=float(np.clip(soc[start] + soc_error, 0.0, 1.0))).run(samples)
     true_soc = np.interp(trace["time_s"], load.time_s, soc)
     scored = (trace["time_s"] - load.time_s[start] >= SETTLING_S) & (true_soc >= MIN_SOC)
-    step_s = np.clip(np.diff(trace["time_s"], append=trace["time_s"][-1]), 0.0, 60.0)[scored]
+    step_s = np.clip(np.diff(trace["time_s"], append=trace["time_s"][-1]), 0.0, MAX_STEP_S)[scored]
     if step_s.sum() < MIN_SCORED_S:
         return float("nan")
     std = trace["soc_std"][scored]

@@ -1,6 +1,7 @@
-"""Parameters a1..a15 of two RC pairs that are equivalent to an RC ladder at 25 C.
+"""Coefficients a1..a15 of two RC pairs and a series resistance that are equivalent to an RC ladder at 25 C.
 
-The elements are (2.5)-(2.9) of the thesis, and delta1 and delta2 are (2.11) and (2.12).
+Each element is an exponential of SOC plus an offset, (2.5)-(2.9) of the thesis. delta1 (2.11) and delta2 (2.12) are the
+SOCs below which the capacitances are negative.
 """
 
 import numpy as np
@@ -18,28 +19,31 @@ EXPONENTS = np.geomspace(1.0, 60.0, 60)
 """Candidate exponents b of A e^(-b SOC) + c."""
 NEGLIGIBLE = 1e-4
 """Relative amplitude that replaces a fitted amplitude of 0. A cell file requires an amplitude above 0."""
+MIN_FRACTION = 1e-4
+"""Minimum resistance of a section, as a fraction of the sum. A cell file requires values above 0."""
 MAX_DELTA = 0.01
 """Maximum delta1 and delta2. The capacitances are positive down to this SOC."""
 SECTIONS = {"r_s": (0, 1), "r_ts": (1, 1 + SHORT), "r_tl": (1 + SHORT, RESISTANCES)}
-"""First index, and index after the last, of the ladder's resistances whose sum is in a section of the cell file."""
+"""First index, and index after the last, of the ladder's resistances whose sum each section of the cell file
+contains."""
 
 
 def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
     """Return the five sections of a cell file that contain a1..a15."""
-    total = (
+    total_ohm = (
         linear_interpolation_matrix(SOC, np.array(ladder.soc))
         @ (np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)).T
     )
     sections: dict[str, Resistance | Capacitance] = {}
-    for name, (first, end) in SECTIONS.items():
-        ohm = np.maximum(total[:, first:end].sum(axis=1), 1e-4 * total.sum(axis=1))
+    for name, (first_index, end_index) in SECTIONS.items():
+        ohm = np.maximum(total_ohm[:, first_index:end_index].sum(axis=1), MIN_FRACTION * total_ohm.sum(axis=1))
         amplitude, exponent, offset = _exponential(ohm, 1.0)
         sections[name] = Resistance(amplitude_ohm=amplitude, exponent=exponent, offset_ohm=offset)
-        if name != "r_s":
+        if name != "r_s":  # the time constant of the RC pair is the mean over the ladder, of ln tau
             # the lower limit gives equal fractions where all resistances are 0
-            share = np.maximum(total[:, first:end], 1e-6 * total.sum(axis=1, keepdims=True))
-            share /= share.sum(axis=1, keepdims=True)
-            farad = np.exp(share @ LN_TAUS[first - 1 : end - 1]) / ohm
+            fraction = np.maximum(total_ohm[:, first_index:end_index], 1e-6 * total_ohm.sum(axis=1, keepdims=True))
+            fraction /= fraction.sum(axis=1, keepdims=True)
+            farad = np.exp(fraction @ LN_TAUS[first_index - 1 : end_index - 1]) / ohm
             amplitude, exponent, offset = _exponential(farad, -1.0)
             sections["c" + name[1:]] = Capacitance(amplitude_farad=amplitude, exponent=exponent, offset_farad=offset)
     return sections
@@ -47,6 +51,7 @@ def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
 
 def _exponential(values: Floats, sign: float) -> tuple[float, float, float]:
     """Fit ``sign`` A e^(-b SOC) + c to ``values`` by relative least squares; return A, b and c, all positive."""
+    # residual, A, b and c; a constant if no exponent fits
     best = (np.inf, NEGLIGIBLE * float(np.median(values)), 10.0, float(np.median(values)))
     for exponent in EXPONENTS:
         curve = np.column_stack([sign * np.exp(-exponent * SOC), np.ones(SOC.size)]) / values[:, None]

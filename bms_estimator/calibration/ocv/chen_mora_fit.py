@@ -1,7 +1,8 @@
-"""Fit of the open-circuit voltage of Chen and Mora, (2.10) of the thesis, to points of relaxation tests.
+"""Fit of Chen and Mora's formula of the open-circuit voltage, (2.10) of the thesis, to points of relaxation tests.
 
-``Points`` of one or more tests are fitted jointly. For comparison, ``average`` averages the parameters of single fits as
-(5.1)-(5.2) of the thesis do. The mean of strongly correlated parameters is a poor fit.
+The formula has the coefficients a16 to a21. ``Points`` of one or more tests are fitted jointly. For comparison,
+``average`` averages the parameters of single fits as the thesis does in (5.1)-(5.2). The mean of strongly correlated
+parameters is a poor fit.
 """
 
 from dataclasses import dataclass
@@ -16,14 +17,17 @@ from bms_estimator.model.cell import ChenMoraOcv
 NAMES = ("a16", "a17", "a18", "a19", "a20", "a21")
 """Names of the parameters of (2.10)."""
 LOWER = np.array([1e-6, 5.0, 1e-6, -np.inf, -np.inf, -np.inf])
-"""Lower bounds of a16..a21. In the thesis all are positive. a19..a21 are unbounded here, because the cubic of a real cell
-may have negative coefficients: the NCR18650 points fit to 9.6 mV RMS, and to 10.6 mV with positive coefficients. Below an
-exponent of 5 the exponential covers all SOC and cannot be distinguished from the cubic."""
+"""Lower bounds of a16..a21. In the thesis all are positive. a19..a21 are unbounded here, because the cubic of a real
+cell may have negative coefficients: the NCR18650 points fit to 9.6 mV RMS, and to 10.6 mV with positive coefficients.
+Below an exponent of 5 the exponential covers all SOC and cannot be distinguished from the cubic."""
 UPPER = np.array([np.inf, 300.0, np.inf, np.inf, np.inf, np.inf])
-"""Upper bounds of a16..a21. At an exponent of 300 the exponential has decayed by SOC 0.01. ``fit_chen_mora`` bounds a16 by
-the highest point, so that E_o(0) is not far below 0 V even if the last points are steep."""
+"""Upper bounds of a16..a21. At an exponent of 300 the exponential has decayed by SOC 0.01. ``fit_chen_mora`` bounds a16
+by the highest point, so that E_o(0) is not far below 0 V even if the last points are steep."""
+TYPICAL = np.array([0.1, 10.0, 1.0, 1.0, 1.0, 1.0])
+"""Typical sizes of a16..a21, which scale the steps of the fit."""
 AT_BOUND_V = 1e-5
-"""Distance from its bound below which an amplitude counts as at the bound: less than the resolution of converters [V]."""
+"""Distance from its bound below which an amplitude counts as at the bound: less than the resolution of converters
+[V]."""
 EXPONENTS = np.geomspace(5.0, 300.0, 60)
 """Candidate exponents a17 from which the search starts."""
 
@@ -71,26 +75,29 @@ def fit_chen_mora(points: Points) -> ChenMoraFit:
     """
     check_points(points)
     upper = np.r_[points.ocv_v.max(), UPPER[1:]]
-    starts = [_with_exponent(points, exponent, upper) for exponent in EXPONENTS]
-    _, start = min(starts, key=lambda found: found[0])
-    inside = np.clip(start, LOWER + 1e-9, upper * 0.999)
-    scale = np.array([0.1, 10.0, 1.0, 1.0, 1.0, 1.0])
-    found = least_squares(
-        lambda a: chen_mora(a, points.soc) - points.ocv_v, inside, bounds=(LOWER, upper), x_scale=scale, xtol=1e-12
+    linear_fits = [_with_exponent(points, exponent, upper) for exponent in EXPONENTS]
+    start_residual2, start_a = min(linear_fits, key=lambda linear_fit: linear_fit[0])
+    strictly_inside = np.clip(start_a, LOWER + 1e-9, upper * 0.999)  # as least_squares requires
+    fit = least_squares(
+        lambda a: chen_mora(a, points.soc) - points.ocv_v,
+        strictly_inside,
+        bounds=(LOWER, upper),
+        x_scale=TYPICAL,
+        xtol=1e-12,
     )
-    a = found.x if 2.0 * found.cost < min(starts, key=lambda x: x[0])[0] else start
+    a = fit.x if 2.0 * fit.cost < start_residual2 else start_a  # the cost is half of the squared residual
     residual_v = points.ocv_v - chen_mora(a, points.soc)
     return ChenMoraFit(a=a, std=_standard_errors(a, upper, points.soc, residual_v), residual_v=residual_v)
 
 
 def _with_exponent(points: Points, exponent: float, upper: Floats) -> tuple[float, Floats]:
     """Fit (2.10) with a given a17; return the squared residual and a16..a21."""
-    x = points.soc
-    basis = np.column_stack([-np.exp(-exponent * x), np.ones_like(x), x, -(x**2), x**3])
-    free = [0, 2, 3, 4, 5]
-    found = lsq_linear(basis, points.ocv_v, bounds=(LOWER[free], upper[free]), tol=1e-14)
-    a16, a18, a19, a20, a21 = found.x
-    return 2.0 * float(found.cost), np.array([a16, exponent, a18, a19, a20, a21])
+    soc = points.soc
+    basis = np.column_stack([-np.exp(-exponent * soc), np.ones_like(soc), soc, -(soc**2), soc**3])
+    free = [0, 2, 3, 4, 5]  # indices of all parameters but a17
+    fit = lsq_linear(basis, points.ocv_v, bounds=(LOWER[free], upper[free]), tol=1e-14)
+    a16, a18, a19, a20, a21 = fit.x
+    return 2.0 * float(fit.cost), np.array([a16, exponent, a18, a19, a20, a21])
 
 
 def _standard_errors(a: Floats, upper: Floats, soc: Floats, residual_v: Floats) -> Floats:

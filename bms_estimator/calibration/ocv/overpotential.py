@@ -34,12 +34,12 @@ def temperature_of(load: CleanCapture, otherwise_c: float = REFERENCE_C) -> Floa
 
 
 def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
-    """Return the drop of the voltage below E_o(SOC) at 25 C, with dE/dT and hysteresis [V].
+    """Return the drop of the voltage below the open-circuit voltage E_o(SOC) at 25 C, with dE/dT and hysteresis [V].
 
     Args:
         cell: Cell with an RC ladder, or with a1..a15, which do not depend on the temperature.
         load: Capture that starts at rest.
-        soc: Shape (n,), counted.
+        soc: Shape (n,), SOC by coulomb counting.
     """
     temperature_c = temperature_of(load)
     if cell.ladder is None:
@@ -50,18 +50,18 @@ def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
 
 
 def ocv_offset(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
-    """Return the change of E_o(SOC) by temperature and hysteresis [V]. The hysteresis starts as after a charge."""
+    """Return the change of E_o(SOC) by temperature and hysteresis [V]. The hysteresis starts as that after a charge."""
     ocv, added_v, temperature_c = cell.ocv, np.zeros(soc.size), temperature_of(load)
     if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
         added_v += np.interp(soc, ocv.soc, ocv.per_kelvin_v) * (temperature_c - REFERENCE_C)
     if isinstance(ocv, TableOcv) and ocv.hysteresis_v is not None:
-        size_v = np.interp(soc, ocv.soc, ocv.hysteresis_v) * arrhenius(HYSTERESIS_J, temperature_c)
-        added_v += size_v * hysteresis(load.time_s, soc, Noise().hysteresis_soc, 1.0)
+        hysteresis_v = np.interp(soc, ocv.soc, ocv.hysteresis_v) * arrhenius(HYSTERESIS_J, temperature_c)
+        added_v += hysteresis_v * hysteresis(load.time_s, soc, Noise().hysteresis_soc, 1.0)
     return added_v
 
 
 def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Floats, first: int) -> Floats:
-    """Return the steady voltage drop across resistances ``first`` and later of a current that has flowed for hours [V].
+    """Return the voltage drop of a current that has flowed for hours across the resistances from ``first`` on [V].
 
     Args:
         ladder: RC ladder of the cell.

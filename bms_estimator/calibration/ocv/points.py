@@ -1,6 +1,6 @@
 """Points of the open-circuit voltage from one or more sources.
 
-(2.10) is an equation of the thesis.
+(2.10) of the thesis is Chen and Mora's formula of the open-circuit voltage.
 """
 
 from collections.abc import Sequence
@@ -22,11 +22,11 @@ COLD_V = 0.012
 DOUBLING_K = 25.0
 """Temperature decrease that doubles the relaxation time [K]."""
 COLD_SOURCE_FRACTION = 0.3
-"""Fraction of the cold error that is independent between sources."""
+"""Fraction of the cold error that is independent between sources. The rest is common to all."""
 LONG_REST_S = 3600.0
 """Duration of a rest beyond which the cold error decreases in inverse proportion [s]."""
 AFTER_CHARGE_V = 0.005
-"""Std of the OCV of a rest after charge due to a hysteresis of unknown size, per cell in series [V]."""
+"""Std of the OCV of a rest after a charge, because the size of the hysteresis is unknown, per cell in series [V]."""
 MIN_SPAN = 0.3
 """Minimum SOC range of the points."""
 
@@ -40,7 +40,8 @@ class Points:
         ocv_v: Shape (n,) [V].
         std_v: Shape (n,), standard deviation of ``ocv_v``, independent between points [V].
         common_v: Shape (n,), standard deviation of the systematic error of the point's source [V].
-        cold_v: Shape (n,), standard deviation of the incomplete relaxation in the cold, common to all sources [V].
+        cold_v: Shape (n,), standard deviation of the error of incomplete relaxation in the cold, which is common to all
+            sources [V].
         temperature_c: Shape (n,), temperature [C]; NaN if unknown.
         direction: Shape (n,), hysteresis state h: -1 after a discharge, 1 after a charge, 0 for their mean.
         source: Shape (n,), index of the point's source, from 0.
@@ -60,7 +61,7 @@ class Points:
     full_v: float = float("nan")
 
     def __post_init__(self) -> None:
-        """Fill in defaults: no common error, unknown temperature, no hysteresis, one source."""
+        """Fill in the defaults: no systematic error, unknown temperature, no hysteresis, one source."""
         if self.common_v.size == 0:
             object.__setattr__(self, "common_v", np.zeros(self.soc.size))
         if self.cold_v.size == 0:
@@ -100,18 +101,18 @@ def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
 
 
 def coldness(temperature_c: Floats) -> Floats:
-    """Return the relaxation time relative to that at 25 C, less 1: 1 at 0 C, 0 for an unknown temperature."""
+    """Return the relaxation time relative to that at 25 C, less 1; 0 for an unknown temperature or above 25 C."""
     colder = np.maximum(REFERENCE_C - np.nan_to_num(temperature_c, nan=REFERENCE_C), 0.0)
     return np.asarray(2.0 ** (colder / DOUBLING_K) - 1.0, dtype=np.float64)
 
 
 def joined(sources: Sequence[Points]) -> Points:
     """Return the points of several sources in the order of SOC, with the index of each point's source."""
-    soc = np.concatenate([one.soc for one in sources])
+    soc = np.concatenate([source.soc for source in sources])
     order = np.argsort(soc, kind="stable")
 
     def column(name: str) -> Floats:
-        return np.asarray(np.concatenate([getattr(one, name) for one in sources])[order])
+        return np.asarray(np.concatenate([getattr(source, name) for source in sources])[order])
 
     return Points(
         soc=soc[order],
@@ -121,9 +122,9 @@ def joined(sources: Sequence[Points]) -> Points:
         cold_v=column("cold_v"),
         temperature_c=column("temperature_c"),
         direction=column("direction"),
-        source=np.repeat(np.arange(len(sources)), [one.soc.size for one in sources])[order],
-        empty_v=_mean([one.empty_v for one in sources]),
-        full_v=_mean([one.full_v for one in sources]),
+        source=np.repeat(np.arange(len(sources)), [source.soc.size for source in sources])[order],
+        empty_v=_mean([source.empty_v for source in sources]),
+        full_v=_mean([source.full_v for source in sources]),
     )
 
 
@@ -135,20 +136,20 @@ def pooled(tests: Sequence[RelaxationTest]) -> Points:
 def with_ends(points: Points, empty_std_v: float, full_std_v: float) -> Points:
     """Append ``empty_v`` and ``full_v`` as points if they are finite and lie outside the other points."""
     ends = [(0.0, points.empty_v, empty_std_v), (1.0, points.full_v, full_std_v)]
-    known = [end for end in ends if np.isfinite(end[1]) and not points.soc[0] <= end[0] <= points.soc[-1]]
-    for soc, ocv_v, std_v in known:
-        at = 0 if soc == 0.0 else points.soc.size
-        nearest = min(at, points.soc.size - 1)
+    missing_ends = [end for end in ends if np.isfinite(end[1]) and not points.soc[0] <= end[0] <= points.soc[-1]]
+    for soc, ocv_v, std_v in missing_ends:
+        index = 0 if soc == 0.0 else points.soc.size
+        nearest = min(index, points.soc.size - 1)
         points = replace(
             points,
-            soc=np.insert(points.soc, at, soc),
-            ocv_v=np.insert(points.ocv_v, at, ocv_v),
-            std_v=np.insert(points.std_v, at, std_v),
-            common_v=np.insert(points.common_v, at, points.common_v[nearest]),
-            cold_v=np.insert(points.cold_v, at, points.cold_v[nearest]),
-            temperature_c=np.insert(points.temperature_c, at, points.temperature_c[nearest]),
-            direction=np.insert(points.direction, at, points.direction[nearest]),
-            source=np.insert(points.source, at, points.source[nearest]),
+            soc=np.insert(points.soc, index, soc),
+            ocv_v=np.insert(points.ocv_v, index, ocv_v),
+            std_v=np.insert(points.std_v, index, std_v),
+            common_v=np.insert(points.common_v, index, points.common_v[nearest]),
+            cold_v=np.insert(points.cold_v, index, points.cold_v[nearest]),
+            temperature_c=np.insert(points.temperature_c, index, points.temperature_c[nearest]),
+            direction=np.insert(points.direction, index, points.direction[nearest]),
+            source=np.insert(points.source, index, points.source[nearest]),
         )
     return points
 
@@ -183,5 +184,5 @@ def max_v(residual_v: Floats) -> float:
 
 
 def _mean(values: list[float]) -> float:
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.mean(known)) if known else float("nan")
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else float("nan")

@@ -1,8 +1,8 @@
-"""Voltage relaxation test, section 5.2.1 of the thesis: points of the open-circuit voltage from a capture of loads and rests.
+"""Voltage relaxation test: points of the open-circuit voltage from a capture of loads and rests.
 
-A cell is discharged in steps with a rest after each. At the end of a rest its voltage is near the open-circuit voltage.
-The remaining relaxation is extrapolated with an exponential, and the standard deviation of the point contains the error
-of the extrapolation.
+The test is described in section 5.2.1 of the thesis. A cell is discharged in steps with a rest after each. At the end
+of a rest its voltage is near the open-circuit voltage. The remaining relaxation is extrapolated with an exponential,
+and the standard deviation of the point contains the error of the extrapolation.
 """
 
 from dataclasses import dataclass
@@ -27,9 +27,9 @@ MIN_REST_S = 30.0
 MAX_STD_V = 0.02
 """Maximum standard deviation of an extrapolated voltage, per cell in series [V]."""
 FIT_FROM = 0.5
-"""Fraction of a rest's duration after which the exponential is fitted. The fast RC pair has decayed by then."""
+"""Fraction of a rest's duration from which on the exponential is fitted. The fast RC pair has decayed by then."""
 END_FROM = 0.98
-"""Fraction of a rest's duration after which the voltages are averaged as the voltage at its end."""
+"""Fraction of a rest's duration from which on the voltages are averaged; the mean is the voltage at the rest's end."""
 MIN_TAU = 0.05
 """Minimum candidate time constant, as a fraction of the rest's duration."""
 MAX_TAU = 0.7
@@ -38,18 +38,19 @@ from a drift, so that its extrapolation diverges."""
 TAU_COUNT = 40
 """Number of candidate time constants."""
 EXTRAPOLATION_ERROR = 0.6
-"""Std of the extrapolated change, as a fraction of the change, because relaxation is no pure exponential. Half-hour rests
-of a NCR18650, cut to a quarter of an hour, miss their end voltage by 2.4 mV RMS with extrapolation and by 4.7 mV without."""
+"""Std of the extrapolated change, as a fraction of the change, because relaxation is no pure exponential. Half-hour
+rests of a NCR18650, cut to a quarter of an hour, miss their end voltage by 2.4 mV RMS with extrapolation and by 4.7 mV
+without."""
 MIN_NOISE_V = 1e-4
 """Minimum noise of a voltage [V]."""
 SLOW_TAU_S = 600.0
 """Time constant of a slow RC pair [s]. A shorter rest cannot distinguish it from a faster one, so that the std of its
 extrapolation contains the difference between both."""
 SLOW_TAU_FRACTION = 0.4
-"""Std of the extrapolation of a rest shorter than ``SLOW_TAU_S``, as a fraction of the difference between the fitted and
-the slow extrapolation."""
+"""Std of the extrapolation of a rest shorter than ``SLOW_TAU_S``, as a fraction of the difference between the fitted
+extrapolation and one with the time constant ``SLOW_TAU_S``."""
 MIN_STD_V = 5e-4
-"""Minimum std of a point: half a step of a usual converter, and effects of temperature [V]."""
+"""Minimum std of a point [V]. It covers half a step of a usual converter and effects of temperature."""
 NEAR_FULL = 0.995
 """SOC above which the first sample counts as full."""
 NEAR_EMPTY = 0.02
@@ -99,9 +100,10 @@ class RelaxationTest:
         glitches: Number of samples dropped as faults of the instrument.
         start_soc: SOC at the first sample.
         end_soc: SOC at the last sample.
-        empty_v: Open-circuit voltage at SOC 0 [V]: the last loaded voltage plus the overpotential at the end of the
-            previous load. NaN when the capture ends above SOC 0.02.
-        full_v: Open-circuit voltage at SOC 1 [V]: the voltage of a first sample at rest and full, otherwise NaN.
+        empty_v: Open-circuit voltage at SOC 0 [V], which is the last loaded voltage plus the overpotential at the end
+            of the previous load. NaN when the capture ends above SOC 0.02 or at rest.
+        full_v: Voltage of the first sample if it is at rest and full, which is the open-circuit voltage at SOC 1 [V];
+            otherwise NaN.
     """
 
     name: str
@@ -257,10 +259,9 @@ def _extrapolated_rest(rest: SampleBlock, soc: float, *, after_charge: bool) -> 
     late = time_s >= FIT_FROM * duration_s
     ocv_v, spread_v = _extrapolate(time_s[late], rest["voltage_v"][late], duration_s)
     voltage_v = float(rest["voltage_v"][time_s >= END_FROM * duration_s].mean())
-    slow, _, _ = _with_tau(
-        time_s[late], rest["voltage_v"][late], SLOW_TAU_S
-    )  # a short rest cannot exclude this time constant
-    slow_std_v = SLOW_TAU_FRACTION * (float(slow[0]) - ocv_v) if duration_s < SLOW_TAU_S else 0.0
+    # a short rest cannot exclude the slow time constant
+    slow_coefficients, _, _ = _with_tau(time_s[late], rest["voltage_v"][late], SLOW_TAU_S)
+    slow_std_v = SLOW_TAU_FRACTION * (float(slow_coefficients[0]) - ocv_v) if duration_s < SLOW_TAU_S else 0.0
     return Rest(
         start_s=float(rest["time_s"][0]),
         duration_s=duration_s,
@@ -278,20 +279,20 @@ def _extrapolated_rest(rest: SampleBlock, soc: float, *, after_charge: bool) -> 
 def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[float, float]:
     """Fit v = v_inf + b e^(-t/tau); return v_inf and its standard deviation [V].
 
-    For each tau of a grid, v_inf and b are fitted by linear least squares. The result is the mean over the grid, weighted
-    by likelihood, so that the standard deviation contains the uncertainty of tau.
+    For each tau of a grid, v_inf and b are fitted by linear least squares. The result is the mean over the grid,
+    weighted by likelihood, so that the standard deviation contains the uncertainty of tau.
     """
     elapsed = time_s - time_s[0]
     taus = np.geomspace(MIN_TAU * duration_s, MAX_TAU * duration_s, TAU_COUNT)
     fits = [_with_tau(elapsed, voltage_v, tau) for tau in taus]
     v_inf = np.array([coefficients[0] for coefficients, _, _ in fits])
-    squares = np.array([s for _, _, s in fits])
-    variance = max(float(squares.min()) / max(elapsed.size - 3, 1), MIN_NOISE_V**2)
-    likelihood = np.exp(-0.5 * (squares - squares.min()) / variance)
+    residual2 = np.array([s for _, _, s in fits])
+    variance = max(float(residual2.min()) / max(elapsed.size - 3, 1), MIN_NOISE_V**2)
+    likelihood = np.exp(-0.5 * (residual2 - residual2.min()) / variance)
     likelihood /= likelihood.sum()
-    of_each = variance * np.array([np.linalg.pinv(basis.T @ basis)[0, 0] for _, basis, _ in fits])
+    variance_of_fits = variance * np.array([np.linalg.pinv(basis.T @ basis)[0, 0] for _, basis, _ in fits])
     mean_v = float(likelihood @ v_inf)
-    spread_v = float(np.sqrt(likelihood @ (of_each + (v_inf - mean_v) ** 2)))
+    spread_v = float(np.sqrt(likelihood @ (variance_of_fits + (v_inf - mean_v) ** 2)))
     return mean_v, spread_v
 
 
@@ -313,9 +314,9 @@ def _check_rests(
     """
     hours = (good["time_s"][-1] - good["time_s"][0]) / 3600.0
     if not resting.any():
-        least = float(np.abs(good["current_a"]).min())
+        min_a = float(np.abs(good["current_a"]).min())
         raise UserError(
-            f"{name}: no rests in {hours:.2f} h: the current never falls below {least:.3f} A; "
+            f"{name}: no rests in {hours:.2f} h: the current never falls below {min_a:.3f} A; "
             "a relaxation test discharges in steps with a rest after each"
         )
     if len(rests) < MIN_POINTS:

@@ -1,7 +1,8 @@
 """Low-rate curves: open-circuit voltage from discharges and charges at a small constant current (pseudo-OCV).
 
 The open-circuit voltage is the mean of a discharge and a charge of one cell. The hysteresis is half of their difference
-less the ohmic drop. An unpaired discharge or charge gives the open-circuit voltage with an error of half the difference.
+less the ohmic drop. An unpaired discharge or charge gives the open-circuit voltage with an error of half the
+difference.
 """
 
 from collections.abc import Sequence
@@ -18,22 +19,26 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 MIN_DURATION_S = 7.0 * 3600.0
-"""Minimum duration of a low-rate curve, that of a full curve at C/7 [s]. At C/10 half of the difference between discharge
-and charge is some 20 mV."""
+"""Minimum duration of a low-rate curve, that of a full curve at C/7 [s]. At C/10 half of the difference between
+discharge and charge is some 20 mV."""
 MAX_CURRENT_DEVIATION = 0.05
-"""Maximum relative deviation of a constant current from its median, in addition to a standard deviation of its noise."""
+"""Maximum relative deviation of a constant current from its median, in addition to a standard deviation of its
+noise."""
 SMOOTH_SAMPLES = 31
 """Length of the median filter [samples]. It removes faults and divides the noise by about five."""
 STD_PER_MEDIAN_STEP = 1.05
 """Standard deviation of white noise over the median absolute difference between its samples."""
 EMPTY_FALL = 0.01
 """Minimum relative fall of the voltage over the last hundredth of the charge for a discharge that ends empty."""
+MAX_BEFORE_FRACTION = 0.01
+"""Maximum charge drawn before a full discharge, as a fraction of the discharge's charge."""
 PAIR_K = 5.0
 """Maximum temperature difference between discharge and charge of a pair [K]."""
 PAIR_CURRENT = 0.3
 """Maximum relative difference of the current between discharge and charge of a pair."""
 MAX_MISSING_SOC = 0.1
-"""Maximum SOC by which a charge may end below full. A larger difference means an incomplete charge or a wrong current."""
+"""Maximum SOC by which a charge may end below full. A larger difference means an incomplete charge or a wrong
+current."""
 GRID = np.unique(
     np.round(np.r_[np.arange(0, 0.1, 0.005), np.arange(0.1, 0.95, 0.01), np.arange(0.95, 1.0, 0.005), 1], 4)
 )
@@ -57,8 +62,8 @@ PAIR_FRACTION = 0.1
 UNPAIRED_FRACTION = 0.5
 """Systematic error as a fraction of the half difference, at SOCs where only one curve of a pair has data."""
 END_TRANSIENT_SOC = 0.03
-"""SOC range before the end of a charge that stops early. The voltage rises there before the end, so that the range is not
-averaged with the discharge."""
+"""SOC range before the end of a charge that stops early. The voltage rises there before the end, so that the range is
+not averaged with the discharge."""
 UNPAIRED_V = 0.01
 """Systematic error of an unpaired curve without its ohmic part, per cell in series [V]."""
 PAIR_COLD_FRACTION = 0.25
@@ -77,7 +82,7 @@ class SlowBranch:
         voltage_v: Shape (n,), terminal voltage [V].
         current_a: Mean magnitude of the current [A].
         temperature_c: Mean temperature [C]; NaN without a sensor.
-        before_ah: Net charge that the capture discharged before the start of the curve [Ah].
+        before_ah: Net charge drawn between the start of the capture and the start of the curve [Ah].
         start_v: Voltage of the rest before the curve [V]; NaN without a rest.
         step_v: Voltage jump between rest and current at the full end of the curve [V]; NaN without a rest there.
         to_empty: True for a discharge down to empty.
@@ -128,15 +133,17 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
     smooth = good.copy()
     smooth["current_a"] = median_filter(good["current_a"], SMOOTH_SAMPLES, mode="nearest")
     noise_a = STD_PER_MEDIAN_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))
-    resting = resting_samples(smooth, float(np.ptp(moved_ah)))
-    found = []
+    resting = resting_samples(smooth, capacity_ah=float(np.ptp(moved_ah)))  # the capacity itself is unknown here
+    branches = []
     for first, last in true_runs(~resting):
         current_a = smooth["current_a"][first:last]
         middle_a = float(np.median(current_a))
-        for a, b in true_runs(np.abs(current_a - middle_a) <= MAX_CURRENT_DEVIATION * abs(middle_a) + noise_a):
-            if good["time_s"][first + b - 1] - good["time_s"][first + a] >= MIN_DURATION_S:
-                found.append(_branch(good, moved_ah, resting, first + a, first + b, name))
-    return found
+        for first_steady, end_steady in true_runs(
+            np.abs(current_a - middle_a) <= MAX_CURRENT_DEVIATION * abs(middle_a) + noise_a
+        ):
+            if good["time_s"][first + end_steady - 1] - good["time_s"][first + first_steady] >= MIN_DURATION_S:
+                branches.append(_branch(good, moved_ah, resting, first + first_steady, first + end_steady, name))
+    return branches
 
 
 def _branch(
@@ -157,12 +164,13 @@ def _branch(
             f"while the voltage went from {voltage_v[0]:.3f} to {voltage_v[-1]:.3f} V; discharge must be positive "
             "(--current-sign)"
         )
-    jump_v = float("nan")
+    jump_v = float("nan")  # at the full end: the end of a charge, the start of a discharge
     if charge and last < good.size and resting[last]:
         jump_v = voltage_v[-1] - float(good["voltage_v"][last])
     elif not charge and first > 0 and resting[first - 1]:
         jump_v = float(good["voltage_v"][first - 1]) - voltage_v[0]
-    late_v = float(np.interp(0.99 * ah[-1], ah, voltage_v)) - voltage_v[-1]
+    # over the last hundredth of the charge, see EMPTY_FALL
+    last_fall_v = float(np.interp(0.99 * ah[-1], ah, voltage_v)) - voltage_v[-1]
     return SlowBranch(
         name=name,
         charge=charge,
@@ -173,13 +181,13 @@ def _branch(
         before_ah=float(moved_ah[first]),
         start_v=float(good["voltage_v"][first - 1]) if first > 0 and resting[first - 1] else float("nan"),
         step_v=max(jump_v, 0.0),
-        to_empty=not charge and late_v > EMPTY_FALL * float(np.median(voltage_v)),
+        to_empty=not charge and last_fall_v > EMPTY_FALL * float(np.median(voltage_v)),
     )
 
 
 def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
     """Return the charge of the full low-rate discharge nearest to 25 C [Ah]; NaN without one."""
-    full = [branch for branch in branches if branch.to_empty and branch.before_ah < 0.01 * branch.ah[-1]]
+    full = [branch for branch in branches if branch.to_empty and branch.before_ah < MAX_BEFORE_FRACTION * branch.ah[-1]]
     if not full:
         return float("nan")
     return float(min(full, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0)).ah[-1])
@@ -200,32 +208,33 @@ def slow_curves(
         UserError: A discharge draws more than the capacity.
     """
     charges = [branch for branch in branches if branch.charge]
-    found = []
+    curves = []
     for discharge in (branch for branch in branches if not branch.charge):
-        start = min(initial_soc - discharge.before_ah / capacity_ah, 1.0)  # a charge before it may have filled it
-        soc = start - discharge.ah / capacity_ah
+        # a charge before the discharge may have filled the cell
+        start_soc = min(initial_soc - discharge.before_ah / capacity_ah, 1.0)
+        soc = start_soc - discharge.ah / capacity_ah
         if soc[-1] < -SOC_SLACK:
             raise UserError(
                 f"{discharge.name}: SOC runs from {soc[0]:.3f} to {soc[-1]:.3f}, outside 0..1: {discharge.ah[-1]:.3f} Ah were "
                 f"drawn, more than a capacity of {capacity_ah:g} Ah holds; give the right capacity or initial SOC"
             )
-        charge = next((one for one in charges if _are_pair(discharge, one)), None)
+        charge = next((candidate for candidate in charges if _are_pair(discharge, candidate)), None)
         if charge is None:
-            found.append(_unpaired(discharge, soc, series_count, ()))
+            curves.append(_unpaired(discharge, soc, series_count, ()))
             continue
         charges.remove(charge)
-        up = soc[-1] + charge.ah / capacity_ah
-        if up[-1] < 1.0 - MAX_MISSING_SOC:
+        charge_soc = soc[-1] + charge.ah / capacity_ah
+        if charge_soc[-1] < 1.0 - MAX_MISSING_SOC:
             incomplete = (
                 f"its charge {charge.name} left out: {charge.ah[-1]:.3f} Ah went in after {discharge.ah[-1]:.3f} Ah had "
                 "come out, so the charge is incomplete or its current is wrong"
             )
-            found.append(_unpaired(discharge, soc, series_count, (incomplete,)))
+            curves.append(_unpaired(discharge, soc, series_count, (incomplete,)))
             continue
-        if up[-1] > 1.0:
-            up = soc[-1] + (1.0 - soc[-1]) * charge.ah / charge.ah[-1]
-        found.append(_pair(discharge, soc, charge, up, series_count))
-    return found + [
+        if charge_soc[-1] > 1.0:  # more went in than the capacity: the charge ends full
+            charge_soc = soc[-1] + (1.0 - soc[-1]) * charge.ah / charge.ah[-1]
+        curves.append(_pair(discharge, soc, charge, charge_soc, series_count))
+    return curves + [
         _unpaired(charge, 1.0 - (charge.ah[-1] - charge.ah) / capacity_ah, series_count, ("assumed to end full",))
         for charge in charges
     ]
@@ -233,37 +242,45 @@ def slow_curves(
 
 def _are_pair(discharge: SlowBranch, charge: SlowBranch) -> bool:
     """Return True if temperatures and currents are nearly equal."""
-    warmer = charge.temperature_c - discharge.temperature_c
-    near = np.isnan(warmer) or abs(warmer) <= PAIR_K
-    return bool(near) and abs(charge.current_a / discharge.current_a - 1.0) <= PAIR_CURRENT
+    difference_k = charge.temperature_c - discharge.temperature_c
+    near_temperature = np.isnan(difference_k) or abs(difference_k) <= PAIR_K
+    return bool(near_temperature) and abs(charge.current_a / discharge.current_a - 1.0) <= PAIR_CURRENT
 
 
-def _pair(down: SlowBranch, soc: Floats, up: SlowBranch, up_soc: Floats, series_count: int) -> SlowCurve:
-    """Return the mean of discharge and charge.
+def _pair(
+    discharge: SlowBranch, discharge_soc: Floats, charge: SlowBranch, charge_soc: Floats, series_count: int
+) -> SlowCurve:
+    """Return the mean of a discharge and a charge.
 
-    At SOCs where one of both has no data, the other is shifted by half of the median difference.
+    At SOCs at which only one of them has data, that curve is shifted by half of the median difference.
     """
-    low, high = max(soc[-1], up_soc[0]), min(soc[0], up_soc[-1])
+    low, high = max(discharge_soc[-1], charge_soc[0]), min(discharge_soc[0], charge_soc[-1])
     if high <= HYSTERESIS_SOC[1]:  # the voltage of a charge that stops early rises before its end
         high -= END_TRANSIENT_SOC
-    both = GRID[(low <= GRID) & (high >= GRID)]
-    differ_v = 0.5 * (_voltage_at(both, up_soc, up.voltage_v) - _voltage_at(both, soc, down.voltage_v))
-    middle_v = float(np.median(differ_v))
-    half_v = np.where((low <= GRID) & (high >= GRID), np.interp(GRID, both, differ_v), middle_v)
-    grid = GRID[(min(soc[-1], up_soc[0]) <= GRID) & (max(soc[0], up_soc[-1]) >= GRID)]
-    half = np.interp(grid, GRID, half_v)
-    known = (grid >= soc[-1]) & (grid <= soc[0])
-    ocv_v = np.where(
-        known, _voltage_at(grid, soc, down.voltage_v) + half, _voltage_at(grid, up_soc, up.voltage_v) - half
+    grid_of_both = GRID[(low <= GRID) & (high >= GRID)]
+    half_of_both_v = 0.5 * (
+        _voltage_at(grid_of_both, charge_soc, charge.voltage_v)
+        - _voltage_at(grid_of_both, discharge_soc, discharge.voltage_v)
     )
-    steps = [branch.step_v for branch in (down, up) if np.isfinite(branch.step_v)]
+    median_half_v = float(np.median(half_of_both_v))
+    half_v = np.where((low <= GRID) & (high >= GRID), np.interp(GRID, grid_of_both, half_of_both_v), median_half_v)
+    grid = GRID[(min(discharge_soc[-1], charge_soc[0]) <= GRID) & (max(discharge_soc[0], charge_soc[-1]) >= GRID)]
+    half_on_grid_v = np.interp(grid, GRID, half_v)
+    has_discharge = (grid >= discharge_soc[-1]) & (grid <= discharge_soc[0])
+    ocv_v = np.where(
+        has_discharge,
+        _voltage_at(grid, discharge_soc, discharge.voltage_v) + half_on_grid_v,
+        _voltage_at(grid, charge_soc, charge.voltage_v) - half_on_grid_v,
+    )
+    steps = [branch.step_v for branch in (discharge, charge) if np.isfinite(branch.step_v)]
     ohmic_v = float(np.mean(steps)) if steps else 0.0
-    points = _points(grid, ocv_v, PAIR_V * series_count, PAIR_COLD_FRACTION, down.temperature_c, series_count)
+    points = _points(grid, ocv_v, PAIR_V * series_count, PAIR_COLD_FRACTION, discharge.temperature_c, series_count)
     unpaired = (grid < low) | (grid > high)
     return SlowCurve(
-        branches=(down, up),
+        branches=(discharge, charge),
         points=replace(
-            points, common_v=points.common_v + np.where(unpaired, UNPAIRED_FRACTION, PAIR_FRACTION) * np.abs(half)
+            points,
+            common_v=points.common_v + np.where(unpaired, UNPAIRED_FRACTION, PAIR_FRACTION) * np.abs(half_on_grid_v),
         ),
         hysteresis_v=_smooth(half_v - ohmic_v),
         notes=() if steps else ("hysteresis includes the ohmic drop",),

@@ -33,12 +33,12 @@ GIVEN_COMMON_V = 2e-3
 """Std of the systematic error of a given curve, per cell [V]."""
 REST_SHARE = 0.7
 """Fraction of the half difference of low-rate curves that is hysteresis and remains in a rest after a discharge. The
-remainder is polarisation. Measured fractions are 0.4 and 0.5 for an NCA cell, 1.0 for an LFP cell."""
+remainder is polarization. Measured fractions are 0.4 and 0.5 for an NCA cell, 1.0 for an LFP cell."""
 REST_SHARE_STD = 0.3
 """Std of ``REST_SHARE``."""
 PLATEAU_SHARE = 0.9
-"""Fraction of the hysteresis that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the hysteresis (Dreyer et
-al., Nature Materials 9, 2010, 448). Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
+"""Fraction of the hysteresis that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the
+hysteresis (Dreyer et al., Nature Materials 9, 2010, 448). Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
 PLATEAU_V = 0.15
 """Maximum slope dOCV/dSOC of a plateau, per cell [V]."""
 PLATEAU_SOC = 0.05
@@ -156,45 +156,48 @@ def find_sources(
     Raises:
         UserError: A capture is neither a relaxation test nor a low-rate curve, or no capacity is given or measured.
     """
-    good = [Recording(one.name, remove_glitches(one.samples, one.name)) for one in recordings]
-    branches = {one.name: slow_branches(one.samples, one.name) for one in good}
-    every = [branch for found in branches.values() for branch in found]
-    measured_ah = measured_capacity_ah(every) / initial_soc if initial_soc > 0.0 else float("nan")
-    known_ah = measured_ah if capacity_ah is None else capacity_ah
-    if not np.isfinite(known_ah):
+    good = [Recording(recording.name, remove_glitches(recording.samples, recording.name)) for recording in recordings]
+    branches = {recording.name: slow_branches(recording.samples, recording.name) for recording in good}
+    all_branches = [branch for branches_of_capture in branches.values() for branch in branches_of_capture]
+    measured_ah = measured_capacity_ah(all_branches) / initial_soc if initial_soc > 0.0 else float("nan")
+    used_ah = measured_ah if capacity_ah is None else capacity_ah
+    if not np.isfinite(used_ah):
         raise UserError(
             "--capacity-ah: not given, and no capture is a slow discharge from full to empty that measures it"
         )
-    slow_ah = measured_ah if np.isfinite(measured_ah) else known_ah
-    slow = slow_curves(every, slow_ah, initial_soc=initial_soc, series_count=series_count)
-    sources = [_slow_curve_source(curve, slow_ah, known_ah) for curve in slow] + [
-        _given_curve_source(one, series_count) for one in curves
+    slow_ah = measured_ah if np.isfinite(measured_ah) else used_ah
+    slow = slow_curves(all_branches, slow_ah, initial_soc=initial_soc, series_count=series_count)
+    sources = [_slow_curve_source(curve, slow_ah, used_ah) for curve in slow] + [
+        _given_curve_source(curve, series_count) for curve in curves
     ]
-    rests = [one for one in recordings if not branches[one.name]]
-    found = _rests(rests, sources, every, known_ah, initial_soc, series_count)
+    rests = [recording for recording in recordings if not branches[recording.name]]
+    tests_with_points = _rests(rests, sources, all_branches, used_ah, initial_soc, series_count)
     hysteresis_source = _hysteresis_source(sources)
     hysteresis_v, hysteresis_std_v = None, np.zeros(NODES.size)
     if hysteresis_source is not None and hysteresis_source.hysteresis_v is not None:
-        share = _measured_share(hysteresis_source, found)
-        half_v = hysteresis_source.hysteresis_v / _hysteresis_factor(hysteresis_source.temperature_c)
-        hysteresis_at_rest_v = half_v * (_typical_share(hysteresis_source, series_count) if share is None else share)
-        given = hysteresis_source in sources[len(slow) :] and share is None  # given curves are used as they are
-        hysteresis_v = np.interp(NODES, GRID, half_v if given else hysteresis_at_rest_v)
-        hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_v)
-        found = [
+        share = _measured_share(hysteresis_source, tests_with_points)
+        half_difference_v = hysteresis_source.hysteresis_v / _hysteresis_factor(hysteresis_source.temperature_c)
+        hysteresis_at_rest_v = half_difference_v * (
+            _typical_share(hysteresis_source, series_count) if share is None else share
+        )
+        # the hysteresis of a given curve is used unchanged, unless rests measure its fraction
+        is_unchanged = hysteresis_source in sources[len(slow) :] and share is None
+        hysteresis_v = np.interp(NODES, GRID, half_difference_v if is_unchanged else hysteresis_at_rest_v)
+        hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_difference_v)
+        tests_with_points = [
             (test, _centered(points, hysteresis_at_rest_v * _hysteresis_factor(test.temperature_c), REST_SHARE_STD))
-            for test, points in found
+            for test, points in tests_with_points
         ]
         if share is not None:
             sources = [
-                replace(one, notes=(*one.notes, f"rests keep {share:.2f} of its hysteresis"))
-                if one is hysteresis_source
-                else one
-                for one in sources
+                replace(source, notes=(*source.notes, f"rests keep {share:.2f} of its hysteresis"))
+                if source is hysteresis_source
+                else source
+                for source in sources
             ]
-    of_rests = [_relaxation_source(test, points) for test, points in found]
-    tests = tuple(test for test, _ in found)
-    return OcvSources(known_ah, measured_ah, (*sources, *of_rests), tests, hysteresis_v, hysteresis_std_v)
+    rest_sources = [_relaxation_source(test, points) for test, points in tests_with_points]
+    tests = tuple(test for test, _ in tests_with_points)
+    return OcvSources(used_ah, measured_ah, (*sources, *rest_sources), tests, hysteresis_v, hysteresis_std_v)
 
 
 def _slow_curve_source(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> Source:
@@ -233,7 +236,7 @@ def _given_curve_source(curve: ExternalCurve, series_count: int) -> Source:
 def _hysteresis_source(sources: Sequence[Source]) -> Source | None:
     """Return the source nearest to 25 C that shows hysteresis."""
     with_hysteresis = [source for source in sources if source.hysteresis_v is not None]
-    return min(with_hysteresis, key=lambda one: _from_reference(one.temperature_c), default=None)
+    return min(with_hysteresis, key=lambda source: _from_reference(source.temperature_c), default=None)
 
 
 def _from_reference(temperature_c: float) -> float:
@@ -245,21 +248,23 @@ def _hysteresis_factor(temperature_c: float) -> float:
     return float(arrhenius(HYSTERESIS_J, float(np.nan_to_num(temperature_c, nan=REFERENCE_C))))
 
 
-def _measured_share(hysteresis_source: Source, found: Sequence[tuple[RelaxationTest, Points]]) -> float | None:
+def _measured_share(
+    hysteresis_source: Source, tests_with_points: Sequence[tuple[RelaxationTest, Points]]
+) -> float | None:
     """Return the median fraction of the hysteresis that remains in rests after discharge; None for too few rests."""
     low, high = SHARE_SOC
     shares: list[float] = []
-    for test, points in found:
+    for test, points in tests_with_points:
         if _from_reference(test.temperature_c) > SHARE_K + _from_reference(hysteresis_source.temperature_c):
             continue
-        size_v = np.interp(
+        hysteresis_v = np.interp(
             points.soc,
             GRID,
             np.zeros(GRID.size) if hysteresis_source.hysteresis_v is None else hysteresis_source.hysteresis_v,
         )
-        below_v = np.interp(points.soc, hysteresis_source.points.soc, hysteresis_source.points.ocv_v) - points.ocv_v
-        usable = (points.soc > low) & (points.soc < high) & (points.direction < 0.0) & (size_v > 0.0)
-        shares += (below_v[usable] / size_v[usable]).tolist()
+        drop_v = np.interp(points.soc, hysteresis_source.points.soc, hysteresis_source.points.ocv_v) - points.ocv_v
+        usable = (points.soc > low) & (points.soc < high) & (points.direction < 0.0) & (hysteresis_v > 0.0)
+        shares += (drop_v[usable] / hysteresis_v[usable]).tolist()
     return float(np.clip(np.median(shares), MIN_SHARE, 1.0)) if len(shares) >= SHARE_POINTS else None
 
 
@@ -297,21 +302,29 @@ def _rests(
 
     A capture that starts at a lower voltage than the others gets its initial SOC from the curve of the others.
     """
-    starts = [initial_rest_v(one.samples, one.name, capacity_ah) for one in recordings]
-    highest_v = np.nanmax([*starts, *(branch.start_v for branch in branches if not branch.charge), -np.inf])
-    low = [start < highest_v - SAME_START_V * series_count for start in starts]
+    start_volts = [initial_rest_v(recording.samples, recording.name, capacity_ah) for recording in recordings]
+    highest_v = np.nanmax([*start_volts, *(branch.start_v for branch in branches if not branch.charge), -np.inf])
+    starts_lower = [start < highest_v - SAME_START_V * series_count for start in start_volts]
 
-    def test(one: Recording, soc: float) -> tuple[RelaxationTest, Points]:
-        found = relaxation_test(one.samples, capacity_ah, initial_soc=soc, series_count=series_count, name=one.name)
-        return found, points_of(found, series_count)
+    def evaluate(recording: Recording, soc: float) -> tuple[RelaxationTest, Points]:
+        test = relaxation_test(
+            recording.samples, capacity_ah, initial_soc=soc, series_count=series_count, name=recording.name
+        )
+        return test, points_of(test, series_count)
 
-    found = {one.name: test(one, initial_soc) for one, lower in zip(recordings, low, strict=True) if not lower}
-    if any(low):
-        curve = fit_table(joined([*(source.points for source in sources), *(points for _, points in found.values())]))
-        for one, start_v, lower in zip(recordings, starts, low, strict=True):
+    tests_with_points = {
+        recording.name: evaluate(recording, initial_soc)
+        for recording, lower in zip(recordings, starts_lower, strict=True)
+        if not lower
+    }
+    if any(starts_lower):
+        curve = fit_table(
+            joined([*(source.points for source in sources), *(points for _, points in tests_with_points.values())])
+        )
+        for recording, start_v, lower in zip(recordings, start_volts, starts_lower, strict=True):
             if lower:
-                found[one.name] = test(one, _soc_at(curve, start_v))
-    return [found[one.name] for one in recordings]
+                tests_with_points[recording.name] = evaluate(recording, _soc_at(curve, start_v))
+    return [tests_with_points[recording.name] for recording in recordings]
 
 
 def _soc_at(curve: TableFit, voltage_v: float) -> float:
@@ -320,13 +333,13 @@ def _soc_at(curve: TableFit, voltage_v: float) -> float:
 
 
 def _centered(points: Points, hysteresis_at_rest_v: Floats, relative_std: float) -> Points:
-    """Move points to the mean of discharge and charge by the hysteresis ``hysteresis_at_rest_v``, with an error of ``relative_std``."""
-    size_v = np.interp(points.soc, GRID, hysteresis_at_rest_v)
+    """Move points to the mean of discharge and charge by a hysteresis with the error ``relative_std``."""
+    hysteresis_v = np.interp(points.soc, GRID, hysteresis_at_rest_v)
     return replace(
         points,
-        ocv_v=points.ocv_v - points.direction * size_v,
-        std_v=np.hypot(points.std_v, np.where(points.direction == 0.0, size_v, 0.0)),
-        common_v=np.hypot(points.common_v, relative_std * size_v),
+        ocv_v=points.ocv_v - points.direction * hysteresis_v,
+        std_v=np.hypot(points.std_v, np.where(points.direction == 0.0, hysteresis_v, 0.0)),
+        common_v=np.hypot(points.common_v, relative_std * hysteresis_v),
     )
 
 
@@ -337,7 +350,7 @@ def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
         found: Result of ``find_sources``.
         ladder: RC ladder with its relative standard deviation, if known.
     """
-    return replace(found, sources=tuple(_without_branches(one, ladder) for one in found.sources))
+    return replace(found, sources=tuple(_without_branches(source, ladder) for source in found.sources))
 
 
 def _without_branches(source: Source, ladder: Ladder) -> Source:
@@ -368,9 +381,12 @@ def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSourc
     on_grid_v = np.interp(GRID, NODES, usual_v)
     moved = tuple(
         replace(
-            one, points=_centered(one.points, on_grid_v * _hysteresis_factor(one.temperature_c), TYPICAL_HYSTERESIS_STD)
+            source,
+            points=_centered(
+                source.points, on_grid_v * _hysteresis_factor(source.temperature_c), TYPICAL_HYSTERESIS_STD
+            ),
         )
-        for one in found.sources
+        for source in found.sources
     )
     return replace(
         found,

@@ -5,11 +5,11 @@ One linear Gaussian model over all points (a smoothing spline with random effect
 
     v = f(SOC) + (T - 25 C) u(SOC) + c(T) w(SOC) + f'(SOC) (s + q (1 - SOC)) + d(SOC) + noise
 
-f is a cubic spline with a prior of the curvature of real cells. u is dE/dT. c(T) w(SOC) is the error of rests that were too
-short at low temperature. c is its std, ``Points.cold_v``. w is common to all sources and hardly distinguishable from u, so
-that the priors divide the observed difference between both. s and q are the errors of a source's first SOC and of its
-capacity. d is the systematic error of a source. The priors of u, w, s, q and d have mean 0. The curve's standard deviation follows from the posterior covariance and is large in gaps
-between points.
+f is the curve, a cubic spline with a prior of the curvature of real cells. u is dE/dT. c(T) w(SOC) is the error of
+rests that were too short at low temperature: c is its std, ``Points.cold_v``. w is common to all sources and can hardly
+be distinguished from u, so that the priors divide the observed difference between both. s and q are the errors of a
+source's first SOC and of its capacity. d is the systematic error of a source. The priors of u, w, s, q and d have mean
+0. The curve's standard deviation follows from the posterior covariance and is large in gaps between points.
 """
 
 import itertools
@@ -41,7 +41,7 @@ d2V/dSOC2, because steep parts bend more."""
 EMPTY_SLOPE_V = 60.0
 """Slope dV/dSOC that every curve may have at SOC 0, per ``CELL_V`` [V]."""
 EMPTY_SOC = 0.02
-"""SOC over which ``EMPTY_SLOPE_V`` decays to 1/e."""
+"""SOC over which ``EMPTY_SLOPE_V`` decays by a factor of e."""
 FIRST_SLOPE_V = 0.8
 """Slope dV/dSOC that the first iteration assumes per ``CELL_V`` [V]."""
 BEND_LENGTH = 0.05
@@ -50,8 +50,8 @@ MIN_SLOPE_V = 1e-3
 """Minimum slope dV/dSOC per ``CELL_V``, so that the curve is invertible [V]."""
 CELL_V = 4.0
 """Cell voltage to which the constants above are scaled [V]."""
-TEMPERATURE_SPAN_C = 10.0
-"""Minimum temperature difference of sources for dE/dT [K]."""
+MIN_SPAN_K = 10.0
+"""Minimum temperature difference between points that determine dE/dT [K]."""
 ENTROPY_V_PER_K = 3.5e-4
 """Prior std of dE/dT per ``CELL_V`` [V/K]. Published entropy profiles have 0.1 to 0.5 mV/K."""
 ENTROPY_NODES = np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
@@ -70,10 +70,11 @@ EMPTY_STD_V = 0.05
 FULL_STD_V = 0.005
 """Std of the voltage at SOC 1 without a rest there, per ``CELL_V`` [V]."""
 MAX_SLOPE_V = 2.0
-"""Upper limit of the slope f' that converts an error of SOC to one of voltage, per ``CELL_V`` [V]. At the ends of the curve
-the slope is too uncertain."""
+"""Upper limit of the slope f' that converts an error of SOC to one of voltage, per ``CELL_V`` [V]. At the ends of the
+curve the slope is too uncertain."""
 STD_OF_MEDIAN = 1.48
-"""Standard deviation of a normal distribution over the median of its magnitude. The median is robust against outliers."""
+"""Standard deviation of a normal distribution over the median of its magnitude. The median is robust against
+outliers."""
 ITERATIONS = 4
 """Number of iterations. Each uses the slope f' and the errors of the sources of the previous iteration."""
 
@@ -133,7 +134,7 @@ class _Model:
         points: Rows of the points, not yet divided by their standard deviations.
         prior: Rows of the priors, divided by their standard deviations.
         splines: Number of spline coefficients.
-        temperature_columns: Number of nodes of u and w.
+        temperature_columns: Number of nodes of u and w; 0 if the temperatures of the points do not determine them.
     """
 
     points: Floats
@@ -159,58 +160,61 @@ def fit_table(points: Points) -> TableFit:
     middle_slope_v: Floats = np.full(middles.size, voltage_scale * FIRST_SLOPE_V)
     slope_v: Floats = np.zeros(points.soc.size)
     for _ in range(ITERATIONS):
-        bends = _bend_rows(voltage_scale * BEND_V + (middle_slope_v + empty_slope_v) / BEND_SOC)
-        model = _model(points, slope_v, systematic_factor, bends, voltage_scale)
+        bend_rows = _bend_rows(voltage_scale * BEND_V + (middle_slope_v + empty_slope_v) / BEND_SOC)
+        model = _model(points, slope_v, systematic_factor, bend_rows, voltage_scale)
         std_v = np.hypot(points.std_v, INDEPENDENT_ERROR_FRACTION * points.common_v) * scatter_factor[points.source]
-        x = _solve(model, points, std_v, voltage_scale)
-        slope_v = np.clip(_spline(points.soc, 1) @ x[: model.splines], 0.0, MAX_SLOPE_V * voltage_scale)
-        middle_slope_v = _spline(middles, 1) @ x[: model.splines]
-        scatter_factor, systematic_factor = _error_factors(points, model, x, systematic_factor)
+        coefficients = _solve(model, points, std_v, voltage_scale)
+        slope_v = np.clip(_spline(points.soc, 1) @ coefficients[: model.splines], 0.0, MAX_SLOPE_V * voltage_scale)
+        middle_slope_v = _spline(middles, 1) @ coefficients[: model.splines]
+        scatter_factor, systematic_factor = _error_factors(points, model, coefficients, systematic_factor)
     basis, entropy = _spline(NODES), linear_interpolation_matrix(NODES, ENTROPY_NODES)
     rows = np.vstack([model.points / std_v[:, None], model.prior])
     covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)[: model.splines, : model.splines]
-    u = x[model.splines : model.splines + ENTROPY_NODES.size]
-    ocv_v = np.maximum.accumulate(
-        basis @ x[: model.splines] + 1e-9 * NODES
-    )  # PCHIP and the inverse need increasing values
-    fit = PchipInterpolator(NODES, ocv_v)
+    per_kelvin_at_nodes_v = coefficients[model.splines : model.splines + ENTROPY_NODES.size]
+    # PCHIP and the inverse need strictly increasing values
+    ocv_v = np.maximum.accumulate(basis @ coefficients[: model.splines] + 1e-9 * NODES)
+    interpolate = PchipInterpolator(NODES, ocv_v)
     return TableFit(
         soc=NODES,
         ocv_v=ocv_v,
         error_v=np.sqrt(np.einsum("ij,jk,ik->i", basis, covariance, basis)),
-        per_kelvin_v=entropy @ u if model.temperature_columns else None,
-        residual_v=measured.ocv_v - fit(measured.soc),
-        deviation_v=_deviations(points, model, x),
+        per_kelvin_v=entropy @ per_kelvin_at_nodes_v if model.temperature_columns else None,
+        residual_v=measured.ocv_v - interpolate(measured.soc),
+        deviation_v=_deviations(points, model, coefficients),
     )
 
 
-def _model(points: Points, slope_v: Floats, systematic_factor: float, bends: Floats, voltage_scale: float) -> _Model:
+def _model(
+    points: Points, slope_v: Floats, systematic_factor: float, bend_rows: Floats, voltage_scale: float
+) -> _Model:
     """Return the rows of the model.
 
     Args:
         points: Points of all sources.
         slope_v: Slope f' of the curve at the points [V].
         systematic_factor: Factor on the declared systematic errors of all sources.
-        bends: Rows of the curvature prior.
+        bend_rows: Rows of the curvature prior.
         voltage_scale: Voltage of the cell relative to ``CELL_V``.
     """
     spline = _spline(points.soc)
     warmer = np.where(np.isfinite(points.temperature_c), points.temperature_c - REFERENCE_C, 0.0)
     columns, stds = [spline], [np.zeros(0)]
-    if np.ptp(warmer) >= TEMPERATURE_SPAN_C:
+    if np.ptp(warmer) >= MIN_SPAN_K:
         by_soc = linear_interpolation_matrix(points.soc, ENTROPY_NODES)
         columns += [warmer[:, None] * by_soc, points.cold_v[:, None] * by_soc]
         stds += [np.full(ENTROPY_NODES.size, ENTROPY_V_PER_K * voltage_scale), np.ones(ENTROPY_NODES.size)]
-    temperature_columns = sum(one.size for one in stds)
+    temperature_columns = sum(column_stds.size for column_stds in stds)
     for source in range(int(points.source.max()) + 1):
-        own = (points.source == source)[:, None]
-        off_v = systematic_factor * points.common_v[:, None] * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
-        columns += [own * off_v, own * _shifts(points.soc, slope_v)]
+        of_source = (points.source == source)[:, None]
+        deviation_columns_v = (
+            systematic_factor * points.common_v[:, None] * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
+        )
+        columns += [of_source * deviation_columns_v, of_source * _shifts(points.soc, slope_v)]
         stds += [np.ones(DEVIATION_NODES.size), np.array([SOC_STD, CAPACITY_STD])]
     weights = 1.0 / np.concatenate(stds)
-    prior = np.zeros((bends.shape[0] + weights.size, spline.shape[1] + weights.size))
-    prior[: bends.shape[0], : spline.shape[1]] = bends
-    prior[bends.shape[0] :, spline.shape[1] :] = np.diag(weights)
+    prior = np.zeros((bend_rows.shape[0] + weights.size, spline.shape[1] + weights.size))
+    prior[: bend_rows.shape[0], : spline.shape[1]] = bend_rows
+    prior[bend_rows.shape[0] :, spline.shape[1] :] = np.diag(weights)
     return _Model(np.hstack(columns), prior, spline.shape[1], temperature_columns)
 
 
@@ -227,45 +231,56 @@ def _solve(model: _Model, points: Points, std_v: Floats, voltage_scale: float) -
     columns = model.splines + model.temperature_columns if points.source.max() == 0 else model.points.shape[1]
     rows = np.vstack([model.points / std_v[:, None], model.prior])[:, :columns]
     target = np.r_[points.ocv_v / std_v, np.zeros(model.prior.shape[0])]
-    sums = np.tril(np.ones((model.splines, model.splines)))  # coefficients from their increments
-    rows[:, : model.splines] = rows[:, : model.splines] @ sums
-    lowest = np.full(rows.shape[1], -np.inf)
-    lowest[1 : model.splines] = MIN_SLOPE_V * voltage_scale * np.diff(_centres())
+    # the unknowns are the increments of the spline coefficients, so that bounds make the spline increase
+    from_increments = np.tril(np.ones((model.splines, model.splines)))
+    rows[:, : model.splines] = rows[:, : model.splines] @ from_increments
+    lower_bounds = np.full(rows.shape[1], -np.inf)
+    lower_bounds[1 : model.splines] = MIN_SLOPE_V * voltage_scale * np.diff(_coefficient_socs())
     orthogonal, triangle = np.linalg.qr(rows)
-    increments = lsq_linear(triangle, orthogonal.T @ target, bounds=(lowest, np.inf), method="bvls").x
-    x = np.zeros(model.points.shape[1])
-    x[: model.splines], x[model.splines : columns] = sums @ increments[: model.splines], increments[model.splines :]
-    return x
+    increments = lsq_linear(triangle, orthogonal.T @ target, bounds=(lower_bounds, np.inf), method="bvls").x
+    coefficients = np.zeros(model.points.shape[1])
+    coefficients[: model.splines], coefficients[model.splines : columns] = (
+        from_increments @ increments[: model.splines],
+        increments[model.splines :],
+    )
+    return coefficients
 
 
-def _error_factors(points: Points, model: _Model, x: Floats, systematic_factor: float) -> tuple[Floats, float]:
+def _error_factors(
+    points: Points, model: _Model, coefficients: Floats, systematic_factor: float
+) -> tuple[Floats, float]:
     """Return the factors by which the observed errors exceed the declared ones, at least 1.
 
     The first factor is that of each source's scatter, the second that of the systematic errors of all sources.
     """
-    normalized = (points.ocv_v - model.points @ x) / np.hypot(
+    normalized = (points.ocv_v - model.points @ coefficients) / np.hypot(
         points.std_v, INDEPENDENT_ERROR_FRACTION * points.common_v
     )
     sources = int(points.source.max()) + 1
     scatter = [
         max(1.0, STD_OF_MEDIAN * float(np.median(np.abs(normalized[points.source == k])))) for k in range(sources)
     ]
-    own = x[model.splines + model.temperature_columns :].reshape(sources, -1)[:, : DEVIATION_NODES.size]
-    return np.array(scatter), max(1.0, systematic_factor * float(np.sqrt(np.mean(own**2))))
+    deviations = coefficients[model.splines + model.temperature_columns :].reshape(sources, -1)[
+        :, : DEVIATION_NODES.size
+    ]
+    return np.array(scatter), max(1.0, systematic_factor * float(np.sqrt(np.mean(deviations**2))))
 
 
-def _deviations(points: Points, model: _Model, x: Floats) -> Floats:
+def _deviations(points: Points, model: _Model, coefficients: Floats) -> Floats:
     """Return the RMS of the systematic error over the points of each source [V]."""
-    own = model.points[:, model.splines + model.temperature_columns :] @ x[model.splines + model.temperature_columns :]
+    systematic_v = (
+        model.points[:, model.splines + model.temperature_columns :]
+        @ coefficients[model.splines + model.temperature_columns :]
+    )
     sources = int(points.source.max()) + 1
-    return np.array([rms_v(own[points.source == k]) for k in range(sources)])
+    return np.array([rms_v(systematic_v[points.source == k]) for k in range(sources)])
 
 
 def _knots() -> Floats:
     return np.concatenate([np.zeros(3), KNOTS, np.ones(3)])
 
 
-def _centres() -> Floats:
+def _coefficient_socs() -> Floats:
     """Return the SOC at which each coefficient of the spline acts (Greville abscissae)."""
     knots = _knots()
     return np.asarray((knots[1:-3] + knots[2:-2] + knots[3:-1]) / 3.0)
@@ -289,7 +304,7 @@ def _middles() -> Floats:
     return np.asarray(0.5 * (edges[1:] + edges[:-1]))
 
 
-def _bend_rows(size_v: Floats) -> Floats:
-    """Return the rows of the curvature prior with std ``size_v``, weighted by interval length over ``BEND_LENGTH``."""
-    weight = np.sqrt(np.diff(_edges()) / BEND_LENGTH) / size_v
+def _bend_rows(std_v: Floats) -> Floats:
+    """Return the rows of the curvature prior with std ``std_v``, weighted by interval length over ``BEND_LENGTH``."""
+    weight = np.sqrt(np.diff(_edges()) / BEND_LENGTH) / std_v
     return np.asarray(_spline(_middles(), 2) * weight[:, None])

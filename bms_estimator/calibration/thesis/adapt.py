@@ -1,4 +1,9 @@
-"""Calibration by the thesis's procedure: steps 2 and 3 on captures, and the replay scores of `identify`."""
+"""Calibration of a1..a15 by the procedure of the thesis "Adaptive Estimation of Li-ion Battery Model Parameters".
+
+a1..a15 are the coefficients of the elements of Chen and Mora's model: three for each of R_ts, R_tl, C_ts, C_tl and R_s
+as functions of SOC, (2.5)-(2.9) of the thesis. Step 1, the OCV, is part of the given cell. Step 2 is the adaptive
+observer for a1..a12, step 3 the fit of R_s, a13..a15. The result is scored by the replays of `identify`.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,9 +13,9 @@ import numpy as np
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.cleaning.rests import remove_glitches
-from bms_estimator.calibration.elements.identify import EQUAL_SCORE_RATIO, initial_soc
+from bms_estimator.calibration.elements.identify import EQUAL_SCORE_RATIO, MIN_ERROR_V, initial_soc
 from bms_estimator.calibration.elements.replay_score import interval_score
-from bms_estimator.calibration.thesis.adapt_steps import AdaptedElements, Start, steps_2_and_3
+from bms_estimator.calibration.thesis.adapt_steps import AdaptedElements, CaptureWithSoc, steps_2_and_3
 from bms_estimator.calibration.thesis.prediction import predict
 from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
 from bms_estimator.calibration.thesis.series_resistance import LOWEST_SOC
@@ -20,9 +25,6 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, Resistance
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-
-MIN_ERROR_V = 1e-5
-"""Minimum model error written to a cell file [V]. A cell file requires a value above 0."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Adaptation:
     """An adapted cell.
 
     Attributes:
-        cell: The cell with a1..a15 and an equivalent RC ladder.
+        cell: The cell with a1..a15 and an RC ladder that is equivalent to these elements.
         steps: Result of steps 2 and 3 over all captures.
         captures: Errors and scores of each capture, in the order given.
         score_before: Geometric mean of the interval scores with the given cell [%]; NaN when no capture is long enough.
@@ -68,95 +70,102 @@ class Adaptation:
 def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = None) -> Adaptation:
     """Estimate a1..a15 by the thesis's procedure.
 
-    Bounds of (3.18) missing in the cell file are those of Table 10, scaled to the cell's capacity.
+    If the cell file has no bounds for the adaptive law (3.18), those printed in Table 10 of the thesis are used, scaled
+    to the cell's capacity.
 
     Args:
         captures: Raw samples, rows of dtype ``SAMPLE``; each starts from rest.
-        cell: Capacity, limits, OCV, and optional bounds of (3.18).
+        cell: Capacity, limits, OCV, and optional bounds of a1..a12.
         soc: SOC 0..1 at the first sample of each capture; None: from its first rest.
 
     Raises:
-        UserError: A capture contradicts the cell, a1..a15 cannot be estimated, or replays get worse.
+        UserError: A capture contradicts the cell, a1..a15 cannot be estimated, or the replays get worse.
     """
     cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
     socs = [initial_soc(load, cell) if soc is None else soc for load in cleaned]
-    found = [
+    contradictions = [
         line
         for load, start_soc in zip(cleaned, socs, strict=True)
         for line in capture_contradictions(load, cell, start_soc)
     ]
-    if found:
-        raise UserError("\n".join(found))
-    # the model is run over all samples without glitches; ``clean_capture`` removes further samples
-    starts = [
-        Start(remove_glitches(capture.rows, capture.name), start_soc)
+    if contradictions:
+        raise UserError("\n".join(contradictions))
+    # the observer runs over all samples except glitches; the cleaned captures lack more samples
+    captures_with_soc = [
+        CaptureWithSoc(remove_glitches(capture.rows, capture.name), start_soc)
         for capture, start_soc in zip(captures, socs, strict=True)
     ]
-    steps, adapted = _adapted_cell(cell, starts)
-    scored = tuple(_scored_capture(cell, adapted, cleaned, starts, j) for j in range(len(starts)))
-    before, after = (_geometric_mean([getattr(c, name) for c in scored]) for name in ("score_before", "score_after"))
+    steps, adapted = _adapted_cell(cell, captures_with_soc)
+    scored_captures = tuple(
+        _scored_capture(cell, adapted, cleaned, captures_with_soc, j) for j in range(len(captures_with_soc))
+    )
+    before = _geometric_mean([capture.score_before for capture in scored_captures])
+    after = _geometric_mean([capture.score_after for capture in scored_captures])
     if after > EQUAL_SCORE_RATIO * before:
         raise UserError(
             f"nothing is written: replays started in mid-load get worse, their interval score (smaller is better) goes "
             f"from {before:.2f} to {after:.2f} % of SOC; use `identify`, or give captures of more currents"
         )
-    return Adaptation(adapted, steps, scored, before, after)
+    return Adaptation(adapted, steps, scored_captures, before, after)
 
 
-def _adapted_cell(cell: CellModel, starts: Sequence[Start]) -> tuple[AdaptedElements, CellModel]:
+def _adapted_cell(cell: CellModel, captures_with_soc: Sequence[CaptureWithSoc]) -> tuple[AdaptedElements, CellModel]:
     """Return the result of steps 2 and 3, and the cell with that result."""
     bounded = cell.model_copy(update={"adaptation": printed_bounds(cell) | cell.adaptation})
-    steps = steps_2_and_3(bounded, starts, LOWEST_SOC)
-    return steps, _with_elements(cell, steps, starts)
+    steps = steps_2_and_3(bounded, captures_with_soc, LOWEST_SOC)
+    return steps, _with_elements(cell, steps, captures_with_soc)
 
 
-def _with_elements(cell: CellModel, steps: AdaptedElements, starts: Sequence[Start]) -> CellModel:
+def _with_elements(cell: CellModel, steps: AdaptedElements, captures_with_soc: Sequence[CaptureWithSoc]) -> CellModel:
     """Return the cell with a1..a15 and an equivalent RC ladder with the errors of the fit."""
     a, update = steps.a, dict[str, object]()
+    # index of each element's first coefficient; a[0] is unused, so that a1 is a[1]
     for name, first in (("r_ts", 1), ("r_tl", 4), ("c_ts", 7), ("c_tl", 10)):
         section = getattr(cell, name)
         keys = tuple(type(section).model_fields)
         update[name] = section.model_copy(update=dict(zip(keys, a[first : first + 3].tolist(), strict=True)))
     update["r_s"] = Resistance.model_validate(steps.r_s.element.model_dump())
-    new = cell.model_copy(update=update | {"adaptation": {}, "ladder": None})
+    with_branches = cell.model_copy(update=update | {"adaptation": {}, "ladder": None})
     # each resistance is the sum of a part with weak and a part with strong temperature dependence
-    ohm, weak = ladder_of_branches(new).T, weak_share(SOC_GRID)
-    errors = np.concatenate([predict(new, s.samples, s.soc, lowest_soc=LOWEST_SOC).error_v for s in starts])
+    ohm, weak_fraction = ladder_of_branches(with_branches).T, weak_share(SOC_GRID)
+    errors = np.concatenate(
+        [predict(with_branches, s.samples, s.soc, lowest_soc=LOWEST_SOC).error_v for s in captures_with_soc]
+    )
     ladder = Ladder(
         soc=tuple(SOC_GRID.tolist()),
-        weak_ohm=_rows(weak * ohm),
-        strong_ohm=_rows((1.0 - weak) * ohm),
+        weak_ohm=_rows(weak_fraction * ohm),
+        strong_ohm=_rows((1.0 - weak_fraction) * ohm),
         std=BRANCHES_STD,
         error_v=max(float(np.sqrt(np.mean(errors**2))), MIN_ERROR_V),
-        temperature_c=_temperatures(starts),
+        temperature_c=_temperatures(captures_with_soc),
     )
-    return new.model_copy(update={"ladder": ladder})
+    return with_branches.model_copy(update={"ladder": ladder})
 
 
 def _scored_capture(
-    cell: CellModel, adapted: CellModel, cleaned: list[CleanCapture], starts: list[Start], j: int
+    cell: CellModel, adapted: CellModel, cleaned: list[CleanCapture], captures_with_soc: list[CaptureWithSoc], j: int
 ) -> AdaptedCapture:
-    """Return the scores of capture ``j``, by a cell adapted to the other captures if there are any."""
-    load, start = cleaned[j], starts[j]
-    others = [s for k, s in enumerate(starts) if k != j]
+    """Return the errors and scores of capture ``j``. If there are other captures, the cell is adapted only to these."""
+    load, capture = cleaned[j], captures_with_soc[j]
+    others = [s for k, s in enumerate(captures_with_soc) if k != j]
     adapted_to_others = _adapted_cell(cell, others)[1] if others else adapted
-    soc = start.soc - load.discharged_ah / cell.cell.capacity_ah
-    error_v = predict(adapted, start.samples, start.soc, lowest_soc=LOWEST_SOC).error_v
+    soc_of_samples = capture.soc - load.discharged_ah / cell.cell.capacity_ah
+    error_v = predict(adapted, capture.samples, capture.soc, lowest_soc=LOWEST_SOC).error_v
     return AdaptedCapture(
         name=load.name,
-        initial_soc=start.soc,
+        initial_soc=capture.soc,
         voltage_rms_v=float(np.sqrt(np.mean(error_v**2))),
-        score_before=interval_score(cell, load, soc),
-        score_after=interval_score(adapted_to_others, load, soc),
+        score_before=interval_score(cell, load, soc_of_samples),
+        score_after=interval_score(adapted_to_others, load, soc_of_samples),
         held_back=bool(others),
     )
 
 
-def _temperatures(starts: Sequence[Start]) -> tuple[float, float]:
-    """Return the lowest and highest temperature of the captures [C]; the range ``ROOM_C`` without a sensor."""
-    temperature_c = np.concatenate([s.samples["temperature_c"] for s in starts])
-    known = temperature_c[np.isfinite(temperature_c)]
-    return (float(known.min()), float(known.max())) if known.size else ROOM_C
+def _temperatures(captures_with_soc: Sequence[CaptureWithSoc]) -> tuple[float, float]:
+    """Return the lowest and highest temperature of the captures [C]; ``ROOM_C`` without a sensor."""
+    temperature_c = np.concatenate([s.samples["temperature_c"] for s in captures_with_soc])
+    measured_c = temperature_c[np.isfinite(temperature_c)]
+    return (float(measured_c.min()), float(measured_c.max())) if measured_c.size else ROOM_C
 
 
 def _geometric_mean(scores: Sequence[float]) -> float:

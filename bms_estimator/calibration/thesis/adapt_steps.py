@@ -1,6 +1,8 @@
-"""Steps 2 and 3 of the thesis on captures: Algorithm 1 with (3.19) gives a1..a12, (4.2) gives a13..a15.
+"""Steps 2 and 3 of the thesis on captures.
 
-Step 1, the fit of the open-circuit voltage to rests, is the command `ocv`. Its result is part of the given cell.
+Step 2 runs the adaptive observer (Algorithm 1) and averages its parameters by (3.19), which gives a1..a12, the
+coefficients of R_ts, R_tl, C_ts and C_tl. Step 3 computes R_s by (4.2) and fits its coefficients a13..a15. Step 1, the
+fit of the open-circuit voltage to rests, is the command `ocv`. Its result is part of the given cell.
 """
 
 from collections.abc import Sequence
@@ -27,7 +29,7 @@ VOLTAGE_STEP_V = 1e-3
 
 
 @dataclass(frozen=True)
-class Start:
+class CaptureWithSoc:
     """Samples of a capture without glitches, and its initial SOC.
 
     Attributes:
@@ -59,7 +61,7 @@ class AdaptedElements:
         return a
 
 
-def steps_2_and_3(cell: CellModel, captures: Sequence[Start], lowest_soc: float) -> AdaptedElements:
+def steps_2_and_3(cell: CellModel, captures: Sequence[CaptureWithSoc], lowest_soc: float) -> AdaptedElements:
     """Adapt a1..a12 to the capture with the smallest mean current, then fit a13..a15 to all captures.
 
     Algorithm 1 needs a very small current; (4.2) needs several currents.

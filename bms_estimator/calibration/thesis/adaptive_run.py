@@ -1,9 +1,10 @@
-"""Step 2 of the thesis: adaptive estimation of a1..a15 over a capture, Algorithm 1 and schemes 1 to 3.
+"""Step 2 of the thesis: run of the adaptive observer over a capture, Algorithm 1 and schemes 1 to 3.
 
 Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md.
 
-The observer runs over the whole capture and stops adapting at the stability conditions (Fig. 19). The result contains
-"converged" or the reason for a failure.
+a1..a15 are the coefficients of the elements of Chen and Mora's model as functions of SOC. The observer runs over the
+whole capture. It stops adapting at the SOC below which a capacitance of the model is negative (Fig. 19). The result
+contains "converged" or the reason for a failure.
 """
 
 import itertools
@@ -41,11 +42,11 @@ SNAPSHOT_FIELDS = (
 
 @dataclass(frozen=True)
 class Crossing:
-    """Point at which a stability condition of Lemma 4.1.1 is met: a dashed line of Fig. 19.
+    """Point at which a stability condition of Lemma 4.1.1 ceases to hold: a dashed line of Fig. 19.
 
     Attributes:
-        parameter: "a8" or "a11".
-        soc: delta1 or delta2 of the parameters at the end of adaptation.
+        parameter: "a8" for C_ts, "a11" for C_tl.
+        soc: delta1 (delta2), the SOC below which C_ts (C_tl) is negative, of the parameters at the end of adaptation.
         time_s: Time at which SOC reached ``soc`` [s]; None if the capture ends above ``soc``.
     """
 
@@ -65,13 +66,13 @@ class AdaptiveRun:
         voltage_v: Measured voltage y [V].
         voltage_estimate_v: Estimated voltage y^ of the run, with time-varying parameters [V].
         error_v: Tracking error e (3.15), the largest in magnitude since the previous snapshot [V].
-        k: Adaptive gain state (3.13).
-        gain: N(k).
+        k: State of the adaptive gain (3.13).
+        gain: Nussbaum gain N(k).
         a: Shape (n, 16), a1..a15 at index 1..15.
-        window: t_int and t_unst of (3.19).
+        window: Interval t_int to t_unst over which (3.19) averages.
         average: Shape (16,), averages (3.19) of a1..a15 at index 1..15.
         crossings: Crossings of a8 and a11.
-        epsilon_v: eps2 of Algorithm 1 [V].
+        epsilon_v: eps2 of Algorithm 1, the maximum error of a converged observer [V].
         lock_losses: Number of times that the observer lost the lock.
         outcome: "converged", or the reason for a failure.
     """
@@ -94,9 +95,10 @@ class AdaptiveRun:
 
     def condition(self, parameter: str) -> Floats:
         """Return the bound of a8 or a11 over time: the right side of the condition in Lemma 4.1.1, Fig. 19."""
-        amplitude, offset = {"a8": (7, 9), "a11": (10, 12)}[parameter]
-        rows = zip(self.soc, self.a[:, offset], self.a[:, amplitude], strict=True)
-        return np.array([crossing(max(soc, 1e-6), low, high) for soc, low, high in rows])
+        amplitude, offset = {"a8": (7, 9), "a11": (10, 12)}[parameter]  # indices in ``a``
+        # the lower limit of SOC avoids a division by zero
+        rows = zip(np.maximum(self.soc, 1e-6), self.a[:, offset], self.a[:, amplitude], strict=True)
+        return np.array([crossing(soc, a_offset, a_amplitude) for soc, a_offset, a_amplitude in rows])
 
 
 def adaptive_run(
@@ -107,69 +109,77 @@ def adaptive_run(
     Args:
         estimator: New estimator, or one whose state the run resumes from.
         samples: Dtype ``SAMPLE``.
-        t_int_s: t_int of (3.19) [s]; None: determined from the run.
-        t_unst_s: t_unst of (3.19) [s]; None: determined from the run.
+        t_int_s: Start of the average (3.19) [s]; None: determined from the run.
+        t_unst_s: End of the average (3.19) [s]; None: determined from the run.
 
     Raises:
         UserError: No sample was accepted, or t_int or t_unst lies outside the run.
     """
-    edges = np.unique(
+    # one snapshot at the end of each block: all first samples, then in geometric and in equal steps
+    block_edges = np.unique(
         np.r_[
             np.arange(min(FIRST_SAMPLES, samples.size) + 1),
             np.geomspace(1, samples.size, FIRST_SAMPLES).astype(int),
             np.linspace(0, samples.size, min(SNAPSHOTS, samples.size) + 1).astype(int),
         ]
     )
-    snapshots = np.zeros(edges.size - 1, dtype=TRACE)
-    error_v, parameters = np.zeros(edges.size - 1), np.zeros((edges.size - 1, PARAMETERS))
-    taken, a = 0, estimator.state["a"][0]
-    for first, last in itertools.pairwise(edges.tolist()):
-        rows = estimator.run(samples[first:last])
-        if rows.size == 0:
+    snapshots = np.zeros(block_edges.size - 1, dtype=TRACE)
+    error_v, parameters = np.zeros(block_edges.size - 1), np.zeros((block_edges.size - 1, PARAMETERS))
+    snapshot_count, a = 0, estimator.state["a"][0]
+    for first, last in itertools.pairwise(block_edges.tolist()):
+        block_trace = estimator.run(samples[first:last])
+        if block_trace.size == 0:
             continue
-        snapshots[taken] = rows[-1]
-        tracking_v = rows["tracking_error_v"]
-        error_v[taken] = tracking_v[0 if rows.size == 1 else int(np.argmax(np.abs(tracking_v)))]
-        parameters[taken] = a
-        taken += 1
-    if taken == 0:
+        snapshots[snapshot_count] = block_trace[-1]
+        tracking_v = block_trace["tracking_error_v"]
+        error_v[snapshot_count] = tracking_v[0 if block_trace.size == 1 else int(np.argmax(np.abs(tracking_v)))]
+        parameters[snapshot_count] = a
+        snapshot_count += 1
+    if snapshot_count == 0:
         raise UserError(f"none of {samples.size} samples is within the cell's limits")
-    found = {name: snapshots[name][:taken].copy() for name in SNAPSHOT_FIELDS}
-    error, parameters = error_v[:taken], parameters[:taken]
+    recorded = {name: snapshots[name][:snapshot_count].copy() for name in SNAPSHOT_FIELDS}
+    error, parameters = error_v[:snapshot_count], parameters[:snapshot_count]
     epsilon_v = float(estimator.settings["epsilon_v"][0])
-    margin = found["stability_margin"] - float(estimator.settings["margin_guard"][0])
+    margin = recorded["stability_margin"] - float(estimator.settings["margin_guard"][0])
     window = averaging_window(
-        found["time_s"], error, found["voltage_v"], margin, parameters, epsilon_v, t_int_s=t_int_s, t_unst_s=t_unst_s
+        recorded["time_s"],
+        error,
+        recorded["voltage_v"],
+        margin,
+        parameters,
+        epsilon_v,
+        t_int_s=t_int_s,
+        t_unst_s=t_unst_s,
     )
     lock_losses = int(estimator.state["lock_losses"][0])
     return AdaptiveRun(
-        time_s=found["time_s"],
-        soc=found["soc"],
-        current_a=found["current_a"],
-        voltage_v=found["voltage_v"],
-        voltage_estimate_v=found["voltage_estimate_v"],
+        time_s=recorded["time_s"],
+        soc=recorded["soc"],
+        current_a=recorded["current_a"],
+        voltage_v=recorded["voltage_v"],
+        voltage_estimate_v=recorded["voltage_estimate_v"],
         error_v=error,
-        k=found["k"],
-        gain=found["nussbaum_gain"],
+        k=recorded["k"],
+        gain=recorded["nussbaum_gain"],
         a=parameters,
         window=window,
-        average=averaged(found["time_s"], parameters, window),
+        average=averaged(recorded["time_s"], parameters, window),
         crossings=(
-            _crossing("a8", parameters[-1], found["soc"], found["time_s"]),
-            _crossing("a11", parameters[-1], found["soc"], found["time_s"]),
+            _crossing("a8", parameters[-1], recorded["soc"], recorded["time_s"]),
+            _crossing("a11", parameters[-1], recorded["soc"], recorded["time_s"]),
         ),
         epsilon_v=epsilon_v,
         lock_losses=lock_losses,
-        outcome=_outcome(window, found["time_s"], error, epsilon_v, lock_losses),
+        outcome=_outcome(window, recorded["time_s"], error, epsilon_v, lock_losses),
     )
 
 
 def _crossing(parameter: str, a: Floats, soc: Floats, time_s: Floats) -> Crossing:
     """Return the point of the run at which ``parameter`` meets its stability condition."""
     i = int(parameter[1:])
-    at = float(delta(a[i], a[i + 1], a[i - 1]))
-    below = np.flatnonzero(soc <= at)
-    return Crossing(parameter, at, float(time_s[below[0]]) if below.size else None)
+    crossing_soc = float(delta(a[i], a[i + 1], a[i - 1]))
+    below = np.flatnonzero(soc <= crossing_soc)
+    return Crossing(parameter, crossing_soc, float(time_s[below[0]]) if below.size else None)
 
 
 def _outcome(window: AveragingWindow, time_s: Floats, error_v: Floats, epsilon_v: float, lock_losses: int) -> str:

@@ -1,8 +1,8 @@
 """Average of the parameters over the settled part of a run, (3.19) of the thesis.
 
-The average begins at t_int, when the error has settled, and ends at t_unst, when the battery becomes unstable. Both times
-are determined from the run. delta1 (2.11) and delta2 (2.12) are the SOCs below which C_ts and C_tl of the model are
-negative.
+The average begins at the time t_int, when the error has settled, and ends at the time t_unst, when the battery becomes
+unstable. Both times are determined from the run. delta1 (2.11) and delta2 (2.12) are the SOCs below which C_ts and C_tl
+of the model are negative.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 
 SETTLED_SHARE = 0.99
-"""Fraction of the samples after t_int whose error must be within the bound."""
+"""Minimum fraction of the samples after t_int whose error is within its bound."""
 SETTLED_PARAMETER = 1e-3
 """Maximum relative deviation of a settled parameter from its median."""
 SLOPE_WINDOWS = 100
@@ -52,14 +52,15 @@ def averaging_window(
 ) -> AveragingWindow:
     """Find t_int and t_unst of (3.19).
 
-    t_unst is the time at which ``margin`` reaches zero or the voltage reaches its knee, whichever is first. From t_int to t_unst, 99 % of the errors are within ``epsilon_v`` and each a_i is within 0.1 % of
-    its median. An average from the first sample on would contain the transient from a_i(t0).
+    t_unst is the time at which ``margin`` reaches zero or the voltage reaches its knee, whichever is first. From t_int
+    to t_unst, 99 % of the errors are within ``epsilon_v`` and each parameter a_i is within 0.1 % of its median. An
+    average from the first sample on would contain the transient from the initial value of a_i.
 
     Args:
         time_s: Shape (n,) [s].
-        error_v: e(t) (3.15) [V].
-        voltage_v: y(t) [V].
-        margin: SOC - max(delta1, delta2) - ``margin_guard`` of the observer.
+        error_v: Tracking error e (3.15) [V].
+        voltage_v: Measured voltage y [V].
+        margin: SOC - max(delta1, delta2), less the observer's setting ``margin_guard``.
         a: Shape (n, 16), a1..a15 at index 1..15.
         epsilon_v: Maximum error of a settled observer [V].
         t_int_s: t_int given by the user [s]; None: determined from the run.
@@ -75,15 +76,17 @@ def averaging_window(
         _check_inside("t_int", t_int_s, time_s[0], end_s)
         return AveragingWindow(t_int_s, end_s, "given", end_reason)
     inside = time_s <= end_s
-    beyond = np.abs(error_v[inside]) > epsilon_v
-    remaining = np.arange(beyond.size, 0, -1)
-    share = np.cumsum(beyond[::-1])[::-1] / remaining  # fraction of large errors in each sample and its successors
-    good = (share <= 1.0 - SETTLED_SHARE) & ~beyond
-    if not good.any():
-        # the window begins at its last sample, and ``averaged`` returns the last values
+    large = np.abs(error_v[inside]) > epsilon_v
+    remaining = np.arange(large.size, 0, -1)
+    large_fraction = (
+        np.cumsum(large[::-1])[::-1] / remaining
+    )  # fraction of large errors in each sample and its successors
+    settled = (large_fraction <= 1.0 - SETTLED_SHARE) & ~large
+    if not settled.any():
+        # the window contains only its last sample, and ``averaged`` returns the values of that sample
         reason = f"the error never settles within {1e3 * epsilon_v:.2f} mV"
         return AveragingWindow(float(time_s[inside][-1]), end_s, reason, end_reason)
-    error_from = int(np.argmax(good))
+    error_from = int(np.argmax(settled))
     a_from = _settled_from(a[inside])
     if a_from > error_from:
         reason = f"every later a_i is within {100 * SETTLED_PARAMETER:g} % of its median"
@@ -119,12 +122,12 @@ def _unstable_from(time_s: Floats, voltage_v: Floats, margin: Floats) -> tuple[f
 def _knee(time_s: Floats, voltage_v: Floats) -> float | None:
     """Return the time at which the last fall of the voltage begins [s]; None without one."""
     edges = np.linspace(0, time_s.size - 1, SLOPE_WINDOWS + 1).astype(int)
-    if np.unique(edges).size < edges.size:
+    if np.unique(edges).size < edges.size:  # fewer samples than windows
         return None
-    fall = -np.diff(voltage_v[edges]) / np.diff(time_s[edges])
-    median = float(np.median(fall))
-    steep = fall > KNEE_SLOPE * median
-    if median <= 0.0 or not steep[-1]:
+    fall_v_per_s = -np.diff(voltage_v[edges]) / np.diff(time_s[edges])
+    median_v_per_s = float(np.median(fall_v_per_s))
+    steep = fall_v_per_s > KNEE_SLOPE * median_v_per_s
+    if median_v_per_s <= 0.0 or not steep[-1]:
         return None
     gentle = np.flatnonzero(~steep)
     first = int(gentle[-1]) + 1 if gentle.size else 0
@@ -140,7 +143,7 @@ def averaged(time_s: Floats, a: Floats, window: AveragingWindow) -> Floats:
         window: t_int and t_unst.
 
     Returns:
-        Shape (16,). If fewer than two samples lie between t_int and t_unst, the last values.
+        Shape (16,). If fewer than two samples lie between t_int and t_unst, the values of the last sample.
     """
     inside = (time_s >= window.t_int_s) & (time_s <= window.t_unst_s)
     if inside.sum() < 2:

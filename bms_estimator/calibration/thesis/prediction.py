@@ -1,8 +1,8 @@
-"""Terminal voltage of a model with constant parameters under a measured current.
+"""Terminal voltage of Chen and Mora's model with constant parameters a1..a15 under a measured current.
 
 Section 5.3 and chapter 6 of the thesis validate the parameters in this way. Numbers in parentheses are equations of the
-thesis. The dynamic model has elements that depend on SOC. The static model has constant elements, those at one SOC. In both,
-E_o depends on SOC.
+thesis. The dynamic model has elements that depend on SOC. The static model has constant elements, those at one SOC. In
+both, E_o depends on SOC.
 """
 
 from dataclasses import dataclass, fields
@@ -23,9 +23,9 @@ GRID = np.linspace(0.0, 1.0, 4001)
 EMPTY_SOC = 0.0
 """SOC at which a prediction ends. The curves of the model are undefined below."""
 DELTA_FACTOR = 1.05
-"""Relative margin of the end of a prediction above delta1 and delta2, where a capacitance vanishes."""
+"""SOC at which a prediction ends, relative to delta1 and delta2, the SOCs at which a capacitance is zero."""
 DELTA_MARGIN = 1e-4
-"""Additional margin in SOC of the end of a prediction above delta1 and delta2."""
+"""Additional SOC above delta1 and delta2 at which a prediction ends."""
 JUMP_FRACTION = 0.1
 """Minimum change of the current between two samples of a current jump, as a fraction of the largest current."""
 
@@ -40,7 +40,7 @@ class Prediction:
         voltage_v: Measured voltage [V].
         predicted_v: Predicted voltage [V].
         soc: SOC by coulomb counting, 0..1.
-        overpotential_v: x2 + x3 of the model [V].
+        overpotential_v: x2 + x3, the voltages of both RC pairs of the model [V].
     """
 
     time_s: Floats
@@ -67,7 +67,7 @@ class Prediction:
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
-        """Mask without the first samples after current jumps, where many loggers report a voltage from before the jump."""
+        """Mask without the first samples after current jumps. Their voltage is often from before the jump."""
         jump_a = np.abs(np.diff(self.current_a, prepend=self.current_a[0]))
         return np.asarray(jump_a <= JUMP_FRACTION * np.abs(self.current_a).max())
 
@@ -85,21 +85,22 @@ class Prediction:
 def predict(
     cell: CellModel, samples: SampleBlock, initial_soc: float, *, a: Floats | None = None, lowest_soc: float = EMPTY_SOC
 ) -> Prediction:
-    """Simulate the frozen model over a capture, from rest.
+    """Simulate the model with constant parameters over a capture that starts at rest.
 
     Args:
-        cell: Capacity and OCV, and the elements without ``a``.
+        cell: Capacity, OCV and elements. ``a``, if given, replaces the elements.
         samples: Raw samples, dtype ``SAMPLE``.
         initial_soc: SOC 0..1 at the first sample.
         a: a1..a15 at index 1..15; None: those of ``cell``.
-        lowest_soc: SOC below which the prediction ends. It also ends at the model's delta1 or delta2.
+        lowest_soc: SOC below which the prediction ends. It also ends just above delta1 and delta2, the SOCs below which
+            a capacitance of the model is negative.
 
     Raises:
         UserError: No sample is good, or SOC is too low at the first one.
     """
     name = f"capture for {cell.cell.name}"
     good = remove_glitches(samples, name)
-    elements = np.zeros(22)
+    elements = np.zeros(22)  # a1..a21 at index 1..21
     elements[1:16] = (cell.a if a is None else a)[1:16]
     floor = max(lowest_soc, _unstable_below(elements))
     soc = soc_by_counting(good, cell.cell.capacity_ah, initial_soc)
@@ -110,22 +111,23 @@ def predict(
     time_s, current_a = (np.ascontiguousarray(good[name]) for name in ("time_s", "current_a"))
     capacity_as = cell.cell.capacity_ah * 3600.0
     start = (initial_soc, 0.0, 0.0)
-    drop_v, soc = simulate_cell(start, time_s, current_a, capacity_as, elements)  # -x2 - x3 - i R_s: a16..a21 are 0
-    ohmic = elements.copy()
-    ohmic[13] = ohmic[15] = 0.0
-    relaxing_v, _ = simulate_cell(start, time_s, current_a, capacity_as, ohmic)
+    # with a16..a21 = 0 the open-circuit voltage is 0, so that the simulated voltage is -x2 - x3 - i R_s
+    without_ocv_v, soc = simulate_cell(start, time_s, current_a, capacity_as, elements)
+    without_r_s = elements.copy()
+    without_r_s[13] = without_r_s[15] = 0.0
+    rc_pairs_v, _ = simulate_cell(start, time_s, current_a, capacity_as, without_r_s)  # -x2 - x3
     return Prediction(
         time_s=time_s,
         current_a=current_a,
         voltage_v=np.ascontiguousarray(good["voltage_v"]),
-        predicted_v=open_circuit(cell, soc) + drop_v,
+        predicted_v=open_circuit(cell, soc) + without_ocv_v,
         soc=soc,
-        overpotential_v=-relaxing_v,
+        overpotential_v=-rc_pairs_v,
     )
 
 
 def open_circuit(cell: CellModel, soc: Floats) -> Floats:
-    """Return E_o(SOC) of the cell by the interpolation of the kernels [V]."""
+    """Return the open-circuit voltage E_o(SOC) of the cell, interpolated as in the kernels [V]."""
     grid = ocv_grid(cell)
     return np.array([ocv(x, *grid) for x in soc])
 
@@ -133,6 +135,7 @@ def open_circuit(cell: CellModel, soc: Floats) -> Floats:
 def static_elements(a: Floats, soc: float) -> Floats:
     """Return a1..a15 of the static model of chapter 6, whose elements are those at ``soc``."""
     frozen = np.array(a)
+    # index of each element's offset; its amplitude is two before
     for offset, element in ((3, r_ts), (6, r_tl), (9, c_ts), (12, c_tl), (15, r_s)):
         frozen[offset] = element(soc, a)
         frozen[offset - 2] = 1e-30  # an amplitude of zero would leave delta1, delta2 undefined
@@ -140,9 +143,9 @@ def static_elements(a: Floats, soc: float) -> Floats:
 
 
 def _unstable_below(a: Floats) -> float:
-    """Return the SOC below which a capacitance is negative, (2.11), (2.12), with a margin; 0 if no capacitance is negative."""
-    worst = max(delta(a[i + 1], a[i + 2], a[i]) for i in (7, 10))
-    return DELTA_FACTOR * worst + DELTA_MARGIN if worst > 0.0 else 0.0
+    """Return the SOC below which a capacitance is negative, (2.11), (2.12), with a margin; 0 if none is negative."""
+    unstable_soc = max(delta(a[i + 1], a[i + 2], a[i]) for i in (7, 10))
+    return DELTA_FACTOR * unstable_soc + DELTA_MARGIN if unstable_soc > 0.0 else 0.0
 
 
 def soc_by_interpolation(cell: CellModel, run: Prediction) -> tuple[Floats, Floats]:

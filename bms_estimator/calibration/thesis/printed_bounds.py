@@ -1,4 +1,4 @@
-"""Bounds of (3.18) printed in Table 10 of the thesis."""
+"""Bounds of a1..a12 in the adaptive law (3.18), as printed in Table 10 of the thesis."""
 
 from bms_estimator.model.cell import Bounds, CellModel, load_cell
 
@@ -13,11 +13,12 @@ def printed_bounds(cell: CellModel) -> dict[str, Bounds]:
     ohm_ratio = (cell.cell.series_count * printed.cell.capacity_ah) / (
         printed.cell.series_count * cell.cell.capacity_ah
     )
-    found = {}
+    scaled_bounds = {}
     for name, bounds in printed.adaptation.items():
-        element, coefficient = divmod(int(name[1:]) - 1, 3)  # coefficient 1 is the exponent, elements 2, 3 capacitances
+        element, coefficient = divmod(int(name[1:]) - 1, 3)
+        # each element has an amplitude, an exponent (1) and an offset; elements 2 and 3 are capacitances
         factor = 1.0 if coefficient == 1 else 1.0 / ohm_ratio if element in (2, 3) else ohm_ratio
         table = bounds.model_dump()
         scaled = {key: factor * table[key] for key in ("upper", "lower", "initial") if table[key] is not None}
-        found[name] = Bounds.model_validate(table | scaled)
-    return found
+        scaled_bounds[name] = Bounds.model_validate(table | scaled)
+    return scaled_bounds

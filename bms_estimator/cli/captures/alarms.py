@@ -18,7 +18,7 @@ from rich.table import Table
 
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
-    OR_FUEL_CELL_HELP,
+    CELL_OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
     SignOfCurrent,
@@ -36,7 +36,7 @@ from bms_estimator.sources.captures.replay import Replay, open_capture
 from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.telemetry.alarms import Change
 
-STEP_S = 1.0
+MAX_BLOCK_S = 1.0
 """Maximum duration of a block [s]. Alarms are evaluated after each block, by the capture's clock."""
 
 
@@ -70,7 +70,7 @@ class AlarmResult:
 
 def alarms(
     capture: Annotated[Path, typer.Argument(help=CAPTURE_HELP, show_default=False)],
-    cell: Annotated[str | None, typer.Option(help=OR_FUEL_CELL_HELP, show_default=False)] = None,
+    cell: Annotated[str | None, typer.Option(help=CELL_OR_FUEL_CELL_HELP, show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     pack: Annotated[
         Path | None,
@@ -93,10 +93,10 @@ def alarms(
     if soc is not None:
         reject_soc_for_fuel_cell(model, "--soc")
         settings = with_pack(settings, initial_soc=soc)
-    with _quiet(), standard_input() if str(capture) == "-" else nullcontext(capture) as path:
+    with _silenced_log(), standard_input() if str(capture) == "-" else nullcontext(capture) as path:
         with show_compile_progress():
             opened = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
-        source = Replay(opened, longest_s=STEP_S)
+        source = Replay(opened, max_block_s=MAX_BLOCK_S)
         result = asyncio.run(_evaluate(settings, model, source))
         if source.samples == 0:
             raise UserError(f"{path}: contains no sample")
@@ -107,49 +107,62 @@ def alarms(
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silenced_log() -> Iterator[None]:
     """Silence the log, because the command itself prints what the service would log."""
-    before = structlog.get_config()
+    previous_config = structlog.get_config()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
     try:
         yield
     finally:
-        structlog.configure(**before)
+        structlog.configure(**previous_config)
 
 
-async def _evaluate(settings: Settings, cell: PackModel, source: Replay) -> AlarmResult:
+async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> AlarmResult:
+    """Run estimator and alarms over a capture."""
     now_s, changes = 0.0, list[Change]()
     with show_compile_progress():
-        estimator = new_estimator(settings, cell)
+        estimator = new_estimator(settings, model)
     without_hooks = settings.alarms.model_copy(update={"hook": ()})
     settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
-    monitor = AlarmMonitor(settings, cell, estimator, source, clock, changes.append)
-    async for block in source:
-        now_s = max(now_s, float(block["time_s"][-1]))
-        monitor.add(block, estimator.run(block), now_s)
+    monitor = AlarmMonitor(settings, model, estimator, source, clock, changes.append)
+    async for received in source:
+        now_s = max(now_s, float(received.samples["time_s"][-1]))
+        monitor.add(received, estimator.run(received.samples), now_s)
     monitor.evaluate(now_s)
-    reported = monitor.report
-    raised, latched = _pair_changes(changes), {alarm.name for alarm in reported if alarm.latched}
-    for each in raised:
-        each.latched = each.ended_s is None and each.alarm in latched
-    measured, raised_names = {alarm.name for alarm in reported}, {each.alarm for each in raised}
-    quiet = [name for name in monitor.alarms.names() if name in measured and name not in raised_names]
-    return AlarmResult(raised, quiet, [name for name in monitor.alarms.names() if name not in measured])
+    raised_alarms = _pair_changes(changes)
+    latched = {alarm.name for alarm in monitor.report if alarm.latched}
+    for alarm in raised_alarms:
+        alarm.latched = alarm.ended_s is None and alarm.alarm in latched
+    raised, measured = {alarm.alarm for alarm in raised_alarms}, {alarm.name for alarm in monitor.report}
+    monitored = monitor.alarms.names()
+    quiet = [name for name in monitored if name in measured and name not in raised]
+    return AlarmResult(raised_alarms, quiet, unmeasured=[name for name in monitored if name not in measured])
 
 
 def _pair_changes(changes: list[Change]) -> list[RaisedAlarm]:
-    """Combine the changes of alarms to raised alarms, each with the time of its end."""
-    raised: list[RaisedAlarm] = []
-    for at_s, alarm, kind in changes:
-        if kind == "watched":
+    """Return the raised alarms, each with the time of its end, from the changes of all alarms."""
+    raised_alarms: list[RaisedAlarm] = []
+    for at_s, alarm, changed_field in changes:
+        if changed_field == "watched":  # the alarm could no longer be evaluated, or could be again
             continue
         if alarm.active:
-            values = alarm.value, alarm.limit, alarm.unit, alarm.text
-            raised.append(RaisedAlarm(alarm.name, alarm.severity, at_s, None, False, *values))
+            raised_alarms.append(
+                RaisedAlarm(
+                    alarm.name,
+                    alarm.severity,
+                    raised_s=at_s,
+                    ended_s=None,
+                    latched=False,
+                    value=alarm.value,
+                    limit=alarm.limit,
+                    unit=alarm.unit,
+                    text=alarm.text,
+                )
+            )
         else:
-            next(each for each in reversed(raised) if each.alarm == alarm.name).ended_s = at_s
-    return raised
+            next(raised for raised in reversed(raised_alarms) if raised.alarm == alarm.name).ended_s = at_s
+    return raised_alarms
 
 
 def _print(title: str, result: AlarmResult) -> None:
@@ -157,10 +170,10 @@ def _print(title: str, result: AlarmResult) -> None:
     for column in ("raised", "ended", "alarm"):
         table.add_column(column, justify="left" if column == "alarm" else "right", no_wrap=True)
     table.add_column("")
-    for each in result.raised:
-        end = "latched" if each.latched else "active" if each.ended_s is None else f"{each.ended_s:,.1f} s"
-        colour = "red" if each.severity == "critical" else "yellow"
-        table.add_row(f"{each.raised_s:,.1f} s", end, f"[{colour}]{each.alarm}[/]", each.text)
+    for alarm in result.raised:
+        end = "latched" if alarm.latched else "active" if alarm.ended_s is None else f"{alarm.ended_s:,.1f} s"
+        color = "red" if alarm.severity == "critical" else "yellow"
+        table.add_row(f"{alarm.raised_s:,.1f} s", end, f"[{color}]{alarm.alarm}[/]", alarm.text)
     console = Console()
     if result.raised:
         console.print(table)

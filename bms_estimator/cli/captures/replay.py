@@ -16,15 +16,15 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from bms_estimator.cli.captures.replay_summary import Result, Summary
+from bms_estimator.cli.captures.replay_summary import ReplayResult, Summary
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
-    OR_FUEL_CELL_HELP,
+    CELL_OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
     Force,
     SignOfCurrent,
-    check_out,
+    check_output_file,
 )
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
@@ -45,13 +45,13 @@ from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 
-MAX_GLITCHES = 0.01
-"""Fraction of dropped samples above which a likely cause is reported."""
+RARE_FAULT_FRACTION = 0.01
+"""Maximum fraction of samples with a fault for which no likely cause is reported."""
 
 
 def replay(
     capture: Annotated[Path, typer.Argument(help=CAPTURE_HELP, show_default=False)],
-    cell: Annotated[str | None, typer.Option(help=OR_FUEL_CELL_HELP, show_default=False)] = None,
+    cell: Annotated[str | None, typer.Option(help=CELL_OR_FUEL_CELL_HELP, show_default=False)] = None,
     capacity_ah: CapacityAh = None,
     pack: Annotated[Path | None, typer.Option(help="settings file of the pack, pack.toml", show_default=False)] = None,
     soc: Annotated[
@@ -89,24 +89,24 @@ def replay(
         settings = with_pack(settings, initial_soc=soc)
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
     if out is not None:
-        check_out(out, [capture], force=force)
+        check_output_file(out, [capture], force=force)
     with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
         with show_compile_progress():
             source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
         replay_source = Replay(source, speed=speed)
         result = asyncio.run(_replay(settings, model, replay_source, table_sink(out) if out else None))
         if isinstance(source, RawCapture):
-            for warning in _unread(source, result.duration_s or 0.0):
+            for warning in _unread_warnings(source, result.duration_s or 0.0):
                 typer.echo(f"warning: {capture}: {warning}", err=True)
         if result.samples == 0:
-            raise UserError(f"{path}: no usable sample; dropped: {_dropped(result)}")
+            raise UserError(f"{path}: no usable sample; dropped: {_dropped_text(result)}")
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
         Console().print(result_table(path.name, result))
 
 
-def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
+def _unread_warnings(source: RawCapture, duration_s: float) -> Iterator[str]:
     """Yield a warning for each part of a capture that was not read."""
     if source.damaged:
         yield f"damaged after {duration_s:.1f} s; the rest was not read"
@@ -114,25 +114,25 @@ def _unread(source: RawCapture, duration_s: float) -> Iterator[str]:
         yield f"the last {source.unread_bytes:,} bytes are no complete record: the file is truncated, or the length in a record is damaged"
 
 
-async def _replay(settings: Settings, cell: PackModel, source: Replay, table: TableSink | None) -> Result:
-    """Run the estimator over a source, and pass its trace to table, summary and broker."""
+async def _replay(settings: Settings, model: PackModel, source: Replay, table: TableSink | None) -> ReplayResult:
+    """Run the estimator over a source, and pass the estimates to table, summary and broker."""
     with show_compile_progress():
-        estimator, summary = new_estimator(settings, cell), Summary()
+        estimator, summary = new_estimator(settings, model), Summary()
     async with AsyncExitStack() as stack:
-        publisher = await _publisher(stack, settings, cell, estimator, source)
+        publisher = await _open_publisher(stack, settings, model, estimator, source)
         stack.enter_context(table or nullcontext())
         update_progress = stack.enter_context(_progress(source))
         started_s, impossible = time.perf_counter(), None
-        async for block in source:
-            trace = estimator.run(block)
+        async for received in source:
+            trace = estimator.run(received.samples)
             summary.add(trace)
-            if trace.size < block.size:
-                impossible = out_of_range_reason(block, estimator.settings[0]) or impossible
+            if trace.size < received.samples.size:  # samples were dropped
+                impossible = out_of_range_reason(received.samples, estimator.settings[0]) or impossible
             if table:
                 table.write(trace)
             if publisher:
-                publisher.add(block, trace)
-                await asyncio.sleep(0)
+                publisher.add(received, trace)
+                await asyncio.sleep(0)  # the MQTT client runs in this event loop
             update_progress()
         wall_s = time.perf_counter() - started_s
         if publisher:
@@ -141,20 +141,20 @@ async def _replay(settings: Settings, cell: PackModel, source: Replay, table: Ta
     return replace(result, impossible=impossible, temperatures_dropped=source.counters.get("implausible", 0))
 
 
-async def _publisher(
-    stack: AsyncExitStack, settings: Settings, cell: PackModel, estimator: Estimator, source: Replay
+async def _open_publisher(
+    stack: AsyncExitStack, settings: Settings, model: PackModel, estimator: Estimator, source: Replay
 ) -> Publisher | None:
     """Return the publisher; None without a broker."""
     if settings.mqtt is None:
         return None
     delivery = DeliveryStats()
-    outbox = Outbox(None, most=settings.store.outbox_messages)
+    outbox = Outbox(None, max_messages=settings.store.outbox_messages)
     home = settings.home_assistant
     mqtt = MqttSink(
         settings.mqtt, settings.pack.name, RequestDispatcher(delivery), delivery, outbox, home_assistant=home
     )
     sinks = [await stack.enter_async_context(mqtt)]
-    return Publisher(settings, cell, estimator, source=source, sinks=sinks, clock=Clock(), delivery=delivery)
+    return Publisher(settings, model, estimator, source=source, sinks=sinks, clock=Clock(), delivery=delivery)
 
 
 @contextmanager
@@ -167,45 +167,45 @@ def _progress(source: Replay) -> Iterator[Callable[[], None]]:
         yield lambda: progress.update(bar, completed=source.capture.fraction, samples=source.samples)
 
 
-def result_table(title: str, result: Result) -> Table:
+def result_table(title: str, result: ReplayResult) -> Table:
     """Return the result as a table."""
     table = Table(title=title, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
     table.add_column(justify="right")
-    lock = f"[red]lost {result.lock_losses} times[/]" if result.lock_lost else "[green]kept[/]"
+    lock_text = f"[red]lost {result.lock_losses} times[/]" if result.lock_lost else "[green]kept[/]"
     rows = {
         "samples": f"{result.samples:,}",
-        "dropped": _dropped(result),
+        "dropped": _dropped_text(result),
         **({"gaps": f"{result.gaps:,}"} if result.gaps else {}),
-        **({"clock set back": _set_back(result)} if result.time_steps_back else {}),
-        "duration": _text(result.duration_s, ",.1f", "s"),
-        **({} if result.parameters else _soc(result)),
-        "innovation, RMS": _text(result.innovation_rms_v, ".3f", "mV", 1e3),
-        "voltage error, RMS": _text(result.voltage_rms_error_v, ".3f", "mV", 1e3),
-        "lock": lock,
-        "k at the end": _text(result.k_final, ".4g", "V²s"),
-        "speed": f"{_text(result.samples_per_s, ',.0f')} samples/s, {result.wall_s:.2f} s",
+        **({"clock set back": _set_back_text(result)} if result.time_steps_back else {}),
+        "duration": _number_text(result.duration_s, ",.1f", "s"),
+        **({} if result.parameters else _soc_rows(result)),  # a fuel cell has parameters, and no SOC
+        "innovation, RMS": _number_text(result.innovation_rms_v, ".3f", "mV", 1e3),
+        "voltage error, RMS": _number_text(result.voltage_rms_error_v, ".3f", "mV", 1e3),
+        "lock": lock_text,
+        "k at the end": _number_text(result.k_final, ".4g", "V²s"),
+        "speed": f"{_number_text(result.samples_per_s, ',.0f')} samples/s, {result.wall_s:.2f} s",
     }
-    learned = {
-        name: f"{'' if p.valid else 'not valid: '}{_text(p.value, '.4g')} ± {_text(p.std, '.2g')}"
+    parameter_rows = {
+        name: f"{'' if p.valid else 'not valid: '}{_number_text(p.value, '.4g')} ± {_number_text(p.std, '.2g')}"
         for name, p in result.parameters.items()
     }
-    for name, value in (rows | learned).items():
+    for name, value in (rows | parameter_rows).items():
         table.add_row(name, value)
     for suspicion in result.suspects:
         table.add_row("suspected", f"[yellow]{suspicion}[/]")
     return table
 
 
-def _soc(result: Result) -> dict[str, str]:
+def _soc_rows(result: ReplayResult) -> dict[str, str]:
     return {
-        "SOC": f"{_text(result.soc_initial, '.2%')} to {_text(result.soc_final, '.2%')}",
-        "SOC, std at the end": _text(result.soc_std_final, ".2%"),
-        **_temperature(result),
+        "SOC": f"{_number_text(result.soc_initial, '.2%')} to {_number_text(result.soc_final, '.2%')}",
+        "SOC, std at the end": _number_text(result.soc_std_final, ".2%"),
+        **_temperature_row(result),
     }
 
 
-def _temperature(result: Result) -> dict[str, str]:
+def _temperature_row(result: ReplayResult) -> dict[str, str]:
     dropped = f"{result.temperatures_dropped:,} implausible values"
     if not result.temperature_sensor:
         reason = dropped if result.temperatures_dropped else "not measured"
@@ -213,18 +213,20 @@ def _temperature(result: Result) -> dict[str, str]:
     return {"temperature": dropped} if result.temperatures_dropped else {}
 
 
-def _set_back(result: Result) -> str:
+def _set_back_text(result: ReplayResult) -> str:
     """Return the number of backward steps of the clock, with the likely cause if there are many."""
     text = f"{result.time_steps_back:,} times"
-    is_frequent = result.time_steps_back > MAX_GLITCHES * result.samples
+    is_frequent = result.time_steps_back > RARE_FAULT_FRACTION * result.samples
     return f"{text}: are the rows in the order of time?" if is_frequent else text
 
 
-def _dropped(result: Result) -> str:
+def _dropped_text(result: ReplayResult) -> str:
     """Return the counts of dropped samples, with the likely cause if there are many."""
-    text, number = dropped_text(result.dropped), sum(result.dropped.values())
-    return f"{text}; {result.impossible}" if result.impossible and number > MAX_GLITCHES * result.samples else text
+    text, count = dropped_text(result.dropped), sum(result.dropped.values())
+    return (
+        f"{text}; {result.impossible}" if result.impossible and count > RARE_FAULT_FRACTION * result.samples else text
+    )
 
 
-def _text(value: float | None, form: str, unit: str = "", scale: float = 1.0) -> str:
+def _number_text(value: float | None, form: str, unit: str = "", scale: float = 1.0) -> str:
     return "-" if value is None else f"{value * scale:{form}} {unit}".rstrip()

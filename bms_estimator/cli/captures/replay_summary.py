@@ -15,7 +15,7 @@ from bms_estimator.telemetry.state import finite
 
 @dataclass(frozen=True)
 class LearnedParameter:
-    """Parameter learned at the end of a replay; None for missing numbers."""
+    """Value of a learned parameter at the end of a replay; None for missing numbers."""
 
     value: float | None
     std: float | None
@@ -23,8 +23,8 @@ class LearnedParameter:
 
 
 @dataclass(frozen=True)
-class Result:
-    """Result of a replay; None for missing numbers."""
+class ReplayResult:
+    """ReplayResult of a replay; None for missing numbers."""
 
     samples: int
     """Number of accepted samples."""
@@ -33,7 +33,7 @@ class Result:
     soc_initial: float | None
     soc_final: float | None
     soc_std_final: float | None
-    """Standard deviation by the identifier; None without it."""
+    """Standard deviation by the identifier; None if the identifier is off."""
     soc_rms_difference_to_coulomb: float | None
     innovation_rms_v: float | None
     """RMS of measured minus predicted voltage, before the correction by the measurement."""
@@ -42,11 +42,13 @@ class Result:
     lock_lost: bool
     lock_losses: int
     k_final: float | None
+    """Adaptive gain of the observer at the end [V²s]."""
     temperature_sensor: bool
     """True if the capture has the cell's temperature."""
     suspects: list[str]
     """Input diagnostics of the identifier at the end."""
     gain_rearms: int
+    """Number of resets of the observer's gain k (setting ``observer.rearm_gain``)."""
     dropped: dict[str, int]
     """Number of dropped samples by kind of fault."""
     impossible: str | None
@@ -55,6 +57,7 @@ class Result:
     """Number of implausible temperatures."""
     gaps: int
     time_steps_back: int
+    """Number of samples whose time is before that of the previous sample."""
     parameters: dict[str, LearnedParameter]
     """Parameters of a fuel cell by the keys of its file; empty for a battery, whose parameters depend on SOC."""
     samples_per_s: float | None
@@ -64,14 +67,15 @@ class Result:
 
 
 class Summary:
-    """Accumulator of sums over trace blocks."""
+    """Accumulator of sums over blocks of a trace, which has one row of estimates for each accepted sample."""
 
     def __init__(self) -> None:
-        self._rows = 0
+        self._row_count = 0
         self._first: np.void | None = None
         self._last: np.void | None = None
         self._duration_s = 0.0
-        self._innovation = self._error = self._soc_difference = 0.0
+        # sums of squares
+        self._innovation_sum = self._error_sum = self._soc_difference_sum = 0.0
 
     def add(self, trace: NDArray[np.void]) -> None:
         """Add a block of dtype TRACE."""
@@ -79,42 +83,43 @@ class Summary:
             return
         if self._first is None:
             self._first = trace[0].copy()
-        before_s = trace["time_s"][0] if self._last is None else self._last["time_s"]
-        self._duration_s += float(np.diff(trace["time_s"], prepend=before_s).clip(min=0.0).sum())
+        previous_s = trace["time_s"][0] if self._last is None else self._last["time_s"]
+        # a step back of the clock counts as 0 s
+        self._duration_s += float(np.diff(trace["time_s"], prepend=previous_s).clip(min=0.0).sum())
         self._last = trace[-1].copy()
-        self._rows += trace.size
-        error = trace["voltage_v"] - trace["voltage_estimate_v"]
-        self._innovation += float(trace["innovation_v"] @ trace["innovation_v"])
-        self._error += float(error @ error)
-        difference = trace["soc"] - trace["soc_coulomb"]
-        self._soc_difference += float(difference @ difference)
+        self._row_count += trace.size
+        error_v = trace["voltage_v"] - trace["voltage_estimate_v"]
+        soc_difference = trace["soc"] - trace["soc_coulomb"]
+        self._innovation_sum += float(trace["innovation_v"] @ trace["innovation_v"])
+        self._error_sum += float(error_v @ error_v)
+        self._soc_difference_sum += float(soc_difference @ soc_difference)
 
-    def result(self, estimator: Estimator, read: int, wall_s: float) -> Result:
-        """Return the result of the replay.
+    def result(self, estimator: Estimator, sample_count: int, wall_s: float) -> ReplayResult:
+        """Return the result of the replay, without ``impossible`` and ``temperatures_dropped``, which the caller sets.
 
         Args:
             estimator: Estimator after the last sample.
-            read: Number of samples in the capture.
+            sample_count: Number of samples in the capture, including dropped samples.
             wall_s: Duration of the replay [s].
         """
         record, settings = estimator.record[0], estimator.settings_record[0]
-        state = record["observer"]
-        counters = sample_counters(state)
-        return Result(
-            samples=self._rows,
-            duration_s=self._duration_s if self._rows else None,
-            soc_initial=_field(self._first, "soc"),
-            soc_final=_field(self._last, "soc"),
-            soc_std_final=_field(self._last, "soc_std"),
-            soc_rms_difference_to_coulomb=self._rms(self._soc_difference),
-            innovation_rms_v=self._rms(self._innovation),
-            voltage_rms_error_v=self._rms(self._error),
-            lock_lost=bool(state["lock_losses"]),
-            lock_losses=int(state["lock_losses"]),
-            k_final=finite(state["k"]),
+        observer = record["observer"]
+        counters = sample_counters(observer)
+        return ReplayResult(
+            samples=self._row_count,
+            duration_s=self._duration_s if self._row_count else None,
+            soc_initial=_finite_field(self._first, "soc"),
+            soc_final=_finite_field(self._last, "soc"),
+            soc_std_final=_finite_field(self._last, "soc_std"),
+            soc_rms_difference_to_coulomb=self._rms(self._soc_difference_sum),
+            innovation_rms_v=self._rms(self._innovation_sum),
+            voltage_rms_error_v=self._rms(self._error_sum),
+            lock_lost=bool(observer["lock_losses"]),
+            lock_losses=int(observer["lock_losses"]),
+            k_final=finite(observer["k"]),
             temperature_sensor=bool(record["filter"]["sensed"]),
             suspects=suspicions(record, settings),
-            gain_rearms=int(state["gain_rearms"]),
+            gain_rearms=int(observer["gain_rearms"]),
             dropped={
                 name.removeprefix("dropped_"): count for name, count in counters.items() if name.startswith("dropped_")
             },
@@ -122,21 +127,22 @@ class Summary:
             temperatures_dropped=0,
             gaps=counters["gaps"],
             time_steps_back=counters["time_steps_back"],
-            parameters=_learned(estimator),
-            samples_per_s=read / wall_s if wall_s > 0.0 else None,
+            parameters=_learned_parameters(estimator),
+            samples_per_s=sample_count / wall_s if wall_s > 0.0 else None,
             wall_s=wall_s,
         )
 
-    def _rms(self, squares: float) -> float | None:
-        return finite(math.sqrt(squares / self._rows)) if self._rows else None
+    def _rms(self, sum_of_squares: float) -> float | None:
+        return finite(math.sqrt(sum_of_squares / self._row_count)) if self._row_count else None
 
 
-def _learned(estimator: Estimator) -> dict[str, LearnedParameter]:
+def _learned_parameters(estimator: Estimator) -> dict[str, LearnedParameter]:
+    """Return the parameters of a fuel cell; empty for a battery, and before the first sample."""
     if not isinstance(estimator.cell, FuelCellModel) or not estimator.state[0]["started"]:
         return {}
-    parameters = fuel_cell_parameters(estimator, 0.0)
+    parameters = fuel_cell_parameters(estimator, now_s=0.0)  # the time is not part of the result
     return {name: LearnedParameter(p.value, p.std, p.valid) for name, p in parameters.items()}
 
 
-def _field(row: np.void | None, name: str) -> float | None:
+def _finite_field(row: np.void | None, name: str) -> float | None:
     return None if row is None else finite(row[name])

@@ -19,11 +19,11 @@ from bms_estimator.cli.options.capture_options import (
     CELL_HELP,
     CapacityAh,
     SignOfCurrent,
-    check_once,
     name_of,
+    reject_duplicates,
 )
 from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.cli.options.pack_options import TABLE_RESOLUTION_V
+from bms_estimator.cli.options.pack_options import LABORATORY_RESOLUTION_V
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports import report_items
@@ -32,8 +32,10 @@ from bms_estimator.reports.html import LONG_CELL, write
 from bms_estimator.reports.thesis_report import Report, build
 from bms_estimator.sources.captures.replay import load_capture
 
-MIN_WIDTH = 160
-"""Minimum width of a printed table of the thesis [characters]."""
+MIN_TABLE_WIDTH = 160
+"""Minimum width of a printed table [characters]."""
+COLUMN_TITLE_WIDTH = 12
+"""Width at which the titles of columns are wrapped [characters]."""
 
 
 def thesis(
@@ -45,7 +47,7 @@ def thesis(
     capacity_ah: CapacityAh = None,
     resolution_v: Annotated[
         float, typer.Option(parser=decimal(1e-9), help="voltage resolution (LSB) of the captures [V]")
-    ] = TABLE_RESOLUTION_V,
+    ] = LABORATORY_RESOLUTION_V,
     current_sign: SignOfCurrent = None,
     out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),
     table: Annotated[
@@ -59,31 +61,31 @@ def thesis(
     Chapter 5 is computed from the captures, all of one type of cell.
     At least one capture must be a voltage relaxation test, and at least one a constant load or a load with steps.
     """
-    recorded = _recorded(captures, cell, capacity_ah, resolution_v, current_sign) if captures else None
+    recorded = _load_recorded(captures, cell, capacity_ah, resolution_v, current_sign) if captures else None
     started_s = time.perf_counter()
-    with _progress() as show:
-        report = build(recorded, table=table, figure=figure, progress=show)
+    with _progress() as show_progress:
+        report = build(recorded, table=table, figure=figure, progress=show_progress)
         try:
             path = write(report, out)
         except OSError as error:
             raise UserError(f"--out {out}: cannot be written: {error.strerror}") from None
     console = Console()
     if table or figure:
-        _show(console, report)
+        _print_items(console, report)
     counts = Counter(item.verdict.value for item in report.items)
     typer.echo("; ".join(f"{count} {verdict}" for verdict, count in counts.items()))
     typer.echo(f"{path}: written in {time.perf_counter() - started_s:.1f} s")
 
 
-def _recorded(
+def _load_recorded(
     captures: list[Path], cell: str | None, capacity_ah: float | None, resolution_v: float, current_sign: SignOfCurrent
 ) -> Recorded:
     if cell is None:
         raise UserError("captures require --cell NAME|CELL.toml, which gives capacity, limits and bounds of the cell")
-    check_once(captures)
+    reject_duplicates(captures)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
-    named = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
-    return Recorded(load_cell(cell, capacity_ah), named, resolution_v)
+    named_rows = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
+    return Recorded(load_cell(cell, capacity_ah), named_rows, resolution_v)
 
 
 @contextmanager
@@ -96,17 +98,18 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
         yield lambda title, done, total: progress.update(bar, description=title, completed=done, total=total)
 
 
-def _show(console: Console, report: Report) -> None:
-    """Print the requested items of the report."""
+def _print_items(console: Console, report: Report) -> None:
+    """Print the tables, and the titles of the figures, of a report."""
     for item in report.items:
         if isinstance(item, report_items.Table):
-            shown = Table(title=f"{report_items.name(item)}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)
+            printed = Table(title=f"{report_items.name(item)}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)
             for column, cells in zip(item.columns, zip(*item.rows, strict=True), strict=True):
-                text = max(map(len, cells)) > LONG_CELL
-                shown.add_column(textwrap.fill(column, 12), justify="left" if text else "right", no_wrap=not text)
+                is_text = max(map(len, cells)) > LONG_CELL
+                title = textwrap.fill(column, COLUMN_TITLE_WIDTH)
+                printed.add_column(title, justify="left" if is_text else "right", no_wrap=not is_text)
             for row in item.rows:
-                shown.add_row(*row)
-            Console(width=max(console.width, MIN_WIDTH)).print(shown)
+                printed.add_row(*row)
+            Console(width=max(console.width, MIN_TABLE_WIDTH)).print(printed)
         else:
             console.print(f"Figure {item.key}  {item.title}", highlight=False)
         console.print(f"{report_items.label(item)}: {item.reason}", highlight=False)

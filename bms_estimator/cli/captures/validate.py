@@ -40,12 +40,12 @@ def validate_command(
     for line in validation.warnings:
         typer.echo(f"warning: {line}", err=True)
     if as_json:
-        sys.stdout.write(json.dumps(_json(validation)) + "\n")
+        sys.stdout.write(json.dumps(_json_result(validation)) + "\n")
     else:
         Console().print(_tables(capture, validation))
 
 
-def _json(validation: Validation) -> dict[str, Any]:
+def _json_result(validation: Validation) -> dict[str, Any]:
     above = {f"{key}_soc_above_0_1": value for key, value in _errors(validation.above).items()}
     return (
         _errors(validation.all)
@@ -57,8 +57,8 @@ def _json(validation: Validation) -> dict[str, Any]:
             "glitches": validation.glitches,
             "resting": _errors(validation.resting),
             "loaded": _errors(validation.loaded),
-            "extra_series_resistance_ohm": _number(validation.extra_ohm),
-            "with_extra_series_resistance": _errors(validation.without_extra_ohm),
+            "extra_series_resistance_ohm": _finite_or_none(validation.extra_ohm),
+            "with_extra_series_resistance": _errors(validation.with_extra_ohm),
             "warnings": list(validation.warnings),
         }
     )
@@ -67,18 +67,18 @@ def _json(validation: Validation) -> dict[str, Any]:
 def _errors(errors: Errors) -> dict[str, Any]:
     return {
         "samples": errors.samples,
-        "voltage_rms_mv": _number(1e3 * errors.voltage_rms_v),
-        "mean_abs_percent": _number(errors.mean_abs_percent),
-        "max_abs_percent": _number(errors.max_abs_percent),
+        "voltage_rms_mv": _finite_or_none(1e3 * errors.voltage_rms_v),
+        "mean_abs_percent": _finite_or_none(errors.mean_abs_percent),
+        "max_abs_percent": _finite_or_none(errors.max_abs_percent),
     }
 
 
-def _number(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
 def _tables(capture: Path, validation: Validation) -> Group:
-    """Return the result as tables."""
+    """Return a table of the errors over several sets of samples, with the SOC below it."""
     table = Table(title=capture.name, title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("", "samples", "RMS", "mean", "max"):
         table.add_column(column, justify="left" if not column else "right")
@@ -87,11 +87,11 @@ def _tables(capture: Path, validation: Validation) -> Group:
         "SOC > 0.1": validation.above,
         "  at rest": validation.resting,
         "  under load": validation.loaded,
-        f"  with {1e3 * validation.extra_ohm:+.2f} mohm in series": validation.without_extra_ohm,
+        f"  with {1e3 * validation.extra_ohm:+.2f} mohm in series": validation.with_extra_ohm,
     }
-    for name, e in rows.items():
-        if e.samples:
-            percents = (f"{e.mean_abs_percent:.3f} %", f"{e.max_abs_percent:.2f} %")
-            table.add_row(name, f"{e.samples:,}", f"{1e3 * e.voltage_rms_v:.2f} mV", *percents)
+    for name, errors in rows.items():
+        if errors.samples:
+            percents = (f"{errors.mean_abs_percent:.3f} %", f"{errors.max_abs_percent:.2f} %")
+            table.add_row(name, f"{errors.samples:,}", f"{1e3 * errors.voltage_rms_v:.2f} mV", *percents)
     soc = f"SOC {validation.initial_soc:.4f} ({validation.initial_soc_from}) to {validation.final_soc:.4f}"
     return Group(table, f"{soc}; {validation.glitches} glitches skipped")

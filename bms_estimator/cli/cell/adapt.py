@@ -1,4 +1,4 @@
-"""``bms-estimator adapt``: cell file by the thesis's steps 2 and 3 from captures."""
+"""``bms-estimator adapt``: cell file by the thesis's steps 2 (RC pairs, a1..a12) and 3 (R_s, a13..a15) from captures."""
 
 import json
 import math
@@ -20,9 +20,9 @@ from bms_estimator.cli.options.capture_options import (
     InitialSoc,
     NewCellFile,
     SignOfCurrent,
-    check_once,
-    check_out,
-    write_as_named,
+    check_output_file,
+    reject_duplicates,
+    write_cell_named_as_file,
 )
 from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.captures.replay import load_capture
@@ -48,13 +48,13 @@ def adapt_command(
     The captures are replayed with the cell file of --cell and with the new cell file.
     The new file is written only if the error score of its replays is at most 5 % higher (docs/cell/adapt.md).
     """
-    check_out(out, captures, force=force)
-    check_once(captures)
+    check_output_file(out, captures, force=force)
+    reject_duplicates(captures)
     model = load_cell(cell, capacity_ah)
     adaptation = adapt([load_capture(path, current_sign=current_sign) for path in captures], model, soc=soc)
-    write_as_named(out, adaptation.cell, _remarks(cell, adaptation))
+    write_cell_named_as_file(out, adaptation.cell, _remarks(cell, adaptation))
     if as_json:
-        sys.stdout.write(json.dumps(_json(out, adaptation)) + "\n")
+        sys.stdout.write(json.dumps(_json_result(out, adaptation)) + "\n")
         return
     console = Console()
     console.print(
@@ -62,8 +62,8 @@ def adapt_command(
     )
 
 
-def _json(out: Path, adaptation: Adaptation) -> dict[str, Any]:
-    std = [None] * 12 + [_number(x) for x in adaptation.steps.r_s.std]
+def _json_result(out: Path, adaptation: Adaptation) -> dict[str, Any]:
+    std = [None] * 12 + [_finite_or_none(x) for x in adaptation.steps.r_s.std]  # a1..a12 have no standard error
     a = adaptation.steps.a[1:].tolist()
     return {
         "out": str(out),
@@ -72,40 +72,41 @@ def _json(out: Path, adaptation: Adaptation) -> dict[str, Any]:
         "t_int_s": adaptation.steps.run.window.t_int_s,
         "t_unst_s": adaptation.steps.run.window.t_unst_s,
         "r_s_rms_mohm": 1e3 * adaptation.steps.r_s.rms_ohm,
-        "error_mv": 1e3 * _error_v(adaptation),
+        "error_mv": 1e3 * _voltage_error_v(adaptation),
         "captures": [
             {
                 "name": c.name,
                 "initial_soc": c.initial_soc,
                 "voltage_rms_mv_soc_above_0_1": 1e3 * c.voltage_rms_v,
-                "score_before_percent": _number(c.score_before),
-                "score_after_percent": _number(c.score_after),
+                "score_before_percent": _finite_or_none(c.score_before),
+                "score_after_percent": _finite_or_none(c.score_after),
                 "held_back": c.held_back,
             }
             for c in adaptation.captures
         ],
-        "score_before_percent": _number(adaptation.score_before),
-        "score_after_percent": _number(adaptation.score_after),
+        "score_before_percent": _finite_or_none(adaptation.score_before),
+        "score_after_percent": _finite_or_none(adaptation.score_after),
     }
 
 
-def _error_v(adaptation: Adaptation) -> float:
+def _voltage_error_v(adaptation: Adaptation) -> float:
     return math.nan if adaptation.cell.ladder is None else adaptation.cell.ladder.error_v
 
 
-def _number(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
 def _remarks(cell: str, adaptation: Adaptation) -> list[str]:
+    """Return the comments at the beginning of the cell file."""
     run, std = adaptation.steps.run, adaptation.steps.r_s.std
     names = ", ".join(c.name for c in adaptation.captures)
     return [
         f"a1..a15 by the thesis's steps 2 and 3 from {names};",
         f"capacity and open-circuit voltage from {Path(cell).name}. Algorithm 1: {run.outcome}.",
-        "a1..a12 have no error: (3.18) leads them to the weighted mean of their bounds.",
+        "a1..a12 have no standard error: the adaptation law (3.18) leads them to the weighted mean of their bounds.",
         f"Standard errors of a13, a14, a15: {std[0]:.2g} ohm, {std[1]:.2g}, {std[2]:.2g} ohm (nan: at a bound).",
-        f"Error of the voltage above SOC 0.1: {1e3 * _error_v(adaptation):.1f} mV RMS.",
+        f"Error of the voltage above SOC 0.1: {1e3 * _voltage_error_v(adaptation):.1f} mV RMS.",
         f"Interval score of replays started in mid-load: {adaptation.score_before:.2f} % before, {adaptation.score_after:.2f} % after.",
     ]
 
@@ -113,7 +114,7 @@ def _remarks(cell: str, adaptation: Adaptation) -> list[str]:
 def _a_table(adaptation: Adaptation) -> Table:
     """Return a1..a15 as a table with a row for each element."""
     table = Table("element", "amplitude", "exponent", "offset", box=box.SIMPLE_HEAD)
-    for name, first in (("R_ts", 1), ("R_tl", 4), ("C_ts", 7), ("C_tl", 10), ("R_s", 13)):
+    for name, first in (("R_ts", 1), ("R_tl", 4), ("C_ts", 7), ("C_tl", 10), ("R_s", 13)):  # index of the amplitude
         table.add_row(f"{name}: a{first}..a{first + 2}", *(f"{x:.4g}" for x in adaptation.steps.a[first : first + 3]))
     return table
 

@@ -18,10 +18,10 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.replay import load_capture
 
-SHOWN_ANCHORS = 30
-"""Maximum number of printed anchors; ``--json`` prints all."""
-MAX_RATIO = 30.0
-"""Maximum ratio of declared and measured capacity. A larger ratio results from wrong units."""
+MAX_SHOWN_ANCHORS = 30
+"""Maximum number of printed anchors, which are rests with an SOC; ``--json`` prints all."""
+MAX_CAPACITY_RATIO = 30.0
+"""Maximum ratio of measured and declared capacity, in either direction. A larger ratio results from wrong units."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def capacity(
     model = load_cell(cell, capacity_ah)
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     measured = measure_capacity(loaded, model, offset_std_a=current_offset_std_a)
-    if not 1.0 / MAX_RATIO < measured.capacity_ah / model.cell.capacity_ah < MAX_RATIO:
+    if not 1.0 / MAX_CAPACITY_RATIO < measured.capacity_ah / model.cell.capacity_ah < MAX_CAPACITY_RATIO:
         raise UserError(
             f"{measured.capacity_ah:.4g} Ah, but {model.cell.capacity_ah:.4g} Ah is declared: is the current in amperes and "
             "the time in seconds?"
@@ -91,7 +91,7 @@ def capacity(
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
-        Console().print(_shown(result))
+        Console().print(_as_table(result))
 
 
 def _result(measured: Capacity, cell: CellModel) -> CapacityResult:
@@ -101,12 +101,15 @@ def _result(measured: Capacity, cell: CellModel) -> CapacityResult:
         declared_ah=cell.cell.capacity_ah,
         current_offset_a=measured.offset_a,
         current_offset_std_a=measured.offset_std_a,
-        anchors=[_anchor(a, off) for a, off in zip(measured.anchors, measured.residual, strict=True)],
+        anchors=[
+            _anchor_result(anchor, soc_error)
+            for anchor, soc_error in zip(measured.anchors, measured.residual, strict=True)
+        ],
         rejected=list(measured.rejected),
     )
 
 
-def _anchor(anchor: Anchor, off: float) -> AnchorResult:
+def _anchor_result(anchor: Anchor, soc_error: float) -> AnchorResult:
     return AnchorResult(
         capture=anchor.capture,
         time_s=anchor.time_s,
@@ -116,21 +119,21 @@ def _anchor(anchor: Anchor, off: float) -> AnchorResult:
         soc=anchor.soc,
         soc_std=anchor.soc_std,
         counted_ah=anchor.counted_ah,
-        off=off,
+        off=soc_error,
     )
 
 
-def _anchor_count(anchors: int) -> str:
-    more = f", the first {SHOWN_ANCHORS} above (--json: all)" if anchors > SHOWN_ANCHORS else ""
-    return f"{anchors} anchors{more}"
+def _anchor_count_text(count: int) -> str:
+    omission = f", the first {MAX_SHOWN_ANCHORS} above (--json: all)" if count > MAX_SHOWN_ANCHORS else ""
+    return f"{count} anchors{omission}"
 
 
-def _shown(result: CapacityResult) -> Group:
-    """Return the result as a table."""
+def _as_table(result: CapacityResult) -> Group:
+    """Return a table of the anchors, with the results below it."""
     anchors = Table("capture", "until", "rest", "OCV", "SOC", "counted", "SOC error", box=box.SIMPLE_HEAD)
     for column in anchors.columns[1:]:
         column.justify, column.no_wrap = "right", True
-    for anchor in result.anchors[:SHOWN_ANCHORS]:
+    for anchor in result.anchors[:MAX_SHOWN_ANCHORS]:
         anchors.add_row(
             anchor.capture,
             f"{anchor.time_s:.0f} s",
@@ -143,6 +146,6 @@ def _shown(result: CapacityResult) -> Group:
     lines = [
         f"capacity {result.capacity_ah:.4g} ± {result.capacity_std_ah:.2g} Ah, declared {result.declared_ah:.4g} Ah",
         f"offset of the current sensor {1e3 * result.current_offset_a:+.1f} ± {1e3 * result.current_offset_std_a:.1f} mA",
-        f"{_anchor_count(len(result.anchors))}, {len(result.rejected)} rejected rests",
+        f"{_anchor_count_text(len(result.anchors))}, {len(result.rejected)} rejected rests",
     ]
     return Group(anchors, *lines)

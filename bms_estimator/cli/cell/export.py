@@ -11,7 +11,7 @@ import typer
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.restore import restore_state
-from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_out, name_of
+from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_output_file, name_of
 from bms_estimator.cli.options.pack_options import load_pack, unpacked_cell
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import identified_cell, ocv_correction_with_std, relative_capacity
@@ -25,12 +25,12 @@ app = typer.Typer(
     help="Write a cell file from the learned state of a pack's live service.",
 )
 
-TENTHS = np.linspace(0.0, 1.0, 11)
+TABULATED_SOC = np.linspace(0.0, 1.0, 11)
 """SOC at which corrections and errors of the OCV are printed."""
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportResult:
     """Output of ``--json``."""
 
     out: str
@@ -40,14 +40,14 @@ class Exported:
     r_s_factor: float
     """Learned R_s divided by R_s of the configured cell."""
     ocv_correction_mv: list[float]
-    """Correction of the OCV of one object of the cell file, at SOC 0, 0.1 ... 1."""
+    """Correction of the OCV at SOC 0, 0.1 ... 1, for the cell or module that the cell file describes."""
     ocv_error_mv: list[float]
-    """Standard deviation of the corrected OCV of one object of the cell file, at SOC 0, 0.1 ... 1."""
+    """Standard deviation of the corrected OCV at SOC 0, 0.1 ... 1, for the cell or module that the cell file describes."""
 
 
 @app.callback()
 def _group() -> None:
-    """Make ``export`` a subcommand. Without this callback, typer would omit the name of an only command."""
+    """Make ``export`` a subcommand. Without this callback, typer would drop the command's name, because it is the only one."""
 
 
 @app.command()
@@ -72,7 +72,7 @@ def export(
     file = CheckpointFile(checkpoint.parent if checkpoint else state_folder(settings), settings, model)
     if checkpoint:
         file.path = checkpoint
-    check_out(out, [pack, file.path], force=force)
+    check_output_file(out, [pack, file.path], force=force)
     if checkpoint and not checkpoint.exists():
         raise UserError(f"--checkpoint {checkpoint}: no such file")
     content = file.load()
@@ -82,16 +82,16 @@ def export(
             f"{settings.state.checkpoint_s:g} s (give another file with --checkpoint)"
         )
     estimator = new_estimator(settings, model)
-    reason = restore_state(estimator, content.state, 0.0)
+    reason = restore_state(estimator, content.state, unseen_s=0.0)
     if reason or not estimator.record[0]["filter"]["started"]:
         raise UserError(
             f"{file.path}: nothing to export: {reason or 'the identifier was off, so that nothing was learned'}"
         )
     learned = identified_cell(estimator, cell, series)
     renamed = learned.model_copy(update={"cell": learned.cell.model_copy(update={"name": name_of(out)})})
-    correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], TENTHS)
+    correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], TABULATED_SOC)
     capacity, cell_ah = relative_capacity(estimator.record[0]), cell.cell.capacity_ah
-    result = Exported(
+    result = ExportResult(
         out=str(out),
         checkpoint=str(file.path),
         capacity_ah=capacity.value * cell_ah,
@@ -104,14 +104,14 @@ def export(
     typer.echo(json.dumps(asdict(result)) if as_json else _text(result))
 
 
-def _remarks(result: Exported, cell: str) -> list[str]:
+def _remarks(result: ExportResult, cell: str) -> list[str]:
     return [
         f"Learned by a service from {Path(cell).name}: capacity {result.capacity_ah:.4g} +- {result.capacity_std_ah:.2g} Ah,",
         f"series resistance times {result.r_s_factor:.3f}, OCV corrected by {_rms(result.ocv_correction_mv):.1f} mV RMS.",
     ]
 
 
-def _text(result: Exported) -> str:
+def _text(result: ExportResult) -> str:
     correction, error = (
         " ".join(f"{mv:.0f}" for mv in column) for column in (result.ocv_correction_mv, result.ocv_error_mv)
     )

@@ -15,7 +15,7 @@ from rich.table import Table
 from bms_estimator.calibration.elements.identify import CaptureFit, Identification, identify
 from bms_estimator.cli.cell.identify_fuel_cell import identify_fuel_cell
 from bms_estimator.cli.options.capture_options import (
-    OR_FUEL_CELL_HELP,
+    CELL_OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
     CapturesFromRest,
@@ -23,9 +23,9 @@ from bms_estimator.cli.options.capture_options import (
     InitialSoc,
     NewCellFile,
     SignOfCurrent,
-    check_once,
-    check_out,
-    write_as_named,
+    check_output_file,
+    reject_duplicates,
+    write_cell_named_as_file,
 )
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.model.cell import is_fuel_cell, load_cell
@@ -35,7 +35,7 @@ from bms_estimator.sources.captures.replay import load_capture
 
 def identify_command(
     captures: CapturesFromRest,
-    cell: Annotated[str, typer.Option(help=f"{OR_FUEL_CELL_HELP}; supplies capacity and OCV", show_default=False)],
+    cell: Annotated[str, typer.Option(help=f"{CELL_OR_FUEL_CELL_HELP}; supplies capacity and OCV", show_default=False)],
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
     soc: InitialSoc = None,
@@ -65,8 +65,8 @@ def identify_command(
     For a fuel cell, give polarization curves (columns current_a, voltage_v) and captures under load
     (docs/theory/fuel-cell.md).
     """
-    check_out(out, captures, force=force)
-    check_once(captures)
+    check_output_file(out, captures, force=force)
+    reject_duplicates(captures)
     if is_fuel_cell(cell):
         if capacity_ah is not None or soc is not None or keep_ocv:
             raise UserError(f"{cell} is a fuel cell: --capacity-ah, --soc and --keep-ocv apply only to batteries")
@@ -76,16 +76,16 @@ def identify_command(
     loaded = [load_capture(path, current_sign=current_sign) for path in captures]
     started_s = time.perf_counter()
     identification = identify(loaded, model, refine_ocv=not keep_ocv, initial_soc=soc, temperature_c=temperature_c)
-    seconds = time.perf_counter() - started_s
-    start = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
-    write_as_named(out, identification.cell, _remarks(start, identification))
+    duration_s = time.perf_counter() - started_s
+    initial_cell = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
+    write_cell_named_as_file(out, identification.cell, _remarks(initial_cell, identification))
     if as_json:
-        sys.stdout.write(json.dumps(_json(out, identification, seconds)) + "\n")
+        sys.stdout.write(json.dumps(_json_result(out, identification, duration_s)) + "\n")
     else:
-        Console().print(_tables(out, identification, seconds))
+        Console().print(_tables(out, identification, duration_s))
 
 
-def _json(out: Path, identification: Identification, seconds: float) -> dict[str, Any]:
+def _json_result(out: Path, identification: Identification, duration_s: float) -> dict[str, Any]:
     return {
         "out": str(out),
         "elements": [
@@ -94,8 +94,8 @@ def _json(out: Path, identification: Identification, seconds: float) -> dict[str
             | {f"{name}_ohm_std": std for name, (_, std) in row.items()}
             for soc, row in identification.elements.items()
         ],
-        "temperature_c": _temperatures(identification),
-        "error_mv": 1e3 * _error_v(identification),
+        "temperature_c": _temperature_range_c(identification),
+        "error_mv": 1e3 * _voltage_error_v(identification),
         "captures": [
             {
                 "name": c.name,
@@ -105,84 +105,88 @@ def _json(out: Path, identification: Identification, seconds: float) -> dict[str
                 "temperature_c": c.temperature_c,
                 "miscount_percent": 100.0 * c.miscount,
                 "voltage_rms_mv_soc_above_0_1": 1e3 * c.voltage_rms_v,
-                "score_before_percent": _number(c.score_before),
-                "score_after_percent": _number(c.score_after),
+                "score_before_percent": _finite_or_none(c.score_before),
+                "score_after_percent": _finite_or_none(c.score_after),
                 "held_back": c.held_back,
             }
             for c in identification.captures
         ],
         "left_out": list(identification.left_out),
         "ocv_correction_rms_mv": 1e3 * identification.ocv_correction_v,
-        "score_before_percent": _number(identification.score_before),
-        "score_after_percent": _number(identification.score_after),
-        "seconds": seconds,
+        "score_before_percent": _finite_or_none(identification.score_before),
+        "score_after_percent": _finite_or_none(identification.score_after),
+        "seconds": duration_s,
     }
 
 
-def _temperatures(identification: Identification) -> tuple[float, float]:
+def _temperature_range_c(identification: Identification) -> tuple[float, float]:
+    """Return the lowest and the highest temperature of the cell [°C]; NaN for a model without an RC ladder."""
     ladder = identification.cell.ladder
     return (math.nan, math.nan) if ladder is None else ladder.temperature_c
 
 
-def _error_v(identification: Identification) -> float:
+def _voltage_error_v(identification: Identification) -> float:
     return math.nan if identification.cell.ladder is None else identification.cell.ladder.error_v
 
 
-def _number(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _remarks(cell: str, identification: Identification) -> list[str]:
+def _remarks(initial_cell: str, identification: Identification) -> list[str]:
+    """Return the comments at the beginning of the cell file."""
     fitted = ", ".join(f"{c.name} ({1e3 * c.voltage_rms_v:.1f} mV RMS)" for c in identification.captures)
-    low_c, high_c = _temperatures(identification)
+    low_c, high_c = _temperature_range_c(identification)
     lines = [
         f"Resistances identified from {fitted}, SOC above 0.1;",
-        f"capacity and open-circuit voltage from {Path(cell).name}. Cell temperatures {low_c:g} to {high_c:g} C.",
+        f"capacity and open-circuit voltage from {Path(initial_cell).name}. Cell temperatures {low_c:g} to {high_c:g} C.",
     ]
     if identification.ocv_correction_v:
         lines.append(
-            f"OCV: that of {Path(cell).name}, corrected by {1e3 * identification.ocv_correction_v:.1f} mV RMS."
+            f"OCV: that of {Path(initial_cell).name}, corrected by {1e3 * identification.ocv_correction_v:.1f} mV RMS."
         )
-    return [*lines, f"{_scores(identification)}."]
+    return [*lines, f"{_score_text(identification)}."]
 
 
-def _scores(identification: Identification) -> str:
+def _score_text(identification: Identification) -> str:
     if not math.isfinite(identification.score_after):
         return "No capture is long enough for replays that start in mid-load"
-    held = sum(c.held_back for c in identification.captures)
+    held_back_count = sum(c.held_back for c in identification.captures)
     return (
         f"Replays that start in mid-load with an SOC error of 0.2: interval score {identification.score_before:.2f} % before, "
-        f"{identification.score_after:.2f} % after; {held} of {len(identification.captures)} captures held back from the fit that they judge"
+        f"{identification.score_after:.2f} % after; {held_back_count} of {len(identification.captures)} captures held back from the fit that they judge"
     )
 
 
-def _tables(out: Path, identification: Identification, seconds: float) -> Group:
-    """Return the result as tables."""
-    shown = Table("SOC", *(f"{soc:g}" for soc in identification.elements), title=f"{out}: written", box=box.SIMPLE_HEAD)
-    shown.title_justify = "left"
+def _tables(out: Path, identification: Identification, duration_s: float) -> Group:
+    """Return a table of the resistances and a table of the captures, with the results for all captures below."""
+    elements = Table(
+        "SOC", *(f"{soc:g}" for soc in identification.elements), title=f"{out}: written", box=box.SIMPLE_HEAD
+    )
+    elements.title_justify = "left"
     for name in next(iter(identification.elements.values())):
-        cells = (identification.elements[soc][name] for soc in identification.elements)
-        shown.add_row(f"{name} \\[mohm], 25 °C", *(f"{1e3 * value:.4g} ± {1e3 * std:.2g}" for value, std in cells))
-    fits = Table(box=box.SIMPLE_HEAD)
+        values = (identification.elements[soc][name] for soc in identification.elements)
+        elements.add_row(f"{name} \\[mohm], 25 °C", *(f"{1e3 * value:.4g} ± {1e3 * std:.2g}" for value, std in values))
+    captures = Table(box=box.SIMPLE_HEAD)
     for column in ("capture", "°C", "SOC", "count", "RMS", "before", "after", "held back"):
-        fits.add_column(column, justify="left" if column in ("capture", "held back") else "right")
-    for c in identification.captures:
-        fits.add_row(*_row(c))
-    low_c, high_c = _temperatures(identification)
+        captures.add_column(column, justify="left" if column in ("capture", "held back") else "right")
+    for fit in identification.captures:
+        captures.add_row(*_capture_row(fit))
+    low_c, high_c = _temperature_range_c(identification)
     lines = [
         f"cell temperatures {low_c:g} to {high_c:g} °C; outside this range, the estimates have larger standard deviations",
-        _scores(identification),
+        _score_text(identification),
     ]
     if identification.ocv_correction_v:
         lines.append(f"OCV corrected by {1e3 * identification.ocv_correction_v:.1f} mV RMS")
     if identification.left_out:
         lines.append(f"skipped, because the current is too small for resistances: {', '.join(identification.left_out)}")
-    return Group(shown, fits, *lines, f"{seconds:.1f} s")
+    return Group(elements, captures, *lines, f"{duration_s:.1f} s")
 
 
-def _row(c: CaptureFit) -> tuple[str, ...]:
+def _capture_row(c: CaptureFit) -> tuple[str, ...]:
     temperature = "no sensor" if c.temperature_c is None else f"{c.temperature_c[0]:.0f} to {c.temperature_c[1]:.0f}"
     scores = (f"{x:.2f} %" if math.isfinite(x) else "-" for x in (c.score_before, c.score_after))
     name, rms = c.name.split(".")[0], f"{1e3 * c.voltage_rms_v:.1f} mV"
-    count = f"{100.0 * c.miscount:+.1f} %"
-    return name, temperature, f"{c.initial_soc:.3f}", count, rms, *scores, "yes" if c.held_back else "no"
+    miscount = f"{100.0 * c.miscount:+.1f} %"
+    return name, temperature, f"{c.initial_soc:.3f}", miscount, rms, *scores, "yes" if c.held_back else "no"

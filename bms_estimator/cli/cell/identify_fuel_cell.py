@@ -28,12 +28,12 @@ from bms_estimator.sources.captures.replay import load_capture
 DIGITS = 4
 """Significant digits of printed values."""
 MIN_POINTS = 3
-"""Minimum number of usable points in a curve or record."""
+"""Minimum number of usable points in a curve or capture."""
 
 
 @dataclass(frozen=True)
-class Value:
-    """Identified parameter in the output."""
+class IdentifiedParameter:
+    """Identified parameter in the output of ``--json``."""
 
     value: float
     std: float | None
@@ -58,17 +58,21 @@ def identify_fuel_cell(
         raise UserError(
             f"--temperature-c {temperature_c:g}: must be between {MIN_PLAUSIBLE_C:g} and {MAX_PLAUSIBLE_C:g} °C"
         )
-    start = load_fuel_cell(cell)
+    initial_model = load_fuel_cell(cell)
     names = unique_names([name_of(path) for path in paths], paths)
-    sources = [_source(*one, start, temperature_c, current_sign) for one in zip(names, paths, strict=True)]
+    sources = [
+        _read_source(name, path, initial_model, temperature_c, current_sign)
+        for name, path in zip(names, paths, strict=True)
+    ]
     started_s = time.perf_counter()
-    fit = fit_fuel_cell(sources, start)
-    seconds = time.perf_counter() - started_s
-    values: dict[str, Value] = {
-        key: Value(
+    fit = fit_fuel_cell(sources, initial_model)
+    duration_s = time.perf_counter() - started_s
+    parameters: dict[str, IdentifiedParameter] = {
+        key: IdentifiedParameter(
             value=getattr(fit.model.fuel_cell, key),
+            # the cell file contains relative standard deviations
             std=fit.model.std[key] * getattr(fit.model.fuel_cell, key) if key in fit.model.std else None,
-            of_start=getattr(start.fuel_cell, key),
+            of_start=getattr(initial_model.fuel_cell, key),
             reason=fit.undetermined.get(key),
         )
         for key in KEYS
@@ -76,37 +80,38 @@ def identify_fuel_cell(
     renamed = fit.model.model_copy(update={"cell": fit.model.cell.model_copy(update={"name": name_of(out)})})
     write_cell(out, renamed, _remarks(cell, fit))
     if as_json:
-        outcome = {"out": str(out), "parameters": {k: asdict(v) for k, v in values.items()}}
-        rms = {f"{name}_rms_mv": 1e3 * rms_v for name, rms_v in fit.rms_v.items()}
-        sys.stdout.write(json.dumps(outcome | rms | {"seconds": seconds}) + "\n")
+        result = {"out": str(out), "parameters": {key: asdict(parameter) for key, parameter in parameters.items()}}
+        rms_mv = {f"{name}_rms_mv": 1e3 * rms_v for name, rms_v in fit.rms_v.items()}
+        sys.stdout.write(json.dumps(result | rms_mv | {"seconds": duration_s}) + "\n")
     else:
-        Console().print(_tables(out, values, fit, seconds))
+        Console().print(_table(out, parameters, fit, duration_s))
 
 
-def _source(
+def _read_source(
     name: str, path: Path, model: FuelCellModel, temperature_c: float | None, sign: CurrentSign | None
 ) -> Source:
-    """Read a polarization curve, or a record if the file has times; drop samples outside the stack's limits."""
-    points = read_polarisation(path)
-    if points is not None:
-        time_s, (current_a, voltage_v, sensed_c) = None, points.T
+    """Read a polarization curve, or a capture if the file has times; drop samples outside the stack's limits."""
+    curve = read_polarisation(path)
+    if curve is not None:
+        time_s = None
+        current_a, voltage_v, sensed_c = curve.T
         current_a = -current_a if sign == "charge_positive" else current_a
     else:
         record = load_capture(path, current_sign=sign)
         time_s, current_a, voltage_v, sensed_c = (
             record[name] for name in ("time_s", "current_a", "voltage_v", "temperature_c")
         )
-    good = _usable(path, model, current_a, voltage_v)
+    usable = _usable(path, model, current_a, voltage_v)
     if time_s is not None:
-        good &= np.diff(time_s, prepend=-np.inf) > 0.0
-    sensed = (sensed_c >= MIN_PLAUSIBLE_C) & (sensed_c <= MAX_PLAUSIBLE_C)
-    celsius = np.where(sensed, sensed_c, math.nan if temperature_c is None else temperature_c)
+        usable &= np.diff(time_s, prepend=-np.inf) > 0.0  # the clock of a capture may be set back
+    is_plausible = (sensed_c >= MIN_PLAUSIBLE_C) & (sensed_c <= MAX_PLAUSIBLE_C)
+    default_c = math.nan if temperature_c is None else temperature_c
     return Source(
         name=name,
-        time_s=None if time_s is None else time_s[good],
-        current_a=np.ascontiguousarray(current_a[good]),
-        voltage_v=voltage_v[good],
-        temperature_c=celsius[good],
+        time_s=None if time_s is None else time_s[usable],
+        current_a=current_a[usable],
+        voltage_v=voltage_v[usable],
+        temperature_c=np.where(is_plausible, sensed_c, default_c)[usable],
     )
 
 
@@ -116,37 +121,38 @@ def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floa
     Raises:
         UserError: Most currents have the wrong sign, or too few points are left.
     """
-    c = model.cell
-    charging = current_a < -model.fuel_cell.internal_current_a
-    if 2 * charging.sum() > charging.size:
+    cell = model.cell
+    is_charging = current_a < -model.fuel_cell.internal_current_a
+    if 2 * is_charging.sum() > is_charging.size:
         raise UserError(f"{path}: the current is negative, but a fuel cell cannot be charged: is --current-sign right?")
-    good: NDArray[np.bool_] = (voltage_v >= c.voltage_min_v) & (voltage_v <= c.voltage_max_v)
-    good &= (current_a <= c.current_max_a) & ~charging
-    if good.sum() < MIN_POINTS:
-        limits = f"{c.voltage_min_v:g} to {c.voltage_max_v:g} V and up to {c.current_max_a:g} A"
+    usable: NDArray[np.bool_] = (voltage_v >= cell.voltage_min_v) & (voltage_v <= cell.voltage_max_v)
+    usable &= (current_a <= cell.current_max_a) & ~is_charging
+    if usable.sum() < MIN_POINTS:
+        limits = f"{cell.voltage_min_v:g} to {cell.voltage_max_v:g} V and up to {cell.current_max_a:g} A"
         raise UserError(
-            f"{path}: only {good.sum()} usable points: at least {MIN_POINTS} are needed within the limits of {c.name}, {limits}"
+            f"{path}: only {usable.sum()} usable points: at least {MIN_POINTS} are needed within the limits of {cell.name}, {limits}"
         )
-    return good
+    return usable
 
 
 def _remarks(cell: str, fit: FuelCellFit) -> list[str]:
+    """Return the comments at the beginning of the cell file."""
     fits = ", ".join(f"{name} ({1e3 * rms_v:.1f} mV RMS)" for name, rms_v in fit.rms_v.items())
-    kept = (
+    unchanged = (
         f"Unchanged, because the data do not determine them: {', '.join(fit.undetermined)}." if fit.undetermined else ""
     )
-    return [line for line in (f"Identified from {fits}, initial values from {Path(cell).name}.", kept) if line]
+    return [line for line in (f"Identified from {fits}, initial values from {Path(cell).name}.", unchanged) if line]
 
 
-def _tables(out: Path, values: dict[str, Value], fit: FuelCellFit, seconds: float) -> Group:
-    """Return the result as tables."""
+def _table(out: Path, parameters: dict[str, IdentifiedParameter], fit: FuelCellFit, duration_s: float) -> Group:
+    """Return a table of the parameters, with the errors and the reasons for unchanged parameters below it."""
     table = Table(title=f"{out}: written", title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("", "identified", "±", "before"):
         table.add_column(column, justify="right" if column else "left")
-    for key, v in values.items():
-        std = "as before" if v.std is None else f"{v.std:.2g}"
-        table.add_row(key, f"{v.value:.{DIGITS}g}", std, f"{v.of_start:.{DIGITS}g}")
+    for key, parameter in parameters.items():
+        std = "not identified" if parameter.std is None else f"{parameter.std:.2g}"
+        table.add_row(key, f"{parameter.value:.{DIGITS}g}", std, f"{parameter.of_start:.{DIGITS}g}")
     residuals = [f"{name}: {1e3 * rms_v:.1f} mV RMS" for name, rms_v in fit.rms_v.items()]
     return Group(
-        table, *residuals, *(f"{key}: {reason}" for key, reason in fit.undetermined.items()), f"{seconds:.1f} s"
+        table, *residuals, *(f"{key}: {reason}" for key, reason in fit.undetermined.items()), f"{duration_s:.1f} s"
     )

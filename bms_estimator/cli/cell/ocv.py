@@ -16,7 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.calibration.cleaning.rests import remove_glitches
-from bms_estimator.calibration.elements.generic_prior import curve, nearest_generic_cell, scaled_generic_ladder
+from bms_estimator.calibration.elements.generic_prior import curve as generic_curve
+from bms_estimator.calibration.elements.generic_prior import nearest_generic_cell, scaled_generic_ladder
 from bms_estimator.calibration.elements.initial_elements import initial_elements
 from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit, fit_chen_mora
 from bms_estimator.calibration.ocv.points import Points, max_v, rms_v
@@ -37,9 +38,9 @@ from bms_estimator.cli.options.capture_options import (
     Force,
     NewCellFile,
     SignOfCurrent,
-    check_once,
-    check_out,
+    check_output_file,
     name_of,
+    reject_duplicates,
     unique_names,
 )
 from bms_estimator.cli.options.number_options import decimal, whole
@@ -50,7 +51,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.replay import load_capture
 
-CELL_VOLTAGE_V = 3.7
+TYPICAL_CELL_V = 3.7
 """Voltage of one Li-ion cell at half charge [V], from which the number of cells in series is estimated."""
 MIN_CELL_V = 1.5
 """Minimum plausible voltage of one cell at half charge [V]."""
@@ -67,11 +68,13 @@ MIN_EMPTY_RATIO = 0.25
 MEASURED_CAPACITY_STD = 0.03
 """Relative standard deviation of a capacity measured by a slow discharge. It covers the gain of the current sensor,
 differences between cells of the type, and ageing over some years."""
-CURRENT_MAX_C = 5.0
-"""Current limit of a valid sample as a multiple of the capacity [1/h], if the captures have no larger current."""
+MIN_CURRENT_LIMIT_C = 5.0
+"""Minimum of the current limit of a valid sample, as a multiple of the capacity [1/h]."""
+PEAK_CURRENT_MARGIN = 1.5
+"""Minimum ratio of the current limit of a valid sample to the largest current in the captures."""
 STEEP_SOC = 0.05
 """Width of the ranges at both ends of the SOC in which OCV curves are steep."""
-TENTHS = np.linspace(0.0, 1.0, 11)
+TABULATED_SOC = np.linspace(0.0, 1.0, 11)
 """SOC at which the error of the table is printed."""
 
 
@@ -106,9 +109,9 @@ class OcvResult:
     form: str
     capacity_ah: float
     capacity_measured_ah: float | None
-    """Capacity by a slow discharge from full to empty; None without one."""
+    """Capacity by a slow discharge from full to empty; None without such a discharge."""
     generic: str
-    """Most similar generic cell, from which resistances are scaled."""
+    """Most similar generic cell, whose resistances are scaled to those of the captures."""
     usual_hysteresis: bool
     """True if the hysteresis is that of the generic cell, because no source determines it."""
     series_count: int
@@ -125,7 +128,7 @@ class OcvResult:
     error_mv: list[float]
     """Standard deviation of the table at SOC 0, 0.1 ... 1; empty for (2.10) of the thesis."""
     parameters: dict[str, dict[str, float | None]]
-    """Values and standard deviations (None at a bound) of a16..a21; empty for a table."""
+    """Values and standard deviations (None at a bound) of a16..a21, the parameters of (2.10); empty for a table."""
     sources: list[SourceResult]
     captures: dict[str, dict[str, float]]
     """Numbers of rests and glitches and the final SOC, by capture with rests."""
@@ -183,8 +186,8 @@ def ocv(
     The cell file also contains resistances, estimated from the rests and the most similar generic cell.
     `identify` improves these resistances.
     """
-    check_out(out, captures, force=force)
-    check_once(captures)
+    check_output_file(out, captures, force=force)
+    reject_duplicates(captures)
     recordings, curves = [], []
     for name, path in zip(unique_names([path.name for path in captures], captures), captures, strict=True):
         columns = read_curve(path)
@@ -193,20 +196,24 @@ def ocv(
         else:
             curves.append(ExternalCurve(name, *columns))
     voltages_v = [_checked_voltage(recording) for recording in recordings]
-    count = _cells_in_series(np.concatenate([*voltages_v, *(curve.ocv_v for curve in curves)]), series)
-    ocv_sources = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=count)
-    fitted: Callable[[Points], ChenMoraFit | TableFit] = fit_table if form is Form.TABLE else fit_chen_mora
-    curve_v = fitted(ocv_sources.points)(NODES)
-    generic = nearest_generic_cell(NODES, curve_v, ocv_sources.capacity_ah, count)
+    series_count = _cells_in_series(np.concatenate([*voltages_v, *(curve.ocv_v for curve in curves)]), series)
+    ocv_sources = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=series_count)
+    fit_curve: Callable[[Points], ChenMoraFit | TableFit] = fit_table if form is Form.TABLE else fit_chen_mora
+    # unpaired curves still contain the overpotential of RC pairs, which are known only with the generic cell
+    preliminary_v = fit_curve(ocv_sources.points)(NODES)
+    generic = nearest_generic_cell(NODES, preliminary_v, ocv_sources.capacity_ah, series_count)
     ladder, elements = _elements(generic, ocv_sources, recordings)
     ocv_sources = without_branches(ocv_sources, ladder)
-    if form is Form.TABLE and ocv_sources.hysteresis_v is None and has_plateau(NODES, curve_v, count):
-        ocv_sources = center_on_typical_hysteresis(ocv_sources, np.interp(NODES, *curve(generic, "hysteresis_v")))
-    fit = fitted(ocv_sources.points)
+    # the two phases of a plateau cause hysteresis, which the form chen-mora does not have
+    if form is Form.TABLE and ocv_sources.hysteresis_v is None and has_plateau(NODES, preliminary_v, series_count):
+        ocv_sources = center_on_typical_hysteresis(
+            ocv_sources, np.interp(NODES, *generic_curve(generic, "hysteresis_v"))
+        )
+    fit = fit_curve(ocv_sources.points)
     _check_ends(fit, ocv_sources)
     result = _result(form, generic, fit, ocv_sources)
-    cell = _cell(name_of(out), count, fit, ocv_sources, recordings)
-    write_cell(out, CellModel.model_validate({**cell, "ladder": ladder, **elements}), _remarks(result))
+    sections = _cell_and_ocv_sections(name_of(out), series_count, fit, ocv_sources, recordings)
+    write_cell(out, CellModel.model_validate({**sections, "ladder": ladder, **elements}), _remarks(result))
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
@@ -233,14 +240,14 @@ def _cells_in_series(voltage_v: NDArray[np.float64], configured: int | None) -> 
     Raises:
         UserError: The voltage of one cell would be implausible.
     """
-    middle_v = float(np.median(voltage_v))
-    count = configured or max(round(middle_v / CELL_VOLTAGE_V), 1)
+    median_v = float(np.median(voltage_v))
+    count = configured or max(round(median_v / TYPICAL_CELL_V), 1)
     if not configured and count > MAX_CELLS:
         raise UserError(
-            f"the median voltage is {middle_v:g} V, as of {count} cells in series; if the column is in millivolts, convert it to volts, otherwise give --series"
+            f"the median voltage is {median_v:g} V, as of {count} cells in series; if the column is in millivolts, convert it to volts, otherwise give --series"
         )
-    if not MIN_CELL_V <= middle_v / count <= MAX_CELL_V:
-        raise UserError(f"--series {count}: {middle_v:g} V would be {middle_v / count:.2f} V per cell")
+    if not MIN_CELL_V <= median_v / count <= MAX_CELL_V:
+        raise UserError(f"--series {count}: {median_v:g} V would be {median_v / count:.2f} V per cell")
     return count
 
 
@@ -250,8 +257,8 @@ def _check_ends(fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> None:
     Raises:
         UserError: The OCV at SOC 0 is implausible.
     """
-    empty_v, middle_v = (float(v) for v in fit(np.array([0.0, 0.5])))
-    if empty_v > MIN_EMPTY_RATIO * middle_v:
+    empty_v, half_full_v = (float(v) for v in fit(np.array([0.0, 0.5])))
+    if empty_v > MIN_EMPTY_RATIO * half_full_v:
         return
     raise UserError(
         f"the points begin at SOC {ocv_sources.points.soc[0]:.2f}, and their curve would be {empty_v:.2f} V at SOC 0: give captures "
@@ -268,7 +275,7 @@ def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, ocv_sou
     return OcvResult(
         form=form.value,
         capacity_ah=ocv_sources.capacity_ah,
-        capacity_measured_ah=_or_none(ocv_sources.measured_ah),
+        capacity_measured_ah=_finite_or_none(ocv_sources.measured_ah),
         generic=generic.cell.name,
         usual_hysteresis=ocv_sources.usual_hysteresis,
         series_count=generic.cell.series_count,
@@ -279,12 +286,15 @@ def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, ocv_sou
         rms_mv=1e3 * rms_v(fit.residual_v),
         max_mv=1e3 * max_v(fit.residual_v),
         rms_inside_mv=1e3 * rms_v(fit.residual_v[(points.soc > STEEP_SOC) & (points.soc < 1.0 - STEEP_SOC)]),
-        error_mv=(1e3 * fit.error_at(TENTHS)).tolist() if isinstance(fit, TableFit) else [],
+        error_mv=(1e3 * fit.error_at(TABULATED_SOC)).tolist() if isinstance(fit, TableFit) else [],
         parameters=parameters,
         sources=_source_results(fit, ocv_sources),
-        captures={t.name: {"rests": len(t.rests), "glitches": t.glitches, "soc_final": t.end_soc} for t in tests},
+        captures={
+            test.name: {"rests": len(test.rests), "glitches": test.glitches, "soc_final": test.end_soc}
+            for test in tests
+        },
         remaining_v=[rest.remaining_v for test in tests for rest in test.rests],
-        rejected=[line for t in tests for line in t.rejected],
+        rejected=[reason for test in tests for reason in test.rejected],
     )
 
 
@@ -294,7 +304,7 @@ def _source_results(fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> lis
             name=source.name,
             kind=source.kind,
             points=source.points.soc.size,
-            temperature_c=_or_none(source.temperature_c),
+            temperature_c=_finite_or_none(source.temperature_c),
             off_mv=1e3 * float(fit.deviation_v[i]) if isinstance(fit, TableFit) else None,
             hysteresis_mv=None if source.hysteresis_v is None else 1e3 * float(source.hysteresis_v.mean()),
             notes=list(source.notes),
@@ -303,31 +313,31 @@ def _source_results(fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> lis
     ]
 
 
-def _or_none(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
 def _elements(
     generic: CellModel, ocv_sources: OcvSources, recordings: list[Recording]
 ) -> tuple[Ladder, dict[str, object]]:
-    """Return resistances over SOC, and a1..a15 by section.
+    """Return resistances over SOC, and the thesis's parameters a1..a15 of R_s and two RC pairs by section of the file.
 
-    Both come from the rests of the warmest capture; without rests, from the generic cell.
+    Both come from the rests of the capture nearest to 25 °C; without rests, from the generic cell.
     """
     test = _nearest_to_reference(ocv_sources.tests)
     if test is None:
         return scaled_generic_ladder(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
-    rests = initial_elements(next(r.samples for r in recordings if r.name == test.name), test, ocv_sources.capacity_ah)
-    return scaled_generic_ladder(generic, rests, float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C))), dict(
-        rests.sections
-    )
+    samples = next(recording.samples for recording in recordings if recording.name == test.name)
+    rests = initial_elements(samples, test, ocv_sources.capacity_ah)
+    temperature_c = float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C))
+    return scaled_generic_ladder(generic, rests, temperature_c), dict(rests.sections)
 
 
-def _cell(
+def _cell_and_ocv_sections(
     name: str, series_count: int, fit: ChenMoraFit | TableFit, ocv_sources: OcvSources, recordings: list[Recording]
 ) -> dict[str, object]:
-    """Return the section ``cell`` with limits of a valid sample, and the section ``ocv``."""
-    middle_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
+    """Return the section ``cell``, which contains the limits of a valid sample, and the section ``ocv``."""
+    half_full_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
     empty_v = float(fit(np.array([0.0]))[0])
     peak_a = max((float(np.nanmax(np.abs(each.samples["current_a"]))) for each in recordings), default=0.0)
     cell = Cell(
@@ -335,10 +345,10 @@ def _cell(
         capacity_ah=round(ocv_sources.capacity_ah, 4),
         capacity_std=MEASURED_CAPACITY_STD if ocv_sources.capacity_ah == ocv_sources.measured_ah else None,
         series_count=series_count,
-        nominal_voltage_v=round(middle_v, 2),
-        voltage_min_v=round(min(MIN_VOLTAGE_RATIO * middle_v, empty_v), 2),
+        nominal_voltage_v=round(half_full_v, 2),
+        voltage_min_v=round(min(MIN_VOLTAGE_RATIO * half_full_v, empty_v), 2),
         voltage_max_v=round(MAX_VOLTAGE_RATIO * full_v, 2),
-        current_max_a=round(max(CURRENT_MAX_C * ocv_sources.capacity_ah, 1.5 * peak_a), 3),
+        current_max_a=round(max(MIN_CURRENT_LIMIT_C * ocv_sources.capacity_ah, PEAK_CURRENT_MARGIN * peak_a), 3),
     )
     ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(ocv_sources.hysteresis_v, ocv_sources.hysteresis_std_v)
     return {"cell": cell, "ocv": ocv}
@@ -351,6 +361,7 @@ def _nearest_to_reference(tests: Sequence[RelaxationTest]) -> RelaxationTest | N
 
 
 def _remarks(result: OcvResult) -> list[str]:
+    """Return the comments at the beginning of the cell file."""
     generic = f"the generic {result.generic}"
     hysteresis = [f"Hysteresis: that of {generic}, because no source determines it."] if result.usual_hysteresis else []
     elements = f"values from the rests of one capture, with the dependence on SOC and temperature of {generic}"
@@ -363,7 +374,7 @@ def _remarks(result: OcvResult) -> list[str]:
 
 
 def _table(out: Path, result: OcvResult, ocv_sources: OcvSources) -> Table:
-    """Return the result as a table."""
+    """Return a table of the result without the sources."""
     table = Table(title=f"{out}: written", title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
     table.add_column(justify="right")

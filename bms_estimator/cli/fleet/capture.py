@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.capture_options import Force, check_out
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.options.capture_options import Force, check_output_file
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.sinks.trace_file import table_sink
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from bms_estimator.fleet.identification.block_capture import BlockCapture
 
 TIME_EXAMPLE = "2026-01-31 or 2026-01-31T12:00"
-"""Start or end time in help texts."""
-FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
+"""Example of a start time in help texts."""
+TIME_FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
 """Formats of start and end time."""
 MAX_SHOWN_GAPS = 5
 """Maximum number of printed gaps."""
 MAX_START_DELAY_S = 120.0
-"""Delay of the first block after the requested start above which a warning is printed [s]: two blocks of a minute."""
+"""Maximum delay of the first block after the requested start without a warning [s]: two blocks of a minute."""
 
 Since = Annotated[
     datetime | None,
     typer.Option(
         "--from",
-        formats=FORMATS,
+        formats=TIME_FORMATS,
         metavar="TIME",
         help=f"start time in UTC: {TIME_EXAMPLE}; default: the oldest stored sample",
     ),
@@ -38,7 +38,10 @@ Since = Annotated[
 Until = Annotated[
     datetime | None,
     typer.Option(
-        "--to", formats=FORMATS, metavar="TIME", help="end time in UTC, exclusive; default: the newest stored sample"
+        "--to",
+        formats=TIME_FORMATS,
+        metavar="TIME",
+        help="end time in UTC, exclusive; default: the newest stored sample",
     ),
 ]
 
@@ -48,7 +51,7 @@ def capture(
     out: Annotated[Path, typer.Argument(help="file to write: .parquet, .csv.gz or .csv", show_default=False)],
     since: Since = None,
     until: Until = None,
-    server: Server = SERVER,
+    server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
     force: Force = False,
@@ -58,7 +61,7 @@ def capture(
     The server stores samples for some days (setting `server.raw_days`). They are written in the order of sending.
     With the settings that `fleet packs show PACK --out FOLDER` writes, `replay` gives the workers' estimates.
     """
-    check_out(out, [], force=force)
+    check_output_file(out, [], force=force)
     sink = table_sink(out)
     since_s, until_s = epoch_s(since, -math.inf), epoch_s(until, math.inf)
     fetched = asyncio.run(fetch_blocks(pack, since_s, until_s, (server, creds, ca)))
@@ -76,7 +79,7 @@ def capture(
 
 
 def epoch_s(time: datetime | None, default_s: float) -> float:
-    """Convert a UTC time to seconds since 1970."""
+    """Convert a UTC time to seconds since 1970; return ``default_s`` for None."""
     return default_s if time is None else time.replace(tzinfo=UTC).timestamp()
 
 
@@ -112,7 +115,7 @@ def _warnings(fetched: "BlockCapture", since_s: float) -> list[str]:
         more = (
             f" and {len(fetched.missing) - MAX_SHOWN_GAPS} more gaps" if len(fetched.missing) > MAX_SHOWN_GAPS else ""
         )
-        lines.append(f"blocks {gaps}{more} are missing: they are lost, or the edge has yet to send them again")
+        lines.append(f"missing blocks: {gaps}{more}; they are lost, or the edge has yet to send them again")
     if fetched.damaged:
-        lines.append(f"{fetched.damaged} messages are damaged and were skipped")
+        lines.append(f"damaged messages, which were skipped: {fetched.damaged}")
     return lines

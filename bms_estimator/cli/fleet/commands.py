@@ -2,28 +2,34 @@
 
 import typer
 
-from bms_estimator.cli.lazy_group import Entry, LazyGroup
+from bms_estimator.cli.lazy_group import LazyCommand, LazyGroup
 
 COMMANDS = {
-    "demo": Entry(
+    "demo": LazyCommand(
         "bms_estimator.cli.fleet.demo:demo", "Run a server, simulated packs, workers and the page in one terminal."
     ),
-    "serve": Entry(
+    "serve": LazyCommand(
         "bms_estimator.cli.fleet.serve:serve", "Run a node of the fleet server, which stores samples and results."
     ),
-    "user": Entry("bms_estimator.cli.fleet.serve:user", "Print the token with which the edge of a pack connects."),
-    "worker": Entry("bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."),
-    "packs": Entry("bms_estimator.cli.fleet.packs:app", "Upload, list, show or remove the settings of packs."),
-    "capture": Entry(
+    "user": LazyCommand(
+        "bms_estimator.cli.fleet.serve:user", "Print the token with which the edge of a pack connects."
+    ),
+    "worker": LazyCommand(
+        "bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."
+    ),
+    "packs": LazyCommand("bms_estimator.cli.fleet.packs:app", "Upload, list, show or remove the settings of packs."),
+    "capture": LazyCommand(
         "bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a CSV or Parquet file."
     ),
-    "identify": Entry("bms_estimator.cli.fleet.identify:identify", "Re-identify packs from their stored samples."),
-    "collect": Entry(
+    "identify": LazyCommand(
+        "bms_estimator.cli.fleet.identify:identify", "Re-identify packs from their stored samples."
+    ),
+    "collect": LazyCommand(
         "bms_estimator.cli.fleet.queries:collect", "Write hourly summaries of all packs to Parquet files."
     ),
-    "ask": Entry("bms_estimator.cli.fleet.queries:ask", "Query the hourly summaries of all packs."),
-    "page": Entry("bms_estimator.cli.fleet.page:page", "Serve a web page of all packs."),
-    "simulate": Entry(
+    "ask": LazyCommand("bms_estimator.cli.fleet.queries:ask", "Query the hourly summaries of all packs."),
+    "page": LazyCommand("bms_estimator.cli.fleet.page:page", "Serve a web page of all packs."),
+    "simulate": LazyCommand(
         "bms_estimator.cli.fleet.simulate:simulate", "Simulate the edges of many packs, which send samples."
     ),
 }

@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.cli.fleet.capture import Since, Until, epoch_s
-from bms_estimator.cli.fleet.packs import known_packs, refuse_unknown
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.capture_options import AsJson, Force, check_out
+from bms_estimator.cli.fleet.packs import fetch_registry, reject_unknown
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.options.capture_options import AsJson, Force, check_output_file
 from bms_estimator.cli.options.number_options import whole
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
@@ -31,7 +31,7 @@ from bms_estimator.model.errors import UserError
 if TYPE_CHECKING:
     from bms_estimator.fleet.identification.reidentify import ReidentificationResult
 
-RESULTS = "results.csv"
+RESULTS_FILE = "results.csv"
 """Name of the file with the results of all packs."""
 
 
@@ -55,7 +55,7 @@ def identify(
             parser=whole(1), help="number of parallel processes; default: one for each CPU", show_default=False
         ),
     ] = None,
-    server: Server = SERVER,
+    server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
     force: Force = False,
@@ -69,47 +69,57 @@ def identify(
     """
     address = (server, creds, ca)
     names = _names(packs or [], from_file)
-    check_out(out / RESULTS, [], force=force)
-    known = asyncio.run(known_packs(address))
-    refuse_unknown(names, known)
+    check_output_file(out / RESULTS_FILE, [], force=force)
+    registry = asyncio.run(fetch_registry(address))
+    reject_unknown(names, registry)
+    span_s = (epoch_s(since, -math.inf), epoch_s(until, math.inf))
     results = list["ReidentificationResult"]()
-    for outcome in _outcomes(names, known, (epoch_s(since, -math.inf), epoch_s(until, math.inf)), address, processes):
-        results.append(outcome)
-        if outcome.cell_file:
-            write_text(out / f"{outcome.pack}.toml", outcome.cell_file, make_folder=True)
+    for result in _reidentify(names, registry, span_s, address, processes):
+        results.append(result)
+        if result.cell_file:
+            write_text(out / f"{result.pack}.toml", result.cell_file, make_folder=True)
         if sys.stderr.isatty():
-            typer.echo(f"{len(results)} of {len(names)}: {outcome.pack}", err=True)
-    _write_results(out / RESULTS, results)
-    changed = asyncio.run(_put(results, known, address)) if put else []
+            typer.echo(f"{len(results)} of {len(names)}: {result.pack}", err=True)
+    _write_results(out / RESULTS_FILE, results)
+    changed_packs = asyncio.run(_upload(results, registry, address)) if put else []
     if as_json:
-        typer.echo(json.dumps([_row(one) for one in results]))
+        typer.echo(json.dumps([_json_row(result) for result in results]))
     else:
-        better = sum(bool(one.cell_file) for one in results)
-        typer.echo(f"{out}: {better} of {len(results)} packs have a better cell")
+        better_count = sum(bool(result.cell_file) for result in results)
+        typer.echo(f"{out}: {better_count} of {len(results)} packs have a better cell")
         Console().print(_table(results))
-    for pack in changed:
+    for pack in changed_packs:
         typer.echo(
             f"warning: {pack}: another client changed its row in the meantime; its new cell was not uploaded", err=True
         )
 
 
-def _outcomes(
+def _reidentify(
     names: Sequence[str],
-    known: PackRegistry,
+    registry: PackRegistry,
     span_s: tuple[float, float],
     address: ServerAddress,
     processes: int | None,
 ) -> Iterator["ReidentificationResult"]:
+    """Yield the result of each pack as soon as it is known; a pack with an invalid row or cell only has a reason.
+
+    Args:
+        names: Names of the packs.
+        registry: Table of packs and cells.
+        span_s: First and last time of the samples [s since 1970].
+        address: Address and credentials of the server.
+        processes: Number of parallel processes; None: one for each CPU.
+    """
     from bms_estimator.fleet.identification.batch import Task, reidentify_all  # noqa: PLC0415 - needs NATS
     from bms_estimator.fleet.identification.reidentify import ReidentificationResult  # noqa: PLC0415 - slow to import
 
     tasks, (server, creds, ca) = [], address
     for name in names:
-        kind = known.kind(name)
-        if isinstance(kind, PackSpec) and not known.reason(name):
-            tasks.append(Task(name, kind, known.cell_file(kind.cell), *span_s, server, creds, ca))
+        spec = registry.parsed_row(name)
+        if isinstance(spec, PackSpec) and not registry.reason(name):
+            tasks.append(Task(name, spec, registry.cell_file(spec.cell), *span_s, server, creds, ca))
         else:
-            yield ReidentificationResult(name, reason=known.reason(name))
+            yield ReidentificationResult(name, reason=registry.reason(name))
     yield from reidentify_all(tasks, processes or os.cpu_count() or 1)
 
 
@@ -119,50 +129,54 @@ def _names(packs: Sequence[str], from_file: Path | None) -> list[str]:
     Raises:
         UserError: There is no name, or the file cannot be read.
     """
-    names = [*packs, *(_listed(from_file) if from_file is not None else [])]
+    names = [*packs, *(_names_in_file(from_file) if from_file is not None else [])]
     if not names:
         raise UserError("name at least one pack, or give --from-file LIST")
     return list(dict.fromkeys(names))
 
 
-def _listed(path: Path) -> list[str]:
-    """Return the column ``pack`` of a CSV file, or its first column."""
+def _names_in_file(path: Path) -> list[str]:
+    """Return the column ``pack`` of a CSV file; without a header that has this column, the first column."""
     try:
         rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row and row[0].strip()]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"--from-file {path}: cannot be read: {error}") from None
-    column = rows[0].index("pack") if rows and "pack" in rows[0] else None
-    listed = rows if column is None else rows[1:]
-    return [row[column or 0].strip() for row in listed if len(row) > (column or 0) and not row[0].startswith("#")]
+    has_header = bool(rows) and "pack" in rows[0]
+    column = rows[0].index("pack") if has_header else 0
+    data_rows = rows[1:] if has_header else rows
+    return [row[column].strip() for row in data_rows if len(row) > column and not row[0].startswith("#")]
 
 
-async def _put(results: Sequence["ReidentificationResult"], known: PackRegistry, address: ServerAddress) -> list[str]:
+async def _upload(
+    results: Sequence["ReidentificationResult"], registry: PackRegistry, address: ServerAddress
+) -> list[str]:
     """Upload new cells and the rows that name them. Return the packs whose rows another client has changed."""
     from bms_estimator.fleet.identification.reidentify import cell_name  # noqa: PLC0415
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.packs.pack_bucket import put, read_bucket  # noqa: PLC0415
 
-    cells, rows, changed = dict[str, bytes](), dict[str, bytes](), list[str]()
+    cells, rows, changed_packs = dict[str, bytes](), dict[str, bytes](), list[str]()
     async with connected(*address) as nc:
         stored_rows = await read_bucket(nc, PACKS_BUCKET)
-        for one in results:
-            kind = known.kind(one.pack)
-            if not one.cell_file or not isinstance(kind, PackSpec):
+        for result in results:
+            spec = registry.parsed_row(result.pack)
+            if not result.cell_file or not isinstance(spec, PackSpec):
                 continue
-            if stored_rows.get(one.pack) != encode_row(kind):
-                changed.append(one.pack)
+            if stored_rows.get(result.pack) != encode_row(spec):
+                changed_packs.append(result.pack)
                 continue
-            name = cell_name(one.pack)
-            cells[name] = one.cell_file.encode()
-            rows[one.pack] = encode_row(kind.model_copy(update={"cell": name, "capacity_ah": None}))
+            name = cell_name(result.pack)
+            cells[name] = result.cell_file.encode()
+            # the new cell file contains the capacity
+            rows[result.pack] = encode_row(spec.model_copy(update={"cell": name, "capacity_ah": None}))
         await put(nc, CELLS_BUCKET, cells)
         await put(nc, PACKS_BUCKET, rows)
-    return changed
+    return changed_packs
 
 
-def _row(one: "ReidentificationResult") -> dict[str, object]:
-    """Return the row for JSON, with None for missing numbers."""
-    values = asdict(one) | {"better": bool(one.cell_file)}
+def _json_row(result: "ReidentificationResult") -> dict[str, object]:
+    """Return the fields of a result for JSON and CSV, with None for missing numbers."""
+    values = asdict(result) | {"better": bool(result.cell_file)}
     del values["cell_file"]
     return {
         name: value if not isinstance(value, float) or math.isfinite(value) else None for name, value in values.items()
@@ -170,7 +184,7 @@ def _row(one: "ReidentificationResult") -> dict[str, object]:
 
 
 def _write_results(path: Path, results: Sequence["ReidentificationResult"]) -> None:
-    rows, table = list(map(_row, results)), io.StringIO()
+    rows, table = list(map(_json_row, results)), io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -183,25 +197,26 @@ def _table(results: Sequence["ReidentificationResult"]) -> Table:
     # the backslash keeps rich from reading a unit as markup
     for column in ("pack", "hours", "Ah", "R_s \\[mohm]", "RMS \\[mV]", "method", "reason"):
         table.add_column(column, justify="left" if column in ("pack", "method", "reason") else "right")
-    for one in results:
+    for result in results:
         table.add_row(
-            one.pack,
-            _number(one.hours, 1),
-            _change(one.capacity_before_ah, one.capacity_ah, one.capacity_std_ah, 1.0),
-            _change(one.r_s_before_ohm, one.r_s_ohm, math.nan, 1e3),
-            _change(one.rms_before_v, one.rms_v, math.nan, 1e3),
-            one.method if one.cell_file else "",
-            one.reason,
+            result.pack,
+            _fixed_point(result.hours, 1),
+            _change(result.capacity_before_ah, result.capacity_ah, std=result.capacity_std_ah),
+            _change(result.r_s_before_ohm, result.r_s_ohm, factor=1e3),
+            _change(result.rms_before_v, result.rms_v, factor=1e3),
+            result.method if result.cell_file else "",
+            result.reason,
         )
     return table
 
 
-def _change(before: float, after: float, std: float, factor: float) -> str:
+def _change(before: float, after: float, *, std: float = math.nan, factor: float = 1.0) -> str:
+    """Return both values, times ``factor``, and the standard deviation of the second; a missing value is omitted."""
     if not math.isfinite(after):
-        return _number(factor * before, 3) if math.isfinite(before) else "-"
+        return _fixed_point(factor * before, 3)
     uncertainty = f" ± {factor * std:.2g}" if math.isfinite(std) else ""
     return f"{factor * before:.4g} to {factor * after:.4g}{uncertainty}"
 
 
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+def _fixed_point(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}" if math.isfinite(value) else "-"

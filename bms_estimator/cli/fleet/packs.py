@@ -9,9 +9,9 @@ from typing import Annotated
 import tomlkit
 import typer
 
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
-from bms_estimator.fleet.packs.csv_table import CELL_FILE, PackTable, check_models, read_table, table_lines
+from bms_estimator.fleet.packs.csv_table import CELL_FILE_SUFFIX, PackTable, check_models, read_table, table_lines
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, model_key, settings_of
 from bms_estimator.model.config_file import write_text
@@ -33,7 +33,7 @@ def load(
             show_default=False,
         ),
     ],
-    server: Server = SERVER,
+    server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
     remove: Annotated[
@@ -45,27 +45,28 @@ def load(
     Workers apply changes within seconds. A cell whose name ends in .toml is a cell file in the folder of the table.
     """
     packs = read_table(table)
-    files = {name: _text(path) for name, path in packs.cell_files.items()}
+    files = {name: _read_text(path) for name, path in packs.cell_files.items()}
     typer.echo(asyncio.run(_load(table, packs, files, (server, creds, ca), remove=remove)))
 
 
 @app.command("list")
-def list_packs(server: Server = SERVER, creds: Creds = None, ca: Ca = None) -> None:
+def list_packs(server: Server = DEFAULT_SERVER, creds: Creds = None, ca: Ca = None) -> None:
     """Print the server's table of packs as CSV, which `load` can read; errors in rows are printed to stderr."""
-    known = asyncio.run(known_packs((server, creds, ca)))
-    kinds = {pack: kind for pack in sorted(known) if isinstance(kind := known.kind(pack), PackSpec)}
-    # packs with equal models have equal errors, so that one pack of each model is checked
-    representatives = {model_key(kind): pack for pack, kind in reversed(kinds.items())}
-    for pack in (*(pack for pack in sorted(known) if pack not in kinds), *representatives.values()):
-        if reason := known.reason(pack):
+    registry = asyncio.run(fetch_registry((server, creds, ca)))
+    specs = {pack: spec for pack in sorted(registry) if isinstance(spec := registry.parsed_row(pack), PackSpec)}
+    invalid_packs = [pack for pack in sorted(registry) if pack not in specs]
+    # packs with equal models have equal errors, so that only the first pack of each model is checked
+    first_packs = {model_key(spec): pack for pack, spec in reversed(specs.items())}
+    for pack in (*invalid_packs, *first_packs.values()):
+        if reason := registry.reason(pack):
             typer.echo(f"warning: {pack}: {reason}", err=True)
-    sys.stdout.writelines(table_lines(kinds))
+    sys.stdout.writelines(table_lines(specs))
 
 
 @app.command()
 def remove(
     packs: Annotated[list[str], typer.Argument(help="names of packs", show_default=False)],
-    server: Server = SERVER,
+    server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
 ) -> None:
@@ -77,7 +78,7 @@ def remove(
 @app.command()
 def show(
     pack: Annotated[str, typer.Argument(help="name of the pack", show_default=False)],
-    server: Server = SERVER,
+    server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
     out: Annotated[
@@ -86,9 +87,9 @@ def show(
     ] = None,
 ) -> None:
     """Print a pack's settings as a pack file; `replay --pack` with this file gives the workers' estimates."""
-    known = asyncio.run(known_packs((server, creds, ca)))
-    refuse_unknown([pack], known)
-    files = pack_files(pack, known)
+    registry = asyncio.run(fetch_registry((server, creds, ca)))
+    reject_unknown([pack], registry)
+    files = pack_files(pack, registry)
     if out is None:
         typer.echo(files["pack.toml"].rstrip())
         return
@@ -97,33 +98,34 @@ def show(
     typer.echo(f"{out}: {' and '.join(files)} written")
 
 
-def pack_files(pack: str, known: PackRegistry) -> dict[str, str]:
+def pack_files(pack: str, registry: PackRegistry) -> dict[str, str]:
     """Return contents by file name: the pack file, and the cell file unless the cell is shipped.
 
     Raises:
         UserError: The row or its cell is invalid.
     """
-    kind = known.kind(pack)
-    if not isinstance(kind, PackSpec) or known.reason(pack):
-        raise UserError(f"{pack}: {known.reason(pack)}")
-    text, cell = known.cell_file(kind.cell), kind.cell
-    settings = settings_of(kind).model_dump(mode="json", exclude_unset=True)
-    settings["pack"] |= {"name": pack, "cell": cell if text is None else f"{cell}{CELL_FILE}"}
-    return {"pack.toml": tomlkit.dumps(settings)} | ({} if text is None else {f"{cell}{CELL_FILE}": text})
+    spec = registry.parsed_row(pack)
+    if not isinstance(spec, PackSpec) or registry.reason(pack):
+        raise UserError(f"{pack}: {registry.reason(pack)}")
+    settings = settings_of(spec).model_dump(mode="json", exclude_unset=True)
+    cell_text = registry.cell_file(spec.cell)
+    cell = spec.cell if cell_text is None else f"{spec.cell}{CELL_FILE_SUFFIX}"
+    settings["pack"] |= {"name": pack, "cell": cell}
+    return {"pack.toml": tomlkit.dumps(settings)} | ({} if cell_text is None else {cell: cell_text})
 
 
-def refuse_unknown(packs: Collection[str], known: Container[str]) -> None:
+def reject_unknown(packs: Collection[str], registry: Container[str]) -> None:
     """Check that each pack is in the table.
 
     Raises:
         UserError: A pack is unknown.
     """
-    unknown = [pack for pack in packs if pack not in known]
+    unknown = [pack for pack in packs if pack not in registry]
     if unknown:
         raise UserError(f"{', '.join(unknown)}: not in the table of packs; `fleet packs list` prints it")
 
 
-async def known_packs(address: ServerAddress) -> PackRegistry:
+async def fetch_registry(address: ServerAddress) -> PackRegistry:
     """Return the server's table of packs and cells."""
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.packs.pack_bucket import PackBucket  # noqa: PLC0415
@@ -139,12 +141,14 @@ async def _load(path: Path, table: PackTable, files: dict[str, str], address: Se
     from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket  # noqa: PLC0415
 
     async with connected(*address) as nc:
-        stored = {name: data.decode(errors="replace") for name, data in (await read_bucket(nc, CELLS_BUCKET)).items()}
-        check_models(path, table, stored | files)
+        stored_cells = {
+            name: data.decode(errors="replace") for name, data in (await read_bucket(nc, CELLS_BUCKET)).items()
+        }
+        check_models(path, table, stored_cells | files)
         cells = await write_bucket(nc, CELLS_BUCKET, {name: text.encode() for name, text in files.items()})
         rows = {name: line.data for name, line in table.packs.items()}
         packs = await write_bucket(nc, PACKS_BUCKET, rows, remove=remove)
-    kinds = len(set(rows.values()))
+    spec_count = len(set(rows.values()))
     counts = {
         "new": packs.new,
         "changed": packs.changed,
@@ -154,7 +158,7 @@ async def _load(path: Path, table: PackTable, files: dict[str, str], address: Se
         "cell files written": cells.new + cells.changed,
     }
     changes = ", ".join(f"{count} {change}" for change, count in counts.items() if count)
-    return f"{path}: {len(rows)} packs of {kinds} kinds: {changes}"
+    return f"{path}: {len(rows)} packs of {spec_count} kinds: {changes}"
 
 
 async def _remove(packs: set[str], address: ServerAddress) -> None:
@@ -162,11 +166,11 @@ async def _remove(packs: set[str], address: ServerAddress) -> None:
     from bms_estimator.fleet.packs.pack_bucket import read_bucket, remove_keys  # noqa: PLC0415
 
     async with connected(*address) as nc:
-        refuse_unknown(packs, await read_bucket(nc, PACKS_BUCKET))
+        reject_unknown(packs, await read_bucket(nc, PACKS_BUCKET))
         await remove_keys(nc, PACKS_BUCKET, packs)
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

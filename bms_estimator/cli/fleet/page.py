@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
 from bms_estimator.cli.options.page_options import open_browser, page_settings
 from bms_estimator.fleet.page import nats_feed
 from bms_estimator.fleet.page.fleet_page import fleet_page
@@ -19,7 +19,7 @@ DEFAULT_LISTEN = "127.0.0.1:8080"
 
 
 def page(
-    server: Server = SERVER,
+    server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
     listen: Annotated[str, typer.Option(help="host:port of the page")] = DEFAULT_LISTEN,

@@ -12,21 +12,23 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
     from bms_estimator.fleet.queries.duckdb_queries import Answer, Query
 
-FOLDER = Path("hours")
+DEFAULT_FOLDER = Path("hours")
 """Default folder of the Parquet files."""
+MAX_TABLE_WIDTH = 10_000
+"""Maximum width of a printed table [characters], above that of any answer."""
 
 
 def collect(
-    server: Server = SERVER,
+    server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
-    folder: Annotated[Path, typer.Option(help="folder of the Parquet files")] = FOLDER,
+    folder: Annotated[Path, typer.Option(help="folder of the Parquet files")] = DEFAULT_FOLDER,
     period: Annotated[
         float, typer.Option(min=0.0, help="write a row to a file at most this many seconds after its arrival")
     ] = 300.0,
@@ -48,10 +50,8 @@ async def _collect(address: ServerAddress, folder: Path, period_s: float) -> Non
 
     server, creds, ca = address
     stop = stop_on_signal()
-    connecting, stopping = (
-        asyncio.ensure_future(connect(server, "collector", creds=creds, ca=ca)),
-        asyncio.ensure_future(stop.wait()),
-    )
+    connecting = asyncio.ensure_future(connect(server, "collector", creds=creds, ca=ca))
+    stopping = asyncio.ensure_future(stop.wait())
     await asyncio.wait((connecting, stopping), return_when=asyncio.FIRST_COMPLETED)
     if not connecting.done():  # stopped before a server was found
         await end(connecting)
@@ -73,7 +73,7 @@ def ask(
     query: Annotated[
         str | None, typer.Argument(help="after sql: a statement SELECT ... FROM hours", show_default=False)
     ] = None,
-    folder: Annotated[Path, typer.Option(help="folder to which `fleet collect` writes")] = FOLDER,
+    folder: Annotated[Path, typer.Option(help="folder to which `fleet collect` writes")] = DEFAULT_FOLDER,
     days: Annotated[
         int | None,
         typer.Option(min=1, help="use only this number of most recent days; default: all days", show_default=False),
@@ -86,25 +86,26 @@ def ask(
     csv: Annotated[bool, typer.Option("--csv", help="print the result as CSV")] = False,
 ) -> None:
     """Query the hourly summaries of all packs. Without a name, list the queries."""
-    from bms_estimator.fleet.queries import duckdb_queries as questions  # noqa: PLC0415 - its packages are optional
+    from bms_estimator.fleet.queries import duckdb_queries  # noqa: PLC0415 - its packages are optional
 
     if name is None:
-        _list(questions.QUESTIONS)
+        _list_queries(duckdb_queries.QUESTIONS)
         return
     if (query is not None) != (name == "sql"):
         raise UserError("give an SQL query after sql, and only there: fleet ask sql 'SELECT count(*) FROM hours'")
     if json and csv:
         raise UserError("--json and --csv: choose one")
     if query is not None:
-        answer = questions.select(folder, query, days=days)
+        answer = duckdb_queries.select(folder, query, days=days)
     else:
-        answer = questions.run_query(folder, name, days=days, limits=questions.Limits(within_days=within))
+        limits = duckdb_queries.Limits(within_days=within)
+        answer = duckdb_queries.run_query(folder, name, days=days, limits=limits)
     (_print_json if json else _print_csv if csv else _print_table)(answer)
 
 
-def _list(questions: "dict[str, Query]") -> None:
-    for name, question in questions.items():
-        typer.echo(f"{name:10}{question.help}")
+def _list_queries(queries: "dict[str, Query]") -> None:
+    for name, query in queries.items():
+        typer.echo(f"{name:10}{query.help}")
     typer.echo(f"{'sql':10}any SELECT from the view hours; fleet ask sql 'DESCRIBE hours' lists its columns")
 
 
@@ -126,7 +127,9 @@ def _print_table(answer: "Answer") -> None:
             *("" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value) for value in row)
         )
     console = Console(highlight=False, markup=False)
-    console.width = max(console.width, console.measure(table, options=console.options.update(max_width=10_000)).maximum)
+    console.width = max(
+        console.width, console.measure(table, options=console.options.update(max_width=MAX_TABLE_WIDTH)).maximum
+    )
     console.print(table)
     if not answer.rows:
         typer.echo("none")

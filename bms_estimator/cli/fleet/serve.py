@@ -12,7 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.nats_config import CLUSTER_PORT, Accounts
 from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec
-from bms_estimator.fleet.server.nats_server import serve as serving
+from bms_estimator.fleet.server.nats_server import serve as run_node
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs, flush_logs
@@ -55,16 +55,16 @@ def serve(
     The first start creates keys for each tenant in the folder. In a cluster, copy keys/claims.json to the other nodes.
     """
     settings = _settings(settings_file, listen=listen, mqtt=mqtt)
-    place = NodeLocation(_folder(settings, folder), node, _nodes(settings, node, of))
+    location = NodeLocation(_folder(settings, folder), node, _nodes(settings, node, of))
 
-    def read() -> ServerSpec:
+    def read_spec() -> ServerSpec:
         settings = _settings(settings_file, listen=listen, mqtt=mqtt)
-        return ServerSpec(settings, _accounts(settings, place))
+        return ServerSpec(settings, _accounts(settings, location))
 
     configure_logs()
     with flush_logs():
-        code = asyncio.run(serving(place, read, typer.echo))
-    raise typer.Exit(code)
+        exit_code = asyncio.run(run_node(location, read_spec, typer.echo))
+    raise typer.Exit(exit_code)
 
 
 def user(
@@ -114,14 +114,20 @@ def _settings(path: Path | None, **options: str | None) -> FleetSettings:
         raise UserError(f"{options_text}: {reason}") from None
 
 
-def _folder(settings: FleetSettings, given: Path | None) -> Path:
-    systemd = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
-    home = Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state") / "bms-estimator-fleet"
-    return (given or settings.server.folder or Path(systemd or home)).expanduser().absolute()
+def _folder(settings: FleetSettings, option: Path | None) -> Path:
+    """Return the folder of streams and keys, from the first source that has one: --folder, settings, systemd, user."""
+    systemd_folder = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    user_folder = Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state") / "bms-estimator-fleet"
+    return (option or settings.server.folder or Path(systemd_folder or user_folder)).expanduser().absolute()
 
 
 def _nodes(settings: FleetSettings, number: int, of: str | None) -> tuple[str, ...]:
-    """Return the addresses of all nodes for each other.
+    """Return the addresses under which the nodes of a cluster connect to each other; empty for a single node.
+
+    Args:
+        settings: Settings of the fleet.
+        number: Position of this node in the list, from 1.
+        of: List of host or host:port, separated by commas; None: a single node.
 
     Raises:
         UserError: --of is invalid, or keys and certificates are missing.
@@ -137,24 +143,28 @@ def _nodes(settings: FleetSettings, number: int, of: str | None) -> tuple[str, .
         raise UserError(f"--node {number}: --of names only {len(nodes)} nodes")
     try:
         if not all(parse_listen(node).loopback for node in nodes):
-            settings.refuse_open(f"--of {of}")
+            settings.reject_unprotected(f"--of {of}")
     except ValueError as error:
         raise UserError(f"--of {of}: {error}") from None
     return nodes
 
 
 def _has_port(host: str) -> bool:
+    """Return True if a host ends in a port. An IPv6 address contains colons, and needs brackets to have a port."""
     return host.rpartition(":")[2].isdigit() and (host.count(":") == 1 or "]:" in host)
 
 
-def _accounts(settings: FleetSettings, place: NodeLocation) -> Accounts | None:
-    """Return the accounts of the tenants; only the first node creates keys.
+def _accounts(settings: FleetSettings, location: NodeLocation) -> Accounts | None:
+    """Return the accounts of the tenants; None without tenants.
+
+    The first node creates the keys of the tenants, and so does any node to which the operator's key was copied. Other
+    nodes read the claims that the first node has written.
 
     Raises:
-        UserError: This is another node, and the keys were not copied to it.
+        UserError: The keys or the claims cannot be read, or the claims were not copied to this node.
     """
     if not settings.tenants:
         return None
-    if place.number == 1 or credentials.has_keys(place.keys):
-        return credentials.make_accounts(place.keys, settings.tenants, datetime.now(UTC))
-    return credentials.read_accounts(place.keys)
+    if location.number == 1 or credentials.has_keys(location.keys):
+        return credentials.make_accounts(location.keys, settings.tenants, datetime.now(UTC))
+    return credentials.read_accounts(location.keys)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-SERVER = "nats://127.0.0.1:4222"
+DEFAULT_SERVER = "nats://127.0.0.1:4222"
 """Default address of the server."""
 
 Server = Annotated[

@@ -22,7 +22,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DeviceName
 
 MAX_PACKS = 999_999
-"""Maximum number of packs, whose names have six digits."""
+"""Maximum number of packs, because their names end in a number of six digits."""
 
 
 def simulate(
@@ -74,12 +74,12 @@ def simulate(
     """
     if mqtt is None and table is None and truth is None:
         raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write only the table of the packs")
-    fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin), prefix=_prefix(prefix))
+    fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin), prefix=_valid_prefix(prefix))
     for path, text in ((table, fleet.table), (truth, fleet.truth_table)):
         if path is not None:
             write_text(path, text())
     if mqtt is not None:
-        settings = _broker(mqtt, username=username, password_file=password_file, ca_file=ca)
+        settings = _broker_settings(mqtt, username=username, password_file=password_file, ca_file=ca)
         typer.echo(asyncio.run(_run(fleet, settings, connections, speed, blocks)))
 
 
@@ -100,7 +100,7 @@ def _begin_ns(begin: datetime | None) -> int:
     return int(begin.timestamp()) * 10**9
 
 
-def _prefix(prefix: str) -> str:
+def _valid_prefix(prefix: str) -> str:
     """Return a prefix after checking that it gives valid pack names."""
     try:
         return TypeAdapter(DeviceName).validate_python(prefix)
@@ -108,7 +108,7 @@ def _prefix(prefix: str) -> str:
         raise UserError(f"--prefix {prefix}: must consist of letters, digits, _ and -") from None
 
 
-def _broker(url: str, **options: str | Path | None) -> MqttSettings:
+def _broker_settings(url: str, **options: str | Path | None) -> MqttSettings:
     """Return the connection settings from the options of the command line.
 
     Raises:
@@ -120,11 +120,11 @@ def _broker(url: str, **options: str | Path | None) -> MqttSettings:
     except ValidationError as error:
         raise UserError(f"--mqtt {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
     except UserError as error:
-        raise UserError(_with_options(str(error))) from None
+        raise UserError(_with_option_names(str(error))) from None
     return settings
 
 
-def _with_options(message: str) -> str:
+def _with_option_names(message: str) -> str:
     """Replace names of settings in an error by the options that set them."""
     for setting, option in (("url", "--mqtt"), ("password_file", "--password-file"), ("ca_file", "--ca")):
         message = message.replace(f"mqtt.{setting} = ", f"{option} ")

@@ -9,7 +9,7 @@ from typing import Annotated
 import structlog
 import typer
 
-from bms_estimator.cli.fleet.server_options import SERVER, Ca, Creds, Server
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.fleet.worker.worker import CHECKPOINT_S, Options, work
@@ -17,11 +17,12 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import startup_signals, stop_on_signal
 
-_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_MAX_NAME_LENGTH = 64
+_VALID_NAME = re.compile(f"[A-Za-z0-9_-]{{1,{_MAX_NAME_LENGTH}}}")
 
 
 def worker(
-    server: Server = SERVER,
+    server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
     name: Annotated[
@@ -50,7 +51,8 @@ async def _work(options: Options) -> None:
 
 def _worker_name(name: str | None) -> str:
     if name is None:
-        return re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}")[-64:]
-    if not _NAME.fullmatch(name):
-        raise UserError(f"--name {name}: must be at most 64 letters, digits, - and _")
+        default = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}")
+        return default[-_MAX_NAME_LENGTH:]  # the process number at its end makes it unique
+    if not _VALID_NAME.fullmatch(name):
+        raise UserError(f"--name {name}: must be at most {_MAX_NAME_LENGTH} letters, digits, - and _")
     return name

@@ -104,16 +104,16 @@ def board(
     try:
         with BoardClient(resolve_port(port), baud) as client:
             hello = client.hello()
-            typer.echo(_described(hello))
+            typer.echo(_properties_text(hello))
             if aref_v is not None:
                 changed = client.send(set_bandgap_command(_bandgap_v(client, hello, aref_v)))
-                typer.echo(f"bandgap: was {_volts(hello)}, now {_volts(changed)}")
+                typer.echo(f"bandgap: was {_bandgap_text(hello)}, now {_bandgap_text(changed)}")
             if divider is not None:
                 changed = client.send(set_divider_command(divider))
-                typer.echo(f"divider: was {_divider(hello)}, now {_divider(changed)}")
+                typer.echo(f"divider: was {_divider_text(hello)}, now {_divider_text(changed)}")
             if volts_per_ampere is not None or ratiometric is not None:
-                changed = _set_current(client, volts_per_ampere, ratiometric)
-                typer.echo(f"current: was {_slope(hello)}, now {_slope(changed)}")
+                changed = _set_current_sensor(client, volts_per_ampere, ratiometric)
+                typer.echo(f"current: was {_slope_text(hello)}, now {_slope_text(changed)}")
             if serial is not None:
                 changed = client.send(set_serial_command(serial))
                 typer.echo(f"serial: was {hello.serial:08x}, now {changed.serial:08x}")
@@ -132,8 +132,8 @@ def _accept_next(settings: Settings, folder: Path) -> None:
             f"sensor.serial = {settings.sensor.serial}: the settings name the board; change sensor.serial instead of --accept"
         )
     file = KnownBoardFile(folder, settings.pack.name)
-    known = file.load()
-    if not known:
+    stored_board = file.load()
+    if not stored_board:
         raise UserError(
             f"{file.path}: no board is stored in this file; give the state folder of the service with --folder "
             "(the installed systemd unit uses /var/lib/bms-estimator, which root can read)"
@@ -142,7 +142,7 @@ def _accept_next(settings: Settings, folder: Path) -> None:
         file.save(NO_BOARD)
     except OSError as error:
         raise UserError(f"{file.path}: cannot be written: {error.strerror}") from error
-    removed = f"board {known['serial']} removed" if known["serial"] else "no board was stored"
+    removed = f"board {stored_board['serial']} removed" if stored_board["serial"] else "no board was stored"
     typer.echo(f"{file.path}: {removed}; the service accepts the next board that connects")
 
 
@@ -157,12 +157,13 @@ def _bandgap_v(client: BoardClient, hello: Hello, aref_v: float) -> float:
     if not MIN_BANDGAP_V <= bandgap_v <= MAX_BANDGAP_V:
         raise UserError(
             f"--aref-v {aref_v:g}: the bandgap voltage would be {bandgap_v:.3f} V, but on every board it is between "
-            f"{MIN_BANDGAP_V} and {MAX_BANDGAP_V} V; with its present bandgap voltage of {_volts(hello)} the board measures {reference_v:.3f} V at AREF"
+            f"{MIN_BANDGAP_V} and {MAX_BANDGAP_V} V; with its present bandgap voltage of {_bandgap_text(hello)} the board measures {reference_v:.3f} V at AREF"
         )
     return bandgap_v
 
 
-def _set_current(client: BoardClient, volts_per_ampere: float | None, ratiometric: bool | None) -> Hello:
+def _set_current_sensor(client: BoardClient, volts_per_ampere: float | None, ratiometric: bool | None) -> Hello:
+    """Set the given properties, at least one, of the current sensor. Return the board's properties after the change."""
     if ratiometric is not None:
         changed = client.send(set_ratiometric_command(ratiometric))
     if volts_per_ampere is not None:
@@ -170,28 +171,28 @@ def _set_current(client: BoardClient, volts_per_ampere: float | None, ratiometri
     return changed
 
 
-def _described(hello: Hello) -> str:
+def _properties_text(hello: Hello) -> str:
     ntc = f"{hello.ntc_r25_ohm} ohm at 25 degC, beta {hello.ntc_beta_k} K" if hello.channels & Channels.NTC else "none"
     return (
         f"firmware   {hello.firmware}\n"
         f"serial     {hello.serial:08x}\n"
         f"rate       {hello.rate_hz} Hz\n"
-        f"voltage    divider {_divider(hello)}\n"
-        f"current    {_slope(hello)}, zero at {hello.current_zero_ppm * 1e-6:.6f} of the reference\n"
+        f"voltage    divider {_divider_text(hello)}\n"
+        f"current    {_slope_text(hello)}, zero at {hello.current_zero_ppm * 1e-6:.6f} of the reference\n"
         f"NTC        {ntc}\n"
-        f"bandgap    {_volts(hello)}\n"
+        f"bandgap    {_bandgap_text(hello)}\n"
         f"reference  {hello.reference_v:.3f} V, measured against the bandgap at reset"
     )
 
 
-def _volts(hello: Hello) -> str:
+def _bandgap_text(hello: Hello) -> str:
     return f"{hello.bandgap_uv * 1e-6:.4f} V"
 
 
-def _divider(hello: Hello) -> str:
+def _divider_text(hello: Hello) -> str:
     return f"{hello.divider_ppm * 1e-6:g}"
 
 
-def _slope(hello: Hello) -> str:
+def _slope_text(hello: Hello) -> str:
     ratiometric = " at 5 V, ratiometric" if hello.channels & Channels.CURRENT_RATIOMETRIC else ""
     return f"{hello.current_uv_per_a * 1e-6:g} V/A{ratiometric}"

@@ -8,7 +8,7 @@ import typer
 
 from bms_estimator.cli.options.pack_options import with_broker
 from bms_estimator.cli.options.page_options import open_browser, page_settings
-from bms_estimator.page.broker_page import dashboard as serving
+from bms_estimator.page.broker_page import dashboard as serve_page
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.state_folder import state_folder
@@ -56,7 +56,7 @@ def dashboard(
 
 async def _serve(broker: MqttSettings, page: PageSettings, folder: Path, *, browser: bool) -> None:
     stop = stop_on_signal()
-    async with serving(broker, page, folder) as url:
+    async with serve_page(broker, page, folder) as url:
         typer.echo(f"live page: {url}")
         if browser:
             open_browser(url)

@@ -11,7 +11,7 @@ from typing import IO, Annotated
 
 import typer
 
-from bms_estimator.cli.options.capture_options import Force, check_out
+from bms_estimator.cli.options.capture_options import Force, check_output_file
 from bms_estimator.cli.options.number_options import whole
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
@@ -21,8 +21,8 @@ from bms_estimator.store.history_reader import HistoryFile, PastEvent
 from bms_estimator.store.minute import MINUTE_S, Minute
 
 TIME_EXAMPLE = "2026-01-31 or 2026-01-31T12:00"
-"""Start or end time in help texts."""
-FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
+"""Example of a start time in help texts."""
+TIME_FORMATS = ["%Y-%m-%d", "%Y-%m-%dT%H:%M", "%Y-%m-%dT%H:%M:%S"]
 """Formats of start and end time."""
 
 
@@ -31,12 +31,12 @@ def history(
     since: Annotated[
         datetime | None,
         typer.Option(
-            formats=FORMATS, metavar="TIME", help=f"first time in UTC: {TIME_EXAMPLE}; default: the oldest row"
+            formats=TIME_FORMATS, metavar="TIME", help=f"first time in UTC: {TIME_EXAMPLE}; default: the oldest row"
         ),
     ] = None,
     until: Annotated[
         datetime | None,
-        typer.Option(formats=FORMATS, metavar="TIME", help="end time in UTC, exclusive; default: now"),
+        typer.Option(formats=TIME_FORMATS, metavar="TIME", help="end time in UTC, exclusive; default: now"),
     ] = None,
     step: Annotated[
         int, typer.Option(parser=whole(MINUTE_S), help="interval of the rows in seconds, a multiple of 60")
@@ -62,28 +62,29 @@ def history(
     settings = load_settings(pack)
     path = (folder or state_folder(settings)) / f"{settings.pack.name}.sqlite"
     if out is not None:
-        check_out(out, [pack, path], force=force)
+        check_output_file(out, [pack, path], force=force)
     since_s = since.replace(tzinfo=UTC).timestamp() if since else 0.0
     until_s = until.replace(tzinfo=UTC).timestamp() if until else time.time() + MINUTE_S
     header: Sequence[str] = PastEvent._fields if events else Minute._fields
-    file = HistoryFile(path)
-    rows = file.events(since_s, until_s) if events else file.rows(since_s, until_s, step)
+    history_file = HistoryFile(path)
+    rows = history_file.events(since_s, until_s) if events else history_file.rows(since_s, until_s, step)
     try:
         with out.open("w", encoding="utf-8", newline="") if out else nullcontext(sys.stdout) as table:
-            _write(table, header, rows)
+            _write_csv(table, header, rows)
     except OSError as error:
         if out is None:
             raise
         raise UserError(f"--out {out}: cannot be written: {error.strerror}") from error
 
 
-def _write(file: IO[str], header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+def _write_csv(file: IO[str], header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write rows as CSV, with times as ISO 8601 text."""
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(["time", *header[1:]])
     for time_s, *values in rows:
-        writer.writerow([iso_utc(float(str(time_s))), *(_number(value) for value in values)])
+        writer.writerow([iso_utc(float(str(time_s))), *(_shortened(value) for value in values)])
 
 
-def _number(value: object) -> object:
+def _shortened(value: object) -> object:
+    """Return a float with six significant digits; another value unchanged."""
     return f"{value:.6g}" if isinstance(value, float) else value

@@ -37,12 +37,12 @@ def ports(
     if not listed:
         typer.echo("there is no serial port; is the board plugged in?")
         return
-    names = {str(name.resolve()): str(name) for name in stable_names()}
+    stable_by_device = {str(name.resolve()): str(name) for name in stable_names()}
     table = Table(box=box.SIMPLE_HEAD)
     for title in ("port", "description", "opened by", *(["device"] if probe else [])):
         table.add_column(title, overflow="fold")
     for device, description in sorted(listed.items()):
-        name = names.get(device, device)
+        name = stable_by_device.get(device, device)
         opened_by = holder(device) or ""
         with show_probing(device) if probe else nullcontext():
             table.add_row(name, description, opened_by, *([str(probe_port(device, baud))] if probe else []))
@@ -50,6 +50,6 @@ def ports(
 
 
 def show_probing(port: str) -> AbstractContextManager[object]:
-    """Show on a terminal that a probe is running."""
+    """Show on stderr that a probe is running, if stderr is a terminal."""
     console = Console(stderr=True)
     return console.status(f"probing {port}: up to 20 s") if console.is_terminal else nullcontext()

@@ -24,7 +24,7 @@ def quit_key(quit_program: Callable[[], object]) -> Iterator[None]:
         yield
         return
     terminal = sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
+    previous_mode = termios.tcgetattr(terminal)
     loop = asyncio.get_running_loop()
 
     def read() -> None:
@@ -41,4 +41,6 @@ def quit_key(quit_program: Callable[[], object]) -> Iterator[None]:
     finally:
         loop.remove_reader(terminal)
         with contextlib.suppress(termios.error):  # the terminal is gone
-            termios.tcsetattr(terminal, termios.TCSANOW, before)  # do not wait for output: the terminal may be blocked
+            termios.tcsetattr(
+                terminal, termios.TCSANOW, previous_mode
+            )  # do not wait for output: the terminal may be blocked

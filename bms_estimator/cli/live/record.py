@@ -27,6 +27,8 @@ from bms_estimator.sources.source import Source
 
 REDRAW_S = 0.25
 """Interval between two updates of the progress line [s]."""
+RATE_INTERVAL_S = 1.0
+"""Minimum time over which the displayed frame rate is averaged [s]."""
 
 
 def record(
@@ -82,32 +84,33 @@ async def _record(settings: Settings, recording: CaptureRecorder, seconds: float
         progress = Progress(source, recording)
         await until_first_ends(
             stop.wait(),
-            _end(recording),
-            _drain(source),
-            _time_over(recording, seconds),
-            _show(console, progress, log),
+            _wait_for_disk_error(recording),
+            _read_all(source),
+            _wait_for_duration(recording, seconds),
+            _show_progress(console, progress, log),
         )
     return progress
 
 
-async def _drain(source: Source) -> None:
+async def _read_all(source: Source) -> None:
+    """Read the source until it ends; its tap, the recorder, receives a copy of all bytes."""
     async for _ in source:
         pass
 
 
-async def _end(recording: CaptureRecorder) -> None:
-    with contextlib.suppress(OSError):  # the caller reports it
+async def _wait_for_disk_error(recording: CaptureRecorder) -> None:
+    with contextlib.suppress(OSError):  # ``record`` reports it as ``recording.fault``
         await asyncio.wrap_future(recording.ended)
 
 
-async def _time_over(recording: CaptureRecorder, seconds: float | None) -> None:
+async def _wait_for_duration(recording: CaptureRecorder, seconds: float | None) -> None:
     """Wait until ``seconds`` after the first bytes; forever if None."""
     while seconds is None or not recording.bytes:  # noqa: ASYNC110 - the recorder has no event for its first bytes
         await asyncio.sleep(REDRAW_S)
     await asyncio.sleep(seconds)
 
 
-async def _show(console: Console, progress: "Progress", log: deque[str]) -> None:
+async def _show_progress(console: Console, progress: "Progress", log: deque[str]) -> None:
     """Show a progress line on a terminal, with the log's lines above it."""
     with Live(console=console, auto_refresh=False, transient=True) as live:
         while True:
@@ -124,26 +127,26 @@ class Progress:
     def __init__(self, source: Source, recording: CaptureRecorder) -> None:
         self._source, self._recording = source, recording
         self._started_s = time.monotonic()
-        self._last = (self._started_s, 0)
+        self._rate_since_s, self._frames_before = self._started_s, 0
         self._rate_hz = 0.0
 
     def line(self) -> Text:
         """Return the progress as one line."""
-        message = f"  {self._source.message}" if self._source.message else ""
+        message = f"  {self._source.silence_reason}" if self._source.silence_reason else ""
         now_s, frames = time.monotonic(), self._source.counters["frames_received"]
-        if now_s - self._last[0] >= 1.0:
-            self._rate_hz = (frames - self._last[1]) / (now_s - self._last[0])
-            self._last = now_s, frames
+        if now_s - self._rate_since_s >= RATE_INTERVAL_S:
+            self._rate_hz = (frames - self._frames_before) / (now_s - self._rate_since_s)
+            self._rate_since_s, self._frames_before = now_s, frames
         return Text(f"{self.summary()}, {self._rate_hz:.0f} Hz{message}", no_wrap=True, overflow="ellipsis")
 
     def summary(self) -> str:
         """Return a summary of the whole recording."""
         counters = self._source.counters
-        faults = sum(
+        other_faults = sum(
             counters.get(name, 0) for name in ("cobs_errors", "length_errors", "version_errors", "text_errors")
         )
         return (
             f"{time.monotonic() - self._started_s:.1f} s, {self._recording.bytes:,} bytes, "
             f"{counters['frames_received']:,} frames, {counters.get('frames_lost', 0):,} lost, "
-            f"{counters.get('crc_errors', 0):,} CRC errors, {faults:,} other faults"
+            f"{counters.get('crc_errors', 0):,} CRC errors, {other_faults:,} other faults"
         )

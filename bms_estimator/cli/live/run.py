@@ -52,7 +52,7 @@ def run(
     """
     paths = packs or [Path("pack.toml")]
     apply_options = partial(_with_options, port=port, mqtt=mqtt)
-    loaded = [(apply_options(settings), cell) for settings, cell in map(load_pack, paths)]
+    loaded = [(apply_options(settings), model) for settings, model in map(load_pack, paths)]
     with startup_signals():
         if len(loaded) == 1:
             _run_one(*loaded[0], record, view=sys.stdout.isatty() if view is None else view)
@@ -76,7 +76,7 @@ def _run_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
         asyncio.run(run_pack_services(packs))
 
 
-def _run_one(settings: Settings, cell: PackModel, record: Path | None, *, view: bool) -> None:
+def _run_one(settings: Settings, model: PackModel, record: Path | None, *, view: bool) -> None:
     log: deque[str] = deque(maxlen=LOG_LINES)
     configure_logs(log if view and sys.stdout.isatty() else None)
     recorder = (
@@ -85,7 +85,7 @@ def _run_one(settings: Settings, cell: PackModel, record: Path | None, *, view: 
     sinks = [TerminalSink(log=log)] if view else []
     with flush_logs(), recorder as tap:
         _load_kernels()
-        service = run_pack_service(settings, cell, sinks=sinks, tap=tap, folder=state_folder(settings))
+        service = run_pack_service(settings, model, sinks=sinks, tap=tap, folder=state_folder(settings))
         asyncio.run(service)
 
 

@@ -23,7 +23,8 @@ from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
 from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
 from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 
-DEVICES = (*METERS, *BMS_ANSWERS)
+DEVICE_PROTOCOLS = (*METERS, *BMS_ANSWERS)
+"""Protocols of the simulated devices that are not boards: battery monitors and BMS."""
 DEFAULT_LOAD_C = 3.0
 """Default load current as a multiple of the capacity [1/h], at which the SOC changes visibly."""
 
@@ -52,7 +53,7 @@ def simulate(
     protocol: Annotated[
         str | None,
         typer.Option(
-            help=f"simulate a device with this protocol instead of a board: {', '.join(DEVICES)} (a JK-BMS with newer frames)",
+            help=f"simulate a device with this protocol instead of a board: {', '.join(DEVICE_PROTOCOLS)} (a JK-BMS with newer frames)",
             show_default=False,
         ),
     ] = None,
@@ -85,30 +86,30 @@ def simulate(
     --protocol simulates a BMS or battery monitor instead.
     --mqtt simulates an ESPHome node with a JK-BMS instead, for the setting `source.profile = "esphome-jk"`.
     """
-    model = load_cell(cell, capacity_ah).pack(series, 1)
-    ampere = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a
-    pack = SimulatedPack(model, LOADS[load](ampere, seed), soc=soc)
-    board: VirtualBoard | SimulatedMeter | SimulatedNode
+    model = load_cell(cell, capacity_ah).pack(series, parallel=1)
+    load_a = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a
+    pack = SimulatedPack(model, LOADS[load](load_a, seed), soc=soc)
+    device: VirtualBoard | SimulatedMeter | SimulatedNode
     if mqtt is not None:
         configure_logs()
         # ``with_broker`` sets mqtt; the default only satisfies the type checker
         broker = with_broker(Settings(), mqtt).mqtt or MqttSettings()
         cells = model.cell.series_count
-        board = SimulatedNode(pack, cells=cells, mqtt=broker, prefix=prefix, speed=speed, seed=seed)
+        device = SimulatedNode(pack, cells=cells, mqtt=broker, prefix=prefix, speed=speed, seed=seed)
     elif protocol is None:
         mode: Literal["binary", "text"] = "text" if text else "binary"
-        board = VirtualBoard(pack, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed)
+        device = VirtualBoard(pack, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed)
     elif protocol in METERS:
-        board = METERS[protocol](pack, speed)
+        device = METERS[protocol](pack, speed)
     elif protocol in BMS_ANSWERS:
-        board = _bms(protocol, pack, model.cell, speed, seed)
+        device = _simulated_bms(protocol, pack, model.cell, speed, seed)
     else:
-        raise UserError(f"--protocol {protocol}: must be one of {', '.join(DEVICES)}")
-    asyncio.run(_serve(board, seconds))
-    typer.echo(f"{board.samples:,} samples in {board.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
+        raise UserError(f"--protocol {protocol}: must be one of {', '.join(DEVICE_PROTOCOLS)}")
+    asyncio.run(_serve(device, seconds))
+    typer.echo(f"{device.samples:,} samples in {device.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
 
 
-def _bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int) -> SimulatedBms:
+def _simulated_bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int) -> SimulatedBms:
     """Return a simulated BMS with one cell voltage for each cell in series.
 
     Raises:
@@ -128,9 +129,9 @@ def _bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int
         raise UserError(f"--series: {error}") from None
 
 
-async def _serve(board: VirtualBoard | SimulatedMeter | SimulatedNode, seconds: float) -> None:
+async def _serve(device: VirtualBoard | SimulatedMeter | SimulatedNode, seconds: float) -> None:
     """Serve until ``seconds`` are over, or SIGINT or SIGTERM."""
     stop = stop_on_signal()
-    with board:
-        typer.echo(board.path)  # the pseudo-terminal, or topics and brokers of the ESPHome node
-        await until_first_ends(stop.wait(), board.run(seconds))
+    with device:
+        typer.echo(device.path)  # the pseudo-terminal, or topics and brokers of the ESPHome node
+        await until_first_ends(stop.wait(), device.run(seconds))

@@ -22,7 +22,7 @@ from bms_estimator.sinks.terminal.screen import LOG_LINES
 from bms_estimator.sinks.terminal.view_state import BrokerOutage
 
 REDRAW_S = 1.0
-"""Redraw interval without messages [s]: a pack becomes stale although nothing arrives."""
+"""Maximum redraw interval [s]. A pack must be drawn as stale although no message arrives."""
 
 
 def top(
@@ -63,14 +63,14 @@ async def _watch(settings: MqttSettings, log: deque[str]) -> None:
         view.on_message(message)
         changed.set()
 
-    def outage() -> BrokerOutage | None:
-        since_s = subscriber.lost_since
-        return None if since_s is None else BrokerOutage(since_s, subscriber.trouble)
+    def current_outage() -> BrokerOutage | None:
+        lost_since_s = subscriber.lost_since
+        return None if lost_since_s is None else BrokerOutage(lost_since_s, subscriber.trouble)
 
     subscriber = Subscriber(settings, on_message, changed.set)
     address = f"{settings.base_topic}/# at {', '.join(settings.urls)}"
     hint = f"{address}; q: quit" if sys.stdin and sys.stdin.isatty() else address
-    view = LiveView(subscriber.devices, log=log, hint=hint, outage=outage)
+    view = LiveView(subscriber.devices, log=log, hint=hint, outage=current_outage)
     async with view, subscriber:
         with quit_key(stop.set):
             await _show_until(stop, changed, view)

@@ -16,7 +16,7 @@ from bms_estimator.model.sample import CurrentSign
 AsJson = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
 """Option that prints the result as JSON."""
 CELL_HELP = "generic cell (lfp, nmc, nca, lco, lmo, lto), name of a shipped cell, or path of a cell file"
-OR_FUEL_CELL_HELP = f"{CELL_HELP}; of a fuel cell: pem_30w, or path of its cell file"
+CELL_OR_FUEL_CELL_HELP = f"{CELL_HELP}; of a fuel cell: pem_30w, or path of its cell file"
 CAPTURE_FORMATS = "file of `record` or `run --record`, CSV (.csv, .csv.gz) or Parquet"
 """Formats of a capture in help texts."""
 CAPTURE_HELP = f"capture to read: {CAPTURE_FORMATS}; -: read standard input"
@@ -51,33 +51,33 @@ SignOfCurrent = Annotated[
 ]
 
 
-def check_out(out: Path, read: Sequence[Path], *, force: bool) -> None:
+def check_output_file(out: Path, inputs: Sequence[Path], *, force: bool) -> None:
     """Reject an output file that exists, unless ``force`` is set, and any output file that is also an input.
 
     Raises:
-        UserError: ``out`` is one of ``read``, or exists and ``force`` is not set.
+        UserError: ``out`` is one of ``inputs``, or exists and ``force`` is not set.
     """
-    if any(out.exists() and path.exists() and out.samefile(path) for path in read):
+    if any(out.exists() and path.exists() and out.samefile(path) for path in inputs):
         raise UserError(f"--out {out}: is also an input; name another file")
     if out.is_file() and not force:
         raise UserError(f"--out {out}: exists already; --force replaces it")
 
 
-def check_once(captures: Sequence[Path]) -> None:
-    """Reject duplicate captures, also under different names.
+def reject_duplicates(captures: Sequence[Path]) -> None:
+    """Reject captures that are given twice, and captures with equal contents.
 
     Raises:
-        UserError: Two captures are equal.
+        UserError: Two captures have equal contents.
     """
     for i, path in enumerate(captures):
         for other in captures[:i]:
             if path.is_file() and other.is_file() and filecmp.cmp(path, other, shallow=False):
-                same = "given twice" if path.samefile(other) else f"has the same content as {other}"
-                raise UserError(f"{path}: {same}; the capture would count twice")
+                reason = "given twice" if path.samefile(other) else f"has the same content as {other}"
+                raise UserError(f"{path}: {reason}; the capture would count twice")
 
 
 def unique_names(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
-    """Return the names. A name that occurs twice is replaced by its path."""
+    """Return the names; a name that occurs more than once is replaced by the path of the file."""
     return [name if names.count(name) == 1 else str(path) for name, path in zip(names, paths, strict=True)]
 
 
@@ -86,6 +86,6 @@ def name_of(path: Path) -> str:
     return path.name.split(".")[0]
 
 
-def write_as_named(out: Path, cell: CellModel, remarks: list[str]) -> None:
-    """Write a cell file whose cell has the file's name. The file begins with ``remarks`` as comments."""
+def write_cell_named_as_file(out: Path, cell: CellModel, remarks: list[str]) -> None:
+    """Write a cell file. The name of its cell becomes that of the file, and ``remarks`` become comments at its beginning."""
     write_cell(out, cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name_of(out)})}), remarks)

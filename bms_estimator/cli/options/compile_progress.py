@@ -12,7 +12,7 @@ from numba.core import event
 from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
-TEXT = "compiling the kernels; this takes a minute or two, and later starts use the cache"
+COMPILE_TEXT = "compiling the kernels; this takes a minute or two, and later starts use the cache"
 """Text of the progress line."""
 
 
@@ -21,7 +21,7 @@ def show_compile_progress(report: Callable[[str], object] | None = None) -> Iter
     """Show a line with the elapsed time as soon as a kernel compiles. No line appears if all kernels are cached.
 
     Args:
-        report: Receives the line if stderr is not a terminal; default: a function that writes to stderr.
+        report: Called with the line, without the elapsed time, if stderr is not a terminal; default: write to stderr.
 
     Raises:
         KeyboardInterrupt: SIGINT arrived. The error is raised only at the next kernel, because an exception inside the
@@ -32,38 +32,39 @@ def show_compile_progress(report: Callable[[str], object] | None = None) -> Iter
 
         def show() -> None:
             if console.is_terminal:
-                clock = Progress(TextColumn(TEXT), TimeElapsedColumn(), console=console, transient=True)
-                stack.enter_context(clock).add_task("")
+                progress = Progress(TextColumn(COMPILE_TEXT), TimeElapsedColumn(), console=console, transient=True)
+                stack.enter_context(progress).add_task("")
             else:
-                (report or _to_stderr)(TEXT)
+                (report or _to_stderr)(COMPILE_TEXT)
 
         listener = _Listener(show)
-        stack.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, listener.interrupt))
+        previous_handler = signal.signal(signal.SIGINT, listener.on_interrupt)
+        stack.callback(signal.signal, signal.SIGINT, previous_handler)
         with event.install_listener("numba:compile", listener):
             yield
-    listener.check()
+    listener.raise_if_interrupted()
 
 
 class _Listener(event.Listener):
     """Listener for functions that numba compiles. Cached functions cause no event."""
 
     def __init__(self, show: Callable[[], None]) -> None:
-        self._show, self._shown, self._interrupted = show, False, False
+        self._show, self._is_shown, self._interrupted = show, False, False
 
-    def interrupt(self, *_: object) -> None:
-        """Handle SIGINT."""
+    def on_interrupt(self, *_: object) -> None:
+        """Remember SIGINT."""
         self._interrupted = True
 
-    def check(self) -> None:
+    def raise_if_interrupted(self) -> None:
         """Raise KeyboardInterrupt after SIGINT."""
         if self._interrupted:
             raise KeyboardInterrupt
 
     def on_start(self, _: event.Event) -> None:
-        """Show the line at the first kernel. The functions that it calls are compiled after this event."""
-        self.check()
-        if not self._shown:
-            self._shown = True
+        """Raise KeyboardInterrupt after SIGINT; otherwise show the line, once."""
+        self.raise_if_interrupted()
+        if not self._is_shown:
+            self._is_shown = True
             self._show()
 
     def on_end(self, _: event.Event) -> None:

@@ -37,7 +37,7 @@ def _limited(parse: Callable[[str], Number], minimum: float, maximum: float) -> 
     """Return a parser that also checks the limits of the number."""
 
     def parse_and_check(text: str | Number) -> Number:
-        if not isinstance(text, str):  # a default value
+        if not isinstance(text, str):  # typer also passes the option's default, which is a number
             return text
         try:
             value = parse(text)

@@ -12,8 +12,8 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import PackSettings, Settings, load_settings
 from bms_estimator.settings.sensor import SensorSettings
 
-TABLE_RESOLUTION_V = 1e-3
-"""Voltage resolution of a capture without a pack file [V]: that of laboratory equipment."""
+LABORATORY_RESOLUTION_V = 1e-3
+"""Voltage resolution of laboratory equipment [V], assumed for a capture without a pack file."""
 
 
 def load_pack(path: Path) -> tuple[Settings, PackModel]:
@@ -29,7 +29,10 @@ def load_pack(path: Path) -> tuple[Settings, PackModel]:
 
 
 def unpacked_cell(path: Path, settings: Settings) -> CellModel:
-    """Return the cell of a pack file before series and parallel are applied, searched as in ``load_pack``."""
+    """Return the model of one cell of a pack, before it is scaled to the cells in series and parallel.
+
+    The cell file is searched as in ``load_pack``.
+    """
     return load_cell(_locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
@@ -41,7 +44,9 @@ def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None)
     """
     if pack is None and cell is None:
         raise UserError("give either --cell NAME|CELL.toml or --pack pack.toml")
-    settings = load_settings(pack) if pack else Settings(sensor=SensorSettings(voltage_resolution_v=TABLE_RESOLUTION_V))
+    settings = (
+        load_settings(pack) if pack else Settings(sensor=SensorSettings(voltage_resolution_v=LABORATORY_RESOLUTION_V))
+    )
     if cell is None and pack is not None:
         cell = _locate_cell(pack, settings.pack.cell)
     if capacity_ah is None:
@@ -52,8 +57,8 @@ def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None)
 
 def _locate_cell(pack: Path, cell: str) -> str:
     """Return the path of the cell file in the folder of a pack file, if it exists; otherwise return ``cell`` unchanged."""
-    beside = pack.parent / cell
-    return str(beside) if beside.is_file() else cell
+    cell_file = pack.parent / cell
+    return str(cell_file) if cell_file.is_file() else cell
 
 
 def _model(settings: Settings, cell: str, capacity_ah: float | None) -> PackModel:
@@ -69,7 +74,7 @@ def reject_soc_for_fuel_cell(model: PackModel, key: str) -> None:
 
     Args:
         model: Model of the whole pack.
-        key: Setting or option of the SOC, for the error.
+        key: Name of the setting or option that gives the SOC, for the error.
 
     Raises:
         UserError: The model is a fuel cell.
@@ -100,7 +105,7 @@ def with_sensor(settings: Settings, **changes: object) -> Settings:
 
 
 def with_broker(settings: Settings, url: str) -> Settings:
-    """Return settings with another broker.
+    """Return settings whose broker is ``url``; the other settings of ``[mqtt]`` are unchanged.
 
     Raises:
         UserError: ``url`` is not a valid broker URL.

@@ -11,15 +11,15 @@ from pydantic import ValidationError
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.page import PageSettings
 
-DESKTOP = ("DISPLAY", "WAYLAND_DISPLAY")
-"""Environment variables of a desktop session."""
+DESKTOP_VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY")
+"""Environment variables of which a desktop session sets at least one."""
 
 
 def page_settings(settings: PageSettings, **options: Any) -> PageSettings:
-    """Return the settings with the page's options of the command line.
+    """Return the settings of a page, changed by options of the command line; None leaves a setting unchanged.
 
     Raises:
-        UserError: An option is invalid.
+        UserError: The address to listen on is invalid, or is open to other machines and there is no token file.
     """
     given = {name: value for name, value in options.items() if value is not None}
     try:
@@ -30,7 +30,10 @@ def page_settings(settings: PageSettings, **options: Any) -> PageSettings:
 
 
 def open_browser(url: str) -> None:
-    """Open ``url`` in a desktop's browser, in a thread, because some browsers block until they are closed."""
-    if not sys.stdout.isatty() or not any(os.environ.get(name) for name in DESKTOP):
+    """Open ``url`` in a browser if the user works on a desktop.
+
+    The browser is opened in a thread, because some browsers block until they are closed.
+    """
+    if not sys.stdout.isatty() or not any(os.environ.get(name) for name in DESKTOP_VARIABLES):
         return
     threading.Thread(target=webbrowser.open, args=[url], name="browser", daemon=True).start()

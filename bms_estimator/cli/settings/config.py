@@ -9,7 +9,7 @@ import typer
 
 from bms_estimator.cli.live.ports import show_probing
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.cli.settings.settings_template import Given, settings_file
+from bms_estimator.cli.settings.settings_template import GivenSettings, settings_file
 from bms_estimator.estimator.settings_plausibility import implausible_settings
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.estimator.stability_conditions import Condition, failed_conditions
@@ -21,7 +21,7 @@ from bms_estimator.mqtt.broker_config import check as check_brokers
 from bms_estimator.page.access_control import make_access_control
 from bms_estimator.process.systemd import is_for_the_service
 from bms_estimator.service.alarm_hooks import hook_warnings
-from bms_estimator.settings.alarm_limits import out_of_range, watched
+from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.settings.mqtt import MqttSettings
@@ -37,7 +37,7 @@ from bms_estimator.sources.serial.port_list import board_ports
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check or show a pack's settings.")
 
 ONLY_IN_SERVICE = "not checked, because a systemd credential exists only while the service runs"
-"""Text of the warning about a file that only the running service can read."""
+"""Warning about a credential file, which is checked only if this process can read it."""
 
 BrokerSettings = TypeVar("BrokerSettings", MqttSettings, EdgeSettings)
 
@@ -70,7 +70,7 @@ def init(
     typer.echo(f"{file}: written; edit it, then: bms-estimator config check {file}")
 
 
-def _probe_settings(ports: Sequence[str]) -> Given:
+def _probe_settings(ports: Sequence[str]) -> GivenSettings:
     """Return the settings for the detected device, and print its name.
 
     Raises:
@@ -102,7 +102,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     settings, cell = load_pack(file)
     warnings = [
         *implausible_settings(settings, cell),
-        *out_of_range(settings, cell),
+        *implausible_limits(settings, cell),
         *hook_warnings(settings),
         *_failed_conditions(cell),
     ]
@@ -117,12 +117,12 @@ def check(file: PackFile = Path("pack.toml")) -> None:
         unreadable, unchecked = _unreadable("page", settings.page, "token_file")
         warnings += unchecked
         if not unreadable:
-            make_access_control(settings.page)
+            make_access_control(settings.page)  # raises UserError if the token file is invalid
     if settings.influx is not None:
         unreadable, unchecked = _unreadable("influx", settings.influx, "password_file", "token_file")
         warnings += unchecked
-        target(settings.influx.model_copy(update=dict.fromkeys(unreadable)))
-    make_line_producer(settings)  # reports parts of [source] that are invalid or not installed
+        target(settings.influx.model_copy(update=dict.fromkeys(unreadable)))  # raises UserError for invalid credentials
+    make_line_producer(settings)  # raises an error if [source] is invalid or its optional package is missing
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: good: {_summary(settings, cell)}")
@@ -145,8 +145,8 @@ def show(
 
 
 def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
-    """Return values derived from the settings: of the pack, the observer and the alarms."""
-    record = estimator_settings(
+    """Return values that follow from the settings and the cell: of pack, observer and alarms, by dotted name."""
+    records = estimator_settings(
         cell,
         settings.observer,
         settings.identifier,
@@ -154,21 +154,25 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         voltage_noise_v=settings.sensor.voltage_noise_v,
         initial_soc=settings.pack.initial_soc,
         sampling=settings.sampling,
-    )[0]["observer"]
+    )
+    observer = records[0]["observer"]
     values = {
         "pack.nominal_voltage_v": cell.cell.nominal_voltage_v,
         "pack.series_count": cell.cell.series_count,
-        "observer.dead_zone_v": record["dead_zone_v"],
-        "observer.epsilon_v": record["epsilon_v"],
-        "observer.lock_error_v": record["lock_error_v"],
+        "observer.dead_zone_v": observer["dead_zone_v"],
+        "observer.epsilon_v": observer["epsilon_v"],
+        "observer.lock_error_v": observer["lock_error_v"],
         "publish_period_s": 1.0 / settings.publish.rate_hz,
     }
     if isinstance(cell, CellModel):
+        # values to which the observer adapts a7..a9 of C_ts and a10..a12 of C_tl
         a = {i: cell.bounds(i).limit for i in range(7, 13)}
         values["pack.capacity_ah"] = cell.cell.capacity_ah
-        values["observer.delta_1"] = delta(a[8], a[9], a[7])  # (2.11) of the thesis
-        values["observer.delta_2"] = delta(a[11], a[12], a[10])  # (2.12) of the thesis
-    for alarm in watched(settings, cell):
+        # SOC below which C_ts is negative, (2.11) of the thesis
+        values["observer.delta_1"] = delta(exponent=a[8], offset=a[9], amplitude=a[7])
+        # SOC below which C_tl is negative, (2.12) of the thesis
+        values["observer.delta_2"] = delta(exponent=a[11], offset=a[12], amplitude=a[10])
+    for alarm in monitored_alarms(settings, cell):
         values[f"alarms.{alarm.name}.limit"], values[f"alarms.{alarm.name}.clear"] = alarm.limit, alarm.clear
     return values
 
@@ -191,10 +195,13 @@ def _unreadable(
 
 
 def _failed_conditions(cell: PackModel) -> list[str]:
-    """Return the conditions of Lemma 4.1.1 of the thesis that the cell's bounds fail; empty for a fuel cell."""
-    return (
-        [f"{cell.cell.name}: {_violation(c)}" for c in failed_conditions(cell)] if isinstance(cell, CellModel) else []
-    )
+    """Return a warning for each condition of Lemma 4.1.1 of the thesis that the cell's bounds fail.
+
+    A fuel cell has no such bounds, and gives no warning.
+    """
+    if not isinstance(cell, CellModel):
+        return []
+    return [f"{cell.cell.name}: {_violation(condition)}" for condition in failed_conditions(cell)]
 
 
 def _violation(condition: Condition) -> str:
@@ -205,7 +212,7 @@ def _violation(condition: Condition) -> str:
 
 
 def _summary(settings: Settings, cell: PackModel) -> str:
-    c = cell.cell
+    ratings = cell.cell
     broker = ", ".join(settings.mqtt.urls) if settings.mqtt else "no broker"
     if settings.edge:
         url = settings.edge.url
@@ -213,6 +220,6 @@ def _summary(settings: Settings, cell: PackModel) -> str:
     capacity = f"{cell.cell.capacity_ah:g} Ah" if isinstance(cell, CellModel) else "fuel cell"
     board = f"{settings.sensor.protocol} board on {settings.sensor.port}"
     return (
-        f"{settings.pack.name}: {c.name}, {c.series_count} in series, {c.nominal_voltage_v:g} V, {capacity}; "
-        f"{settings.source.described if settings.source else board}; {broker}"
+        f"{settings.pack.name}: {ratings.name}, {ratings.series_count} in series, {ratings.nominal_voltage_v:g} V, {capacity}; "
+        f"{settings.source.short_description if settings.source else board}; {broker}"
     )

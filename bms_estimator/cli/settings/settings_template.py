@@ -11,46 +11,51 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 UNITS = {"v": "V", "a": "A", "s": "s", "h": "h", "hz": "Hz", "ah": "Ah", "ohm": "ohm", "c": "°C"}
-"""Units by the last part of a key's name."""
-WIDTH = 110
+"""Units by the part of a key after its last underscore."""
+COMMENT_WIDTH = 110
 """Maximum line length of comments."""
 HEAD = """\
 # Settings of one pack. A setting that begins with # has the default value shown; remove the # to change it.
 # A key such as poll_s ends in the unit of its value. Current is positive on discharge.
 """
-_SIGNS = {Gt: ("gt", "above"), Ge: ("ge", "at least"), Lt: ("lt", "below"), Le: ("le", "at most")}
+_LIMIT_WORDS = {Gt: ("gt", "above"), Ge: ("ge", "at least"), Lt: ("lt", "below"), Le: ("le", "at most")}
+"""Attribute with the value of a constraint, and its words in a comment, by the constraint's type."""
+
+GivenSettings = Mapping[str, Mapping[str, object]]
+"""Values by section and key, which replace the defaults."""
 
 
-Given = Mapping[str, Mapping[str, object]]
-"""Values by section and key."""
-
-
-def settings_file(model: type[BaseModel], given: Given = MappingProxyType({})) -> str:
+def settings_file(model: type[BaseModel], given: GivenSettings = MappingProxyType({})) -> str:
     """Return TOML text with the description, unit, constraints and default of each setting of ``model``.
 
     Args:
-        model: Model of the sections.
-        given: Settings whose values differ from their defaults.
+        model: Model of the whole file; each of its fields is a section.
+        given: Settings that are written without ``#``.
     """
     lines = [HEAD]
     for name, field in model.model_fields.items():
-        optional = field.default is None
-        omission = f" {_sentence(field.description)}" if optional and field.description else ""
-        for section in _models(field.annotation):  # a section for each alternative
-            lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{omission}")
-            lines += [f"{'#' if optional else ''}[{name}]", *_settings(section, given.get(name, {})), ""]
+        is_optional = field.default is None
+        effect_of_omission = f" {_sentence(field.description)}" if is_optional and field.description else ""
+        for section in _models(field.annotation):  # [source] has one model for each kind of source
+            lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{effect_of_omission}")
+            lines += [f"{'#' if is_optional else ''}[{name}]", *_setting_lines(section, given.get(name, {})), ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _settings(section: type[BaseModel], given: Mapping[str, object]) -> Iterator[str]:
+def _setting_lines(section: type[BaseModel], given: Mapping[str, object]) -> Iterator[str]:
     for name, field in section.model_fields.items():
         key = field.alias or name
-        yield from _comment("  ".join(part for part in (field.description, _allowed(key, field)) if part))
-        yield f"{key} = {tomlkit.item(given[key]).as_string()}" if key in given else f"#{key} = {_value(field)}"
+        yield from _comment("  ".join(part for part in (field.description, _unit_and_constraints(key, field)) if part))
+        yield (
+            f"{key} = {tomlkit.item(given[key]).as_string()}" if key in given else f"#{key} = {_default_as_toml(field)}"
+        )
 
 
-def _value(field: FieldInfo) -> str:
-    """Return the default as TOML. A required literal gives its first choice; any other required field gives no text."""
+def _default_as_toml(field: FieldInfo) -> str:
+    """Return the default as TOML.
+
+    A required field has no default: a literal gives its first choice, any other field an empty text.
+    """
     if get_origin(field.annotation) is Literal and field.is_required():
         return f'"{get_args(field.annotation)[0]}"'
     default = None if field.is_required() else field.get_default(call_default_factory=True)
@@ -60,10 +65,10 @@ def _value(field: FieldInfo) -> str:
     return "" if default is None else tomlkit.item(default).as_string()
 
 
-def _allowed(key: str, field: FieldInfo) -> str:
+def _unit_and_constraints(key: str, field: FieldInfo) -> str:
     """Return unit and constraints, such as ``[V, at least 0]``; empty without unit and constraints."""
     choices, limits = _constraints(field.annotation)
-    limits += [_limit(item) for item in field.metadata if type(item) in _SIGNS]
+    limits += [_limit(item) for item in field.metadata if type(item) in _LIMIT_WORDS]
     unit = [UNITS[key.rsplit("_", 1)[-1]]] if "_" in key and key.rsplit("_", 1)[-1] in UNITS else []
     one_of = [f"one of {', '.join(choices)}"] if len(choices) > 1 else [f"always {choice}" for choice in choices]
     parts = ", ".join(unit + one_of + limits)
@@ -78,8 +83,9 @@ def _constraints(annotation: Any) -> tuple[list[str], list[str]]:
     choices: list[str] = []
     limits: list[str] = []
     if origin is Annotated:
-        for constraint in arguments[1:]:
-            limits += [_limit(item) for item in getattr(constraint, "metadata", [constraint]) if type(item) in _SIGNS]
+        for constraint in arguments[1:]:  # pydantic's Field keeps its constraints in ``metadata``
+            items = getattr(constraint, "metadata", [constraint])
+            limits += [_limit(item) for item in items if type(item) in _LIMIT_WORDS]
     for inner in arguments[:1] if origin is Annotated else arguments:
         inner_choices, inner_limits = _constraints(inner)
         choices += inner_choices
@@ -88,7 +94,7 @@ def _constraints(annotation: Any) -> tuple[list[str], list[str]]:
 
 
 def _limit(constraint: Any) -> str:
-    attribute, words = _SIGNS[type(constraint)]
+    attribute, words = _LIMIT_WORDS[type(constraint)]
     return f"{words} {getattr(constraint, attribute):.10g}"
 
 
@@ -96,7 +102,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
     """Return the models of an annotation, which may be optional or a union."""
     if isinstance(annotation, type):
         return [annotation] if issubclass(annotation, BaseModel) else []
-    return [model for option in get_args(annotation) for model in _models(option)]
+    return [model for argument in get_args(annotation) for model in _models(argument)]
 
 
 def _sentence(text: str | None) -> str:
@@ -106,4 +112,4 @@ def _sentence(text: str | None) -> str:
 
 
 def _comment(text: str) -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+    return textwrap.wrap(text, COMMENT_WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)

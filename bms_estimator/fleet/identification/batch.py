@@ -23,14 +23,14 @@ class Task:
 
     Attributes:
         pack: Name of the pack.
-        kind: Row of the pack in the table of packs.
-        cell_file: Text of the cell file that ``kind`` names; None for a shipped cell.
+        spec: Row of the pack in the table of packs.
+        cell_file: Text of the cell file that ``spec`` names; None for a shipped cell.
         since_s, until_s: Time span of the samples [s since 1970].
         server, creds, ca: Address, credentials file and certificate authority of the NATS server.
     """
 
     pack: str
-    kind: PackSpec
+    spec: PackSpec
     cell_file: str | None
     since_s: float
     until_s: float
@@ -62,7 +62,7 @@ def reidentify_one(task: Task) -> ReidentificationResult:
         capture = asyncio.run(_fetch(task))
         if not capture.blocks:
             return ReidentificationResult(task.pack, reason="the server keeps no sample of it in this span")
-        return reidentify(task.pack, np.concatenate(list(capture.samples())), task.kind, task.cell_file)
+        return reidentify(task.pack, np.concatenate(list(capture.samples())), task.spec, task.cell_file)
     except UserError as error:
         return ReidentificationResult(task.pack, reason=str(error))
     except Exception as error:  # noqa: BLE001 - reported for this pack, so that the others' hours of work are not lost

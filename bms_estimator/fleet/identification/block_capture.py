@@ -1,5 +1,6 @@
 """Capture of a pack's blocks from the stream, in order and without repetitions."""
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ AHEAD_S = 3600.0
 """Maximum lead of an edge's clock over the server's clock [s]. A block may be stored this long before the time of its
 samples."""
 
-MIN_YIELDED_ROWS = 65_536
+MIN_YIELDED_SAMPLES = 65_536
 """Minimum number of samples that are yielded at a time, except for the last ones."""
 
 
@@ -24,7 +25,7 @@ MIN_YIELDED_ROWS = 65_536
 class BlockCapture:
     """Blocks of one pack, to be added in the order of the stream.
 
-    Blocks of a store that the edge has replaced by a newer store are skipped, as by the workers.
+    Blocks of a store that the edge has replaced by a newer store are skipped, because workers skip them too.
 
     Args:
         since_s: Beginning of the time span [s since 1970].
@@ -32,15 +33,15 @@ class BlockCapture:
 
     Attributes:
         damaged: Number of messages that cannot be decoded.
-        again: Number of blocks that arrived more than once, or belong to a former store.
+        repeated: Number of blocks that arrived more than once, or belong to a former store.
     """
 
     since_s: float = -np.inf
     until_s: float = np.inf
     damaged: int = 0
-    again: int = 0
-    _blocks: dict[tuple[int, int], bytes] = field(default_factory=dict)
-    _store: int = 0
+    repeated: int = 0
+    _blocks: dict[tuple[int, int], bytes] = field(default_factory=dict)  # by store and number
+    _store: int = 0  # newest store
 
     def add(self, data: bytes) -> None:
         """Add the next message of the pack."""
@@ -51,7 +52,7 @@ class BlockCapture:
             return
         key = (block.store, block.number)
         if block.store < self._store or key in self._blocks:
-            self.again += 1
+            self.repeated += 1
             return
         self._store = block.store
         if _wall_s(block, -1) >= self.since_s and _wall_s(block, 0) < self.until_s:
@@ -74,8 +75,12 @@ class BlockCapture:
     @property
     def missing(self) -> list[tuple[int, int]]:
         """First and last number of each range of missing blocks within a store."""
-        pairs = zip(ordered := sorted(self._blocks), ordered[1:], strict=False)
-        return [(a + 1, b - 1) for (store, a), (other, b) in pairs if store == other and b > a + 1]
+        pairs = itertools.pairwise(sorted(self._blocks))
+        return [
+            (number + 1, next_number - 1)
+            for (store, number), (next_store, next_number) in pairs
+            if store == next_store and next_number > number + 1
+        ]
 
     def samples(self) -> Iterator[SampleBlock]:
         """Yield all samples.
@@ -83,26 +88,26 @@ class BlockCapture:
         ``time_s`` counts from the creation of the first store. Samples of a later store follow by the edge's wall clock,
         or immediately after the last sample if that clock was set back.
         """
-        parts, rows = list[SampleBlock](), 0
+        parts, count = list[SampleBlock](), 0
         for part in self._parts():
             parts.append(part)
-            rows += part.size
-            if rows >= MIN_YIELDED_ROWS:
+            count += part.size
+            if count >= MIN_YIELDED_SAMPLES:
                 yield np.concatenate(parts)
-                parts, rows = [], 0
+                parts, count = [], 0
         if parts:
             yield np.concatenate(parts)
 
     def _parts(self) -> Iterator[SampleBlock]:
-        store, origin, offset_s, last_s = 0, 0, 0.0, 0.0
+        store, first_store, offset_s, last_s = 0, 0, 0.0, 0.0  # store 0: none yet
         for key in sorted(self._blocks):
             block = self._block(key)
             samples = block.samples[self._in_span(block)]
             if not samples.size:
                 continue
-            origin = origin or block.store
+            first_store = first_store or block.store
             if store not in (0, block.store):
-                offset_s = max((block.store - origin) * 1e-9, last_s - float(samples["time_s"][0]))
+                offset_s = max((block.store - first_store) * 1e-9, last_s - float(samples["time_s"][0]))
             store = block.store
             samples["time_s"] += offset_s
             last_s = float(samples["time_s"][-1])
@@ -124,7 +129,7 @@ async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: f
     """Fetch the blocks of a pack that the stream still has.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         pack: Name of the pack.
         since_s: Beginning of the time span by the edge's clock [s since 1970].
         until_s: End of the time span [s since 1970].

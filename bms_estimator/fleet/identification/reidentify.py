@@ -5,6 +5,8 @@ estimator's filter has learned at their end. The second method starts from this 
 has the largest charge throughput (``calibration.elements.identify``). The last third is the holdout: each cell predicts
 the voltage from the current in open loop for some hours at a time, and the prediction is compared with the measured
 voltage.
+
+All quantities are those of one cell-file object, which is the cell, module or block that the cell file describes.
 """
 
 import math
@@ -44,7 +46,7 @@ MAX_SOC_STD = 0.05
 """Maximum standard deviation of the SOC at which a fit starts."""
 MIN_GAIN = 0.03
 """Minimum relative reduction of the RMS error on the holdout for which a new cell replaces the old cell."""
-ROWS = 65_536
+MAX_BLOCK_SAMPLES = 65_536
 """Maximum number of samples that are estimated at a time."""
 
 
@@ -95,8 +97,8 @@ class ReidentificationResult:
     remark: str = ""
 
 
-class _NotEnoughError(ValueError):
-    """Insufficient samples; the message gives the reason."""
+class _UnsuitableError(ValueError):
+    """Samples or pack that cannot be identified; the message gives the reason."""
 
 
 def cell_name(pack: str) -> str:
@@ -104,46 +106,48 @@ def cell_name(pack: str) -> str:
     return f"of-{pack}"
 
 
-def reidentify(pack: str, samples: SampleBlock, kind: PackSpec, cell_file: str | None) -> ReidentificationResult:
+def reidentify(pack: str, samples: SampleBlock, spec: PackSpec, cell_file: str | None) -> ReidentificationResult:
     """Re-identify one pack.
 
     Args:
         pack: Name of the pack.
         samples: Samples of the pack, dtype ``SAMPLE``.
-        kind: Row of the pack in the table of packs.
+        spec: Row of the pack in the table of packs.
         cell_file: Text of the cell file that the row names; None for a shipped cell.
     """
     seconds = float(np.ptp(samples["time_s"])) if samples.size else 0.0
     outcome = ReidentificationResult(pack, hours=seconds / 3600.0)
     try:
-        cell = _battery(kind, cell_file)
-        outcome = replace(outcome, capacity_before_ah=cell.cell.capacity_ah, r_s_before_ohm=_r_s(cell))
-        return _Pack(outcome, _single_cell_samples(samples, kind), kind, cell).reidentify()
-    except (_NotEnoughError, UserError) as error:
-        return replace(outcome, reason=_in_a_line(error))
+        cell = _battery(spec, cell_file)
+        outcome = replace(
+            outcome, capacity_before_ah=cell.cell.capacity_ah, r_s_before_ohm=_series_resistance_ohm(cell)
+        )
+        return _Pack(outcome, _single_cell_samples(samples, spec), spec, cell).reidentify()
+    except (_UnsuitableError, UserError) as error:
+        return replace(outcome, reason=_on_one_line(error))
 
 
 class _Pack:
     """Samples of one pack, converted to one cell-file object."""
 
-    def __init__(self, outcome: ReidentificationResult, samples: SampleBlock, kind: PackSpec, cell: CellModel) -> None:
-        self._outcome, self._kind, self._cell = outcome, kind, cell
+    def __init__(self, outcome: ReidentificationResult, samples: SampleBlock, spec: PackSpec, cell: CellModel) -> None:
+        self._outcome, self._spec, self._cell = outcome, spec, cell
         seconds = 3600.0 * outcome.hours
         if seconds < MIN_DURATION_S:
-            raise _NotEnoughError(
+            raise _UnsuitableError(
                 f"{seconds / 3600.0:.1f} h of samples: at least {MIN_DURATION_S / 3600.0:g} h are needed"
             )
         pieces = [piece for piece in _pieces(samples) if np.ptp(piece["time_s"]) >= MIN_PIECE_S]
         throughput = sum(map(_throughput_ah, pieces)) / cell.cell.capacity_ah
         if throughput < MIN_THROUGHPUT:
-            raise _NotEnoughError(
+            raise _UnsuitableError(
                 f"{throughput:.2f} capacities were charged and discharged in {seconds / 3600.0:.1f} h: at least {MIN_THROUGHPUT:g} is needed"
             )
         split_s = samples["time_s"][0] + TRAINING_FRACTION * seconds
         self._training = list(_clipped(pieces, -math.inf, split_s))
         self._holdout = list(_clipped(pieces, split_s, math.inf))
         if not self._training or not self._holdout:
-            raise _NotEnoughError(
+            raise _UnsuitableError(
                 f"no {MIN_PIECE_S / 60.0:g} min without a gap: check the edge's connection and its board"
             )
 
@@ -154,35 +158,35 @@ class _Pack:
         remark = ""
         try:
             cells["fitted"] = self._fit(learned, soc, std)
-        except (UserError, _NotEnoughError) as error:
-            remark = _in_a_line(error)
-        before = self._holdout_error(self._cell)
-        judged = {method: self._holdout_error(cell) for method, cell in cells.items()}
-        best = min(judged, key=lambda method: judged[method].rms_v)
-        cell, rms_v = cells[best], judged[best].rms_v
+        except (UserError, _UnsuitableError) as error:
+            remark = _on_one_line(error)
+        old_error = self._holdout_error(self._cell)
+        new_errors = {method: self._holdout_error(cell) for method, cell in cells.items()}
+        best = min(new_errors, key=lambda method: new_errors[method].rms_v)
+        cell, rms_v = cells[best], new_errors[best].rms_v
         outcome = replace(
             self._outcome,
             method=best,
             capacity_ah=cell.cell.capacity_ah,
             capacity_std_ah=cell.cell.capacity_ah * (cell.cell.capacity_std or math.nan),
-            r_s_ohm=_r_s(cell),
-            rms_before_v=before.rms_v,
+            r_s_ohm=_series_resistance_ohm(cell),
+            rms_before_v=old_error.rms_v,
             rms_v=rms_v,
-            judged=judged[best].samples,
+            judged=new_errors[best].samples,
             remark=remark,
         )
-        if not judged[best].samples:
+        if not new_errors[best].samples:
             return replace(outcome, reason="no holdout sample is above SOC 0.1")
-        if not rms_v < (1.0 - MIN_GAIN) * before.rms_v:
+        if not rms_v < (1.0 - MIN_GAIN) * old_error.rms_v:
             return replace(outcome, reason="not better than the present cell")
-        return replace(outcome, cell_file=self._cell_file(cell, best, before.rms_v, rms_v))
+        return replace(outcome, cell_file=self._cell_file(cell, best, old_error.rms_v, rms_v))
 
     def _learn(self) -> tuple[CellModel, Floats, Floats]:
         """Return the cell that the filter has learned from the training samples, and their SOC with its standard deviation."""
         estimator = self._estimator(self._cell)
         soc, std = _estimate(estimator, np.concatenate(self._training))
         if not estimator.state[0]["started"]:
-            raise _NotEnoughError("no sample is plausible for this cell: check series, parallel and cell")
+            raise _UnsuitableError("no sample is plausible for this cell: check series, parallel and cell")
         return identified_cell(estimator, self._cell, 1), soc, std
 
     def _fit(self, cell: CellModel, soc: Floats, std: Floats) -> CellModel:
@@ -195,10 +199,11 @@ class _Pack:
         first = sum(part.size for part in self._training[:selected])
         start_sample = first + int(np.argmin(std[first : first + piece.size]))
         if not std[start_sample] <= MAX_SOC_STD:
-            raise _NotEnoughError(
+            raise _UnsuitableError(
                 f"its SOC is known to {100.0 * std[start_sample]:.0f} % at best: rests, or a charge to the top, are missing"
             )
         drawn_ah = _drawn_ah(piece)[start_sample - first]
+        # SOC at the beginning of the piece, by counting back
         start = float(np.clip(soc[start_sample] + drawn_ah / cell.cell.capacity_ah, 0.0, 1.0))
         return identify([Columns(piece, self._outcome.pack)], cell, initial_soc=start).cell
 
@@ -210,18 +215,19 @@ class _Pack:
         for window in _windows(self._holdout):
             start = float(estimator.state["soc"][0])
             try:
-                errors = validate(Columns(window, self._outcome.pack), cell, initial_soc=start).above
+                report = validate(Columns(window, self._outcome.pack), cell, initial_soc=start)
             except UserError:  # the SOC leaves 0..1, or most samples are implausible for this cell
                 return HoldoutError(math.inf, count)
+            errors = report.above  # above SOC 0.1
             if errors.samples:
                 squares, count = squares + errors.samples * errors.voltage_rms_v**2, count + errors.samples
             _estimate(estimator, window)
         return HoldoutError(math.sqrt(squares / count) if count else math.inf, count)
 
     def _estimator(self, cell: CellModel) -> Estimator:
-        settings = settings_of(self._kind)
+        settings = settings_of(self._spec)
         sensor, sampling = settings.sensor, settings.sampling
-        series, parallel = self._kind.series, self._kind.parallel
+        series, parallel = self._spec.series, self._spec.parallel
         return Estimator(
             cell,
             settings.observer,
@@ -241,25 +247,25 @@ class _Pack:
             "fitted": "fitted to its longest piece without a gap",
         }
         remarks = [
-            f"{self._kind.cell} of the pack {self._outcome.pack}, {origins[method]}, from {self._outcome.hours:.1f} h.",
+            f"{self._spec.cell} of the pack {self._outcome.pack}, {origins[method]}, from {self._outcome.hours:.1f} h.",
             f"RMS error of the voltage on later samples: {1e3 * before_v:.1f} mV before, {1e3 * after_v:.1f} mV after.",
         ]
         return cell_text(cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name})}), remarks)
 
 
-def _battery(kind: PackSpec, cell_file: str | None) -> CellModel:
-    cell = cell_of(kind, cell_file)
+def _battery(spec: PackSpec, cell_file: str | None) -> CellModel:
+    cell = cell_of(spec, cell_file)
     if not isinstance(cell, CellModel):
-        raise _NotEnoughError(f"{kind.cell} is a fuel cell: its cell file is identified from polarisation curves")
+        raise _UnsuitableError(f"{spec.cell} is a fuel cell: its cell file is identified from polarisation curves")
     return cell
 
 
-def _single_cell_samples(samples: SampleBlock, kind: PackSpec) -> SampleBlock:
+def _single_cell_samples(samples: SampleBlock, spec: PackSpec) -> SampleBlock:
     """Return the samples with increasing time, converted to one cell-file object."""
     latest_s = np.maximum.accumulate(np.r_[-math.inf, samples["time_s"][:-1]])
     one = samples[samples["time_s"] > latest_s]
-    one["voltage_v"] /= kind.series
-    one["current_a"] /= kind.parallel
+    one["voltage_v"] /= spec.series
+    one["current_a"] /= spec.parallel
     return one
 
 
@@ -285,8 +291,8 @@ def _windows(pieces: list[SampleBlock]) -> Iterator[SampleBlock]:
 def _estimate(estimator: Estimator, samples: SampleBlock) -> tuple[Floats, Floats]:
     """Return SOC and its standard deviation at each sample: NaN and infinity before the first accepted sample."""
     soc, std = np.empty(samples.size), np.empty(samples.size)
-    for first in range(0, samples.size, ROWS):
-        block = samples[first : first + ROWS]
+    for first in range(0, samples.size, MAX_BLOCK_SAMPLES):
+        block = samples[first : first + MAX_BLOCK_SAMPLES]
         trace = estimator.run(block)
         last = np.searchsorted(trace["time_s"], block["time_s"], side="right") - 1
         part = slice(first, first + block.size)
@@ -306,10 +312,10 @@ def _throughput_ah(piece: SampleBlock) -> float:
     return float(np.abs(np.diff(_drawn_ah(piece))).sum())
 
 
-def _in_a_line(error: Exception) -> str:
+def _on_one_line(error: Exception) -> str:
     return str(error).replace("\n", "; ")
 
 
-def _r_s(cell: CellModel) -> float:
+def _series_resistance_ohm(cell: CellModel) -> float:
     """Return R_s at SOC 0.5 [ohm]."""
     return float(r_s(0.5, cell.a))

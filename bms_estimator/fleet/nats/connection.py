@@ -132,12 +132,12 @@ def parse_addresses(servers: str) -> list[str]:
     Raises:
         UserError: An address is invalid or of another protocol.
     """
-    found = [each.strip() for each in servers.split(",")]
-    if not all(re.fullmatch(r"((nats|tls)://)?[^/\s]+", each) for each in found):
+    addresses = [each.strip() for each in servers.split(",")]
+    if not all(re.fullmatch(r"((nats|tls)://)?[^/\s]+", each) for each in addresses):
         raise UserError(
             f"--server {servers}: must be nats://host:port or tls://host:port, or several separated by commas"
         )
-    return found
+    return addresses
 
 
 def check_credentials_file(creds: Path) -> Path:
@@ -185,7 +185,7 @@ class _ConnectionEvents:
             log.warning("error of the connection to the server", server=self._servers, reason=text)
 
     async def on_disconnect(self) -> None:
-        if self._nc.is_closed:  # by this process
+        if self._nc.is_closed:  # closed by this process
             return
         self._on_link_change("the connection is lost")
         log.warning("the connection to the server is lost; reconnecting", server=self._servers)
@@ -199,8 +199,8 @@ class _ConnectionEvents:
 def error_text(error: BaseException) -> str:
     """Return the text of an error of NATS or of the connection, with a remedy if one is known."""
     text = str(getattr(error, "description", None) or error).removeprefix("nats: ") or type(error).__name__
-    for kind, reason in _TEXT_BY_CLASS.items():
-        if isinstance(error, kind):
+    for error_class, reason in _TEXT_BY_CLASS.items():
+        if isinstance(error, error_class):
             return f"{reason} ({text})" if isinstance(error, nats.js.errors.APIError) else reason
     for part_of_text, reason in _TEXT_BY_PART.items():
         if part_of_text in text.lower():

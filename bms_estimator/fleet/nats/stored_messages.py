@@ -19,9 +19,9 @@ async def read_messages(
     The node that responds may lag behind the stream's leader. Therefore it is polled until it has the message ``last``.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         stream: Name of the stream; it must allow direct gets.
-        subject: May have wildcards.
+        subject: Subject of the messages; may have wildcards.
         first: First stream sequence number.
         last: Stream sequence number of the subject's last message.
 

@@ -41,11 +41,11 @@ async def read_stream(
     """Yield batches of messages in the order of the stream, up to its last message.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         stream: Name of the stream; it must allow direct gets.
         subject: Subject of the messages; may have wildcards.
         first: First stream sequence number.
-        since_s: If given, messages stored since this wall clock are read instead [s since 1970].
+        since_s: Wall clock from which on stored messages are read [s since 1970]; replaces ``first``.
 
     Raises:
         StreamError: The server does not respond or rejects the request.
@@ -54,15 +54,15 @@ async def read_stream(
     if since_s is not None:
         start = {"start_time": datetime.fromtimestamp(since_s, UTC).isoformat()}
     while True:
-        batch, pending = await _batch(nc, stream, {"next_by_subj": subject, **start})
+        batch, has_more = await _fetch_batch(nc, stream, {"next_by_subj": subject, **start})
         if batch:
             yield batch
-        if not pending:
+        if not has_more:
             return
         start = {"seq": batch[-1].sequence + 1}
 
 
-async def _batch(nc: Client, stream: str, request: dict[str, object]) -> tuple[list[StoredMessage], bool]:
+async def _fetch_batch(nc: Client, stream: str, request: dict[str, object]) -> tuple[list[StoredMessage], bool]:
     """Return one batch, and True if the stream has further messages."""
     inbox = nc.new_inbox()
     responses = await nc.subscribe(inbox, pending_msgs_limit=-1, pending_bytes_limit=-1)
@@ -75,6 +75,7 @@ async def _batch(nc: Client, stream: str, request: dict[str, object]) -> tuple[l
 
 
 async def _collect(responses: Subscription, stream: str) -> tuple[list[StoredMessage], bool]:
+    """Receive the messages of one batch up to the status that ends it. The result is that of ``_fetch_batch``."""
     batch = list[StoredMessage]()
     while True:
         try:

@@ -69,7 +69,7 @@ async def make_streams(
     """Create missing streams and consumers, and set limits and replicas as configured. The function is idempotent.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         partitions: Number of partitions of ``RAW``, which cannot change.
         replicas: Number of replicas: 1, or 3 in a cluster of three.
         raw_bytes: Maximum size of ``RAW`` [bytes]; beyond it the oldest messages are dropped.
@@ -79,13 +79,13 @@ async def make_streams(
         UserError: The streams have another number of partitions, or the server has too little disk space.
         NoAnswerError: The server does not respond.
     """
-    found = await partitions_of(nc)
-    if found not in (None, partitions):
+    existing = await partitions_of(nc)
+    if existing not in (None, partitions):
         raise UserError(
-            f"the stream {subjects.RAW_STREAM} has {found} partitions, but {partitions} are configured: "
+            f"the stream {subjects.RAW_STREAM} has {existing} partitions, but {partitions} are configured: "
             "the number of a stream cannot change"
         )
-    for stream in (_raw(partitions, raw_bytes, raw_age_s), _hours(raw_bytes), *_buckets()):
+    for stream in (_raw_stream(partitions, raw_bytes, raw_age_s), _hours_stream(raw_bytes), *_bucket_streams()):
         await _retry(_ensure_stream, nc, stream | {"num_replicas": replicas})
     numbers = range(partitions)
     for first in range(0, partitions, CONSUMER_BATCH):
@@ -114,7 +114,7 @@ def pack_blocks(raw_bytes: int) -> int:
     return max(round(PACK_FRACTION * raw_bytes / MAX_BLOCK_BYTES), MIN_PACK_BLOCKS)
 
 
-def _raw(partitions: int, max_bytes: int, age_s: float) -> dict[str, Any]:
+def _raw_stream(partitions: int, max_bytes: int, age_s: float) -> dict[str, Any]:
     source, destination = subjects.mapping(partitions)
     limits = {
         "max_bytes": max_bytes,
@@ -133,7 +133,7 @@ def _raw(partitions: int, max_bytes: int, age_s: float) -> dict[str, Any]:
     )
 
 
-def _hours(raw_bytes: int) -> dict[str, Any]:
+def _hours_stream(raw_bytes: int) -> dict[str, Any]:
     limits = {
         "max_bytes": round(HOURS_FRACTION * raw_bytes),
         "max_age": _ns(HOURS_AGE_S),
@@ -143,7 +143,7 @@ def _hours(raw_bytes: int) -> dict[str, Any]:
     return _stream(subjects.HOURS_STREAM, subjects.hours(), duplicate_window=_ns(DUPLICATES_S), **limits)
 
 
-def _buckets() -> list[dict[str, Any]]:
+def _bucket_streams() -> list[dict[str, Any]]:
     common = {"discard": "new", "allow_rollup_hdrs": True, "allow_direct": True}
     states = subjects.STATES_BUCKET
     return [

@@ -20,7 +20,7 @@ from bms_estimator.settings.pack import DEVICE_NAME
 
 MAX_ERRORS = 20
 """Maximum number of reported errors of a table."""
-CELL_FILE = ".toml"
+CELL_FILE_SUFFIX = ".toml"
 """Suffix in column ``cell`` that marks the name of a cell file beside the table."""
 _INTEGER_COLUMNS = ("series", "parallel")
 _TEXT_COLUMNS = ("pack", "cell", "protocol")
@@ -28,10 +28,11 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 class Line(NamedTuple):
-    """A row of the table and its line number."""
+    """A row of the table."""
 
     number: int
-    kind: PackSpec
+    """Number of the line in the file."""
+    spec: PackSpec
     data: bytes
     """Row as ``encode_row`` encodes it."""
 
@@ -65,7 +66,7 @@ def read_table(path: Path) -> PackTable:
 
 
 def check_models(path: Path, table: PackTable, cell_files: Mapping[str, str]) -> None:
-    """Check that each kind of pack has a valid cell model.
+    """Check that each specification has a valid cell model.
 
     Args:
         path: Path of the table, for error texts.
@@ -73,16 +74,16 @@ def check_models(path: Path, table: PackTable, cell_files: Mapping[str, str]) ->
         cell_files: Texts of the cell files by cell name.
 
     Raises:
-        UserError: A line for each kind without a valid model, with its first line in the table.
+        UserError: A line of text for each specification without a valid model, with the number of its first line in the table.
     """
     lines_by_model = dict[tuple[object, ...], list[Line]]()
     for line in table.packs.values():
-        lines_by_model.setdefault(model_key(line.kind), []).append(line)
+        lines_by_model.setdefault(model_key(line.spec), []).append(line)
     errors = []
     for lines in lines_by_model.values():
         first = lines[0]
         try:
-            model_of(first.kind, cell_files.get(first.kind.cell))
+            model_of(first.spec, cell_files.get(first.spec.cell))
         except UserError as error:
             others = f", and {len(lines) - 1} more like this" if len(lines) > 1 else ""
             errors.append(f"{path}: line {first.number}{others}: {error}")
@@ -94,7 +95,9 @@ class _Reader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._kinds = dict[tuple[str, ...], tuple[PackSpec, bytes]]()
+        self._specs = dict[
+            tuple[str, ...], tuple[PackSpec, bytes]
+        ]()  # parsed and encoded, by the values without the name
         self._files = dict[str, Path]()
 
     def table(self) -> PackTable:
@@ -107,9 +110,9 @@ class _Reader:
                 if not any(value.strip() for value in values):
                     continue
                 try:
-                    name, kind, data = self._row(columns, [value.strip() for value in values])
+                    name, spec, data = self._row(columns, [value.strip() for value in values])
                     _reject_duplicate(name, packs)
-                    packs[name] = Line(rows.line_num, kind, data)
+                    packs[name] = Line(rows.line_num, spec, data)
                 except _RowError as error:
                     errors.append(f"{self._path}: line {rows.line_num}, {error}")
         except csv.Error as error:
@@ -148,35 +151,35 @@ class _Reader:
         if not re.fullmatch(DEVICE_NAME, name):
             raise _RowError(_error_text("pack", name, "must be 1 to 64 letters, digits, _ and -"))
         key = (*values[:index], *values[index + 1 :])
-        if key not in self._kinds:
+        if key not in self._specs:
             filled = {
                 column: value for column, value in zip(columns, values, strict=True) if value and column != "pack"
             }
-            kind = self._kind(filled)
-            self._kinds[key] = kind, encode_row(kind)
-        return name, *self._kinds[key]
+            spec = self._spec(filled)
+            self._specs[key] = spec, encode_row(spec)
+        return name, *self._specs[key]
 
-    def _kind(self, filled: Mapping[str, str]) -> PackSpec:
+    def _spec(self, filled: Mapping[str, str]) -> PackSpec:
         """Return the row of the filled columns, without the pack's name."""
         values: dict[str, object] = {column: _value(column, value) for column, value in filled.items()}
         cell = filled.get("cell", "")
-        if cell.endswith(CELL_FILE):
+        if cell.endswith(CELL_FILE_SUFFIX):
             values["cell"] = self._cell_file(cell)
         try:
             return PackSpec.model_validate(values)
         except ValidationError as error:
             detail = error.errors()[0]
             column = str(detail["loc"][0])
-            described = PackSpec.model_fields[column].description
+            description = PackSpec.model_fields[column].description
             if column not in filled:
-                raise _RowError(f"column {column} is empty; it must be {described}") from None
+                raise _RowError(f"column {column} is empty; it must be {description}") from None
             message = detail["msg"].removeprefix("Value error, ")
-            raise _RowError(_error_text(column, filled[column], f"{message} ({described})")) from None
+            raise _RowError(_error_text(column, filled[column], f"{message} ({description})")) from None
 
     def _cell_file(self, value: str) -> str:
         """Check the file of a cell and return the cell's name."""
         path = self._path.parent / value
-        name = path.name.removesuffix(CELL_FILE)
+        name = path.name.removesuffix(CELL_FILE_SUFFIX)
         if not path.is_file():
             raise _RowError(_error_text("cell", value, f"no such file beside the table ({path})"))
         if not re.fullmatch(DEVICE_NAME, name):
@@ -221,13 +224,13 @@ def _suggestion(name: str) -> str:
 
 def _raise_errors(path: Path, errors: Sequence[str]) -> None:
     if errors:
-        left = len(errors) - MAX_ERRORS
-        raise UserError("\n".join([*errors[:MAX_ERRORS], *([f"{path}: and {left} more"] if left > 0 else [])]))
+        omitted = len(errors) - MAX_ERRORS
+        raise UserError("\n".join([*errors[:MAX_ERRORS], *([f"{path}: and {omitted} more"] if omitted > 0 else [])]))
 
 
 def table_lines(packs: Mapping[str, PackSpec]) -> Iterator[str]:
     """Yield the table as CSV lines with line ends; empty columns are omitted."""
-    rows = {name: kind.model_dump(exclude_defaults=True) for name, kind in sorted(packs.items())}
+    rows = {name: spec.model_dump(exclude_defaults=True) for name, spec in sorted(packs.items())}
     columns = [column for column in COLUMNS if column == "pack" or any(column in row for row in rows.values())]
     yield ",".join(columns) + "\n"
     for name, row in rows.items():

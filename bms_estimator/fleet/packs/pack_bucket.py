@@ -22,7 +22,7 @@ _REMOVING_OPERATIONS = frozenset({"DEL", "PURGE"})
 
 
 @dataclass(frozen=True)
-class Written:
+class WriteCounts:
     """Numbers of rows by the effect of a write."""
 
     new: int
@@ -30,14 +30,14 @@ class Written:
     same: int
     removed: int
     left: int
-    """Rows that stay in the bucket although they are not among the written values."""
+    """Number of rows that stay in the bucket although they are not among the written values."""
 
 
 class PackBucket:
     """Copy of the table, updated by polling. An error in a row is not raised: it makes the row's pack unknown.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
 
     Attributes:
         packs: Registry of the packs.
@@ -49,7 +49,7 @@ class PackBucket:
         self.packs = PackRegistry()
         self.faults, self.fault = 0, ""
         self._nc = nc
-        self._next = {PACKS_BUCKET: 1, CELLS_BUCKET: 1}
+        self._next_sequence = {PACKS_BUCKET: 1, CELLS_BUCKET: 1}
         self._changed: dict[str, set[str]] = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
 
     async def refresh(self) -> set[str]:
@@ -70,14 +70,16 @@ class PackBucket:
             state = (await self._nc.jetstream().stream_info(_stream(bucket))).state
         except nats.errors.Error as error:
             raise StreamError(f"the server rejects reading {_stream(bucket)}: {error_text(error)}") from None
-        if state.last_seq + 1 < self._next[bucket]:
-            self._next[bucket] = 1  # the stream was recreated or has lost its end: sequence numbers are used again
-        async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next[bucket]):
+        if state.last_seq + 1 < self._next_sequence[bucket]:
+            self._next_sequence[bucket] = (
+                1  # the stream was recreated or has lost its end: sequence numbers are used again
+            )
+        async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next_sequence[bucket]):
             for message in batch:
                 key, data = _entry(bucket, message)
                 if set_value(key, data):
                     self._changed[bucket].add(key)
-            self._next[bucket] = batch[-1].sequence + 1
+            self._next_sequence[bucket] = batch[-1].sequence + 1
 
     async def follow(self, changed: Callable[[set[str]], None]) -> None:
         """Poll for changes until cancelled; call ``changed`` with the packs whose row or cell has changed.
@@ -113,11 +115,11 @@ async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:
     return values
 
 
-async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, remove: bool = False) -> Written:
+async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, remove: bool = False) -> WriteCounts:
     """Write values to a bucket; unchanged ones are skipped.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         bucket: Name of the bucket.
         values: Values by key.
         remove: True to remove entries that are not in ``values``.
@@ -132,7 +134,13 @@ async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, 
     if remove:
         await remove_keys(nc, bucket, others)
     new, removed = len(differing.keys() - stored.keys()), len(others) if remove else 0
-    return Written(new, len(differing) - new, len(values) - len(differing), removed, len(others) - removed)
+    return WriteCounts(
+        new=new,
+        changed=len(differing) - new,
+        same=len(values) - len(differing),
+        removed=removed,
+        left=len(others) - removed,
+    )
 
 
 async def remove_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:

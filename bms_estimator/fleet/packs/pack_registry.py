@@ -7,14 +7,14 @@ unknown; ``PackRegistry.reason`` returns the error.
 from collections.abc import Collection, Iterator
 from functools import lru_cache
 
-from bms_estimator.fleet.packs.pack_row import PackSpec, kind_of, known_cells, model_of, settings_of
+from bms_estimator.fleet.packs.pack_row import PackSpec, decode_row, known_cells, model_of, settings_of
 from bms_estimator.fleet.packs.pack_type import type_estimator
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
 
-MAX_KINDS = 1024
-"""Maximum number of cached kinds of packs."""
+MAX_CACHED_SPECS = 1024
+"""Maximum number of cached specifications, each of which many packs share."""
 
 UNKNOWN_PACK = "not in the table of packs; add a row and load it with `bms-estimator fleet packs load`"
 
@@ -24,10 +24,10 @@ class PackRegistry:
 
     def __init__(self) -> None:
         self._rows = dict[str, bytes]()
-        self._shared = dict[bytes, bytes]()
-        self._cells = dict[str, str]()
-        self._kind = lru_cache(MAX_KINDS)(_parse_row)
-        self._model = lru_cache(MAX_KINDS)(_make_model)
+        self._shared_rows = dict[bytes, bytes]()  # one object for all packs with equal rows
+        self._cell_files = dict[str, str]()
+        self._parse = lru_cache(MAX_CACHED_SPECS)(_parse_row)
+        self._model = lru_cache(MAX_CACHED_SPECS)(_make_model)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -39,23 +39,23 @@ class PackRegistry:
         return pack in self._rows
 
     def __call__(self, pack: str) -> tuple[Settings, PackModel] | None:
-        """Return settings and model; None if the pack is unknown. All packs of a kind share these objects."""
-        found = self._look_up(pack)
-        return None if isinstance(found, str) else found
+        """Return settings and model; None if the pack is unknown. Packs with equal rows share these objects."""
+        result = self._look_up(pack)
+        return None if isinstance(result, str) else result
 
     def reason(self, pack: str) -> str:
         """Return the reason for which a pack is unknown; empty if the pack is known."""
-        found = self._look_up(pack)
-        return found if isinstance(found, str) else ""
+        result = self._look_up(pack)
+        return result if isinstance(result, str) else ""
 
-    def kind(self, pack: str) -> PackSpec | str | None:
-        """Return the pack's row, or the error in it; None without a row."""
+    def parsed_row(self, pack: str) -> PackSpec | str | None:
+        """Return a pack's specification, or the error in its row; None without a row."""
         data = self._rows.get(pack)
-        return None if data is None else self._kind(data)
+        return None if data is None else self._parse(data)
 
     def cell_file(self, name: str) -> str | None:
-        """Return the text of a cell file; None if it is missing or a shipped cell has this name."""
-        return None if name in known_cells() else self._cells.get(name)
+        """Return the text of a cell file; None if it is missing or not used, because a shipped cell has this name."""
+        return None if name in known_cells() else self._cell_files.get(name)
 
     def set_row(self, pack: str, data: bytes | None) -> bool:
         """Set or remove (None) a pack's row. Return True if the row has changed."""
@@ -64,49 +64,50 @@ class PackRegistry:
         if data is None:
             del self._rows[pack]
         else:
-            self._rows[pack] = self._shared.setdefault(data, data)
+            self._rows[pack] = self._shared_rows.setdefault(data, data)
         return True
 
     def set_cell(self, name: str, file: bytes | None) -> bool:
         """Set or remove (None) a cell file. Return True if the file has changed."""
         text = None if file is None else file.decode(errors="replace")
-        if text == self._cells.get(name):
+        if text == self._cell_files.get(name):
             return False
         if text is None:
-            del self._cells[name]
+            del self._cell_files[name]
         else:
-            self._cells[name] = text
+            self._cell_files[name] = text
         return True
 
     def packs_using(self, cells: Collection[str]) -> set[str]:
         """Return the packs that use one of ``cells``. The method searches all packs."""
         found = set[str]()
         for pack, data in self._rows.items() if cells else ():
-            kind = self._kind(data)
-            if not isinstance(kind, str) and kind.cell in cells:
+            spec = self._parse(data)
+            if not isinstance(spec, str) and spec.cell in cells:
                 found.add(pack)
         return found
 
     def _look_up(self, pack: str) -> tuple[Settings, PackModel] | str:
-        kind = self.kind(pack)
-        if kind is None:
+        """Return settings and model of a pack, or the reason for which it is unknown."""
+        spec = self.parsed_row(pack)
+        if spec is None:
             return UNKNOWN_PACK
-        if isinstance(kind, str):
-            return f"its row is wrong: {kind}"
-        return self._model(kind, self._cells.get(kind.cell))
+        if isinstance(spec, str):
+            return f"its row is wrong: {spec}"
+        return self._model(spec, self._cell_files.get(spec.cell))
 
 
 def _parse_row(data: bytes) -> PackSpec | str:
     try:
-        return kind_of(data)
+        return decode_row(data)
     except ValueError as error:
         return str(error)
 
 
-def _make_model(kind: PackSpec, cell_file: str | None) -> tuple[Settings, PackModel] | str:
+def _make_model(spec: PackSpec, cell_file: str | None) -> tuple[Settings, PackModel] | str:
     try:
-        settings, model = settings_of(kind), model_of(kind, cell_file)
-        type_estimator(settings, model)  # cached for the partitions
+        settings, model = settings_of(spec), model_of(spec, cell_file)
+        type_estimator(settings, model)  # raises an error for invalid values; the result is cached for the partitions
     except UserError as error:
         return str(error)
     except (ValueError, ArithmeticError) as error:

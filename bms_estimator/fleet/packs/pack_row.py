@@ -1,6 +1,6 @@
 """Row of the table of packs, and the settings and model computed from it.
 
-On the server the key of a row is the pack's name. The value is JSON without the name, so that packs of one kind have equal
+On the server the key of a row is the pack's name. The value is JSON without the name, so that similar packs have equal
 values.
 """
 
@@ -31,7 +31,7 @@ _COUNT = Field(ge=1, le=10_000)
 
 
 class PackSpec(Strict):
-    """Values that packs of one kind share: those of the sections ``[pack]`` and ``[sensor]`` of a settings file.
+    """Specification that many packs share: values of the sections ``[pack]`` and ``[sensor]`` of a settings file.
 
     A cell-file object is the object that a cell file describes: a cell, a module or a block.
     """
@@ -66,7 +66,7 @@ class PackRow(PackSpec):
     pack: DeviceName = Field(description="name of the pack in topics: 1 to 64 letters, digits, _ and -")
 
     @property
-    def kind(self) -> PackSpec:
+    def spec(self) -> PackSpec:
         """Specification of the pack: the row without the name."""
         return PackSpec.model_validate(self.model_dump(exclude={"pack"}, exclude_unset=True))
 
@@ -75,12 +75,12 @@ COLUMNS = ("pack", *PackSpec.model_fields)
 """Columns of a table in written order."""
 
 
-def encode_row(kind: PackSpec) -> bytes:
+def encode_row(spec: PackSpec) -> bytes:
     """Encode the specification of a pack for the server. Equal specifications give equal bytes."""
-    return kind.model_dump_json(exclude_defaults=True).encode()
+    return spec.model_dump_json(exclude_defaults=True).encode()
 
 
-def kind_of(data: bytes) -> PackSpec:
+def decode_row(data: bytes) -> PackSpec:
     """Decode a row encoded by ``encode_row``.
 
     Raises:
@@ -112,37 +112,37 @@ def known_cells() -> tuple[str, ...]:
     return (*shipped_cells(), *generic_cells(), *shipped_fuel_cells())
 
 
-def model_of(kind: PackSpec, cell_file: str | None) -> PackModel:
+def model_of(spec: PackSpec, cell_file: str | None) -> PackModel:
     """Return the model of a whole pack.
 
     Args:
-        kind: Row of the pack.
-        cell_file: Text of the loaded file of that name; None without one. A shipped cell takes precedence.
+        spec: Specification of the pack.
+        cell_file: Text of the loaded file with the cell's name; None without one. A shipped cell takes precedence.
 
     Raises:
         UserError: The cell is missing or invalid, or the capacity is missing or not allowed.
     """
-    return cell_of(kind, cell_file).pack(kind.series, kind.parallel)
+    return cell_of(spec, cell_file).pack(spec.series, spec.parallel)
 
 
-def model_key(kind: PackSpec) -> tuple[object, ...]:
-    """Return the values that decide whether a kind has a valid model. Kinds with equal keys are checked once."""
-    return kind.cell, kind.capacity_ah is None, kind.series, kind.parallel
+def model_key(spec: PackSpec) -> tuple[object, ...]:
+    """Return the values that decide whether a specification has a valid model. Each key is checked only once."""
+    return spec.cell, spec.capacity_ah is None, spec.series, spec.parallel
 
 
-def cell_of(kind: PackSpec, cell_file: str | None) -> PackModel:
+def cell_of(spec: PackSpec, cell_file: str | None) -> PackModel:
     """Return the model of one cell-file object of a pack. Arguments and errors are those of ``model_of``."""
-    name = kind.cell
+    name = spec.cell
     if name in known_cells():
-        return load_any(name, kind.capacity_ah)
+        return load_any(name, spec.capacity_ah)
     if cell_file is None:
         raise UserError(
             f"{name}: no cell file of this name was loaded, and the package's are {', '.join(known_cells())}"
         )
     if not _is_fuel_cell(cell_file):
         cell = parse_toml(cell_file, CellModel, f"cell {name}")
-        return cell if kind.capacity_ah is None else with_capacity(cell, kind.capacity_ah)
-    if kind.capacity_ah is not None:
+        return cell if spec.capacity_ah is None else with_capacity(cell, spec.capacity_ah)
+    if spec.capacity_ah is not None:
         raise UserError(f"{name} is a fuel cell, which has no capacity: leave out capacity_ah")
     return parse_toml(cell_file, FuelCellModel, f"cell {name}")
 

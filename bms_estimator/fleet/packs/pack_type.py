@@ -1,6 +1,6 @@
-"""Type of packs, whose packs share one estimator.
+"""Type of packs. All packs of a type share one estimator.
 
-Creating an estimator takes longer than estimating the samples of a day.
+The estimator is shared because its creation takes longer than estimating the samples of a day.
 """
 
 import hashlib
@@ -32,9 +32,9 @@ class PackType:
         settings: Settings of the packs; the name is not used.
         config_digest: Digest of the configuration of the estimator. A state of another digest is migrated.
         state_digest: Digest of the configuration that a state depends on. A state of another digest is reset.
-        estimator: Estimator bound to the work record of the partition.
-        meter: Charge and energy meter bound to the work record.
-        capacity_ah: Rated capacity of a pack; None for a fuel cell.
+        estimator: Estimator bound to the unpacked record of the partition.
+        meter: Charge and energy meter bound to the unpacked record.
+        capacity_ah: Rated capacity of a pack [Ah]; None for a fuel cell.
     """
 
     settings: PackSettings
@@ -46,7 +46,7 @@ class PackType:
 
 
 @dataclass(frozen=True)
-class _Recipe:
+class _EstimatorKey:
     """Cache key of an estimator; only the digest is compared."""
 
     config_digest: Digest
@@ -58,8 +58,14 @@ def config_digest(settings: Settings, cell: PackModel) -> Digest:
     """Return the digest of all values that a pack's estimator is created from."""
     sensor = settings.sensor
     parts = (
-        *(settings.observer, settings.identifier, settings.sampling, settings.pack.initial_soc, cell),
-        *(sensor.voltage_resolution_v, sensor.voltage_noise_v, sensor.current_sign),
+        settings.observer,
+        settings.identifier,
+        settings.sampling,
+        settings.pack.initial_soc,
+        cell,
+        sensor.voltage_resolution_v,
+        sensor.voltage_noise_v,
+        sensor.current_sign,
     )
     return _digest(hashlib.sha256(repr(parts).encode()).digest())
 
@@ -68,7 +74,7 @@ class PackTypes:
     """Cache of the types of a partition's packs.
 
     Args:
-        record: Work record of the partition, shape (1,), dtype ``PACK_STATE``.
+        record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
     """
 
     def __init__(self, record: NDArray[np.void]) -> None:
@@ -82,7 +88,7 @@ class PackTypes:
             settings: Settings of the packs.
             cell: A pack as one object (``CellModel.pack``).
         """
-        key = id(settings), id(cell)
+        key = id(settings), id(cell)  # not reused, because the cached tuple keeps both objects alive
         if key not in self._types:
             if len(self._types) >= MAX_TYPES:
                 self._types.clear()
@@ -96,7 +102,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
     Args:
         settings: Settings of the packs.
         cell: A pack as one object (``CellModel.pack``).
-        record: Work record of the partition, shape (1,), dtype ``PACK_STATE``.
+        record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
     """
     digest = config_digest(settings, cell)
     estimator = type_estimator(settings, cell).bound_to_record(record["estimator"])
@@ -117,12 +123,12 @@ def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
         settings: Settings of the packs.
         cell: A pack as one object (``CellModel.pack``).
     """
-    return _estimator(_Recipe(config_digest(settings, cell), settings, cell))
+    return _estimator(_EstimatorKey(config_digest(settings, cell), settings, cell))
 
 
 @lru_cache(maxsize=MAX_TYPES)
-def _estimator(recipe: _Recipe) -> Estimator:
-    return make_estimator(recipe.settings, recipe.cell)
+def _estimator(key: _EstimatorKey) -> Estimator:
+    return make_estimator(key.settings, key.cell)
 
 
 def _digest(sha256: bytes) -> Digest:

@@ -65,13 +65,13 @@ async def fleet_page(
 
     async def pack(request: web.Request) -> web.Response:
         name = request.query.get("name", "")
-        found = view.packs.one(name, time.monotonic())
-        if found is None:
+        details = view.packs.details(name, time.monotonic())
+        if details is None:
             raise web.HTTPNotFound(text="unknown pack\n")
-        return _json(found)
+        return _json(details)
 
     async with (
-        WebServer(settings, FILES, latest, {"/packs": packs, "/pack": pack}, patient=False) as page,
+        WebServer(settings, FILES, latest, {"/packs": packs, "/pack": pack}, retry=False) as page,
         FleetFeed(server, view, latest.set_link_state),
     ):
         tasks = [asyncio.create_task(_send_overviews(view, latest, step_s), name="fleet page")]
@@ -89,7 +89,7 @@ async def _send_overviews(view: FleetView, latest: LatestValues, step_s: float) 
     """Send an overview every ``step_s``. Without a connection to the server the last overview stays on the page."""
     while True:
         if view.listening:
-            latest.set_value(FLEET_KEY, view.text(time.monotonic(), time.time()))
+            latest.set_value(FLEET_KEY, view.overview_json(time.monotonic(), time.time()))
         await asyncio.sleep(step_s)
 
 
@@ -101,8 +101,8 @@ async def _send_query_results(hours: Path, latest: LatestValues) -> None:
     from bms_estimator.fleet.page.query_results import PAGE_QUERIES, answer  # noqa: PLC0415 - only queries need duckdb
 
     while True:
-        found = {name: await asyncio.to_thread(answer, hours, name) for name in PAGE_QUERIES}
-        latest.set_value(ANSWERS_KEY, json.dumps(found, allow_nan=False, separators=(",", ":")))
+        results = {name: await asyncio.to_thread(answer, hours, name) for name in PAGE_QUERIES}
+        latest.set_value(ANSWERS_KEY, json.dumps(results, allow_nan=False, separators=(",", ":")))
         await asyncio.sleep(QUERY_S)
 
 

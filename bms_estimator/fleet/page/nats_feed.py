@@ -146,8 +146,8 @@ class FleetFeed:
         async def refresh() -> None:
             view.workers.partitions = await partitions_of(nc) or view.workers.partitions
             for pack in await bucket.refresh():
-                kind = bucket.packs.kind(pack)
-                view.set_type(pack, None if kind is None else type_name(kind))
+                spec = bucket.packs.parsed_row(pack)
+                view.set_type(pack, None if spec is None else type_name(spec))
 
         while True:
             await self._retry(refresh)
@@ -183,12 +183,12 @@ class FleetFeed:
         self._on_link_change(trouble and f"{self._server.urls}: {trouble}")
 
 
-def type_name(kind: PackSpec | str) -> str:
+def type_name(spec: PackSpec | str) -> str:
     """Return the type of a table row, such as ``lfp 16s2p 280 Ah``, or that the row is wrong."""
-    if isinstance(kind, str):
+    if isinstance(spec, str):
         return "wrong rows"
-    capacity = "" if kind.capacity_ah is None else f" {kind.capacity_ah:g} Ah"
-    return f"{kind.cell} {kind.series}s{kind.parallel}p{capacity}"
+    capacity = "" if spec.capacity_ah is None else f" {spec.capacity_ah:g} Ah"
+    return f"{spec.cell} {spec.series}s{spec.parallel}p{capacity}"
 
 
 def _pack(message: Msg) -> str:

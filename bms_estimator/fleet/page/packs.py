@@ -20,6 +20,8 @@ MAX_LISTED = 20
 """Maximum number of packs in a list."""
 MAX_TYPES = 8
 """Maximum number of types that are shown. All further types are combined."""
+MAX_TYPE_INDEX = 65_535
+"""Largest value of column ``type``. All types beyond this number share this index."""
 OTHER = "other types"
 """Name of the combination of all further types."""
 UNLISTED = "not in the table"
@@ -40,7 +42,7 @@ ROW = np.dtype(
         ("listed", "?"),  # True if the pack is in the table of packs
     ]
 )
-_NEW = np.array([(-math.inf, math.nan, math.nan, math.nan, 0, 0, False)], dtype=ROW)
+_NEW_ROW = np.array([(-math.inf, math.nan, math.nan, math.nan, 0, 0, False)], dtype=ROW)
 FIELDS = {"soc": "soc", "soc_std": "soc_std", "margin": "stability_margin"}
 """Fields of a state, by column of ``ROW``."""
 
@@ -53,16 +55,16 @@ class Concern(NamedTuple):
 
     column: str
     """Column of the ranking."""
-    falls: bool
+    is_low_bad: bool
     """True if the smallest values are the worst."""
     limit: float
     """Limit beyond which a pack is counted."""
 
 
 CONCERNS = {
-    "margin": Concern("margin", falls=True, limit=0.05),
-    "soc": Concern("soc", falls=True, limit=0.1),
-    "uncertain": Concern("soc_std", falls=False, limit=0.05),
+    "margin": Concern("margin", is_low_bad=True, limit=0.05),
+    "soc": Concern("soc", is_low_bad=True, limit=0.1),
+    "uncertain": Concern("soc_std", is_low_bad=False, limit=0.05),
 }
 """Criteria of live packs, by name."""
 
@@ -73,19 +75,19 @@ class FleetPacks:
     def __init__(self) -> None:
         self._indexes: dict[str, int] = {}
         self._names: list[str] = []
-        self._sorted: list[str] = []
-        self._rows = np.repeat(_NEW, 1024)
+        self._sorted_names: list[str] = []
+        self._rows = np.repeat(_NEW_ROW, 1024)  # grows by doubling
         self._states: list[bytes] = []
         self._parameters: dict[str, bytes] = {}
-        self._types: dict[str, int] = {UNLISTED: 0}
+        self._types: dict[str, int] = {UNLISTED: 0}  # index of each type
         self.states, self.damaged = 0, 0
         """Number of received states; number of those that are not a JSON object."""
 
-    def list_pack(self, name: str, kind: str | None) -> None:
+    def list_pack(self, name: str, type_name: str | None) -> None:
         """Set the type of a pack in the fleet's table, such as ``lfp 16s2p``; None removes it."""
         row = self._row(name)
-        row["listed"] = kind is not None
-        row["type"] = self._types.setdefault(kind or UNLISTED, min(len(self._types), 65_535))
+        row["listed"] = type_name is not None
+        row["type"] = self._types.setdefault(type_name or UNLISTED, min(len(self._types), MAX_TYPE_INDEX))
 
     def receive_state(self, name: str, state: bytes, now_s: float) -> None:
         """Store a pack's newest state."""
@@ -114,24 +116,24 @@ class FleetPacks:
 
     def find(self, prefix: str) -> list[str]:
         """Return the first ``MAX_LISTED`` names with this prefix, sorted."""
-        if len(self._sorted) != len(self._names):
-            self._sorted = sorted(self._names)
-        first = bisect.bisect_left(self._sorted, prefix)
-        return [name for name in self._sorted[first : first + MAX_LISTED] if name.startswith(prefix)]
+        if len(self._sorted_names) != len(self._names):
+            self._sorted_names = sorted(self._names)
+        first = bisect.bisect_left(self._sorted_names, prefix)
+        return [name for name in self._sorted_names[first : first + MAX_LISTED] if name.startswith(prefix)]
 
-    def one(self, name: str, now_s: float) -> dict[str, Any] | None:
+    def details(self, name: str, now_s: float) -> dict[str, Any] | None:
         """Return the details of a pack; None if it is unknown."""
         index = self._indexes.get(name)
         if index is None:
             return None
-        row, packed = self._rows[index], self._parameters.get(name)
+        row, compressed = self._rows[index], self._parameters.get(name)
         return {
             "pack": name,
             "type": list(self._types)[row["type"]],
             "heard_s": _age_s(float(row["heard_s"]), now_s),
             "suspects": InputFault(int(row["suspects"])).text,
             "state": _object(self._states[index]),
-            "parameters": _object(zlib.decompress(packed)) if packed else None,
+            "parameters": _object(zlib.decompress(compressed)) if compressed else None,
         }
 
     def overview(self, now_s: float, since_s: float) -> dict[str, Any]:
@@ -143,7 +145,7 @@ class FleetPacks:
 
         Returns:
             ``packs`` (counts), ``types`` (number and distribution of each), ``soc_std_edges`` (histogram edges; the last bin
-            is open), ``concerns`` (of each kind the number of packs and the worst ones), ``attention`` (number of packs with
+            is open), ``concerns`` (number of packs and worst packs of each concern), ``attention`` (number of packs with
             any concern).
         """
         rows = self._rows[: len(self._names)]
@@ -168,7 +170,7 @@ class FleetPacks:
         if index is None:
             index = self._indexes[name] = len(self._names)
             if index == self._rows.size:
-                self._rows = np.concatenate((self._rows, np.repeat(_NEW, index)))
+                self._rows = np.concatenate((self._rows, np.repeat(_NEW_ROW, index)))
             self._names.append(name)
             self._states.append(b"")
         return self._rows[index]
@@ -176,8 +178,8 @@ class FleetPacks:
     def _types_overview(self, rows: Rows, counted: Mask, alive: Mask) -> list[dict[str, Any]]:
         counts = np.bincount(rows["type"][counted], minlength=len(self._types))
         names = list(self._types)
-        found = sorted((-int(counts[index]), names[index], int(index)) for index in np.flatnonzero(counts))
-        shown = [index for _, _, index in found[:MAX_TYPES]]
+        by_size = sorted((-int(counts[index]), names[index], int(index)) for index in np.flatnonzero(counts))
+        shown = [index for _, _, index in by_size[:MAX_TYPES]]
         masks: list[tuple[str, Mask]] = [(names[index], counted & (rows["type"] == index)) for index in shown]
         rest = counted & ~np.isin(rows["type"], shown)
         if rest.any():
@@ -186,24 +188,24 @@ class FleetPacks:
 
     def _concerns(self, rows: Rows, alive: Mask, silent: Mask, now_s: float) -> dict[str, Any]:
         """Return number and worst packs of each concern, and the number of packs with any."""
-        found, attention = {}, silent | (rows["suspects"] > 0)
+        concerns, attention = {}, silent | (rows["suspects"] > 0)
         for name, concern in CONCERNS.items():
-            sign = 1.0 if concern.falls else -1.0
+            sign = 1.0 if concern.is_low_bad else -1.0  # the worst values of the column become the smallest
             column = sign * rows[concern.column]
             beyond = alive & (column < sign * concern.limit)
             listed = [[self._names[i], sign * value] for i, value in _extremes(column, alive & np.isfinite(column))]
-            found[name] = {"count": int(beyond.sum()), "limit": concern.limit, "packs": listed}
+            concerns[name] = {"count": int(beyond.sum()), "limit": concern.limit, "packs": listed}
             attention |= beyond
         suspected = _extremes(-np.bitwise_count(rows["suspects"]).astype("f8"), rows["suspects"] > 0)
-        found["suspects"] = {
+        concerns["suspects"] = {
             "count": int(np.count_nonzero(rows["suspects"])),
             "packs": [[self._names[i], _fault_names(int(rows["suspects"][i]))] for i, _ in suspected],
         }
-        found["silent"] = {
+        concerns["silent"] = {
             "count": int(silent.sum()),
             "packs": [[self._names[i], _age_s(heard, now_s)] for i, heard in _extremes(rows["heard_s"], silent)],
         }
-        return {"concerns": found, "attention": int(attention.sum())}
+        return {"concerns": concerns, "attention": int(attention.sum())}
 
 
 def _fault_names(suspects: int) -> str:
@@ -216,8 +218,8 @@ def _extremes(column: NDArray[np.float64], mask: Mask) -> list[tuple[int, float]
     indexes = np.flatnonzero(mask)
     values = column[indexes]
     if indexes.size > MAX_LISTED:
-        few = np.argpartition(values, MAX_LISTED)[:MAX_LISTED]
-        indexes, values = indexes[few], values[few]
+        smallest = np.argpartition(values, MAX_LISTED)[:MAX_LISTED]
+        indexes, values = indexes[smallest], values[smallest]
     order = np.argsort(values, kind="stable")
     return [(int(indexes[i]), float(values[i])) for i in order]
 
@@ -251,8 +253,8 @@ def _age_s(last_state_s: float, now_s: float) -> float | None:
 
 def _number(value: Any) -> float:
     """Return a number unchanged; NaN if it is not a number."""
-    real = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if real and math.isfinite(value) else math.nan
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if is_real and math.isfinite(value) else math.nan
 
 
 def _object(data: bytes) -> dict[str, Any] | None:

@@ -25,9 +25,9 @@ def answer(folder: Path, name: str) -> dict[str, Any]:
         ``columns``, the first ``rows``, and their number (``count``); or the reason why they are missing (``reason``).
     """
     try:
-        found = run_query(folder, name)
+        result = run_query(folder, name)
     except (UserError, duckdb.Error) as error:
         return {"reason": str(error)}
-    # The page shows only the rows of types of ``soh``, which have no pack.
-    rows = [row for row in found.rows if name != "soh" or row[found.columns.index("pack")] is None]
-    return {"columns": found.columns, "rows": rows[:MAX_ROWS], "count": len(rows)}
+    # Rows of ``soh`` for a type have no pack; the page shows only these rows.
+    rows = [row for row in result.rows if name != "soh" or row[result.columns.index("pack")] is None]
+    return {"columns": result.columns, "rows": rows[:MAX_ROWS], "count": len(rows)}

@@ -56,13 +56,13 @@ class FleetView:
         if len(self._unknown) > MAX_UNKNOWN:
             del self._unknown[next(iter(self._unknown))]
 
-    def set_type(self, name: str, kind: str | None) -> None:
+    def set_type(self, name: str, type_name: str | None) -> None:
         """Set the type of a pack in the table; None removes it."""
-        self.packs.list_pack(name, kind)
-        if kind is not None:
+        self.packs.list_pack(name, type_name)
+        if type_name is not None:
             self._unknown.pop(name, None)
 
-    def text(self, now_s: float, wall_s: float) -> str:
+    def overview_json(self, now_s: float, wall_s: float) -> str:
         """Return the overview as one line of JSON."""
         return json.dumps(self.overview(now_s, wall_s), allow_nan=False, separators=(",", ":"))
 

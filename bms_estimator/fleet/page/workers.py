@@ -75,7 +75,7 @@ class FleetWorkers:
                 if holders[partition] != NO_WORKER:
                     twice.add(partition)
                 holders[partition] = index
-        lags = [_lag(received) for received in alive.values()]
+        lags = [_max_lag_s(received) for received in alive.values()]
         return {
             "workers": [
                 _worker_overview(self._by_worker[name], now_s, name in alive) for name in sorted(self._by_worker)
@@ -90,7 +90,7 @@ class FleetWorkers:
         return {name: received for name, received in self._by_worker.items() if received[-1].at_s >= now_s - ALIVE_S}
 
 
-def _lag(received: deque[_Received]) -> float | None:
+def _max_lag_s(received: deque[_Received]) -> float | None:
     """Return the largest recent lag [s]; None without any block."""
     lags = [each.heartbeat.lag_s for each in received if each.heartbeat.lag_s is not None]
     return max(lags, default=None)
@@ -98,10 +98,10 @@ def _lag(received: deque[_Received]) -> float | None:
 
 def _worker_overview(received: deque[_Received], now_s: float, alive: bool) -> dict[str, Any]:
     first, last = received[0], received[-1]
-    heartbeat, over_s = last.heartbeat, last.at_s - first.at_s
+    heartbeat, span_s = last.heartbeat, last.at_s - first.at_s
 
-    def rate(now: float, before: float) -> float | None:
-        return (now - before) / over_s if over_s > 0.0 and alive else None
+    def rate(last_value: float, first_value: float) -> float | None:
+        return (last_value - first_value) / span_s if span_s > 0.0 and alive else None
 
     return {
         "id": heartbeat.id,
@@ -110,7 +110,7 @@ def _worker_overview(received: deque[_Received], now_s: float, alive: bool) -> d
         "heard_s": now_s - last.at_s,
         "partitions": len(heartbeat.partitions),
         "packs": heartbeat.packs,
-        "lag_s": _lag(received),
+        "lag_s": _max_lag_s(received),
         "blocks_per_s": rate(heartbeat.blocks, first.heartbeat.blocks),
         "samples_per_s": rate(heartbeat.samples, first.heartbeat.samples),
         "waiting": heartbeat.waiting,

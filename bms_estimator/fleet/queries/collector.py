@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from bms_estimator.edge.subjects import HOURS_STREAM
 from bms_estimator.fleet.hour_row import Hour
-from bms_estimator.fleet.queries.parquet_files import compact, remove_unfinished, to_compact, write
+from bms_estimator.fleet.queries.parquet_files import compact, days_to_compact, remove_unfinished, write
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 
@@ -49,7 +49,7 @@ class Collector:
     """Collector of hourly rows.
 
     Args:
-        nc: Connection of the tenant, which reconnects.
+        nc: Connection to the tenant's NATS account, which reconnects.
         folder: Folder of the Parquet files.
         period_s: Maximum time that a row waits for its file [s].
         clock: Wall and monotonic clock.
@@ -62,7 +62,8 @@ class Collector:
         self._nc, self._folder, self._period_s, self._clock = nc, folder, period_s, clock or Clock()
         self._subscription: JetStreamContext.PullSubscription | None = None
         self._waiting: list[tuple[Msg, Hour]] = []
-        self._first_s = self._compacted_s = self._clock.monotonic()
+        self._first_waiting_s = self._clock.monotonic()  # arrival of the oldest waiting row
+        self._compacted_s = self._first_waiting_s  # last merge of files
         self.counters = Counter[str]()
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -72,9 +73,9 @@ class Collector:
             UserError: The server has no such stream, or has closed the connection permanently.
         """
         while not stop.is_set():
-            await self._take(await self._fetch(stop))
+            await self._queue_rows(await self._fetch(stop))
             now_s = self._clock.monotonic()
-            if len(self._waiting) >= MAX_ROWS or (self._waiting and now_s - self._first_s >= self._period_s):
+            if len(self._waiting) >= MAX_ROWS or (self._waiting and now_s - self._first_waiting_s >= self._period_s):
                 await self._save(stop)
             if now_s - self._compacted_s >= COMPACT_S:
                 self._compacted_s = now_s
@@ -84,7 +85,9 @@ class Collector:
 
     async def _subscribe(self) -> JetStreamContext.PullSubscription:
         js = self._nc.jetstream()
-        wait_s = 2.0 * self._period_s + 60.0  # longer than a row waits here; otherwise the server would redeliver it
+        wait_s = (
+            2.0 * self._period_s + 60.0
+        )  # longer than a row waits in this process; otherwise the server would redeliver the row
         config = ConsumerConfig(
             durable_name=DURABLE, ack_policy=AckPolicy.EXPLICIT, ack_wait=wait_s, max_ack_pending=3 * MAX_ROWS
         )
@@ -107,36 +110,36 @@ class Collector:
             self._subscription = None
             if self._nc.is_closed:
                 raise UserError("the server has closed the connection: check --creds") from None
-            await self._failed("rows cannot be fetched from the server", error, stop)
+            await self._wait_after_error("rows cannot be fetched from the server", error, stop)
             return ()
 
-    async def _take(self, messages: Sequence[Msg]) -> None:
+    async def _queue_rows(self, messages: Sequence[Msg]) -> None:
         if messages and not self._waiting:
-            self._first_s = self._clock.monotonic()
+            self._first_waiting_s = self._clock.monotonic()
         for message in messages:
             try:
                 row = Hour.model_validate_json(message.data)
             except ValidationError as error:
-                await self._unreadable(message, error)
+                await self._reject(message, error)
             else:
                 self._waiting.append((message, row))
 
-    async def _unreadable(self, message: Msg, error: ValidationError) -> None:
+    async def _reject(self, message: Msg, error: ValidationError) -> None:
         """Log a message that cannot be decoded, and end its delivery. The message stays in the stream."""
         self.counters["unreadable"] += 1
         detail = error.errors()[0]
         reason = f"{'.'.join(map(str, detail['loc'])) or 'message'}: {detail['msg']}"
         log.warning("invalid row of an hour", subject=message.subject, reason=reason)
-        with contextlib.suppress(nats.errors.Error):  # the message is delivered again
+        with contextlib.suppress(nats.errors.Error):  # the message is then redelivered and rejected again
             await message.term()
 
     async def _save(self, stop: asyncio.Event) -> None:
-        """Write the waiting rows and acknowledge them. The server delivers rows that cannot be written again."""
+        """Write the waiting rows and acknowledge them. If they cannot be written, the server redelivers them."""
         waiting, self._waiting = self._waiting, []
         try:
             files = await asyncio.to_thread(write, self._folder, [row for _, row in waiting])
         except OSError as error:
-            await self._failed("rows cannot be written; the server delivers them again", error, stop)
+            await self._wait_after_error("rows cannot be written; the server delivers them again", error, stop)
             return
         self.counters["rows"] += len(waiting)
         self.counters["files"] += len(files)
@@ -145,9 +148,9 @@ class Collector:
                 await message.ack()
             await self._nc.flush()
         except (nats.errors.Error, TimeoutError) as error:  # the rows are delivered again; queries drop duplicates
-            await self._failed("written rows could not be acknowledged", error, stop)
+            await self._wait_after_error("written rows could not be acknowledged", error, stop)
 
-    async def _failed(self, event: str, error: Exception, stop: asyncio.Event) -> None:
+    async def _wait_after_error(self, event: str, error: Exception, stop: asyncio.Event) -> None:
         """Count and log an error, and wait before the next attempt."""
         self.counters["faults"] += 1
         log.warning(event, reason=str(error) or type(error).__name__, again_in_s=RETRY_S)
@@ -156,13 +159,13 @@ class Collector:
 
 
 def compact_days(folder: Path, now_s: float) -> None:
-    """Merge the files of the days of ``to_compact``. Disk errors are logged; the next call retries.
+    """Merge the files of the days of ``days_to_compact``. Disk errors are logged; the next call retries.
 
     Args:
         folder: Folder of the Parquet files.
         now_s: Wall clock [s since 1970].
     """
-    for day in to_compact(folder, now_s):
+    for day in days_to_compact(folder, now_s):
         try:
             compact(day)
         except (OSError, duckdb.Error) as error:

@@ -1,4 +1,4 @@
-"""Queries on the hourly rows of all packs: SQL on Parquet files by DuckDB. A collector may write meanwhile.
+"""Queries on the hourly rows of all packs: SQL on Parquet files by DuckDB. A collector may write at the same time.
 
 Meaning, method and limits of each query are in docs/fleet/questions.md.
 """
@@ -28,8 +28,8 @@ CHARGE_ERROR = 0.002
 """Standard deviation of the counted charge in the filter [sqrt(capacities)], as in
 ``kernels.kalman_filter.records.Noise``."""
 READ_ONLY_STATEMENTS = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
-"""Kinds of statements that a user's SQL query may contain."""
-BY_CHANCE = 0.1
+"""Types of statements that a user's SQL query may contain."""
+EXPECTED_FALSE_REPORTS = 0.1
 """Expected number of packs of the fleet that are reported by chance, for each quantity."""
 MIN_STDS = 3.0
 """Minimum deviation of a reported pack, which applies in a small fleet [standard deviations]."""
@@ -38,8 +38,8 @@ MIN_STDS = 3.0
 class Query(NamedTuple):
     """Named query."""
 
-    needs: tuple[str, ...]
-    """SQL files of the tables that the query uses."""
+    tables: tuple[str, ...]
+    """Tables that the query uses; each is created by an SQL file of its name."""
     help: str
 
 
@@ -64,21 +64,21 @@ class Limits:
     """Query failing: upper limit of R_s as a multiple of that of the cell file."""
     r_s_fresh_s: float = 86_400.0
     """Maximum time since R_s was last identified [s]; older values are not used."""
-    least_days: int = 7
+    min_days: int = 7
     """Queries soh, failing: minimum number of days in a trend."""
-    least_packs: int = 5
+    min_packs: int = 5
     """Query outliers: minimum number of packs with a valid value that define the reference of their type."""
-    least_spread: float = 0.01
+    min_spread: float = 0.01
     """Query outliers: lower bound of the relative standard deviation between packs of a type."""
     recent_days: int = 3
     """Query failing: number of most recent days. A pack is reported if more than half of them have a new input fault."""
     silent_hours: int = 2
     """Query silent: maximum age of the last summary [h]. The newest summary of a live pack is of the previous hour."""
-    most_packs: int = 10_000
+    max_packs: int = 10_000
     """Query honest: maximum number of packs, selected by a hash of their name."""
-    least_seen_s: float = 3590.0
+    min_seen_s: float = 3590.0
     """Query honest: minimum measured part of each hour between an estimate and its reference [s]."""
-    surer: float = 0.5
+    max_variance_ratio: float = 0.5
     """Query honest: maximum variance of the reference, a later estimate, as a fraction of the variance of the estimate."""
 
 
@@ -112,15 +112,15 @@ def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limit
     """
     if name not in QUESTIONS:
         raise UserError(f"{name}: no such query; there are {', '.join(QUESTIONS)}, and sql 'SELECT ...'")
-    with opened(folder, days) as database:
+    with open_database(folder, days) as database:
         (now_hour,) = database.execute("SELECT max(hour) FROM hours").fetchone() or (None,)
         if now_hour is None:
             raise UserError(f"--folder {folder}: its files hold no rows yet")
         parameters = vars(limits) | _parameters(int(now_hour))
-        for table in QUESTIONS[name].needs:
+        for table in QUESTIONS[name].tables:
             _run(database, _sql(table), parameters)
-            if table == "packs":
-                parameters["stds"] = _stds(database)
+            if table == "packs":  # the limit depends on the number of packs
+                parameters["stds"] = _reporting_limit_stds(database)
         return _answer(_run(database, _sql(name), parameters))
 
 
@@ -130,7 +130,7 @@ def select(folder: Path, query: str, *, days: int | None = None) -> Answer:
     Raises:
         UserError: The folder or its rows do not exist, a file is damaged, or the query is invalid.
     """
-    with opened(folder, days) as database:
+    with open_database(folder, days) as database:
         database.execute("SET allowed_directories = $folders", {"folders": [str(folder)]})
         database.execute("SET enable_external_access = false")
         database.execute("SET lock_configuration = true")
@@ -143,7 +143,7 @@ def select(folder: Path, query: str, *, days: int | None = None) -> Answer:
 
 
 @contextlib.contextmanager
-def opened(folder: Path, days: int | None = None) -> Iterator[duckdb.DuckDBPyConnection]:
+def open_database(folder: Path, days: int | None = None) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open a database with the view ``hours``: one row for each hour of each pack.
 
     Raises:
@@ -152,7 +152,7 @@ def opened(folder: Path, days: int | None = None) -> Iterator[duckdb.DuckDBPyCon
     files = _files(folder, days)
     with duckdb.connect() as database, _user_errors(folder):
         database.execute("SET TimeZone = 'UTC'")
-        _view(database, files)
+        _create_hours_view(database, files)
         yield database
 
 
@@ -189,7 +189,7 @@ def _files(folder: Path, days: int | None) -> dict[Path, list[Path]]:
     return by_day
 
 
-def _view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
+def _create_hours_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
     """Create the view ``hours``. A day with a single, merged file has no duplicate rows and needs no deduplication.
 
     Raises:
@@ -221,10 +221,10 @@ def _parameters(now_hour: int) -> dict[str, Any]:
     }
 
 
-def _stds(database: duckdb.DuckDBPyConnection) -> float:
-    """Return the deviation [standard deviations] that ``BY_CHANCE`` packs of the fleet exceed by chance."""
+def _reporting_limit_stds(database: duckdb.DuckDBPyConnection) -> float:
+    """Return the deviation that ``EXPECTED_FALSE_REPORTS`` packs exceed by chance [standard deviations]."""
     (packs,) = database.execute("SELECT count(*) FROM packs").fetchone() or (0,)
-    return max(NormalDist().inv_cdf(1.0 - 0.5 * BY_CHANCE / max(packs, 1)), MIN_STDS)
+    return max(NormalDist().inv_cdf(1.0 - 0.5 * EXPECTED_FALSE_REPORTS / max(packs, 1)), MIN_STDS)
 
 
 def _sql(name: str) -> str:

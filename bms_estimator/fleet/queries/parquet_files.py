@@ -29,9 +29,9 @@ MAX_FILES_PER_DAY = 48
 """Number of files at which the files of a day are merged, although the day has not ended or was merged before."""
 ROW_GROUP = 100_000
 """Size of a row group [rows], the smallest unit that a query reads."""
-CLOSED_S = 2 * HOUR_S
+DAY_CLOSE_DELAY_S = 2 * HOUR_S
 """Time after the end of a day at which its files are merged [s], because most late blocks have arrived by then."""
-MEMORY = "500MB"
+MERGE_MEMORY = "500MB"
 """Memory limit of a merge. A day of 100,000 packs is larger. DuckDB then sorts it in parts on the disk."""
 _MAGIC = b"PAR1"
 """First and last bytes of a Parquet file."""
@@ -74,11 +74,11 @@ def day_folder(folder: Path, day: date) -> Path:
 
 def _write_day(folder: Path, day: int, rows: pa.Table) -> Path:
     """Write the rows of a day, given in days since 1970."""
-    path_of_day = day_folder(folder, datetime.fromtimestamp(day * 24 * HOUR_S, UTC).date())
-    if not path_of_day.is_dir():
-        path_of_day.mkdir(parents=True, exist_ok=True)
+    folder_of_day = day_folder(folder, datetime.fromtimestamp(day * 24 * HOUR_S, UTC).date())
+    if not folder_of_day.is_dir():
+        folder_of_day.mkdir(parents=True, exist_ok=True)
         _sync(folder)
-    path = path_of_day / f"{BATCH_PREFIX}{uuid.uuid4().hex}.parquet"
+    path = folder_of_day / f"{BATCH_PREFIX}{uuid.uuid4().hex}.parquet"
     unfinished = path.with_name(f".{path.name}{UNFINISHED_SUFFIX}")
     pq.write_table(rows, unfinished, compression="zstd")
     _finish(unfinished, path)
@@ -100,7 +100,7 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def to_compact(folder: Path, now_s: float) -> list[Path]:
+def days_to_compact(folder: Path, now_s: float) -> list[Path]:
     """Return the folders of days whose files should be merged.
 
     These are the unmerged days that have ended, and the days with at least ``MAX_FILES_PER_DAY`` files.
@@ -109,7 +109,7 @@ def to_compact(folder: Path, now_s: float) -> list[Path]:
         folder: Folder of the Parquet files.
         now_s: Wall clock [s since 1970].
     """
-    ended_before = datetime.fromtimestamp(now_s - CLOSED_S, UTC).date().isoformat()
+    ended_before = datetime.fromtimestamp(now_s - DAY_CLOSE_DELAY_S, UTC).date().isoformat()
     days = []
     for day in sorted(folder.glob(f"{DAY_FOLDER_PREFIX}*")):
         files = complete_files(day)
@@ -136,10 +136,10 @@ def compact(day: Path) -> Path:
     path = day / f"{MERGED_PREFIX}{uuid.uuid4().hex}.parquet"
     unfinished = path.with_name(f".{path.name}{UNFINISHED_SUFFIX}")
     names = [str(file) for file in files]
-    with duckdb.connect(config={"memory_limit": MEMORY, "temp_directory": str(day / ".sorting")}) as base:
-        base.read_parquet(names, union_by_name=True, hive_partitioning=False).create_view("rows")
-        each_once = base.sql("SELECT DISTINCT ON (pack, hour) * FROM rows ORDER BY pack, hour")
-        each_once.write_parquet(str(unfinished), compression="zstd", row_group_size=ROW_GROUP)
+    with duckdb.connect(config={"memory_limit": MERGE_MEMORY, "temp_directory": str(day / ".sorting")}) as database:
+        database.read_parquet(names, union_by_name=True, hive_partitioning=False).create_view("rows")
+        unique_rows = database.sql("SELECT DISTINCT ON (pack, hour) * FROM rows ORDER BY pack, hour")
+        unique_rows.write_parquet(str(unfinished), compression="zstd", row_group_size=ROW_GROUP)
     _finish(unfinished, path)
     for file in files:
         file.unlink(missing_ok=True)

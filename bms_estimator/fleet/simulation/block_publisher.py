@@ -16,7 +16,7 @@ import paho.mqtt.client as mqtt
 from paho.mqtt.enums import CallbackAPIVersion
 from pydantic import ValidationError
 
-from bms_estimator.edge.subjects import BlockRequest, awaits, raw
+from bms_estimator.edge.subjects import BlockRequest, block_request, raw
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from bms_estimator.mqtt.broker_config import brokers, password, tls_context
@@ -36,7 +36,7 @@ MIN_RECONNECT_DELAY_S = 1
 """Minimum delay before a reconnect [s]."""
 MAX_RECONNECT_DELAY_S = 4
 """Maximum delay before a reconnect [s]."""
-_REPLIES = awaits("+").replace(".", "/")
+_REPLIES = block_request("+").replace(".", "/")
 
 
 class Report(NamedTuple):
@@ -44,8 +44,8 @@ class Report(NamedTuple):
 
     blocks: int
     """Number of sent blocks, with repetitions."""
-    again: int
-    """Number of repetitions."""
+    repeated: int
+    """Number of sent blocks that were sent before."""
     bytes: int
     """Total size of the blocks [bytes]."""
     resends: int
@@ -57,7 +57,7 @@ class Report(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"{self.blocks:,} blocks sent, {self.again:,} of them again after {self.resends:,} requests of workers, "
+            f"{self.blocks:,} blocks sent, {self.repeated:,} of them again after {self.resends:,} requests of workers, "
             f"{self.unacknowledged:,} not acknowledged, {self.lag_s:.1f} s behind"
         )
 
@@ -144,19 +144,20 @@ async def run_edges(
         UserError: An address, password or certificate cannot be used.
     """
     replies: deque[tuple[str, bytes]] = deque()
+    # only the first connection subscribes, because the replies to all edges arrive on it
     open_connections = [_Connection(settings, None if i else replies) for i in range(connections)]
     topics = [raw(name).replace(".", "/") for name in fleet.names]
-    size, progress_s, busy_s = 0, time.monotonic(), time.monotonic()
+    sent_bytes, last_progress_s, last_busy_s = 0, time.monotonic(), time.monotonic()
     try:
-        while not await _ended(stop) and time.monotonic() - busy_s < quiet_s:
+        while not await _ended(stop) and time.monotonic() - last_busy_s < quiet_s:
             _process_replies(replies, edges)
-            size += _send(fleet, edges, open_connections, topics)
+            sent_bytes += _send(fleet, edges, open_connections, topics)
             if not edges.done or any(connection.in_flight for connection in open_connections):
-                busy_s = time.monotonic()
-            if time.monotonic() - progress_s >= PROGRESS_S:
-                progress_s = time.monotonic()
-                report(str(_report(edges, open_connections, size)))
-        return _report(edges, open_connections, size)
+                last_busy_s = time.monotonic()
+            if time.monotonic() - last_progress_s >= PROGRESS_S:
+                last_progress_s = time.monotonic()
+                report(str(_report(edges, open_connections, sent_bytes)))
+        return _report(edges, open_connections, sent_bytes)
     finally:
         for connection in open_connections:
             await asyncio.to_thread(connection.end)
@@ -181,16 +182,15 @@ def _process_replies(replies: deque[tuple[str, bytes]], edges: SimulatedEdges) -
 
 def _send(fleet: SimulatedFleet, edges: SimulatedEdges, open_connections: list[_Connection], topics: list[str]) -> int:
     """Send due blocks within the limit of messages in flight; return their size [bytes]."""
-    free = min(MAX_IN_FLIGHT - connection.in_flight for connection in open_connections)
-    due = edges.due(time.time(), max(0, free))
-    blocks = list(
-        fleet.blocks(*due)
-    )  # before any publish, because the connections' threads would slow down this thread
+    capacity = min(MAX_IN_FLIGHT - connection.in_flight for connection in open_connections)
+    due = edges.due(time.time(), max(0, capacity))
+    # all blocks are computed before the first one is published, because the connections' threads would slow down this one
+    blocks = list(fleet.blocks(*due))
     for pack, block in zip(due.packs.tolist(), blocks, strict=True):
         open_connections[pack % len(open_connections)].publish(topics[pack], block)
     return sum(map(len, blocks))
 
 
-def _report(edges: SimulatedEdges, open_connections: list[_Connection], size: int) -> Report:
+def _report(edges: SimulatedEdges, open_connections: list[_Connection], sent_bytes: int) -> Report:
     unacknowledged = sum(connection.in_flight for connection in open_connections)
-    return Report(edges.sent, edges.again, size, edges.resends, unacknowledged, edges.lag_s(time.time()))
+    return Report(edges.sent, edges.repeated, sent_bytes, edges.resends, unacknowledged, edges.lag_s(time.time()))

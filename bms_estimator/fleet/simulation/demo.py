@@ -7,7 +7,6 @@ import asyncio
 import contextlib
 import itertools
 import json
-import math
 import random
 import socket
 import sys
@@ -56,10 +55,10 @@ class DemoObserver:
     """Heartbeats and estimates received during a demo.
 
     Attributes:
-        partitions: Partitions with packs.
+        partitions: Numbers of the partitions that contain packs.
         workers: Last heartbeat of each worker and the monotonic clock of its arrival [s].
         errors: Estimated minus true SOC since the last progress line.
-        within: Numbers of estimates with the true SOC within two standard deviations (True) or not (False).
+        within: Number of estimates whose true SOC is within two standard deviations (True), or is not (False).
         dead: Names of the killed workers.
         max_lag_s: Largest lag since the last progress line [s].
     """
@@ -131,7 +130,7 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
         f'[server]\nfolder = "{demo.folder}/server"\nlisten = "{LOOPBACK}:{nats_port}"\n'
         f'mqtt = "{LOOPBACK}:{mqtt_port}"\nmonitor = "{LOOPBACK}:{monitor_port}"\n'
     )
-    begin_s = int(time.time()) - BLOCK_S
+    begin_s = int(time.time()) - BLOCK_S  # the first blocks are then complete when the edges start
     fleet = SimulatedFleet(demo.packs, seed=SEED, begin_ns=begin_s * 10**9)
     table = demo.folder / "packs.csv"
     table.write_text(fleet.table())
@@ -170,35 +169,39 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
 
 
 async def _report_progress(demo: Demo, observer: DemoObserver, processes: "Processes", stop: asyncio.Event) -> None:
-    """Report the progress, kill a worker after ``KILL_AFTER``, and report when the other one has taken over."""
-    begin_s, kill_s, killed_s, line_count, processed = time.monotonic(), KILL_AFTER * demo.seconds, math.inf, 1, 0
+    """Report the progress, kill a worker after ``KILL_AFTER``, and report when the other worker has taken over."""
+    begin_s, line_count, processed = time.monotonic(), 1, 0
+    killed_s: float | None = None
+    is_taken_over = False
     while not stop.is_set():
         now_s = time.monotonic() - begin_s
-        if kill_s == math.inf and now_s >= demo.seconds + (0.0 if killed_s == math.inf else TIMEOUT_S):
+        if killed_s is not None and now_s >= demo.seconds + (0.0 if is_taken_over else TIMEOUT_S):
             return
         processes.check()
-        if now_s >= kill_s:
-            held = len(observer.alive[_KILLED].partitions) if _KILLED in observer.alive else 0
+        if killed_s is None and now_s >= KILL_AFTER * demo.seconds:
+            owned_count = len(observer.alive[_KILLED].partitions) if _KILLED in observer.alive else 0
             await processes.kill(_KILLED)
             observer.dead.add(_KILLED)
-            demo.report(f"{now_s:4.0f} s  {_KILLED} is killed (SIGKILL), and its states of {held} partitions are lost")
-            kill_s, killed_s = math.inf, now_s
-        if killed_s < now_s and observer.owned_partitions >= observer.partitions:
+            demo.report(
+                f"{now_s:4.0f} s  {_KILLED} is killed (SIGKILL), and its states of {owned_count} partitions are lost"
+            )
+            killed_s = now_s
+        elif killed_s is not None and not is_taken_over and observer.owned_partitions >= observer.partitions:
             demo.report(
                 f"{now_s:4.0f} s  {_WORKERS[1]} has all partitions, {now_s - killed_s:.1f} s after the kill: it continues from "
                 f"{_KILLED}'s last checkpoints and reads the later blocks from the stream"
             )
-            killed_s = math.inf
+            is_taken_over = True
         if now_s >= line_count * PROGRESS_S:
-            demo.report(f"{now_s:4.0f} s  {_line(observer, processed)}")
+            demo.report(f"{now_s:4.0f} s  {_progress_line(observer, processed)}")
             line_count, processed = line_count + 1, observer.processed
             observer.errors.clear()
             observer.max_lag_s = 0.0
         await asyncio.sleep(0.1)
 
 
-def _line(observer: DemoObserver, processed: int) -> str:
-    rate = f"{(observer.processed - processed) / PROGRESS_S:4,.0f} blocks/s estimated, at most {observer.max_lag_s:.1f} s after their arrival"
+def _progress_line(observer: DemoObserver, processed_before: int) -> str:
+    rate = f"{(observer.processed - processed_before) / PROGRESS_S:4,.0f} blocks/s estimated, at most {observer.max_lag_s:.1f} s after their arrival"
     error = f"; mean SOC error {100.0 * float(np.mean(np.abs(observer.errors))):.1f} %" if observer.errors else ""
     return f"{rate}{error}; {_partition_counts(observer)} partitions"
 
@@ -213,13 +216,13 @@ async def _totals(nc: Client, observer: DemoObserver, processes: "Processes", st
     """Wait until all blocks are processed, and return the totals as text."""
     stored = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.messages
 
-    def all_taken() -> bool:
+    def all_processed() -> bool:
         return (
             observer.counted_blocks + sum(heartbeat.counters.get("resends", 0) for heartbeat in observer.alive.values())
             >= stored
         )
 
-    await processes.until(all_taken, stop)
+    await processes.until(all_processed, stop)
     within = observer.within[True] / max(1, observer.within.total())
     counters = Counter[str]()
     for heartbeat in observer.alive.values():
@@ -241,7 +244,7 @@ async def _observe(nc: Client, fleet: SimulatedFleet) -> DemoObserver:
         observer.workers[heartbeat.id] = time.monotonic(), heartbeat
         observer.max_lag_s = max(observer.max_lag_s, heartbeat.lag_s or 0.0)
 
-    async def state(message: Msg) -> None:
+    async def on_state(message: Msg) -> None:
         estimate = json.loads(message.data)
         pack = np.array([index[message.subject.split(".")[1]]])
         error = estimate["soc"] - float(fleet.soc(pack, np.array([estimate["board_time_s"]]))[0])
@@ -250,7 +253,7 @@ async def _observe(nc: Client, fleet: SimulatedFleet) -> DemoObserver:
 
     await nc.subscribe(subjects.worker(), cb=on_heartbeat)
     for name in fleet.names[:: max(1, len(fleet.names) // OBSERVED_PACKS)]:
-        await nc.subscribe(subjects.published(name, "state"), cb=state)
+        await nc.subscribe(subjects.published(name, "state"), cb=on_state)
     await nc.flush()
     return observer
 

@@ -29,39 +29,40 @@ class SimulatedEdges:
         fleet: Simulated packs.
         start_s: Wall clock at which the first block began [s since 1970].
         speed: Simulated seconds per second.
-        last: Initial value of the attribute ``last``.
+        last: Number of the last block of each edge; None without end.
 
     Attributes:
-        last: Number of the last block of each edge; None without end.
-        next: Number of the block that each edge sends next, shape (packs,).
-        safe: Number of each edge below which workers have confirmed all blocks, shape (packs,).
+        last: Argument ``last``, which may be changed.
+        next_number: Number of the block that each edge sends next, shape (packs,).
+        confirmed_below: Number below which workers have confirmed all blocks of each edge, shape (packs,).
         resends: Number of requests to resend.
         sent: Number of blocks sent, with repetitions.
-        again: Number of repetitions.
+        repeated: Number of blocks sent that were sent before.
     """
 
     def __init__(self, fleet: SimulatedFleet, *, start_s: float, speed: float, last: int | None = None) -> None:
         self._fleet, self._start_s, self._speed, self.last = fleet, start_s, speed, last
         self._index = {name: i for i, name in enumerate(fleet.names)}
         self._store_offset_s = (fleet.store - fleet.begin_ns) / 1e9
-        self.next: Whole = np.ones(len(fleet.names), dtype=np.int64)
-        self.safe, self._furthest = self.next.copy(), self.next.copy()
+        self.next_number: Whole = np.ones(len(fleet.names), dtype=np.int64)
+        self.confirmed_below = self.next_number.copy()
+        self._first_unsent = self.next_number.copy()  # lowest number that each edge has never sent
         self._requested: Whole = np.zeros(len(fleet.names), dtype=np.int64)
         self._requested_s: Floats = np.full(len(fleet.names), -np.inf)
-        self.resends = self.sent = self.again = 0
+        self.resends = self.sent = self.repeated = 0
 
-    def due(self, now_s: float, most: int) -> Due:
-        """Return the blocks complete at ``now_s`` [s since 1970] and not sent yet; beyond ``most`` only the oldest."""
-        ready_s = self._ready_s(self.next)
-        open_ = ready_s <= now_s if self.last is None else (ready_s <= now_s) & (self.next <= self.last)
-        packs = np.flatnonzero(open_)
-        if packs.size > most:
-            packs = packs[np.argpartition(ready_s[packs], most)[:most]]
-        numbers = self.next[packs]
-        self.next[packs] += 1
+    def due(self, now_s: float, max_blocks: int) -> Due:
+        """Return up to ``max_blocks`` of the oldest blocks that are complete at ``now_s`` [s since 1970] and not sent yet."""
+        ready_s = self._ready_s(self.next_number)
+        is_due = ready_s <= now_s if self.last is None else (ready_s <= now_s) & (self.next_number <= self.last)
+        packs = np.flatnonzero(is_due)
+        if packs.size > max_blocks:
+            packs = packs[np.argpartition(ready_s[packs], max_blocks)[:max_blocks]]
+        numbers = self.next_number[packs]
+        self.next_number[packs] += 1
         self.sent += packs.size
-        self.again += int(np.count_nonzero(numbers < self._furthest[packs]))
-        self._furthest[packs] = np.maximum(self._furthest[packs], self.next[packs])
+        self.repeated += int(np.count_nonzero(numbers < self._first_unsent[packs]))
+        self._first_unsent[packs] = np.maximum(self._first_unsent[packs], self.next_number[packs])
         return Due(packs, numbers, ready_s[packs])
 
     def receive_reply(self, pack: str, reply: BlockRequest, now_s: float) -> bool:
@@ -69,26 +70,27 @@ class SimulatedEdges:
         i = self._index.get(pack)
         if i is None or reply.store != self._fleet.store[i]:
             return False
-        safe_before, self.safe[i] = self.safe[i], max(self.safe[i], reply.number)
+        confirmed_before = self.confirmed_below[i]
+        self.confirmed_below[i] = max(confirmed_before, reply.number)
         if reply.resend:
             self.resends += 1
-            if reply.number >= safe_before and (
+            if reply.number >= confirmed_before and (
                 reply.number != self._requested[i] or now_s - self._requested_s[i] >= RESEND_S
             ):
-                self.next[i] = min(self.next[i], reply.number)
+                self.next_number[i] = min(self.next_number[i], reply.number)
                 self._requested[i], self._requested_s[i] = reply.number, now_s
         else:  # skip blocks that an earlier run has sent
-            self.next[i] = max(self.next[i], reply.number)
+            self.next_number[i] = max(self.next_number[i], reply.number)
         return True
 
     @property
     def done(self) -> bool:
         """True if every edge has sent its last block."""
-        return self.last is not None and bool((self.next > self.last).all())
+        return self.last is not None and bool((self.next_number > self.last).all())
 
     def lag_s(self, now_s: float) -> float:
         """Return the age of the oldest due block that was not sent [s]; 0 without one."""
-        ready_s = self._ready_s(self.next)
+        ready_s = self._ready_s(self.next_number)
         return 0.0 if self.done else max(0.0, now_s - float(ready_s.min()))
 
     def _ready_s(self, numbers: Whole) -> Floats:

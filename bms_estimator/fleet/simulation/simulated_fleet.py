@@ -11,6 +11,7 @@ from the values in the table of packs, because real packs age and vary.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -62,13 +63,29 @@ MAX_CAPACITY = 1.02
 WORN_OUT_CAPACITY = 0.6
 """True capacity of a worn-out pack as a fraction of the rated capacity."""
 MIN_RESISTANCE = 0.8
-"""Minimum true resistance as a multiple of that of the cell file."""
+"""Minimum true resistance as a multiple of the cell file's resistance."""
 MAX_RESISTANCE = 1.6
-"""Maximum true resistance as a multiple of that of the cell file."""
+"""Maximum true resistance as a multiple of the cell file's resistance."""
 FAILING_RESISTANCE = 3.0
-"""True resistance of a failing pack as a multiple of that of the cell file."""
+"""True resistance of a failing pack as a multiple of the cell file's resistance."""
 OUTLIER_FRACTION = 0.01
 """Fraction of packs that are worn out. An equal fraction is failing."""
+
+
+class _Draw(IntEnum):
+    """Random values of a pack. Each has its own stream of numbers."""
+
+    STORE_DELAY = 1
+    PERIOD = 2
+    PHASE = 3
+    TEMPERATURE = 4
+    DEFECT = 5
+    CAPACITY = 6
+    RESISTANCE = 7
+    JITTER = 8
+    CURRENT_NOISE = 9
+    VOLTAGE_NOISE = 10
+    PULSE = 11
 
 
 class Kind(NamedTuple):
@@ -112,7 +129,10 @@ class _Curves:
         a, soc = pack.a, np.linspace(0.0, 1.0, OCV_POINTS)
         self.capacity_as = pack.cell.capacity_ah * 3600.0
         self.soc, self.ocv_v = soc, ocv_grid(pack)[0]
-        self.r_s, self.r_ts, self.r_tl = (a[i] * np.exp(-a[i + 1] * soc) + a[i + 2] for i in (13, 1, 4))
+        self.r_s, self.r_ts, self.r_tl = (
+            a[i] * np.exp(-a[i + 1] * soc) + a[i + 2]
+            for i in (13, 1, 4)  # index of the first coefficient: (2.9), (2.5) and (2.6) of the thesis
+        )
 
 
 @dataclass(frozen=True)
@@ -131,7 +151,7 @@ class SimulatedFleet:
     Args:
         packs: Number of packs.
         seed: Seed of all random values.
-        begin_ns: Creation time of the first edge's store [ns since 1970]; those of the other edges follow within a minute.
+        begin_ns: Creation time of the first edge's store [ns since 1970]. The other stores follow within a minute.
         prefix: Prefix of the packs' names.
 
     Attributes:
@@ -145,27 +165,27 @@ class SimulatedFleet:
         self.names = tuple(f"{prefix}-{i:06d}" for i in range(packs))
         self._salt = np.uint64(seed % 2**64)
         self._curves = tuple(_Curves(kind) for kind in KINDS)
-        self._kind = pack % len(KINDS)
-        within_s = self._uniform(pack, 1) * BLOCK_S
+        self._kind_index = pack % len(KINDS)
+        store_delay_s = self._uniform(pack, _Draw.STORE_DELAY) * BLOCK_S
         self.begin_ns = begin_ns
-        self.store: Whole = begin_ns + (within_s * 1e9).astype(np.int64)
-        self._omega = 2.0 * math.pi / (MIN_PERIOD_S + (MAX_PERIOD_S - MIN_PERIOD_S) * self._uniform(pack, 2))
-        self._phase = 2.0 * math.pi * self._uniform(pack, 3)
-        self._temperature_c = np.round(20.0 + 10.0 * self._uniform(pack, 4), 1)
+        self.store: Whole = begin_ns + (store_delay_s * 1e9).astype(np.int64)
+        self._omega = 2.0 * math.pi / (MIN_PERIOD_S + (MAX_PERIOD_S - MIN_PERIOD_S) * self._uniform(pack, _Draw.PERIOD))
+        self._phase = 2.0 * math.pi * self._uniform(pack, _Draw.PHASE)
+        self._temperature_c = np.round(20.0 + 10.0 * self._uniform(pack, _Draw.TEMPERATURE), 1)
         self.truth = self._draw_truth(pack)
 
     def _draw_truth(self, pack: Whole) -> Truth:
-        defect = self._uniform(pack, 5)
-        capacity = MIN_CAPACITY + (MAX_CAPACITY - MIN_CAPACITY) * self._uniform(pack, 6)
-        resistance = MIN_RESISTANCE + (MAX_RESISTANCE - MIN_RESISTANCE) * self._uniform(pack, 7)
+        defect = self._uniform(pack, _Draw.DEFECT)
+        capacity = MIN_CAPACITY + (MAX_CAPACITY - MIN_CAPACITY) * self._uniform(pack, _Draw.CAPACITY)
+        resistance = MIN_RESISTANCE + (MAX_RESISTANCE - MIN_RESISTANCE) * self._uniform(pack, _Draw.RESISTANCE)
         capacity[defect < OUTLIER_FRACTION] = WORN_OUT_CAPACITY
         resistance[(defect >= OUTLIER_FRACTION) & (defect < 2 * OUTLIER_FRACTION)] = FAILING_RESISTANCE
         rated_as = np.array([curves.capacity_as for curves in self._curves])
-        return Truth(capacity * rated_as[self._kind], resistance)
+        return Truth(capacity * rated_as[self._kind_index], resistance)
 
     def kind(self, pack: int) -> Kind:
         """Return the kind of a pack as in the table of packs."""
-        return KINDS[self._kind[pack]]
+        return KINDS[self._kind_index[pack]]
 
     def blocks(self, packs: Whole, numbers: Whole, arrival_s: Floats) -> Iterator[bytes]:
         """Yield one encoded block of each pack, as edges send it.
@@ -187,15 +207,17 @@ class SimulatedFleet:
         second = np.arange(BLOCK_S)
         index = ((numbers[:, None] - 1) * BLOCK_S + second).astype(np.int64)
         samples = np.zeros((packs.size, BLOCK_S), dtype=SAMPLE)
-        samples["time_s"] = index + np.round(JITTER_S * self._uniform(packs[:, None], 8, index), 3)
+        samples["time_s"] = index + np.round(JITTER_S * self._uniform(packs[:, None], _Draw.JITTER, index), 3)
         samples["temperature_c"] = self._temperature_c[packs][:, None]
-        for kind, (declared, curves) in enumerate(zip(KINDS, self._curves, strict=True)):
-            rows = np.flatnonzero(self._kind[packs] == kind)
+        for kind_index, (declared, curves) in enumerate(zip(KINDS, self._curves, strict=True)):
+            rows = np.flatnonzero(self._kind_index[packs] == kind_index)
             if rows.size:
                 current_a, voltage_v = self._terminals(packs[rows], numbers[rows], curves)
-                noise = [self._uniform(packs[rows][:, None], stream, index[rows]) - 0.5 for stream in (9, 10)]
-                samples["current_a"][rows] = _quantize(current_a, noise[0], declared.current_resolution_a)
-                samples["voltage_v"][rows] = _quantize(voltage_v, 2.0 * noise[1], declared.voltage_resolution_v)
+                # within half a step of the current, and one step of the voltage
+                noise_a = self._uniform(packs[rows][:, None], _Draw.CURRENT_NOISE, index[rows]) - 0.5
+                noise_v = 2.0 * (self._uniform(packs[rows][:, None], _Draw.VOLTAGE_NOISE, index[rows]) - 0.5)
+                samples["current_a"][rows] = _quantize(current_a, noise_a, declared.current_resolution_a)
+                samples["voltage_v"][rows] = _quantize(voltage_v, noise_v, declared.voltage_resolution_v)
                 if not declared.thermometer:
                     samples["temperature_c"][rows] = np.nan
         return samples
@@ -203,7 +225,7 @@ class SimulatedFleet:
     def table(self) -> str:
         """Return the table of packs in the format that ``fleet packs load`` reads."""
         lines = [",".join(COLUMNS)]
-        lines += [_row(name, KINDS[kind]) for name, kind in zip(self.names, self._kind.tolist(), strict=True)]
+        lines += [_row(name, KINDS[index]) for name, index in zip(self.names, self._kind_index.tolist(), strict=True)]
         return "\n".join(lines) + "\n"
 
     def truth_table(self) -> str:
@@ -238,17 +260,21 @@ class SimulatedFleet:
 
     def _pulse_a(self, packs: Whole, minutes: Whole) -> Floats:
         """Return the current of the pulse in each minute [A]."""
-        return PULSE_C / 3600.0 * self.truth.capacity_as[packs] * (2.0 * self._uniform(packs, 11, minutes) - 1.0)
+        return (
+            PULSE_C / 3600.0 * self.truth.capacity_as[packs] * (2.0 * self._uniform(packs, _Draw.PULSE, minutes) - 1.0)
+        )
 
     def _terminals(self, packs: Whole, numbers: Whole, curves: _Curves) -> tuple[Floats, Floats]:
         """Return true current [A] and voltage [V] in each second of a block, both of shape (n, BLOCK_S)."""
         column, second = packs[:, None], np.arange(BLOCK_S, dtype=np.float64)
         time_s = (numbers[:, None] - 1) * BLOCK_S + second
+        # a slow current that passes the slow branch is nearly delayed by the time constant
         slow_a, delayed_a = self._slow_a(column, time_s), self._slow_a(column, time_s - TAU_TL_S)
-        past_a = self._pulse_a(column, numbers[:, None] - 1 - np.arange(PAST_PULSES + 1))
-        current_a = slow_a + past_a[:, :1] * _PULSE
+        # pulses of this minute (first column) and of the minutes before
+        pulse_a = self._pulse_a(column, numbers[:, None] - 1 - np.arange(PAST_PULSES + 1))
+        current_a = slow_a + pulse_a[:, :1] * _PULSE
         branch_a = (
-            slow_a + past_a[:, :1] * _RESPONSE + (past_a[:, 1:] @ _REMAINDER)[:, None] * np.exp(-second / TAU_TS_S)
+            slow_a + pulse_a[:, :1] * _RESPONSE + (pulse_a[:, 1:] @ _REMAINDER)[:, None] * np.exp(-second / TAU_TS_S)
         )
         soc = self.soc(column, time_s)
         ocv_v, r_s, r_ts, r_tl = (
@@ -257,11 +283,11 @@ class SimulatedFleet:
         drop_v = r_s * current_a + r_ts * branch_a + r_tl * delayed_a  # (2.4) of the thesis
         return current_a, ocv_v - self.truth.resistance[column] * drop_v
 
-    def _uniform(self, packs: Whole, stream: int, index: Whole | int = 0) -> Floats:
-        """Return uniform numbers in [0, 1) that depend only on seed, pack, ``stream`` and ``index``."""
-        key = _mixed(np.asarray(packs, dtype=np.uint64) + (self._salt << np.uint64(32)) + np.uint64(stream << 56))
+    def _uniform(self, packs: Whole, draw: _Draw, index: Whole | int = 0) -> Floats:
+        """Return uniform numbers in [0, 1) that depend only on seed, pack, ``draw`` and ``index``."""
+        key = _mixed(np.asarray(packs, dtype=np.uint64) + (self._salt << np.uint64(32)) + np.uint64(draw << 56))
         bits = _mixed(key + np.asarray(index).astype(np.uint64)) >> np.uint64(11)
-        return bits.astype(np.float64) * 2.0**-53
+        return bits.astype(np.float64) * 2.0**-53  # a double has 53 bits
 
 
 def _mixed(bits: Bits) -> Bits:

@@ -1,7 +1,7 @@
 """Order of a pack's blocks, and replies to its edge. Both depend only on the received blocks.
 
-An edge stores each block until a reply confirms that all earlier blocks are safe. On request it resends the awaited block
-and all later blocks. Therefore late, repeated and early blocks can be dropped.
+A reply names the awaited block and confirms all earlier ones, which the edge may then delete. On request, the edge resends
+the awaited block and all later blocks. Therefore late, repeated and early blocks can be dropped.
 """
 
 from enum import Enum
@@ -47,7 +47,7 @@ def classify_block(d: np.void, block: Block) -> BlockOrder:
     if block.store < store:
         return BlockOrder.FORMER_STORE
     if block.store > store:
-        d["store"], number = block.store, _expect(d, 1)
+        d["store"], number = block.store, _await_block(d, 1)
     if block.oldest > number:
         number = _skip_lost_blocks(d, block.oldest)
     if block.number < number:
@@ -67,14 +67,14 @@ def mark_taken(d: np.void) -> None:
     Args:
         d: The pack's record of dtype ``DELIVERY``.
     """
-    _expect(d, int(d["awaited"]) + 1)
+    _await_block(d, int(d["awaited"]) + 1)
     d["blocks"] += 1
 
 
 def _skip_lost_blocks(d: np.void, number: int) -> int:
     """Count the missing blocks before ``number`` as lost, await block ``number``, and return ``number``."""
     d["lost_blocks"] = min(int(d["lost_blocks"]) + number - int(d["awaited"]), MAX_LOST_BLOCKS)
-    return _expect(d, number)
+    return _await_block(d, number)
 
 
 def _count_first_early_block(d: np.void, number: int) -> None:
@@ -84,25 +84,26 @@ def _count_first_early_block(d: np.void, number: int) -> None:
     d["passed"] += number == d["first_ahead"]
 
 
-def _expect(d: np.void, number: int) -> int:
+def _await_block(d: np.void, number: int) -> int:
     """Await block ``number``, reset the counts of early blocks, and return ``number``."""
     d["awaited"], d["ahead"], d["first_ahead"], d["passed"] = number, 0, 0, 0
     return number
 
 
-def edge_reply(order: BlockOrder, d: np.void, block: Block, *, first: bool) -> BlockRequest | None:
+def edge_reply(order: BlockOrder, d: np.void, block: Block, *, is_first: bool) -> BlockRequest | None:
     """Return the reply to a block's edge; None if no reply is due.
 
     Args:
         order: Result of ``classify_block``.
         d: The pack's record of dtype ``DELIVERY``, after the block.
         block: The received block.
-        first: True for the first block of this pack since the worker took over the partition.
+        is_first: True for the first block of this pack since the worker took over the partition.
     """
     store, number = int(d["store"]), int(d["awaited"])
     if order is BlockOrder.AHEAD:
-        due = first or int(d["ahead"]) % REQUEST_EVERY == 1
+        # the first early block requests the missing one at once
+        due = is_first or int(d["ahead"]) % REQUEST_EVERY == 1
         return BlockRequest(store=store, number=number, resend=True) if due else None
-    if first or block.number % CONFIRM_EVERY == 0:
+    if is_first or block.number % CONFIRM_EVERY == 0:
         return BlockRequest(store=store, number=number, resend=False)
     return None

@@ -36,61 +36,64 @@ Publications = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
 
 
 class BlockProcessor:
-    """Processor of the pack whose state is in the work record.
+    """Processor of the pack whose state is in the unpacked record.
 
     Args:
-        record: Work record, shape (1,), dtype ``PACK_STATE``.
+        record: Unpacked record, shape (1,), dtype ``PACK_STATE``.
         counters: Counters of the partition; updated.
         wall: Wall clock for publish times [s since 1970].
     """
 
     def __init__(self, record: NDArray[np.void], counters: Counter[str], wall: Callable[[], float]) -> None:
         self._record, self._counters, self._wall = record, counters, wall
-        self._delivery, self._flows, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
+        self._delivery, self._flow, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
         self._observer = record[0]["estimator"]["observer"]
         self._window = Window()
 
-    def step(self, pack: str, block: Block, pack_type: PackType, former: Fields | None) -> Publications:
+    def step(self, pack: str, block: Block, pack_type: PackType, unmigrated_fields: Fields | None) -> Publications:
         """Estimate the pack's next block and return the resulting messages.
 
         Args:
             pack: Name of the pack.
             block: The block; its implausible timestamps are set to NaN.
-            pack_type: Type of the pack; its estimator is bound to the work record.
-            former: Estimator fields in the layout of another version; None if the work record has them.
+            pack_type: Type of the pack; its estimator is bound to the unpacked record.
+            unmigrated_fields: Estimator fields in the layout of another version; None if the unpacked record has them.
         """
         self._check_times(block.samples)
-        self._restore_or_reset(pack_type, former, block)
+        self._restore_or_reset(pack_type, unmigrated_fields, block)
         rows, is_new_hour = self._roll_over_hour(pack, block, pack_type)
         self._resume_after_store_change(pack_type.estimator, block)
+        # another pack may have used the window meanwhile
         self._window.previous_end_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
         self._record_last_sample(block)
         arrival_s, now_s = self._arrival_s(block), self._wall()
         self._estimate(block, pack_type, arrival_s)
-        state = self._state(pack_type, now_s)
-        parameters = (
-            self._parameters(pack_type.estimator, arrival_s, now_s) if is_new_hour and state is not None else None
-        )
+        state = self._state_payload(pack_type, now_s)
+        parameters = None
+        if is_new_hour and state is not None:
+            parameters = self._parameters_payload(pack_type.estimator, arrival_s, now_s)
         return state, parameters, rows
 
     def reset_window(self) -> None:
         """Drop the samples of a failed block from the publish window."""
         self._window = Window()
 
-    def _restore_or_reset(self, pack_type: PackType, former: Fields | None, block: Block) -> None:
+    def _restore_or_reset(self, pack_type: PackType, unmigrated_fields: Fields | None, block: Block) -> None:
         """Adapt the pack's state to its present settings and this version. Reset an incompatible state."""
         d, record = self._delivery, self._record[0]
         is_same_config = _digest(d["made_of"]) == pack_type.config_digest
-        if is_same_config and former is None:
+        if is_same_config and unmigrated_fields is None:
             return
-        has_state = bool(self._hour["store"])
+        has_state = bool(self._hour["store"])  # 0 before the first block
         if _digest(d["meaning"]) == pack_type.state_digest and has_state:
-            saved = former if former is not None else {name: v.copy() for name, v in fields(self._record["estimator"])}
+            saved = unmigrated_fields
+            if saved is None:
+                saved = {name: v.copy() for name, v in fields(self._record["estimator"])}
             record["estimator"] = np.zeros((), PACK_STATE["estimator"])
-            error = restore_state(
-                pack_type.estimator, saved if is_same_config else without_observer(saved), self._gap_s(block)
-            )
-            self._flows["sums"]["counted"] = self._hour["outliers_before"] = self._hour["searches_before"] = 0
+            valid = saved if is_same_config else without_observer(saved)
+            error = restore_state(pack_type.estimator, valid, self._gap_s(block))
+            # the restored estimator has no last sample, and its counters begin at 0
+            self._flow["sums"]["counted"] = self._hour["outliers_before"] = self._hour["searches_before"] = 0
             self._counters["not_taken_over" if error else "taken_over"] += 1
         else:
             for name in ("flow", "hour", "estimator"):
@@ -106,17 +109,16 @@ class BlockProcessor:
         """
         if int(self._delivery["clock"]) == block.store:
             return
-        self._flows["sums"]["counted"] = 0
-        if self._observer["started"] and math.isfinite(
-            self._observer["time_s"]
-        ):  # otherwise the estimator has already been resumed
+        self._flow["sums"]["counted"] = 0  # no charge is counted over the gap
+        has_time_base = math.isfinite(self._observer["time_s"])  # otherwise the estimator has already been resumed
+        if self._observer["started"] and has_time_base:
             estimator.resume(self._gap_s(block))
 
     def _estimate(self, block: Block, pack_type: PackType, arrival_s: float) -> None:
         """Estimate the samples; add the estimates to the hour, the charge and energy meter and the publish window."""
         observer, counters = self._observer, self._counters
-        accepted, steps_back = int(observer["samples"]), int(observer["time_steps_back"])
-        pack_type.meter.continue_from(ChargeEnergy(*(float(self._flows[name]) for name in ChargeEnergy._fields)))
+        accepted_before, steps_back_before = int(observer["samples"]), int(observer["time_steps_back"])
+        pack_type.meter.continue_from(ChargeEnergy(*(float(self._flow[name]) for name in ChargeEnergy._fields)))
         for part in _parts(block):
             trace = pack_type.estimator.run(part.samples)
             hour_summary.add(self._record["hour"], trace, part, pack_type.estimator)
@@ -124,21 +126,22 @@ class BlockProcessor:
             self._window.add(trace, arrival_s)
         counters["blocks"] += 1
         counters["samples"] += block.samples.size
-        counters["dropped_samples"] += block.samples.size - (int(observer["samples"]) - accepted)
-        counters["time_steps_back"] += int(observer["time_steps_back"]) - steps_back
+        counters["dropped_samples"] += block.samples.size - (int(observer["samples"]) - accepted_before)
+        counters["time_steps_back"] += int(observer["time_steps_back"]) - steps_back_before
 
-    def _state(self, pack_type: PackType, now_s: float) -> bytes | None:
+    def _state_payload(self, pack_type: PackType, now_s: float) -> bytes | None:
         """Return the payload of topic ``state`` from the publish window; None if no sample was accepted."""
         flow, window, d = pack_type.meter.update_totals(), self._window.take(), self._delivery
         for name, value in zip(ChargeEnergy._fields, flow, strict=True):
-            self._flows[name] = value
+            self._flow[name] = value
         if window is None:
             return None
+        # ``blocks`` does not count the present block yet
         counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
         remaining = remaining_charge(pack_type.estimator, window.current_a)
         return _json(make_state_payload(window, remaining, counters, now_s, flow, pack_type.capacity_ah))
 
-    def _parameters(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
+    def _parameters_payload(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
         """Return the payload of topic ``parameters``. Its ages refer to the arrival time of the samples."""
         return _json(make_parameters_payload(estimator, arrival_s).model_copy(update={"publish_time": iso_utc(now_s)}))
 
@@ -172,12 +175,8 @@ class BlockProcessor:
         rows: tuple[tuple[str, bytes], ...] = ()
         if current:
             settings = pack_type.settings.model_copy(update={"name": pack})
-            rows = (
-                (
-                    f"{pack}.{current}",
-                    _json(hour_summary.row(settings, current, self._record["hour"], pack_type.estimator)),
-                ),
-            )
+            row = hour_summary.row(settings, current, self._record["hour"], pack_type.estimator)
+            rows = ((f"{pack}.{current}", _json(row)),)
         hour_summary.begin(self._record["hour"], self._record[0]["estimator"])
         self._delivery["hour"] = hour
         return rows, True

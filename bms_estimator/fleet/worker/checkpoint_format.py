@@ -33,12 +33,12 @@ FORMAT = 1
 """Version of the format."""
 CHUNK_BYTES = 1 << 20
 """Size at which a chunk of entries is finished [bytes]."""
-_HEAD, _CHUNK, _ENTRY = struct.Struct("<8sHII"), struct.Struct("<II"), struct.Struct("<BHI")
+_FILE_HEAD, _CHUNK_HEAD, _ENTRY_HEAD = struct.Struct("<8sHII"), struct.Struct("<II"), struct.Struct("<BHI")
 _MAGIC = b"BMSFLEET"
-_FORMER_BLOCK = 255
+_STORED_BLOCK = 255
 """Layout number of a block of an unknown pack, which an earlier version stored."""
 _MAX_LAYOUTS = 255
-"""Maximum number of layouts, whose indexes are below ``_FORMER_BLOCK``."""
+"""Maximum number of layouts, whose indexes are below ``_STORED_BLOCK``."""
 _MAX_RECORD_BYTES = 1 << 24
 """Maximum size of a record that a layout from a checkpoint may describe [bytes]."""
 
@@ -71,7 +71,7 @@ def dtype_of(layout: str) -> np.dtype[Any]:
         raise ValueError(f"no layout of a record: {error}") from None
     if dtype.itemsize > _MAX_RECORD_BYTES:
         raise ValueError(f"{dtype.itemsize} bytes: no layout of a pack's record")
-    symmetry_map(dtype)  # rejects data that are not whole words
+    symmetry_map(dtype)  # raises ValueError if the record does not consist of whole words
     return dtype
 
 
@@ -101,7 +101,7 @@ class PartitionCheckpoint:
         sequence: Stream sequence number of the last included message.
         counters: Counts by name.
         packs: Packed records in this version's layout, by pack.
-        former: Packed records in another version's layout, by pack.
+        unmigrated: Packed records in the layout of another version, by pack.
         deferred: Deferred messages by pack, in the order in which the packs are served.
     """
 
@@ -109,22 +109,24 @@ class PartitionCheckpoint:
     sequence: int
     counters: Mapping[str, int] = field(default_factory=dict)
     packs: Mapping[str, bytes] = field(default_factory=dict)
-    former: Mapping[str, PreviousLayoutState] = field(default_factory=dict)
+    unmigrated: Mapping[str, PreviousLayoutState] = field(default_factory=dict)
     deferred: Mapping[str, Span] = field(default_factory=dict)
 
     def chunks(self) -> Iterator[bytes]:
         """Yield the checkpoint's bytes in chunks of about ``CHUNK_BYTES``."""
-        layouts = list(dict.fromkeys([CURRENT_LAYOUT, *(each.layout for each in self.former.values())]))[:_MAX_LAYOUTS]
+        layouts = list(dict.fromkeys([CURRENT_LAYOUT, *(each.layout for each in self.unmigrated.values())]))[
+            :_MAX_LAYOUTS
+        ]
         header = {
             "partition": self.number,
             "sequence": self.sequence,
             "counters": dict(self.counters),
             "deferred": dict(self.deferred),
             "layouts": [json.loads(layout) for layout in layouts],
-            "entries": len(self.packs) + len(self.former),
+            "entries": len(self.packs) + len(self.unmigrated),
         }
         text = json.dumps(header, separators=(",", ":")).encode()
-        chunk = [_HEAD.pack(_MAGIC, FORMAT, len(text), zlib.crc32(text)), text]
+        chunk = [_FILE_HEAD.pack(_MAGIC, FORMAT, len(text), zlib.crc32(text)), text]
         entries: list[bytes] = []
         size = 0
         for entry in self._entries(layouts):
@@ -133,24 +135,24 @@ class PartitionCheckpoint:
             if size >= CHUNK_BYTES:
                 yield b"".join([*chunk, *_framed_chunk(entries)])
                 chunk, entries, size = [], [], 0
-        yield b"".join([*chunk, *(_framed_chunk(entries) if entries else ()), _CHUNK.pack(0, 0)])
+        yield b"".join([*chunk, *(_framed_chunk(entries) if entries else ()), _CHUNK_HEAD.pack(0, 0)])
 
     def _entries(self, layouts: list[str]) -> Iterator[bytes]:
-        indexes = {layout: place for place, layout in enumerate(layouts)}
+        indexes = {layout: index for index, layout in enumerate(layouts)}
         for pack, packed in self.packs.items():
             yield _entry(indexes[CURRENT_LAYOUT], pack, packed)
-        for pack, former in self.former.items():
-            yield _entry(indexes[former.layout], pack, former.packed)
+        for pack, state in self.unmigrated.items():
+            yield _entry(indexes[state.layout], pack, state.packed)
 
 
-def _entry(layout: int, pack: str, data: bytes) -> bytes:
+def _entry(layout_index: int, pack: str, data: bytes) -> bytes:
     name = pack.encode()
-    return _ENTRY.pack(layout, len(name), len(data)) + name + data
+    return _ENTRY_HEAD.pack(layout_index, len(name), len(data)) + name + data
 
 
 def _framed_chunk(entries: list[bytes]) -> tuple[bytes, bytes]:
     content = b"".join(entries)
-    return _CHUNK.pack(len(content), zlib.crc32(content)), content
+    return _CHUNK_HEAD.pack(len(content), zlib.crc32(content)), content
 
 
 def read_checkpoint(data: bytes) -> PartitionCheckpoint:
@@ -168,7 +170,7 @@ def read_checkpoint(data: bytes) -> PartitionCheckpoint:
 
 
 def _read(data: memoryview) -> PartitionCheckpoint:
-    magic, version, length, crc = _HEAD.unpack_from(data)
+    magic, version, length, crc = _FILE_HEAD.unpack_from(data)
     if magic != _MAGIC:
         raise CheckpointError("not a checkpoint: its first bytes differ")
     if version != FORMAT:
@@ -176,54 +178,52 @@ def _read(data: memoryview) -> PartitionCheckpoint:
             f"the checkpoint is of format {version}, this version reads {FORMAT}: start the version that wrote it, "
             "or start without a checkpoint, from the stream"
         )
-    at = _HEAD.size + length
-    header = json.loads(_verified(data[_HEAD.size : at], length, crc))
+    header_end = _FILE_HEAD.size + length
+    header = json.loads(_verify(data[_FILE_HEAD.size : header_end], length, crc))
     layouts = [json.dumps(layout, separators=(",", ":")) for layout in header["layouts"]]
     for layout in layouts:
         if layout != CURRENT_LAYOUT:
             dtype_of(layout)
     packs: dict[str, bytes] = {}
-    former: dict[str, PreviousLayoutState] = {}
+    unmigrated: dict[str, PreviousLayoutState] = {}
     sequence = int(header["sequence"])
     deferred = {str(pack): Span(int(first), int(last)) for pack, (first, last) in header.get("deferred", {}).items()}
     entries = 0
-    for place, pack, content in _read_entries(data, at):
+    for layout_index, pack, content in _read_entries(data, header_end):
         entries += 1
-        if place == _FORMER_BLOCK:
-            deferred[pack] = Span(1, sequence)
-        elif layouts[place] == CURRENT_LAYOUT:
+        if layout_index == _STORED_BLOCK:
+            deferred[pack] = Span(1, sequence)  # all messages of the pack are read from the stream again
+        elif layouts[layout_index] == CURRENT_LAYOUT:
             packs[pack] = content
         else:
-            former[pack] = PreviousLayoutState(layouts[place], content)
+            unmigrated[pack] = PreviousLayoutState(layouts[layout_index], content)
     if entries != header["entries"]:
         raise CheckpointError(f"the checkpoint is damaged: {entries} of {header['entries']} entries")
     counters = {str(name): int(count) for name, count in header["counters"].items()}
-    return PartitionCheckpoint(int(header["partition"]), sequence, counters, packs, former, deferred)
+    return PartitionCheckpoint(int(header["partition"]), sequence, counters, packs, unmigrated, deferred)
 
 
-def _read_entries(data: memoryview, at: int) -> Iterator[tuple[int, str, bytes]]:
+def _read_entries(data: memoryview, offset: int) -> Iterator[tuple[int, str, bytes]]:
+    """Yield layout index, pack and record of each entry; the chunks begin at ``offset``."""
     while True:
-        length, crc = _CHUNK.unpack_from(data, at)
-        at += _CHUNK.size
+        length, crc = _CHUNK_HEAD.unpack_from(data, offset)
+        offset += _CHUNK_HEAD.size
         if length == 0:
-            if at != len(data) or crc:
-                raise CheckpointError(f"the checkpoint is damaged: its end is at {at} of {len(data)} bytes")
+            if offset != len(data) or crc:
+                raise CheckpointError(f"the checkpoint is damaged: its end is at {offset} of {len(data)} bytes")
             return
-        chunk = _verified(data[at : at + length], length, crc)
-        at += length
-        place = 0
-        while place < length:
-            layout, name_bytes, data_bytes = _ENTRY.unpack_from(chunk, place)
-            place += _ENTRY.size
-            name, content = (
-                chunk[place : place + name_bytes],
-                chunk[place + name_bytes : place + name_bytes + data_bytes],
-            )
-            place += name_bytes + data_bytes
-            yield layout, str(name, "utf-8"), bytes(content)
+        chunk = _verify(data[offset : offset + length], length, crc)
+        offset += length
+        begin = 0  # of the entry in the chunk
+        while begin < length:
+            layout_index, name_bytes, data_bytes = _ENTRY_HEAD.unpack_from(chunk, begin)
+            name_begin = begin + _ENTRY_HEAD.size
+            data_begin = name_begin + name_bytes
+            begin = data_begin + data_bytes
+            yield layout_index, str(chunk[name_begin:data_begin], "utf-8"), bytes(chunk[data_begin:begin])
 
 
-def _verified(part: memoryview, length: int, crc: int) -> bytes:
+def _verify(part: memoryview, length: int, crc: int) -> bytes:
     if len(part) != length or zlib.crc32(part) != crc:
         raise CheckpointError(f"the checkpoint is damaged: {len(part)} of {length} bytes, or a wrong checksum")
     return bytes(part)

@@ -14,6 +14,7 @@ import json
 import time
 from collections.abc import AsyncGenerator, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import structlog
 from nats.aio.client import Client
@@ -69,6 +70,13 @@ class Pointer(BaseModel):
     """Stored checkpoints, newest first."""
 
 
+class StoredPointer(NamedTuple):
+    """Pointer as read from the bucket."""
+
+    revision: int
+    pointer: Pointer
+
+
 @dataclass(frozen=True)
 class Claim:
     """Claim of a partition: the pointer that this worker wrote last, and its revision."""
@@ -82,7 +90,7 @@ class CheckpointStore:
     """Checkpoints of one tenant.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         worker: Name of this worker.
         checkpoints: Key-value bucket of the pointers.
         states: Object store of the checkpoints.
@@ -91,7 +99,7 @@ class CheckpointStore:
     def __init__(self, nc: Client, worker: str, checkpoints: KeyValue, states: ObjectStore) -> None:
         self._nc, self._js, self._worker = nc, nc.jetstream(), worker
         self._checkpoints, self._states = checkpoints, states
-        self._names = NUID()
+        self._object_names = NUID()
         self._last_sent: dict[int, Pointer] = {}  # last pointer sent by partition, possibly without a response
 
     async def claim(self, partition: int) -> Claim:
@@ -100,10 +108,11 @@ class CheckpointStore:
         Raises:
             FencedError: Another worker has claimed it at the same time.
         """
-        revision, previous = await self._read_pointer(partition) or (0, None)
-        claim = await self._write_pointer(partition, revision, previous.kept if previous else ())
-        if previous:
-            await self._remove_object(previous.next)
+        stored = await self._read_pointer(partition)
+        if stored is None:
+            return await self._write_pointer(partition, 0, ())  # revision 0: the key must not exist
+        claim = await self._write_pointer(partition, stored.revision, stored.pointer.kept)
+        await self._remove_object(stored.pointer.next)
         return claim
 
     async def confirm_claim(self, claim: Claim) -> Claim:
@@ -112,12 +121,12 @@ class CheckpointStore:
         Raises:
             FencedError: Another worker has taken the partition over.
         """
-        found = await self._read_pointer(claim.partition)
-        if found is None or found[0] <= claim.revision:  # a lower revision comes from a lagging node
+        stored = await self._read_pointer(claim.partition)
+        if stored is None or stored.revision <= claim.revision:  # a lower revision comes from a lagging node
             return claim
-        if found[1] == self._last_sent.get(claim.partition):
-            return Claim(claim.partition, *found)
-        raise FencedError(found[1].worker)
+        if stored.pointer == self._last_sent.get(claim.partition):
+            return Claim(claim.partition, stored.revision, stored.pointer)
+        raise FencedError(stored.pointer.worker)
 
     async def load(self, claim: Claim) -> AsyncGenerator[tuple[CheckpointInfo, bytes], None]:
         """Yield the readable checkpoints, newest first; log the damaged ones."""
@@ -150,8 +159,8 @@ class CheckpointStore:
         claim = await self.confirm_claim(claim)
         pointer = claim.pointer
         size = await self._write_object(pointer.next, chunks)
-        made = CheckpointInfo(sequence=sequence, object=pointer.next, bytes=size, made_s=time.time())
-        kept = (made, *pointer.kept)
+        info = CheckpointInfo(sequence=sequence, object=pointer.next, bytes=size, made_s=time.time())
+        kept = (info, *pointer.kept)
         try:
             claim = await self._write_pointer(claim.partition, claim.revision, kept[:CHECKPOINTS_PER_PARTITION])
         except FencedError:
@@ -161,28 +170,28 @@ class CheckpointStore:
             await self._remove_object(old.object)
         return claim
 
-    async def _read_pointer(self, partition: int) -> tuple[int, Pointer] | None:
+    async def _read_pointer(self, partition: int) -> StoredPointer | None:
         try:
             entry = await self._checkpoints.get(_key(partition))
         except KeyNotFoundError:
             return None
         try:
-            return entry.revision or 0, Pointer.model_validate_json(entry.value or b"")
+            return StoredPointer(entry.revision or 0, Pointer.model_validate_json(entry.value or b""))
         except ValidationError as error:
             log.warning("the pointer to a checkpoint cannot be read", partition=partition, reason=str(error))
-            return entry.revision or 0, Pointer(worker="", next="")
+            return StoredPointer(entry.revision or 0, Pointer(worker="", next=""))
 
     async def _write_pointer(self, partition: int, revision: int, kept: tuple[CheckpointInfo, ...]) -> Claim:
-        pointer = Pointer(worker=self._worker, next=f"p{partition}-{self._names.next().decode()}", kept=kept)
+        pointer = Pointer(worker=self._worker, next=f"p{partition}-{self._object_names.next().decode()}", kept=kept)
         self._last_sent[partition] = pointer
         try:
             data = pointer.model_dump_json().encode()
             return Claim(partition, await self._checkpoints.update(_key(partition), data, revision), pointer)
         except KeyWrongLastSequenceError:
-            found = await self._read_pointer(partition)
-            if found and found[1] == pointer:  # the write succeeded, but its response was lost
-                return Claim(partition, found[0], pointer)
-            raise FencedError(found[1].worker if found else "") from None
+            stored = await self._read_pointer(partition)
+            if stored and stored.pointer == pointer:  # the write succeeded, but its response was lost
+                return Claim(partition, stored.revision, pointer)
+            raise FencedError(stored.pointer.worker if stored else "") from None
 
     async def _write_object(self, name: str, chunks: Iterator[bytes]) -> int:
         """Write an object and return its size [bytes].
@@ -191,7 +200,7 @@ class CheckpointStore:
         object can be found and removed.
         """
         subject, digest, size, count = _chunk_subject(name), hashlib.sha256(), 0, 0
-        await self._js.purge_stream(_STREAM, subject=subject)  # of an earlier attempt
+        await self._js.purge_stream(_STREAM, subject=subject)  # chunks of an earlier attempt
         reader = io.BufferedReader(_ChunkReader(chunks), MESSAGE_BYTES)
         while message := await asyncio.to_thread(reader.read, MESSAGE_BYTES):
             await self._js.publish(subject, message)
@@ -226,10 +235,11 @@ class CheckpointStore:
 
 
 class _ChunkReader(io.RawIOBase):
-    """Iterator of bytes as a readable file."""
+    """Readable file with the bytes of an iterator."""
 
     def __init__(self, chunks: Iterator[bytes]) -> None:
-        self._chunks, self._rest = chunks, memoryview(b"")
+        self._chunks = chunks
+        self._rest = memoryview(b"")  # unread part of the last chunk
 
     def readable(self) -> bool:
         return True

@@ -11,7 +11,7 @@ MAX_CHARGE_S = 0.1
 """Maximum processor time that is charged for one block [s], the cost of 20,000 samples. The first block may take longer,
 because it compiles kernels."""
 MAX_PACKS = 10_000
-"""Number of stored bucket levels above which those of idle packs are removed. The pack that is charged stays."""
+"""Number of stored bucket levels above which the levels of idle packs, which are 0, are removed."""
 
 
 class CpuBudget:
@@ -23,9 +23,8 @@ class CpuBudget:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._levels: dict[
-            str, tuple[float, float]
-        ] = {}  # level of the bucket [s] and the time at which it was computed [s]
+        # level of each pack's bucket [s], and the time at which the level was computed [s]
+        self._levels: dict[str, tuple[float, float]] = {}
 
     def is_exhausted(self, pack: str) -> bool:
         """Return True if a pack has used up its budget."""

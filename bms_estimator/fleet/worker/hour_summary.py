@@ -42,7 +42,7 @@ def begin(sums: Sums, record: np.void) -> None:
     """Begin an hour: reset the sums and counts, but not the last sample.
 
     Args:
-        sums: Updated in position.
+        sums: Updated in place.
         record: The pack's record of dtype ``ESTIMATOR_STATE``.
     """
     for name in HOURLY_FIELDS:
@@ -54,7 +54,7 @@ def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> No
     """Add a block to the sums of the hour.
 
     Args:
-        sums: Updated in position.
+        sums: Updated in place.
         trace: Estimates of the block's samples.
         block: Block of samples.
         estimator: Estimator of the pack, or of another pack of its type: only its settings are read.
@@ -107,18 +107,16 @@ def _counts(h: np.void, record: np.void) -> dict[str, object]:
 def _measurements(h: np.void) -> dict[str, object]:
     """Return means and extremes; empty if no sample was accepted."""
     values: dict[str, object] = {}
-    for names, unit, count in (
+    for quantity, unit, count_field in (
         ("voltage", "v", "samples"),
         ("current", "a", "samples"),
         ("temperature", "c", "temperatures"),
     ):
-        n = int(h[count])
-        if n:
-            values[f"{names}_{unit}"] = float(h[f"sum_{unit}"]) / n
-            values[f"{names}_min_{unit}"], values[f"{names}_max_{unit}"] = (
-                float(h[f"min_{unit}"]),
-                float(h[f"max_{unit}"]),
-            )
+        count = int(h[count_field])
+        if count:
+            values[f"{quantity}_{unit}"] = float(h[f"sum_{unit}"]) / count
+            values[f"{quantity}_min_{unit}"] = float(h[f"min_{unit}"])
+            values[f"{quantity}_max_{unit}"] = float(h[f"max_{unit}"])
     if h["samples"]:
         values["stability_margin_min"] = float(h["min_margin"])
     if h["innovations"]:

@@ -3,7 +3,7 @@
 Rendezvous hashing (Thaler and Ravishankar, "A name-based mapping scheme for rendezvous", 1996) with bounded loads (Mirrokni,
 Thorup and Zadimoghaddam, "Consistent hashing with bounded loads", 2016): a partition belongs to the worker with the highest
 hash of the pair, unless that worker already has its fair share. Therefore few partitions move when a worker joins or leaves.
-The workers may disagree for a moment, because the server pins each partition to one worker.
+The workers may disagree for a moment without harm, because the server pins each partition to one worker.
 """
 
 import math
@@ -55,9 +55,9 @@ class Membership:
         if leaving:
             self._last_heartbeat_s.pop(worker, None)
             return False
-        new = worker not in self._last_heartbeat_s
+        is_new = worker not in self._last_heartbeat_s
         self._last_heartbeat_s[worker] = now_s
-        return new and worker != self.me
+        return is_new and worker != self.me
 
     def extend_all(self, now_s: float) -> None:
         """Extend the deadline of all workers after a time without a connection, in which no heartbeat could arrive."""

@@ -39,8 +39,7 @@ DELIVERY = np.dtype(
         ("blocks", "i8"),
         # number of blocks that were never received
         ("lost_blocks", "i8"),
-        # creation time of the store of the last valid sample, from which its timestamp counts [ns since 1970]; 0: no
-        # sample yet
+        # creation time of the store that contains the last valid sample [ns since 1970]; 0: no sample yet
         ("clock", "u8"),
         # timestamp of the last valid sample [s since ``clock``]
         ("last_s", "f8"),
@@ -73,7 +72,7 @@ class StateError(ValueError):
     """Invalid bytes of a packed record."""
 
 
-class WorkRecord:
+class UnpackedRecord:
     """Unpacked record into which the packs of a partition are loaded in turn.
 
     Attributes:
@@ -108,7 +107,7 @@ class WorkRecord:
             raise StateError(f"{len(packed)} bytes are not a packed record")
 
     def load_previous_layout(self, dtype: np.dtype[Any], packed: bytes) -> Fields:
-        """Unpack a pack's record of another layout. Copy the fields that exist here, except those of the estimator.
+        """Unpack a pack's record of another layout. Copy its fields that exist in this layout, except the estimator's.
 
         Args:
             dtype: Dtype of the record.
@@ -118,19 +117,19 @@ class WorkRecord:
             The fields of the estimator by name.
 
         Raises:
-            ValueError: The bytes do not have this dtype, or the dtype is not that of a pack.
+            ValueError: The bytes do not have this dtype, or no pack's record can have it.
         """
-        former = WorkRecord(dtype)
-        former.load(packed)
-        estimator_fields, others = {}, {}
-        for name, value in fields(former.record):
+        previous = UnpackedRecord(dtype)
+        previous.load(packed)
+        estimator_fields, other_fields = {}, {}
+        for name, value in fields(previous.record):
             part, _, rest = name.partition(".")
             if part == "estimator":
                 estimator_fields[rest] = value
             else:
-                others[name] = value
+                other_fields[name] = value
         self.clear()
-        copy_known_fields(self.record, others)
+        copy_known_fields(self.record, other_fields)
         return estimator_fields
 
     def count_lost(self, blocks: int) -> None:

@@ -1,4 +1,4 @@
-"""Partition: states of its packs, which the kernel of all commands estimates block by block.
+"""States of the packs of one partition, updated block by block by the kernel that all commands share.
 
 The states depend only on the order of the stream and on the table of packs. From any checkpoint on, equal blocks lead to
 bit-identical states. The module performs no I/O, and uses the clock only for publish times.
@@ -27,11 +27,11 @@ from bms_estimator.fleet.worker.checkpoint_format import (
 )
 from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
 from bms_estimator.fleet.worker.density import density_fault
-from bms_estimator.fleet.worker.pack_state import Fields, WorkRecord
+from bms_estimator.fleet.worker.pack_state import Fields, UnpackedRecord
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
 
-Table = Callable[[str], tuple[Settings, PackModel] | None]
+PackLookup = Callable[[str], tuple[Settings, PackModel] | None]
 """Function that returns settings and model of a pack; None: the pack is unknown."""
 
 log = structlog.get_logger(__name__)
@@ -72,23 +72,24 @@ class Partition:
         deferred: Queue of packs with deferred messages.
     """
 
-    def __init__(self, number: int, table: Table, *, wall: Callable[[], float] = time.time) -> None:
+    def __init__(self, number: int, table: PackLookup, *, wall: Callable[[], float] = time.time) -> None:
         self.number, self.sequence = number, 0
         self._table = table
         self._counters: Counter[str] = Counter()
         self._packs: dict[str, bytes] = {}
-        self._former: dict[str, PreviousLayoutState] = {}
-        self._former_deliveries: dict[str, np.void] = {}
+        self._unmigrated: dict[str, PreviousLayoutState] = {}  # packs whose record still has a previous layout
+        # delivery records of these packs, which only this process has updated since it restored the partition
+        self._unmigrated_deliveries: dict[str, np.void] = {}
         self.deferred = Deferred()
         self._type_by_pack: dict[str, PackType] = {}
-        self._replied: set[str] = set()
+        self._replied: set[str] = set()  # packs whose edge has had a reply from this worker
         self._logged_rejections: set[str] = set()
-        self._work = WorkRecord()
-        self._types = PackTypes(self._work.record)
-        self._processor = BlockProcessor(self._work.record, self._counters, wall)
+        self._unpacked = UnpackedRecord()
+        self._types = PackTypes(self._unpacked.record)
+        self._processor = BlockProcessor(self._unpacked.record, self._counters, wall)
 
     @classmethod
-    def restore(cls, number: int, table: Table, data: bytes, *, wall: Callable[[], float] = time.time) -> Self:
+    def restore(cls, number: int, table: PackLookup, data: bytes, *, wall: Callable[[], float] = time.time) -> Self:
         """Restore a partition from the bytes of a checkpoint.
 
         Raises:
@@ -101,21 +102,25 @@ class Partition:
         partition.sequence = checkpoint.sequence
         partition._counters.update(checkpoint.counters)
         partition._packs.update(checkpoint.packs)
-        partition._former.update(checkpoint.former)
+        partition._unmigrated.update(checkpoint.unmigrated)
         partition.deferred = Deferred(checkpoint.deferred)
         return partition
 
     def snapshot(self) -> PartitionCheckpoint:
         """Return a snapshot of the partition. Records are not copied, because they are immutable bytes."""
-        spans = self.deferred.spans()
         return PartitionCheckpoint(
-            self.number, self.sequence, dict(self._counters), dict(self._packs), dict(self._former), spans
+            number=self.number,
+            sequence=self.sequence,
+            counters=dict(self._counters),
+            packs=dict(self._packs),
+            unmigrated=dict(self._unmigrated),
+            deferred=self.deferred.spans(),
         )
 
     @property
     def counters(self) -> Mapping[str, int]:
         """Counters since the partition was created, over all its workers."""
-        return {**self._counters, "packs": len(self._packs) + len(self._former), "unknown": len(self.unknown)}
+        return {**self._counters, "packs": len(self._packs) + len(self._unmigrated), "unknown": len(self.unknown)}
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -127,8 +132,8 @@ class Partition:
         packed = self._packs.get(pack)
         if packed is None:
             return None
-        self._work.load(packed)
-        return self._work.record.copy()
+        self._unpacked.load(packed)
+        return self._unpacked.record.copy()
 
     def take(self, pack: str, data: bytes, sequence: int) -> BlockResult:
         """Process a message of the stream, or defer it if its pack is unknown or has other deferred messages.
@@ -207,76 +212,78 @@ class Partition:
 
     def _take(self, pack: str, block: Block, pack_type: PackType) -> BlockResult:
         """Process a block of a known pack."""
-        former = self._load(pack)
-        d = self._work.delivery
-        lost = int(d["lost_blocks"])
-        self._put_former_delivery(pack)
+        unmigrated_fields = self._load(pack)
+        d = self._unpacked.delivery
+        stored_lost = int(d["lost_blocks"])
+        self._restore_unmigrated_delivery(pack)
         order = classify_block(d, block)
-        lost = int(d["lost_blocks"]) - lost
-        self._work.count_lost(lost)
+        newly_lost = int(d["lost_blocks"]) - stored_lost  # since the record was stored
+        self._unpacked.count_lost(newly_lost)
         result = BlockResult(pack)
         if order is BlockOrder.NEXT:
             stepped, fault = None, density_fault(block.samples)
             if fault:
                 self._log_rejection(pack, fault)
             else:
-                stepped = self._step(pack, block, pack_type, former)
+                stepped = self._step(pack, block, pack_type, unmigrated_fields)
             if stepped is None:  # reload the record, which the failed block may have changed
                 self._load(pack)
-                self._put_former_delivery(pack)
+                self._restore_unmigrated_delivery(pack)
                 classify_block(d, block)
-                self._work.count_lost(lost)
+                self._unpacked.count_lost(newly_lost)
                 self._counters["too_dense" if fault else "failed"] += 1
             result = stepped or BlockResult(pack, failed=int(not fault))
             mark_taken(d)
-            self._former.pop(pack, None)
-            self._former_deliveries.pop(pack, None)
+            self._unmigrated.pop(pack, None)
+            self._unmigrated_deliveries.pop(pack, None)
         else:
             self._counters[order.value] += 1
-            if former is not None:  # only a processed block migrates the record, but the block counts must not be lost
-                self._former_deliveries[pack] = d.copy()
-        # A record of another layout stays unchanged until a block is processed.
-        if order is BlockOrder.NEXT or former is None:
-            self._counters["lost_blocks"] += lost
-            self._packs[pack] = self._work.packed_bytes()
-        first = pack not in self._replied
+            if unmigrated_fields is not None:  # the record keeps its layout until a block is processed
+                self._unmigrated_deliveries[pack] = d.copy()
+        if order is BlockOrder.NEXT or unmigrated_fields is None:
+            self._counters["lost_blocks"] += newly_lost
+            self._packs[pack] = self._unpacked.packed_bytes()
+        is_first = pack not in self._replied
         self._replied.add(pack)
-        return result._replace(reply=edge_reply(order, d, block, first=first))
+        return result._replace(reply=edge_reply(order, d, block, is_first=is_first))
 
-    def _put_former_delivery(self, pack: str) -> None:
-        """Restore the block counts of this process for a pack whose record has another layout."""
-        if pack in self._former_deliveries:
-            self._work.record["delivery"][0] = self._former_deliveries[pack]
+    def _restore_unmigrated_delivery(self, pack: str) -> None:
+        """Restore the delivery record of a pack whose stored record still has a previous layout."""
+        if pack in self._unmigrated_deliveries:
+            self._unpacked.record["delivery"][0] = self._unmigrated_deliveries[pack]
 
-    def _log_rejection(self, pack: str, why: str) -> None:
+    def _log_rejection(self, pack: str, reason: str) -> None:
         """Log the first rejected block of a pack; ``counters`` counts all."""
         if pack not in self._logged_rejections:
             self._logged_rejections.add(pack)
-            log.warning("a block is rejected", partition=self.number, pack=pack, reason=why)
+            log.warning("a block is rejected", partition=self.number, pack=pack, reason=reason)
 
-    def _step(self, pack: str, block: Block, pack_type: PackType, former: Fields | None) -> BlockResult | None:
+    def _step(
+        self, pack: str, block: Block, pack_type: PackType, unmigrated_fields: Fields | None
+    ) -> BlockResult | None:
         """Estimate the next block; None after an internal error."""
         try:
-            return BlockResult(pack, None, *self._processor.step(pack, block, pack_type, former))
+            state, parameters, hours = self._processor.step(pack, block, pack_type, unmigrated_fields)
+            return BlockResult(pack, state=state, parameters=parameters, hours=hours)
         except Exception:  # an internal error with one block must not stop the pack
             log.exception("a block is skipped", partition=self.number, pack=pack, number=block.number)
         self._processor.reset_window()
         return None
 
     def _load(self, pack: str) -> Fields | None:
-        """Load a pack into the work record.
+        """Load a pack into the unpacked record.
 
         Returns:
-            The estimator fields by name if the pack's record has another layout; otherwise None.
+            The estimator fields by name if the pack's record has a previous layout; otherwise None.
         """
-        packed, former = self._packs.get(pack), self._former.get(pack)
+        packed, unmigrated = self._packs.get(pack), self._unmigrated.get(pack)
         try:
             if packed is not None:
-                self._work.load(packed)
+                self._unpacked.load(packed)
                 return None
-            if former is not None:
-                return self._work.load_previous_layout(dtype_of(former.layout), former.packed)
+            if unmigrated is not None:
+                return self._unpacked.load_previous_layout(dtype_of(unmigrated.layout), unmigrated.packed)
         except ValueError:  # does not happen with a checkpoint whose checksums were correct
             self._counters["damaged_states"] += 1
-        self._work.clear()
+        self._unpacked.clear()
         return None

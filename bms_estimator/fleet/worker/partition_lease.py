@@ -1,6 +1,6 @@
 """Lease of one partition by a worker: take-over, processing of messages, checkpoints, release.
 
-The state depends only on the order of the stream. Therefore the sequence number of the last message defines the state.
+The state depends only on the order of the stream. Therefore the sequence number of the last processed message defines the state.
 Messages that were delivered to another worker, or lost in transit, are read from the stream. The stream is also read after
 some time without a delivery, because the server does not redeliver messages that it delivered to a worker that has died.
 """
@@ -27,18 +27,18 @@ from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
 from bms_estimator.fleet.worker.deferred import Span
-from bms_estimator.fleet.worker.partition import BlockResult, Partition, Table
+from bms_estimator.fleet.worker.partition import BlockResult, PackLookup, Partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
 from bms_estimator.process.tasks import until_first_ends
 
 RETRY_S = 0.5
 """Retry interval of server requests [s]."""
 SILENCE_S = 3.0
-"""Time without a delivery after which the stream is searched for further messages [s]. A worker that releases a partition
-has finished by then."""
+"""Time without a delivery after which the stream is searched for further messages [s]. It exceeds the time in
+which another worker releases the partition."""
 IDLE_SILENCE_S = 5.0 * SILENCE_S
-"""Interval of further searches while the stream has no further message [s]."""
-MAX_PENDING_HOURS = 128
+"""Interval between two searches while the stream has no new messages [s]."""
+MAX_PENDING_SUMMARIES = 128
 """Maximum number of published summaries that wait for the server's acknowledgment."""
 RETRYABLE_ERRORS = (NatsError, TimeoutError, StreamError)
 """Errors of the connection or the server after which a request is repeated."""
@@ -50,7 +50,7 @@ class PartitionLease:
     """Partition that this worker has claimed. The worker owns the partition until another worker claims it.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         number: Number of the partition.
         table: Settings and models of the packs.
         checkpoints: Store of the checkpoints.
@@ -64,19 +64,19 @@ class PartitionLease:
         consumer: Consumer of the messages.
         partition: State of the packs; None while the partition is not taken over.
         claim: Claim of this worker; None while it has none.
-        hours: Summaries that the server has not acknowledged yet: (message id, pack, row).
+        waiting_summaries: Summaries that the server has not acknowledged yet: (message id, pack, row).
         lag_s: Largest lag since it was last reset to None [s].
         blocks, samples: Number of blocks and samples processed by this lease.
         faults: Number of blocks skipped because of an internal error.
-        due_s: Monotonic clock at which the next checkpoint is due [s].
-        trouble: Present error in words; empty without one.
+        checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
+        trouble: Text of the present error; empty without one.
     """
 
     def __init__(
         self,
         nc: Client,
         number: int,
-        table: Table,
+        table: PackLookup,
         checkpoints: CheckpointStore,
         inbox: str,
         step_lock: asyncio.Lock,
@@ -90,17 +90,18 @@ class PartitionLease:
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
         self.partition: Partition | None = None
         self.claim: Claim | None = None
-        self.hours: deque[tuple[str, str, bytes]] = deque()
+        self.waiting_summaries: deque[tuple[str, str, bytes]] = deque()
         self.lag_s: float | None = None
         self.blocks = self.samples = self.faults = 0
-        self.trouble, self.due_s = "", 0.0
+        self.trouble, self.checkpoint_due_s = "", 0.0
         self._pin = 0  # number of the pin under which the claim was last confirmed
         self._is_gapless = False  # the state includes all messages before the last delivered one
-        self._pin_lapsed = self._silent = False
-        self._search_s = time.monotonic() + SILENCE_S  # when the stream is next searched for further messages
+        self._pin_lapsed = False  # the ownership must be checked, because the pin has ended
+        self._silent = False  # the stream must be searched, because no message has arrived
+        self._next_search_s = time.monotonic() + SILENCE_S  # monotonic clock of the next search of the stream
         self._wake_up, self._wake_up_deferred = asyncio.Event(), asyncio.Event()
-        self._state_lock = asyncio.Lock()  # of ``partition`` and ``claim``
-        self._hours_lock = asyncio.Lock()
+        self._state_lock = asyncio.Lock()  # held while ``partition`` and ``claim`` change
+        self._summaries_lock = asyncio.Lock()
 
     @property
     def last_checkpoint(self) -> CheckpointInfo | None:
@@ -115,31 +116,31 @@ class PartitionLease:
     def receive(self, message: Msg) -> None:
         """Process a message or status from the server."""
         if self.consumer.receive(message):
-            self._pin_lapsed, self._search_s = True, time.monotonic() + SILENCE_S
+            self._pin_lapsed, self._next_search_s = True, time.monotonic() + SILENCE_S
         self._wake_up.set()
 
     def check_silence(self) -> None:
         """Request a search of the stream after silence, and a check of deferred packs. Call it about once a second."""
-        if time.monotonic() >= self._search_s:
+        if time.monotonic() >= self._next_search_s:
             self._silent = True
             self._wake_up.set()
         self._wake_up_deferred.set()
 
     async def run(self) -> None:
         """Process messages until cancelled."""
-        await until_first_ends(self._run(), self._run_deferred())
+        await until_first_ends(self._process_messages(), self._process_deferred())
 
-    async def _run(self) -> None:
+    async def _process_messages(self) -> None:
         while True:
             self._wake_up.clear()
             if self._pin_lapsed:
                 await self._try(self._check_ownership)
             delivered = await self.consumer.take()
             if delivered is not None:
-                await self._take(delivered)
-                self._search_s = time.monotonic() + SILENCE_S
+                await self._process_delivered(delivered)
+                self._next_search_s = time.monotonic() + SILENCE_S
             elif self._silent:
-                self._silent, self._search_s = False, time.monotonic() + SILENCE_S
+                self._silent, self._next_search_s = False, time.monotonic() + SILENCE_S
                 await self._try(self._read_undelivered)
             else:
                 await self._wake_up.wait()
@@ -163,7 +164,7 @@ class PartitionLease:
             snapshot, partition.deferred.is_saved = partition.snapshot(), True
             try:
                 # The summaries are sent first, because the next owner does not compute those of saved samples again.
-                await self.send_hours()
+                await self.send_summaries()
                 self.claim = await self._checkpoints.write(claim, snapshot.sequence, snapshot.chunks())
             except FencedError as error:
                 self._drop_ownership(error)
@@ -171,24 +172,24 @@ class PartitionLease:
                 partition.deferred.is_saved = False
                 raise
 
-    async def send_hours(self) -> None:
+    async def send_summaries(self) -> None:
         """Publish the waiting summaries and await the server's acknowledgment.
 
         Raises:
-            nats.errors.Error: Some were not acknowledged; they remain in ``hours``.
+            nats.errors.Error: Some were not acknowledged; they remain in ``waiting_summaries``.
         """
         js = self._nc.jetstream()
 
         async def send(message_id: str, pack: str, row: bytes) -> None:
             await js.publish(subjects.hours(pack), row, headers={"Nats-Msg-Id": message_id})
 
-        async with self._hours_lock:
-            while self.hours:
-                rows = list(islice(self.hours, MAX_PENDING_HOURS))
+        async with self._summaries_lock:
+            while self.waiting_summaries:
+                rows = list(islice(self.waiting_summaries, MAX_PENDING_SUMMARIES))
                 await asyncio.gather(*(send(*row) for row in rows))
-                for row in rows:
-                    if self.hours and self.hours[0] is row:
-                        self.hours.popleft()
+                for row in rows:  # the queue was cleared meanwhile if the ownership was lost
+                    if self.waiting_summaries and self.waiting_summaries[0] is row:
+                        self.waiting_summaries.popleft()
 
     async def release(self) -> None:
         """Write a checkpoint and release the partition; ``run`` has ended."""
@@ -215,12 +216,12 @@ class PartitionLease:
             self.partition.settings_changed(pack)
             self._wake_up_deferred.set()
 
-    async def _run_deferred(self) -> None:
+    async def _process_deferred(self) -> None:
         """Process deferred messages until cancelled, one of each pack at a time."""
         while True:
             self._wake_up_deferred.clear()
-            while self.partition and (found := self.partition.deferred.next(self._is_due)):
-                if not await self._try(partial(self._take_deferred, self.partition, *found)):
+            while self.partition and (due := self.partition.deferred.next(self._is_due)):
+                if not await self._try(partial(self._take_deferred, self.partition, *due)):
                     await asyncio.sleep(RETRY_S)
             await self._wake_up_deferred.wait()
 
@@ -234,22 +235,24 @@ class PartitionLease:
         js, subject = self._nc.jetstream(), subjects.stored_raw(self.number, pack)
         try:
             message = await js.get_msg(subjects.RAW_STREAM, span.first, subject, next=True)
-        except NotFoundError:  # the stream has dropped them; the reply to the edge's next block requests them again
+        except (
+            NotFoundError
+        ):  # the stream has dropped the messages; the reply to the edge's next block requests them again
             partition.deferred.advance(pack, span.last)
             return
         data, sequence = message.data or b"", message.seq or 0
-        if sequence > span.last:
+        if sequence > span.last:  # the stream has dropped the deferred messages
             partition.deferred.advance(pack, span.last)
             return
         take = partial(partition.take_deferred, pack, data, sequence)
-        self._count(data)
+        self._count_block(data)
         await self._publish(await self._step(pack, sequence, take))
 
-    async def _take(self, delivered: DeliveredMessage) -> None:
+    async def _process_delivered(self, delivered: DeliveredMessage) -> None:
         """Process a delivered message after all earlier ones; return when that is done or the pin is lost."""
         while not await self._try(lambda: self._process_before(delivered)):
             await asyncio.sleep(RETRY_S)
-            if not self.consumer.pinned:
+            if not self.consumer.has_pin:
                 self._is_gapless = False
                 return
         partition = self.partition
@@ -272,7 +275,7 @@ class PartitionLease:
 
     async def _read_undelivered(self) -> None:
         """Bring the state up to the end of the stream after silence, unless another worker is pinned."""
-        if not self.consumer.pinned and await self.consumer.is_pinned():
+        if not self.consumer.has_pin and await self.consumer.is_pinned_to_any_worker():
             await self._check_ownership()
             return
         async with self._state_lock:
@@ -281,7 +284,7 @@ class PartitionLease:
         try:
             await js.get_msg(subjects.RAW_STREAM, partition.sequence + 1, subject, next=True)
         except NotFoundError:
-            self._search_s = time.monotonic() + IDLE_SILENCE_S
+            self._next_search_s = time.monotonic() + IDLE_SILENCE_S
         else:
             await self._catch_up(partition, (await js.get_last_msg(subjects.RAW_STREAM, subject)).seq or 0)
 
@@ -294,12 +297,12 @@ class PartitionLease:
             partition = await self._restore(claim)
             self.partition, self.claim = partition, claim
             self._wake_up_deferred.set()
-        last = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
-        if partition.sequence > last:
+        last_sequence = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
+        if partition.sequence > last_sequence:
             log.warning(
                 "the stream ends before the checkpoint, because it was recreated or has lost its end: reading it from its beginning",
                 partition=self.number,
-                stream=last,
+                stream=last_sequence,
                 checkpoint=partition.sequence,
             )
             partition.sequence = 0
@@ -309,18 +312,18 @@ class PartitionLease:
     async def _restore(self, claim: Claim) -> Partition:
         """Return the partition of the newest usable checkpoint; an empty one without a checkpoint."""
         async with aclosing(self._checkpoints.load(claim)) as checkpoints:
-            async for kept, data in checkpoints:
+            async for checkpoint, data in checkpoints:
                 try:
                     partition = Partition.restore(self.number, self._table, data)
                 except ValueError as error:
                     log.warning(
                         "a checkpoint cannot be used: continuing from an earlier one, or from the stream",
                         partition=self.number,
-                        object=kept.object,
+                        object=checkpoint.object,
                         reason=str(error),
                     )
                 else:
-                    log.info("taken over", partition=self.number, sequence=kept.sequence, bytes=len(data))
+                    log.info("taken over", partition=self.number, sequence=checkpoint.sequence, bytes=len(data))
                     return partition
         log.info("taken over without a checkpoint: the stream is read from its beginning", partition=self.number)
         return Partition(self.number, self._table)
@@ -345,19 +348,19 @@ class PartitionLease:
         if subjects.partition_of(pack, self._partitions) != self.number:
             return partition.reject_misplaced(pack, sequence)
         if pack in partition.deferred or self._budget.is_exhausted(pack):
-            await asyncio.sleep(0)
+            await asyncio.sleep(0)  # lets the event loop send heartbeats while many messages are deferred
             partition.defer(pack, sequence)
             self._wake_up_deferred.set()
             return BlockResult(pack)
         result = await self._step(pack, sequence, partial(partition.take, pack, data, sequence))
         if pack not in partition.deferred:
-            self._count(data)
+            self._count_block(data)
         return result
 
     async def _step(self, pack: str, sequence: int, take: Callable[[], BlockResult]) -> BlockResult:
         """Process a message while no other block is processed, and charge the processor time to its pack."""
         async with self._step_lock:
-            await asyncio.sleep(0)
+            await asyncio.sleep(0)  # lets the event loop send heartbeats between two blocks
             begin_s = time.thread_time()
             try:
                 result = take()
@@ -368,7 +371,7 @@ class PartitionLease:
         self._record_result(result)
         return result
 
-    def _count(self, data: bytes) -> None:
+    def _count_block(self, data: bytes) -> None:
         """Count the block and its samples, and update the lag."""
         samples, arrival_s = peek_header(data)
         self.blocks += 1
@@ -377,14 +380,14 @@ class PartitionLease:
 
     def _record_result(self, result: BlockResult) -> None:
         self.faults += result.failed
-        self.hours.extend((message_id, result.pack, row) for message_id, row in result.hours)
+        self.waiting_summaries.extend((message_id, result.pack, row) for message_id, row in result.hours)
 
     async def _publish(self, result: BlockResult) -> None:
         """Publish reply and estimates of a result. Without a connection they are dropped, because later ones replace them."""
         if not self._nc.is_connected:
             return
         if result.reply is not None:
-            await self._nc.publish(subjects.awaits(result.pack), result.reply.model_dump_json().encode())
+            await self._nc.publish(subjects.block_request(result.pack), result.reply.model_dump_json().encode())
         for topic, payload in (("state", result.state), ("parameters", result.parameters)):
             if payload is not None:
                 await self._nc.publish(subjects.published(result.pack, topic), payload)
@@ -408,7 +411,7 @@ class PartitionLease:
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
         self.partition = self.claim = None
         self._pin, self._is_gapless = 0, False
-        self.hours.clear()  # the owner of the partition computes them from the last checkpoint on
+        self.waiting_summaries.clear()  # the owner of the partition computes them from the last checkpoint on
 
     async def _try(self, action: Callable[[], Awaitable[None]]) -> bool:
         """Return True if ``action`` succeeded; log the error if it failed."""
@@ -427,7 +430,7 @@ class PartitionLease:
 
 
 def _merge(before: BlockResult | None, result: BlockResult) -> BlockResult:
-    """Merge two successive results of one pack: the newest of each message."""
+    """Merge two successive results of one pack: the newest reply, state and parameters."""
     if before is None:
         return result
     return result._replace(

@@ -22,7 +22,7 @@ RENEW_S = PIN_S / 4.0
 EXPIRES_S = 2.5 * RENEW_S
 """Expiry of a request [s]."""
 BATCH = 32
-"""Number of messages in a request. If this many messages wait, a request is for one message only."""
+"""Number of messages in a request. If this many messages wait, a request is for one message only, to renew the pin."""
 PIN_HEADER = "Nats-Pin-Id"
 """Header with the identifier of the pin under which a message is delivered."""
 STATUS_HEADER = "Status"
@@ -42,7 +42,7 @@ class DeliveredMessage(NamedTuple):
     sequence: int
     """Sequence number in the stream."""
     pin: int
-    """Number of pins that this worker had received with this message."""
+    """Number of the pin under which this worker received the message, from 1."""
     follows: bool
     """True if no other message of the partition lies between this one and the last delivered one."""
 
@@ -51,7 +51,7 @@ class PinnedConsumer:
     """Requests messages of a partition and queues them until they are processed.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         partition: Number of the partition.
         inbox: Prefix of the subject for responses; one token is added. The caller passes its messages to ``receive``.
 
@@ -69,15 +69,15 @@ class PinnedConsumer:
         self.trouble = ""
         self._pin = ""
         self._pin_count = 0
-        self._last = -1  # consumer sequence number of the last message
-        self._taken_since_request = 0  # messages since the last request
+        self._last_consumer_sequence = -1  # of the last message; before the first message, no number is the next one
+        self._taken_since_request = 0  # messages taken since the last request
 
     @property
-    def pinned(self) -> bool:
+    def has_pin(self) -> bool:
         """True if the consumer is pinned to this worker as far as it knows."""
         return bool(self._pin)
 
-    async def is_pinned(self) -> bool:
+    async def is_pinned_to_any_worker(self) -> bool:
         """Return True if the server has pinned the consumer to any worker.
 
         Raises:
@@ -103,7 +103,7 @@ class PinnedConsumer:
         if not self.waiting:
             return None
         self._taken_since_request += 1
-        if self._taken_since_request >= BATCH // 2 and len(self.waiting) < BATCH:
+        if self._taken_since_request >= BATCH // 2 and len(self.waiting) < BATCH:  # request before the queue is empty
             await self._request(self._taken_since_request)
         return self.waiting.popleft()
 
@@ -112,18 +112,19 @@ class PinnedConsumer:
         headers = message.headers or {}
         status = headers.get(STATUS_HEADER)
         if status is None:
-            self._add(message, headers.get(PIN_HEADER, ""))
+            self._queue_message(message, headers.get(PIN_HEADER, ""))
             return False
         if status != WRONG_PIN:
             self.trouble = (
                 "" if status in EXPECTED_STATUSES else f"status {status} {headers.get('Description', '')}".strip()
             )
             return False
-        lost = self.pinned and message.subject.rpartition(".")[2] == str(self._pin_count)
-        if lost:
+        # a status may still answer a request under an earlier pin
+        is_pin_lost = self.has_pin and message.subject.rpartition(".")[2] == str(self._pin_count)
+        if is_pin_lost:
             self._pin = ""
             self.waiting.clear()  # the server delivers them again to the next pinned worker
-        return lost
+        return is_pin_lost
 
     async def unpin(self) -> None:
         """Release the pin, so that another worker can get it at once."""
@@ -139,13 +140,13 @@ class PinnedConsumer:
         self._taken_since_request = 0
         await self._nc.publish(self._next_subject, json.dumps(request).encode(), f"{self._inbox}.{self._pin_count}")
 
-    def _add(self, message: Msg, pin: str) -> None:
+    def _queue_message(self, message: Msg, pin: str) -> None:
         stream_sequence, consumer_sequence = parse_sequences(message.reply)
         if pin != self._pin:
             self._pin, self._pin_count = pin, self._pin_count + 1
         self.trouble = ""
-        follows = consumer_sequence == self._last + 1
-        self._last = consumer_sequence
+        follows = consumer_sequence == self._last_consumer_sequence + 1
+        self._last_consumer_sequence = consumer_sequence
         pack = message.subject.rpartition(".")[2]
         self.waiting.append(DeliveredMessage(pack, message.data, stream_sequence, self._pin_count, follows))
 

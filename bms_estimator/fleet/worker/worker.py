@@ -126,7 +126,7 @@ class Worker:
     """Worker process with its partitions.
 
     Args:
-        nc: Connection of the tenant.
+        nc: Connection to the tenant's NATS account.
         options: Options of the worker.
         partitions: Total number of partitions.
         checkpoints: Store of the checkpoints.
@@ -149,14 +149,13 @@ class Worker:
         self._inbox = nc.new_inbox()
         self._lease_tasks: dict[int, tuple[PartitionLease, asyncio.Task[None]]] = {}
         self._releases: dict[int, asyncio.Task[None]] = {}
-        self._changed: asyncio.Queue[set[str]] = asyncio.Queue()
+        self._changed_packs: asyncio.Queue[set[str]] = asyncio.Queue()
         self._started_s = time.time()
-        self._renewed_s = time.monotonic()
-        self._blocks = self._samples = self._faults = 0  # of released partitions
+        self._leases_updated_s = time.monotonic()
+        self._released_blocks = self._released_samples = self._released_faults = 0  # totals of released leases
         self._leaving = False
-        self._step_lock = (
-            asyncio.Lock()
-        )  # blocks are estimated one at a time; the event loop sends heartbeats between them
+        # blocks are estimated one at a time; the event loop sends heartbeats between them
+        self._step_lock = asyncio.Lock()
         self._release_slots = asyncio.Semaphore(MAX_RELEASES)
         self._reported_unknown: set[str] = set()
 
@@ -177,7 +176,7 @@ class Worker:
             _repeat(RENEW_S, self._update_leases),
             _repeat(CHECK_S, self._save),
             _repeat(CHECK_S, self._send_hourly_summaries),
-            self._bucket.follow(self._changed.put_nowait),
+            self._bucket.follow(self._changed_packs.put_nowait),
             self._apply_table_changes(),
         )
 
@@ -191,7 +190,7 @@ class Worker:
             )
         for number in list(self._lease_tasks):
             self._start_release(number)
-        # pinned consumers that are still to be released expire without requests
+        # a pin expires without requests: continue them until each consumer is released
         renewing = asyncio.ensure_future(_repeat(RENEW_S, self._send_requests))
         await asyncio.gather(*self._releases.values())
         await end(renewing)
@@ -246,9 +245,10 @@ class Worker:
         """Claim assigned partitions, release the others, and request more messages."""
         _raise_if_closed(self._nc, self._options)
         now_s = time.monotonic()
-        if not self._nc.is_connected or now_s > self._renewed_s + DEAD_S / 2.0:
-            self._members.extend_all(now_s)  # no heartbeat could be received
-        self._renewed_s = now_s
+        # without a connection no heartbeat arrives, and while the event loop was blocked none was read
+        if not self._nc.is_connected or now_s > self._leases_updated_s + DEAD_S / 2.0:
+            self._members.extend_all(now_s)
+        self._leases_updated_s = now_s
         share = self._members.share(self._partitions, now_s)
         for number in self._lease_tasks.keys() - share:
             self._start_release(number)
@@ -279,7 +279,8 @@ class Worker:
             partitions=self._partitions,
             is_busy=lambda: any(each.consumer.waiting for each in self._leases),
         )
-        lease.due_s = now_s + self._options.checkpoint_s * (number + 1) / self._partitions
+        # spread the checkpoints of the partitions over the interval
+        lease.checkpoint_due_s = now_s + self._options.checkpoint_s * (number + 1) / self._partitions
         self._lease_tasks[number] = lease, asyncio.create_task(lease.run())
 
     def _start_release(self, number: int) -> None:
@@ -291,24 +292,26 @@ class Worker:
         async with self._release_slots:
             if self._nc.is_connected:
                 await lease.release()
-        self._blocks, self._samples = self._blocks + lease.blocks, self._samples + lease.samples
-        self._faults += lease.faults
+        self._released_blocks += lease.blocks
+        self._released_samples += lease.samples
+        self._released_faults += lease.faults
         del self._lease_tasks[lease.number], self._releases[lease.number]
 
     async def _save(self) -> None:
         """Write the due checkpoints."""
-        for lease in sorted(self._leases, key=lambda each: each.due_s):
+        for lease in sorted(self._leases, key=lambda each: each.checkpoint_due_s):
             now_s = time.monotonic()
-            if lease.due_s <= now_s and self._nc.is_connected:
-                lease.due_s = now_s + self._options.checkpoint_s
-                await self._try(lease, lease.save)
+            if lease.checkpoint_due_s <= now_s and self._nc.is_connected:
+                lease.checkpoint_due_s = now_s + self._options.checkpoint_s
+                await self._try_to_store(lease, lease.save)
 
     async def _send_hourly_summaries(self) -> None:
         for lease in self._leases:
-            if lease.hours and self._nc.is_connected:
-                await self._try(lease, lease.send_hours)
+            if lease.waiting_summaries and self._nc.is_connected:
+                await self._try_to_store(lease, lease.send_summaries)
 
-    async def _try(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:
+    async def _try_to_store(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:
+        """Run ``action``. After an error of connection or server, the next periodic call tries again."""
         try:
             await action()
         except RETRYABLE_ERRORS as error:
@@ -321,7 +324,7 @@ class Worker:
     async def _apply_table_changes(self) -> None:
         """Notify partitions of changed and new rows of the table of packs."""
         while True:
-            for pack in await self._changed.get():
+            for pack in await self._changed_packs.get():
                 entry = self._lease_tasks.get(subjects.partition_of(pack, self._partitions))
                 if entry:
                     entry[0].settings_changed(pack)
@@ -345,15 +348,15 @@ class Worker:
             partitions=tuple(lease.number for lease in owned_leases),
             packs=counters["packs"],
             # totals over all leases: they must not fall when a partition is no longer owned
-            blocks=self._blocks + sum(lease.blocks for lease in self._leases),
-            samples=self._samples + sum(lease.samples for lease in self._leases),
-            faults=self._faults + sum(lease.faults for lease in self._leases),
+            blocks=self._released_blocks + sum(lease.blocks for lease in self._leases),
+            samples=self._released_samples + sum(lease.samples for lease in self._leases),
+            faults=self._released_faults + sum(lease.faults for lease in self._leases),
             lag_s=max(lags, default=None),
             counters=dict(counters),
             unknown_count=len(unknown),
             unknown=tuple(sorted(unknown)[:MAX_UNKNOWN]),
             waiting=sum(len(lease.consumer.waiting) for lease in self._leases),
-            hours_waiting=sum(len(lease.hours) for lease in self._leases),
+            hours_waiting=sum(len(lease.waiting_summaries) for lease in self._leases),
             checkpoint_age_s=max(ages, default=None),
             cpu_s=usage.ru_utime + usage.ru_stime,
             rss_mib=_rss_mib(),
@@ -369,5 +372,5 @@ async def _repeat(period_s: float, action: Callable[[], Awaitable[None]]) -> Non
 
 
 def _rss_mib() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20
+    resident_pages = int(Path("/proc/self/statm").read_text().split()[1])  # second field
+    return resident_pages * resource.getpagesize() / 2**20

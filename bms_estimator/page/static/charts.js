@@ -1,12 +1,12 @@
-// Curves: uPlot, drawn no more often than asked; colours come from the style sheet, so they follow light and dark.
+// Charts with uPlot. Colors come from the style sheet, light or dark.
 import { clock, dayMonth, hourMinute, when } from "./format.js";
 
 /* global uPlot */
 const style = getComputedStyle(document.documentElement);
-const colour = (name) => () => style.getPropertyValue(name).trim();
-const faint = (name) => colour(`${name}-faint`);
+const color = (name) => () => style.getPropertyValue(name).trim();
+const faint = (name) => color(`${name}-faint`);
 
-/** Rows of numbers in order of the first, the newest `size` of them; views of it cost nothing. */
+/** The newest `size` rows, sorted by the first column. Columns are contiguous, so views need no copy. */
 export class Ring {
 	constructor(columns, size) {
 		this.size = size;
@@ -16,8 +16,8 @@ export class Ring {
 	clear() { this.start = this.end = 0; }
 	get last() { return this.end > this.start ? this.columns[0][this.end - 1] : -Infinity; }
 	push(row) {
-		if (!(row[0] > this.last)) return; // what comes late, after an outage
-		if (this.end === 2 * this.size) {
+		if (!(row[0] > this.last)) return; // late, after an outage
+		if (this.end === 2 * this.size) { // full: move the rows to the start
 			for (const column of this.columns) column.copyWithin(0, this.start, this.end);
 			this.end -= this.start;
 			this.start = 0;
@@ -34,38 +34,38 @@ export class Ring {
 	}
 }
 
-/** uPlot takes null for a gap, NaN it does not know. */
+/** Multiply by a factor. A missing value becomes null, uPlot's gap. */
 export const scaled = (values, factor) => Array.from(values, (x) => (x !== null && Number.isFinite(x) ? factor * x : null));
-export const gaps = (values) => scaled(values, 1);
+export const nullGaps = (values) => scaled(values, 1);
 
 const DAY_S = 86400, STEPS_S = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 3600, 7200, 14400, 21600, DAY_S, 2 * DAY_S, 5 * DAY_S, 10 * DAY_S];
-function times(plot, splits) {
+function timeLabels(plot, splits) {
 	const span = plot.scales.x.max - plot.scales.x.min;
 	const text = span > 2 * DAY_S ? dayMonth : span > 600 ? hourMinute : clock;
 	return splits.map((s) => text(new Date(1e3 * s)));
 }
 
-const axis = { stroke: colour("--dim"), grid: { stroke: colour("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui, sans-serif" };
+const axis = { stroke: color("--dim"), grid: { stroke: color("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui, sans-serif" };
 const thin = { points: { show: false }, pxAlign: 0 };
 const minus = (text) => text.replace("-", "−");
 
-/** A range that no noise fills: at least `least` high. */
-function roomy(least, low = -Infinity, high = Infinity) {
+/** Range of the data and a margin, at least `minSpan`, so that noise does not fill it. */
+function rangeOver(minSpan, low = -Infinity, high = Infinity) {
 	return (_, min, max) => {
 		if (!Number.isFinite(min)) return [0, 1];
-		const middle = (min + max) / 2, half = Math.max((max - min) * 0.56, least / 2);
+		const middle = (min + max) / 2, half = Math.max((max - min) * 0.56, minSpan / 2);
 		return [Math.max(middle - half, low), Math.min(middle + half, high)];
 	};
 }
 
-/** Labels of an axis with the decimals that tell them apart. */
-function labels(_, splits) {
+/** Axis labels with as many decimals as distinguish them. */
+function axisLabels(_, splits) {
 	const step = Math.abs(splits[1] - splits[0]) || 1;
 	const decimals = [0, 1, 2, 3].find((d) => Math.abs(step * 10 ** d - Math.round(step * 10 ** d)) < 1e-6) ?? 4;
 	return splits.map((v) => minus(v.toFixed(decimals)));
 }
 
-/** As wide as its box. */
+/** Chart as wide as its box. */
 class Sized {
 	draw(data) {
 		const width = this.box.clientWidth;
@@ -74,9 +74,9 @@ class Sized {
 	}
 }
 
-/** A chart over time of a value, the edges of its band first, and what may stand beside it. */
+/** Chart over time. Data: times, edges of the band, value, and optionally a second value. */
 export class Curve extends Sized {
-	constructor(parent, { title, unit, colour: name, height, least, low, high, beside }) {
+	constructor(parent, { title, unit, color: name, height, minSpan, low, high, second }) {
 		super();
 		Object.assign(this, { title, unit });
 		this.box = document.createElement("figure");
@@ -85,8 +85,8 @@ export class Curve extends Sized {
 		const [caption, body] = this.box.children;
 		caption.children[0].textContent = title;
 		caption.children[1].textContent = unit;
-		if (beside) {
-			for (const [line, label] of [[name, "measured"], [beside.colour, beside.label]]) {
+		if (second) {
+			for (const [line, label] of [[name, "measured"], [second.color, second.label]]) {
 				const key = document.createElement("i");
 				key.className = line.slice(2);
 				key.textContent = label;
@@ -99,15 +99,15 @@ export class Curve extends Sized {
 		const edge = { ...thin, width: 0 };
 		this.plot = new uPlot({
 			width: 300, height, legend: { show: false }, padding: [8, 26, 0, 0],
-			series: [{}, edge, edge, { ...thin, stroke: colour(name), width: 1.6 }, ...(beside ? [{ ...thin, stroke: colour(beside.colour), width: 1.6, dash: beside.dash }] : [])],
+			series: [{}, edge, edge, { ...thin, stroke: color(name), width: 1.6 }, ...(second ? [{ ...thin, stroke: color(second.color), width: 1.6, dash: second.dash }] : [])],
 			bands: [{ series: [1, 2], fill: faint(name) }],
 			cursor: { drag: { x: false, y: false }, points: { show: false }, sync: { key: "time" } },
-			hooks: { setCursor: [(u) => this.point(u.cursor.idx)] },
-			scales: { x: { time: false }, y: { range: roomy(least, low, high) } },
-			axes: [{ ...axis, values: times, size: 24, space: 90, incrs: STEPS_S }, { ...axis, size: 52, space: 26, values: labels }],
-		}, [[], [], [], [], ...(beside ? [[]] : [])], body);
+			hooks: { setCursor: [(u) => this.showValues(u.cursor.idx)] },
+			scales: { x: { time: false }, y: { range: rangeOver(minSpan, low, high) } },
+			axes: [{ ...axis, values: timeLabels, size: 24, space: 90, incrs: STEPS_S }, { ...axis, size: 52, space: 26, values: axisLabels }],
+		}, [[], [], [], [], ...(second ? [[]] : [])], body);
 	}
-	point(index) {
+	showValues(index) {
 		const [time, , , ...values] = this.plot.data, at = index == null ? null : time[index];
 		const shown = values.map((v) => v[index]).filter((v) => v != null).map((v) => `${minus(v.toFixed(3))} ${this.unit}`);
 		this.readout.textContent = at == null ? "" : `${(this.span > DAY_S / 2 ? when : clock)(new Date(1e3 * at))}  ${shown.join("  ")}`;
@@ -119,38 +119,38 @@ export class Curve extends Sized {
 			this.plot.setScale("x", { min: from, max: to });
 		});
 	}
-	/** A sentence for who cannot see it. */
+	/** Describe the chart for screen readers. */
 	describe(span) {
-		const values = Array.from(this.plot.data[3]).filter((v) => v != null), say = (v) => v.toFixed(3);
-		const text = values.length ? `from ${say(Math.min(...values))} to ${say(Math.max(...values))} ${this.unit}, last ${say(values.at(-1))} ${this.unit}` : "nothing yet";
+		const values = Array.from(this.plot.data[3]).filter((v) => v != null), fixed = (v) => v.toFixed(3);
+		const text = values.length ? `from ${fixed(Math.min(...values))} to ${fixed(Math.max(...values))} ${this.unit}, last ${fixed(values.at(-1))} ${this.unit}` : "nothing yet";
 		this.body.setAttribute("aria-label", `${this.title}, ${span}: ${text}`);
 	}
 }
 
-/** A value over the state of charge [%]: a band, what was learned, a formula, and with its error where it stands now. */
+/** Chart over the SOC [%]: band, learned values, a formula, and the present value with its error bar. */
 export class OverSoc extends Sized {
 	constructor(box, height) {
 		super();
 		this.box = box;
 		box.setAttribute("role", "img");
-		const room = (_, a, b) => {
-			const more = 0.06 * (b - a || 1e-3 * Math.abs(a) || 1);
-			return Number.isFinite(a) ? [a - more, b + more] : [0, 1];
+		const range = (_, min, max) => {
+			const margin = 0.06 * (max - min || 1e-3 * Math.abs(min) || 1);
+			return Number.isFinite(min) ? [min - margin, max + margin] : [0, 1];
 		};
 		this.plot = new uPlot({
 			width: 300, height, legend: { show: false }, padding: [8, 20, 0, 0], cursor: { show: false },
-			series: [{}, { ...thin, width: 0 }, { ...thin, width: 0 }, { ...thin, stroke: colour("--volt"), width: 2 }, { ...thin, stroke: colour("--dim"), width: 1.4, dash: [5, 4] }],
+			series: [{}, { ...thin, width: 0 }, { ...thin, width: 0 }, { ...thin, stroke: color("--volt"), width: 2 }, { ...thin, stroke: color("--dim"), width: 1.4, dash: [5, 4] }],
 			bands: [{ series: [1, 2], fill: faint("--volt") }],
-			hooks: { draw: [(u) => this.now && this.mark(u, this.now)] },
-			scales: { x: { time: false, range: [0, 100] }, y: { range: room } },
-			axes: [{ ...axis, size: 24, values: (_, s) => s.map((v) => `${v} %`) }, { ...axis, size: 56, space: 34, values: labels }],
+			hooks: { draw: [(u) => this.now && this.drawError(u, this.now)] },
+			scales: { x: { time: false, range: [0, 100] }, y: { range } },
+			axes: [{ ...axis, size: 24, values: (_, s) => s.map((v) => `${v} %`) }, { ...axis, size: 56, space: 34, values: axisLabels }],
 		}, [[], [], [], [], []], box);
 	}
-	mark(u, { soc, value, std }) {
+	drawError(u, { soc, value, std }) {
 		const c = u.ctx, r = devicePixelRatio, x = u.valToPos(soc, "x", true);
 		const y = (v) => u.valToPos(Math.min(Math.max(v, u.scales.y.min), u.scales.y.max), "y", true);
 		c.save();
-		c.strokeStyle = c.fillStyle = colour("--soc")();
+		c.strokeStyle = c.fillStyle = color("--soc")();
 		c.lineWidth = 2 * r;
 		c.setLineDash([]);
 		c.beginPath();

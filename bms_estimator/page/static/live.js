@@ -1,23 +1,23 @@
-// What pages share: the stream of what is new; elements touched only where they change.
-const SILENT_MS = 16_000; // it speaks each 5 s
+// Shared by the pages: the event stream, and updates of elements that have changed.
+const SILENT_MS = 16_000; // an event arrives each 5 s
 
-/** Hear /events for ever: `heard` gets each message, `turned` as `stream.open` may change. */
-export function listen(heard, turned, stream = { open: false }) {
+/** Receive /events for ever. `onState` is called when `stream.open` may have changed. */
+export function listen(onMessage, onState, stream = { open: false }) {
 	const source = new EventSource("/events");
 	let last = Date.now();
-	const turn = (open) => { stream.open = open; turned(); };
+	const setOpen = (open) => { stream.open = open; onState(); };
 	source.onmessage = (event) => {
 		last = Date.now();
-		heard(JSON.parse(event.data));
-		turn(true);
+		onMessage(JSON.parse(event.data));
+		setOpen(true);
 	};
-	source.onerror = () => turn(false);
-	const watch = setInterval(() => { // refused, or a line that swallows all
+	source.onerror = () => setOpen(false);
+	const watch = setInterval(() => { // refused, or nothing arrives any more
 		if (source.readyState !== EventSource.CLOSED && Date.now() - last < SILENT_MS) return;
 		clearInterval(watch);
 		source.close();
-		turn(false);
-		listen(heard, turned, stream);
+		setOpen(false);
+		listen(onMessage, onState, stream);
 	}, 1000);
 	return stream;
 }

@@ -1,13 +1,13 @@
-// The live page: drawn four times a second at most, curves twice.
+// The live page, drawn at most four times a second, its curves twice.
 import * as f from "./format.js";
 import { attribute, changed, hide, listen, node, text } from "./live.js";
-import { Curve, OverSoc, Ring, gaps, scaled } from "./charts.js";
+import { Curve, OverSoc, Ring, nullGaps, scaled } from "./charts.js";
 
 const DRAW_MS = 250, CURVES_MS = 500, DESCRIBE_MS = 10_000, HISTORY_MS = 60_000, AHEAD_MS = 86_400_000;
 const SPANS = { live: 300, hour: 3600, day: 86400, month: 30 * 86400 }; // [s]
-const ROWS = 3600;
+const ROWS = 3600; // of recent states
 const COLUMNS = ["voltage_v", "voltage_estimate_v", "current_a", "soc", "soc_std", "innovation_v"];
-const MOST_EVENTS = 50;
+const MAX_EVENTS = 50;
 
 const $ = (id) => document.getElementById(id);
 const number = (x) => typeof x === "number";
@@ -24,8 +24,8 @@ class Pack {
 	learned = {}; // element -> percent of SOC -> [value, std]
 	events = [];
 	history = {}; // span -> { at, data } or { at, reason }
-	stateAt = 0; // of its last state, by our clock
-	since = null;
+	stateMs = 0; // arrival of the last state
+	since = null; // time of the last state when it became stale
 	constructor(name) { this.name = name; }
 	take(topic, value) {
 		if (topic === "recent") {
@@ -37,9 +37,9 @@ class Pack {
 		if (topic === "event" && value) this.addEvent(value);
 		this.topics[topic] = value;
 		if (topic === "state" && value) {
-			this.stateAt = Date.now();
+			this.stateMs = Date.now();
 			const time = Date.parse(value.time);
-			if (time < this.stateAt + AHEAD_MS) this.recent.push([time / 1e3, ...COLUMNS.map((c) => value[c])]);
+			if (time < this.stateMs + AHEAD_MS) this.recent.push([time / 1e3, ...COLUMNS.map((c) => value[c])]);
 		}
 		if (topic === "parameters" && value?.soc != null) {
 			for (const [name, p] of Object.entries(value.elements)) {
@@ -51,18 +51,18 @@ class Pack {
 		if (this.events.some((e) => e.time === event.time && e.name === event.name)) return;
 		this.events.push(event);
 		this.events.sort((a, b) => Date.parse(b.time) - Date.parse(a.time));
-		this.events.length = Math.min(this.events.length, MOST_EVENTS);
+		this.events.length = Math.min(this.events.length, MAX_EVENTS);
 	}
 	get alarms() { return Object.entries(this.topics).filter(([t, a]) => t.startsWith("alarm/") && a).map(([, a]) => a); }
 	get raised() { return this.alarms.some((a) => a.active); }
-	/** Why the values are not what is now; "" when they are. */
+	/** Reason why the values are not current; "" if they are. */
 	get trouble() {
 		const { availability, "sensor/availability": sensor, health, state } = this.topics;
 		if (!stream.open) return "the page's server does not answer";
 		if (link && !link.up) return link.reason;
 		if ((availability ?? "online") !== "online") return "the service is offline";
 		if ((sensor ?? "online") !== "online") return health?.sensor_message || "the sensor is offline";
-		return state && this.stateAt < linkSince ? "no value since the broker was lost" : "";
+		return state && this.stateMs < linkSince ? "no value since the broker was lost" : "";
 	}
 }
 
@@ -125,20 +125,20 @@ function draw() {
 
 function drawStatus(pack) {
 	const { state } = pack?.topics ?? {}, trouble = pack ? pack.trouble : link?.reason ?? "";
-	let kind = "wait", said = pack ? "waiting for a sample" : stream.open ? "waiting for a pack" : "connecting";
+	let kind = "wait", label = pack ? "waiting for a sample" : stream.open ? "waiting for a pack" : "connecting";
 	if (trouble) {
 		kind = "stale";
-		said = "no value yet";
+		label = "no value yet";
 		if (state) {
 			pack.since ??= new Date(state.time);
-			said = `stale since ${f.clock(pack.since)}`;
+			label = `stale since ${f.clock(pack.since)}`;
 		}
 	} else if (state) {
 		kind = "live";
-		said = "live";
+		label = "live";
 		pack.since = null;
 	}
-	text($("status").lastElementChild, said);
+	text($("status").lastElementChild, label);
 	attribute($("status"), "data-state", kind);
 	attribute(document.body, "data-state", kind);
 	text($("why"), trouble);
@@ -150,8 +150,8 @@ function drawStatus(pack) {
 function drawHead(pack) {
 	const { info, state } = pack.topics;
 	text($("name"), pack.name);
-	const said = info ? [info.cell, `${info.series_count} in series`, f.volts(info.nominal_voltage_v), f.ampereHours(info.capacity_ah)] : [];
-	text($("what"), [...said, state && `as of ${f.clock(new Date(state.time))}`].filter(Boolean).join(" · "));
+	const facts = info ? [info.cell, `${info.series_count} in series`, f.volts(info.nominal_voltage_v), f.ampereHours(info.capacity_ah)] : [];
+	text($("what"), [...facts, state && `as of ${f.clock(new Date(state.time))}`].filter(Boolean).join(" · "));
 	for (const tab of $("packs").children) {
 		const here = tab.dataset.pack === pack.name;
 		attribute(tab, "aria-selected", String(here));
@@ -266,19 +266,19 @@ function drawParameters(report) {
 			rows.set(key, node("tr", { "data-p": key }, node("th", { scope: "row" }, name), ...Array.from({ length: 5 }, () => node("td", {}))));
 			$("params").append(rows.get(key));
 		}
-		const said = [...f.withError(p.value, p.std, factor), unit, p.valid ? "✓ yes" : "no",
+		const texts = [...f.withError(p.value, p.std, factor), unit, p.valid ? "✓ yes" : "no",
 			p.valid ? p.source + (p.updated ? `, ${f.clock(new Date(p.updated))}` : "") : p.reason ?? ""];
 		const cells = [...rows.get(key).children].slice(1);
-		cells.forEach((cell, i) => text(cell, said[i]));
+		cells.forEach((cell, i) => text(cell, texts[i]));
 		attribute(cells[3], "class", p.valid ? "good" : "");
 	}
 }
 
 function drawHealth({ topics: { health: h, info, state } }) {
 	if (!h) return;
-	const wrong = [h.sensor_message, ...(h.suspects ?? [])].filter(Boolean);
-	if (changed($("suspects"), wrong.join("\n"))) {
-		$("suspects").replaceChildren(...(wrong.length ? wrong.map((w) => node("li", { class: "bad" }, w)) : [node("li", { class: "good" }, "Nothing is suspected of the input.")]));
+	const faults = [h.sensor_message, ...(h.suspects ?? [])].filter(Boolean);
+	if (changed($("suspects"), faults.join("\n"))) {
+		$("suspects").replaceChildren(...(faults.length ? faults.map((w) => node("li", { class: "bad" }, w)) : [node("li", { class: "good" }, "Nothing is suspected of the input.")]));
 	}
 	const of = (x, unit) => number(x) && `${f.digits(x, 3)} ${unit}`;
 	const facts = {
@@ -307,10 +307,10 @@ function drawEvents(pack) {
 let curves = null;
 
 function makeCurves() {
-	const make = (title, unit, colour, least, more) => new Curve($("curves"), { title, unit, colour, least, height: 132, ...more });
+	const make = (title, unit, color, minSpan, more) => new Curve($("curves"), { title, unit, color, minSpan, height: 132, ...more });
 	curves = {
 		soc: make("State of charge", "%", "--soc", 2, { low: 0, high: 100 }),
-		v: make("Voltage", "V", "--volt", 0.02, { beside: { colour: "--estimate", label: "estimated", dash: [5, 3] } }),
+		v: make("Voltage", "V", "--volt", 0.02, { second: { color: "--estimate", label: "estimated", dash: [5, 3] } }),
 		i: make("Current", "A", "--amp", 0.02),
 		inno: make("Innovation", "mV", "--inno", 2),
 		temp: make("Temperature", "°C", "--inno", 2),
@@ -322,7 +322,7 @@ function drawCurves(pack) {
 	const live = ui.span === "live";
 	if (!live) loadHistory(pack, ui.span);
 	const past = pack.history[ui.span];
-	const reason = live ? "" : past?.reason ?? (past?.data?.time_s.length ? "" : past?.data ? "Nothing was kept of this span yet." : "reading…");
+	const reason = live ? "" : past?.reason ?? (past?.data?.time_s.length ? "" : past?.data ? "Nothing was recorded in this span." : "reading…");
 	text($("nohistory"), reason);
 	hide($("nohistory"), !reason);
 	hide($("curves"), !!reason);
@@ -338,23 +338,23 @@ function drawCurves(pack) {
 	}
 }
 
-const none = (time) => new Array(time.length).fill(null);
-/** Edges and middle of a state of charge [%]. */
+const nulls = (time) => new Array(time.length).fill(null);
+/** Upper edge, lower edge and value of the SOC [%]. */
 function socColumns(soc, std) {
 	const edge = (sign) => Array.from(soc, (v, i) => (Number.isFinite(v) && Number.isFinite(std[i]) ? 100 * clip(v + sign * 2 * std[i]) : null));
 	return [edge(1), edge(-1), scaled(soc, 100)];
 }
 
 function liveColumns(pack) {
-	const [time, v, estimate, i, soc, std, inno] = pack.recent.views(pack.recent.last - SPANS.live), no = none(time);
-	return { time, v: [no, no, gaps(v), gaps(estimate)], i: [no, no, gaps(i)], soc: socColumns(soc, std), inno: [no, no, scaled(inno, 1e3)] };
+	const [time, v, estimate, i, soc, std, inno] = pack.recent.views(pack.recent.last - SPANS.live), no = nulls(time);
+	return { time, v: [no, no, nullGaps(v), nullGaps(estimate)], i: [no, no, nullGaps(i)], soc: socColumns(soc, std), inno: [no, no, scaled(inno, 1e3)] };
 }
 
-/** With a gap where nothing was measured for more than two steps. */
+/** Columns of a history, with a gap after 2.5 steps without a row. */
 function pastColumns(data) {
 	const at = [];
 	data.time_s.forEach((t, i) => { if (i && t - data.time_s[i - 1] > 2.5 * data.step_s) at.push(-1); at.push(i); });
-	const pick = (name) => at.map((i) => data[name][i] ?? null), no = none(at);
+	const pick = (name) => at.map((i) => data[name][i] ?? null), no = nulls(at);
 	const span = (name, unit) => [pick(`${name}_max_${unit}`), pick(`${name}_min_${unit}`), pick(`${name}_${unit}`)];
 	const time = at.map((i, n) => (i < 0 ? data.time_s[at[n - 1]] + data.step_s : data.time_s[i]));
 	return { time, v: [...span("voltage", "v"), no], i: span("current", "a"), soc: socColumns(pick("soc"), pick("soc_std")), temp: [no, no, pick("temperature_c")] };
@@ -364,13 +364,13 @@ async function loadHistory(pack, span) {
 	const before = pack.history[span];
 	if (before && Date.now() - before.at < HISTORY_MS) return;
 	pack.history[span] = { ...before, at: Date.now() };
-	let found = before?.data ? { data: before.data } : { reason: "The page's server does not answer." };
+	let result = before?.data ? { data: before.data } : { reason: "The page's server does not answer." };
 	try {
 		const answer = await fetch(`/history?pack=${encodeURIComponent(pack.name)}&span=${span}`);
-		found = answer.ok ? { data: await answer.json() } : { reason: "No history is kept here: it lies where the pack's service runs." };
-	} catch { /* said by the status, too */ }
-	for (const e of found.data?.events ?? []) pack.addEvent({ ...e, time: new Date(1e3 * e.time_s).toISOString() });
-	pack.history[span] = { at: Date.now(), ...found };
+		result = answer.ok ? { data: await answer.json() } : { reason: "No history is kept here: it lies where the pack's service runs." };
+	} catch { /* the status shows it, too */ }
+	for (const e of result.data?.events ?? []) pack.addEvent({ ...e, time: new Date(1e3 * e.time_s).toISOString() });
+	pack.history[span] = { at: Date.now(), ...result };
 	redrawAll();
 }
 
@@ -382,8 +382,9 @@ function describe(pack) {
 	attribute($("elementchart"), "aria-label", `${name} over state of charge, now ${value} ${unit}${std && `, standard deviation ${std} ${unit}`}`);
 }
 
-// elements over SOC: the functions (2.5)-(2.9), and what was learned with its error where the pack has been
+// elements over SOC: functions (2.5)-(2.9) of Chen and Mora, and learned values with errors
 
+// number of the first of three coefficients a1..a15, sign of its term
 const FORM = { r_ts_ohm: [1, 1], r_tl_ohm: [4, 1], c_ts_farad: [7, -1], c_tl_farad: [10, -1], r_s_ohm: [13, 1] };
 const GRID = Array.from({ length: 101 }, (_, i) => i);
 let overSoc = null;
@@ -402,7 +403,7 @@ function drawElement(pack) {
 	const now = number(soc) && number(p.value) ? { soc: 100 * soc, value: factor * p.value, std: factor * (p.std ?? 0) } : null;
 	if (name === "e_o_v") {
 		const edge = (sign) => ocv.ocv_v.map((v, i) => v + sign * 2 * ocv.std_v[i]);
-		overSoc.draw([scaled(ocv.soc, 100), edge(1), edge(-1), ocv.ocv_v, none(ocv.soc)], now);
+		overSoc.draw([scaled(ocv.soc, 100), edge(1), edge(-1), ocv.ocv_v, nulls(ocv.soc)], now);
 		text($("elementnote"), "Open-circuit voltage at 25 °C, ± 2 std.");
 		return;
 	}
@@ -412,18 +413,18 @@ function drawElement(pack) {
 	text($("elementnote"), `Dashed: ${label} as a₁…a₁₅ have it. ${seen ? `Band: learned, ± 2 std, where the pack has been since this page is served.` : "Not known well enough yet for a band."}`);
 }
 
-/** a e^(-b soc) + c, or with -a for a capacitance, which ends where it is not positive. */
+/** a e^(-b soc) + c, with -a for a capacitance; null where it is not positive. */
 function curveOf(a, name, factor) {
 	const [first, sign] = FORM[name], [p, q, r] = [0, 1, 2].map((i) => a?.[`a${first + i}`]?.value);
 	const value = (soc) => sign * p * Math.exp(-q * soc) + r;
 	return GRID.map((i) => (value(i / 100) > 0 ? factor * value(i / 100) : null));
 }
 
-// what people do
+// user input
 
 function redrawAll() { ui.curves = ui.described = -Infinity; drawSoon(); }
 
-/** Packs with a raised alarm first. */
+/** List packs, those with a raised alarm first. */
 function listPacks() {
 	const names = [...packs.keys()].sort((a, b) => packs.get(b).raised - packs.get(a).raised || (a < b ? -1 : 1));
 	if (!changed($("packs"), names.join())) return;

@@ -1,4 +1,4 @@
-"""Description of a BMS or meter: its name in the settings, its resolution and its protocol."""
+"""Description of a BMS or meter: its name in the settings, its default settings and its protocol."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 
 
 @dataclass(frozen=True)
-class Resolution:
+class SensorDefaults:
     """Defaults of ``[sensor]`` for one kind of device. None: the default of the firmware's board."""
 
     baud: int | None = None
@@ -18,9 +18,9 @@ class Resolution:
     period_s: float | None = None
     """Time between two samples [s]."""
     voltage_resolution_v: float | None = None
-    """One step of the pack's voltage [V]."""
+    """Smallest step of the pack's voltage [V]."""
     current_resolution_a: float | None = None
-    """One step of the current [A]."""
+    """Smallest step of the current [A]."""
     current_dead_band_a: float | None = None
     """Current below which the device reports 0 [A]."""
 
@@ -34,12 +34,12 @@ class Device:
     Attributes:
         name: Value of ``sensor.protocol``.
         make: Creates the protocol from the sign of the current and the address (None: the first device that responds).
-        resolution: Defaults of ``[sensor]``.
+        sensor_defaults: Defaults of ``[sensor]``.
         has_binary_frames: True if the frames are not lines of text. A device search sends binary queries last, because a device that
             reads lines would interpret them as the beginning of a line.
     """
 
     name: str
     make: Callable[[CurrentSign, int | None], DeviceProtocol]
-    resolution: Resolution
+    sensor_defaults: SensorDefaults
     has_binary_frames: bool = False

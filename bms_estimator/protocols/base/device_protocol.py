@@ -19,7 +19,7 @@ class Command:
 
     done: bool = False
     refusal: str | None = None
-    """Reason why the device rejects the command, as text; None if it does not."""
+    """Reason why the device rejected the command; None if it did not."""
 
 
 class DeviceProtocol(ABC):
@@ -65,7 +65,7 @@ class DeviceProtocol(ABC):
 
     @abstractmethod
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line.
+        """Decode the bytes of one read.
 
         Args:
             arrival_s: Arrival time, on any clock that never steps back [s].
@@ -78,7 +78,13 @@ class DeviceProtocol(ABC):
     def feed_reads(
         self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
     ) -> SampleBlock:
-        """Decode many reads of the line, the arrays of a ``CaptureBatch``, to the samples that ``feed`` would return."""
+        """Decode many reads at once. The samples are those that ``feed`` would return for each read.
+
+        Args:
+            arrivals_s: Arrival time of each read [s].
+            ends: End of each read in ``data``.
+            data: Concatenated bytes of the reads.
+        """
         blocks, cells = [np.empty(0, dtype=SAMPLE)], list[Sequence[float]]()
         begin = 0
         for arrival_s, end in zip(arrivals_s.tolist(), ends.tolist(), strict=True):

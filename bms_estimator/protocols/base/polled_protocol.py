@@ -20,8 +20,8 @@ MAX_NOISE_BYTES = 64
 """Maximum number of bytes without a frame before it is reported as a fault. Fewer may be a single glitch."""
 MAX_START_BYTES = 4
 """Maximum length of the constant bytes at the start of a frame."""
-FAULTS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs")
-FRESH_S = 3.0
+FAULT_COUNTERS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs")
+MAX_ATTACHED_AGE_S = 3.0
 """Values from a separate response are attached to a sample only if they are newer than this [s]."""
 
 
@@ -36,8 +36,8 @@ class ParseResult(Enum):
 class PolledProtocol(ReadingProtocol):
     """Protocol that polls a device in cycles and decodes its frames to samples. It takes no commands.
 
-    Bytes outside frames are skipped one by one, so that the next complete frame is found. The division of the bytes into
-    reads affects only the sample times.
+    Bytes outside frames are skipped one by one, so that the next complete frame is found. Apart from the sample times, the
+    result does not depend on how the bytes are split into reads.
 
     Args:
         name: Name of the device, as text.
@@ -49,15 +49,15 @@ class PolledProtocol(ReadingProtocol):
     def __init__(
         self, name: str, start: re.Pattern[bytes], current_sign: CurrentSign, address: int | None = None
     ) -> None:
-        super().__init__(current_sign, FAULTS)
+        super().__init__(current_sign, FAULT_COUNTERS)
         self._name, self._start, self._address = name, start, address
-        self._rest = b""
+        self._unparsed = b""
         self._responses = 0  # number of valid frames
         self._noise_bytes = 0  # since the last valid frame
-        self._due: list[bytes] = []
+        self._due_queries: list[bytes] = []
         self._query = b""
-        self._variant = self._unanswered = 0
-        self._responses_before = -1  # at the begin of the last cycle; -1: no cycle yet
+        self._variant_index = self._unanswered_cycles = 0
+        self._responses_before = -1  # number of responses at the beginning of the last cycle; -1: no cycle yet
         self._cycle_s = self._query_s = -math.inf
 
     @property
@@ -76,7 +76,7 @@ class PolledProtocol(ReadingProtocol):
         """Return the length of the frame that begins at ``at``, including start and checksum [bytes]."""
 
     @abstractmethod
-    def _is_whole(self, frame: bytes) -> bool:
+    def _has_valid_checksum(self, frame: bytes) -> bool:
         """Return True if the checksum of a frame is right."""
 
     @abstractmethod
@@ -88,29 +88,29 @@ class PolledProtocol(ReadingProtocol):
 
         Decoded values are not reset, because a capture does not contain the openings of the port.
         """
-        self._due, self._variant, self._unanswered, self._responses_before = [], 0, 0, -1
+        self._due_queries, self._variant_index, self._unanswered_cycles, self._responses_before = [], 0, 0, -1
         self._cycle_s = self._query_s = -math.inf
 
     def next_output(self, now_s: float) -> bytes:
         """Return the next query of the poll cycle; nothing while the device has time to respond."""
         if now_s - self._query_s < QUERY_INTERVAL_S:
             return b""
-        if not self._due:
+        if not self._due_queries:
             if now_s - self._cycle_s < POLL_CYCLE_S:
                 return b""
             self._begin_cycle(now_s)
-        self._query_s, self._query = now_s, self._due.pop(0)
+        self._query_s, self._query = now_s, self._due_queries.pop(0)
         return self._query
 
     def _begin_cycle(self, now_s: float) -> None:
         on_time = now_s - self._cycle_s < 2.0 * POLL_CYCLE_S
         self._cycle_s = self._cycle_s + POLL_CYCLE_S if on_time else now_s  # a short delay does not shift the schedule
-        self._unanswered = self._unanswered + 1 if self._responses == self._responses_before else 0
+        self._unanswered_cycles = self._unanswered_cycles + 1 if self._responses == self._responses_before else 0
         self._responses_before = self._responses
-        if self._unanswered > MAX_UNANSWERED_CYCLES:
-            self._variant, self._unanswered = self._variant + 1, 0
+        if self._unanswered_cycles > MAX_UNANSWERED_CYCLES:
+            self._variant_index, self._unanswered_cycles = self._variant_index + 1, 0
         variants = self._query_variants()
-        self._due = list(variants[self._variant % len(variants)])
+        self._due_queries = list(variants[self._variant_index % len(variants)])
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:
         for frame in self._frames(data):
@@ -121,26 +121,27 @@ class PolledProtocol(ReadingProtocol):
 
     def _frames(self, data: bytes) -> list[bytes]:
         """Return the complete frames that end in ``data``; store an incomplete frame for the next call."""
-        rest = self._rest + data
-        frames, done, incomplete = list[bytes](), 0, -1  # parsed up to ``done``; start of an incomplete frame
-        at = self._next(rest, 0)
-        while at >= 0:
-            length = self._frame_length(rest, at)
-            if isinstance(length, int) and at + length > len(rest):
+        buffer = self._unparsed + data
+        frames, parsed_end = list[bytes](), 0
+        incomplete = -1  # start of an incomplete frame; -1: none
+        start = self._find_start(buffer, 0)
+        while start >= 0:
+            length = self._frame_length(buffer, start)
+            if isinstance(length, int) and start + length > len(buffer):
                 length = ParseResult.MORE
-            if isinstance(length, int) and self._is_whole(rest[at : at + length]):
-                if incomplete >= 0:
+            if isinstance(length, int) and self._has_valid_checksum(buffer[start : start + length]):
+                if incomplete >= 0:  # the frame that looked incomplete was cut off, because another one follows
                     self._count_fault(
                         "short_frames", "a response was cut off: interference, or a second master on the line?"
                     )
-                self._skip(at - done)
-                done, incomplete = at + length, -1
-                frames.append(rest[at:done])
-                at = self._next(rest, done)
+                self._skip(start - parsed_end)
+                parsed_end, incomplete = start + length, -1
+                frames.append(buffer[start:parsed_end])
+                start = self._find_start(buffer, parsed_end)
                 continue
-            if incomplete < 0:  # inside an incomplete frame it is parsed again later
+            if incomplete < 0:  # the bytes of an incomplete frame are parsed again with the next read
                 if length is ParseResult.MORE:
-                    incomplete = at
+                    incomplete = start
                 elif length is ParseResult.LENGTH:
                     self._count_fault(
                         "length_errors", "responses with invalid lengths arrive: interference, or a wrong baud rate?"
@@ -150,23 +151,24 @@ class PolledProtocol(ReadingProtocol):
                         "crc_errors",
                         "responses with wrong checksums arrive: interference, or a second master on the line?",
                     )
-            at = self._next(rest, at + 1)
-        end = incomplete if incomplete >= 0 else max(done, len(rest) - MAX_START_BYTES + 1)
-        self._skip(end - done)
-        self._rest = rest[end:]
+            start = self._find_start(buffer, start + 1)
+        # without an incomplete frame, only the last bytes may be the beginning of a frame
+        end = incomplete if incomplete >= 0 else max(parsed_end, len(buffer) - MAX_START_BYTES + 1)
+        self._skip(end - parsed_end)
+        self._unparsed = buffer[end:]
         return frames
 
-    def _next(self, data: bytes, at: int) -> int:
+    def _find_start(self, data: bytes, at: int) -> int:
         """Return the position of the next possible frame start; -1 without one."""
-        found = self._start.search(data, at)
-        return found.start() if found else -1
+        match = self._start.search(data, at)
+        return match.start() if match else -1
 
     def _skip(self, count: int) -> None:
         """Skip bytes outside of frames."""
         self._counts["noise_bytes"] += count
         self._noise_bytes += count
 
-    def _is_other(self, address: int) -> bool:
+    def _is_other_pack(self, address: int) -> bool:
         """Return True if a response is from another pack.
 
         Without a configured address the first response selects the pack.
@@ -180,7 +182,7 @@ class PolledProtocol(ReadingProtocol):
         )
         return True
 
-    def _mean_c(self, probes_c: Sequence[float]) -> float:
+    def _mean_temperature_c(self, probes_c: Sequence[float]) -> float:
         """Return the mean temperature of the probes [C].
 
         Absent or broken probes report values outside of the plausible range and are omitted.

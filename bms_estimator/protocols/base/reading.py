@@ -62,16 +62,16 @@ def read_line(line: bytes) -> Reading | None:
 
     Examples: ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
     ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
-    ``time_s`` is the board's timestamp; a cell that is ``null`` was not measured. Unknown names are skipped. A repeated name or an unknown
-    unit makes the line invalid.
+    ``time_s`` is the board's timestamp. A cell that is ``null`` was not measured. Unknown names are skipped. A repeated
+    name or an unknown unit makes the line invalid.
     """
     if b";" in line and b"." not in line:
         line = line.replace(b",", b".")
     try:
         if line.lstrip().startswith(b"{"):
-            return _to_reading(_members(line))
+            return _to_reading(_json_values(line))
         if b"=" in line or b":" in line:
-            return _to_reading(_pairs(line.decode("ascii", "replace")))
+            return _to_reading(_pair_values(line.decode("ascii", "replace")))
         columns = line.translate(_SEPARATORS).decode("ascii").split()
         if len(columns) not in (2, 3):
             return None
@@ -84,12 +84,12 @@ _NamedValues = tuple[str, list[float], str]
 """Name, values, unit or an empty string."""
 
 
-def _pairs(text: str) -> Iterable[_NamedValues]:
+def _pair_values(text: str) -> Iterable[_NamedValues]:
     for name, values, unit in _PAIR.findall(text):
         yield name, [number(value) for value in values.split(",")], unit
 
 
-def _members(line: bytes) -> Iterable[_NamedValues]:
+def _json_values(line: bytes) -> Iterable[_NamedValues]:
     for name, value in json.loads(line.decode(), parse_float=number, parse_constant=number).items():
         values = [nan if v is None else v for v in value] if isinstance(value, list) else [value]
         if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):

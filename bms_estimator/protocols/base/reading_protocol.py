@@ -49,7 +49,7 @@ class ReadingProtocol(DeviceProtocol):
         return self._fault_text
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; ``time_s`` is the arrival time since the first sample."""
+        """Decode the bytes of one read; ``time_s`` is the arrival time since the first sample."""
         self._counts["bytes_received"] += len(data)
         readings = []
         for reading in self._read(arrival_s, data):
@@ -70,7 +70,7 @@ class ReadingProtocol(DeviceProtocol):
 
     @abstractmethod
     def _read(self, arrival_s: float, data: bytes) -> Iterable[Reading]:
-        """Decode one read of the line. Subclasses report faults with ``_count_fault``."""
+        """Decode the bytes of one read. Subclasses report faults with ``_count_fault``."""
 
     def _count_fault(self, counter: str, text: str) -> None:
         """Count a fault. The first one since the last reading is reported by ``fault``."""
@@ -79,7 +79,7 @@ class ReadingProtocol(DeviceProtocol):
 
     def _spaced_times(self, arrival_s: float, count: int) -> NDArray[np.float64]:
         """Return evenly spaced times of ``count`` samples that arrived together [s]."""
-        if self._counts["frames_received"] == count:
+        if self._counts["frames_received"] == count:  # these are the first samples
             self._first_s = self._last_s = arrival_s
             return np.zeros(count)
         steps = np.arange(1, count + 1) / count
@@ -92,11 +92,11 @@ class RecentCellVoltages:
     """Cell voltages from a separate response, for the next sample.
 
     Args:
-        fresh_s: Maximum age of values that are attached to a sample [s].
+        max_age_s: Maximum age of values that are attached to a sample [s].
     """
 
-    def __init__(self, fresh_s: float) -> None:
-        self._fresh_s = fresh_s
+    def __init__(self, max_age_s: float) -> None:
+        self._max_age_s = max_age_s
         self._arrival_s, self._cells_v = -math.inf, tuple[float, ...]()
 
     def store(self, arrival_s: float, cells_v: Sequence[float]) -> None:
@@ -104,5 +104,5 @@ class RecentCellVoltages:
         self._arrival_s, self._cells_v = arrival_s, tuple(cells_v)
 
     def at(self, arrival_s: float) -> tuple[float, ...]:
-        """Return the values for a sample of this time; empty without a recent response."""
-        return self._cells_v if arrival_s - self._arrival_s < self._fresh_s else ()
+        """Return the voltages for a sample that arrived at ``arrival_s`` [V]; empty without a recent response."""
+        return self._cells_v if arrival_s - self._arrival_s < self._max_age_s else ()

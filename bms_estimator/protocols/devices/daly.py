@@ -14,8 +14,8 @@ import struct
 from collections.abc import Mapping, Sequence
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.device import Device, Resolution
-from bms_estimator.protocols.base.polled_protocol import FRESH_S, ParseResult, PolledProtocol
+from bms_estimator.protocols.base.device import Device, SensorDefaults
+from bms_estimator.protocols.base.polled_protocol import MAX_ATTACHED_AGE_S, ParseResult, PolledProtocol
 from bms_estimator.protocols.base.reading import Reading
 
 PACK, STATUS, CELLS, PROBES = 0x90, 0x94, 0x95, 0x96
@@ -28,7 +28,7 @@ DATA_BYTES, FRAME_BYTES = 8, 13
 """Number of data bytes of a frame, and of all its bytes."""
 HOSTS = (0x40, 0x80)
 """Addresses of the host on RS485 or USB, and on UART."""
-PACKS = range(0x01, 0x40)
+PACK_ADDRESSES = range(0x01, 0x40)
 """Addresses of responses."""
 ZERO_CURRENT = 30000
 """Value at 0 A [0.1 A]."""
@@ -60,10 +60,11 @@ class DalyProtocol(PolledProtocol):
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive", address: int | None = None) -> None:
         super().__init__("Daly BMS", re.compile(b"\xa5"), current_sign, address)
-        self._cells: int | None = None
-        self._probes: int | None = None
-        self._has_sample = self._known = False  # a sample was received; a status was received since the port was opened
-        self._first = 1  # number of the frame with cell 1
+        self._cell_count: int | None = None
+        self._probe_count: int | None = None
+        self._has_sample = False
+        self._has_status = False  # True once a status was received after the port was opened
+        self._first_frame_number = 1  # number of the frame with cell 1
         self._cells_v: dict[int, Sequence[float]] = {}  # voltages by frame number [V]
         self._probes_c: dict[int, Sequence[float]] = {}
         self._cells_s = self._probes_s = -math.inf
@@ -71,83 +72,87 @@ class DalyProtocol(PolledProtocol):
     @property
     def description(self) -> str | None:
         """Number of cells; None before it and a sample have arrived."""
-        return f"Daly BMS, {self._cells} cells" if self._has_sample and self._cells is not None else None
+        return f"Daly BMS, {self._cell_count} cells" if self._has_sample and self._cell_count is not None else None
 
     def on_port_opened(self) -> None:
         """Reset; the pack may be another one, with more cells."""
         super().on_port_opened()
-        self._known = False
+        self._has_status = False
 
     def _query_variants(self) -> Sequence[Sequence[bytes]]:
         if self.probing:
             return [[request(host, command) for host in HOSTS for command in (STATUS, CELLS, PACK)]]
-        commands = (CELLS, PROBES, PACK) if self._known else (STATUS, CELLS, PROBES, PACK)
+        commands = (CELLS, PROBES, PACK) if self._has_status else (STATUS, CELLS, PROBES, PACK)
         return [[request(host, command) for command in commands] for host in HOSTS]
 
     def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
         head = data[at + 1 : at + 4]
-        if any(byte not in allowed for byte, allowed in zip(head, (PACKS, COMMANDS), strict=False)):
+        if any(byte not in allowed for byte, allowed in zip(head, (PACK_ADDRESSES, COMMANDS), strict=False)):
             return ParseResult.NOISE
         if len(head) < 3:
             return ParseResult.MORE
         return FRAME_BYTES if head[2] == DATA_BYTES else ParseResult.LENGTH
 
-    def _is_whole(self, frame: bytes) -> bool:
+    def _has_valid_checksum(self, frame: bytes) -> bool:
         return with_checksum(frame[:-1]) == frame
 
     def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
-        if self._is_other(frame[1]):
+        if self._is_other_pack(frame[1]):
             return None
         command, data = frame[2], frame[4:-1]
         if command == PACK:
-            return self._pack(arrival_s, data)
+            return self._decode_pack(arrival_s, data)
         if command == STATUS:
-            self._cells, self._probes, self._known = data[0] or None, data[1], True
+            self._cell_count, self._probe_count, self._has_status = data[0] or None, data[1], True
         elif command in (CELLS, PROBES) and data[0] > MAX_FRAMES:
             self._count_fault("length_errors", f"a frame has number {data[0]}, and there are at most {MAX_FRAMES}")
         elif command == CELLS:
-            self._first = 0 if data[0] == 0 else self._first
+            self._first_frame_number = 0 if data[0] == 0 else self._first_frame_number
             self._cells_v[data[0]], self._cells_s = [mv / 1000 for mv in struct.unpack_from(">3H", data, 1)], arrival_s
         elif command == PROBES:
             self._probes_c[data[0]], self._probes_s = [c - ZERO_C if c else math.nan for c in data[1:]], arrival_s
         return None
 
-    def _pack(self, arrival_s: float, data: bytes) -> Reading:
+    def _decode_pack(self, arrival_s: float, data: bytes) -> Reading:
         decivolts, _, deciamperes, _ = struct.unpack(">4H", data)
         cells_v = (
-            self._joined(self._cells_v, CELLS_PER_FRAME, self._cells) if arrival_s - self._cells_s < FRESH_S else []
+            self._join_frames(self._cells_v, CELLS_PER_FRAME, self._cell_count)
+            if arrival_s - self._cells_s < MAX_ATTACHED_AGE_S
+            else []
         )
-        has_recent_probes = arrival_s - self._probes_s < FRESH_S
-        probes_c = self._joined(self._probes_c, PROBES_PER_FRAME, self._probes) if has_recent_probes else []
-        # each cell voltage is part of one sample only; temperatures are repeated for up to ``FRESH_S``
+        while self._cell_count is None and cells_v and not cells_v[-1] > 0.0:
+            cells_v.pop()  # unused positions of the last frame have 0 V
+        has_recent_probes = arrival_s - self._probes_s < MAX_ATTACHED_AGE_S
+        probes_c = self._join_frames(self._probes_c, PROBES_PER_FRAME, self._probe_count) if has_recent_probes else []
+        # each cell voltage is part of one sample only; temperatures are repeated for up to ``MAX_ATTACHED_AGE_S``
         self._cells_v, self._has_sample = {}, True
         present_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
-        return Reading(decivolts / 10, (deciamperes - ZERO_CURRENT) / 10, self._mean_c(present_c), tuple(cells_v))
+        return Reading(
+            decivolts / 10, (deciamperes - ZERO_CURRENT) / 10, self._mean_temperature_c(present_c), tuple(cells_v)
+        )
 
-    def _joined(self, frames: Mapping[int, Sequence[float]], values_per_frame: int, count: int | None) -> list[float]:
+    def _join_frames(
+        self, frames: Mapping[int, Sequence[float]], values_per_frame: int, count: int | None
+    ) -> list[float]:
         """Return the values of all frames in the order of their numbers; NaN for a missing frame.
 
         Args:
             frames: Frames by number.
             values_per_frame: Number of values in one frame.
-            count: Number of values; None: unknown. Trailing values that are NaN or at most 0 are then omitted, because unused
-                positions of a frame have such values.
+            count: Number of values; None: unknown, so that the unused positions of the last frame are also returned.
         """
         if not frames:
             return []
-        lost = [math.nan] * values_per_frame
-        values = [value for number in range(self._first, max(frames) + 1) for value in frames.get(number, lost)]
-        if count is not None:
-            return (values + [math.nan] * count)[:count]
-        while values and not values[-1] > 0.0:
-            values.pop()
-        return values
+        missing_frame = [math.nan] * values_per_frame
+        numbers = range(self._first_frame_number, max(frames) + 1)
+        values = [value for number in numbers for value in frames.get(number, missing_frame)]
+        return values if count is None else (values + [math.nan] * count)[:count]
 
 
 DEVICE = Device(
     "daly",
     lambda sign, address: DalyProtocol(current_sign=sign, address=address),
-    Resolution(
+    SensorDefaults(
         baud=9600,
         current_sign=None,
         period_s=1.0,

@@ -10,8 +10,8 @@ import struct
 from collections.abc import Sequence
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.device import Device, Resolution
-from bms_estimator.protocols.base.polled_protocol import FRESH_S, ParseResult, PolledProtocol
+from bms_estimator.protocols.base.device import Device, SensorDefaults
+from bms_estimator.protocols.base.polled_protocol import MAX_ATTACHED_AGE_S, ParseResult, PolledProtocol
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import RecentCellVoltages
 
@@ -23,11 +23,11 @@ READ = 0xA5
 """Second byte of a request that reads a register."""
 REFUSED = 0x80
 """Status of a response that rejects the request; 0 is success."""
-HEAD, TAIL = 4, 3
+HEAD_BYTES, TAIL_BYTES = 4, 3
 """Number of bytes of a frame before its data, and after them."""
-MIN_BASIC = 23
-"""Minimum length of the basic information, without a probe [bytes]."""
-MAX_DATA = 128
+MIN_BASIC_BYTES = 23
+"""Length of the basic information before the probes [bytes]. Its last two bytes are the numbers of cells and probes."""
+MAX_DATA_BYTES = 128
 """Maximum length of the data of a frame [bytes]. 32 cells need 64 bytes."""
 ZERO_C = 2731
 """Value at 0 degC [0.1 K]."""
@@ -47,69 +47,72 @@ class JbdProtocol(PolledProtocol):
     """Protocol of a JBD BMS. Each poll cycle requests cells and basic information, and the name until it is known.
 
     Args:
-        current_sign: Direction of positive current; by its documentation charge.
+        current_sign: Direction of positive current. JBD's documentation states charge.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__("JBD BMS", re.compile(b"\xdd"), current_sign)
-        self._recent_cells = RecentCellVoltages(FRESH_S)
+        self._recent_cells = RecentCellVoltages(MAX_ATTACHED_AGE_S)
         self._model = ""
-        self._cells: int | None = None
+        self._cell_count: int | None = None
 
     @property
     def description(self) -> str | None:
         """Name and number of cells; None before the basic information has arrived."""
-        return None if self._cells is None else f"JBD BMS {self._model}".rstrip() + f", {self._cells} cells"
+        return None if self._cell_count is None else f"JBD BMS {self._model}".rstrip() + f", {self._cell_count} cells"
 
     def _query_variants(self) -> Sequence[Sequence[bytes]]:
         registers = (CELLS, BASIC) if self._model else (NAME, CELLS, BASIC)
         return ([request(register) for register in registers],)
 
     def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
-        if len(data) < at + HEAD:
+        if len(data) < at + HEAD_BYTES:
             return ParseResult.MORE if len(data) < at + 2 or data[at + 1] in (BASIC, CELLS, NAME) else ParseResult.NOISE
-        _, register, status, length = data[at : at + HEAD]
+        _, register, status, length = data[at : at + HEAD_BYTES]
         if register not in (BASIC, CELLS, NAME) or status not in (0, REFUSED):
             return ParseResult.NOISE
-        return HEAD + length + TAIL if length <= MAX_DATA else ParseResult.LENGTH
+        return HEAD_BYTES + length + TAIL_BYTES if length <= MAX_DATA_BYTES else ParseResult.LENGTH
 
-    def _is_whole(self, frame: bytes) -> bool:
-        return frame[-1] == END and checksum(frame[2:-TAIL]) == frame[-TAIL:-1]
+    def _has_valid_checksum(self, frame: bytes) -> bool:
+        return frame[-1] == END and checksum(frame[2:-TAIL_BYTES]) == frame[-TAIL_BYTES:-1]
 
     def _decode_frame(self, arrival_s: float, frame: bytes) -> Reading | None:
-        register, status, data = frame[1], frame[2], frame[HEAD:-TAIL]
+        register, status, data = frame[1], frame[2], frame[HEAD_BYTES:-TAIL_BYTES]
         if status == REFUSED:
             self._count_fault("refused", f"the BMS rejects a request of register 0x{register:02x}")
         elif register == NAME:
             self._model = data.decode("ascii", "replace").strip("\0 ")
         elif register == CELLS:
-            self._recent_cells.store(
-                arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", data[: len(data) & ~1])]
-            )
-        elif len(data) < MIN_BASIC:
+            self._recent_cells.store(arrival_s, [mv / 1000 for (mv,) in struct.iter_unpack(">H", _whole_words(data))])
+        elif len(data) < MIN_BASIC_BYTES:
             self._count_fault("length_errors", "its basic information is too short")
         else:
-            return self._basic(arrival_s, data)
+            return self._decode_basic(arrival_s, data)
         return None
 
-    def _basic(self, arrival_s: float, data: bytes) -> Reading:
-        volts, amperes = struct.unpack_from(">Hh", data)
-        self._cells, probes = data[21], data[22]
-        probe_data = data[MIN_BASIC:][: 2 * probes]
+    def _decode_basic(self, arrival_s: float, data: bytes) -> Reading:
+        centivolts, centiamperes = struct.unpack_from(">Hh", data)
+        self._cell_count, probes = data[MIN_BASIC_BYTES - 2 : MIN_BASIC_BYTES]
+        probe_data = data[MIN_BASIC_BYTES:][: 2 * probes]
         return Reading(
-            volts / 100,
-            amperes / 100,
-            self._mean_c(
-                [(step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", probe_data[: len(probe_data) & ~1])]
+            centivolts / 100,
+            centiamperes / 100,
+            self._mean_temperature_c(
+                [(step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", _whole_words(probe_data))]
             ),
-            self._recent_cells.at(arrival_s)[: self._cells],
+            self._recent_cells.at(arrival_s)[: self._cell_count],
         )
+
+
+def _whole_words(data: bytes) -> bytes:
+    """Return the data without an odd byte at the end."""
+    return data[: len(data) // 2 * 2]
 
 
 DEVICE = Device(
     "jbd",
     lambda sign, _: JbdProtocol(current_sign=sign),
-    Resolution(
+    SensorDefaults(
         baud=9600,
         current_sign="charge_positive",
         period_s=1.0,

@@ -16,7 +16,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.device import Device, Resolution
+from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.polled_protocol import ParseResult, PolledProtocol
 from bms_estimator.protocols.base.reading import Reading
 
@@ -45,10 +45,15 @@ ABSENT_C = 140
 CHARGING = 0x8000
 """Bit of the current in an older frame of protocol version 1 that is set on charge."""
 
+ZERO_CURRENT = 10_000
+"""Value at 0 A in an older frame of protocol version 0 [10 mA]."""
+
 FRAME_BYTES, RECORD_BYTES = 300, 8
 """Length of a newer frame, and of the Modbus record after it [bytes]."""
 REALTIME = 0x02
 """Kind of a newer frame with measured values."""
+CELLS_OFFSET, CELL_BITS_OFFSET, VOLTAGE_OFFSET, CURRENT_OFFSET, PROBES_OFFSET = 6, 70, 150, 158, 162
+"""Offsets in a newer frame of the voltages of 32 cells, a bit for each present cell, voltage, current, and two probes."""
 KINDS = (0x01, 0x02, 0x03)
 """Valid kinds of newer frames."""
 MODBUS_WRITE = 0x10
@@ -90,7 +95,7 @@ class JkProtocol(PolledProtocol):
     """Protocol of a JK-BMS of either family.
 
     Args:
-        current_sign: Direction of positive current; by its documentation charge.
+        current_sign: Direction of positive current. JK's documentation states charge.
         address: Address of the pack on a shared line; None: the first that responds.
     """
 
@@ -145,10 +150,10 @@ class JkProtocol(PolledProtocol):
         if data[at + len(START)] not in KINDS:
             return ParseResult.NOISE
         record = data[at + FRAME_BYTES : at + FRAME_BYTES + RECORD_BYTES]
-        follows = len(record) < RECORD_BYTES or crc16(record[:-2]) == record[-2:]
-        return FRAME_BYTES + RECORD_BYTES if follows else FRAME_BYTES
+        has_record = len(record) < RECORD_BYTES or crc16(record[:-2]) == record[-2:]  # a short record is incomplete
+        return FRAME_BYTES + RECORD_BYTES if has_record else FRAME_BYTES
 
-    def _is_whole(self, frame: bytes) -> bool:
+    def _has_valid_checksum(self, frame: bytes) -> bool:
         if frame.startswith(OLD_START):
             return frame[-5] == OLD_END and with_old_checksum(frame[:-4]) == frame
         return sum(frame[: FRAME_BYTES - 1]) & 0xFF == frame[FRAME_BYTES - 1]
@@ -157,7 +162,7 @@ class JkProtocol(PolledProtocol):
         return self._decode_old(frame) if frame.startswith(OLD_START) else self._decode_newer(arrival_s, frame)
 
     def _decode_old(self, frame: bytes) -> Reading | None:
-        if self._is_other(frame[7]):
+        if self._is_other_pack(frame[7]):  # last byte of the terminal number
             return None
         registers = dict(_registers(frame[OLD_HEAD:-OLD_TAIL]))
         if not {VOLTAGE, CURRENT} <= registers.keys():
@@ -169,38 +174,42 @@ class JkProtocol(PolledProtocol):
             self._description += f", software {software}"
         raw = _number(registers[CURRENT])
         if _number(registers.get(VERSION, b"\0")) == 0:
-            current_a = (10000 - raw) / 100
+            current_a = (ZERO_CURRENT - raw) / 100
         else:
             current_a = (raw & ~CHARGING) / (100 if raw & CHARGING else -100)
         probes = [_number(registers[code]) for code in (BOX_C, BATTERY_C) if code in registers]
+        # values above 100 are negative temperatures: 101 is -1 degC
         probes_c = [float(probe if probe <= 100 else 100 - probe) for probe in probes if probe != ABSENT_C]
-        return Reading(_number(registers[VOLTAGE]) / 100, current_a, self._mean_c(probes_c), tuple(cells_v))
+        return Reading(_number(registers[VOLTAGE]) / 100, current_a, self._mean_temperature_c(probes_c), tuple(cells_v))
 
     def _decode_newer(self, arrival_s: float, frame: bytes) -> Reading | None:
         address = frame[FRAME_BYTES] if len(frame) > FRAME_BYTES else None
-        if address is not None and request(address) != self._query:
+        if address is not None and request(address) != self._query:  # the response to another master
             self._overheard_s = arrival_s
-        if (address is not None and self._is_other(address)) or frame[4] != REALTIME:
+        if (address is not None and self._is_other_pack(address)) or frame[4] != REALTIME:
             return None
-        (cell_bits,) = struct.unpack_from("<I", frame, 70)
-        (millivolts,) = struct.unpack_from("<I", frame, 150)
-        (milliamperes,) = struct.unpack_from("<i", frame, 158)
-        cells = struct.unpack_from("<32H", frame, 6)
+        (cell_bits,) = struct.unpack_from("<I", frame, CELL_BITS_OFFSET)
+        (millivolts,) = struct.unpack_from("<I", frame, VOLTAGE_OFFSET)
+        (milliamperes,) = struct.unpack_from("<i", frame, CURRENT_OFFSET)
+        cells = struct.unpack_from("<32H", frame, CELLS_OFFSET)
         cells_v = [mv / 1000 for i, mv in enumerate(cells) if cell_bits >> i & 1]
         self._description = f"JK-BMS, {len(cells_v)} cells" + ("" if address is None else f", pack {address}")
-        probes_c = [c / 10 for c in struct.unpack_from("<2h", frame, 162) if c != ABSENT_DECI_C]
-        return Reading(millivolts / 1000, milliamperes / 1000, self._mean_c(probes_c), tuple(cells_v))
+        probes_c = [c / 10 for c in struct.unpack_from("<2h", frame, PROBES_OFFSET) if c != ABSENT_DECI_C]
+        return Reading(millivolts / 1000, milliamperes / 1000, self._mean_temperature_c(probes_c), tuple(cells_v))
 
 
 def _registers(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield code and content of each register up to the first unknown one, and of the protocol version at the end."""
+    """Yield code and content of each register up to the first unknown one.
+
+    The protocol version, at the end of the registers, is yielded first, because an unknown register may precede it.
+    """
     if data[-2:-1] == bytes((VERSION,)):
         yield VERSION, data[-1:]
     at = 0
     while at < len(data):
         code, at = data[at], at + 1
         if code == CELLS and at < len(data):
-            length, at = data[at] // 3 * 3, at + 1
+            length, at = data[at] // 3 * 3, at + 1  # three bytes for each cell: its number and its voltage
         else:
             length = REGISTER_BYTES.get(code, 0)
         content, at = data[at : at + length], at + length
@@ -216,7 +225,7 @@ def _number(content: bytes) -> int:
 DEVICE = Device(
     "jk",
     lambda sign, address: JkProtocol(current_sign=sign, address=address),
-    Resolution(
+    SensorDefaults(
         baud=115_200,
         current_sign="charge_positive",
         period_s=1.0,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.device import Device, Resolution
+from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
@@ -24,6 +24,12 @@ MAX_LINE_BYTES = 256
 """Maximum length of a line [bytes]."""
 VOLTAGE, CURRENT, TEMPERATURE, DIRECTION = 0, 1, 6, 9
 """Indices of the values in a response."""
+MIN_VALUES = DIRECTION + 3
+"""Minimum number of values of a response: address, checksum, and values up to the direction."""
+RESPONSE = b":r50="
+"""Beginning of a response with measured values."""
+MAX_SHOWN_BYTES = 40
+"""Maximum number of characters of an invalid line that are shown."""
 ZERO_C = 100
 """Value at 0 degC [degC]."""
 MAX_VALUE_DIGITS = 12
@@ -35,12 +41,12 @@ class JunctekProtocol(ReadingProtocol):
     """Protocol of a battery monitor, which is polled once a second.
 
     Args:
-        current_sign: Direction of positive current; by its documentation charge.
+        current_sign: Direction of positive current. The manuals state charge.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__(current_sign, ("checksum_errors", "length_errors", "text_errors", "other_address"))
-        self._rest = b""
+        self._unparsed = b""
         self._overlong = False
         self._synchronized = False
         self._query_s = -math.inf
@@ -64,39 +70,44 @@ class JunctekProtocol(ReadingProtocol):
         return QUERY
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - a line carries no time
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        *lines, self._unparsed = (self._unparsed + data).split(b"\n")
         for line in lines:
             skipped, self._overlong = self._overlong, False
-            counted, self._synchronized = self._synchronized, True
+            is_complete, self._synchronized = self._synchronized, True
             if len(line) > MAX_LINE_BYTES:
                 self._count_fault("length_errors", TOO_LONG)
-            elif not skipped and (reading := self._parse(line.strip(b"\r\0"), counted)) is not None:
+            elif not skipped and (reading := self._parse(line.strip(b"\r\0"), is_complete)) is not None:
                 yield reading
-        if len(self._rest) > MAX_LINE_BYTES:
+        if len(self._unparsed) > MAX_LINE_BYTES:
             self._count_fault("length_errors", TOO_LONG)
             self._overlong = True
         if self._overlong:
-            self._rest = b""
+            self._unparsed = b""
 
-    def _parse(self, line: bytes, counted: bool) -> Reading | None:
-        """Parse a line; None if it is not a response with values. A partial first line is not counted as a fault."""
-        at = line.rfind(b":")
-        if not line or line[at:].startswith(
+    def _parse(self, line: bytes, is_complete: bool) -> Reading | None:
+        """Parse a line; None if it is not a response with values.
+
+        Args:
+            line: Received line.
+            is_complete: False for the first line, which may be partial and is therefore not counted as a fault.
+        """
+        begin = line.rfind(b":")
+        if not line or line[begin:].startswith(
             (b":R", b":W", b":w", b":r00=", b":r51=")
         ):  # queries of the display, or other responses
             return None
-        if at < 0 or not line[at:].startswith(b":r50="):
-            if counted:
-                text = not line.translate(None, PRINTABLE)
-                shown = repr(line[:40])[1:]
+        if begin < 0 or not line[begin:].startswith(RESPONSE):
+            if is_complete:
+                is_text = not line.translate(None, PRINTABLE)
+                shown = repr(line[:MAX_SHOWN_BYTES])[1:]
                 self._count_fault(
-                    "text_errors", f"{'a line' if text else 'noise'} that is no response of a Junctek: {shown}"
+                    "text_errors", f"{'a line' if is_text else 'noise'} that is no response of a Junctek: {shown}"
                 )
             return None
-        values = line[at + 5 :].strip().split(b",")
+        values = line[begin + len(RESPONSE) :].strip().split(b",")
         if not values[-1]:
             values.pop()
-        if not all(0 < len(v) <= MAX_VALUE_DIGITS and v.isdigit() for v in values) or len(values) < DIRECTION + 3:
+        if not all(0 < len(v) <= MAX_VALUE_DIGITS and v.isdigit() for v in values) or len(values) < MIN_VALUES:
             self._count_fault("length_errors", "a response is cut off or contains no numbers")
             return None
         address, checksum, *measured = map(int, values)
@@ -119,7 +130,7 @@ class JunctekProtocol(ReadingProtocol):
 DEVICE = Device(
     "junctek",
     lambda sign, _: JunctekProtocol(current_sign=sign),
-    Resolution(
+    SensorDefaults(
         baud=115_200,
         current_sign="charge_positive",
         period_s=1.0,

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator, Sequence
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.device import Device, Resolution
+from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol, RecentCellVoltages
 
@@ -46,12 +46,12 @@ class PylontechProtocol(ReadingProtocol):
     The cells of all batteries are concatenated, each with its last recent voltage.
 
     Args:
-        current_sign: Direction that the device calls positive: charge.
+        current_sign: Direction of positive current. The device reports charge as positive.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__(current_sign, ("text_errors", "length_errors"))
-        self._rest = b""
+        self._unparsed = b""
         self._cells = dict[int, RecentCellVoltages]()
         self._batteries: tuple[int, ...] = ()
         self._responses = 0
@@ -92,8 +92,8 @@ class PylontechProtocol(ReadingProtocol):
         return command
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:
-        self._rest += data
-        *answers, self._rest = PROMPT.split(self._rest)
+        self._unparsed += data
+        *answers, self._unparsed = PROMPT.split(self._unparsed)
         for answer in answers:
             self._responses += 1
             if (
@@ -101,8 +101,8 @@ class PylontechProtocol(ReadingProtocol):
                 and (reading := self._parse(arrival_s, answer.decode("ascii", "replace"))) is not None
             ):
                 yield reading
-        if len(self._rest) > MAX_RESPONSE_BYTES:
-            self._rest = b""
+        if len(self._unparsed) > MAX_RESPONSE_BYTES:
+            self._unparsed = b""
             self._count_fault(
                 "length_errors", "bytes arrive, but no prompt of a Pylontech console: its baud rate is 115200"
             )
@@ -110,6 +110,7 @@ class PylontechProtocol(ReadingProtocol):
     def _parse(self, arrival_s: float, answer: str) -> Reading | None:
         """Parse a response: return the reading of ``pwr``; store the cells of ``bat`` and return None."""
         lines = [line.split() for line in re.split(r"[\r\n]+", answer) if line.strip()]
+        # the table of ``pwr`` begins with Power, that of ``bat`` with Battery
         header = next((n for n, line in enumerate(lines) if line[:2] in (["Power", "Volt"], ["Battery", "Volt"])), None)
         if header is None:
             if "Unknown command" in answer or "Invalid" in answer:
@@ -125,7 +126,7 @@ class PylontechProtocol(ReadingProtocol):
             if lines[header][0] == "Battery":
                 self._store_cells(arrival_s, answer, rows)
                 return None
-            return self._stack(arrival_s, lines[header], rows)
+            return self._stack_reading(arrival_s, lines[header], rows)
         except (ValueError, LookupError):
             self._count_fault("text_errors", "a table has a row that cannot be parsed")
             return None
@@ -139,23 +140,26 @@ class PylontechProtocol(ReadingProtocol):
         cells_v = [1e-3 * _parse_integer(row[1]) for row in rows]
         self._cells.setdefault(battery, RecentCellVoltages(MAX_CELLS_AGE_S)).store(arrival_s, cells_v)
 
-    def _stack(self, arrival_s: float, names: Sequence[str], rows: Sequence[Sequence[str]]) -> Reading | None:
+    def _stack_reading(self, arrival_s: float, names: Sequence[str], rows: Sequence[Sequence[str]]) -> Reading | None:
         """Return the reading of all batteries in parallel; None if none is present.
 
         Raises:
             ValueError, LookupError: A row cannot be parsed.
         """
-        volt, amp, mean_c, low, high = (names.index(name) for name in ("Volt", "Curr", "Tempr", "Tlow", "Thigh"))
-        present = [row for row in rows if row[volt] != ABSENT]
+        columns = (names.index(name) for name in ("Volt", "Curr", "Tempr", "Tlow", "Thigh"))
+        voltage, current, temperature, lowest_temperature, highest_temperature = columns
+        present = [row for row in rows if row[voltage] != ABSENT]
         if not present:
             self._count_fault("text_errors", "the console reports no present battery")
             return None
-        voltages_v = [1e-3 * _parse_integer(row[volt]) for row in present]
-        currents_a = [1e-3 * _parse_integer(row[amp]) for row in present]
-        cell_texts = [
-            [row[low], row[high]] if ABSENT not in (row[low], row[high]) else [row[mean_c]] for row in present
+        voltages_v = [1e-3 * _parse_integer(row[voltage]) for row in present]
+        currents_a = [1e-3 * _parse_integer(row[current]) for row in present]
+        cell_temperatures = [[row[lowest_temperature], row[highest_temperature]] for row in present]
+        temperature_texts = [
+            texts if ABSENT not in texts else [row[temperature]]
+            for texts, row in zip(cell_temperatures, present, strict=True)
         ]
-        temperatures_c = [1e-3 * _parse_integer(text) for texts in cell_texts for text in texts]
+        temperatures_c = [1e-3 * _parse_integer(text) for texts in temperature_texts for text in texts]
         self._batteries = tuple(int(row[0]) for row in present)
         battery_cells_v = [
             self._cells[battery].at(arrival_s) if battery in self._cells else () for battery in self._batteries
@@ -182,7 +186,7 @@ def _mean(values: Sequence[float]) -> float:
 DEVICE = Device(
     "pylontech",
     lambda sign, _: PylontechProtocol(current_sign=sign),
-    Resolution(
+    SensorDefaults(
         baud=115_200,
         current_sign="charge_positive",
         period_s=2.0,

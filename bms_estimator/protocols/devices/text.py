@@ -16,13 +16,15 @@ from bms_estimator.model.sample import (
     SampleBlock,
     remove_implausible,
 )
-from bms_estimator.protocols.base.device import Device, Resolution
+from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.device_clock import DeviceClock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
 from bms_estimator.protocols.base.reading import Reading, read_line
 
 MAX_LINE_BYTES = 4096
 """Maximum length of a line [bytes]: 400 cells of seven characters fit. A longer line is noise."""
+MAX_UNPRINTABLE_FRACTION = 0.25
+"""Maximum fraction of unprintable bytes in a line. More shows binary data or a wrong baud rate."""
 MAX_SHOWN_BYTES = 60
 """Maximum number of characters of an invalid line that are shown."""
 
@@ -31,7 +33,7 @@ class TextProtocol(DeviceProtocol):
     """Protocol of a board that prints lines. It takes no commands.
 
     Lines without values are counted and skipped. Lines without ``time_s`` are spaced evenly over the time since the
-    previous read. The division of the bytes into reads affects only these times.
+    previous read. Apart from these times, the result does not depend on how the bytes are split into reads.
 
     Args:
         current_sign: Direction of positive current of the board; samples are positive on discharge.
@@ -39,11 +41,11 @@ class TextProtocol(DeviceProtocol):
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive") -> None:
         self._sign = 1.0 if current_sign == "discharge_positive" else -1.0
-        self._rest = b""
-        self._overlong = False  # the line is too long, its rest is skipped
+        self._unparsed = b""
+        self._overlong = False  # True while the rest of a line that is too long is skipped
         self._synchronized = False  # True once a line has ended, because earlier bytes may be half a line
         self._clock, self._last_s = DeviceClock(), math.nan
-        self._bytes = self._samples = self._errors = self._too_long = self._implausible = 0
+        self._received_bytes = self._samples = self._invalid_lines = self._overlong_lines = self._implausible = 0
         self._first_invalid: bytes | None = None  # the first line without values since the last good one
         self._last_reading: Reading | None = None
 
@@ -51,10 +53,10 @@ class TextProtocol(DeviceProtocol):
     def counters(self) -> Mapping[str, int]:
         """Samples and faults since start."""
         return {
-            "bytes_received": self._bytes,
+            "bytes_received": self._received_bytes,
             "frames_received": self._samples,
-            "text_errors": self._errors,
-            "length_errors": self._too_long,
+            "text_errors": self._invalid_lines,
+            "length_errors": self._overlong_lines,
             "implausible": self._implausible,
             "clock_jumps": self._clock.jumps,
         }
@@ -67,9 +69,11 @@ class TextProtocol(DeviceProtocol):
         shown = repr(self._first_invalid[:MAX_SHOWN_BYTES])[1:] + (
             "..." if len(self._first_invalid) > MAX_SHOWN_BYTES else ""
         )
-        if 4 * len(self._first_invalid.translate(None, PRINTABLE)) > len(self._first_invalid):
+        unprintable_bytes = len(self._first_invalid.translate(None, PRINTABLE))
+        if unprintable_bytes > MAX_UNPRINTABLE_FRACTION * len(self._first_invalid):
             return (
-                f"bytes that are no text come: wrong baud rate, or sensor.protocol should be binary? They begin {shown}"
+                "the received bytes are not text: wrong baud rate, or should sensor.protocol be binary? "
+                f"They begin {shown}"
             )
         return f"lines without voltage and current arrive; the first: {shown}"
 
@@ -81,15 +85,15 @@ class TextProtocol(DeviceProtocol):
         return f"prints text, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; ``time_s`` is the time since the first sample, from ``DeviceClock``."""
-        self._bytes += len(data)
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        """Decode the bytes of one read; ``time_s`` is the time since the first sample, from ``DeviceClock``."""
+        self._received_bytes += len(data)
+        *lines, self._unparsed = (self._unparsed + data).split(b"\n")
         readings = [reading for line in lines if (reading := self._end_line(line)) is not None]
         if self._overlong:
-            self._rest = b""
-        elif len(self._rest) > MAX_LINE_BYTES:
-            self._begin_overlong(self._rest)
-            self._rest, self._overlong = b"", True
+            self._unparsed = b""
+        elif len(self._unparsed) > MAX_LINE_BYTES:
+            self._begin_overlong(self._unparsed)
+            self._unparsed, self._overlong = b"", True
         self.cells = cell_block([reading.cells_v for reading in readings])
         self._implausible += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
@@ -111,8 +115,8 @@ class TextProtocol(DeviceProtocol):
         return [self._clock.sample_time(at_s, reading.time_s) for at_s, reading in zip(arrivals, readings, strict=True)]
 
     def _end_line(self, line: bytes) -> Reading | None:
-        """Parse a line. A partial first line is not counted as a fault."""
-        counted, self._synchronized = self._synchronized, True
+        """Parse a line. The first line may be partial; it is not counted as a fault and does not describe the device."""
+        is_complete, self._synchronized = self._synchronized, True
         if self._overlong:  # this is the end of the overlong line
             self._overlong = False
             return None
@@ -122,20 +126,20 @@ class TextProtocol(DeviceProtocol):
         reading = read_line(line)
         if reading is not None:
             self._first_invalid = None
-            self._last_reading = reading if counted else None
-        elif counted and line.strip():
-            self._errors += 1
+            self._last_reading = reading if is_complete else None
+        elif is_complete and line.strip():
+            self._invalid_lines += 1
             self._first_invalid = self._first_invalid or line.rstrip(b"\r")
         return reading
 
     def _begin_overlong(self, line: bytes) -> None:
-        self._too_long += 1
+        self._overlong_lines += 1
         self._first_invalid = self._first_invalid or line[:MAX_LINE_BYTES]
 
 
 DEVICE = Device(
     "text",
     lambda sign, _: TextProtocol(current_sign=sign),
-    Resolution(period_s=1.0),
+    SensorDefaults(period_s=1.0),
 )
 """Boards print at their own pace, usually once a second."""

@@ -12,26 +12,30 @@ from math import nan
 
 from bms_estimator.model.decimal_text import number
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.device import Device, Resolution
+from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
 MAX_BLOCK_BYTES = 2048
 """Maximum length of a block [bytes]: 22 fields of at most 44 bytes each, with a margin."""
 HEX = re.compile(rb":[0-9A-Fa-f]*\r?\n")
+"""HEX message."""
 END = b"Checksum\t"
+"""Label of the last line of a block."""
+NO_SENSOR = "---"
+"""Value of the temperature without a sensor."""
 
 
 class VeDirectProtocol(ReadingProtocol):
     """Protocol of a battery monitor, which sends blocks unsolicited and receives nothing.
 
     Args:
-        current_sign: Direction of positive current; by its documentation charge.
+        current_sign: Direction of positive current. Victron's documentation states charge.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
         super().__init__(current_sign, ("checksum_errors", "length_errors", "text_errors"))
-        self._rest = b""
+        self._unparsed = b""
         self._synchronized = False  # True once a block has ended, because earlier bytes may be half a block
         self._product = ""
 
@@ -43,23 +47,23 @@ class VeDirectProtocol(ReadingProtocol):
         return f"VE.Direct battery monitor {self._product}, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - the block carries no time
-        self._rest += data
-        while (at := self._rest.find(END)) >= 0 and len(self._rest) > at + len(END):
+        self._unparsed += data
+        while (at := self._unparsed.find(END)) >= 0 and len(self._unparsed) > at + len(END):
             end = at + len(END) + 1
-            block, self._rest = self._rest[:end], self._rest[end:]
-            counted, self._synchronized = self._synchronized, True
+            block, self._unparsed = self._unparsed[:end], self._unparsed[end:]
+            is_complete, self._synchronized = self._synchronized, True
             head = HEX.sub(b"", block[:at])
             if len(head) > MAX_BLOCK_BYTES:
                 self._count_fault("length_errors", "blocks arrive that are too long for VE.Direct text")
             elif sum(head) + sum(block[at:]) & 0xFF:
-                if counted:
+                if is_complete:
                     self._count_fault(
                         "checksum_errors", "VE.Direct blocks with a wrong checksum arrive: is the cable too long?"
                     )
             elif (reading := self._parse(head)) is not None:
                 yield reading
-        if len(self._rest) > MAX_BLOCK_BYTES and at < 0:
-            self._rest = self._rest[-len(END) :]
+        if len(self._unparsed) > MAX_BLOCK_BYTES and at < 0:
+            self._unparsed = self._unparsed[-len(END) :]
             self._count_fault(
                 "length_errors", "bytes arrive that are no VE.Direct text: its line setting is 19200 baud, 8N1"
             )
@@ -71,21 +75,21 @@ class VeDirectProtocol(ReadingProtocol):
         if "V" not in fields:
             return None
         self._product = fields.get("BMV") or fields.get("PID", "")
-        if "I" not in fields or not fields.keys() & {"SOC", "CE", "TTG"}:
+        if "I" not in fields or not fields.keys() & {"SOC", "CE", "TTG"}:  # only battery monitors send one of these
             device = f"product {fields['PID']}" if "PID" in fields else "the device"
             self._count_fault(
                 "text_errors", f"{device} is no battery monitor: the current that it reports is not the battery's"
             )
             return None
-        return self._measured(fields)
+        return self._make_reading(fields)
 
-    def _measured(self, fields: Mapping[str, str]) -> Reading | None:
+    def _make_reading(self, fields: Mapping[str, str]) -> Reading | None:
         try:
-            temperature = fields.get("T", "---")
+            temperature = fields.get("T", NO_SENSOR)
             return Reading(
                 1e-3 * number(fields["V"]),
                 1e-3 * number(fields["I"]),
-                nan if temperature == "---" else number(temperature),
+                nan if temperature == NO_SENSOR else number(temperature),
             )
         except ValueError as error:
             self._count_fault("text_errors", f"a VE.Direct block without a voltage or a current: {error}")
@@ -95,7 +99,7 @@ class VeDirectProtocol(ReadingProtocol):
 DEVICE = Device(
     "vedirect",
     lambda sign, _: VeDirectProtocol(current_sign=sign),
-    Resolution(
+    SensorDefaults(
         baud=19_200,
         current_sign="charge_positive",
         period_s=1.0,

@@ -3,6 +3,8 @@
 Line, USB bridge and scheduler delay a sample, but never advance it. Therefore only the sample with the smallest delay in
 each ten seconds is used. The rate follows from the lower convex hull of these delays (Moon, Skelly, Towsley 1999). Other
 delayed samples do not affect the result. The result does not change the times of the samples.
+
+``d`` is the state of the frame decoder, a record of ``framing.DECODER``.
 """
 
 import math
@@ -38,9 +40,9 @@ def add_arrival(d: Record, arrival_s: float) -> None:
         d.clock_begin_us = d.elapsed_us
     elif delay_s >= d.clock_late_s[(d.clock_windows - 1) % CLOCK_WINDOWS]:
         return
-    at = (d.clock_windows - 1) % CLOCK_WINDOWS
-    d.clock_at_us[at] = d.elapsed_us
-    d.clock_late_s[at] = delay_s
+    window = (d.clock_windows - 1) % CLOCK_WINDOWS
+    d.clock_at_us[window] = d.elapsed_us
+    d.clock_late_s[window] = delay_s
 
 
 @njit(cache=True)
@@ -58,15 +60,15 @@ def clock_ppm(d: Record) -> float:
     if count < 2 or at_s[-1] - at_s[0] < _MIN_US * _US:
         return math.nan
     hull = np.empty(count, np.int64)
-    corners = 0
+    hull_size = 0
     for i in range(count):
-        while corners > 1 and _above(at_s, delay_s, hull[corners - 2], hull[corners - 1], i):
-            corners -= 1
-        hull[corners] = i
-        corners += 1
+        while hull_size > 1 and _is_above(at_s, delay_s, hull[hull_size - 2], hull[hull_size - 1], i):
+            hull_size -= 1
+        hull[hull_size] = i
+        hull_size += 1
     # of all edges of the hull, the one at the mean time has the smallest mean distance from all points
-    middle_s, corner = at_s.mean(), 1
-    while at_s[hull[corner]] < middle_s:
+    mean_time_s, corner = at_s.mean(), 1
+    while at_s[hull[corner]] < mean_time_s:
         corner += 1
     begin, end = hull[corner - 1], hull[corner]
     board_s = at_s[end] - at_s[begin]
@@ -75,6 +77,6 @@ def clock_ppm(d: Record) -> float:
 
 
 @njit(cache=True)
-def _above(x: np.ndarray, y: np.ndarray, begin: int, middle: int, end: int) -> bool:
+def _is_above(x: np.ndarray, y: np.ndarray, begin: int, middle: int, end: int) -> bool:
     """Return True if the middle one of three points lies on or above the line through the others."""
     return bool((y[middle] - y[begin]) * (x[end] - x[begin]) >= (y[end] - y[begin]) * (x[middle] - x[begin]))

@@ -29,7 +29,7 @@ MAX_CLOCK_PPM = 20_000.0
 """Maximum plausible rate error of a clock [1e-6]. A larger one shows a suspended host or an accelerated simulation."""
 HELLO_FRAME_BYTES = HELLO_BYTES + 1
 """Length of a COBS-encoded hello without its delimiter [bytes]."""
-_MESSAGES = 8
+_MAX_MESSAGES = 8
 """Maximum number of messages of one call of the kernel, and of stored acknowledgments."""
 
 
@@ -50,7 +50,7 @@ class FrameCounters:
     frames_received: int = 0
     """Decoded samples."""
     frames_lost: int = 0
-    """Frames lost by gaps in the sequence, for any reason."""
+    """Frames missing in the sequence, for any reason."""
     crc_errors: int = 0
     cobs_errors: int = 0
     length_errors: int = 0
@@ -93,10 +93,10 @@ class FrameDecoder:
         self._state["current_sign"] = 1.0 if current_sign == "discharge_positive" else -1.0
         self._scaling = np.zeros(1, dtype=SCALING)
         self._samples = np.zeros(256, dtype=SAMPLE)
-        self._messages = np.zeros((_MESSAGES, PACKET_BYTES), dtype=np.uint8)
+        self._messages = np.zeros((_MAX_MESSAGES, PACKET_BYTES), dtype=np.uint8)
         self._hello: Hello | None = None
         self._acks: list[Ack] = []
-        self._printable = 0
+        self._printable_bytes = 0
         # numba compiles both kernels now, before bytes arrive
         self._decode(np.empty(0), np.empty(0, dtype=np.int64), np.frombuffer(b"", dtype=np.uint8), 0, 0)
         clock_ppm(self._state[0])
@@ -145,16 +145,16 @@ class FrameDecoder:
         return FrameCounters(**dict(zip(_COUNTERS, counts, strict=True)))
 
     @property
-    def heard_at(self) -> int:
+    def last_frame_end(self) -> int:
         """``bytes_received`` at the end of the last frame with a right CRC."""
-        return int(self._state["heard_at"][0])
+        return int(self._state["last_frame_end"][0])
 
     @property
     def fault(self) -> FrameFault | None:
         """Fault of the line as a whole; None while frames arrive."""
         state = self._state[0]
-        if state["bytes_received"] - state["heard_at"] > MAX_BYTES_WITHOUT_FRAME:
-            return FrameFault.TEXT if self._printable > MAX_BYTES_WITHOUT_FRAME else FrameFault.WRONG_BAUD
+        if state["bytes_received"] - state["last_frame_end"] > MAX_BYTES_WITHOUT_FRAME:
+            return FrameFault.TEXT if self._printable_bytes > MAX_BYTES_WITHOUT_FRAME else FrameFault.WRONG_BAUD
         if state["frames_received"] == 0 and state["version_errors"] > 0:
             return FrameFault.NEWER_PROTOCOL
         if state["frames_received"] == 0 and state["before_hello"] > 0:
@@ -164,8 +164,8 @@ class FrameDecoder:
     def serial_number_in(self, data: bytes) -> str | None:
         """Return the serial number of the last hello in ``data`` without feeding it; empty if the board has none."""
         state, serial = self._state[0], None
-        begun = state["buffer"][: state["length"]].tobytes()
-        for frame in (begun + data).split(DELIMITER)[:-1]:
+        buffered = state["buffer"][: state["length"]].tobytes()
+        for frame in (buffered + data).split(DELIMITER)[:-1]:
             if len(frame) == HELLO_FRAME_BYTES:
                 with contextlib.suppress(ProtocolError):
                     serial = _hexadecimal(Hello.decode(unseal(frame)).serial)
@@ -181,25 +181,25 @@ class FrameDecoder:
         return acks
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line.
+        """Decode the bytes of one read.
 
         Args:
             arrival_s: Arrival time, on any clock that never steps back [s].
             data: Received bytes.
 
         Returns:
-            Samples, shape (n,), n may be 0. ``time_s`` is the board's clock since the first of them, unwrapped;
-            across a reset of the board it continues by arrival.
+            Samples, shape (n,), n may be 0. ``time_s`` is the unwrapped board clock since the first sample. Across a reset
+            of the board it continues by the arrival time.
         """
         block = self.feed_reads(np.array([arrival_s]), np.array([len(data)]), np.frombuffer(data, dtype=np.uint8))
-        if self._state["heard_at"][0] + MAX_BYTES_WITHOUT_FRAME < self._state["bytes_received"][0]:
-            self._printable = self._printable + len(data) if is_text(data) else 0
+        if self._state["last_frame_end"][0] + MAX_BYTES_WITHOUT_FRAME < self._state["bytes_received"][0]:
+            self._printable_bytes = self._printable_bytes + len(data) if is_text(data) else 0
         return block
 
     def feed_reads(
         self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
     ) -> SampleBlock:
-        """Decode many reads of the line at once. The samples are those that ``feed`` would return for each read.
+        """Decode many reads at once. The samples are those that ``feed`` would return for each read.
 
         Args:
             arrivals_s: Shape (reads,): arrival time of each read [s].
@@ -217,7 +217,7 @@ class FrameDecoder:
             position, samples, messages = self._decode(arrivals_s, ends, data, position, count)
             count += samples
             for packet in self._messages[:messages]:
-                self._take_message(packet)
+                self._store_message(packet)
         return self._samples[:count].copy()
 
     def _decode(
@@ -232,12 +232,14 @@ class FrameDecoder:
         out = self._samples[count:]
         return decode(data, position, ends, arrivals_s, self._state, self._scaling, out, self._messages)
 
-    def _take_message(self, packet: NDArray[np.uint8]) -> None:
-        if packet[1] == MessageType.HELLO:
+    def _store_message(self, packet: NDArray[np.uint8]) -> None:
+        """Decode and store a hello or an acknowledgment: version, type and body, padded with zeros."""
+        message_type, ack_result = packet[1], packet[3]
+        if message_type == MessageType.HELLO:
             self._hello = Hello.decode(packet[: 2 + Hello.LAYOUT.size].tobytes())
-        elif packet[3] in _ACK_RESULTS:
+        elif ack_result in _ACK_RESULTS:
             self._acks.append(Ack.decode(packet[: 2 + Ack.LAYOUT.size].tobytes()))
-            del self._acks[:-_MESSAGES]
+            del self._acks[:-_MAX_MESSAGES]
 
 
 def _hexadecimal(serial: int) -> str:

@@ -2,6 +2,9 @@
 
 One decoder serves the live line and the replay. Its state holds everything between calls, and the result does not
 depend on how the bytes were divided into calls, except for the arrival time of the byte that ends a frame.
+
+``d`` is the state of the decoder (a record of ``DECODER``), and ``s`` the scaling of the board (a record of ``SCALING``).
+Offsets in a packet are those of the tables in firmware/PROTOCOL.md.
 """
 
 import math
@@ -37,6 +40,8 @@ ACK_BYTES = 10
 """Length of an acknowledgment packet with its CRC [bytes]."""
 PACKET_BYTES = 64
 """Maximum length of a packet [bytes]."""
+MIN_PACKET_BYTES = 4
+"""Length of a packet without body: version, message type and CRC [bytes]."""
 SAMPLE_FRAME_BYTES = SAMPLE_BYTES + 2
 """Length of a sample frame: the packet, one byte of COBS and the delimiter [bytes]."""
 
@@ -46,21 +51,21 @@ DECODER = np.dtype(
         ("packet", "u1", PACKET_BYTES + 2),  # last complete frame, decoded
         ("length", "i8"),  # bytes in the buffer
         ("overlong", "i8"),  # 1: the frame is too long and is skipped up to its end
-        ("in_step", "i8"),  # 1 once a delimiter was received, because earlier bytes may be half a frame
+        ("synchronized", "i8"),  # 1 once a delimiter was received, because earlier bytes may be half a frame
         ("started", "i8"),  # 1 after the first sample
-        ("expected", "i8"),  # sequence of the next sample
+        ("expected_sequence", "i8"),  # sequence of the next sample
         ("boot_id", "i8"),  # boot id of the last hello; -1: none since a reset, or since another board may be connected
         ("serial", "i8"),  # serial number of the last hello
         ("period_us", "f8"),  # sample period of the last hello [us]
         ("doubted_s", "f8"),  # arrival time at which boot_id became -1 [s]
-        ("withheld", "i8"),  # status bits of samples that were dropped since doubted_s
+        ("withheld_status", "i8"),  # status bits of samples that were dropped since doubted_s
         ("reset_pending", "i8"),  # 1 from a hello that reported a reset until the next sample
         ("board_us", "i8"),  # board clock of the last sample, 32 bit [us]
         ("elapsed_us", "i8"),  # board clock since the first sample or the reset, without wraps [us]
         ("origin_s", "f8"),  # sample time at which elapsed_us was 0 [s]
         ("time_s", "f8"),  # time of the last sample since the first one [s]
         ("arrival_s", "f8"),  # arrival time of the last sample [s]
-        ("least_late_s", "f8"),  # smallest recent delay: arrival time minus sample time [s]
+        ("min_delay_s", "f8"),  # smallest recent delay: arrival time minus sample time [s]
         ("clock_windows", "i8"),  # number of windows of the clock estimate since the first sample or the reset
         ("clock_begin_us", "i8"),  # elapsed_us at the beginning of the last window
         ("clock_origin_s", "f8"),  # arrival time that is the origin of the delays
@@ -68,7 +73,7 @@ DECODER = np.dtype(
         ("clock_late_s", "f8", CLOCK_WINDOWS),  # delay of the sample with the smallest delay in each window [s]
         ("current_sign", "f8"),  # 1 if the board's positive current is a discharge, otherwise -1
         ("bytes_received", "i8"),
-        ("heard_at", "i8"),  # bytes_received at the end of the last frame with a right CRC
+        ("last_frame_end", "i8"),  # bytes_received at the end of the last frame with a right CRC
         ("frames_received", "i8"),  # decoded samples
         ("frames_lost", "i8"),
         ("cobs_errors", "i8"),
@@ -146,7 +151,7 @@ def cobs_decode(frame: Bytes, length: int, packet: Bytes) -> int:
             packet[n] = frame[i]
             n += 1
             i += 1
-        if i < length:
+        if i < length:  # packets are shorter than 254 bytes, so that each block but the last stands for a zero
             packet[n] = 0
             n += 1
     return n
@@ -164,7 +169,7 @@ def read_unsigned(packet: Bytes, offset: int, size: int) -> int:
 @njit(cache=True)
 def unpack_frame(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
     """Unpack the buffered frame into ``packet``. Return its message type, or 0 if it is invalid. Count faults by kind."""
-    counted = d.in_step  # an incomplete frame before the first delimiter is no fault
+    counted = d.synchronized  # an incomplete frame before the first delimiter is no fault
     if d.overlong:
         d.length_errors += counted
         return 0
@@ -173,22 +178,22 @@ def unpack_frame(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
     if length < 0:
         d.cobs_errors += counted
         return 0
-    if length < 4:
+    if length < MIN_PACKET_BYTES:
         d.length_errors += counted
         return 0
     if crc16(packet, 0, length - 2) != read_unsigned(packet, length - 2, 2):
         d.crc_errors += counted
         return 0
-    d.heard_at = d.bytes_received
+    d.last_frame_end = d.bytes_received
     if packet[0] != PROTOCOL_VERSION:
         d.version_errors += 1
         return 0
-    kind = int(packet[1])
-    if kind == MESSAGE_SAMPLE:
+    message_type = int(packet[1])
+    if message_type == MESSAGE_SAMPLE:
         expected_length = SAMPLE_BYTES
-    elif kind == MESSAGE_HELLO:
+    elif message_type == MESSAGE_HELLO:
         expected_length = HELLO_BYTES
-    elif kind == MESSAGE_ACK:
+    elif message_type == MESSAGE_ACK:
         expected_length = ACK_BYTES
     else:
         d.type_errors += 1
@@ -196,7 +201,7 @@ def unpack_frame(d: Record) -> int:  # noqa: PLR0911 - one return for each fault
     if length != expected_length:
         d.length_errors += 1
         return 0
-    return kind
+    return message_type
 
 
 @njit(cache=True)
@@ -205,8 +210,8 @@ def apply_hello(d: Record, s: Record) -> None:
     p = d.packet
     boot_id, serial = read_unsigned(p, 6, 2), read_unsigned(p, 8, 4)
     is_new = boot_id != d.boot_id or serial != d.serial
-    behind = (read_unsigned(p, 12, 4) - d.expected) & _MASK >= _HALF
-    if d.started and (behind or (d.boot_id >= 0 and is_new)):
+    is_behind = (read_unsigned(p, 12, 4) - d.expected_sequence) & _MASK >= _HALF  # the sequence restarted
+    if d.started and (is_behind or (d.boot_id >= 0 and is_new)):
         d.reset_pending = 1
     if is_new:
         reset_readings(s)
@@ -231,7 +236,7 @@ def apply_hello(d: Record, s: Record) -> None:
 @njit(cache=True)
 def is_early(d: Record, arrival_s: float, time_s: float) -> bool:
     """Return True if the sample of ``time_s`` arrived more than ``MAX_LEAD_S`` earlier than the smallest delay allows."""
-    return bool(arrival_s - time_s < d.least_late_s - MAX_LEAD_S)
+    return bool(arrival_s - time_s < d.min_delay_s - MAX_LEAD_S)
 
 
 @njit(cache=True)
@@ -255,6 +260,7 @@ def advance_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool
         wraps = round((arrival_s - d.arrival_s - step_us * _US) / _WRAP_S)
         step_us += max(wraps, 0) * MODULUS
     time_s = d.origin_s + (d.elapsed_us + step_us) * _US
+    # advance of the board's clock that neither the sequence numbers nor the arrival times explain
     excess_s = (step_us - (lost + 1) * d.period_us) * _US - (arrival_s - d.arrival_s)
     if (
         excess_s > MAX_ADVANCE_S
@@ -262,19 +268,19 @@ def advance_clock(d: Record, board_us: int, arrival_s: float, lost: int) -> bool
         or (lost > 0 and not is_consistent_with_clock(d, lost + 1, step_us))
     ):
         return False
-    d.least_late_s = min(d.least_late_s + MAX_SLOWNESS * step_us * _US, arrival_s - time_s)
+    d.min_delay_s = min(d.min_delay_s + MAX_SLOWNESS * step_us * _US, arrival_s - time_s)
     d.elapsed_us += step_us
     d.time_s = time_s
     return True
 
 
 @njit(cache=True)
-def restart_clock(d: Record, arrival_s: float, least_s: float) -> None:
-    """Restart the board's clock: continue by arrival time, advancing by at least ``least_s``."""
-    d.origin_s = d.time_s + max(arrival_s - d.arrival_s, least_s)
+def restart_clock(d: Record, arrival_s: float, min_advance_s: float) -> None:
+    """Restart the board's clock: continue by arrival time, advancing by at least ``min_advance_s``."""
+    d.origin_s = d.time_s + max(arrival_s - d.arrival_s, min_advance_s)
     d.time_s = d.origin_s
     d.elapsed_us = 0
-    d.least_late_s = arrival_s - d.origin_s
+    d.min_delay_s = arrival_s - d.origin_s
     reset_clock_estimate(d)
 
 
@@ -291,15 +297,15 @@ def check_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) ->
     status = 0
     if not d.started:
         d.started = 1
-        d.least_late_s = arrival_s - d.origin_s
+        d.min_delay_s = arrival_s - d.origin_s
     else:
-        ahead = (sequence - d.expected) & _MASK
+        ahead = (sequence - d.expected_sequence) & _MASK
         behind = MODULUS - ahead if ahead >= _HALF else 0
         if d.reset_pending or behind > _REORDER_WINDOW:
             if not d.reset_pending:
                 require_new_hello(d, arrival_s)  # the hello after the reset was lost; the next one is no further reset
             uptime_s = board_us * _US  # time since the reset
-            if is_early(d, arrival_s, d.time_s + uptime_s):
+            if is_early(d, arrival_s, d.time_s + uptime_s):  # implausible, so that the arrival time alone counts
                 uptime_s = 0.0
                 d.clock_jumps += 1
             restart_clock(d, arrival_s, uptime_s)
@@ -319,7 +325,7 @@ def check_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) ->
                 require_new_hello(d, arrival_s)
             d.frames_lost += ahead
             status = _GAP if ahead else 0
-    d.expected = (sequence + 1) & _MASK
+    d.expected_sequence = (sequence + 1) & _MASK
     d.board_us = board_us
     d.arrival_s = arrival_s
     add_arrival(d, arrival_s)
@@ -337,20 +343,20 @@ def decode_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     if status < 0:
         return 0
     if d.boot_id < 0 and arrival_s - d.doubted_s < MAX_DOUBT_S:
-        d.withheld |= status
+        d.withheld_status |= status
         d.before_hello += 1
         return 0
-    status |= d.withheld
-    d.withheld = 0
+    status |= d.withheld_status
+    d.withheld_status = 0
     d.frames_received += 1
-    bits = int(p[21])
+    status_bits = int(p[21])
     aux_count = float(p[20])
     if aux_count > 0.0:
-        if bits & _AUX_IS_NTC:
+        if status_bits & _AUX_IS_NTC:
             add_ntc(s, float(read_unsigned(p, 18, 2)), aux_count, d.board_us)
         else:
             add_bandgap(s, float(read_unsigned(p, 18, 2)), aux_count, d.board_us)
-    if bits & _OVERRUN:
+    if status_bits & _OVERRUN:
         d.overruns += 1
     count = float(read_unsigned(p, 16, 2))
     reference_v = reference(s)
@@ -361,7 +367,7 @@ def decode_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     if out.temperature_c < MIN_C or out.temperature_c > MAX_C:
         out.temperature_c = math.nan
         d.implausible += 1
-    out.status = status | (bits & _SATURATED_OR_OVERRUN)
+    out.status = status | (status_bits & _SATURATED_OR_OVERRUN)
     return 1
 
 
@@ -411,18 +417,18 @@ def decode(
         counted = i
         if length > 0:
             d.length = length
-            kind = unpack_frame(d)
-            if kind == MESSAGE_SAMPLE:
+            message_type = unpack_frame(d)
+            if message_type == MESSAGE_SAMPLE:
                 while ends[read] < i:
                     read += 1
                 n_samples += decode_sample(d, s, arrivals_s[read], samples[n_samples])
-            elif kind != 0:
-                if kind == MESSAGE_HELLO:
+            elif message_type != 0:
+                if message_type == MESSAGE_HELLO:
                     apply_hello(d, s)
                 messages[n_messages, :] = d.packet[:PACKET_BYTES]
-                messages[n_messages, HELLO_BYTES if kind == MESSAGE_HELLO else ACK_BYTES :] = 0
+                messages[n_messages, HELLO_BYTES if message_type == MESSAGE_HELLO else ACK_BYTES :] = 0
                 n_messages += 1
-        d.in_step = 1
+        d.synchronized = 1
         d.overlong = 0
         length = 0
     d.length = length

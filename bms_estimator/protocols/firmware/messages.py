@@ -102,16 +102,16 @@ def unseal(frame: bytes) -> bytes:
         packet = bytes(cobs.decode(frame.removesuffix(DELIMITER)))
     except cobs.DecodeError as error:
         raise ProtocolError(f"not COBS: {error}") from None
-    if len(packet) < 4:
+    if len(packet) < 4:  # version, type and CRC
         raise ProtocolError(f"a packet of {len(packet)} bytes")
     if binascii.crc_hqx(packet[:-2], 0xFFFF) != int.from_bytes(packet[-2:], "little"):
         raise ProtocolError("wrong CRC")
     return packet[:-2]
 
 
-def command(kind: MessageType, body: bytes = b"") -> bytes:
+def command(message_type: MessageType, body: bytes = b"") -> bytes:
     """Return the frame of a command."""
-    return seal(bytes((PROTOCOL_VERSION, kind)) + body)
+    return seal(bytes((PROTOCOL_VERSION, message_type)) + body)
 
 
 def hello_command() -> bytes:
@@ -179,7 +179,7 @@ def relay_word(relay: Relay) -> int:
 
 @dataclass(frozen=True)
 class Hello:
-    """Hello: description of a board by itself, in the units of the line."""
+    """Hello: description that a board sends of itself, in the units of the line."""
 
     firmware_major: int
     firmware_minor: int
@@ -275,7 +275,9 @@ class SampleMessage:
     status: int
 
     HEAD: ClassVar[struct.Struct] = struct.Struct("<BBII")
+    """Version, type, sequence and time, before the sums."""
     TAIL: ClassVar[struct.Struct] = struct.Struct("<HHBB")
+    """Fields after the sums."""
     SUM_BYTES: ClassVar[int] = 3
 
     def encode(self, version: int = PROTOCOL_VERSION) -> bytes:
@@ -296,11 +298,13 @@ class SampleMessage:
         """
         body = extract_body(packet, MessageType.SAMPLE, cls.HEAD.size - 2 + 2 * cls.SUM_BYTES + cls.TAIL.size)
         sequence, board_us = struct.unpack_from("<II", body)
-        sums = (int.from_bytes(body[i : i + cls.SUM_BYTES], "little") for i in (8, 8 + cls.SUM_BYTES))
-        return cls(sequence, board_us, *sums, *cls.TAIL.unpack_from(body, 8 + 2 * cls.SUM_BYTES))
+        sums_begin = cls.HEAD.size - 2  # the body has neither version nor type
+        current_begin = sums_begin + cls.SUM_BYTES
+        sums = (int.from_bytes(body[i : i + cls.SUM_BYTES], "little") for i in (sums_begin, current_begin))
+        return cls(sequence, board_us, *sums, *cls.TAIL.unpack_from(body, current_begin + cls.SUM_BYTES))
 
 
-def extract_body(packet: bytes, kind: MessageType, size: int) -> bytes:
+def extract_body(packet: bytes, message_type: MessageType, size: int) -> bytes:
     """Return the body of a packet without CRC.
 
     Raises:
@@ -308,8 +312,8 @@ def extract_body(packet: bytes, kind: MessageType, size: int) -> bytes:
     """
     if packet[0] != PROTOCOL_VERSION:
         raise ProtocolError(f"protocol version {packet[0]}: this is version {PROTOCOL_VERSION}")
-    if packet[1] != kind:
-        raise ProtocolError(f"message type {packet[1]:#04x} where {kind:#04x} was expected")
+    if packet[1] != message_type:
+        raise ProtocolError(f"message type {packet[1]:#04x} where {message_type:#04x} was expected")
     if len(packet) - 2 != size:
         raise ProtocolError(f"a body of {len(packet) - 2} bytes where {size} were expected")
     return packet[2:]

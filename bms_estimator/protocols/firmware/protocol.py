@@ -34,6 +34,7 @@ class _PendingCommand(Command):
     frame: bytes = b""
     retry_s: float = RETRY_S
     hint: str = ""
+    """Possible cause of a rejection, which is appended to the error text."""
     changes_hello: bool = True
     acknowledged: bool = False
 
@@ -49,7 +50,7 @@ class BoardProtocol(DeviceProtocol):
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive", rate_hz: int | None = None) -> None:
         self._decoder = FrameDecoder(current_sign=current_sign)
         self._rate_hz = rate_hz
-        self._opened_at = 0
+        self._frame_end_at_opening = 0
         self._last_output, self._output_s = b"", -math.inf
         self._command: _PendingCommand | None = None
 
@@ -98,13 +99,13 @@ class BoardProtocol(DeviceProtocol):
     def on_port_opened(self) -> None:
         """Discard the hello and a pending command. Samples use the last scaling until the next hello."""
         self._decoder.discard_hello()
-        self._opened_at = self._decoder.heard_at
+        self._frame_end_at_opening = self._decoder.last_frame_end
         if self._command is not None and not self._command.done:
             self._command.refusal = "the line was lost before the board answered, and another board may be there now"
             self._command.done = True
 
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode one read of the line; for ``time_s`` see ``FrameDecoder.feed``."""
+        """Decode the bytes of one read; for ``time_s`` see ``FrameDecoder.feed``."""
         block = self._decoder.feed(arrival_s, data)
         if self._command is not None:
             self._update_command(self._command)
@@ -113,11 +114,11 @@ class BoardProtocol(DeviceProtocol):
     def feed_reads(
         self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
     ) -> SampleBlock:
-        """Decode many reads of the line at once."""
+        """Decode many reads at once."""
         return self._decoder.feed_reads(arrivals_s, ends, data)
 
     def next_output(self, now_s: float) -> bytes:
-        """Return a request of the hello, then the pending command, then the rate command. Each is repeated until answered."""
+        """Return a request for the hello, then the pending command, then the rate command. Each is repeated until answered."""
         output, retry_s = self._choose_output()
         if output == self._last_output and now_s - self._output_s < retry_s:
             return b""
@@ -155,7 +156,7 @@ class BoardProtocol(DeviceProtocol):
         """Return the next bytes to send, and their retry interval [s]."""
         hello = self._decoder.hello
         if hello is None:
-            return _HELLO if self._decoder.heard_at > self._opened_at else b"", RETRY_S
+            return _HELLO if self._decoder.last_frame_end > self._frame_end_at_opening else b"", RETRY_S
         if self._command is not None and not self._command.done:
             return self._command.frame, self._command.retry_s
         if self._rate_hz is not None and self._rate_hz != hello.rate_hz:
@@ -165,7 +166,8 @@ class BoardProtocol(DeviceProtocol):
     def _update_command(self, command: _PendingCommand) -> None:
         """Update the pending command from received acknowledgments and hellos."""
         for ack in self._decoder.pop_acks():
-            if ack.command != unseal(command.frame)[1]:
+            message_type = unseal(command.frame)[1]
+            if ack.command != message_type:
                 continue
             if ack.result == AckResult.OK:
                 command.acknowledged = True

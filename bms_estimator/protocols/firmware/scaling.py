@@ -1,4 +1,7 @@
-"""Scaling of the board's sums to volts, amperes and degrees Celsius (firmware/PROTOCOL.md)."""
+"""Scaling of the board's sums to volts, amperes and degrees Celsius (firmware/PROTOCOL.md).
+
+``s`` is the scaling of a board, a record of ``SCALING``.
+"""
 
 import math
 
@@ -59,7 +62,7 @@ def running_mean(mean: float, weight: float, total: float, count: float, elapsed
         elapsed_fraction: Time since the last readings divided by the time constant.
     """
     weight += count
-    if elapsed_fraction * weight > count:
+    if elapsed_fraction * weight > count:  # the earlier readings span more than the time constant
         weight = max(count / elapsed_fraction, count)
     return mean + (total - mean * count) / weight
 
@@ -99,10 +102,10 @@ def reference(s: Record) -> float:
 @njit(cache=True, error_model="numpy")  # a board that scales by zero gives inf or NaN, which the estimator drops
 def temperature(s: Record) -> float:
     """Return the temperature of the NTC [C]; NaN without one or if it is open or shorted."""
-    x = s.ntc_mean / s.full_scale
-    if not s.ntc_fitted or s.ntc_weight == 0.0 or not _RAIL < x < 1.0 - _RAIL:
+    ratio = s.ntc_mean / s.full_scale  # voltage over the NTC as a fraction of the converter's range
+    if not s.ntc_fitted or s.ntc_weight == 0.0 or not _RAIL < ratio < 1.0 - _RAIL:
         return math.nan
-    r_ohm = s.ntc_series_ohm * x / (1.0 - x)
+    r_ohm = s.ntc_series_ohm * ratio / (1.0 - ratio)
     return 1.0 / (1.0 / _R25_K + math.log(r_ohm / s.ntc_r25_ohm) / s.ntc_beta_k) - _ZERO_C_K
 
 

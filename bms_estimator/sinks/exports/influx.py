@@ -27,7 +27,7 @@ from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.line_protocol import lines
 
 MAX_WAITING = 10_000
-"""Maximum number of queued lines, hours of states at one a second. Beyond it, the oldest line is dropped."""
+"""Maximum number of queued lines. With one state a second they last almost three hours; then the oldest is dropped."""
 BATCH = 1000
 """Maximum number of lines in a request of about a megabyte."""
 RESPONSE_TIMEOUT_S = 10.0
@@ -36,7 +36,7 @@ CLOSING_S = 3.0
 """Timeout of the last request [s]."""
 PERMANENT_ERRORS = (400, 413, 422)
 """HTTP status codes for lines that the server will never accept. After any other code the lines are sent again."""
-MAX_LOGGED = 200
+MAX_LOGGED_CHARACTERS = 200
 """Maximum length of a response in the log [characters]."""
 
 log = structlog.get_logger(__name__)
@@ -73,10 +73,10 @@ class InfluxSink:
         target(settings)  # unusable settings are reported at start
         self._settings = settings
         self._backoff = Backoff(first_delay_s)
-        self._waiting: deque[str] = deque()
+        self._queue: deque[str] = deque()
         self._batch: list[str] = []  # lines of the current request
-        self._before: Snapshot | None = None
-        self._full, self._closing = asyncio.Event(), asyncio.Event()
+        self._previous: Snapshot | None = None
+        self._batch_is_full, self._closing = asyncio.Event(), asyncio.Event()
         self._failure = ""  # reason for the last failed request; empty after a success
         self._thread = DiskThread("influx")
         self._task: asyncio.Task[None] | None = None
@@ -86,19 +86,19 @@ class InfluxSink:
     @property
     def waiting(self) -> int:
         """Number of lines that the server has not accepted yet."""
-        return len(self._waiting) + len(self._batch)
+        return len(self._queue) + len(self._batch)
 
     def publish(self, snapshot: Snapshot) -> None:
         """Queue the lines of a snapshot without waiting."""
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
-        self._waiting.extend(lines(self._before, snapshot))
-        self._before = snapshot
-        while len(self._waiting) > MAX_WAITING:
-            self._waiting.popleft()
+        self._queue.extend(lines(self._previous, snapshot))
+        self._previous = snapshot
+        while len(self._queue) > MAX_WAITING:
+            self._queue.popleft()
             self.dropped += 1
-        if len(self._waiting) >= BATCH:
-            self._full.set()
+        if len(self._queue) >= BATCH:
+            self._batch_is_full.set()
 
     async def __aenter__(self) -> Self:
         """Start the sending task."""
@@ -110,7 +110,7 @@ class InfluxSink:
         if self._task is None:
             return
         self._closing.set()
-        self._full.set()
+        self._batch_is_full.set()
         done, _ = await asyncio.wait([self._task], timeout=CLOSING_S)
         if not done:
             self._task.cancel()
@@ -124,8 +124,9 @@ class InfluxSink:
         """
         delay_s = self._settings.every_s
         while True:
-            await self._wait(self._closing if self._failure else self._full, delay_s)
-            self._full.clear()
+            # after a failure, a full batch does not shorten the delay
+            await self._wait(self._closing if self._failure else self._batch_is_full, delay_s)
+            self._batch_is_full.clear()
             succeeded = await self._write()
             if self._closing.is_set():
                 return
@@ -140,8 +141,8 @@ class InfluxSink:
         """Send batches until the queue is empty. Return False if the server must be retried."""
         loop = asyncio.get_running_loop()
         while self.waiting:
-            while self._waiting and len(self._batch) < BATCH:
-                self._batch.append(self._waiting.popleft())
+            while self._queue and len(self._batch) < BATCH:
+                self._batch.append(self._queue.popleft())
             try:
                 await loop.run_in_executor(self._thread, partial(_post, self._settings, "\n".join(self._batch)))
             except RefusedError as error:
@@ -175,10 +176,10 @@ def target(settings: InfluxSettings) -> Target:
     """
     if settings.bucket:
         query = {"bucket": settings.bucket, "org": settings.org or "", "precision": "ms"}
-        url, authorization = "/api/v2/write", _token(settings)
+        path, authorization = "/api/v2/write", _token_header(settings)
     else:
         query = {"db": settings.database, "precision": "ms"}
-        url, authorization = "/write", _basic(settings)
+        path, authorization = "/write", _basic_header(settings)
     context = None
     if settings.url.startswith("https:"):
         try:
@@ -186,10 +187,10 @@ def target(settings: InfluxSettings) -> Target:
         except OSError as error:  # includes ssl.SSLError
             raise UserError(f"influx.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
     headers = {"Content-Type": "text/plain; charset=utf-8"} | authorization
-    return Target(f"{settings.url.rstrip('/')}{url}?{urllib.parse.urlencode(query)}", headers, context)
+    return Target(f"{settings.url.rstrip('/')}{path}?{urllib.parse.urlencode(query)}", headers, context)
 
 
-def _token(settings: InfluxSettings) -> dict[str, str]:
+def _token_header(settings: InfluxSettings) -> dict[str, str]:
     if settings.token_file is None:
         return {}
     token = _secret("token_file", settings.token_file)
@@ -198,12 +199,12 @@ def _token(settings: InfluxSettings) -> dict[str, str]:
     return {"Authorization": f"Token {token}"}
 
 
-def _basic(settings: InfluxSettings) -> dict[str, str]:
+def _basic_header(settings: InfluxSettings) -> dict[str, str]:
     if settings.username is None:
         return {}
     password = _secret("password_file", settings.password_file) if settings.password_file else ""
-    packed = base64.b64encode(f"{settings.username}:{password}".encode()).decode()
-    return {"Authorization": f"Basic {packed}"}
+    encoded = base64.b64encode(f"{settings.username}:{password}".encode()).decode()
+    return {"Authorization": f"Basic {encoded}"}
 
 
 def _secret(key: str, path: Path) -> str:
@@ -255,11 +256,11 @@ def _response_start(error: urllib.error.HTTPError) -> bytes:
     """Return the start of the server's response; empty without one."""
     try:
         with error:
-            return error.read(MAX_LOGGED * 4)
+            return error.read(MAX_LOGGED_CHARACTERS * 4)  # a character has at most four bytes
     except (OSError, http.client.HTTPException):
         return b""
 
 
 def _printable(response: bytes) -> str:
     """Return the printable start of a response, for the log."""
-    return "".join(c for c in response.decode(errors="replace") if c.isprintable())[:MAX_LOGGED]
+    return "".join(c for c in response.decode(errors="replace") if c.isprintable())[:MAX_LOGGED_CHARACTERS]

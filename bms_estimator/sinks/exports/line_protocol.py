@@ -28,13 +28,13 @@ def lines(before: Snapshot | None, snapshot: Snapshot) -> list[str]:
 def _state(device: str, estimate: Estimate) -> str:
     fields = dict(estimate)
     time = fields.pop("time")
-    return f"{STATE},device={device} {','.join(_fields(fields))} {_ms(time)}"
+    return f"{STATE},device={device} {','.join(_fields(fields))} {_epoch_ms(time)}"
 
 
 def _alarm(device: str, alarm: Alarm, time: str) -> str:
     fields = {"active": alarm.active, "watched": alarm.watched, "value": alarm.value, "limit": alarm.limit}
     items = [*_fields(fields), f"text={_quoted(alarm.text)}"]
-    return f"{ALARM},device={device},name={alarm.name},severity={alarm.severity} {','.join(items)} {_ms(time)}"
+    return f"{ALARM},device={device},name={alarm.name},severity={alarm.severity} {','.join(items)} {_epoch_ms(time)}"
 
 
 def _fields(values: Mapping[str, object]) -> Iterator[str]:
@@ -56,5 +56,5 @@ def _quoted(text: str) -> str:
     return f'"{escaped}"'
 
 
-def _ms(iso: str) -> int:
+def _epoch_ms(iso: str) -> int:
     return round(datetime.fromisoformat(iso).timestamp() * 1000.0)

@@ -70,5 +70,5 @@ class PrometheusSink(Collector):
         with CONNECTIONS.serving(request.transport):
             if request.method not in {"GET", "HEAD"}:
                 return web.Response(status=405, headers={"Allow": "GET, HEAD"})
-            encode, kind = choose_encoder(request.headers.get("Accept", ""))
-            return web.Response(body=encode(self._registry), headers={"Content-Type": kind})
+            encode, content_type = choose_encoder(request.headers.get("Accept", ""))
+            return web.Response(body=encode(self._registry), headers={"Content-Type": content_type})

@@ -35,8 +35,8 @@ UNITS = {
     "kwh": Unit("joules", 3.6e6),
 }
 """Units by the last part of a field's name."""
-KINDS = {"line": "counters of the link", "samples": "samples by result", "requests": "requests by result"}
-"""Help texts of the health payload's counters by kind."""
+COUNTER_FIELDS = {"line": "counters of the link", "samples": "samples by result", "requests": "requests by result"}
+"""Help texts of the fields of the health payload that count by kind."""
 LIST_ITEMS = {"cells_v": "cell"}
 """Names of one item, by list field."""
 
@@ -47,8 +47,8 @@ def metrics(snapshot: Snapshot) -> Iterator[Metric]:
     if snapshot.estimate is not None and health.sensor_online:
         yield from _fields(device, snapshot.estimate, Estimate)
     yield from _fields(device, health, Health)
-    for name, meaning in KINDS.items():
-        yield _by_kind(device, name, meaning, getattr(health, name))
+    for name, meaning in COUNTER_FIELDS.items():
+        yield _counters_by_kind(device, name, meaning, getattr(health, name))
     yield _elements(device, snapshot)
     yield _alarms(device, snapshot)
     yield _watched(device, snapshot)
@@ -60,12 +60,13 @@ def metrics(snapshot: Snapshot) -> Iterator[Metric]:
 def _fields(device: str, report: Estimate | Health, model: type[Estimate | Health]) -> Iterator[Metric]:
     """Yield metrics of the numbers and Booleans of a payload."""
     for name, field in model.model_fields.items():
-        value, help_text, kind = getattr(report, name), field.description or name, quantity(model, name).prometheus
-        if kind == "none":
+        value, help_text = getattr(report, name), field.description or name
+        metric_kind = quantity(model, name).prometheus
+        if metric_kind == "none":
             continue
         if isinstance(value, bool | int | float):
-            metric_name, factor = (f"bms_{name}_ratio", 1.0) if kind == "ratio" else name_and_factor(name)
-            family = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
+            metric_name, factor = (f"bms_{name}_ratio", 1.0) if metric_kind == "ratio" else name_and_factor(name)
+            family = CounterMetricFamily if metric_kind == "counter" else GaugeMetricFamily
             metric = family(metric_name, help_text, labels=["device"])
             metric.add_metric([device], value * factor)
             yield metric
@@ -83,7 +84,7 @@ def _list_metric(device: str, name: str, help_text: str, values: Iterable[float 
     return metric
 
 
-def _by_kind(device: str, name: str, meaning: str, counts: Mapping[str, int]) -> Metric:
+def _counters_by_kind(device: str, name: str, meaning: str, counts: Mapping[str, int]) -> Metric:
     metric = CounterMetricFamily(f"bms_{name}", f"{meaning}, since start", labels=["device", "kind"])
     for kind, count in counts.items():
         metric.add_metric([device, kind], count)

@@ -24,7 +24,7 @@ from bms_estimator.sinks.home_assistant.entities import (
 VALUES = "home_assistant"
 """Topic of the values, below the device's topic."""
 MIN_EXPIRY_S = 30
-"""Minimum age at which Home Assistant shows a value as unavailable [s]."""
+"""Minimum of ``expire_after``, the age at which Home Assistant shows a value as unavailable [s]."""
 _ALARM_CLASSES: Mapping[str, str] = {name: kind.device_class for name, kind in ALARM_KINDS.items()}
 _ALARM_AVAILABILITY = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
 """Template of an alarm's availability. A raised alarm stays available even if its quantity is lost later."""
@@ -69,17 +69,17 @@ def discovery_topic(settings: HomeAssistantSettings, device: str) -> str:
 
 
 def discovery(
-    settings: HomeAssistantSettings, described: DiscoveryInputs, root: str, sample_period_s: float
+    settings: HomeAssistantSettings, inputs: DiscoveryInputs, root: str, sample_period_s: float
 ) -> dict[str, Any]:
     """Return the discovery message.
 
     Args:
         settings: Settings of Home Assistant.
-        described: Data that determine the entities.
+        inputs: Data that determine the entities.
         root: Topic of the device, ``bms/<device>``.
         sample_period_s: Sample period [s].
     """
-    info = described.info
+    info = inputs.info
     device = {
         "identifiers": [device_id(info.device)],
         "name": settings.name or info.device,
@@ -91,41 +91,39 @@ def discovery(
         device["serial_number"] = info.board["serial"]
     fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
     expiry_s = max(MIN_EXPIRY_S, math.ceil(fresh_s))
-    positive = settings.current_sign.removesuffix("_positive")
-    numbers = entities(info, described.cells).items()
+    positive_direction = settings.current_sign.removesuffix("_positive")
+    sensors = entities(info, inputs.cells).items()
     components = {
-        **{key: _number(key, entity, root, expiry_s) for key, entity in numbers},
+        **{key: _sensor(key, entity, root, expiry_s) for key, entity in sensors},
         **{
-            key: _number(key, entity, root, expiry_s) | _sign(root, positive)
-            for key, entity in numbers
+            key: _sensor(key, entity, root, expiry_s) | _current_sign_attribute(root, positive_direction)
+            for key, entity in sensors
             if entity.signed
         },
-        **{f"alarm_{name}": _alarm(name, root) for name in described.alarms},
-        **{name: _COMMANDS[name](root) for name in described.commands},
+        **{f"alarm_{name}": _alarm(name, root) for name in inputs.alarms},
+        **{name: _COMMANDS[name](root) for name in inputs.commands},
     }
-    names = settings.names | _cell_names(settings, described.cells)
+    names = settings.names | _cell_names(settings, inputs.cells)
     return {
         "device": device,
         "origin": {"name": "bms_estimator", "sw_version": info.version},
         "availability": [{"topic": f"{root}/availability"}, {"topic": f"{root}/sensor/availability"}],
         "availability_mode": "all",
         "components": {
-            key: component | _identity(info.device, key, component["platform"]) | _named(names, key)
+            key: component | _identity(info.device, key, component["platform"]) | _configured_name(names, key)
             for key, component in components.items()
         }
-        | _removed(described),
+        | _removed_components(inputs),
     }
 
 
-def _removed(described: DiscoveryInputs) -> dict[str, dict[str, str]]:
+def _removed_components(inputs: DiscoveryInputs) -> dict[str, dict[str, str]]:
     """Return components that an earlier configuration may have had, in the form that makes Home Assistant remove them.
 
-    Home Assistant removes a component of which the message contains only the platform.
+    Home Assistant removes a component if the message contains only its platform.
     """
-    platforms = {f"alarm_{name}": "binary_sensor" for name in described.unwatched}
-    platforms |= {
-        name: control("")["platform"] for name, control in _COMMANDS.items() if name not in described.commands
-    }
+    platforms = {f"alarm_{name}": "binary_sensor" for name in inputs.unwatched}
+    platforms |= {name: control("")["platform"] for name, control in _COMMANDS.items() if name not in inputs.commands}
     return {key: {"platform": platform} for key, platform in platforms.items()}
 
 
@@ -135,7 +133,7 @@ def _cell_names(settings: HomeAssistantSettings, cells: int) -> dict[str, str]:
     return {cell_key(number): f"{settings.names[CELL]} {number}" for number in range(1, cells + 1)}
 
 
-def _named(names: Mapping[str, str], key: str) -> dict[str, str]:
+def _configured_name(names: Mapping[str, str], key: str) -> dict[str, str]:
     name = names.get(key.removeprefix("alarm_"))
     return {"name": name} if name else {}
 
@@ -149,7 +147,7 @@ def _identity(device: str, key: str, platform: str) -> dict[str, str]:
     return {"unique_id": entity, "default_entity_id": f"{platform}.{entity}", "object_id": entity}
 
 
-def _number(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any]:
+def _sensor(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any]:
     topic = f"{root}/{VALUES}"
     options = {
         "platform": "sensor",
@@ -167,9 +165,9 @@ def _number(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any
     return {option: value for option, value in options.items() if value is not None}
 
 
-def _sign(root: str, positive: str) -> dict[str, str]:
+def _current_sign_attribute(root: str, positive_direction: str) -> dict[str, str]:
     """Return the attribute with the direction of positive current."""
-    template = f"{{{{ {{'positive': '{positive}'}} | tojson }}}}"
+    template = f"{{{{ {{'positive': '{positive_direction}'}} | tojson }}}}"
     return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template}
 
 

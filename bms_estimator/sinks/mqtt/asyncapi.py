@@ -115,11 +115,11 @@ def _schemas() -> Document:
 
 def _arguments(name: str) -> Document:
     """Return the JSON schema of a request's arguments."""
-    own = ARGUMENTS[name]
+    arguments = ARGUMENTS[name]
     return {
         "type": "object",
-        "properties": own | {"transaction": TRANSACTION},
-        "required": [field for field in own if field not in OPTIONAL],
+        "properties": arguments | {"transaction": TRANSACTION},
+        "required": [field for field in arguments if field not in OPTIONAL],
         "description": f"at most {MAX_PAYLOAD_BYTES} bytes; may be empty if no field is required",
     }
 

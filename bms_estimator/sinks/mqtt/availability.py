@@ -27,7 +27,7 @@ class AvailabilityMonitor:
     """Compares the availability messages that the broker returns with those that the service has published.
 
     Args:
-        own: Returns the correct messages, of which the first is that of the service itself.
+        correct_messages: Returns the correct messages. The first message is the availability of the service itself.
         delivery: Statistics in which corrections are counted.
         denied: Denied topics, to which a missing echo is reported.
         wake: Called when ``correct`` is due.
@@ -36,13 +36,13 @@ class AvailabilityMonitor:
 
     def __init__(
         self,
-        own: Callable[[], Sequence[Message]],
+        correct_messages: Callable[[], Sequence[Message]],
         delivery: DeliveryStats,
         denied: DeniedTopics,
         wake: Callable[[], object],
         echo_s: float = ECHO_S,
     ) -> None:
-        self._own, self._delivery, self._denied = own, delivery, denied
+        self._correct_messages, self._delivery, self._denied = correct_messages, delivery, denied
         self._wake, self._echo_s = wake, echo_s
         self._echoed = asyncio.Event()
         self._is_wrong = False  # another client has overwritten an availability
@@ -59,7 +59,7 @@ class AvailabilityMonitor:
 
     def on_message(self, topic: str, payload: bytes) -> None:
         """Handle a received availability: our own echo, or another client's."""
-        correct = {own.topic: own.payload for own in self._own()}
+        correct = {message.topic: message.payload for message in self._correct_messages()}
         # the sensor's availability has no correct value before the first snapshot, and then cannot be wrong
         if correct.get(topic, payload) == payload:
             self._echoed.set()
@@ -79,7 +79,7 @@ class AvailabilityMonitor:
         if not self._is_wrong or since_s < CORRECTION_S:
             return
         self._is_wrong, self._corrected_s = False, now_s
-        await publish(self._own())
+        await publish(self._correct_messages())
         self._delivery.corrections += 1
         if since_s > BURST_S:
             log.warning(
@@ -88,7 +88,7 @@ class AvailabilityMonitor:
 
     async def expect_echo(self) -> None:
         """Detect a broker that denies the topic silently, as Mosquitto does with topics that may not be read."""
-        topic = self._own()[0].topic
+        topic = self._correct_messages()[0].topic
         try:
             async with asyncio.timeout(self._echo_s):
                 await self._echoed.wait()

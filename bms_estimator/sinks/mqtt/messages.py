@@ -30,8 +30,8 @@ class PublishedState(NamedTuple):
     """State that the broker has; initially empty."""
 
     snapshot: Snapshot | None = None
-    shown: EntityStates = EntityStates()
-    described: DiscoveryInputs | None = None
+    entity_states: EntityStates = EntityStates()
+    discovery_inputs: DiscoveryInputs | None = None
     """Data of the last discovery message."""
 
 
@@ -41,7 +41,8 @@ class MessageBuilder:
     Args:
         base_topic: First part of all topics.
         device: Name of the pack.
-        sample_period_s: Sample period, if it may exceed the publish period [s].
+        sample_period_s: Sample period if it may exceed the publish period, otherwise 0 [s]. Home Assistant's values
+            expire later with a longer period.
         home_assistant: Settings of Home Assistant.
         alarms: Monitored alarms; retained messages of others are removed.
 
@@ -64,8 +65,8 @@ class MessageBuilder:
         self._unwatched = tuple(name for name in ALARMS if name not in alarms)
         self.root = f"{base_topic}/{device}"
         self.commands: tuple[str, ...] = ()
-        self._home = home_assistant or HomeAssistantSettings()
-        check_names(self._home)
+        self._home_settings = home_assistant or HomeAssistantSettings()
+        check_names(self._home_settings)
         self._device, self._sample_period_s = device, sample_period_s
         self._schema = _schema()  # takes milliseconds, which would delay the event loop later
 
@@ -83,7 +84,7 @@ class MessageBuilder:
         sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
         return [self._retained(AVAILABILITY, b"online"), *sensor]
 
-    def must_deliver(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
+    def guaranteed_messages(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
         """Return the messages of a snapshot that must reach the broker, late if necessary, with their own timestamps.
 
         Args:
@@ -96,7 +97,7 @@ class MessageBuilder:
     def live_messages(
         self, sent: PublishedState, snapshot: Snapshot, now_s: float
     ) -> tuple[list[Message], PublishedState]:
-        """Return those other messages of a snapshot that the broker does not have yet.
+        """Return the messages that are not in ``guaranteed_messages`` and differ from what the broker has.
 
         Args:
             sent: State that the broker has.
@@ -109,6 +110,7 @@ class MessageBuilder:
         _, parameters, health, info, alarms = snapshot
         before, messages = sent.snapshot, []
         has_sample = bool(parameters.elements)
+        # parameters and health have a publish time, so that each new object is published
         if has_sample and (before is None or before.parameters is not parameters):
             messages.append(self._live("parameters", parameters.json_bytes))
         if before is None or before.health.sensor_online != health.sensor_online:
@@ -117,47 +119,53 @@ class MessageBuilder:
             messages.append(self._retained("health", health.json_bytes))
         if before is None or before.info != info:
             messages.append(self._retained("info", info.json_bytes))
-        described = self._described(sent, snapshot)
-        if described != sent.described:
-            payload = self._discovery(described)
-            if sent.described is None or payload != self._discovery(sent.described):
-                messages.append(Message(discovery_topic(self._home, self._device), payload, 1, retain=True))
+        discovery_inputs = self._discovery_inputs(sent, snapshot)
+        if discovery_inputs != sent.discovery_inputs:
+            payload = self._discovery(discovery_inputs)
+            if sent.discovery_inputs is None or payload != self._discovery(sent.discovery_inputs):
+                messages.append(
+                    Message(discovery_topic(self._home_settings, self._device), payload, qos=1, retain=True)
+                )
         published = {alarm.name: alarm for alarm in before.alarms} if before else {}
         messages += [self._retained(f"alarm/{a.name}", a.json_bytes) for a in alarms if a != published.get(a.name)]
-        values, shown = self._home_assistant(sent.shown, snapshot, described, now_s)
-        return messages + values, PublishedState(snapshot, shown, described)
+        values, entity_states = self._home_assistant(sent.entity_states, snapshot, discovery_inputs, now_s)
+        return messages + values, PublishedState(snapshot, entity_states, discovery_inputs)
 
-    def _described(self, sent: PublishedState, snapshot: Snapshot) -> DiscoveryInputs:
+    def _discovery_inputs(self, sent: PublishedState, snapshot: Snapshot) -> DiscoveryInputs:
         """Return the discovery data of a snapshot. The number of cells never decreases."""
         cells = len((snapshot.estimate and snapshot.estimate.cells_v) or ())
-        known_cells = sent.described.cells if sent.described else 0
+        known_cells = sent.discovery_inputs.cells if sent.discovery_inputs else 0
         alarms = tuple(alarm.name for alarm in snapshot.alarms)
         return DiscoveryInputs(snapshot.info, max(cells, known_cells), alarms, self.commands, self._unwatched)
 
     def _home_assistant(
-        self, before: EntityStates, snapshot: Snapshot, described: DiscoveryInputs, now_s: float
+        self, before: EntityStates, snapshot: Snapshot, discovery_inputs: DiscoveryInputs, now_s: float
     ) -> tuple[list[Message], EntityStates]:
-        if not self._home.enabled:
+        if not self._home_settings.enabled:
             return [], before
-        sign = 1.0 if self._home.current_sign == "discharge_positive" else -1.0
-        shown = values_to_publish(before, snapshot, described, now_s, sign=sign)
-        return ([] if shown is before else [self._live(VALUES, _json(shown.values))]), shown
+        sign = 1.0 if self._home_settings.current_sign == "discharge_positive" else -1.0
+        entity_states = values_to_publish(before, snapshot, discovery_inputs, now_s, sign=sign)
+        return ([] if entity_states is before else [self._live(VALUES, _json(entity_states.values))]), entity_states
 
     def _sensor(self, health: Health) -> Message:
         return self._retained(SENSOR_AVAILABILITY, b"online" if health.sensor_online else b"offline")
 
-    def _discovery(self, described: DiscoveryInputs) -> bytes:
+    def _discovery(self, discovery_inputs: DiscoveryInputs) -> bytes:
         """Return the discovery payload. It is empty, which removes the device, if discovery is disabled."""
-        return _json(discovery(self._home, described, self.root, self._sample_period_s)) if self._home.enabled else b""
+        return (
+            _json(discovery(self._home_settings, discovery_inputs, self.root, self._sample_period_s))
+            if self._home_settings.enabled
+            else b""
+        )
 
     def _queued(self, topic: str, report: Payload) -> Message:
-        return Message(f"{self.root}/{topic}", report.json_bytes, 1, retain=False)
+        return Message(f"{self.root}/{topic}", report.json_bytes, qos=1, retain=False)
 
     def _live(self, topic: str, payload: bytes) -> Message:
-        return Message(f"{self.root}/{topic}", payload, 0, retain=False)
+        return Message(f"{self.root}/{topic}", payload, qos=0, retain=False)
 
     def _retained(self, topic: str, payload: bytes) -> Message:
-        return Message(f"{self.root}/{topic}", payload, 1, retain=True)
+        return Message(f"{self.root}/{topic}", payload, qos=1, retain=True)
 
 
 @cache

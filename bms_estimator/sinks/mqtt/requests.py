@@ -27,7 +27,7 @@ MAX_PAYLOAD_BYTES = 4096
 REQUESTS_PER_MIN = 6.0
 """Rate limit of all clients' requests together, granted or not [1/min]. This number of requests may arrive at once."""
 LOG_S = 60.0
-"""Minimum interval between two log lines for each kind of rejection [s]; all rejections are counted."""
+"""Minimum interval between two log lines for each counter of rejection [s]; all rejections are counted."""
 MAX_SHOWN = 40
 """Maximum length of a foreign name in the log [characters]."""
 
@@ -37,7 +37,7 @@ log = structlog.get_logger(__name__)
 
 
 class RequestDispatcher:
-    """Handlers by name, with permissions and rate limits.
+    """Dispatcher of requests to their handlers, with permissions and rate limits.
 
     Args:
         delivery: Statistics in which requests are counted by result.
@@ -54,7 +54,7 @@ class RequestDispatcher:
     ) -> None:
         self._counts, self._allowed, self._monotonic = delivery.requests, commands, monotonic
         self._handlers: dict[str, Handler] = {}
-        self._commands, self._former = (RateLimiter(REQUESTS_PER_MIN, monotonic) for _ in range(2))
+        self._command_limiter, self._former_limiter = (RateLimiter(REQUESTS_PER_MIN, monotonic) for _ in range(2))
         self._logged_s: dict[str, float] = {}
 
     def register(self, name: str, handler: Handler) -> None:
@@ -80,7 +80,7 @@ class RequestDispatcher:
         if name not in COMMANDS + FORMER_READS:
             self.count_refusal("unknown", name[:MAX_SHOWN])
             return None
-        if not (self._commands if name in COMMANDS else self._former).take():
+        if not (self._command_limiter if name in COMMANDS else self._former_limiter).take():
             self.count_refusal("too_many", name)
             return None
         transaction = None
@@ -97,19 +97,19 @@ class RequestDispatcher:
         self._counts["granted"] += 1
         return response
 
-    def count_refusal(self, kind: str, name: str, **why: Any) -> None:
+    def count_refusal(self, counter: str, name: str, **log_fields: Any) -> None:
         """Count a request that is not granted; log the first of a burst.
 
         Args:
-            kind: Counter.
+            counter: Name of the counter.
             name: Name of the request.
-            why: Fields for the log.
+            log_fields: Fields for the log.
         """
-        self._counts[kind] += 1
+        self._counts[counter] += 1
         now_s = self._monotonic()
-        if now_s - self._logged_s.get(kind, -math.inf) >= LOG_S:
-            self._logged_s[kind] = now_s
-            log.warning("request not granted", kind=kind, request=name, so_far=self._counts[kind], **why)
+        if now_s - self._logged_s.get(counter, -math.inf) >= LOG_S:
+            self._logged_s[counter] = now_s
+            log.warning("request not granted", kind=counter, request=name, so_far=self._counts[counter], **log_fields)
 
     def _handler(self, name: str, prefix: str) -> Handler:
         """Return the handler of a request.
@@ -120,7 +120,7 @@ class RequestDispatcher:
         if name in FORMER_READS:
             raise UserError(f"no such request: subscribe to {prefix}{name}")
         if name not in self._allowed:
-            raise UserError(f"{name}: not allowed; the pack file's mqtt.commands names what is")
+            raise UserError(f"{name}: not allowed; mqtt.commands in the pack file lists the allowed commands")
         if name not in self._handlers:
             raise UserError(f"{name}: cannot be asked here")
         return self._handlers[name]

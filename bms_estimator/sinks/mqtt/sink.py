@@ -106,7 +106,7 @@ class MqttSink:
         """Queue a snapshot for publication without waiting."""
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
-        self._outbox_sender.put(self._messages.must_deliver(self._last, snapshot))
+        self._outbox_sender.put(self._messages.guaranteed_messages(self._last, snapshot))
         self._unsent = self._last = snapshot
         self._wake.set()
 

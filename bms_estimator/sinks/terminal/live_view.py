@@ -57,10 +57,10 @@ class LiveView:
         self._true_soc, self._outage = true_soc, outage
         self._states: deque[ViewState] = deque(maxlen=1)  # a newer state replaces one that was not drawn
         self._lines: deque[str] = deque(maxlen=MAX_WAITING_LINES)
-        self._due, self._closing = threading.Event(), threading.Event()
+        self._draw_event, self._closing = threading.Event(), threading.Event()
         self._error: OSError | None = None
         # a daemon: a thread that is blocked in a write must not keep the process alive
-        self._thread = threading.Thread(target=self._work, name="console", daemon=True)
+        self._thread = threading.Thread(target=self._run_thread, name="console", daemon=True)
 
     async def __aenter__(self) -> Self:
         """Start the drawing thread."""
@@ -71,7 +71,7 @@ class LiveView:
     async def __aexit__(self, *_: object) -> None:
         """Restore the terminal and print the last screen once more."""
         self._closing.set()
-        self._due.set()
+        self._draw_event.set()
         await asyncio.to_thread(self._thread.join, CLOSE_S)
 
     def on_message(self, message: DeviceMessage) -> None:
@@ -89,14 +89,14 @@ class LiveView:
             raise self._error
         if self._terminal:
             self._states.append(self._present_state())
-        self._due.set()
+        self._draw_event.set()
 
     def _present_state(self) -> ViewState:
         """Return a copy, because the drawing thread must not see changes."""
         packs = [PackView(name, dict(device.topics), device.last_s) for name, device in self._devices.items()]
         return ViewState(self._wall(), packs, self._outage(), tuple(self._log), self._hint, self._true_soc())
 
-    def _work(self) -> None:
+    def _run_thread(self) -> None:
         try:
             if self._terminal:
                 self._draw_screens()
@@ -123,8 +123,8 @@ class LiveView:
         """Yield the waiting items until the view is closed and no item waits."""
         closed = False
         while not closed:
-            self._due.wait()
-            self._due.clear()
+            self._draw_event.wait()
+            self._draw_event.clear()
             closed = self._closing.is_set()
             while waiting:
                 yield waiting.popleft()

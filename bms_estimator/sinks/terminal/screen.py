@@ -27,14 +27,14 @@ def build_screen(view: ViewState, width: int, height: int) -> RenderableType:
     packs = sorted(view.packs, key=lambda pack: not pack.alarms())
     messages = [message for pack in packs for message in _messages(pack, view)]
     messages.sort(key=lambda message: message.style != URGENT_STYLE)
-    free = max(height - OTHER_LINES - min(len(messages), MAX_MESSAGES), 1)
+    max_packs = max(height - OTHER_LINES - min(len(messages), MAX_MESSAGES), 1)
     lines: list[RenderableType] = []
     if view.outage is not None:
         reason = f": {view.outage.reason}" if view.outage.reason else ""
         lines.append(Text(f"no broker since {clock_text(view.outage.since_s)}{reason}", style=URGENT_STYLE))
-    lines.append(_pack_table(view, packs[:free], width) if packs else "no pack has published anything yet")
-    if len(packs) > free:
-        lines.append(f"packs not shown: {len(packs) - free}")
+    lines.append(_pack_table(view, packs[:max_packs], width) if packs else "no pack has published anything yet")
+    if len(packs) > max_packs:
+        lines.append(f"packs not shown: {len(packs) - max_packs}")
     lines += messages[:MAX_MESSAGES]
     if len(messages) > MAX_MESSAGES:
         lines.append(Text(f"alarms and faults not shown: {len(messages) - MAX_MESSAGES}", style=URGENT_STYLE))

@@ -33,10 +33,10 @@ class TerminalSink:
         clock: Clock | None = None,
     ) -> None:
         self._clock = clock or Clock()
-        self._published = TopicCache(BASE_TOPIC)
-        self._view = LiveView(self._published.devices, log=log, hint=hint, true_soc=true_soc, wall=self._clock.wall)
+        self._cache = TopicCache(BASE_TOPIC)
+        self._view = LiveView(self._cache.devices, log=log, hint=hint, true_soc=true_soc, wall=self._clock.wall)
         self._builder: MessageBuilder | None = None
-        self._before: Snapshot | None = None
+        self._previous: Snapshot | None = None
         self._sent = PublishedState()
 
     async def __aenter__(self) -> Self:
@@ -55,7 +55,7 @@ class TerminalSink:
             OSError: Standard output could not be written.
         """
         for message in self._messages(snapshot):
-            received = self._published.take(message.topic, message.payload, self._clock.wall())
+            received = self._cache.take(message.topic, message.payload, self._clock.wall())
             if received is not None:
                 self._view.on_message(received)
         self._view.show()
@@ -66,7 +66,7 @@ class TerminalSink:
         if self._builder is None:
             self._builder = MessageBuilder(BASE_TOPIC, snapshot.info.device)
             birth = self._builder.birth_messages()
-        must_deliver = self._builder.must_deliver(self._before, snapshot)
+        guaranteed_messages = self._builder.guaranteed_messages(self._previous, snapshot)
         live, self._sent = self._builder.live_messages(self._sent, snapshot, self._clock.monotonic())
-        self._before = snapshot
-        return [*birth, *must_deliver, *live]
+        self._previous = snapshot
+        return [*birth, *guaranteed_messages, *live]

@@ -8,7 +8,7 @@ from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.sinks.terminal.json_fields import JsonFields
 
 MAX_SILENT_S = 10.0
-"""Interval of a service's health messages [s]. A service that is silent for longer counts as gone."""
+"""Maximum time between two messages of a running service [s]. A service that is silent for longer counts as gone."""
 ALARM_PREFIX = "alarm/"
 """Prefix of alarm topics."""
 BAND_STDS = 2.0
@@ -29,7 +29,7 @@ class PackView(NamedTuple):
     device: str
     """Name of the device."""
     topics: Mapping[str, Any]
-    """Payloads by topic below the device's."""
+    """Payloads by topic, relative to the device's topic."""
     received_s: float
     """Time of the last message, seconds since 1970."""
 

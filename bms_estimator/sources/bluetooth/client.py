@@ -38,18 +38,18 @@ class BleProducer(LineProducer):
         for library in ("aiobmsble", "bleak", "bleak_retry_connector"):  # LineSource logs the reason in one line
             logging.getLogger(library).setLevel(logging.CRITICAL)
         self._settings = settings
-        self._not_measured = 0
+        self._unmeasured_samples = 0
         self._fault: str | None = None
 
     @property
     def name(self) -> str:
         """Name of the BMS."""
-        return self._settings.described
+        return self._settings.short_description
 
     @property
     def counters(self) -> Mapping[str, int]:
         """Number of samples without voltage or current since start."""
-        return {"not_measured": self._not_measured}
+        return {"not_measured": self._unmeasured_samples}
 
     @property
     def fault(self) -> str | None:
@@ -59,17 +59,17 @@ class BleProducer(LineProducer):
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """Connect, and yield one line for each poll."""
         try:
-            device, kind = await self._find()
-            async with kind(device) as bms:
+            device, driver = await self._find()
+            async with driver(device) as bms:
                 sample = await bms.async_update()
                 yield CONNECTED
                 loop = asyncio.get_running_loop()
-                next_s = loop.time()
+                next_poll_s = loop.time()
                 while True:
                     if line := self._line(sample):
                         yield line
-                    next_s = max(next_s + self._settings.poll_s, loop.time())
-                    await asyncio.sleep(next_s - loop.time())
+                    next_poll_s = max(next_poll_s + self._settings.poll_s, loop.time())
+                    await asyncio.sleep(next_poll_s - loop.time())
                     sample = await bms.async_update()
         except PermissionError:
             raise SourceUnavailableError("the BMS asks for a password; remove the password in its app") from None
@@ -85,7 +85,7 @@ class BleProducer(LineProducer):
     def _line(self, sample: Mapping[str, object]) -> bytes | None:
         reading = convert_sample(sample)
         if reading is None:
-            self._not_measured += 1
+            self._unmeasured_samples += 1
             self._fault = "the BMS responds, but reports no voltage or no current"
             return None
         self._fault = None
@@ -94,12 +94,12 @@ class BleProducer(LineProducer):
         )
 
     async def _find(self) -> tuple[BLEDevice, type[BaseBMS]]:
-        """Find the BMS and the driver of its kind.
+        """Find the BMS and its driver.
 
         Raises:
-            SourceUnavailableError: The BMS does not advertise, or its kind is unknown.
+            SourceUnavailableError: The BMS does not advertise, or aiobmsble does not recognize it.
         """
-        advertisements: list[AdvertisementData] = []
+        advertisements: list[AdvertisementData] = []  # only the latest; at the end that of the BMS
 
         def is_wanted(device: BLEDevice, advertisement: AdvertisementData) -> bool:
             advertisements[:] = [advertisement]
@@ -113,13 +113,13 @@ class BleProducer(LineProducer):
                 "the BMS does not advertise: is it in range and on, and is no phone connected to it?"
             )
         configured = self._settings.bms
-        kind = await (
+        driver = await (
             bms_cls(f"{configured.removesuffix('_bms')}_bms")
             if configured
             else bms_identify(advertisements[0], device.address)
         )
-        if kind is None:
+        if driver is None:
             raise SourceUnavailableError(
                 f"{device.name or device.address}: its kind is not recognized by aiobmsble; set source.bms"
             )
-        return device, kind
+        return device, driver

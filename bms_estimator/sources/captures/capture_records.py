@@ -30,13 +30,13 @@ def split_records(
 
     Args:
         raw: Records; the last one may be incomplete.
-        max_length: Maximum length of a record [bytes]; a longer one is damaged.
+        max_length: Maximum length of a record's payload [bytes]. A record with a longer one is damaged.
         arrival_bits: Output, shape (n,): arrival times as the bits of a float64.
         ends: Output, shape (n,): end of each record's bytes in ``payload``.
         payload: Output: concatenated bytes of the records.
 
     Returns:
-        Number of bytes parsed, of records, and of payload bytes; and 1 if the next record is damaged, 0 if incomplete.
+        Number of parsed bytes, number of records, number of payload bytes, and 1 if the next record is damaged, otherwise 0.
     """
     position = records = payload_bytes = 0
     while records < ends.size:

@@ -33,7 +33,10 @@ def read_curve(path: Path) -> CurveColumns | None:
         UserError: The columns are there, but their values are not a curve.
     """
     rows = _rows(path, OCV_COLUMNS)
-    return None if rows is None else _checked(path, rows, has_hysteresis=not np.isnan(rows[:, 2]).all())
+    if rows is None:
+        return None
+    hysteresis_v = rows[:, 2]
+    return _make_curve(path, rows, has_hysteresis=not np.isnan(hysteresis_v).all())
 
 
 def read_polarisation(path: Path) -> Floats | None:
@@ -46,25 +49,25 @@ def read_polarisation(path: Path) -> Floats | None:
     Raises:
         UserError: The columns exist, but a row lacks a number.
     """
-    rows = _rows(path, POLARISATION_COLUMNS, without="time_s")
-    if rows is not None and (rows.shape[0] == 0 or not np.isfinite(rows[:, :2]).all()):
+    rows = _rows(path, POLARISATION_COLUMNS, excluded_column="time_s")
+    if rows is not None and (rows.shape[0] == 0 or not np.isfinite(rows[:, :2]).all()):  # temperature is optional
         raise UserError(
             f"{path}: {'no rows' if rows.shape[0] == 0 else 'a value is missing'}: give current_a and voltage_v"
         )
     return rows
 
 
-def _rows(path: Path, columns: tuple[str, str, str], without: str = "") -> Floats | None:
+def _rows(path: Path, columns: tuple[str, str, str], excluded_column: str = "") -> Floats | None:
     """Return three columns of a CSV file, shape (n, 3), or None if the file does not have the first two.
 
-    The third column is optional and NaN if absent. A file with the column ``without`` is not read.
+    The third column is optional, and NaN if absent. A file that has the column ``excluded_column`` is not read.
     """
     if not path.is_file() or not path.name.lower().endswith((".csv", ".csv.gz")):
         return None
     try:
         with gzip.open(path, "rt") if path.name.lower().endswith(".gz") else path.open() as text:
             rows = csv.DictReader(line for line in text if line.strip() and not line.startswith("#"))
-            if not set(columns[:2]) <= set(rows.fieldnames or ()) or without in (rows.fieldnames or ()):
+            if not set(columns[:2]) <= set(rows.fieldnames or ()) or excluded_column in (rows.fieldnames or ()):
                 return None
             values = [[_number(path, rows.line_num, name, row.get(name)) for name in columns] for row in rows]
     except (OSError, EOFError, UnicodeDecodeError):
@@ -81,11 +84,16 @@ def _number(path: Path, line: int, name: str, cell: str | None) -> float:
         raise UserError(f"{path}: line {line}: {name} = {cell!r}: must be a number") from None
 
 
-def _checked(path: Path, values: Floats, has_hysteresis: bool) -> CurveColumns:
+def _make_curve(path: Path, values: Floats, has_hysteresis: bool) -> CurveColumns:
+    """Sort and check the values of a curve.
+
+    Raises:
+        UserError: A value is missing, or the SOC is outside 0..1.
+    """
     values = values[np.argsort(values[:, 0], kind="stable")]
     soc, ocv_v, hysteresis_v = values.T
-    wanted = values if has_hysteresis else values[:, :2]
-    if soc.size == 0 or not np.isfinite(wanted).all():
+    required_values = values if has_hysteresis else values[:, :2]
+    if soc.size == 0 or not np.isfinite(required_values).all():
         raise UserError(f"{path}: {'no rows' if soc.size == 0 else 'a value is missing'}: give numbers in every column")
     if soc[0] < 0.0 or soc[-1] > 1.0:
         raise UserError(f"{path}: soc runs from {soc[0]:g} to {soc[-1]:g}: must lie within 0..1, not percent")

@@ -35,7 +35,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.settings.polled_source import PolledSource
+from bms_estimator.settings.base_source import BaseSource
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES, split_records
 
@@ -79,10 +79,10 @@ class CaptureHeader:
 _VERSION_ADAPTER, _HEADER_ADAPTER = TypeAdapter(_HeaderVersion), TypeAdapter(CaptureHeader)
 
 
-def make_header(sensor: SensorSettings, source: PolledSource | None = None) -> CaptureHeader:
+def make_header(sensor: SensorSettings, source: BaseSource | None = None) -> CaptureHeader:
     """Return the header of a capture of ``source``; None: of the serial device of ``sensor``."""
     if source is not None:
-        return CaptureHeader(sensor.protocol, source.described, 0, sensor.current_sign)
+        return CaptureHeader(sensor.protocol, source.short_description, baud=0, current_sign=sensor.current_sign)
     return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign, address=sensor.address)
 
 
@@ -108,8 +108,11 @@ class CaptureBatch:
     """Batch of recorded reads, as arguments of a decoder's ``feed_reads``."""
 
     arrivals_s: NDArray[np.float64]
+    """Arrival time of each read [s]."""
     ends: NDArray[np.int64]
+    """End of each read's bytes in ``data``."""
     data: NDArray[np.uint8]
+    """Concatenated bytes of the reads."""
     damaged: bool
     """The record after this batch is damaged."""
     unread_bytes: int = 0
@@ -136,14 +139,15 @@ class CaptureWriter:
 
     def __init__(self, path: Path, header: CaptureHeader) -> None:
         started = header.started or datetime.now(tz=UTC).isoformat(timespec="milliseconds")
-        head = json.dumps(dataclasses.asdict(header) | {"started": started}).encode()
+        header_json = json.dumps(dataclasses.asdict(header) | {"started": started}).encode()
         try:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
         except FileExistsError:
             raise UserError(f"{path}: exists already; a capture is never overwritten") from None
         except OSError as error:
             raise UserError(f"{path}: cannot be written: {error.strerror}") from None
-        self._append(MAGIC + _LENGTH.pack(len(head)) + head + _CRC.pack(binascii.crc_hqx(head, 0xFFFF)))
+        crc = _CRC.pack(binascii.crc_hqx(header_json, 0xFFFF))
+        self._append(MAGIC + _LENGTH.pack(len(header_json)) + header_json + crc)
 
     def write(self, arrival_s: float, data: bytes) -> None:
         """Append one read of the line.
@@ -228,17 +232,18 @@ def read_capture(path: Path) -> Iterator[CaptureBatch]:
             _read_header(path, file)
         except (OSError, EOFError, zlib.error) as error:
             raise UserError(f"{path}: cannot be read: {error}") from None
-        rest = b""
-        while more := _read_some(file, CHUNK_BYTES):
-            raw = np.frombuffer(rest + more, dtype=np.uint8)
+        unparsed = b""  # start of an incomplete record
+        while chunk := _read_chunk(file, CHUNK_BYTES):
+            raw = np.frombuffer(unparsed + chunk, dtype=np.uint8)
             batch, parsed_bytes = _split(raw)
-            rest = raw[parsed_bytes:].tobytes()
+            unparsed = raw[parsed_bytes:].tobytes()
             if batch.ends.size or batch.damaged:
                 yield batch
             if batch.damaged:
                 return
-        if rest:  # the record is known to be incomplete only at the end of the file, after the last batch
-            yield dataclasses.replace(_split(np.frombuffer(b"", dtype=np.uint8))[0], unread_bytes=len(rest))
+        if unparsed:  # the record is known to be incomplete only at the end of the file, after the last batch
+            empty_batch, _ = _split(np.frombuffer(b"", dtype=np.uint8))
+            yield dataclasses.replace(empty_batch, unread_bytes=len(unparsed))
 
 
 def _split(raw: NDArray[np.uint8]) -> tuple[CaptureBatch, int]:
@@ -258,7 +263,7 @@ def _open(path: Path) -> IO[bytes]:
     return path.open("rb")
 
 
-def _read_some(file: IO[bytes], size: int) -> bytes:
+def _read_chunk(file: IO[bytes], size: int) -> bytes:
     """Read up to ``size`` bytes. A truncated or damaged gzip file counts as ended."""
     try:
         return file.read(size)
@@ -276,10 +281,10 @@ def _read_header(path: Path, file: IO[bytes]) -> CaptureHeader:
     text, crc = file.read(min(length, _MAX_HEADER_BYTES)), file.read(_CRC.size)
     if len(text) != length or len(crc) != _CRC.size or _CRC.unpack(crc)[0] != binascii.crc_hqx(text, 0xFFFF):
         raise UserError(f"{path}: its header is damaged or cut off")
-    return _checked_header(path, text)
+    return _parse_header(path, text)
 
 
-def _checked_header(path: Path, text: bytes) -> CaptureHeader:
+def _parse_header(path: Path, text: bytes) -> CaptureHeader:
     """Parse and check a header's JSON.
 
     Raises:

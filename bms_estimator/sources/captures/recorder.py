@@ -47,15 +47,15 @@ class CaptureRecorder:
     ) -> None:
         self._writer = CaptureWriter(path, header)
         self._path, self._max_queued_chunks, self._sync_s = path, max_queued_chunks, sync_s
-        self._waiting: queue.SimpleQueue[tuple[float, bytes] | OSError | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[float, bytes] | OSError | None] = queue.SimpleQueue()
         self._overflowed = False
-        self._received = self._written = self.bytes = 0
+        self._received_chunks = self._written_chunks = self.bytes = 0
         self.ended: Future[None] = DiskThread("recording").submit(self._record)
 
     @property
     def missed_reads(self) -> int:
         """Number of chunks missing in the file; 0 until the recording has ended."""
-        return self._received - self._written if self.ended.done() else 0
+        return self._received_chunks - self._written_chunks if self.ended.done() else 0
 
     @property
     def fault(self) -> str:
@@ -67,17 +67,17 @@ class CaptureRecorder:
 
     def write(self, arrival_s: float, data: bytes) -> None:
         """Queue one chunk. After the end of the recording it is only counted."""
-        self._received += 1
+        self._received_chunks += 1
         if self._overflowed or self.ended.done():
             return
-        if self._waiting.qsize() >= self._max_queued_chunks:
+        if self._queue.qsize() >= self._max_queued_chunks:
             self._overflowed = True
-            self._waiting.put(
+            self._queue.put(
                 OSError(errno.ENOBUFS, f"the disk is too slow, {self._max_queued_chunks:,} chunks are queued")
             )
             return
         self.bytes += len(data)
-        self._waiting.put((arrival_s, data))
+        self._queue.put((arrival_s, data))
 
     def __enter__(self) -> Self:
         """Return the recorder."""
@@ -85,10 +85,10 @@ class CaptureRecorder:
 
     def __exit__(self, *_: object) -> None:
         """Wait until the queued chunks are written, unless the disk writes none for ``SHUTDOWN_TIMEOUT_S``."""
-        self._waiting.put(None)
-        before = -1
-        while not self.ended.done() and self._written > before:
-            before = self._written
+        self._queue.put(None)
+        written_before = -1
+        while not self.ended.done() and self._written_chunks > written_before:
+            written_before = self._written_chunks
             wait([self.ended], SHUTDOWN_TIMEOUT_S)
         if not self.ended.done():
             log.warning("recording not ended", file=str(self._path), reason=self.fault)
@@ -103,18 +103,23 @@ class CaptureRecorder:
             raise
 
     def _write_chunks(self) -> None:
-        sync_s = time.monotonic() + self._sync_s
+        """Write queued chunks until None is queued.
+
+        Raises:
+            OSError: The disk failed, or the queue overflowed.
+        """
+        sync_due_s = time.monotonic() + self._sync_s
         while True:
-            if (now_s := time.monotonic()) >= sync_s:
+            if (now_s := time.monotonic()) >= sync_due_s:
                 self._writer.sync()
-                sync_s = now_s + self._sync_s
+                sync_due_s = now_s + self._sync_s
             try:
-                read = self._waiting.get(timeout=sync_s - now_s)
+                item = self._queue.get(timeout=sync_due_s - now_s)
             except queue.Empty:
                 continue
-            if read is None:
+            if item is None:
                 return
-            if isinstance(read, OSError):
-                raise read
-            self._writer.write(*read)
-            self._written += 1
+            if isinstance(item, OSError):
+                raise item
+            self._writer.write(*item)
+            self._written_chunks += 1

@@ -19,6 +19,7 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, read_sensor_settings
 from bms_estimator.sources.captures.tables import READERS, ColumnTable, Sign, convert_table, table_reader
+from bms_estimator.sources.source import ReceivedSamples
 
 PACED_INTERVAL_S = 0.05
 """Interval at which a paced replay yields due samples [s]."""
@@ -64,13 +65,15 @@ class RawCapture:
         self, path: Path, sensor: SensorSettings | None = None, current_sign: CurrentSign | None = None
     ) -> None:
         recorded = read_sensor_settings(path)
-        used = sensor or recorded
-        if used.protocol != recorded.protocol:
+        decoder_settings = sensor or recorded
+        if decoder_settings.protocol != recorded.protocol:
             raise UserError(
-                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {used.protocol!r}: "
+                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {decoder_settings.protocol!r}: "
                 "give settings with that protocol, or none"
             )
-        self.decoder = make_protocol(used.model_copy(update={"current_sign": current_sign or used.current_sign}))
+        self.decoder = make_protocol(
+            decoder_settings.model_copy(update={"current_sign": current_sign or decoder_settings.current_sign})
+        )
         self.damaged, self.unread_bytes = False, 0
         self._path = path
         self._read_bytes, self._size = 0, path.stat().st_size
@@ -103,11 +106,11 @@ class Replay:
     Args:
         capture: Capture to replay.
         speed: Speed relative to the recording; None: full speed.
-        longest_s: At full speed, maximum duration of a block on the samples' clock [s].
+        max_block_s: At full speed, maximum duration of a block on the samples' clock [s].
         monotonic: Monotonic clock [s].
     """
 
-    message: str | None = None
+    silence_reason: str | None = None
     """Reason why no samples arrive; None, because a capture always has a next sample or ends."""
 
     def __init__(
@@ -115,14 +118,13 @@ class Replay:
         capture: Capture,
         *,
         speed: float | None = None,
-        longest_s: float = math.inf,
+        max_block_s: float = math.inf,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self.capture = capture
         self._decoder = capture.decoder if isinstance(capture, RawCapture) else None
-        self._speed, self._longest_s, self._monotonic = speed, longest_s, monotonic
+        self._speed, self._max_block_s, self._monotonic = speed, max_block_s, monotonic
         self.samples = 0
-        self.cells: CellBlock = NO_CELLS
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -148,24 +150,23 @@ class Replay:
     async def __aexit__(self, *_: object) -> None:
         """Do nothing; the file is closed by the iteration."""
 
-    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+    async def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks of samples; none of them is empty."""
-        async for block in self._unpaced() if self._speed is None else self._paced(self._speed):
-            self.samples += block.size
-            yield block
+        async for received in self._unpaced() if self._speed is None else self._paced(self._speed):
+            self.samples += received.samples.size
+            yield received
 
-    async def _unpaced(self) -> AsyncIterator[SampleBlock]:
+    async def _unpaced(self) -> AsyncIterator[ReceivedSamples]:
         for block in self.capture:
             cells = self._cells()
-            for part in _parts(block["time_s"], self._longest_s):
-                self.cells = cells[part]
-                yield block[part]
+            for part in _parts(block["time_s"], self._max_block_s):
+                yield ReceivedSamples(block[part], cells[part])
 
     def _cells(self) -> CellBlock:
         """Return the cell voltages of the capture's last block."""
         return self._decoder.cells if self._decoder else NO_CELLS
 
-    async def _paced(self, speed: float) -> AsyncIterator[SampleBlock]:
+    async def _paced(self, speed: float) -> AsyncIterator[ReceivedSamples]:
         """Yield each sample when it is due; the first one immediately."""
         start_s, last_s, elapsed_s = self._monotonic(), math.nan, 0.0
         for block in self.capture:
@@ -175,21 +176,20 @@ class Replay:
                 now_s = speed * (self._monotonic() - start_s)
                 end = int(np.searchsorted(due_s, now_s, side="right"))
                 if end > first:
-                    self.cells = self._cells()[first:end]
-                    yield block[first:end]
+                    yield ReceivedSamples(block[first:end], self._cells()[first:end])
                     first = end
                 else:
                     await asyncio.sleep(min((due_s[first] - now_s) / speed + PACED_INTERVAL_S, 1.0))
             last_s, elapsed_s = float(block["time_s"][-1]), float(due_s[-1])
 
 
-def _parts(time_s: NDArray[np.float64], longest_s: float) -> Iterator[slice]:
+def _parts(time_s: NDArray[np.float64], max_block_s: float) -> Iterator[slice]:
     """Yield slices that divide a block into parts of limited duration."""
-    if math.isinf(longest_s):
+    if math.isinf(max_block_s):
         yield slice(None)
         return
-    number = np.floor(_elapsed(time_s, float(time_s[0])) / longest_s)
-    edges = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), time_s.size]
+    part_number = np.floor(_elapsed(time_s, float(time_s[0])) / max_block_s)
+    edges = [0, *(np.flatnonzero(np.diff(part_number)) + 1).tolist(), time_s.size]
     for first, end in itertools.pairwise(edges):
         yield slice(first, end)
 

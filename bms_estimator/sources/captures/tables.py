@@ -36,6 +36,11 @@ class ColumnNaming(NamedTuple):
     current_sign: CurrentSign | None
     """Direction of positive current; None if the column names do not define it."""
 
+    @property
+    def required(self) -> tuple[str, str, str]:
+        """Names of the columns that a table must have."""
+        return self.time_s, self.current_a, self.voltage_v
+
 
 NAMINGS = (
     ColumnNaming("time_s", "current_a", "voltage_v", "temperature_c", None),
@@ -47,14 +52,14 @@ NAMINGS = (
 class Sign(NamedTuple):
     """Direction of positive current in a table."""
 
-    given: CurrentSign | None = None
+    configured: CurrentSign | None = None
     """Configured direction, which takes precedence over the column names; None: not configured."""
-    otherwise: CurrentSign = "discharge_positive"
-    """Default direction if neither ``given`` nor the column names define one."""
+    default: CurrentSign = "discharge_positive"
+    """Default direction if neither ``configured`` nor the column names define one."""
 
     def factor(self, naming: ColumnNaming) -> float:
         """Return the factor, 1 or -1, that makes discharge positive."""
-        return 1.0 if (self.given or naming.current_sign or self.otherwise) == "discharge_positive" else -1.0
+        return 1.0 if (self.configured or naming.current_sign or self.default) == "discharge_positive" else -1.0
 
 
 class ColumnTable(Protocol):
@@ -118,15 +123,15 @@ class CsvTable:
             raise UserError(f"{self._path}: cannot be read: {error.strerror}") from None
 
     def _blocks(self, text: TextIOWrapper) -> Iterator[SampleBlock]:
-        header, line = _header(self._path, text)
-        columns = _columns(self._path, header, self._sign)
+        header, line = _read_header(self._path, text)
+        columns = _find_columns(self._path, header, self._sign)
         rows = 0
         while lines := list(itertools.islice(text, BLOCK_ROWS)):
             values = self._values(lines, line + 1, columns, len(header))
             line += len(lines)
             if len(values):
                 rows += len(values)
-                block, implausible = _block(values.T, columns)
+                block, implausible = _make_block(values.T, columns)
                 self.implausible += implausible
                 yield block
         if rows == 0:
@@ -151,8 +156,8 @@ class CsvTable:
             cells = next(csv.reader([line]))
             if len(cells) <= max(columns.indices):
                 raise UserError(f"{self._path}: line {number}: {len(cells)} values, but the header has {width} columns")
-            named = zip(columns.names, columns.indices, strict=True)
-            rows.append([self._number(cells[index], number, name) for name, index in named])
+            indices_by_name = zip(columns.names, columns.indices, strict=True)
+            rows.append([self._number(cells[index], number, name) for name, index in indices_by_name])
         return np.array(rows)
 
     def _number(self, cell: str, line: int, column: str) -> float:
@@ -188,7 +193,7 @@ class ParquetTable:
 
         try:
             with parquet.ParquetFile(self._path) as file:
-                columns = _columns(self._path, file.schema_arrow.names, self._sign)
+                columns = _find_columns(self._path, file.schema_arrow.names, self._sign)
                 if file.metadata.num_rows == 0:
                     raise UserError(f"{self._path}: no samples")
                 rows = 0
@@ -196,7 +201,7 @@ class ParquetTable:
                     rows += batch.num_rows
                     self.fraction = rows / file.metadata.num_rows
                     values = [self._numbers(batch.column(name), name) for name in columns.names]
-                    block, implausible = _block(values, columns)
+                    block, implausible = _make_block(values, columns)
                     self.implausible += implausible
                     yield block
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError, MemoryError) as error:
@@ -236,8 +241,8 @@ def convert_table(table: ColumnTable, sign: Sign) -> SampleBlock:
     Raises:
         UserError: A column is missing or does not contain numbers.
     """
-    columns = _columns("the table", list(table), sign)
-    return _block([_numeric(name, table[name]) for name in columns.names], columns)[0]
+    columns = _find_columns("the table", list(table), sign)
+    return _make_block([_numeric(name, table[name]) for name in columns.names], columns)[0]
 
 
 def _numeric(name: str, column: ArrayLike) -> NDArray[np.float64]:
@@ -260,7 +265,7 @@ def _is_data(line: str) -> bool:
     return bool(line.strip()) and not line.startswith("#")
 
 
-def _header(path: Path, text: TextIOWrapper) -> tuple[list[str], int]:
+def _read_header(path: Path, text: TextIOWrapper) -> tuple[list[str], int]:
     """Return the names in the first line that is neither empty nor a comment, and the number of that line."""
     for number, line in enumerate(iter(text.readline, ""), 1):
         if _is_data(line):
@@ -268,28 +273,30 @@ def _header(path: Path, text: TextIOWrapper) -> tuple[list[str], int]:
     raise UserError(f"{path}: empty: the first line must name the columns, {_header_text(NAMINGS[0])}")
 
 
-def _columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Columns:
+def _find_columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Columns:
     """Find the columns of a sample.
 
     Raises:
         UserError: Columns are missing; the message lists them and the existing columns.
     """
-    naming = max(NAMINGS, key=lambda naming: sum(name in header for name in naming[:3]))
-    missing = [name for name in naming[:3] if name not in header]
+    naming = max(NAMINGS, key=lambda naming: sum(name in header for name in naming.required))
+    missing = [name for name in naming.required if name not in header]
     if missing:
         raise UserError(
             f"{path}: no column {' nor '.join(missing)}; found {', '.join(header)}; "
             f"needed: {_header_text(NAMINGS[0])}, or {_header_text(NAMINGS[1])} (Battery Data Format)"
         )
-    names = tuple(name for name in naming[:4] if name in header)
+    names = tuple(name for name in (*naming.required, naming.temperature_c) if name in header)
     return _Columns(tuple(header.index(name) for name in names), names, sign.factor(naming))
 
 
 def _header_text(naming: ColumnNaming) -> str:
-    return f"{','.join(naming[:3])}[,{naming.temperature_c}]"
+    return f"{','.join(naming.required)}[,{naming.temperature_c}]"
 
 
-def _block(values: Sequence[NDArray[np.float64]] | NDArray[np.float64], columns: _Columns) -> tuple[SampleBlock, int]:
+def _make_block(
+    values: Sequence[NDArray[np.float64]] | NDArray[np.float64], columns: _Columns
+) -> tuple[SampleBlock, int]:
     """Return the samples of a table's columns, and the number of implausible temperatures."""
     block = np.zeros(len(values[0]), dtype=SAMPLE)
     block["time_s"] = values[0]

@@ -14,14 +14,14 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.fieldbus.can_signals import CanMap
+from bms_estimator.sources.fieldbus.can_signals import CanDecoder
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
-LISTEN_S = 0.2
-"""Interval at which the thread checks for its end [s]."""
-CLOSE_S = 5.0
+RECEIVE_TIMEOUT_S = 0.2
+"""Timeout of a receive call [s]. After each call the thread checks if it must stop."""
+SHUTDOWN_TIMEOUT_S = 5.0
 """Timeout of the thread at its end [s]. A thread whose adapter hangs is abandoned."""
-BUS_OFF = 0x40
+BUS_OFF_BIT = 0x40
 """Bit in the identifier of an error frame: CAN_ERR_BUSOFF of linux/can/error.h."""
 
 Deliver = Callable[[bytes | Exception], None]
@@ -44,26 +44,26 @@ class CanProducer(LineProducer):
             raise UserError(f"source.interface = {settings.interface!r}: python-can has {known}")
         logging.getLogger("can").setLevel(logging.CRITICAL)  # its log lines are replaced by one of this module
         self._settings = settings
-        self._map = CanMap(settings)
-        self._junk = self._error_frames = 0
-        self._is_off = False
+        self._decoder = CanDecoder(settings)
+        self._invalid_frames = self._error_frames = 0
+        self._is_bus_off = False
 
     @property
     def name(self) -> str:
         """Name of the bus."""
-        return self._settings.described
+        return self._settings.short_description
 
     @property
     def counters(self) -> Mapping[str, int]:
         """Counters of the decoder, number of ``error_frames``, and number of invalid frames of an adapter (``junk``)."""
-        return {**self._map.counters, "error_frames": self._error_frames, "junk": self._junk}
+        return {**self._decoder.counters, "error_frames": self._error_frames, "junk": self._invalid_frames}
 
     @property
     def fault(self) -> str | None:
         """Reason why no reading arrives."""
-        if self._is_off:
+        if self._is_bus_off:
             return "the controller is bus off: are bitrate, wiring and termination right?"
-        missing = self._map.missing
+        missing = self._decoder.missing
         return missing and f"connected, but nothing comes of {missing}: are identifiers, bitrate and wiring right?"
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
@@ -83,7 +83,7 @@ class CanProducer(LineProducer):
             raise item
         finally:
             stop.set()
-            await asyncio.to_thread(thread.join, CLOSE_S)
+            await asyncio.to_thread(thread.join, SHUTDOWN_TIMEOUT_S)
 
     def _listen(self, deliver: Deliver, stop: threading.Event) -> None:
         """Deliver lines until the bus is lost, and then the error. Runs in the thread."""
@@ -92,7 +92,7 @@ class CanProducer(LineProducer):
             try:
                 deliver(CONNECTED)
                 while not stop.is_set():
-                    self._take(self._next(bus), deliver)
+                    self._handle_message(self._receive(bus), deliver)
             finally:
                 with contextlib.suppress(Exception):  # the adapter may have been removed
                     bus.shutdown()
@@ -109,9 +109,9 @@ class CanProducer(LineProducer):
         options: dict[str, Any] = {**settings.options}
         if settings.bitrate is not None:
             options["bitrate"] = settings.bitrate
-        filters = [
+        filters = [  # identifiers have 29 or 11 bits
             {"can_id": frame.id, "can_mask": 0x1FFF_FFFF if frame.extended else 0x7FF, "extended": frame.extended}
-            for frame in self._map.frame_ids
+            for frame in self._decoder.frame_ids
         ]
         try:
             return can.Bus(
@@ -124,35 +124,35 @@ class CanProducer(LineProducer):
         except Exception as error:  # each interface raises the errors of its library
             raise SourceUnavailableError(f"cannot be opened: {error}") from error
 
-    def _next(self, bus: can.BusABC) -> can.Message | None:
+    def _receive(self, bus: can.BusABC) -> can.Message | None:
         """Return the next frame if it arrives soon.
 
         Raises:
             SourceUnavailableError: The bus is lost.
         """
         try:
-            return bus.recv(LISTEN_S)
+            return bus.recv(RECEIVE_TIMEOUT_S)
         except ValueError:  # slcan received a line that is not a frame
-            self._junk += 1
+            self._invalid_frames += 1
             return None
         except Exception as error:  # each interface raises the errors of its library
             raise SourceUnavailableError(f"lost: {error}") from error
 
-    def _take(self, message: can.Message | None, deliver: Deliver) -> None:
+    def _handle_message(self, message: can.Message | None, deliver: Deliver) -> None:
         if message is None or message.is_remote_frame:
             return
-        self._is_off = message.is_error_frame and bool(message.arbitration_id & BUS_OFF)
+        self._is_bus_off = message.is_error_frame and bool(message.arbitration_id & BUS_OFF_BIT)
         if message.is_error_frame:
             self._error_frames += 1
         elif message.dlc != len(message.data):  # slcan received a frame with lost characters
-            self._junk += 1
+            self._invalid_frames += 1
         elif (line := self._line(message)) is not None:
             deliver(line)
 
     def _line(self, message: can.Message) -> bytes | None:
         """Return the line of a sample that this frame completes."""
         data = bytes(message.data)
-        reading = self._map.feed(time.monotonic(), message.arbitration_id, message.is_extended_id, data)
+        reading = self._decoder.feed(time.monotonic(), message.arbitration_id, message.is_extended_id, data)
         return reading and sample_json_line(
             reading.voltage_v, reading.current_a, temperature_c=reading.temperature_c, cells_v=reading.cells_v
         )

@@ -22,6 +22,8 @@ MAX_DISTANCE_PERIODS = 3.0
 """Maximum time between voltage and current of one reading, in sample periods."""
 MAX_SHOWN_NAMES = 20
 """Maximum number of signal names of a DBC file in an error text."""
+MAX_ERROR_CHARACTERS = 300
+"""Maximum length of the shown error of a DBC file [characters]."""
 
 
 class FrameId(NamedTuple):
@@ -34,7 +36,7 @@ class FrameId(NamedTuple):
         return f"0x{self.id:08X}" if self.extended else f"0x{self.id:03X}"
 
 
-Key = tuple[str, int]
+SignalKey = tuple[str, int]
 """Name of the quantity in ``[source]``, and cell number from 0; 0 for other quantities."""
 
 
@@ -42,9 +44,9 @@ class _Frame(NamedTuple):
     """Frame that contains signals of the settings."""
 
     message: Message
-    signals: list[tuple[Key, Signal]]
+    signals: list[tuple[SignalKey, Signal]]
 
-    def values(self, data: bytes) -> Iterator[tuple[Key, float | None]]:
+    def values(self, data: bytes) -> Iterator[tuple[SignalKey, float | None]]:
         """Yield the values of the signals [V, A, degC]. Signals of another multiplexer value are skipped.
 
         A value is NaN if the device reports it as absent, and None if ``data`` is too short for its signal.
@@ -52,7 +54,7 @@ class _Frame(NamedTuple):
         decoded = _decode(self.message, data)
         is_multiplexed = bool(decoded) and self.message.is_multiplexed()
         for key, signal in self.signals:
-            raw = decoded.get(signal.signal.split(".")[-1])
+            raw = decoded.get(signal.signal.split(".")[-1])  # without the name of the message
             if raw is None and is_multiplexed:
                 continue
             if raw is None:
@@ -63,7 +65,7 @@ class _Frame(NamedTuple):
             yield key, round(value, DECIMALS) if math.isfinite(value) else math.nan
 
 
-class CanMap:
+class CanDecoder:
     """Decoder that assembles readings from the latest values of a bus. The current has the sign of the bus.
 
     A reading is complete when voltage and current have both been updated. It contains the latest temperature and cells.
@@ -77,21 +79,21 @@ class CanMap:
 
     def __init__(self, settings: CanSource) -> None:
         self._frames: dict[FrameId, _Frame] = {}
-        database = _load_profile(settings.profile) if settings.dbc is None else _load(settings.dbc)
+        database = _load_profile(settings.profile) if settings.dbc is None else _load_dbc(settings.dbc)
         for key, signal in _signals(settings):
-            message = _message(key[0], signal.signal, database)
+            message = _find_message(key[0], signal.signal, database)
             frame_id = FrameId(message.frame_id, message.is_extended_frame)
             self._frames.setdefault(frame_id, _Frame(message, [])).signals.append((key, signal))
-        self._cells = sum(cells.count for cells in settings.cells)
+        self._cell_count = sum(cells.count for cells in settings.cells)
         self._max_distance_s = min(MAX_DISTANCE_PERIODS * settings.interval_s, MAX_AGE_S)
-        self._newest: dict[Key, tuple[float, float]] = {}  # arrival time [s] and value
-        self._fresh: set[str] = set()
-        self._short = self._absent = 0
+        self._newest_values: dict[SignalKey, tuple[float, float]] = {}  # arrival time [s] and value
+        self._updated_quantities: set[str] = set()
+        self._short_frames = self._absent_values = 0
 
     @property
     def counters(self) -> Mapping[str, int]:
         """Number of frames that are too short for a signal, and of values that the device does not measure, since start."""
-        return {"short_frames": self._short, "not_measured": self._absent}
+        return {"short_frames": self._short_frames, "not_measured": self._absent_values}
 
     @property
     def frame_ids(self) -> Sequence[FrameId]:
@@ -105,7 +107,7 @@ class CanMap:
             quantity: str(frame_id)
             for frame_id, frame in self._frames.items()
             for (quantity, _), _ in frame.signals
-            if quantity in ("voltage", "current") and quantity not in self._fresh
+            if quantity in ("voltage", "current") and quantity not in self._updated_quantities
         }
         return ", ".join(f"source.{quantity} (frame {frame_id})" for quantity, frame_id in missing.items()) or None
 
@@ -122,41 +124,41 @@ class CanMap:
         if frame is None:
             return None
         values = dict(frame.values(data))
-        self._short += None in values.values()
+        self._short_frames += None in values.values()
         for key, value in values.items():
             if value is None:
                 continue
-            self._newest[key] = arrival_s, value
-            self._absent += math.isnan(value)
-            self._fresh.add(key[0])
-        if not {"voltage", "current"} <= self._fresh:
+            self._newest_values[key] = arrival_s, value
+            self._absent_values += math.isnan(value)
+            self._updated_quantities.add(key[0])
+        if not {"voltage", "current"} <= self._updated_quantities:
             return None
-        self._fresh.clear()
-        reading = self._reading(arrival_s)
+        self._updated_quantities.clear()
+        reading = self._make_reading(arrival_s)
         return None if math.isnan(reading.voltage_v) or math.isnan(reading.current_a) else reading
 
-    def _reading(self, now_s: float) -> Reading:
-        cells_v = tuple(self._get("cells", now_s, number) for number in range(self._cells))
+    def _make_reading(self, now_s: float) -> Reading:
+        cells_v = tuple(self._newest_value("cells", now_s, number) for number in range(self._cell_count))
         return Reading(
-            self._get("voltage", now_s, max_age_s=self._max_distance_s),
-            self._get("current", now_s, max_age_s=self._max_distance_s),
-            self._get("temperature", now_s),
+            self._newest_value("voltage", now_s, max_age_s=self._max_distance_s),
+            self._newest_value("current", now_s, max_age_s=self._max_distance_s),
+            self._newest_value("temperature", now_s),
             () if all(map(math.isnan, cells_v)) else cells_v,
         )
 
-    def _get(self, quantity: str, now_s: float, number: int = 0, max_age_s: float = MAX_AGE_S) -> float:
+    def _newest_value(self, quantity: str, now_s: float, number: int = 0, max_age_s: float = MAX_AGE_S) -> float:
         """Return the newest value; NaN if it is missing or too old."""
-        arrival_s, value = self._newest.get((quantity, number), (-math.inf, math.nan))
+        arrival_s, value = self._newest_values.get((quantity, number), (-math.inf, math.nan))
         return value if now_s - arrival_s <= max_age_s else math.nan
 
 
-def _signals(settings: CanSource) -> Iterator[tuple[Key, Signal]]:
+def _signals(settings: CanSource) -> Iterator[tuple[SignalKey, Signal]]:
     """Yield all signals of the settings."""
     yield ("voltage", 0), settings.voltage
     yield ("current", 0), settings.current
     if settings.temperature is not None:
         yield ("temperature", 0), settings.temperature
-    members = [signal for cells in settings.cells for signal in cells.members()]
+    members = [signal for cells in settings.cells for signal in cells.cell_signals()]
     yield from ((("cells", number), signal) for number, signal in enumerate(members))
 
 
@@ -167,7 +169,7 @@ def _load_profile(profile: str | None) -> Database:
     return database
 
 
-def _load(path: Path) -> Database:
+def _load_dbc(path: Path) -> Database:
     """Load the DBC file of the settings.
 
     Raises:
@@ -178,32 +180,32 @@ def _load(path: Path) -> Database:
     except OSError as error:
         raise UserError(f"source.dbc = {path}: cannot be read: {error.strerror}") from None
     except (cantools.Error, ValueError) as error:
-        raise UserError(f"source.dbc = {path}: {str(error)[:300]}") from None
+        raise UserError(f"source.dbc = {path}: {str(error)[:MAX_ERROR_CHARACTERS]}") from None
     if not isinstance(loaded, Database):
         raise UserError(f"source.dbc = {path}: it describes no frames of a CAN bus")
     return loaded
 
 
-def _message(quantity: str, signal: str, database: Database) -> Message:
+def _find_message(quantity: str, signal: str, database: Database) -> Message:
     """Return the message that contains a signal.
 
     Raises:
         UserError: No message contains the signal, or several do.
     """
     *message_name, name = signal.split(".")
-    found = [
+    matches = [
         message
         for message in database.messages
         if (not message_name or message.name == message_name[0]) and name in (s.name for s in message.signals)
     ]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        reason = f"several messages have it: write {' or '.join(f'{message.name}.{name}' for message in found)}"
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        reason = f"several messages have it: write {' or '.join(f'{message.name}.{name}' for message in matches)}"
     else:
-        known = sorted(s.name for message in database.messages for s in message.signals)
-        shown = ", ".join(known[:MAX_SHOWN_NAMES]) + (
-            f" and {len(known) - MAX_SHOWN_NAMES} more" if len(known) > MAX_SHOWN_NAMES else ""
+        signal_names = sorted(s.name for message in database.messages for s in message.signals)
+        shown = ", ".join(signal_names[:MAX_SHOWN_NAMES]) + (
+            f" and {len(signal_names) - MAX_SHOWN_NAMES} more" if len(signal_names) > MAX_SHOWN_NAMES else ""
         )
         reason = f"the DBC file has no such signal; it has {shown or 'none'}"
     raise UserError(f"source.{quantity}: signal = {signal!r}: {reason}")

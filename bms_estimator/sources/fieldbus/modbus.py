@@ -13,7 +13,14 @@ from pymodbus.exceptions import ModbusException
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.fieldbus.modbus_registers import Request, Table, decode_reading, list_values, plan, split
+from bms_estimator.sources.fieldbus.modbus_registers import (
+    Request,
+    Table,
+    decode_reading,
+    list_values,
+    plan_requests,
+    split_request,
+)
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
 Client = AsyncModbusSerialClient | AsyncModbusTcpClient
@@ -46,8 +53,8 @@ class _ExceptionResponseError(Exception):
 class ModbusProducer(LineProducer):
     """Line producer that polls the registers of a device.
 
-    If a device rejects a request, its quantities are requested separately. Rejected temperature and cells are omitted;
-    without voltage and current there are no samples.
+    If the device rejects a request, the quantities of the request are requested separately. Rejected temperatures and cells
+    are omitted. If voltage or current is rejected, there are no samples.
 
     Args:
         settings: Settings of the device.
@@ -57,14 +64,14 @@ class ModbusProducer(LineProducer):
         logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # LineSource logs the reason in one line
         self._settings, self._values = settings, list_values(settings)
         self._requests: Sequence[Request] = ()
-        self._refused: set[str] = set()
+        self._logged_omissions: set[str] = set()
         self._counters = {"refused": 0, "not_measured": 0}
         self._fault: str | None = None
 
     @property
     def name(self) -> str:
         """Address of the device."""
-        return self._settings.described
+        return self._settings.short_description
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -81,19 +88,19 @@ class ModbusProducer(LineProducer):
 
         After a late or missing response the connection is reopened, so that a late response is not assigned to a later request.
         """
-        self._requests = plan(self._values)
-        client = _client(self._settings)
+        self._requests = plan_requests(self._values)
+        client = _make_client(self._settings)
         try:
             await self._connect(client)
             words = await self._read(client)
             yield CONNECTED
             loop = asyncio.get_running_loop()
-            next_s = loop.time()
+            next_poll_s = loop.time()
             while True:
                 if line := self._line(words):
                     yield line
-                next_s = max(next_s + self._settings.poll_s, loop.time())  # missed polls are not repeated
-                await asyncio.sleep(next_s - loop.time())
+                next_poll_s = max(next_poll_s + self._settings.poll_s, loop.time())  # missed polls are not repeated
+                await asyncio.sleep(next_poll_s - loop.time())
                 words = await self._read(client)
         finally:
             client.close()
@@ -151,18 +158,18 @@ class ModbusProducer(LineProducer):
         """
         self._counters["refused"] += 1
         if error.code in PERMANENT_EXCEPTIONS:
-            smaller = split(request)
-            if smaller != (request,):
-                return smaller
-            if not any(value.needed for value in request.values):
+            parts = split_request(request)
+            if parts != (request,):
+                return parts
+            if not any(value.is_required for value in request.values):
                 self._log_omitted(request, error)
                 return ()
         raise SourceUnavailableError(f"{request.described}: {error}")
 
     def _log_omitted(self, request: Request, error: _ExceptionResponseError) -> None:
-        """Log an omitted request, once for each."""
-        if request.described not in self._refused:
-            self._refused.add(request.described)
+        """Log an omitted request, unless it was logged before."""
+        if request.described not in self._logged_omissions:
+            self._logged_omissions.add(request.described)
             log.warning("quantity omitted", source=self.name, failure=request.described, reason=str(error))
 
     async def _request(self, client: Client, request: Request) -> Sequence[int]:
@@ -189,7 +196,7 @@ class ModbusProducer(LineProducer):
         return answer.registers
 
 
-def _client(settings: ModbusSource) -> Client:
+def _make_client(settings: ModbusSource) -> Client:
     """Create an unconnected client. It does not retry or reconnect, because ``LineSource`` does."""
     if settings.port is None:
         return AsyncModbusTcpClient(

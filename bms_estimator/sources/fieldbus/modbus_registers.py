@@ -28,7 +28,7 @@ class Value(NamedTuple):
     register: Register
 
     @property
-    def needed(self) -> bool:
+    def is_required(self) -> bool:
         """True if a reading needs this value."""
         return self.quantity in ("voltage", "current")
 
@@ -59,23 +59,26 @@ def list_values(settings: ModbusSource) -> tuple[Value, ...]:
     return tuple(values)
 
 
-def plan(values: Sequence[Value], *, gap: int = GAP_WORDS) -> tuple[Request, ...]:
-    """Return the requests that read ``values``, as few as tables, ``gap`` and ``MAX_WORDS`` allow."""
+def plan_requests(values: Sequence[Value], *, gap: int = GAP_WORDS) -> tuple[Request, ...]:
+    """Return the requests that read ``values``, as few as possible.
+
+    A request reads one table, at most ``MAX_WORDS`` registers, and at most ``gap`` unused registers between two values.
+    """
     requests: list[Request] = []
     for value in sorted(values, key=lambda value: (value.register.table, value.register.address)):
         register, end = value.register, value.register.address + value.register.words
         if requests:
-            last = requests[-1]
-            is_adjacent = last.table == register.table and register.address <= last.address + last.words + gap
-            if is_adjacent and end - last.address <= MAX_WORDS:
-                words = max(last.words, end - last.address)
-                requests[-1] = last._replace(words=words, values=(*last.values, value))
+            previous = requests[-1]
+            is_near = previous.table == register.table and register.address <= previous.address + previous.words + gap
+            if is_near and end - previous.address <= MAX_WORDS:
+                words = max(previous.words, end - previous.address)
+                requests[-1] = previous._replace(words=words, values=(*previous.values, value))
                 continue
         requests.append(Request(register.table, register.address, register.words, (value,)))
     return tuple(requests)
 
 
-def split(request: Request) -> tuple[Request, ...]:
+def split_request(request: Request) -> tuple[Request, ...]:
     """Split a request by quantity and without gaps, to find the part that a device rejects.
 
     A request that cannot be split is returned alone.
@@ -84,7 +87,7 @@ def split(request: Request) -> tuple[Request, ...]:
     return tuple(
         part
         for quantity in quantities
-        for part in plan([value for value in request.values if value.quantity == quantity], gap=0)
+        for part in plan_requests([value for value in request.values if value.quantity == quantity], gap=0)
     )
 
 

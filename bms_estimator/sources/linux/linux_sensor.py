@@ -35,6 +35,7 @@ class _Channels(NamedTuple):
     amperes_per_unit: float
     """Current per unit of the current channel: [A/A], or [A/V] if the channel is a voltage over a shunt."""
     interval_s: float
+    """Time between two samples [s]."""
 
 
 class LinuxSensor(LineProducer):
@@ -49,14 +50,14 @@ class LinuxSensor(LineProducer):
     def __init__(self, settings: LinuxSource, root: Path = SYS, read_timeout_s: float = READ_TIMEOUT_S) -> None:
         self._settings, self._root, self._read_timeout_s = settings, root, read_timeout_s
         self._thread = DiskThread("sysfs")
-        self._hung_call: asyncio.Future[Any] | None = None  # it must end before the next call: only one runs at a time
+        self._hung_call: asyncio.Future[Any] | None = None  # the thread runs one call at a time, so this must end first
         self._counters = {"read_errors": 0, "value_errors": 0}
         self._fault: str | None = None
 
     @property
     def name(self) -> str:
         """Chip and files of the sensor."""
-        return self._settings.described
+        return self._settings.short_description
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -77,15 +78,15 @@ class LinuxSensor(LineProducer):
         Raises:
             SourceUnavailableError, OSError: The chip or one of its files is missing, or its bus hangs.
         """
-        chip = await self._read(self._find_channels)
+        channels = await self._read(self._find_channels)
         yield CONNECTED
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while True:
-            line = await self._read(lambda: self._sample(chip))
+            line = await self._read(lambda: self._sample(channels))
             if line:
                 yield line
-            due_s = max(due_s + chip.interval_s, loop.time())
+            due_s = max(due_s + channels.interval_s, loop.time())
             await asyncio.sleep(due_s - loop.time())
 
     async def _read(self, call: Callable[[], T]) -> T:
@@ -98,7 +99,7 @@ class LinuxSensor(LineProducer):
             await self._wait(future)
         except SourceUnavailableError:
             # asyncio logs an exception that is never retrieved, and no caller waits for this call any more
-            future.add_done_callback(lambda late: late.exception())
+            future.add_done_callback(lambda call: call.exception())
             self._hung_call = future
             raise
         return future.result()
@@ -165,20 +166,20 @@ class LinuxSensor(LineProducer):
             )
         return max(chip_interval_s, MIN_INTERVAL_S)
 
-    def _sample(self, chip: _Channels) -> bytes:
+    def _sample(self, channels: _Channels) -> bytes:
         """Return the line of a sample; empty if voltage or current cannot be read now. Runs in the thread.
 
         Raises:
             OSError: The chip is gone.
         """
         settings, self._fault = self._settings, None
-        voltage, current = self._value(chip.voltage), self._value(chip.current)
-        temperature_c = self._value(chip.temperature) if chip.temperature else None
+        voltage, current = self._value(channels.voltage), self._value(channels.current)
+        temperature_c = self._value(channels.temperature) if channels.temperature else None
         if voltage is None or current is None:
             return b""
         return sample_json_line(
             settings.voltage_scale * voltage + settings.voltage_offset_v,
-            chip.amperes_per_unit * current + settings.current_offset_a,
+            channels.amperes_per_unit * current + settings.current_offset_a,
             temperature_c=temperature_c,
         )
 

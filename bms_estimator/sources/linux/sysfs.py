@@ -15,6 +15,8 @@ from bms_estimator.sources.line_source import SourceUnavailableError
 SYS = Path("/sys")
 MAX_BYTES = 4096
 """Maximum size of a sysfs file, one page [bytes]."""
+MAX_SHOWN_BYTES = 40
+"""Maximum number of bytes of an invalid number that are shown."""
 
 
 class NotANumberError(Exception):
@@ -60,7 +62,7 @@ def read_number(path: Path) -> float:
     try:
         return number(text.decode("ascii"))
     except ValueError:  # UnicodeDecodeError is a subclass
-        raise NotANumberError(f"{path}: no number: {text[:40]!r}") from None
+        raise NotANumberError(f"{path}: no number: {text[:MAX_SHOWN_BYTES]!r}") from None
 
 
 def find_chip(chip: str, root: Path = SYS) -> Path:
@@ -80,13 +82,13 @@ def find_chip(chip: str, root: Path = SYS) -> Path:
     chips = list(_chips(root))
     matches = [path for path, name in chips if chip == name or chip in path.resolve().parts]
     if len(matches) > 1:
-        places = ", ".join(map(_bus_address, matches))
+        addresses = ", ".join(map(_bus_address, matches))
         raise SourceUnavailableError(
-            f"{chip}: {len(matches)} chips have this name ({places}); set the bus address of one of them"
+            f"{chip}: {len(matches)} chips have this name ({addresses}); set the bus address of one of them"
         )
     if not matches:
-        there = ", ".join(sorted({name for _, name in chips})) or "none at all"
-        raise SourceUnavailableError(f"{chip}: no such chip in hwmon or iio; present: {there}. Is its driver loaded?")
+        present = ", ".join(sorted({name for _, name in chips})) or "none at all"
+        raise SourceUnavailableError(f"{chip}: no such chip in hwmon or iio; present: {present}. Is its driver loaded?")
     return matches[0]
 
 
@@ -103,10 +105,10 @@ def find_channel(name: str, chip: str, root: Path = SYS) -> Channel:
     """
     folder, _, file = name.rpartition("/")
     channel = Channel(find_chip(folder or chip, root) / file)
-    needed = _iio_file(channel.path, "raw") if _is_iio(channel.path) else channel.path
-    if not needed.exists():
+    required_file = _iio_file(channel.path, "raw") if _is_iio(channel.path) else channel.path
+    if not required_file.exists():
         raise SourceUnavailableError(
-            f"{needed}: no such file; the chip has {', '.join(_channel_names(needed.parent)) or 'none'}"
+            f"{required_file}: no such file; the chip has {', '.join(_channel_names(required_file.parent)) or 'none'}"
         )
     if not channel.kind:
         raise SourceUnavailableError(f"{channel.path}: neither a voltage, a current nor a temperature")
@@ -130,6 +132,7 @@ def _bus_address(chip: Path) -> str:
 
 
 def _is_iio(path: Path) -> bool:
+    """Return True for an iio channel. Names of hwmon files end in ``_input``."""
     return not path.name.endswith("_input")
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+import math
 import secrets
 from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Mapping
@@ -56,8 +57,8 @@ class MqttProducer(LineProducer):
         configured = brokers(mqtt)
         self._broker, self._brokers = configured[0], itertools.cycle(configured)
         self._connect = connect or BrokerConnector(mqtt)
-        self._conflicting = False
-        self._lost: Counter[str] = Counter({"too_long": 0, "overflow": 0})
+        self._has_conflict = False
+        self._lost_messages: Counter[str] = Counter({"too_long": 0, "overflow": 0})
         self._options = ConnectOptions(
             f"bms-source-{secrets.token_hex(4)}",
             will=None,
@@ -69,12 +70,12 @@ class MqttProducer(LineProducer):
     @property
     def name(self) -> str:
         """Topics and broker of the source."""
-        return f"{self._settings.described}, {self._broker.url}"
+        return f"{self._settings.short_description}, {self._broker.url}"
 
     @property
     def counters(self) -> Mapping[str, int]:
         """Counters of the assembler, and of messages that were too long or arrived too fast."""
-        return {**self._assembler.counters, **self._lost}
+        return {**self._assembler.counters, **self._lost_messages}
 
     @property
     def fault(self) -> str | None:
@@ -104,7 +105,7 @@ class MqttProducer(LineProducer):
         """Yield the lines of a connection; raises ``BrokerConnectionError`` when it is lost."""
         poll_messages = self._settings.ask  # payloads by topic
         receiving: asyncio.Future[ReceivedMessage] | None = None
-        poll_sent_s = -float("inf")
+        poll_sent_s = -math.inf
         try:
             while True:
                 now_s = self._monotonic()
@@ -134,7 +135,7 @@ class MqttProducer(LineProducer):
     async def _poll(self, connection: Connection) -> None:
         """Publish the messages that make the publisher report its values."""
         for topic, payload in self._settings.ask.items():
-            message = Message(self._settings.substitute(topic), payload.encode(), 0, retain=False)
+            message = Message(self._settings.substitute(topic), payload.encode(), qos=0, retain=False)
             refusal = await connection.publish(message)
             if refusal is not None:
                 raise SourceUnavailableError(f"not allowed to write {message.topic}: {refusal.reason}")
@@ -142,16 +143,16 @@ class MqttProducer(LineProducer):
     def _log_conflict(self) -> None:
         """Log the beginning and the end of a conflict between two publishers."""
         conflict = self._assembler.conflict
-        if bool(conflict) == self._conflicting:
+        if bool(conflict) == self._has_conflict:
             return
-        self._conflicting = bool(conflict)
+        self._has_conflict = bool(conflict)
         if conflict:
             log.warning("two publishers write the same topic; stop one of them", values=conflict)
         else:
             log.info("one publisher writes the topic again")
 
     def _count_lost(self, kind: str, _topic: str) -> None:
-        self._lost[kind] += 1
+        self._lost_messages[kind] += 1
 
 
 def producer(settings: Settings) -> MqttProducer:

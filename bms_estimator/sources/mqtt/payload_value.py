@@ -14,20 +14,22 @@ MAX_SHOWN_CHARACTERS = 40
 """Maximum number of characters of an invalid number that are shown."""
 MAX_CELL_NUMBER = 400
 """Highest cell number in a path or topic."""
+MAX_INDEX_DIGITS = 9
+"""Number of digits of a list index that are compared with the length of the list. No list has an index with more digits."""
 CELL_PLACEHOLDER = re.compile(r"\{cell\}")
 
 
 class InvalidValueError(Exception):
     """The payload has no valid value of the quantity; the message gives the reason."""
 
-    kind = "no_number"
-    """Name of the counter."""
+    counter = "no_number"
+    """Name of the counter of these errors."""
 
 
 class MissingError(InvalidValueError):
     """The payload is JSON, but the path does not exist in it."""
 
-    kind = "missing"
+    counter = "missing"
 
 
 def cell_pattern(text: str) -> re.Pattern[str]:
@@ -41,7 +43,7 @@ def read_value(payload: bytes, location: ValueLocation, path: str) -> float:
     Raises:
         InvalidValueError: The payload has no such value, or it is not a finite number.
     """
-    return _si(_value_at(_parsed(payload, path), path), location)
+    return _to_si(_value_at(_parse(payload, path), path), location)
 
 
 def read_cells(payload: bytes, location: ValueLocation, path: str) -> dict[int, float]:
@@ -52,44 +54,46 @@ def read_cells(payload: bytes, location: ValueLocation, path: str) -> dict[int, 
     Raises:
         InvalidValueError: No cell has a valid value.
     """
-    found = dict(_cells(_parsed(payload, path), path))
+    found = dict(_iter_cells(_parse(payload, path), path))
     cells = {}
     for cell, value in found.items():
         try:
-            cells[cell] = _si(value, location)
+            cells[cell] = _to_si(value, location)
         except InvalidValueError:
             cells[cell] = math.nan
     if all(map(math.isnan, cells.values())):
-        raise InvalidValueError(f"{path or 'payload'}: no cells in {_shown(payload.decode('utf-8', 'replace'))}")
+        raise InvalidValueError(f"{path or 'payload'}: no cells in {_shorten(payload.decode('utf-8', 'replace'))}")
     return cells
 
 
-def _cells(value: Any, path: str) -> Iterator[tuple[int, Any]]:
-    before, cell, after = path.partition("{cell}")
-    if not cell:
+def _iter_cells(value: Any, path: str) -> Iterator[tuple[int, Any]]:
+    """Yield the number and the value of each cell."""
+    before, placeholder, after = path.partition("{cell}")
+    if not placeholder:
         listed = _value_at(value, path)
         if not isinstance(listed, list):
-            raise InvalidValueError(f"{path or 'payload'}: no list of cells: {_shown(listed)}")
+            raise InvalidValueError(f"{path or 'payload'}: no list of cells: {_shorten(listed)}")
         yield from enumerate(listed[:MAX_CELL_NUMBER], start=1)
         return
-    *above, begin = before.split(".")
-    end, *below = after.split(".")
-    parent = _value_at(value, ".".join(above))
+    *keys_above, key_prefix = before.split(".")
+    key_suffix, *keys_below = after.split(".")
+    parent = _value_at(value, ".".join(keys_above))
     keys = parent if isinstance(parent, dict) else ()
-    pattern = cell_pattern(f"{begin}{{cell}}{end}")
+    pattern = cell_pattern(f"{key_prefix}{{cell}}{key_suffix}")
     for key in keys:
         match = pattern.fullmatch(key)
         if match and 1 <= int(match[1]) <= MAX_CELL_NUMBER:
-            yield int(match[1]), _value_at(parent[key], ".".join(below))
+            yield int(match[1]), _value_at(parent[key], ".".join(keys_below))
 
 
-def _parsed(payload: bytes, path: str) -> Any:
+def _parse(payload: bytes, path: str) -> Any:
+    """Return the parsed JSON; without a path, the payload as text."""
     try:
         text = payload.decode()
-        return json.loads(text, parse_constant=str) if path else text
+        return json.loads(text, parse_constant=str) if path else text  # NaN and Infinity become text
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are subclasses
-        what = "no JSON" if path else "no text"
-        raise InvalidValueError(f"{what}: {_shown(payload.decode('utf-8', 'replace'))}") from None
+        fault = "no JSON" if path else "no text"
+        raise InvalidValueError(f"{fault}: {_shorten(payload.decode('utf-8', 'replace'))}") from None
 
 
 def _value_at(value: Any, path: str) -> Any:
@@ -101,25 +105,25 @@ def _value_at(value: Any, path: str) -> Any:
     for key in path.split(".") if path else ():
         if isinstance(value, dict) and key in value:
             value = value[key]
-        elif isinstance(value, list) and key.isascii() and key.isdigit() and int(key[:9]) < len(value):
+        elif isinstance(value, list) and key.isascii() and key.isdigit() and int(key[:MAX_INDEX_DIGITS]) < len(value):
             value = value[int(key)]
         else:
-            raise MissingError(f"{path}: not in {_shown(value)}")
+            raise MissingError(f"{path}: not in {_shorten(value)}")
     return value
 
 
-def _si(value: Any, location: ValueLocation) -> float:
+def _to_si(value: Any, location: ValueLocation) -> float:
     if location.unit == "iso":
         return _epoch_s(value)
     try:
         found = number(value) if isinstance(value, str) else value
         if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
-            raise InvalidValueError(f"no number: {_shown(value)}")
-        value_si = location.si(float(found))
+            raise InvalidValueError(f"no number: {_shorten(value)}")
+        value_si = location.to_si(float(found))
     except (ValueError, OverflowError):
-        raise InvalidValueError(f"no number: {_shown(value)}") from None
+        raise InvalidValueError(f"no number: {_shorten(value)}") from None
     if not math.isfinite(value_si):
-        raise InvalidValueError(f"no number: {_shown(value)}")
+        raise InvalidValueError(f"no number: {_shorten(value)}")
     return value_si
 
 
@@ -129,9 +133,9 @@ def _epoch_s(value: Any) -> float:
         moment = datetime.fromisoformat(value)
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
     except (ValueError, TypeError, OverflowError):
-        raise InvalidValueError(f"no time: {_shown(value)}") from None
+        raise InvalidValueError(f"no time: {_shorten(value)}") from None
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = repr(value)
     return text[:MAX_SHOWN_CHARACTERS] + ("..." if len(text) > MAX_SHOWN_CHARACTERS else "")

@@ -10,13 +10,13 @@ from statistics import median, quantiles
 from typing import NamedTuple
 
 MAX_MESSAGES = 64
-"""Number of stored messages of a topic."""
+"""Maximum number of stored messages of a topic."""
 MIN_INTERVALS = 8
 """Minimum number of intervals for estimating the usual interval."""
 QUICK_FRACTION = 0.5
 """A message is quick if it follows the previous one within this fraction of the usual interval."""
 MIN_RETURNS = 4
-"""Minimum number of quick returns to an earlier value, among the stored messages, that shows two publishers."""
+"""Minimum number of quick returns to an earlier value among the stored messages. Fewer do not show two publishers."""
 MAX_INTERVAL_DEVIATION = 0.1
 """Maximum deviation of one publisher's interval from the median of its intervals, as a fraction of the median."""
 MIN_RETURN_FRACTION = 0.75
@@ -36,14 +36,14 @@ class _Message(NamedTuple):
 
     Attributes:
         value: Value of the quantity.
-        at_s: Arrival time on a monotonic clock [s].
+        arrival_s: Arrival time on a monotonic clock [s].
         is_jump: True if the value differs from the previous message's by more than the minimum jump.
         is_back: True if the value jumped back to the value before the last jump.
         is_quick: True if the message arrived sooner than one publisher would publish.
     """
 
     value: float
-    at_s: float
+    arrival_s: float
     is_jump: bool = False
     is_back: bool = False
     is_quick: bool = False
@@ -65,7 +65,7 @@ class PublisherConflict:
     def __init__(self, min_jump: float, interval_s: float) -> None:
         self._min_jump, self._interval_s = min_jump, interval_s
         self._messages: deque[_Message] = deque(maxlen=MAX_MESSAGES)
-        self._levels: tuple[float, float] | None = None  # before and after the last jump
+        self._levels: tuple[float, float] | None = None  # values before and after the last jump
 
     def add(self, value: float, now_s: float) -> bool:
         """Add a value; return True if there are two publishers.
@@ -79,7 +79,7 @@ class PublisherConflict:
             before, levels = self._messages[-1], self._levels
             self._levels = before.value, value
             is_back = levels is not None and _is_near(value, levels[0], other=levels[1])
-            is_quick = self._is_quick(now_s - before.at_s)
+            is_quick = self._is_quick(now_s - before.arrival_s)
             message = _Message(value, now_s, is_jump=True, is_back=is_back, is_quick=is_quick)
         self._messages.append(message)
         return self._has_two_publishers
@@ -114,15 +114,19 @@ class PublisherConflict:
         ]
         frequent = max(indices_by_level, key=len)
         pairs = list(itertools.pairwise(frequent))
-        usual_s = median([messages[j].at_s - messages[i].at_s for i, j in pairs] or [0.0])
+        usual_interval_s = median([messages[j].arrival_s - messages[i].arrival_s for i, j in pairs] or [0.0])
         return sum(
             any(message.is_back and message.is_quick for message in messages[i + 1 : j + 1])
-            and abs(messages[j].at_s - messages[i].at_s - usual_s) < MAX_INTERVAL_DEVIATION * usual_s
+            and abs(messages[j].arrival_s - messages[i].arrival_s - usual_interval_s)
+            < MAX_INTERVAL_DEVIATION * usual_interval_s
             for i, j in pairs
         )
 
     def _jumps_are_regular(self, jumps: Sequence[_Message]) -> bool:
-        """Return True if every second jump arrives at the expected interval or faster, with little spread."""
+        """Return True if every second jump arrives at the expected interval or faster, with little spread.
+
+        Jumps alternate between the two values, so that every second jump belongs to one publisher.
+        """
         intervals_s = _intervals_s(jumps[::2])
         if len(intervals_s) < MIN_RETURNS:
             return False
@@ -140,11 +144,12 @@ class PublisherConflict:
         intervals_s = _intervals_s(self._messages)
         if len(intervals_s) < MIN_INTERVALS:
             return False
-        return interval_s < QUICK_FRACTION * quantiles(intervals_s, n=4)[2]
+        usual_interval_s = quantiles(intervals_s, n=4)[2]
+        return interval_s < QUICK_FRACTION * usual_interval_s
 
 
 def _intervals_s(messages: Sequence[_Message]) -> list[float]:
-    return [after.at_s - before.at_s for before, after in itertools.pairwise(messages)]
+    return [after.arrival_s - before.arrival_s for before, after in itertools.pairwise(messages)]
 
 
 def _is_near(value: float, level: float, *, other: float) -> bool:

@@ -16,8 +16,10 @@ from bms_estimator.sources.mqtt.payload_value import (
 )
 from bms_estimator.sources.mqtt.publisher_conflict import MIN_JUMPS, PublisherConflict
 
-NEEDED = ("voltage", "current")
+REQUIRED_QUANTITIES = ("voltage", "current")
 """Quantities without which there is no sample."""
+MAX_STATUS_CHARACTERS = 80
+"""Maximum number of characters of the publisher's status that are shown."""
 
 
 class _TopicBinding(NamedTuple):
@@ -26,7 +28,9 @@ class _TopicBinding(NamedTuple):
     quantity: str
     location: ValueLocation
     path: str
+    """Path of the value in a JSON payload; empty for a plain number."""
     topic: str
+    """Topic, which may contain ``{cell}``."""
     pattern: re.Pattern[str]
     """Pattern of the topic. Its group, if any, is the cell number."""
 
@@ -35,7 +39,7 @@ class _TimestampedValue(NamedTuple):
     """A value and its arrival time [s]."""
 
     value: float
-    at_s: float
+    arrival_s: float
 
 
 class SampleAssembler:
@@ -50,20 +54,20 @@ class SampleAssembler:
         self._settings = settings
         self._bindings = [
             _TopicBinding(quantity, location, settings.substitute(location.path), topic, cell_pattern(topic))
-            for quantity, location in settings.places()
+            for quantity, location in settings.locations()
             for topic in settings.topics(location)
         ]
-        self._availability = settings.substitute(settings.availability_topic or "")
-        self._offline = ""  # latest status from the publisher or its last will
+        self._availability_topic = settings.substitute(settings.availability_topic or "")
+        self._offline_status = ""  # latest status from the publisher or its last will
         self._values: dict[str, _TimestampedValue] = {}
         self._cells: dict[int, _TimestampedValue] = {}
         self._faults: dict[str, str] = {}  # latest error of each quantity
-        self._unused: dict[str, float] = {}  # arrival times of voltage and current since the last sample
+        self._unused_arrival_s: dict[str, float] = {}  # arrival times of voltage and current since the last sample
         self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale", "publisher_errors"), 0)
         self._detectors = {
             (binding.quantity, binding.topic): PublisherConflict(MIN_JUMPS[binding.quantity], settings.interval_s)
             for binding in self._bindings
-            if binding.quantity in NEEDED
+            if binding.quantity in REQUIRED_QUANTITIES
         }
         self._conflicts: dict[tuple[str, str], str] = {}  # topic and values of each conflict, by quantity and topic
 
@@ -73,8 +77,10 @@ class SampleAssembler:
 
         A filter that another one covers is omitted, because some brokers would deliver its messages twice.
         """
-        topics = [binding.topic for binding in self._bindings] + ([self._availability] if self._availability else [])
-        filters = list(dict.fromkeys(_filter(topic) for topic in topics))
+        topics = [binding.topic for binding in self._bindings] + (
+            [self._availability_topic] if self._availability_topic else []
+        )
+        filters = list(dict.fromkeys(_topic_filter(topic) for topic in topics))
         return [topic for topic in filters if not any(_covers(other, topic) for other in filters if other != topic)]
 
     @property
@@ -95,20 +101,24 @@ class SampleAssembler:
     @property
     def fault(self) -> str | None:
         """Reason why no sample is complete; None if unknown."""
-        if self._offline:
-            return f"the publisher reports {self._offline} on {self._availability}"
-        errors = [fault for name in NEEDED if (fault := self._faults.get(name))]
+        if self._offline_status:
+            return f"the publisher reports {self._offline_status} on {self._availability_topic}"
+        errors = [fault for name in REQUIRED_QUANTITIES if (fault := self._faults.get(name))]
         if errors:
             return "; ".join(errors)
         if not self._values:
             retained = " but retained messages" if self._counters["retained"] else ""
-            return f"no message on {', '.join(dict.fromkeys(self._find_topics(*NEEDED)))}{retained}"
-        absent = [name for name in NEEDED if name not in self._values]
+            return f"no message on {', '.join(dict.fromkeys(self._find_topics(*REQUIRED_QUANTITIES)))}{retained}"
+        absent = [name for name in REQUIRED_QUANTITIES if name not in self._values]
         return f"{absent[0]}: no message on {', '.join(self._find_topics(absent[0]))}" if absent else None
 
     def wait_s(self, now_s: float) -> float | None:
         """Return the time until a sample is complete without a further message [s]; None if a message is needed."""
-        return max(min(self._unused.values()) + self._settings.settle_s - now_s, 0.0) if self._unused else None
+        return (
+            max(min(self._unused_arrival_s.values()) + self._settings.settle_s - now_s, 0.0)
+            if self._unused_arrival_s
+            else None
+        )
 
     def add_message(self, topic: str, payload: bytes, now_s: float, *, retained: bool) -> None:
         """Store the values of a message.
@@ -119,34 +129,36 @@ class SampleAssembler:
             now_s: Monotonic clock [s].
             retained: True for a retained message.
         """
-        if topic == self._availability:
+        if topic == self._availability_topic:
             text = payload.decode("utf-8", "replace").strip()
-            self._offline = text[:80] if "offline" in text.lower() else ""
+            self._offline_status = text[:MAX_STATUS_CHARACTERS] if "offline" in text.lower() else ""
             return
         bindings = [(binding, match) for binding in self._bindings if (match := binding.pattern.fullmatch(topic))]
         if retained:
             self._counters["retained"] += bool(bindings)
             return
-        conflict = False
+        has_conflict = False
         for binding, match in bindings:
             cell = int(match[1]) if match.re.groups else None
             try:
                 self._store_value(binding, payload, cell, now_s)
             except InvalidValueError as error:
                 self._remove(binding.quantity, cell)
-                self._counters[error.kind] += 1
+                self._counters[error.counter] += 1
                 self._faults[binding.quantity] = f"{binding.quantity}: {topic}: {error}"
             else:
                 self._faults.pop(binding.quantity, None)
-                conflict |= self._update_conflict(binding, now_s)
-        self._counters["publisher_errors"] += conflict
+                has_conflict |= self._update_conflict(binding, now_s)
+        self._counters["publisher_errors"] += has_conflict
 
     def line(self, now_s: float) -> bytes:
         """Return the line of a complete sample; empty without one."""
-        if not self._unused or (len(self._unused) < len(NEEDED) and (self.wait_s(now_s) or 0.0) > 0.0):
+        if not self._unused_arrival_s or (
+            len(self._unused_arrival_s) < len(REQUIRED_QUANTITIES) and (self.wait_s(now_s) or 0.0) > 0.0
+        ):
             return b""
-        self._unused.clear()
-        voltage_v, current_a = (self._value(name, now_s, self._settings.max_age_s) for name in NEEDED)
+        self._unused_arrival_s.clear()
+        voltage_v, current_a = (self._value(name, now_s, self._settings.max_age_s) for name in REQUIRED_QUANTITIES)
         if voltage_v is None or current_a is None:
             self._count_stale("current" if current_a is None else "voltage")
             return b""
@@ -155,7 +167,7 @@ class SampleAssembler:
             current_a,
             temperature_c=self._value("temperature", now_s, self._settings.slow_max_age_s),
             cells_v=self._cells_v(now_s),
-            time_s=self._value("time", now_s, self._settings.settle_s),
+            time_s=self._value("time", now_s, self._settings.settle_s),  # an older time belongs to an earlier sample
         )
 
     def _store_value(self, binding: _TopicBinding, payload: bytes, cell: int | None, now_s: float) -> None:
@@ -168,8 +180,8 @@ class SampleAssembler:
             self._values[binding.quantity] = _TimestampedValue(
                 read_value(payload, binding.location, binding.path), now_s
             )
-            if binding.quantity in NEEDED:
-                self._unused.setdefault(binding.quantity, now_s)
+            if binding.quantity in REQUIRED_QUANTITIES:
+                self._unused_arrival_s.setdefault(binding.quantity, now_s)
         elif cell is None:
             self._cells |= {
                 number: _TimestampedValue(v, now_s)
@@ -184,7 +196,7 @@ class SampleAssembler:
         For ``cells``, remove the voltage of ``cell``, or of all cells without ``cell``.
         """
         self._values.pop(quantity, None)
-        self._unused.pop(quantity, None)
+        self._unused_arrival_s.pop(quantity, None)
         if quantity == "cells":
             removed = tuple(self._cells) if cell is None else (cell,)
             for each in removed:
@@ -210,24 +222,26 @@ class SampleAssembler:
     def _value(self, name: str, now_s: float, max_age_s: float) -> float | None:
         """Return a value unless it is older than ``max_age_s``."""
         stored = self._values.get(name)
-        return stored.value if stored and now_s - stored.at_s <= max_age_s else None
+        return stored.value if stored and now_s - stored.arrival_s <= max_age_s else None
 
     def _cells_v(self, now_s: float) -> list[float]:
         """Return the voltages from cell 1 to the last cell with a recent value [V]; NaN for a cell without one."""
         max_age_s = self._settings.slow_max_age_s
-        fresh = {cell: stored.value for cell, stored in self._cells.items() if now_s - stored.at_s <= max_age_s}
+        fresh = {cell: stored.value for cell, stored in self._cells.items() if now_s - stored.arrival_s <= max_age_s}
         return [fresh.get(cell, math.nan) for cell in range(1, max(fresh, default=0) + 1)]
 
     def _find_topics(self, *quantities: str) -> list[str]:
         return [binding.topic for binding in self._bindings if binding.quantity in quantities]
 
 
-def _filter(topic: str) -> str:
+def _topic_filter(topic: str) -> str:
     """Return the topic filter of a topic with ``{cell}``."""
     return "/".join("+" if "{cell}" in level else level for level in topic.split("/"))
 
 
-def _covers(one: str, other: str) -> bool:
-    """Return True if the first topic filter covers the second."""
-    levels, others = one.split("/"), other.split("/")
-    return len(levels) == len(others) and all(a in ("+", b) for a, b in zip(levels, others, strict=True))
+def _covers(wide: str, narrow: str) -> bool:
+    """Return True if the topic filter ``wide`` matches all topics of the filter ``narrow``."""
+    wide_levels, narrow_levels = wide.split("/"), narrow.split("/")
+    return len(wide_levels) == len(narrow_levels) and all(
+        level in ("+", other) for level, other in zip(wide_levels, narrow_levels, strict=True)
+    )

@@ -1,4 +1,6 @@
-"""Check that the board on the port is the pack's: the configured one, the stored one, or the first one of this run.
+"""Check that the board on the port is the pack's.
+
+The pack's board is the configured one, otherwise the stored one, otherwise the first board of this run.
 
 Another board has another voltage divider. Its voltages would be wrong by several percent without any other symptom.
 """
@@ -31,18 +33,21 @@ class BoardCheck:
 
     Args:
         make_decoder: Creates a decoder for pending chunks.
-        serial: Configured serial number; empty: that of the stored board, otherwise of the first board.
-        memory: File of the pack's board; None: the board is not stored.
+        serial: Configured serial number. If it is empty, the number of the stored board counts, and without a stored
+            board the number of the first board.
+        board_file: File that stores the pack's board; None: the board is not stored.
     """
 
     def __init__(
-        self, make_decoder: Callable[[], DeviceProtocol], serial: str = "", memory: KnownBoardFile | None = None
+        self, make_decoder: Callable[[], DeviceProtocol], serial: str = "", board_file: KnownBoardFile | None = None
     ) -> None:
-        self._make_decoder, self._configured, self._memory = make_decoder, serial, memory
-        self._known: Mapping[str, str] = memory.load() if memory else {}
+        self._make_decoder, self._configured, self._board_file = make_decoder, serial, board_file
+        self._known: Mapping[str, str] = board_file.load() if board_file else {}
         self._stored = self._known  # content of the file
-        self._logged_without_serial = self._is_reloading = self._is_storing = self._store_failed = self._refused = False
-        self._store_begun_s = -math.inf
+        self._logged_without_serial = self._is_reloading = self._is_storing = self._store_failed = self._is_rejected = (
+            False
+        )
+        self._store_attempt_s = -math.inf
         self.pending_protocol: DeviceProtocol | None = None
         """Decoder of the pending chunks; None if no chunks are pending."""
         self._pending = deque[Chunk]()
@@ -57,20 +62,20 @@ class BoardCheck:
     def on_port_opened(self) -> None:
         """Reset after the port was opened. The board on the port is unknown again."""
         self.pending_protocol = self._make_decoder() if self.serial else None
-        self._refused = False
+        self._is_rejected = False
         self._drop(self._pending)
         self._pending.clear()
 
     def reload_known_board(self) -> None:
         """Start a thread that checks if a user has accepted another board. A missing file does not count as acceptance."""
-        if self._memory and not self._is_reloading:
+        if self._board_file and not self._is_reloading:
             self._is_reloading = True
-            Thread(target=self._reload, args=(self._memory,), daemon=True).start()
+            Thread(target=self._reload, args=(self._board_file,), daemon=True).start()
 
-    def _reload(self, memory: KnownBoardFile) -> None:
+    def _reload(self, board_file: KnownBoardFile) -> None:
         """Read the file. It runs in its own thread, so that a hung disk does not block samples."""
         try:
-            if memory.load() == NO_BOARD:
+            if board_file.load() == NO_BOARD:
                 self._known = self._stored = NO_BOARD
         finally:
             self._is_reloading = False
@@ -81,10 +86,10 @@ class BoardCheck:
         Raises:
             OtherBoardError: The chunk is from another board. Later chunks are dropped until the port is reopened.
         """
-        if self._refused:
+        if self._is_rejected:
             self._drop((chunk,))
             return ()
-        if self.pending_protocol is None:
+        if self.pending_protocol is None:  # the board may have been exchanged on the open port
             if self.serial and (new_serial := decoder.serial_number_in(chunk[1])) is not None:
                 self._check(new_serial, (chunk,))
             return (chunk,)
@@ -115,7 +120,7 @@ class BoardCheck:
         previous, self._known = self._known, {name: board.get(name, "") for name in STORED_FIELDS}
         if self._known != previous:
             self._log_new_board(previous)
-            self._store_begun_s = -math.inf
+            self._store_attempt_s = -math.inf
         self._store_board(now_s)
 
     def _log_new_board(self, previous: Mapping[str, str]) -> None:
@@ -130,20 +135,20 @@ class BoardCheck:
 
     def _store_board(self, now_s: float) -> None:
         """Start a thread that stores the board, unless one is running or the last attempt is less than ``STORE_RETRY_S`` ago."""
-        if self._memory is None or self._is_storing or now_s - self._store_begun_s < STORE_RETRY_S:
+        if self._board_file is None or self._is_storing or now_s - self._store_attempt_s < STORE_RETRY_S:
             return
-        self._is_storing, self._store_begun_s = True, now_s
-        Thread(target=self._store, args=(self._memory, self._known), daemon=True).start()
+        self._is_storing, self._store_attempt_s = True, now_s
+        Thread(target=self._store, args=(self._board_file, self._known), daemon=True).start()
 
-    def _store(self, memory: KnownBoardFile, board: Mapping[str, str]) -> None:
+    def _store(self, board_file: KnownBoardFile, board: Mapping[str, str]) -> None:
         """Store the board. It runs in its own thread, so that a hung disk does not block samples."""
         try:
-            if board != self._stored or memory.is_missing():
-                memory.save(board)
+            if board != self._stored or board_file.is_missing():
+                board_file.save(board)
             self._stored, self._store_failed = board, False
         except OSError as error:
             if not self._store_failed:
-                log.warning("the board cannot be stored yet", file=str(memory.path), reason=str(error))
+                log.warning("the board cannot be stored yet", file=str(board_file.path), reason=str(error))
             self._store_failed = True
         finally:
             self._is_storing = False
@@ -159,13 +164,13 @@ class BoardCheck:
         """
         if serial == self.serial:
             return
-        self._refused = True
+        self._is_rejected = True
         self._drop(chunks)
         remedy = (
             "or set sensor.serial to its number"
             if self._configured
-            else f"or, to use this board instead, run `{self._memory.accept_command}` with the pack's settings file"
-            if self._memory
+            else f"or, to use this board instead, run `{self._board_file.accept_command}` with the pack's settings file"
+            if self._board_file
             else "or restart the service to use this board"
         )
         raise OtherBoardError(

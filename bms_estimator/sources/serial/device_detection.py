@@ -30,7 +30,7 @@ READ_TIMEOUT_S = 0.1
 READ_BYTES = 4096
 """Maximum size of a read [bytes]."""
 REFERENCE_RATE_HZ = 100
-"""Default sample rate of the firmware [Hz]. It measures the bandgap in every second sample, without an NTC in each."""
+"""Default sample rate of the firmware [Hz]. Every sample has a bandgap reading, or every second one if an NTC is fitted."""
 REFERENCE_SAMPLES = 300
 """Number of samples for the mean of the bandgap. Its noise is then 0.03 %."""
 REFERENCE_TIMEOUT_S = 10.0
@@ -45,15 +45,14 @@ class DetectedDevice:
 
     protocol: str
     baud: int
-    described: str
-    """Description as text."""
+    description: str
     cells: int | None = None
-    """Cells in series, if reported."""
+    """Number of cells in series, if reported."""
 
     def __str__(self) -> str:
         """Describe the device; add protocol and baud rate unless it is a board at the default rate."""
-        usual = self.baud == BAUD and self.protocol in ("binary", "text")
-        return self.described if usual else f"{self.described}; protocol {self.protocol}, {self.baud} baud"
+        is_default = self.baud == BAUD and self.protocol in ("binary", "text")
+        return self.description if is_default else f"{self.description}; protocol {self.protocol}, {self.baud} baud"
 
 
 def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
@@ -66,19 +65,19 @@ def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
         port: Device path; opened exclusively.
         baud: Baud rate of all protocols [1/s]; None: the default of each.
     """
-    rates = _rates() if baud is None else {baud: list(PROTOCOLS)}
+    protocols_by_baud = _protocols_by_baud() if baud is None else {baud: list(PROTOCOLS)}
     reason = "silent"
     BoardProtocol().feed(0.0, b"\0\n")  # compiles its kernel before the timeouts begin
     try:
-        with open_port(port, next(iter(rates)), READ_TIMEOUT_S) as line:
-            for rate, protocols in rates.items():
+        with open_port(port, next(iter(protocols_by_baud)), READ_TIMEOUT_S) as line:
+            for rate, protocols in protocols_by_baud.items():
                 line.baudrate = rate
                 line.reset_input_buffer()
                 decoders = {name: _probing_decoder(name) for name in protocols}
                 timeout_s = BOOT_TIMEOUT_S if rate == BAUD and baud is None else PROTOCOL_TIMEOUT_S * len(decoders)
                 if (found := _query_in_turn(line, decoders, timeout_s)) is not None:
-                    return DetectedDevice(found, rate, *_described(decoders[found]))
-                if reason == "silent":
+                    return DetectedDevice(found, rate, *_describe(decoders[found]))
+                if reason == "silent":  # the first other reason is reported
                     reason = _failure_reason(list(decoders.values()))
     except NoPortError as error:
         return str(error).removeprefix(f"{port}: ")
@@ -87,15 +86,15 @@ def probe(port: str, baud: int | None = None) -> DetectedDevice | str:
     return reason
 
 
-def _rates() -> Mapping[int, Sequence[str]]:
+def _protocols_by_baud() -> Mapping[int, Sequence[str]]:
     """Return the protocols to try at each baud rate: the firmware's rate first, then descending. Text is tried at each."""
-    rates: dict[int, list[str]] = {BAUD: []}
+    protocols_by_baud: dict[int, list[str]] = {BAUD: []}
     for name in PROTOCOLS:
-        rates.setdefault(SensorSettings.model_validate({"protocol": name}).baud, []).append(name)
-    for protocols in rates.values():
+        protocols_by_baud.setdefault(SensorSettings.model_validate({"protocol": name}).baud, []).append(name)
+    for protocols in protocols_by_baud.values():
         if "text" not in protocols:
             protocols.append("text")
-    return {rate: rates[rate] for rate in sorted(rates, key=lambda rate: (rate != BAUD, -rate))}
+    return {rate: protocols_by_baud[rate] for rate in sorted(protocols_by_baud, key=lambda rate: (rate != BAUD, -rate))}
 
 
 def _probing_decoder(protocol: str) -> DeviceProtocol:
@@ -128,7 +127,7 @@ def _query_in_turn(line: "serial.Serial", decoders: Mapping[str, DeviceProtocol]
     return None
 
 
-def _described(decoder: DeviceProtocol) -> tuple[str, int | None]:
+def _describe(decoder: DeviceProtocol) -> tuple[str, int | None]:
     """Return the device's description and its number of cells."""
     return decoder.description or "", decoder.cells.shape[1] or None
 
@@ -145,7 +144,7 @@ class BoardClient:
     """
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
-        self._port, self._line = port, open_port(port, baud, RETRY_S)
+        self._port, self._line = port, open_port(port, baud, RETRY_S)  # reads end in time to repeat a command
         self._board, self._text = BoardProtocol(), TextProtocol()
 
     def __enter__(self) -> Self:
@@ -187,6 +186,7 @@ class BoardClient:
         """
         hello = self.send(set_rate_command(REFERENCE_RATE_HZ))
         decoder = BoardProtocol()
+        # a hello without a measurement, so that only the samples count
         decoder.feed(0.0, replace(hello, bandgap_sum=0, bandgap_count=0).encode())
 
         def measured() -> float | None:

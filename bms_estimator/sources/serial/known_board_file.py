@@ -13,7 +13,7 @@ STORED_FIELDS = ("serial", "divider", "volts_per_ampere", "bandgap_v")
 """Fields of a board's hello that are stored."""
 NO_BOARD: Mapping[str, str] = dict.fromkeys(STORED_FIELDS, "")
 """Content of the file that makes the service accept any board as the pack's."""
-_SERIAL = re.compile(r"([0-9a-f]{8})?")
+_SERIAL_PATTERN = re.compile(r"([0-9a-f]{8})?")
 MAX_FILE_BYTES = 4096
 """Maximum size of the file [bytes]."""
 
@@ -24,7 +24,7 @@ class KnownBoardFile:
     """File ``<pack.name>.board.json`` in the state folder, readable by its owner only.
 
     The file is separate from the checkpoint, because a checkpoint is discarded when the cell changes, but the board is not.
-    A person may read and delete the file.
+    Users may read and delete the file.
 
     Args:
         folder: The state folder.
@@ -42,7 +42,7 @@ class KnownBoardFile:
     def load(self) -> Mapping[str, str]:
         """Load the stored board; empty if the file is missing or not valid. An invalid file is logged."""
         try:
-            return _checked(json.loads(read_private(self.path, MAX_FILE_BYTES)))
+            return _validate(json.loads(read_private(self.path, MAX_FILE_BYTES)))
         except FileNotFoundError:
             return {}
         except (OSError, UnsafeFileError, ValueError, RecursionError) as error:
@@ -71,7 +71,7 @@ class KnownBoardFile:
         write_private(self.path, json.dumps(dict(board)).encode() + b"\n")
 
 
-def _checked(content: object) -> Mapping[str, str]:
+def _validate(content: object) -> Mapping[str, str]:
     """Return the stored fields of a file's content.
 
     Raises:
@@ -79,6 +79,6 @@ def _checked(content: object) -> Mapping[str, str]:
     """
     if not isinstance(content, dict) or not all(isinstance(content.get(name), str) for name in STORED_FIELDS):
         raise ValueError("no board in it")
-    if not _SERIAL.fullmatch(content["serial"]):
+    if not _SERIAL_PATTERN.fullmatch(content["serial"]):
         raise ValueError(f"serial {content['serial'][:20]!r} is not valid")
     return {name: content[name] for name in STORED_FIELDS}

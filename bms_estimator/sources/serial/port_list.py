@@ -40,8 +40,8 @@ class NoPortError(Exception):
 class PortBusyError(NoPortError):
     """Another process has the port at ``path`` open.
 
-    Its text names the process that uses the port. The search through all processes takes milliseconds, so that it runs
-    only when the text is needed.
+    The error text names the process that uses the port. The search through all processes takes milliseconds, so that it
+    runs only when the text is needed.
     """
 
     def __init__(self, path: str) -> None:
@@ -49,7 +49,7 @@ class PortBusyError(NoPortError):
         self.path = path
 
     def __str__(self) -> str:
-        return f"{self.path}: in use by {holder(self.path) or 'another process, or another pack of this one'}"
+        return f"{self.path}: in use by {holder(self.path) or 'another process or another pack of this process'}"
 
 
 def stable_names() -> list[Path]:

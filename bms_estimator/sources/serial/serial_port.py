@@ -29,28 +29,28 @@ class SerialPort:
     Arrival times therefore never step.
 
     Args:
-        open_next: Opens the port: returns its path, and the port.
+        find_and_open: Finds and opens the port; returns its path and the port.
         report: Called with the reason why the port is not open.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: Delay before a missing or lost port is retried [s].
 
     Attributes:
-        openings: Number of openings of the port.
+        openings: Number of times that the port was opened.
         lost: Event that is set when the port fails. The owner may also set it to have the port closed.
     """
 
     def __init__(
         self,
-        open_next: Callable[[], tuple[str, "serial.Serial"]],
+        find_and_open: Callable[[], tuple[str, "serial.Serial"]],
         *,
         report: Callable[[str], None],
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = since_boot,
         first_retry_s: float = FIRST_RETRY_S,
     ) -> None:
-        self._open_next, self._report = open_next, report
-        self._monotonic, self._epoch_s = monotonic, wall() - monotonic()
+        self._find_and_open, self._report = find_and_open, report
+        self._monotonic, self._wall_offset_s = monotonic, wall() - monotonic()
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
         self._chunks: asyncio.Queue[Chunk | None] = asyncio.Queue()
         self._port: serial.Serial | None = None
@@ -60,7 +60,7 @@ class SerialPort:
     @property
     def now_s(self) -> float:
         """Present time on the clock of the arrival times [s since 1970]."""
-        return self._epoch_s + self._monotonic()
+        return self._wall_offset_s + self._monotonic()
 
     @property
     def is_open(self) -> bool:
@@ -81,7 +81,7 @@ class SerialPort:
             await asyncio.sleep(self._retry_s)
             self._retry_s = min(max(2.0 * self._retry_s, self._first_retry_s), MAX_RETRY_S)
             try:
-                path, self._port = self._open_next()
+                path, self._port = self._find_and_open()
             except PortBusyError as error:
                 # the error's text needs a slow search through /proc, which must not block other packs
                 reason = await asyncio.to_thread(str, error)

@@ -11,7 +11,7 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.sample import SampleBlock
 from bms_estimator.process.backoff import FIRST_RETRY_S
 from bms_estimator.protocols.base.device_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
@@ -23,7 +23,7 @@ from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.port_discovery import BUSY_PORT_RETRY_S, WRONG_PORT_RETRY_S, PortDiscovery
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
 from bms_estimator.sources.serial.serial_port import SerialPort
-from bms_estimator.sources.source import Chunk, ReadTap, SourceHealth
+from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
 
 if TYPE_CHECKING:
     import serial
@@ -50,7 +50,7 @@ class SerialSource:
 
     Args:
         settings: Port, protocol, baud rate, sample rate.
-        memory: File that stores the pack's board. It is used only if the board reports a serial number. None: the board is
+        board_file: File that stores the pack's board. It is used only if the board reports a serial number. None: the board is
             not stored.
         tap: Receives a copy of each arrival time and chunk that the decoder is fed.
         wall: Wall clock [s since 1970].
@@ -63,7 +63,7 @@ class SerialSource:
         self,
         settings: SensorSettings,
         *,
-        memory: KnownBoardFile | None = None,
+        board_file: KnownBoardFile | None = None,
         tap: ReadTap | None = None,
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = since_boot,
@@ -71,30 +71,30 @@ class SerialSource:
         silent_s: float = SILENT_S,
     ) -> None:
         self._settings, self._tap = settings, tap
-        slow_s = settings.period_s or 0.0
-        self._silent_s = max(silent_s, SILENT_PERIODS * slow_s if slow_s > 1.0 else 0.0)
+        period_s = settings.period_s or 0.0
+        self._silence_limit_s = max(silent_s, SILENT_PERIODS * period_s if period_s > 1.0 else 0.0)
         self._monotonic = monotonic
         make_protocol(settings).feed(0.0, b"\0\n")  # ends a frame, so that numba compiles the decoder now
         self._decoder = make_protocol(settings)
         has_serial_number = settings.protocol == "binary"  # other devices report no serial number
         self._board_check = BoardCheck(
-            lambda: make_protocol(settings), settings.serial or "", memory if has_serial_number else None
+            lambda: make_protocol(settings), settings.serial or "", board_file if has_serial_number else None
         )
         self._discovery = PortDiscovery(settings.port, monotonic)
         self._port = SerialPort(
-            self._open_next,
+            self._find_and_open,
             report=self._report,
             wall=wall,
             monotonic=monotonic,
             first_retry_s=first_retry_s,
         )
-        self._message: str | None = "not opened yet"
-        self._openings = 0  # number of openings of the port whose chunks have been read
-        self._rejected = False  # True from the rejection of a device until another message is set
+        self._silence_reason: str | None = "not opened yet"
+        self._openings_read = 0  # number of openings of the port whose chunks have been read
+        self._rejected = False  # True from the rejection of a device until another reason for silence is set
         self._path = ""  # path of the open port
         self._last_check_s = monotonic()  # time of the last iteration of the task
         self._block_arrival_s = math.nan  # arrival time of the last block's bytes
-        self._faults = FaultLog()
+        self._fault_log = FaultLog()
         self._decoded = asyncio.Event()
         self._command_lock = asyncio.Lock()
         self._task: asyncio.Task[None] | None = None
@@ -110,19 +110,14 @@ class SerialSource:
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
 
     @property
-    def message(self) -> str | None:
-        """Reason why no samples arrive; None when they do."""
-        return self._message
+    def silence_reason(self) -> str | None:
+        """Reason why no samples arrive; None while they arrive."""
+        return self._silence_reason
 
     @property
     def board(self) -> Mapping[str, str]:
         """Properties from the board's hello; empty without one."""
         return self._decoder.board
-
-    @property
-    def cells(self) -> CellBlock:
-        """Cell voltages of the last block [V]."""
-        return self._decoder.cells
 
     @property
     def clock_ppm(self) -> float | None:
@@ -133,7 +128,9 @@ class SerialSource:
         """Return the health of the port and its task."""
         now_s = self._port.now_s
         return SourceHealth(
-            self._monotonic() - self._last_check_s, now_s - self._block_arrival_s, self._port.queued_chunks
+            task_idle_s=self._monotonic() - self._last_check_s,
+            block_age_s=now_s - self._block_arrival_s,
+            queued_reads=self._port.queued_chunks,
         )
 
     async def __aenter__(self) -> Self:
@@ -148,7 +145,7 @@ class SerialSource:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
 
-    async def __aiter__(self) -> AsyncIterator[SampleBlock]:
+    async def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks as bytes arrive.
 
         A chunk goes to the tap when its block is requested, so that nothing is recorded that the caller has not received.
@@ -158,17 +155,17 @@ class SerialSource:
                 block = self._decode(arrival_s, data)
                 if block.size:
                     self._block_arrival_s = arrival_s
-                    if self._message is not None:
-                        self._message, self._rejected = None, False
+                    if self._silence_reason is not None:
+                        self._silence_reason, self._rejected = None, False
                         self._port.reset_backoff()
-                    yield block
+                    yield ReceivedSamples(block, self._decoder.cells)
         if self._task is not None and not self._task.cancelled():
             self._task.result()
 
     def _accepted_chunks(self, chunk: Chunk) -> Sequence[Chunk]:
         """Return the chunks to decode now."""
         if not chunk[1]:  # an empty chunk marks an opening of the port
-            self._openings += 1
+            self._openings_read += 1
             self._decoder.on_port_opened()
             self._board_check.on_port_opened()
             return ()
@@ -178,9 +175,9 @@ class SerialSource:
             self._reject_device(f"{self._path}: refused: {error}")
             return ()
 
-    def _reject_device(self, message: str) -> None:
+    def _reject_device(self, reason: str) -> None:
         """Reject the device on the port and search elsewhere."""
-        self._report(message)
+        self._report(reason)
         self._rejected = True
         self._discovery.skip_port(self._path, WRONG_PORT_RETRY_S)
         self._port.lost.set()
@@ -192,7 +189,7 @@ class SerialSource:
 
     def _send_due(self) -> None:
         """Send the decoder's output, unless chunks from before the last opening of the port are still queued."""
-        if self._openings == self._port.openings and not self._port.lost.is_set():
+        if self._openings_read == self._port.openings and not self._port.lost.is_set():
             self._port.send(self._current_decoder.next_output(self._port.now_s))
 
     def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
@@ -237,7 +234,7 @@ class SerialSource:
         """
         try:
             if not self._port.is_open:
-                raise UserError(f"the board is not connected: {self._message}")
+                raise UserError(f"the board is not connected: {self._silence_reason}")
             self._send_due()
             async with asyncio.timeout(COMMAND_TIMEOUT_S):
                 while not command.done:
@@ -250,7 +247,7 @@ class SerialSource:
         if command.refusal:
             raise UserError(command.refusal)
 
-    def _open_next(self) -> tuple[str, "serial.Serial"]:
+    def _find_and_open(self) -> tuple[str, "serial.Serial"]:
         """Open the next candidate port.
 
         Raises:
@@ -279,7 +276,7 @@ class SerialSource:
     async def _supervise(self, path: str) -> None:
         """Report silence and faults until the port is lost."""
         if not self._rejected:
-            self._message = f"{path}: open, no frame yet"
+            self._silence_reason = f"{path}: open, no frame yet"
             log.info("port opened", port=path, baud=self._settings.baud)
         last_frame_s, frames = self._monotonic(), self._decoder.counters["frames_received"]
         while not self._port.lost.is_set():
@@ -289,20 +286,20 @@ class SerialSource:
             if counters["frames_received"] != frames:
                 last_frame_s, frames = now_s, counters["frames_received"]
                 self._board_check.remember_board(self.board, now_s)
-            elif self._rejected:
+            elif self._rejected:  # the reason is already reported
                 continue
             elif fault := self._current_decoder.fault:
                 self._report_or_reject(f"{path} at {self._settings.baud} baud: {fault}")
-            elif now_s - last_frame_s >= max(self._silent_s, self._current_decoder.allowed_silence_s):
+            elif now_s - last_frame_s >= max(self._silence_limit_s, self._current_decoder.allowed_silence_s):
                 self._report_or_reject(f"{path}: open, but silent")
-            self._faults.check(counters, now_s)
+            self._fault_log.check(counters, now_s)
 
-    def _report_or_reject(self, message: str) -> None:
+    def _report_or_reject(self, reason: str) -> None:
         """Report why no samples arrive. On a port that is not the preferred one, try other ports."""
         if self._discovery.is_preferred:
-            self._report(message)
+            self._report(reason)
         else:
-            self._reject_device(message)
+            self._reject_device(reason)
 
     async def _send_until_check(self) -> None:
         """Send due bytes until the next check, or until the port is lost."""
@@ -314,9 +311,9 @@ class SerialSource:
                     await self._port.lost.wait()
                     return
 
-    def _report(self, message: str) -> None:
-        """Set the message; log it if it is new."""
+    def _report(self, reason: str) -> None:
+        """Set the reason why no samples arrive; log it if it is new."""
         self._last_check_s = self._monotonic()
-        if message != self._message:
-            log.warning("no samples", reason=message)
-        self._message, self._rejected = message, False
+        if reason != self._silence_reason:
+            log.warning("no samples", reason=reason)
+        self._silence_reason, self._rejected = reason, False

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from bms_estimator.calibration.cleaning.rests import soc_by_counting
-from bms_estimator.calibration.thesis.adapt_steps import Start, steps_2_and_3
+from bms_estimator.calibration.thesis.adapt_steps import CaptureWithSoc, steps_2_and_3
 from bms_estimator.calibration.thesis.prediction import open_circuit, predict
 from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
 from bms_estimator.estimator import Estimator
@@ -312,7 +312,7 @@ def learn_thesis(cell: CellModel, samples: SampleBlock, initial_soc: float) -> L
 
 def learn_from_start(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
     """Run steps 2 and 3 of the thesis with bounds around the initial parameters."""
-    return Counted(cell, steps_2_and_3(cell, [Start(samples, initial_soc)], LOWEST_SOC).a)
+    return Counted(cell, steps_2_and_3(cell, [CaptureWithSoc(samples, initial_soc)], LOWEST_SOC).a)
 
 
 def run_joint_ekf(cell: CellModel, samples: SampleBlock) -> Callable[[], object]:

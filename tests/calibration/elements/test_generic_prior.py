@@ -1,4 +1,4 @@
-"""Prior of the elements from the most similar generic cell."""
+"""Prior of the circuit elements: those of the most similar generic cell."""
 
 import numpy as np
 import pytest
@@ -19,10 +19,8 @@ SOC = np.linspace(0.0, 1.0, 51)
 @pytest.mark.parametrize("name", ["lfp", "lto", "nca"])
 @pytest.mark.parametrize("series_count", [1, 4])
 def test_nearest_generic_cell_has_the_chemistry_of_the_curve(name, series_count):
-    error_v = 0.01 * series_count * np.sin(9.0 * SOC)
-    result = nearest_generic_cell(
-        SOC, series_count * np.interp(SOC, *curve(load_cell(name, 1.0), "ocv_v")) + error_v, 7.0, series_count
-    )
+    cell_v = np.interp(SOC, *curve(load_cell(name, 1.0), "ocv_v")) + 0.01 * np.sin(9.0 * SOC)  # with an error of 10 mV
+    result = nearest_generic_cell(SOC, series_count * cell_v, 7.0, series_count)
     assert result == load_cell(name, 7.0).pack(series_count, 1)
 
 
@@ -31,7 +29,7 @@ def test_nearest_generic_cell_of_a_real_layered_oxide_is_nca_or_nmc(data):
     assert nearest_generic_cell(soc, ocv_v, 5.0, 1).cell.name in {"nca", "nmc"}
 
 
-def test_ladder_has_the_resistances_of_the_rests_and_the_shape_of_the_generic_cell():
+def test_the_prior_ladder_has_the_resistances_of_the_rests_and_the_shape_of_the_generic_cell():
     generic = load_cell("nmc", 3.0)
     assert scaled_generic_ladder(generic, None) == generic.ladder
     result = scaled_generic_ladder(
@@ -39,18 +37,19 @@ def test_ladder_has_the_resistances_of_the_rests_and_the_shape_of_the_generic_ce
     )
 
     def ohm(ladder):
+        """Return the resistances with weak and with strong temperature dependence."""
         return np.array(ladder.weak_ohm), np.array(ladder.strong_ohm)
 
     middle_ohm = sum(ohm(result))[:, result.soc.index(0.5)]
-    assert middle_ohm[0] == pytest.approx(0.05, rel=1e-3)
-    assert middle_ohm[1:].sum() == pytest.approx(0.03, rel=1e-3)
+    assert middle_ohm[0] == pytest.approx(0.05, rel=1e-3)  # R_s
+    assert middle_ohm[1:].sum() == pytest.approx(0.03, rel=1e-3)  # R_ts + R_tl
     for part, generic_part in zip(ohm(result), ohm(generic.ladder), strict=True):
         assert np.ptp(part / generic_part, axis=1) == pytest.approx(0.0, abs=2e-3)
     assert (result.std, result.temperature_c) == (RESTS_STD, generic.ladder.temperature_c)
 
 
 def test_resistances_of_cold_rests_are_converted_to_25_c():
-    """The rests of an 18650 NCA cell give 29 and 39 mohm at 25 C, and 62 and 101 mohm at 0 C.
+    """The rests of an 18650 NCA cell give R_s = 29 mohm and R_ts + R_tl = 39 mohm at 25 C, and 62 and 101 mohm at 0 C.
 
     The generic temperature dependence converts the values at 0 C to 27 and 37 mohm.
     """

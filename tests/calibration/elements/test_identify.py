@@ -21,32 +21,38 @@ from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps, wrong_start
 
 WARM_C, COLD_C = 25.0, -5.0
+"""Temperatures of the simulated captures [C]."""
 OHM = {"r_s": 28e-3, "r_ts": 24e-3, "r_tl": 24e-3}
 """Resistances of ``LADDER`` at SOC 0.5 and 25 C."""
 
 
 @pytest.fixture(scope="module")
 def warm():
+    """Return a capture of random steps at 25 C."""
     return Columns(ladder_capture(steps(), WARM_C), "warm")
 
 
 @pytest.fixture(scope="module")
 def cold():
+    """Return a capture of random steps at -5 C."""
     return Columns(ladder_capture(steps(3), COLD_C), "cold")
 
 
 @pytest.fixture(scope="module")
 def identified(warm, cold):
+    """Return the identification from both captures, which starts from wrong elements."""
     return identify([warm, cold], wrong_start())
 
 
 @pytest.fixture(scope="module")
 def from_warm(warm):
+    """Return the identification from the warm capture."""
     return identify([warm], wrong_start())
 
 
 @pytest.fixture(scope="module")
 def from_warm_with_given_ocv(warm):
+    """Return the identification from the warm capture, without a correction of the OCV."""
     return identify([warm], wrong_start(), refine_ocv=False)
 
 
@@ -70,7 +76,7 @@ def test_captures_at_two_temperatures_predict_a_temperature_between(identified, 
     assert voltage_rms_mv(from_warm.cell, between) > 1.5 * voltage_rms_mv(identified.cell, between)
 
 
-def test_at_one_temperature_the_weak_share_is_that_of_the_given_file(identified, warm):
+def test_from_one_temperature_the_weak_share_of_each_resistance_is_that_of_the_given_file(identified, warm):
     result = identify([warm], identified.cell).cell.ladder
     ladders = result, identified.cell.ladder
     weak, strong = (np.array([getattr(x, part) for x in ladders]) for part in ("weak_ohm", "strong_ohm"))
@@ -78,8 +84,9 @@ def test_at_one_temperature_the_weak_share_is_that_of_the_given_file(identified,
     assert is_positive.mean() > 0.8
     fitted_share, given_share = (weak / (weak + strong + 1e-15))[:, is_positive]
     assert fitted_share == pytest.approx(given_share, abs=1e-6)
-    assert np.ptp(given_share) > 0.2
-    assert (weak + strong).sum(axis=1)[0, 2:] == pytest.approx((weak + strong).sum(axis=1)[1, 2:], rel=0.1)
+    assert np.ptp(given_share) > 0.2  # so that the comparison is not trivial
+    total_ohm = (weak + strong).sum(axis=1)
+    assert total_ohm[0, 2:] == pytest.approx(total_ohm[1, 2:], rel=0.1)
     assert result.temperature_c == (COLD_C, WARM_C)
 
 
@@ -90,28 +97,27 @@ def growth_near_empty(ladder):
 
 
 def test_without_data_near_empty_the_resistances_grow_partly_as_in_the_given_file(warm):
-    without_low_soc = Columns(
-        warm.rows[: int(np.argmax(np.cumsum(warm.rows["current_a"]) > 0.6 * 3600.0 * 3.0))], "above"
-    )
-    result = {}
-    for name, times in (("level", 1.0), ("growing", 4.0)):
-        rows = ((0.004 * times, 0.004, 0.004),) * 7
+    end = int(np.argmax(np.cumsum(warm.rows["current_a"]) > 0.6 * 3600.0 * TRUTH.cell.capacity_ah))
+    without_low_soc = Columns(warm.rows[:end], "above")
+    growth = {}
+    for name, given_growth in (("level", 1.0), ("growing", 4.0)):
+        rows = ((0.004 * given_growth, 0.004, 0.004),) * 7
         parts = {"soc": (0.0, 0.3, 1.0), "weak_ohm": rows, "strong_ohm": rows, "std": 0.6}
         given = TRUTH.model_copy(update={"ladder": LADDER.model_copy(update=parts)})
         cell = identify([without_low_soc], given, refine_ocv=False).cell
-        result[name] = growth_near_empty(cell.ladder)
+        growth[name] = growth_near_empty(cell.ladder)
         growth_again = growth_near_empty(identify([without_low_soc], cell, refine_ocv=False).cell.ladder)
-        assert growth_again == pytest.approx(result[name], rel=0.1)
-    assert 1.5 * result["level"] < result["growing"] < 3.0
+        assert growth_again == pytest.approx(growth[name], rel=0.1)
+    assert 1.5 * growth["level"] < growth["growing"] < 3.0
 
 
 def test_a_capture_with_little_information_gives_a_larger_std(warm, from_warm_with_given_ocv):
     from_short = identify([Columns(warm.rows[:700], "short")], wrong_start(), refine_ocv=False)
-    stds = [result.cell.ladder.std for result in (from_warm_with_given_ocv, from_short)]
-    assert module.LADDER_STD < stds[0] < 1.3 * module.LADDER_STD < 1.5 * stds[0] < stds[1]
+    std, std_from_short = (result.cell.ladder.std for result in (from_warm_with_given_ocv, from_short))
+    assert module.LADDER_STD < std < 1.3 * module.LADDER_STD < 1.5 * std < std_from_short
 
 
-def test_elements_of_the_file_are_equivalent_to_the_ladder(identified):
+def test_the_two_rc_pairs_of_the_file_are_equivalent_to_its_ladder(identified):
     ladder, a = identified.cell.ladder, identified.cell.a
     for soc in (0.35, 0.5, 0.9):
         rows = np.array(ladder.weak_ohm) + np.array(ladder.strong_ohm)
@@ -119,6 +125,7 @@ def test_elements_of_the_file_are_equivalent_to_the_ladder(identified):
         assert r_s(soc, a) == pytest.approx(ohm[0], rel=0.1)
         assert r_ts(soc, a) == pytest.approx(ohm[1:4].sum(), rel=0.1)
         assert r_tl(soc, a) == pytest.approx(ohm[4:].sum(), rel=0.1)
+        # The time constants lie between those of the RC pairs of the ladder that each replaces.
         assert 1.0 < r_ts(soc, a) * c_ts(soc, a) < 30.0
         assert 120.0 < r_tl(soc, a) * c_tl(soc, a) < 2000.0
 
@@ -141,7 +148,7 @@ def test_rc_pairs_that_a_slow_capture_does_not_determine_have_small_positive_res
     assert 1.0 < sections["r_ts"].offset_ohm * sections["c_ts"].offset_farad < 30.0
 
 
-def test_captures_at_similar_temperatures_are_held_back_from_the_fit_that_they_score(warm, cold):
+def test_a_capture_is_held_back_from_its_score_if_another_has_a_similar_temperature(warm, cold):
     other = Columns(ladder_capture(steps(5), WARM_C + 3.0), "other")
     result = identify([warm, cold, other], wrong_start())
     assert [c.held_back for c in result.captures] == [True, False, True]
@@ -153,7 +160,7 @@ def test_captures_at_similar_temperatures_are_held_back_from_the_fit_that_they_s
         assert mean == pytest.approx(gmean(of_captures))
 
 
-def test_identification_that_makes_replays_worse_is_rejected_with_the_scores(warm, monkeypatch):
+def test_an_identification_that_makes_replays_worse_is_rejected_with_the_scores(warm, monkeypatch):
     given = wrong_start()
     monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell is given else 5.25)
     with pytest.raises(UserError, match=r"^nothing is written: .* from 1\.50 to 5\.25 % of SOC") as caught:
@@ -175,12 +182,12 @@ def test_captures_too_short_for_a_replay_are_identified_without_score():
     assert np.isnan(result.captures[0].score_after)
 
 
-def test_the_score_is_larger_for_a_wrong_interval():
+def test_the_score_is_larger_if_the_true_soc_is_outside_the_interval():
     load = clean_capture("steps", capture(steps()), TRUTH)
     soc = 0.98 - load.discharged_ah / TRUTH.cell.capacity_ah
-    good = interval_score(TRUTH, load, soc)
-    assert 0.0 < good < 10.0
-    assert interval_score(TRUTH, load, np.clip(soc + 0.2, 0.0, 1.0)) > 3.0 * good
+    score = interval_score(TRUTH, load, soc)
+    assert 0.0 < score < 10.0
+    assert interval_score(TRUTH, load, np.clip(soc + 0.2, 0.0, 1.0)) > 3.0 * score
 
 
 def test_a_wrong_ocv_is_corrected(warm):
@@ -195,27 +202,27 @@ def test_a_wrong_ocv_is_corrected(warm):
     assert (np.diff(result.ocv_v) > 0.0).all()
 
 
-def test_a_possible_error_of_hysteresis_does_not_change_the_curve(warm):
+def test_an_ocv_error_within_the_hysteresis_hardly_changes_the_curve(warm):
     """With a hysteresis of +-25 mV, an error of 8 mV in a discharge gives no information on the OCV after charge."""
     soc = np.linspace(0.0, 1.0, 101)
     true_v = np.interp(soc, np.linspace(0.0, 1.0, ocv_grid(TRUTH)[0].size), ocv_grid(TRUTH)[0])
     curve_shift_v = {}
-    for name, hysteresis_v in (("branches", 0.025), ("one", None)):
-        middle_v = true_v + 8e-3 + (hysteresis_v or 0.0)
-        with_given_temperature = TableOcv(
+    for name, hysteresis_v in (("with hysteresis", 0.025), ("without", None)):
+        mean_v = true_v + 8e-3 + (hysteresis_v or 0.0)
+        wrong = TableOcv(
             form="table",
             soc=tuple(soc),
-            ocv_v=tuple(middle_v),
+            ocv_v=tuple(mean_v),
             error_v=(8e-3,) * soc.size,
             hysteresis_v=None if hysteresis_v is None else (hysteresis_v,) * soc.size,
         )
-        result = identify([warm], TRUTH.model_copy(update={"ocv": with_given_temperature}), initial_soc=0.98).cell.ocv
-        curve_shift_v[name] = np.mean((np.interp(soc, result.soc, result.ocv_v) - middle_v)[20:90])
+        result = identify([warm], TRUTH.model_copy(update={"ocv": wrong}), initial_soc=0.98).cell.ocv
+        curve_shift_v[name] = np.mean((np.interp(soc, result.soc, result.ocv_v) - mean_v)[20:90])
         assert result.hysteresis_v is None or result.hysteresis_v[0] == hysteresis_v
-    assert abs(curve_shift_v["branches"]) < 0.5 * abs(curve_shift_v["one"])
+    assert abs(curve_shift_v["with hysteresis"]) < 0.5 * abs(curve_shift_v["without"])
 
 
-def test_the_miscount_of_a_capture_is_identified(warm, from_warm_with_given_ocv):
+def test_the_error_of_the_counted_charge_of_a_capture_is_identified(warm, from_warm_with_given_ocv):
     rows = warm.rows.copy()
     rows["current_a"] *= 0.98
     with_small_current = identify([Columns(rows, "lacking")], wrong_start(), refine_ocv=False)
@@ -234,6 +241,7 @@ def test_a_pack_is_identified_with_the_accuracy_of_a_cell():
     pack = TRUTH.pack(6, 2)
     samples = capture(2.0 * steps(), cell=pack, noise_v=3e-3)
     result = identify([Columns(samples, "pack")], wrong_start().pack(6, 2))
+    # Six cells in series and two in parallel have three times the resistance of a cell.
     assert result.elements[0.5]["r_s"][0] == pytest.approx(3.0 * r_s(0.5, TRUTH.a), rel=0.03)
     assert voltage_rms_mv(result.cell, samples) < 36.0
 
@@ -241,13 +249,13 @@ def test_a_pack_is_identified_with_the_accuracy_of_a_cell():
 def test_glitches_do_not_change_the_result(warm, from_warm):
     samples = warm.rows.copy()
     rng = np.random.default_rng(5)
-    samples_with_faults = rng.choice(np.arange(100, samples.size - 100), 60, replace=False)
-    samples["voltage_v"][samples_with_faults[:20]] = 0.0
-    samples["voltage_v"][samples_with_faults[20:35]] = 3.0
-    samples["voltage_v"][samples_with_faults[35:45]] = np.nan
-    resting = samples_with_faults[45:][samples["current_a"][samples_with_faults[45:]] == 0.0]
+    faulty = rng.choice(np.arange(100, samples.size - 100), 60, replace=False)
+    samples["voltage_v"][faulty[:20]] = 0.0
+    samples["voltage_v"][faulty[20:35]] = 3.0
+    samples["voltage_v"][faulty[35:45]] = np.nan
+    resting = faulty[45:][samples["current_a"][faulty[45:]] == 0.0]
     samples["current_a"][resting] = 4.6
-    samples["time_s"][50:52] = samples["time_s"][49]
+    samples["time_s"][50:52] = samples["time_s"][49]  # repeated time stamps
     result = identify([Columns(samples, "glitches")], wrong_start())
     assert result.captures[0].glitches >= 45
     for name in OHM:
@@ -285,12 +293,13 @@ def test_without_a_sensor_the_given_temperature_is_used(cold):
 
 def test_the_initial_soc_can_be_given_and_a_cold_rest_near_full_is_full():
     samples = ladder_capture(steps(), COLD_C, soc=1.0)
-    samples["voltage_v"] -= 0.015
+    samples["voltage_v"] -= 0.015  # so that the OCV would give an SOC below 1
     assert identify([Columns(samples, "cold")], wrong_start()).captures[0].initial_soc == 1.0
     assert identify([Columns(samples, "cold")], wrong_start(), initial_soc=0.99).captures[0].initial_soc == 0.99
 
 
 def with_capacity(capacity_ah):
+    """Return the true cell with another capacity in its file."""
     cell = TRUTH.cell.model_copy(update={"capacity_ah": capacity_ah})
     return TRUTH.model_copy(update={"cell": cell})
 
@@ -351,14 +360,14 @@ def convert_time_to_hours(samples):
         "another cell",
     ],
 )
-def test_errors_contain_the_fault_and_its_numbers(samples, cell, expected_texts):
+def test_a_faulty_capture_is_rejected_with_the_fault_and_its_numbers(samples, cell, expected_texts):
     with pytest.raises(UserError) as caught:
         identify([Columns(samples, "bad.csv")], cell)
     assert str(caught.value).startswith("bad.csv: ")
     assert all(word in str(caught.value) for word in expected_texts)
 
 
-def test_a_good_capture_contradicts_only_a_wrong_initial_soc():
+def test_a_capture_without_faults_contradicts_only_a_wrong_initial_soc():
     load = clean_capture("good", capture(steps()), TRUTH)
     start = initial_soc(load, TRUTH)
     assert capture_contradictions(load, TRUTH, start) == []

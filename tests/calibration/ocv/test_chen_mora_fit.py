@@ -17,6 +17,7 @@ GRID = np.linspace(0.0, 1.0, 501)
 
 
 def make_points(soc, ocv_v, std_v=1e-3):
+    """Return points of an OCV that all have the std ``std_v``."""
     soc = np.asarray(soc, dtype=float)
     return Points(soc, np.asarray(ocv_v, dtype=float), np.full(soc.size, std_v))
 
@@ -32,9 +33,9 @@ def test_exact_points_give_the_true_parameters(a):
 def test_shipped_cell_has_the_curve_of_table_1():
     ocv = load_cell("chen_mora").ocv
     assert ocv.a == pytest.approx(TABLE_1)
-    x = 0.37
-    expected_v = -1.031 * np.exp(-35.0 * x) + 3.685 + 0.2156 * x - 0.1178 * x**2 + 0.3201 * x**3
-    assert chen_mora(np.array(TABLE_1), np.array([x]))[0] == pytest.approx(expected_v, rel=1e-15)
+    soc = 0.37
+    expected_v = -1.031 * np.exp(-35.0 * soc) + 3.685 + 0.2156 * soc - 0.1178 * soc**2 + 0.3201 * soc**3
+    assert chen_mora(np.array(TABLE_1), np.array([soc]))[0] == pytest.approx(expected_v, rel=1e-15)
 
 
 def test_standard_errors_equal_the_scatter_of_the_fits():
@@ -48,7 +49,7 @@ def test_standard_errors_equal_the_scatter_of_the_fits():
     assert np.mean([rms_v(fit.residual_v) for fit in fits]) == pytest.approx(1e-3, rel=0.1)
 
 
-def test_points_that_end_above_the_knee_give_a_voltage_near_or_above_0_at_soc_0():
+def test_points_above_the_knee_do_not_give_a_large_negative_voltage_at_soc_0():
     """Points above SOC 0.07 do not determine the amplitude of the exponential. The fit bounds it by the highest voltage."""
     soc = np.linspace(0.07, 1.0, 19)
     ocv_v = 3.2 + 0.1 * soc
@@ -76,12 +77,9 @@ def test_joint_fit_of_several_runs_is_better_than_the_mean_of_their_parameters()
     fits = [fit_chen_mora(run) for run in runs]
     mean = average(fits)
     assert mean == pytest.approx(sum(fit.a for fit in fits) / 3)  # (5.1), (5.2)
-    order = np.argsort(np.concatenate([run.soc for run in runs]))
-    joint = fit_chen_mora(
-        make_points(
-            np.concatenate([run.soc for run in runs])[order], np.concatenate([run.ocv_v for run in runs])[order]
-        )
-    )
+    soc, ocv_v = np.concatenate([run.soc for run in runs]), np.concatenate([run.ocv_v for run in runs])
+    order = np.argsort(soc)
+    joint = fit_chen_mora(make_points(soc[order], ocv_v[order]))
     above_knee = GRID[GRID > 0.05]
     true_v = chen_mora(true_a, above_knee)
     assert rms_v(joint(above_knee) - true_v) < rms_v(chen_mora(mean, above_knee) - true_v)

@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH
-from tests.calibration.simulated_relaxation import BAD, FIRST_REST_S, LOAD_S, REST_S, glitched, relaxation
+from tests.calibration.simulated_relaxation import FIRST_REST_S, INVALID_CAPTURES, LOAD_S, REST_S, glitched, relaxation
 
 CAPACITY_AH = TRUTH.cell.capacity_ah
 ROUNDS = 19
@@ -30,10 +30,11 @@ def true_ocv_v(soc):
 
 @pytest.fixture(scope="module")
 def noisy_test():
+    """Return the relaxation test of the true cell with 0.5 mV of noise."""
     return relaxation_test(relaxation(), CAPACITY_AH, name="noisy")
 
 
-def test_every_rest_is_found_at_its_time_and_soc(noisy_test):
+def test_every_rest_is_found_with_its_time_and_soc(noisy_test):
     assert len(noisy_test.rests) == 1 + ROUNDS
     assert noisy_test.rejected == ()
     assert noisy_test.glitches == 0
@@ -44,7 +45,7 @@ def test_every_rest_is_found_at_its_time_and_soc(noisy_test):
     assert noisy_test.full_v == pytest.approx(true_ocv_v([1.0])[0], abs=2e-3)
 
 
-def test_temperature_is_the_mean_of_the_rests_with_a_sensor(noisy_test):
+def test_the_temperature_is_the_mean_of_the_rests_that_have_one(noisy_test):
     rests = [replace(rest, temperature_c=c) for rest, c in zip(noisy_test.rests, (-10.0, -12.0, np.nan), strict=False)]
     assert replace(noisy_test, rests=tuple(rests)).temperature_c == pytest.approx(-11.0)
     assert np.isnan(replace(noisy_test, rests=tuple(rests[2:])).temperature_c)
@@ -56,11 +57,11 @@ def test_points_lie_on_the_open_circuit_voltage(noisy_test):
     assert np.sqrt(np.mean(error_v**2)) < 1e-3
 
 
-def test_extrapolation_is_nearer_than_the_end_voltage_and_within_its_std():
+def test_the_extrapolated_ocv_is_nearer_than_the_last_voltage_of_a_rest_and_within_its_std():
     extrapolated_error_v, end_error_v, is_within_std = [], [], []
     for seed in range(4):
         result = relaxation_test(relaxation(seed=seed), CAPACITY_AH, name="mine")
-        loaded = [rest for rest in result.rests if rest.soc < 0.99]
+        loaded = [rest for rest in result.rests if rest.soc < 0.99]  # rests after a load
         true_v = true_ocv_v([rest.soc for rest in loaded])
         extrapolated_error_v.append(result.ocv_v[1:] - true_v)
         end_error_v.append([rest.voltage_v for rest in loaded] - true_v)
@@ -84,7 +85,8 @@ def test_rests_of_any_length_are_within_their_std(rest_s):
     assert len(result.rests) + len(result.rejected) == 1 + ROUNDS
     assert len(result.rejected) <= (rest_s < 400)  # the last rest, at a low SOC at which the time constants are long
     error_v = np.abs(result.ocv_v - true_ocv_v(result.soc))
-    assert error_v.max() < {240: 0.016, 400: 8e-3, 3600: 1e-3}[rest_s]
+    max_error_v = {240: 0.016, 400: 8e-3, 3600: 1e-3}[rest_s]
+    assert error_v.max() < max_error_v
     assert np.sqrt(np.mean((error_v / result.std_v) ** 2)) < 1.3
 
 
@@ -98,10 +100,8 @@ def test_a_longer_rest_is_more_certain():
 
 @pytest.mark.parametrize("noise_v", [1e-3, 2e-3, 5e-3])
 def test_noise_makes_points_uncertain_but_not_wrong(noise_v):
-    """The noise is up to five times the remaining relaxation at the end of a rest.
-
-    Therefore the time constant is uncertain.
-    """
+    """The noise is up to five times the remaining relaxation at the end of a rest, so that the time constant is
+    uncertain."""
     errors_over_std, error_v = [], []
     for seed in range(3):
         result = relaxation_test(relaxation(noise_v=noise_v, seed=seed), CAPACITY_AH, name="mine")
@@ -113,7 +113,7 @@ def test_noise_makes_points_uncertain_but_not_wrong(noise_v):
 
 
 @pytest.mark.parametrize("every", [10, 30])
-def test_slow_sampling_gives_points_on_the_ocv(every):
+def test_a_sample_every_10_or_30_s_gives_points_on_the_ocv(every):
     result = relaxation_test(relaxation()[::every], CAPACITY_AH, name="mine")
     assert len(result.rests) >= ROUNDS
     error_v = result.ocv_v - true_ocv_v(result.soc)
@@ -122,7 +122,7 @@ def test_slow_sampling_gives_points_on_the_ocv(every):
 
 
 def test_real_rests_cut_in_half_are_extrapolated_towards_their_end(shared_data):
-    """Rests of half an hour of an NCR18650 are cut to their first quarter of an hour."""
+    """Rests of half an hour of an NCR18650 are cut to 15 min. The voltage after half an hour is the reference."""
     samples = load_capture(shared_data / "ncr18650" / "cell1_dst.csv.gz").rows
     uncut_test = relaxation_test(samples, 3.1, initial_soc=1.0, name="mine")
     is_cut = np.zeros(samples.size, dtype=bool)
@@ -189,19 +189,19 @@ def test_charge_is_counted_over_uneven_steps():
     assert soc_by_counting(samples, 2.0, 0.9) == pytest.approx([0.9, 0.895, 0.895, 0.395])
 
 
-@pytest.mark.parametrize("fault", BAD)
+@pytest.mark.parametrize("fault", INVALID_CAPTURES)
 def test_bad_input_is_rejected_with_its_numbers(fault):
-    make, capacity_ah, message = BAD[fault]
-    samples = make()
+    simulate, capacity_ah, message = INVALID_CAPTURES[fault]
+    samples = simulate()
     with pytest.raises(UserError) as caught:
         fit_chen_mora(pooled([relaxation_test(samples, capacity_ah, name="mine")]))
     assert message in str(caught.value)
 
 
 def test_short_rests_are_listed_with_their_lengths():
-    make, capacity_ah, _ = BAD["short rests"]
+    simulate, capacity_ah, _ = INVALID_CAPTURES["short rests"]
     with pytest.raises(UserError, match="rest at 420 s: 19 s long, shorter than 30 s"):
-        relaxation_test(make(), capacity_ah, name="mine")
+        relaxation_test(simulate(), capacity_ah, name="mine")
 
 
 @pytest.mark.parametrize(

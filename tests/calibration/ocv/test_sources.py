@@ -1,4 +1,4 @@
-"""Kinds of captures, and the OCV from several captures."""
+"""OCV from several captures: slow charges and discharges, relaxation tests, and given curves."""
 
 import numpy as np
 import pytest
@@ -27,8 +27,8 @@ INSIDE = (NODES > 0.1) & (NODES < 0.95)
 
 
 def sources_of(*samples, curves=(), capacity_ah=None, **options):
-    """Return the sources of the OCV in captures and external curves."""
-    recordings = [Recording(f"run{i}", one) for i, one in enumerate(samples)]
+    """Return the sources of the OCV in captures, which are named run0, run1 and so on, and in given curves."""
+    recordings = [Recording(f"run{i}", capture_samples) for i, capture_samples in enumerate(samples)]
     return find_sources(recordings, curves, capacity_ah=capacity_ah, **options)
 
 
@@ -38,14 +38,14 @@ def ocv_error_v(result):
 
 
 @pytest.mark.parametrize("files", [1, 2])
-def test_a_pair_gives_mean_hysteresis_and_capacity(files):
+def test_a_slow_discharge_and_charge_give_ocv_hysteresis_and_capacity(files):
     """Discharge and charge are in one file or in two."""
     result = sources_of(slow((1.0, -1.0))) if files == 1 else sources_of(slow((1.0,)), slow((-1.0,)))
     (source,) = result.sources
     assert source.kind.startswith("C/20 discharge and charge, 2.99")
     assert result.capacity_ah == result.measured_ah == pytest.approx(CAPACITY_AH, rel=2e-3)
     assert np.abs(ocv_error_v(result)).max() < 2e-3
-    # The rest of the difference between discharge and charge is polarization.
+    # 0.7 is ``REST_SHARE``. The other part of the difference between charge and discharge is polarization.
     assert result.hysteresis_v[INSIDE] == pytest.approx(0.7 * hysteresis_v(NODES[INSIDE]), abs=2e-3)
 
 
@@ -53,7 +53,7 @@ def test_a_pair_gives_mean_hysteresis_and_capacity(files):
 def test_a_noisy_current_sensor_and_a_charge_before_the_discharge_are_accepted(noise_a):
     samples = slow((-1.0, 1.0))
     samples["current_a"] += noise_a * np.random.default_rng(1).standard_normal(samples.size)
-    samples["current_a"][[700, 4000]] = 0.5
+    samples["current_a"][[700, 4000]] = 0.5  # glitches
     result = sources_of(samples)
     assert result.sources[0].kind.startswith("C/20 discharge and charge")
     assert result.capacity_ah == pytest.approx(CAPACITY_AH, rel=1e-2)
@@ -69,12 +69,12 @@ def test_an_unpaired_discharge_has_the_hysteresis_in_its_error():
     assert (np.abs(ocv_error_v(result)) < 2.5 * fit.error_v[INSIDE]).all()
 
 
-@pytest.mark.parametrize(("direction", "sign"), [(1.0, 1.0), (-1.0, -1.0)])
-def test_an_unpaired_curve_is_moved_by_half_of_a_typical_hysteresis(direction, sign):
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_an_unpaired_curve_is_moved_by_half_of_a_typical_hysteresis(direction):
     result, typical_v = sources_of(slow((direction,)), capacity_ah=CAPACITY_AH), hysteresis_v(NODES)
     centered = center_on_typical_hysteresis(result, typical_v)
     uncorrected, points = result.points, centered.points
-    assert points.ocv_v - uncorrected.ocv_v == pytest.approx(sign * hysteresis_v(uncorrected.soc), abs=1e-4)
+    assert points.ocv_v - uncorrected.ocv_v == pytest.approx(direction * hysteresis_v(uncorrected.soc), abs=1e-4)
     assert (points.common_v > uncorrected.common_v).all()
     assert centered.hysteresis_v == pytest.approx(typical_v)
     assert centered.hysteresis_std_v == pytest.approx(TYPICAL_HYSTERESIS_STD * typical_v)
@@ -87,6 +87,7 @@ def test_the_overpotential_of_an_unpaired_curve_is_subtracted(direction, rested)
     samples, ladder = slow((direction,)), load_cell("nca", CAPACITY_AH).ladder
     result = sources_of(samples if rested else samples[samples["current_a"] != 0.0], capacity_ah=CAPACITY_AH)
     uncorrected, (source,) = result.points, without_branches(result, ladder).sources
+    # With a rest, the step of the current has already shown the series resistance, the first row.
     rows = [row for part in (ladder.weak_ohm, ladder.strong_ohm) for row in part[int(rested) :]]
     drop_v = CURRENT_A * sum(np.interp(uncorrected.soc, ladder.soc, row) for row in rows)
     assert source.points.ocv_v - uncorrected.ocv_v == pytest.approx(direction * drop_v, rel=1e-3)
@@ -104,13 +105,13 @@ def test_a_cold_unpaired_curve_has_a_larger_overpotential():
     assert 1.5 < overpotential_v[1] / overpotential_v[0] < 5.0
 
 
-def test_nothing_is_subtracted_from_pairs_rests_and_given_curves():
+def test_no_overpotential_is_subtracted_from_pairs_rests_and_given_curves():
     soc, ladder = np.linspace(0.0, 1.0, 101), load_cell("nca", CAPACITY_AH).ladder
     result = sources_of(slow((1.0, -1.0)), relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)])
     assert without_branches(result, ladder) == result
 
 
-def test_rests_and_given_curves_without_hysteresis_are_moved_to_the_mean():
+def test_rests_and_given_curves_without_hysteresis_are_moved_by_half_of_a_typical_hysteresis():
     soc = np.linspace(0.0, 1.0, 101)
     result = sources_of(
         relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)], capacity_ah=TRUTH.cell.capacity_ah
@@ -122,13 +123,13 @@ def test_rests_and_given_curves_without_hysteresis_are_moved_to_the_mean():
 
 
 def test_an_incomplete_charge_is_left_out_with_a_note():
-    result = sources_of(slow((1.0,)), slow((-1.0,), part=0.85))
+    result = sources_of(slow((1.0,)), slow((-1.0,), moved_fraction=0.85))
     assert result.hysteresis_v is None
     assert len(result.sources) == 1
     assert "charge run1 left out: 2.5" in result.sources[0].notes[0]
 
 
-def test_a_slow_curve_of_an_aged_cell_uses_its_measured_capacity():
+def test_the_soc_of_a_slow_curve_of_an_aged_cell_is_counted_with_its_measured_capacity():
     result = sources_of(slow((1.0, -1.0), capacity_ah=2.7), capacity_ah=CAPACITY_AH)
     assert result.capacity_ah == CAPACITY_AH
     assert result.measured_ah == pytest.approx(2.7, rel=2e-3)
@@ -156,7 +157,7 @@ def test_rests_determine_the_remaining_fraction_of_the_hysteresis(fraction):
     assert f"rests keep {result.hysteresis_v[0] / 0.02:.2f} of its hysteresis" in result.sources[0].notes
 
 
-def test_a_capture_that_starts_lower_is_aligned_by_its_first_rest():
+def test_a_capture_that_does_not_start_full_is_aligned_by_its_first_rest():
     full, lower = relaxation(), capture(schedule(rounds=12), soc=0.93)
     result = sources_of(full, lower, capacity_ah=TRUTH.cell.capacity_ah)
     assert [test.start_soc for test in result.tests] == [1.0, pytest.approx(0.93, abs=5e-3)]
@@ -166,7 +167,7 @@ def test_a_capture_that_starts_lower_is_aligned_by_its_first_rest():
 
 
 def test_rests_after_charge_within_a_test_are_less_certain():
-    """In some rounds of the test, the load is a charge."""
+    """In every fifth round of the test, the load is a charge with half of the current."""
     current_a = schedule(rounds=17)
     is_load = current_a > 0.0
     current_a[is_load & (np.cumsum(np.diff(is_load, prepend=False) & is_load) % 5 == 4)] *= -0.5
@@ -177,11 +178,12 @@ def test_rests_after_charge_within_a_test_are_less_certain():
     grid = np.linspace(points.soc[0], 0.95, 50)
     uncorrected = fit_table(sources_of(relaxation(), capacity_ah=TRUTH.cell.capacity_ah).points)
     assert fit_table(points)(grid) == pytest.approx(uncorrected(grid), abs=4e-3)
-    by_soc = after_charge[np.argsort(test.tests[0].soc, kind="stable")]
-    assert points.std_v[by_soc].min() > np.median(points.std_v[~by_soc])
+    # Points are in the order of the SOC, rests in the order of time.
+    is_after_charge = after_charge[np.argsort(test.tests[0].soc, kind="stable")]
+    assert points.std_v[is_after_charge].min() > np.median(points.std_v[~is_after_charge])
 
 
-def test_pairs_at_several_temperatures_determine_de_dt():
+def test_pairs_at_several_temperatures_determine_the_temperature_coefficient():
     per_kelvin_v = 3e-4
     runs = [slow((1.0, -1.0), temperature_c=t, offset_v=per_kelvin_v * (t - 25.0)) for t in (10.0, 25.0, 45.0)]
     fit = fit_table(sources_of(*runs).points)
@@ -194,8 +196,8 @@ def test_pairs_at_several_temperatures_determine_de_dt():
     ("samples", "capacity_ah", "message"),
     [
         (relaxation, None, "--capacity-ah: not given, and no capture is a slow discharge"),
-        (lambda: slow((1.0,), part=0.7), None, "--capacity-ah: not given"),
-        (lambda: slow((1.0,), part=0.7), 1.8, "SOC runs from 1.000 to -0.16"),
+        (lambda: slow((1.0,), moved_fraction=0.7), None, "--capacity-ah: not given"),
+        (lambda: slow((1.0,), moved_fraction=0.7), 1.8, "SOC runs from 1.000 to -0.16"),
         (lambda: capture(np.full(7200, 1.5), soc=1.0), 3.0, "no rests in 1.94 h"),
     ],
 )

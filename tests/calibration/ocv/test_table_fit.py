@@ -15,11 +15,12 @@ GRID = np.linspace(0.0, 1.0, 401)
 
 
 def true_v(soc):
+    """Return the OCV of Table 1 of the thesis at each SOC [V]."""
     return chen_mora(np.array(TABLE_1), soc)
 
 
 def make_points(soc, *, noise_v=0.0, offset_v=0.0, std_v=1e-3, common_v=2e-3, temperature_c=np.nan, seed=0):
-    """Return points of one capture of the cell of Table 1."""
+    """Return points of one capture; ``common_v`` is the std of an error that all points share [V]."""
     ocv_v = true_v(soc) + offset_v + noise_v * np.random.default_rng(seed).standard_normal(soc.size)
     ones = np.ones(soc.size)
     return Points(soc, ocv_v, std_v * ones, common_v=common_v * ones, temperature_c=temperature_c * ones)
@@ -67,7 +68,7 @@ def test_the_error_of_the_curve_equals_the_scatter_of_the_fits():
     assert 0.3 < np.sqrt(np.mean(error_over_std**2)) < 1.1
 
 
-def test_error_grows_in_a_gap_beyond_the_points_and_with_disagreement():
+def test_the_error_is_larger_in_a_gap_beyond_the_points_and_if_captures_disagree():
     soc = np.linspace(0.1, 0.98, 45)
     without_gap = fit_table(make_points(soc))
     with_gap = fit_table(make_points(soc[(soc < 0.4) | (soc > 0.7)]))
@@ -87,7 +88,7 @@ def test_the_more_certain_source_determines_the_curve():
     assert max_v((fit.ocv_v - true_v(NODES))[inside]) < 2e-3
 
 
-def test_known_end_voltages_are_reached_and_unknown_ones_extrapolated():
+def test_known_end_voltages_are_reached_and_unknown_ones_are_extrapolated():
     soc = np.linspace(0.1, 0.9, 33)
     points = Points(soc, 3.4 + 0.7 * soc, np.full(soc.size, 1e-3))
     without_ends = fit_table(points)
@@ -98,7 +99,7 @@ def test_known_end_voltages_are_reached_and_unknown_ones_extrapolated():
 
 
 @pytest.mark.parametrize("per_kelvin_v", [3e-4, -2e-4])
-def test_de_dt_is_between_its_true_value_and_0(per_kelvin_v):
+def test_the_temperature_coefficient_is_between_its_true_value_and_0(per_kelvin_v):
     soc = np.linspace(0.05, 0.98, 45)
     at_temperatures = [
         make_points(soc, offset_v=per_kelvin_v * (t - 25.0), temperature_c=t, common_v=5e-4) for t in (15.0, 25.0, 45.0)
@@ -115,14 +116,14 @@ def test_de_dt_is_between_its_true_value_and_0(per_kelvin_v):
 
 
 @pytest.mark.parametrize("temperatures_c", [(25.0, 30.0), (np.nan, np.nan)])
-def test_de_dt_requires_a_temperature_span(temperatures_c):
+def test_the_temperature_coefficient_requires_different_temperatures(temperatures_c):
     soc = np.linspace(0.05, 0.98, 45)
     fit = fit_table(joined([make_points(soc, temperature_c=t) for t in temperatures_c]))
     assert fit.per_kelvin_v is None
     assert fit.table().per_kelvin_v is None
 
 
-def test_cells_in_series_scale_the_table():
+def test_points_of_cells_in_series_give_the_table_times_their_number():
     soc = np.linspace(0.05, 0.98, 45)
     cell_points = make_points(soc, noise_v=1e-3)
     pack_points = replace(

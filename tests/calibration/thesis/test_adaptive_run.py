@@ -1,6 +1,7 @@
-"""Schemes 1 to 3 and the improved law of the thesis in the estimator, and its Algorithm 1 over a whole discharge.
+"""Adaptation laws of the thesis (schemes 1 to 3 and the improved law), and its Algorithm 1 over a whole discharge.
 
-Numbers in parentheses are equations of the thesis.
+Numbers in parentheses are equations of the thesis. a1..a12 are the parameters of the RC pairs, a13..a15 those of R_s. k
+is the adaptive gain, and e is the error of the voltage that drives both.
 """
 
 import numpy as np
@@ -17,15 +18,16 @@ from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 
 CELL = load_cell("chen_mora")
 SMALL = [1, 3, 6, 13, 15]
-"""Indices of the parameters below the default epsilon of scheme 2."""
+"""Indices of the parameters below the default epsilon of scheme 2, which returns them to their initial values."""
 LARGE = [i for i in range(1, 16) if i not in SMALL]
 DISTURBANCE_V = 0.3
 """Error of the measured voltage, so that e, which drives (3.16), is far from zero [V]."""
 DISTURBED_SAMPLES = 500
+"""Number of samples with ``DISTURBANCE_V``, which are the first ones."""
 
 
 def make_settings(law, **others):
-    """Return settings of the printed law: no dead zone, no rearming of k, no loss of lock."""
+    """Return settings of a law as printed: no dead zone, no rearming of k, no loss of lock."""
     printed = {"law": law, "dead_zone_v": 0.0, "rearm_gain": None, "lock_error_v": 100.0}
     return ObserverSettings.model_validate(printed | others)
 
@@ -33,7 +35,7 @@ def make_settings(law, **others):
 @pytest.fixture(scope="module")
 def disturbed_samples():
     """Return samples of half a minute at 1C and 100 Hz, the first seconds with a voltage error."""
-    samples = discharge(CELL, 0.275, 0.01)[:3000]
+    samples = discharge(CELL, 0.275, 0.01)[:3000]  # current [A], sample period [s]
     samples["voltage_v"][:DISTURBED_SAMPLES] -= DISTURBANCE_V
     return samples
 
@@ -48,7 +50,7 @@ def parameter_change(law, samples, cell=CELL):
 
 @pytest.mark.parametrize("every", [1, 10, 100])
 def test_scheme_1_changes_every_parameter_by_the_increase_of_k(disturbed_samples, every):
-    """(3.16) and (3.13) both integrate e^2, at 100, 10 and 1 Hz."""
+    """(3.16) of the parameters and (3.13) of k both integrate e^2. The samples are at 100, 10 and 1 Hz."""
     change, integral = parameter_change("scheme-1", disturbed_samples[::every])
     assert integral > 1e-3
     assert change[1:] == pytest.approx(np.full(15, integral), rel=1e-6)
@@ -65,6 +67,7 @@ def test_scheme_2_returns_small_parameters_to_their_initial_values(disturbed_sam
 
 
 def test_scheme_2_returns_the_parameters_below_its_epsilon():
+    """``rate`` is the rate at which a parameter returns to its initial value."""
     estimator = Estimator(
         CELL, make_settings("scheme-2", scheme_2_epsilon=7.0, scheme_2_lambda=50.0), initial_soc=1.0, identifier=None
     )
@@ -75,16 +78,19 @@ def test_scheme_2_returns_the_parameters_below_its_epsilon():
 @pytest.mark.parametrize(("law", "last"), [("scheme-3", 15), ("improved", 12)])
 @pytest.mark.parametrize("factor", [0.05, 1.0, 40.0])
 def test_bounded_laws_converge_to_their_limits_from_any_initial_value(disturbed_samples, law, last, factor):
-    """(3.18): the limit of Lemma 4.1.3 once the error is gone."""
+    """By (3.18), parameters converge to the limits of Lemma 4.1.3 once the error is gone.
+
+    ``last`` is the index of the last parameter that a law adapts.
+    """
     bounds = {
         i: CELL.bounds(i).model_copy(update={"initial": factor * CELL.bounds(i).limit}) for i in range(1, last + 1)
     }
     cell = with_bounds(CELL, bounds)
     estimator = Estimator(cell, make_settings(law), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
     estimator.run(disturbed_samples)
-    found = estimator.state["a"][0]
-    assert found[1 : last + 1] == pytest.approx([bounds[i].limit for i in range(1, last + 1)], rel=1e-4)
-    assert found[last + 1 : 16] == pytest.approx(CELL.a[last + 1 : 16], rel=1e-15)  # a13..a15 come from (4.2)
+    a = estimator.state["a"][0]
+    assert a[1 : last + 1] == pytest.approx([bounds[i].limit for i in range(1, last + 1)], rel=1e-4)
+    assert a[last + 1 : 16] == pytest.approx(CELL.a[last + 1 : 16], rel=1e-15)  # a13..a15 come from (4.2)
 
 
 def test_scheme_3_converges_to_the_limits_of_table_4(disturbed_samples):
@@ -103,8 +109,8 @@ def test_scheme_3_converges_to_the_limits_of_table_4(disturbed_samples):
 
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2", "scheme-3", "improved"])
-def test_output_equation_of_each_law(law):
-    """The schemes solve (3.14) together with u = -N e, because y^ depends on u. The improved method uses (4.1)."""
+def test_the_estimated_voltage_satisfies_the_output_equation_of_each_law(law):
+    """The schemes solve (3.14) together with u = -N e, because y^ depends on u. The improved law uses (4.1)."""
     samples = discharge(CELL, 0.275, 0.01)[:40]
     samples["voltage_v"] -= 0.1
     estimator = Estimator(CELL, make_settings(law, k0=0.3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
@@ -122,7 +128,7 @@ def test_output_equation_of_each_law(law):
 
 @pytest.fixture(scope="module")
 def converged():
-    """Algorithm 1 at C/10, 1 Hz."""
+    """Return the run of Algorithm 1 over a discharge at C/10 and 1 Hz."""
     samples = discharge(CELL, 0.0275, 1.0)
     estimator = Estimator(
         CELL, make_settings("improved", epsilon_v=1e-3), voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None
@@ -131,6 +137,7 @@ def converged():
 
 
 def test_algorithm_1_converges_and_stops_at_the_stability_conditions(converged):
+    """The conditions are violated at the SOCs delta1 and delta2, at which the capacitances C_ts and C_tl are zero."""
     run = converged
     assert run.outcome == "converged"
     assert run.average[1:13] == pytest.approx([CELL.bounds(i).limit for i in range(1, 13)], rel=1e-3)
@@ -146,16 +153,17 @@ def test_algorithm_1_converges_and_stops_at_the_stability_conditions(converged):
     assert np.ptp(run.a[stopped], axis=0).max() == 0.0
 
 
-def test_conditions_of_figure_19_meet_their_parameters_at_the_crossings(converged):
+def test_a8_and_a11_cross_their_stability_conditions_at_the_reported_socs(converged):
+    """Figure 19 of the thesis plots both parameters with their conditions."""
     run = converged
     for crossing in run.crossings:
         above = run.soc > 1.02 * crossing.soc
         below = run.soc < 0.98 * crossing.soc
-        own = run.a[:, int(crossing.parameter[1:])]
+        parameter = run.a[:, int(crossing.parameter[1:])]
         settled = above & (run.time_s > 60.0)
         condition = run.condition(crossing.parameter)
-        assert (own[settled] > condition[settled]).all()
-        assert (own[below] < condition[below]).all()
+        assert (parameter[settled] > condition[settled]).all()
+        assert (parameter[below] < condition[below]).all()
 
 
 def test_algorithm_1_reports_why_it_did_not_converge():
@@ -174,10 +182,9 @@ def test_algorithm_1_reports_why_it_did_not_converge():
     assert outcome(noisy, epsilon_v=0.2) == "converged"
 
 
-def test_error_of_a_run_is_that_of_the_observer_with_the_identifier_enabled():
-    samples = discharge(CELL, 0.055, 1.0)[
-        :150
-    ]  # fewer than FIRST_SAMPLES of ``adaptive_run``, so that each is a snapshot
+def test_the_error_of_a_run_is_that_of_the_observer_also_with_the_identifier():
+    # Fewer samples than FIRST_SAMPLES of ``adaptive_run``, so that each is a snapshot.
+    samples = discharge(CELL, 0.055, 1.0)[:150]
     for_adaptive_run, for_plain_run = (
         Estimator(CELL, make_settings("improved"), identifier=IdentifierSettings(), initial_soc=0.9) for _ in range(2)
     )

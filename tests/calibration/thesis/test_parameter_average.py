@@ -1,4 +1,8 @@
-"""Means of the parameters over a time window, (3.19) of the thesis. The ends t_int and t_unst are detected or given."""
+"""Means of the parameters a1..a15 over a time window, (3.19) of the thesis.
+
+The window begins at t_int, when errors and parameters have settled. It ends at t_unst, before the model becomes
+unstable at a low SOC. Both ends are detected or given.
+"""
 
 import numpy as np
 import pytest
@@ -14,22 +18,27 @@ from bms_estimator.settings.observer import ObserverSettings
 CELL = load_cell("chen_mora")
 SETTINGS = ObserverSettings.model_validate({"dead_zone_v": 0.0, "rearm_gain": None, "epsilon_v": 1e-3})
 TIME_S = np.arange(0.0, 1000.0)
+"""Sample times of ``find_window`` [s]."""
 
 
 def run_algorithm(samples, **ends):
+    """Return the run of Algorithm 1 of the thesis over the samples; ``ends`` are given ends of the window."""
     estimator = Estimator(CELL, SETTINGS, voltage_resolution_v=1e-6, initial_soc=1.0, identifier=None)
     return adaptive_run(estimator, samples, **ends)
 
 
 def find_window(error_v=None, voltage_v=None, margin=None, a=None, **ends):
-    """Return the averaging window of a run of 1000 s that contains only the given events."""
+    """Return the averaging window of a run of 1000 s.
+
+    By default the error is zero, the voltage falls linearly, and margin and parameters are constant.
+    """
     return averaging_window(
         TIME_S,
         np.zeros(TIME_S.size) if error_v is None else error_v,
         np.linspace(4.2, 3.6, TIME_S.size) if voltage_v is None else voltage_v,
         np.ones(TIME_S.size) if margin is None else margin,
         np.ones((TIME_S.size, 16)) if a is None else a,
-        1e-3,
+        1e-3,  # limit of a settled error [V]
         **ends,
     )
 
@@ -52,15 +61,14 @@ def test_a_simulated_discharge_is_averaged_from_settling_to_instability(samples)
 
 
 def test_both_ends_can_be_given():
-    """By (4.5), the mean from the first sample on is limit + (a_i(t0) - limit) / (rate t)."""
+    """By (4.5) of the thesis, the mean from the first sample to t is limit + (a_i(t0) - limit) / (rate t)."""
     result = run_algorithm(discharge(CELL, 0.055, 0.01)[:50_000], t_int_s=0.0, t_unst_s=400.0)
     assert result.window == AveragingWindow(0.0, 400.0, "given", "given")
     for i in (1, 3, 4, 6, 8, 12):
         bounds = CELL.bounds(i)
         expected_deviation = (bounds.initial - bounds.limit) / (bounds.rate * 400.0)
-        assert result.average[i] - bounds.limit == pytest.approx(
-            expected_deviation, rel=0.15
-        )  # error of trapezoids at 100 Hz
+        # The tolerance covers the error of trapezoids at 100 Hz.
+        assert result.average[i] - bounds.limit == pytest.approx(expected_deviation, rel=0.15)
 
 
 def test_a_given_end_does_not_change_the_other_end(samples):
@@ -110,7 +118,7 @@ def test_an_error_that_never_settles_leaves_no_window():
     assert window.t_int_s == TIME_S[-1]
 
 
-def test_t_unst_is_the_first_of_margin_knee_and_end():
+def test_t_unst_is_the_first_of_stability_limit_voltage_knee_and_end_of_the_run():
     assert (find_window().t_unst_s, find_window().end_reason) == (TIME_S[-1], "end of the run")
     margin = np.where(TIME_S >= 900.0, -1e-3, 0.1)
     assert (find_window(margin=margin).t_unst_s, find_window(margin=margin).end_reason) == (
@@ -125,7 +133,7 @@ def test_t_unst_is_the_first_of_margin_knee_and_end():
     assert find_window(voltage_v=temporary_load).end_reason == "end of the run"  # a temporary load is no knee
 
 
-def test_mean_over_uneven_steps_is_the_integral():
+def test_the_mean_over_uneven_steps_is_weighted_by_time():
     time_s = np.cumsum(np.random.default_rng(1).uniform(0.01, 2.0, 5000))
     a = np.tile(time_s[:, None], (1, 16))  # a_i(t) = t, whose mean is the middle
     times_in_window = time_s[(time_s >= 500.0) & (time_s <= 2000.0)]

@@ -1,4 +1,8 @@
-"""Prediction of the voltage by models of the thesis: frozen parameters (5.3), the static model of chapter 6, SOC by (7.1)."""
+"""Prediction of the voltage by models of the thesis, and SOC by interpolation.
+
+The models are that of constant parameters a1..a15, (5.3), and the static model of chapter 6, whose elements do not
+depend on the SOC. The SOC by interpolation of the OCV is (7.1).
+"""
 
 import dataclasses
 
@@ -17,6 +21,7 @@ CELL = load_cell("chen_mora")
 
 
 def pulses(current_a=1.5, pulse_s=600, rounds=12):
+    """Return a current at 1 Hz of pulses, each with a rest of the same duration [A]."""
     return np.tile(np.r_[np.full(pulse_s, current_a), np.zeros(pulse_s)], rounds)
 
 
@@ -32,7 +37,8 @@ def test_the_error_of_the_true_model_is_the_noise(load):
 
 
 @pytest.mark.parametrize("load", LOADS)
-def test_percentages_of_table_11_are_relative_to_the_measured_voltage(load):
+def test_percentages_are_relative_to_the_measured_voltage(load):
+    """Table 11 of the thesis uses these percentages."""
     run = predict(wrong_start(), capture(LOADS[load]), 0.98, lowest_soc=0.1)
     percent = 100.0 * np.abs(run.voltage_v - run.predicted_v) / run.voltage_v
     assert run.mean_percent == pytest.approx(percent.mean(), rel=1e-12)
@@ -58,17 +64,15 @@ def test_static_elements_are_those_of_one_soc_everywhere(soc_of_elements):
 
 
 @pytest.mark.parametrize("load", ["pulse", "variable steps"])
-def test_the_dynamic_model_is_better_than_the_static_one_where_elements_rise(load):
+def test_the_static_model_has_larger_errors_near_empty_where_resistances_rise(load):
     samples = capture(LOADS[load])
     dynamic = predict(TRUTH, samples, 0.98)
     static = predict(TRUTH, samples, 0.98, a=static_elements(TRUTH.a, 0.5))
     assert static.mean_percent > 2.0 * dynamic.mean_percent
     near_empty = static.soc < 0.15
     assert static.error_percent[near_empty].mean() > 3.0 * static.error_percent[~near_empty].mean()
-    at_soc_of_static_model = np.abs(static.soc - 0.5) < 0.02
-    assert (
-        np.abs(static.error_v[at_soc_of_static_model]).max() < 4e-3
-    )  # both models agree at the SOC of the static model
+    at_soc_of_static_model = np.abs(static.soc - 0.5) < 0.02  # there both models agree
+    assert np.abs(static.error_v[at_soc_of_static_model]).max() < 4e-3
 
 
 def test_given_parameters_replace_those_of_the_cell():
@@ -78,8 +82,9 @@ def test_given_parameters_replace_those_of_the_cell():
     assert np.array_equal(with_given_parameters.predicted_v, with_own_parameters.predicted_v)
 
 
-def test_prediction_ends_before_a_capacitance_is_negative():
+def test_the_prediction_ends_before_a_capacitance_is_negative():
     samples = discharge(CELL, 0.275, 1.0)
+    # SOCs at which the capacitances C_ts and C_tl are zero.
     max_delta = max(delta(CELL.a[8], CELL.a[9], CELL.a[7]), delta(CELL.a[11], CELL.a[12], CELL.a[10]))
     assert max_delta == pytest.approx(0.011156, abs=1e-6)  # erratum 13 of the thesis
     run = predict(CELL, samples, 1.0)
@@ -113,15 +118,15 @@ def test_open_circuit_equals_the_curve_of_the_kernels():
 
 
 @pytest.mark.parametrize("load", LOADS)
-def test_soc_by_interpolation_agrees_with_counting(load):
-    """SOC by (7.1) is compared with coulomb counting, as in Figs. 41 and 42."""
+def test_the_soc_by_interpolation_agrees_with_counting(load):
+    """Figures 41 and 42 of the thesis show this comparison."""
     run = predict(TRUTH, capture(LOADS[load], noise_v=0.0), 0.98)
-    soc, e_o = soc_by_interpolation(TRUTH, run)
+    soc, ocv_v = soc_by_interpolation(TRUTH, run)
     assert soc == pytest.approx(run.soc, abs=2e-3)
-    assert e_o == pytest.approx(open_circuit(TRUTH, run.soc), abs=1e-6)
+    assert ocv_v == pytest.approx(open_circuit(TRUTH, run.soc), abs=1e-6)
 
 
-def test_soc_by_interpolation_corrects_a_wrong_start_unlike_counting():
+def test_the_soc_by_interpolation_does_not_depend_on_a_wrong_initial_soc():
     samples = capture(LOADS["pulse"], soc=0.90, noise_v=0.0)
     run = predict(TRUTH, samples, 0.95)  # counting begins 5 % too high
     true_soc = run.soc - 0.05
@@ -130,7 +135,7 @@ def test_soc_by_interpolation_corrects_a_wrong_start_unlike_counting():
     assert np.abs(soc - true_soc)[middle].max() < 5e-3
 
 
-def test_soc_by_interpolation_stays_within_the_curve():
+def test_the_soc_by_interpolation_is_0_or_1_beyond_the_ends_of_the_curve():
     run = predict(TRUTH, capture(np.zeros(10), noise_v=0.0), 0.98)
     for offset_v, end in ((1.0, 1.0), (-1.5, 0.0)):
         shifted = dataclasses.replace(run, voltage_v=run.voltage_v + offset_v)

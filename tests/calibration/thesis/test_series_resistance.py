@@ -1,4 +1,4 @@
-"""R_s by (4.2) of the thesis and its fit (2.9), step 3 of the procedure of the thesis, for a known cell."""
+"""Step 3 of the thesis's procedure for a known cell: R_s in SOC bins by (4.2), and the fit of a13..a15 by (2.9)."""
 
 import numpy as np
 import pytest
@@ -22,11 +22,12 @@ SOC = np.linspace(0.05, 0.99, 200)
 
 
 def true_ohm(soc, cell=CELL):
+    """Return the true R_s at each SOC [ohm]."""
     return np.array([r_s(x, cell.a) for x in soc])
 
 
 def r_s_of_load(current_a, noise_v=0.0):
-    """Return R_s by (4.2) from one constant load with the true a1..a12."""
+    """Return R_s by (4.2) from one constant load with the true RC pairs."""
     samples = discharge(CELL, current_a, 1.0)
     samples["voltage_v"] += noise_v * np.random.default_rng(1).standard_normal(samples.size)
     return series_resistance(CELL, predict(CELL, samples, 1.0, lowest_soc=0.02))
@@ -34,6 +35,7 @@ def r_s_of_load(current_a, noise_v=0.0):
 
 @pytest.fixture(scope="module")
 def r_s_of_loads():
+    """Return R_s by (4.2) from each of three constant loads, with 0.5 mV of noise."""
     return [r_s_of_load(current_a, noise_v=0.5e-3) for current_a in CURRENTS_A]
 
 
@@ -56,7 +58,7 @@ def test_fit_to_several_noisy_currents_is_within_2_percent(r_s_of_loads):
 
 
 def test_steps_with_rests_give_the_series_resistance():
-    """Samples of the cell at 1 Hz have 0.5 mV of noise. Only samples under load contribute."""
+    """The samples at 1 Hz have 0.5 mV of noise. Only samples under load contribute."""
     samples = capture(steps(3), soc=0.98)
     run = predict(TRUTH, samples, 0.98, lowest_soc=0.05)
     result = series_resistance(TRUTH, run)
@@ -67,6 +69,7 @@ def test_steps_with_rests_give_the_series_resistance():
 
 
 def test_mean_over_currents_is_weighted_by_the_squared_current():
+    # SOC, R_s [ohm], and mean squared current [A^2].
     first = SeriesResistance(np.array([0.205, 0.305, 0.405]), np.full(3, 1.0), np.full(3, 3.0))
     second = SeriesResistance(np.array([0.305, 0.405, 0.505]), np.full(3, 3.0), np.full(3, 1.0))
     mean_curve = mean_of([first, second])
@@ -75,10 +78,10 @@ def test_mean_over_currents_is_weighted_by_the_squared_current():
     assert mean_curve.weight == pytest.approx([3.0, 4.0, 4.0, 1.0])
 
 
-def test_an_error_of_the_open_circuit_voltage_has_the_weight_of_its_current():
-    """By erratum 19 of the thesis, 10 mV are 65 mohm at C/20 of a cell of 3 Ah.
+def test_an_ocv_error_affects_r_s_less_at_a_large_current():
+    """An OCV error of 10 mV is 65 mohm of R_s at C/20 of a cell of 3 Ah (erratum 19 of the thesis).
 
-    In the mean with a load of 1.5 A, R_s by each load is weighted by the square of its current.
+    In the mean of this load and a load of 1.5 A, each R_s is weighted by the square of the current.
     """
     cell = TRUTH.model_copy(
         update={"ocv": TRUTH.ocv.model_copy(update={"ocv_v": tuple(v + 0.01 for v in TRUTH.ocv.ocv_v)})}
@@ -88,9 +91,7 @@ def test_an_error_of_the_open_circuit_voltage_has_the_weight_of_its_current():
         for load_a, seconds in ((0.153, 40_000), (1.5, 5_000))
     ]
     slow, fast = (series_resistance(cell, run) for run in runs)
-    slow_error_ohm, fast_error_ohm = (
-        r_s_of_load.r_s_ohm - true_ohm(r_s_of_load.soc, TRUTH) for r_s_of_load in (slow, fast)
-    )
+    slow_error_ohm, fast_error_ohm = (result.r_s_ohm - true_ohm(result.soc, TRUTH) for result in (slow, fast))
     assert np.median(slow_error_ohm) == pytest.approx(0.01 / 0.153, rel=0.01)
     assert np.median(fast_error_ohm) == pytest.approx(0.01 / 1.5, rel=0.01)
     mean_curve = mean_of([slow, fast])
@@ -108,7 +109,7 @@ def test_errors_of_the_rc_pairs_become_part_of_r_s():
     assert result.r_s_ohm[settled] == pytest.approx(true_ohm(result.soc)[settled] - 0.02, abs=5e-4)
 
 
-def test_a_constant_resistance_has_no_amplitude_and_no_std():
+def test_a_constant_resistance_has_no_amplitude_over_the_soc():
     soc = np.linspace(0.05, 0.95, 60)
     fit = fit_series_resistance(SeriesResistance(soc, np.full(60, 0.08), np.ones(60)))
     assert fit(soc) == pytest.approx(np.full(60, 0.08), rel=1e-6)

@@ -1,4 +1,4 @@
-"""``alarms``: raised alarms of a capture. ``config``: check and display of the limits."""
+"""``alarms``: raised alarms of a capture. ``config``: check and output of the alarms' limits and hooks."""
 
 import json
 from pathlib import Path
@@ -11,6 +11,7 @@ from tests.telemetry.alarm_captures import Line, record
 
 @pytest.fixture
 def pack(tmp_path: Path) -> Path:
+    """Write a pack file that ends with the headline of ``[alarms]``, to which tests append."""
     file = tmp_path / "pack.toml"
     file.write_text("[pack]\ncell = 'nmc'\ncapacity_ah = 10\nseries = 2\n[sensor]\nprotocol = 'text'\n[alarms]\n")
     return file
@@ -19,7 +20,13 @@ def pack(tmp_path: Path) -> Path:
 def test_raised_alarms_are_listed_with_their_times(
     tmp_path: Path, pack: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lines = [Line(30), Line(10, voltage_v=8.6), Line(30), Line(20, temperature_c=61.0), Line(80)]
+    lines = [
+        Line(seconds=30),
+        Line(seconds=10, voltage_v=8.6),
+        Line(seconds=30),
+        Line(seconds=20, temperature_c=61.0),
+        Line(seconds=80),
+    ]
     capture = record(tmp_path / "capture.bms", lines)
     with pack.open("a") as file:
         file.write("over_temperature = {delay_s = 5}\nhook = [{run = ['/none/such']}]\n")
@@ -28,8 +35,8 @@ def test_raised_alarms_are_listed_with_their_times(
     result = json.loads(out)
     times = {each["alarm"]: (each["raised_s"], each["ended_s"], each["latched"]) for each in result["raised"]}
     assert times == {
-        "pack_over_voltage": (pytest.approx(32.0), None, True),  # 30 s + delay_s = 2
-        # 70 s + delay_s = 5; 90 s + clear_delay_s = 60
+        "pack_over_voltage": (pytest.approx(32.0), None, True),  # 30 s and its delay_s of 2 s
+        # 70 s and its delay_s of 5 s; 90 s and its clear_delay_s of 60 s
         "over_temperature": (pytest.approx(75.0), pytest.approx(150.0), False),
     }
     assert result["unmeasured"] == ["cell_over_voltage", "cell_under_voltage", "cell_imbalance"]
@@ -55,7 +62,7 @@ def test_raised_alarms_are_listed_with_their_times(
         ("hook = [{topic = 'a', payload = '$nothing'}]", 2, "payload: 'nothing': must be one of $json"),
     ],
 )
-def test_check_of_limits_and_hooks(
+def test_check_reports_wrong_and_implausible_limits_and_hooks(
     pack: Path, capsys: pytest.CaptureFixture[str], alarms: str, code: int, message: str
 ) -> None:
     with pack.open("a") as file:

@@ -19,7 +19,7 @@ from bms_estimator import estimate, load_capture, load_cell
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 from tests.command_line import run
 
-SUMMARY = {
+SUMMARY_KEYS = {  # some of the keys
     "samples",
     "duration_s",
     "soc_initial",
@@ -33,7 +33,7 @@ SUMMARY = {
     "samples_per_s",
     "wall_s",
 }
-COLUMNS = [
+COLUMNS = [  # some of the columns
     "time_s",
     "voltage_v",
     "current_a",
@@ -64,6 +64,7 @@ def capture(tmp_path):
 
 
 def columns_of_csv(path):
+    """Return the columns of a table as arrays, by name."""
     data = path.read_bytes()
     text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode()
     header, *rows = csv.reader(text.splitlines())
@@ -72,17 +73,18 @@ def columns_of_csv(path):
 
 
 def columns_of_parquet(path):
+    """Return the columns of a table as arrays, by name."""
     table = parquet.read_table(path)
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def test_real_capture_gives_one_json_object(data, capsys):
+def test_real_capture_gives_one_json_object_with_small_errors(data, capsys):
     capture = data / "leaf" / "hppc_25c_from_full.csv.gz"
     code, out, err = run(capsys, "replay", capture, "--cell", "leaf", "--json")
     assert (code, err) == (0, "")
     result = json.loads(out, parse_constant=lambda name: pytest.fail(f"{name} in the summary"))
     assert out.count("\n") == 1
-    assert set(result) >= SUMMARY
+    assert set(result) >= SUMMARY_KEYS
     assert result["lock_lost"] is False
     assert result["suspects"] == []
     with gzip.open(capture, "rt") as file:
@@ -148,19 +150,19 @@ def test_summary_is_printed_as_a_table(capture, capsys):
 def test_user_errors_end_with_code_2(capture, tmp_path, capsys):
     wrong = tmp_path / "wrong.csv"
     wrong.write_text(capture.read_text().replace("voltage_v", "volts"))
-    words = tmp_path / "words.csv"
-    words.write_text("time_s,current_a,voltage_v\n0,0,3.9\n1,none,3.9\n")
+    no_number = tmp_path / "words.csv"
+    no_number.write_text("time_s,current_a,voltage_v\n0,0,3.9\n1,none,3.9\n")
     missing, other = tmp_path / "missing.csv", tmp_path / "other.csv"
     other.write_text("kept as it is\n")
     cell = ("--cell", "ncr18650")
-    for arguments, texts in [
+    for arguments, message_parts in [
         ((missing, *cell), ["missing.csv: no such file"]),
         ((missing, *cell, "--out", other, "--force"), ["missing.csv: no such file"]),
         ((capture, *cell, "--out", other), ["other.csv: exists already; --force replaces it"]),
         ((capture, "--cell", "nonsense"), ["nonsense", "ncr18650"]),
         ((capture, "--cell", ""), ["(empty name)", "ncr18650"]),
         ((wrong, *cell), ["wrong.csv", "voltage_v"]),
-        ((words, *cell), ["words.csv", "line 3", "current_a", "none"]),
+        ((no_number, *cell), ["words.csv", "line 3", "current_a", "none"]),
         ((capture,), ["--cell", "--pack"]),
         ((capture, "--cell", "nmc"), ["nmc is a generic cell", "--capacity-ah"]),
         ((capture, *cell, "--capacity-ah", "-3"), ["capacity_ah = -3.0", "above 0"]),
@@ -171,7 +173,7 @@ def test_user_errors_end_with_code_2(capture, tmp_path, capsys):
     ]:
         code, out, err = run(capsys, "replay", *arguments)
         assert (code, out) == (2, ""), arguments
-        assert [name for name in texts if name not in err] == [], err
+        assert [part for part in message_parts if part not in err] == [], err
         assert "Traceback" not in err
     assert other.read_text() == "kept as it is\n"
 
@@ -179,12 +181,12 @@ def test_user_errors_end_with_code_2(capture, tmp_path, capsys):
 @pytest.mark.parametrize("capacity_from", ["option", "pack", "option over pack"])
 def test_generic_cell_has_the_given_capacity(capacity_from, capture, tmp_path, capsys):
     pack, out = tmp_path / "pack.toml", tmp_path / "out.csv"
-    in_file = {"pack": "capacity_ah = 3\n", "option over pack": "capacity_ah = 50\n"}.get(capacity_from, "")
-    pack.write_text(f'[pack]\ncell = "nmc"\n{in_file}')
+    in_pack_file = {"pack": "capacity_ah = 3\n", "option over pack": "capacity_ah = 50\n"}.get(capacity_from, "")
+    pack.write_text(f'[pack]\ncell = "nmc"\n{in_pack_file}')
     option = () if capacity_from == "pack" else ("--capacity-ah", "3")
     assert run(capsys, "replay", capture, "--pack", pack, "--soc", "0.6", *option, "--out", out)[0] == 0
-    drawn_ah = columns_of_csv(out)["soc_coulomb"][[0, -1]] @ [3.0, -3.0]
-    assert drawn_ah == pytest.approx(SAMPLES / 2 / 3600, rel=0.02)  # 1 A for half of the time
+    first_soc, last_soc = columns_of_csv(out)["soc_coulomb"][[0, -1]]
+    assert 3.0 * (first_soc - last_soc) == pytest.approx(SAMPLES / 2 / 3600, rel=0.02)  # 1 A for half of the time
 
 
 def test_capture_is_never_overwritten(capture, tmp_path, capsys):
@@ -226,7 +228,7 @@ def test_a_capture_without_a_usable_sample_is_an_error(tmp_path, capsys):
 
 
 def test_error_suggests_the_unit_of_the_columns(capture, tmp_path, capsys):
-    """The current may be scaled in all rows, or only above a few milliamperes."""
+    """The voltage is in millivolts, or the current in milliamperes, which is seen only in the rows with a load."""
     rows = read_csv(capture).to_pylist()
     head = ",".join(rows[0])
     tables = {
@@ -234,22 +236,22 @@ def test_error_suggests_the_unit_of_the_columns(capture, tmp_path, capsys):
         "ampere.csv": ("current_a", "are these milliamperes?"),
     }
     for name, (column, guess) in tables.items():
-        lines = [",".join(str(1e3 * v if k == column else v) for k, v in row.items()) for row in rows]
+        lines = [",".join(str(1e3 * value if key == column else value) for key, value in row.items()) for row in rows]
         (tmp_path / name).write_text("\n".join([head, *lines]))
         _, out, err = run(capsys, "replay", tmp_path / name, "--cell", "chen_mora")
         assert guess in " ".join((out + err).split())
 
 
 def test_missing_and_implausible_temperatures_are_reported(tmp_path, capsys):
-    for cell_c, words in (
+    for temperature_c, message in (
         (297.0, "10 implausible values: SOC std is larger"),
         (math.nan, "not measured: SOC std is larger"),
     ):
         table = tmp_path / "warm.csv"
-        lines = [f"{j},0.1,3.8,{cell_c}" for j in range(10)]
+        lines = [f"{j},0.1,3.8,{temperature_c}" for j in range(10)]
         table.write_text("\n".join(["time_s,current_a,voltage_v,temperature_c", *lines]))
         _, out, _ = run(capsys, "replay", table, "--cell", "ncr18650")
-        assert words in " ".join(out.split())
+        assert message in " ".join(out.split())
 
 
 def test_backward_time_steps_are_reported(tmp_path, capsys):
@@ -276,11 +278,12 @@ def test_replay_equals_estimate_bit_for_bit(data, tmp_path, capsys):
 
 
 def as_gzip(path):
+    """Return the bytes of the file, compressed."""
     return gzip.compress(path.read_bytes())
 
 
 def as_raw(path):
-    """Convert samples to the recording of a board that prints text lines."""
+    """Return the bytes of a recording of a board that prints the samples of a CSV file as text lines."""
     recorded = path.with_name("small.bms")
     with CaptureWriter(recorded, CaptureHeader(mode="text")) as writer:
         for line in path.read_text().splitlines()[1:]:
@@ -300,23 +303,25 @@ def test_documented_replays_run(monkeypatch, capsys):
 
 
 def as_parquet(path):
+    """Return the bytes of a Parquet file with the samples of a CSV file."""
     buffer = BufferOutputStream()
     parquet.write_table(read_csv(path), buffer)
     return buffer.getvalue().to_pybytes()
 
 
 def replay_stdin(monkeypatch, capsys, data, *arguments):
+    """Replay these bytes from stdin. Return exit code, stdout and stderr."""
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(data)))
     return run(capsys, "replay", "-", "--cell", "ncr18650", *arguments)
 
 
 @pytest.mark.parametrize(
-    "form",
+    "convert",
     [Path.read_bytes, as_gzip, as_parquet, as_raw, lambda path: gzip.compress(as_raw(path))],
     ids=["CSV", "CSV.gz", "Parquet", "raw", "raw.gz"],
 )
-def test_capture_from_stdin_equals_that_from_a_file(form, capture, monkeypatch, capsys):
-    code, out, err = replay_stdin(monkeypatch, capsys, form(capture), "--json")
+def test_capture_of_every_format_is_read_from_stdin(convert, capture, monkeypatch, capsys):
+    code, out, err = replay_stdin(monkeypatch, capsys, convert(capture), "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["samples"] == SAMPLES
 
@@ -348,7 +353,7 @@ def replayed_currents(capsys, out, *arguments):
     return np.unique(columns_of_csv(out)["current_a"]).tolist()
 
 
-def test_sign_of_a_table_is_that_of_the_pack_or_the_option(capture, tmp_path, capsys):
+def test_sign_of_a_table_is_that_of_the_option_or_else_of_the_pack(capture, tmp_path, capsys):
     out, pack = tmp_path / "out.csv", tmp_path / "pack.toml"
     pack.write_text('[sensor]\ncurrent_sign = "charge_positive"\n')
     charge, discharge = (("--current-sign", f"{sign}_positive") for sign in ("charge", "discharge"))
@@ -358,7 +363,7 @@ def test_sign_of_a_table_is_that_of_the_pack_or_the_option(capture, tmp_path, ca
     assert replayed_currents(capsys, out, capture, "--pack", pack, *discharge) == [0.0, 1.0]
 
 
-def test_battery_data_format_has_its_own_sign(capture, tmp_path, capsys):
+def test_battery_data_format_is_charge_positive_unless_the_option_says_otherwise(capture, tmp_path, capsys):
     bdf, out, pack = tmp_path / "small.bdf", tmp_path / "out.csv", tmp_path / "pack.toml"
     bdf.write_text(capture.read_text().replace("time_s,current_a,voltage_v", "Test Time / s,Current / A,Voltage / V"))
     for sign in ("charge_positive", "discharge_positive"):

@@ -22,16 +22,21 @@ RELAXATION, SLOW, FAST, STEPS = (
     "cell5_random_steps.csv.gz",
 )
 NO_DATA, CONTRADICTED = "no data printed", "contradicted by the thesis's own numbers"
+"""Verdicts of the report."""
 
 
 class ReportParser(HTMLParser):
-    """Articles of the report: number, title, verdict, headings of the table, number of drawn shapes, reason; and what a
-    browser loaded_urls.
+    """Parser of the report.
+
+    Attributes:
+        articles: For each article (a table or figure) its number, title, verdict and reason, the headings and the number
+            of rows of its table, and the number of shapes drawn.
+        loaded_urls: URLs that a browser loads for the report.
     """
 
     def __init__(self, text):
         super().__init__()
-        self.articles, self.loaded_urls, self.unclosed = {}, [], []
+        self.articles, self.loaded_urls = {}, []
         self._article, self._field = None, None
         self.feed(text)
 
@@ -87,6 +92,7 @@ def report_text(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(report_text):
+    """Return the parsed report."""
     return ReportParser(report_text)
 
 
@@ -171,7 +177,7 @@ def test_closing_note_lists_every_item(report_text, page):
 
 
 def cells(report_text, key):
-    """Return the rows of the table of one article."""
+    """Return the cells of the table of one article, by rows."""
     article = re.search(rf'<article id="{key}">.*?</article>', report_text, re.DOTALL).group()
     return [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(<td.*?)</tr>", article)]
 
@@ -188,11 +194,12 @@ def test_tables_2_and_3_are_reproduced_from_one_initial_state(report_text):
         rows = cells(report_text, key)
         assert len(rows) == 15
         for row in rows:
-            assert float(row[4]) == pytest.approx(float(row[3]), rel=2e-5), (key, row)
+            printed, recomputed = float(row[3]), float(row[4])
+            assert recomputed == pytest.approx(printed, rel=2e-5), (key, row)
 
 
 @pytest.mark.thorough
-def test_small_parameters_of_table_3_keep_the_error_of_the_start(report_text):
+def test_small_parameters_of_table_3_keep_the_errors_of_their_initial_values(report_text):
     errors_percent = {row[0]: float(row[8]) for row in cells(report_text, "table-3")}
     assert [errors_percent[f"a{i}"] for i in (1, 3, 6, 13, 15)] == pytest.approx(
         [6.48, 14.3, 19.7, 36.0, 5.99], abs=0.05
@@ -200,7 +207,7 @@ def test_small_parameters_of_table_3_keep_the_error_of_the_start(report_text):
 
 
 @pytest.mark.thorough
-def test_static_beats_dynamic_with_the_printed_parameters(report_text):
+def test_static_beats_dynamic_in_table_12_with_the_printed_parameters_and_not_with_refitted_ones(report_text):
     dynamic, static = ([float(cell) for cell in row[2:]] for row in cells(report_text, "table-12"))
     assert (dynamic[0], static[0]) == pytest.approx((0.0826, 0.0812), abs=5e-5)
     assert dynamic[2] < 0.5 * static[2]  # with refitted a13 to a15
@@ -210,7 +217,7 @@ def test_option_table_selects_one_table(tmp_path, capsys):
     code, out, err = run(capsys, "thesis", "--table", "5", "--out", tmp_path)
     assert (code, err) == (0, "")
     assert "Table 5" in out
-    assert "3666.67" in out  # a12, recomputed
+    assert "3666.67" in out  # the recomputed parameter a12
     page = ReportParser((tmp_path / "index.html").read_text(encoding="utf-8"))
     assert list(page.articles) == ["table-5"]
 
@@ -253,14 +260,15 @@ def test_chapter_5_runs_on_real_captures(tmp_path, capsys, shared_data):
     assert code == 0
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "4 captures of" in text
-    measured = {
+    # mean current [A], use in the procedure, printed mean error [%], and mean [%], maximum [%] and RMS [mV] of the error
+    expected_rows = {
         "cell1_discharge_c4": "0.77 step 2 - 0.419 4.99 27.6",
         "cell1_discharge_1c5": "4.62 validation - 5.31 25.8 195",
         "cell5_random_steps": "2.35 validation - 0.284 4.05 13.9",
     }
-    for name, figures in measured.items():
+    for name, values in expected_rows.items():
         row = next(line for line in out.splitlines() if name in line)
-        assert " ".join(row.split()).startswith(f"{name} {figures} ")
+        assert " ".join(row.split()).startswith(f"{name} {values} ")
     assert "claim tested on other data: fails" in out
     assert "met on 0 of 1 captures (values 5.31)" in " ".join(out.split())
     code, out, _ = run(capsys, "thesis", *captures, "--cell", "ncr18650", "--table", "8", "--out", tmp_path)

@@ -15,7 +15,7 @@ from tests.command_line import run
 
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
-    """Write a capture of steps to a file."""
+    """Write a capture of a simulated cell under steps of the current to a CSV file."""
     samples = capture(steps(0), seed=0)
     rows = np.column_stack([samples[name] for name in ("time_s", "current_a", "voltage_v")])
     path = tmp_path / "steps.csv"
@@ -35,12 +35,11 @@ def test_adapt_writes_a_cell_with_the_series_resistance_of_the_capture(table, tm
     assert [cell.a[i] for i in range(1, 16)] == pytest.approx([result["a"][f"a{i}"]["value"] for i in range(1, 16)])
     assert cell.ladder is not None
     assert cell.ladder.error_v == pytest.approx(1e-3 * result["error_mv"])
-    dc_ohm = r_s(0.5, cell.a)
-    assert dc_ohm == pytest.approx(r_s(0.5, TRUTH.a), rel=0.3)
+    assert r_s(0.5, cell.a) == pytest.approx(r_s(0.5, TRUTH.a), rel=0.3)
 
 
 def test_cell_file_with_worse_replays_is_not_written(table, tmp_path, capsys, monkeypatch):
-    scores = iter([1.0, 9.0])
+    scores = iter([1.0, 9.0])  # before and after
     monkeypatch.setattr(adapt, "interval_score", lambda *_: next(scores))
     out = tmp_path / "worse.toml"
     code, text, err = run(capsys, "adapt", table, "--cell", "ncr18650", "--out", out)

@@ -13,6 +13,7 @@ CAPACITY_AH = TRUTH.cell.capacity_ah
 
 
 def save(path, samples):
+    """Write samples to a CSV file. Return its path."""
     rows = np.column_stack([samples[name] for name in ("time_s", "current_a", "voltage_v")])
     np.savetxt(path, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
     return path
@@ -20,6 +21,7 @@ def save(path, samples):
 
 @pytest.fixture
 def capture(tmp_path):
+    """Write a capture of a simulated cell with rests."""
     return save(tmp_path / "rests.csv", relaxation())
 
 
@@ -36,12 +38,13 @@ def test_json_has_capacity_and_anchors(capsys, capture):
     assert (np.abs(errors[:, 0]) < 3.0 * errors[:, 1]).all()
 
 
-def test_known_sensor_offset_reduces_the_error(capsys, capture):
+def test_capacity_is_more_certain_if_the_current_sensor_has_no_offset(capsys, capture):
     stds = []
     for offset in ("0.02", "0.0"):
         arguments = ("capacity", capture, "--cell", "ncr18650", "--current-offset-std-a", offset, "--json")
         stds.append(json.loads(run(capsys, *arguments)[1])["capacity_std_ah"])
-    assert stds[1] < 0.7 * stds[0]
+    with_offset, without_offset = stds
+    assert without_offset < 0.7 * with_offset
 
 
 def test_table_shows_anchors_and_capacity(capsys, capture):
@@ -80,11 +83,11 @@ def test_error_on_missing_rests_suggests_a_remedy(tmp_path, capsys):
     assert "rest the cell for half an hour" in err
 
 
-def test_wrong_sign_is_detected(capsys, capture):
+def test_wrong_sign_of_the_current_is_detected(capsys, capture):
     code, _, err = run(capsys, "capacity", capture, "--cell", "ncr18650", "--current-sign", "charge_positive")
     assert code == 2
     assert "check the sign of the current (--current-sign)" in err
-    assert "rest" not in err.replace("the rests", "")
+    assert "rest" not in err.replace("the rests", "")  # no advice to rest the cell
 
 
 @pytest.mark.parametrize(

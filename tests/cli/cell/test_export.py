@@ -16,11 +16,14 @@ from tests.command_line import run
 from tests.estimator.anywhere.cases import OXIDE, Case, capture
 
 SERIES = 6
+SETTLING = 900
+"""Number of samples (15 min) after the start with a wrong SOC that are not compared."""
 DECLARED_AH = 1.1 * OXIDE.capacity_ah
+"""Capacity in the pack file, 10 % too large [Ah]."""
 
 
 def simulate_discharge(seed: int, **changes: object):
-    """Simulate a discharge of six equal cells from full."""
+    """Simulate a discharge of six equal cells from full, at 1 Hz. Return its samples and true SOC."""
     case = Case("", seed=seed, soc=1.0, unseen_h=0.0, hours=1.6, **changes)
     simulated = capture(case)
     simulated.samples["voltage_v"] *= SERIES
@@ -46,6 +49,7 @@ def pack(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def exported(pack) -> Path:
+    """Return the path to which the learned cell is exported."""
     return pack.with_name("learned.toml")
 
 
@@ -64,24 +68,24 @@ def test_file_contains_the_learned_values(capsys, pack, exported):
     errors, generic_errors = np.array(cell.ocv.error_v), np.array(generic.ocv.error_v)
     assert (errors < generic_errors + 1e-9).mean() > 0.9
     true_v = np.interp(cell.ocv.soc, np.linspace(0.0, 1.0, OXIDE.ocv_v.size), OXIDE.ocv_v)
-    deviation_v, old = np.array(cell.ocv.ocv_v) - true_v, np.array(generic.ocv.ocv_v) - true_v
+    deviation_v, generic_deviation_v = np.array(cell.ocv.ocv_v) - true_v, np.array(generic.ocv.ocv_v) - true_v
     inside = (np.array(cell.ocv.soc) > 0.3) & (np.array(cell.ocv.soc) < 0.95)
-    assert np.sqrt(np.mean(deviation_v[inside] ** 2)) < np.sqrt(np.mean(old[inside] ** 2))
+    assert np.sqrt(np.mean(deviation_v[inside] ** 2)) < np.sqrt(np.mean(generic_deviation_v[inside] ** 2))
     assert (np.abs(deviation_v[inside]) < 2.5 * errors[inside]).all()
     assert cell.ladder.std < 0.5 * generic.ladder.std
     assert cell.ladder.weak_ohm[0][0] / generic.ladder.weak_ohm[0][0] == pytest.approx(result["r_s_factor"], rel=1e-4)
 
 
-def test_service_that_starts_from_the_file_is_better(capsys, pack, exported):
-    """Check that in another discharge from an unknown SOC the error is smaller, and the interval narrower and valid."""
+def test_service_that_starts_from_the_exported_file_is_more_accurate(capsys, pack, exported):
+    """In another discharge from an unknown SOC, the SOC error is smaller, and the interval is narrower and contains the SOC."""
     run(capsys, "cell", "export", pack, "--out", exported, "--force")
     simulated = simulate_discharge(2, load_c=0.4)
-    samples = simulated.samples[simulated.samples.size // 4 :]
-    true_soc = simulated.soc[simulated.samples.size // 4 :]
+    begin = simulated.samples.size // 4
+    samples, true_soc = simulated.samples[begin:], simulated.soc[begin:]
     results = []
     for cell in (load_cell(exported), load_cell("nmc", DECLARED_AH)):
-        trace = Estimator(cell.pack(SERIES, 1), initial_soc=float(true_soc[0]) - 0.15).run(samples)[900:]
-        error = trace["soc"] - true_soc[900:]
+        trace = Estimator(cell.pack(SERIES, 1), initial_soc=float(true_soc[0]) - 0.15).run(samples)[SETTLING:]
+        error = trace["soc"] - true_soc[SETTLING:]
         results.append(
             (np.sqrt(np.mean(error**2)), trace["soc_std"].mean(), np.mean(np.abs(error) < 2.0 * trace["soc_std"]))
         )
@@ -141,8 +145,8 @@ def test_existing_file_is_replaced_only_with_force(tmp_path, capsys, pack):
 def test_input_is_never_overwritten(capsys, pack):
     checkpoint = next((pack.parent / "state").glob("*.npz"))
     for out in (pack, checkpoint):
-        generic_errors = out.read_bytes()
+        content_before = out.read_bytes()
         code, _, err = run(capsys, "cell", "export", pack, "--checkpoint", checkpoint, "--out", out, "--force")
         assert code == 2
         assert "is also an input" in err
-        assert out.read_bytes() == generic_errors
+        assert out.read_bytes() == content_before

@@ -16,10 +16,11 @@ from tests.command_line import run
 
 PEM = load_fuel_cell("pem_30w")
 AGED = np.array([1.0, 1.3, *[1.0] * 14])
-"""Factors of the parameters of an aged stack, whose resistance is 30 % above that of the file."""
+"""Factors of the kernel's parameters for an aged stack, whose resistance (index 1) is 30 % above that of the file."""
 
 
 def write_csv(path: Path, **columns: np.ndarray) -> Path:
+    """Write columns to a CSV file. Return its path."""
     rows = np.column_stack(list(columns.values()))
     np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.6g")
     return path
@@ -34,21 +35,27 @@ def with_negated_current(path: Path, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def curve(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the polarization curve of the aged stack."""
     current_a = np.array([0, 0.05, 0.2, 0.5, 1, 2, 3, 4, 5, 6, 7, 8, 8.5])
-    voltage_v, _ = polarisation(PEM.a * AGED, np.zeros(8), current_a, np.full(current_a.size, np.nan))
+    no_temperature = np.full(current_a.size, np.nan)
+    voltage_v, _ = polarisation(PEM.a * AGED, np.zeros(8), current_a, no_temperature)
     return write_csv(tmp_path_factory.mktemp("fuel") / "curve.csv", current_a=current_a, voltage_v=voltage_v)
 
 
 @pytest.fixture(scope="module")
 def steps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a minute of the aged stack under steps of the current, at 200 Hz, with a noise of 3 mV."""
     time_s, current_a = mann_stack.random_steps(60.0, 200.0, seed=1)
-    voltage_v, _ = open_loop(PEM.a * AGED, np.zeros(8), time_s, current_a, np.full(time_s.size, np.nan))
+    no_temperature = np.full(time_s.size, np.nan)
+    voltage_v, _ = open_loop(PEM.a * AGED, np.zeros(8), time_s, current_a, no_temperature)
     voltage_v += np.random.default_rng(0).normal(0.0, 0.003, time_s.size)
     folder = tmp_path_factory.mktemp("fuel")
     return write_csv(folder / "steps.csv", time_s=time_s, current_a=current_a, voltage_v=voltage_v)
 
 
-def test_identify_writes_a_file_that_replays_use(capsys, curve: Path, steps: Path, tmp_path: Path) -> None:
+def test_identify_writes_a_cell_file_with_which_the_replay_has_smaller_innovations(
+    capsys, curve: Path, steps: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "mine.toml"
     code, printed, _ = run(capsys, "identify", curve, steps, "--cell", "pem_30w", "--out", out, "--json")
     assert code == 0
@@ -61,14 +68,16 @@ def test_identify_writes_a_file_that_replays_use(capsys, curve: Path, steps: Pat
     assert mine.cell.name == "mine"
     assert mine.std["r_ohm"] == pytest.approx(r_ohm["std"] / r_ohm["value"], rel=0.1)
     assert "Identified from curve" in out.read_text()
-    before, after = (
+    rms_before, rms_after = (
         json.loads(run(capsys, "replay", steps, "--cell", cell, "--json")[1])["innovation_rms_v"]
         for cell in ("pem_30w", out)
     )
-    assert after < 0.2 * before
+    assert rms_after < 0.2 * rms_before
 
 
-def test_residual_is_reported_for_files_of_equal_names(capsys, steps: Path, tmp_path: Path) -> None:
+def test_residuals_of_files_with_equal_names_are_distinguished_by_their_paths(
+    capsys, steps: Path, tmp_path: Path
+) -> None:
     (tmp_path / "later").mkdir()
     later = tmp_path / "later" / steps.name
     later.write_text("".join(steps.read_text().splitlines(keepends=True)[:-20]))
@@ -96,11 +105,13 @@ def test_charge_positive_current_is_negated(
     assert json.loads(printed)["parameters"]["r_ohm"]["value"] == pytest.approx(AGED[1] * PEM.fuel_cell.r_ohm, rel=0.05)
 
 
-@pytest.mark.parametrize("celsius", ["inf", "-273.15", "-127"])
-def test_implausible_temperature_counts_as_missing(capsys, curve: Path, tmp_path: Path, celsius: str) -> None:
+@pytest.mark.parametrize("temperature_c", ["inf", "-273.15", "-127"])
+def test_implausible_temperature_counts_as_missing(capsys, curve: Path, tmp_path: Path, temperature_c: str) -> None:
     lines = curve.read_text().splitlines()
     with_temperature = tmp_path / curve.name
-    with_temperature.write_text("\n".join([f"{lines[0]},temperature_c", *(f"{line},{celsius}" for line in lines[1:])]))
+    with_temperature.write_text(
+        "\n".join([f"{lines[0]},temperature_c", *(f"{line},{temperature_c}" for line in lines[1:])])
+    )
     cells = []
     for path in (curve, with_temperature):
         out = tmp_path / "mine.toml"
@@ -111,7 +122,7 @@ def test_implausible_temperature_counts_as_missing(capsys, curve: Path, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("celsius", "message"),
+    ("temperature_c", "message"),
     [
         ("-300", "--temperature-c -300: must be between -60 and 120 °C"),
         ("121", "--temperature-c 121: must be between -60 and 120 °C"),
@@ -119,18 +130,18 @@ def test_implausible_temperature_counts_as_missing(capsys, curve: Path, tmp_path
     ],
 )
 def test_option_with_an_implausible_temperature_is_rejected(
-    capsys, curve: Path, tmp_path: Path, celsius: str, message: str
+    capsys, curve: Path, tmp_path: Path, temperature_c: str, message: str
 ) -> None:
     command = "identify", curve, "--cell", "pem_30w", "--out", tmp_path / "mine.toml"
-    code, _, err = run(capsys, *command, "--temperature-c", celsius)
+    code, _, err = run(capsys, *command, "--temperature-c", temperature_c)
     assert code == 2
     assert message in err
 
 
 def test_replay_accepts_implausible_temperatures(capsys, tmp_path: Path) -> None:
-    celsius = np.array([40.0, -273.15, 40.0, 40.0])
+    temperatures_c = np.array([40.0, -273.15, 40.0, 40.0])
     columns = {"time_s": np.arange(4.0), "current_a": np.full(4, 3.0), "voltage_v": np.full(4, 9.4)}
-    path = write_csv(tmp_path / "cold.csv", **columns, temperature_c=celsius)
+    path = write_csv(tmp_path / "cold.csv", **columns, temperature_c=temperatures_c)
     code, printed, _ = run(capsys, "replay", path, "--cell", "pem_30w", "--json")
     assert code == 0
     assert json.loads(printed)["innovation_rms_v"] < 0.2
@@ -141,7 +152,7 @@ def test_replay_learns_and_has_no_soc(capsys, steps: Path, tmp_path: Path) -> No
     assert code == 0
     result = json.loads(printed)
     assert (result["soc_initial"], result["soc_final"], result["lock_lost"]) == (None, None, False)
-    assert result["samples"] == 12_000
+    assert result["samples"] == 12_000  # a minute at 200 Hz
     assert result["parameters"]["r_ohm"]["value"] > 1.1 * PEM.fuel_cell.r_ohm
     assert not result["parameters"]["concentration_v"]["valid"]
     with (tmp_path / "out.csv").open() as rows:
@@ -205,7 +216,7 @@ def test_parallel_stacks_beyond_the_tafel_range_are_rejected(capsys, tmp_path: P
     assert err == "error: pem_30w: exchange_current_a of 3 in parallel is 1.2: must be less than 1\n"
 
 
-def test_help_mentions_fuel_cells_where_supported(capsys) -> None:
+def test_help_names_a_fuel_cell_only_for_commands_that_support_fuel_cells(capsys) -> None:
     commands = {
         c
         for c in ("capacity", "identify", "replay", "simulate", "thesis", "validate")
@@ -215,6 +226,7 @@ def test_help_mentions_fuel_cells_where_supported(capsys) -> None:
 
 
 def help_mentions_fuel_cell(capsys, command: str) -> bool:
+    """Return True if the help of the command names the shipped fuel cell."""
     code, printed, _ = run(capsys, command, "--help")
     assert code == 0
     return "pem_30w" in printed
@@ -230,16 +242,16 @@ def help_mentions_fuel_cell(capsys, command: str) -> bool:
         ("thesis", "{steps}", "--cell", "pem_30w"),
         ("replay", "{steps}", "--cell", "pem_30w", "--soc", "0.5"),
         ("replay", "{steps}", "--cell", "pem_30w", "--capacity-ah", "3"),
-        ("replay", "{steps}", "--pack", "{soc}"),
+        ("replay", "{steps}", "--pack", "{pack_with_soc}"),
         ("identify", "{steps}", "--cell", "pem_30w", "--out", "{out}", "--keep-ocv"),
     ],
     ids=" ".join,
 )
-def test_unsuitable_commands_reject_a_fuel_cell(capsys, arguments, steps: Path, tmp_path: Path) -> None:
-    pack, soc = tmp_path / "pack.toml", tmp_path / "soc.toml"
+def test_commands_and_options_for_batteries_reject_a_fuel_cell(capsys, arguments, steps: Path, tmp_path: Path) -> None:
+    pack, pack_with_soc = tmp_path / "pack.toml", tmp_path / "soc.toml"
     pack.write_text('[pack]\ncell = "pem_30w"\n')
-    soc.write_text('[pack]\ncell = "pem_30w"\ninitial_soc = 0.5\n')
-    files = {"steps": steps, "pack": pack, "soc": soc, "out": tmp_path / "out.toml"}
+    pack_with_soc.write_text('[pack]\ncell = "pem_30w"\ninitial_soc = 0.5\n')
+    files = {"steps": steps, "pack": pack, "pack_with_soc": pack_with_soc, "out": tmp_path / "out.toml"}
     code, out, err = run(capsys, *(argument.format(**files) for argument in arguments))
     assert (code, out) == (2, "")
     assert err.count("\n") == 1

@@ -11,12 +11,12 @@ from bms_estimator.model.cell import load_cell
 from tests.calibration.simulated_load import TRUTH, capture, steps
 from tests.command_line import run
 
-ERRORS = ["samples", "voltage_rms_mv", "mean_abs_percent", "max_abs_percent"]
+ERROR_KEYS = ["samples", "voltage_rms_mv", "mean_abs_percent", "max_abs_percent"]
 
 
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory):
-    """Write two captures to files."""
+    """Write two captures of a simulated cell under steps of the current. Return their folder."""
     folder = tmp_path_factory.mktemp("captures")
     for seed in (0, 7):
         samples = capture(steps(seed), seed=seed)
@@ -53,13 +53,13 @@ def test_identify_writes_a_cell_that_validates_on_another_capture(tables, tmp_pa
     code, text, err = run(capsys, "validate", tables / "steps7.csv", "--cell", out, "--json")
     validated = json.loads(text)
     assert (code, err) == (0, "")
-    assert set(ERRORS) | {f"{key}_soc_above_0_1" for key in ERRORS} <= set(validated)
+    assert set(ERROR_KEYS) | {f"{key}_soc_above_0_1" for key in ERROR_KEYS} <= set(validated)
     assert validated["voltage_rms_mv_soc_above_0_1"] < 10.0
     assert validated["initial_soc"] == pytest.approx(0.98, abs=0.005)
     assert validated["initial_soc_from"] == "first rest"
 
 
-def test_tables_show_the_result(tables, tmp_path, capsys):
+def test_identify_and_validate_print_their_results_as_tables(tables, tmp_path, capsys):
     captures = [tables / "steps0.csv", tables / "steps7.csv"]
     code, text, _ = run(capsys, "identify", *captures, "--cell", "ncr18650", "--out", tmp_path / "c.toml", "--keep-ocv")
     assert code == 0
@@ -75,7 +75,7 @@ def test_tables_show_the_result(tables, tmp_path, capsys):
 
 
 def test_user_errors_end_with_code_2(tables, tmp_path, capsys):
-    rows = np.loadtxt(tables / "steps0.csv", delimiter=",", skiprows=1) * [1, -1, 1]
+    rows = np.loadtxt(tables / "steps0.csv", delimiter=",", skiprows=1) * [1, -1, 1]  # negates the current
     flipped = tmp_path / "flipped.csv"
     np.savetxt(flipped, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="")
     code, text, err = run(capsys, "identify", flipped, "--cell", "ncr18650", "--out", tmp_path / "c.toml")
@@ -92,17 +92,19 @@ def test_user_errors_end_with_code_2(tables, tmp_path, capsys):
 
 
 def test_sign_of_the_current_is_an_option(tables, tmp_path, capsys):
-    rows = np.loadtxt(tables / "steps7.csv", delimiter=",", skiprows=1) * [1, -1, 1]
+    rows = np.loadtxt(tables / "steps7.csv", delimiter=",", skiprows=1) * [1, -1, 1]  # negates the current
     flipped = tmp_path / "flipped.csv"
     np.savetxt(flipped, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="")
-    plain = run(capsys, "validate", tables / "steps7.csv", "--cell", "ncr18650", "--json")
-    turned = run(capsys, "validate", flipped, "--cell", "ncr18650", "--json", "--current-sign", "charge_positive")
-    assert turned == plain
-    for name in ("first.toml", "second.toml"):
-        capture, sign = (
-            (flipped, "charge_positive") if name == "second.toml" else (tables / "steps7.csv", "discharge_positive")
-        )
-        arguments = (capture, "--cell", "ncr18650", "--out", tmp_path / name, "--current-sign", sign)
+    result = run(capsys, "validate", tables / "steps7.csv", "--cell", "ncr18650", "--json")
+    result_of_flipped = run(
+        capsys, "validate", flipped, "--cell", "ncr18650", "--json", "--current-sign", "charge_positive"
+    )
+    assert result_of_flipped == result
+    for name, table, sign in (
+        ("first.toml", tables / "steps7.csv", "discharge_positive"),
+        ("second.toml", flipped, "charge_positive"),
+    ):
+        arguments = (table, "--cell", "ncr18650", "--out", tmp_path / name, "--current-sign", sign)
         assert run(capsys, "identify", *arguments)[0] == 0
     assert load_cell(tmp_path / "first.toml").ladder == load_cell(tmp_path / "second.toml").ladder
 

@@ -1,4 +1,4 @@
-"""``ocv``: curves from rests, slow discharges and tables, and errors of unusable captures."""
+"""``ocv``: OCV curves from rests, slow discharges and tables, and errors of unusable captures."""
 
 import json
 
@@ -7,13 +7,14 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.model.cell import ChenMoraOcv, TableOcv, load_cell
-from tests.calibration.simulated_relaxation import BAD, relaxation
+from tests.calibration.simulated_relaxation import INVALID_CAPTURES, relaxation
 from tests.command_line import run
 
 RELAXATION_FILE = "cell5_relaxation_c2.csv.gz"
 
 
 def save(path, samples):
+    """Write samples to a CSV file. Return its path."""
     rows = np.column_stack([samples[name] for name in ("time_s", "current_a", "voltage_v")])
     np.savetxt(path, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
     return path
@@ -27,7 +28,7 @@ def captures(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("form", "limit_mv"), [("chen-mora", 10.0), ("table", 2.0)])
-def test_curve_of_a_real_cell(tmp_path, capsys, shared_data, form, limit_mv):
+def test_curve_of_a_real_cell_fits_the_voltages_of_its_rests(tmp_path, capsys, shared_data, form, limit_mv):
     out = tmp_path / "cell5.toml"
     capture = shared_data / "ncr18650" / RELAXATION_FILE
     code, text, err = run(capsys, "ocv", capture, "--capacity-ah", "3.0", "--form", form, "--out", out, "--json")
@@ -111,38 +112,42 @@ def test_number_of_cells_is_estimated_from_the_voltage(tmp_path, capsys):
     assert load_cell(tmp_path / "p.toml").cell.series_count == 6
 
 
-@pytest.mark.parametrize("why", BAD)
-def test_invalid_input_ends_with_code_2(tmp_path, capsys, why):
-    make, capacity_ah, message = BAD[why]
-    capture, out = save(tmp_path / "bad.csv", make()), tmp_path / "c.toml"
+@pytest.mark.parametrize("fault", INVALID_CAPTURES)
+def test_invalid_input_ends_with_code_2(tmp_path, capsys, fault):
+    make_samples, capacity_ah, message = INVALID_CAPTURES[fault]
+    capture, out = save(tmp_path / "bad.csv", make_samples()), tmp_path / "c.toml"
     code, text, err = run(capsys, "ocv", capture, "--capacity-ah", capacity_ah, "--out", out)
     assert (code, text) == (2, "")
     assert " ".join(message.split()) in " ".join(err.split())
     assert "Traceback" not in err
-    assert why == "span" or "bad.csv: " in err  # the SOC span is that of all captures together
+    assert fault == "span" or "bad.csv: " in err  # the SOC span is that of all captures together
     assert not out.exists()
 
 
 @pytest.mark.parametrize(
-    ("volt", "options", "why"),
+    ("distort", "options", "message"),
     [
-        (lambda v: 0.0 * v + 3.7, (), "bad.csv: the voltage is 3.7 V throughout: is the sensor connected?"),
         (
-            lambda v: 1e3 * v,
+            lambda voltage_v: 0.0 * voltage_v + 3.7,
+            (),
+            "bad.csv: the voltage is 3.7 V throughout: is the sensor connected?",
+        ),
+        (
+            lambda voltage_v: 1e3 * voltage_v,
             (),
             "cells in series; if the column is in millivolts, convert it to volts, otherwise give --series",
         ),
-        (lambda v: v, ("--series", 4), "V per cell"),
+        (lambda voltage_v: voltage_v, ("--series", 4), "V per cell"),
     ],
     ids=["dead", "millivolts", "too many cells"],
 )
-def test_implausible_voltage_is_rejected(volt, options, why, tmp_path, capsys):
+def test_implausible_voltage_is_rejected(distort, options, message, tmp_path, capsys):
     samples = relaxation()
-    samples["voltage_v"] = volt(samples["voltage_v"])
+    samples["voltage_v"] = distort(samples["voltage_v"])
     capture, out = save(tmp_path / "bad.csv", samples), tmp_path / "c.toml"
     code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "3", *options, "--out", out)
     assert code == 2
-    assert why in " ".join(err.split())
+    assert message in " ".join(err.split())
     assert not out.exists()
 
 
@@ -192,8 +197,8 @@ def test_sign_of_the_current_is_an_option(tmp_path, capsys):
     assert "20 rests of charge.csv" in (tmp_path / "c.toml").read_text()
 
 
-def test_kind_of_each_source_is_recognized(tmp_path, capsys, data):
-    """Sources are a slow discharge, a tabulated curve with hysteresis, and rests of another pouch cell."""
+def test_kinds_of_captures_are_recognized_and_combined_to_one_curve(tmp_path, capsys, data):
+    """The captures are a slow discharge and a tabulated curve with hysteresis."""
     out = tmp_path / "m50.toml"
     folder = data / "lgm50"
     arguments = ("ocv", folder / "rate_0p1c_25c.csv.gz", folder / "ocv_25c.csv", "--out", out)
@@ -222,11 +227,11 @@ def test_kind_of_each_source_is_recognized(tmp_path, capsys, data):
 
 @pytest.mark.parametrize("direction", ["dis", "chg"])
 def test_unpaired_slow_curve_of_lfp_is_centered_on_the_hysteresis(tmp_path, capsys, shared_data, direction):
-    """On a plateau, hysteresis corresponds to a tenth of the charge or more; that of the generic cell is used."""
+    """On a plateau, a tenth of the charge or more lies within the hysteresis. That of the generic cell is used."""
     folder, out, pair = shared_data / "a123", tmp_path / "lone.toml", tmp_path / "pair.toml"
     files = {name: folder / f"c30_{name}_p25.csv.gz" for name in ("dis", "chg")}
-    for captures, to in (([files[direction]], out), (list(files.values()), pair)):
-        assert run(capsys, "ocv", *captures, "--capacity-ah", "2.05", "--out", to)[0] == 0
+    for captures, cell_file in (([files[direction]], out), (list(files.values()), pair)):
+        assert run(capsys, "ocv", *captures, "--capacity-ah", "2.05", "--out", cell_file)[0] == 0
     unpaired, paired = load_cell(out).ocv, load_cell(pair).ocv
     inside = (np.array(paired.soc) > 0.15) & (np.array(paired.soc) < 0.95)
     deviation_v = np.abs(np.array(unpaired.ocv_v) - np.array(paired.ocv_v))[inside]
@@ -238,7 +243,7 @@ def test_unpaired_slow_curve_of_lfp_is_centered_on_the_hysteresis(tmp_path, caps
 
 
 def test_unpaired_slow_curve_of_a_layered_oxide_is_corrected(tmp_path, capsys, data):
-    """The mean of the LG M50's discharge at C/10 is 17 mV below the published curve; correcting the RC pairs halves that."""
+    """The LG M50's discharge at C/10 is on average 17 mV below the published curve. The correction for the RC pairs halves that."""
     out, folder = tmp_path / "lone.toml", data / "lgm50"
     code, text, _ = run(capsys, "ocv", folder / "rate_0p1c_25c.csv.gz", "--out", out)
     assert code == 0
@@ -263,7 +268,7 @@ def test_curve_that_falls_to_0_v_is_rejected(tmp_path, capsys, shared_data):
     assert not (tmp_path / "large.toml").exists()
 
 
-def test_error_of_the_curve_of_a_pouch_cell_is_largest_near_empty(tmp_path, capsys, data):
+def test_declared_error_of_the_curve_of_a_pouch_cell_is_largest_near_empty(tmp_path, capsys, data):
     out = tmp_path / "leaf.toml"
     code, text, _ = run(
         capsys, "ocv", data / "leaf" / "hppc_25c_from_full.csv.gz", "--capacity-ah", "30.5", "--out", out, "--json"

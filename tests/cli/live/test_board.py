@@ -1,4 +1,4 @@
-"""``board``: properties, settings, and errors."""
+"""``board``: it shows the properties of a board, changes its settings, and reports errors."""
 
 import asyncio
 import contextlib
@@ -26,7 +26,7 @@ def run_board(capsys, *arguments):
 
 @contextlib.contextmanager
 def running_board(**options):
-    """Run a board in a thread and yield its path."""
+    """Run a virtual board in a thread. Yield the path of its line."""
     with VirtualBoard(lambda _: Reading(2.5, 22.2, 25.0), **options) as virtual_board:
         loop = asyncio.new_event_loop()
         task = loop.create_task(virtual_board.run())
@@ -40,7 +40,7 @@ def running_board(**options):
 
 @pytest.fixture
 def long_timeouts(monkeypatch):
-    """Set long timeouts, for boards that respond."""
+    """Set timeouts that a board that responds never reaches."""
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
     monkeypatch.setattr(device_detection, "REFERENCE_TIMEOUT_S", LONG_S)
 
@@ -52,19 +52,19 @@ def short_timeouts(monkeypatch):
 
 
 @pytest.mark.usefixtures("long_timeouts")
-def test_shows_the_properties_of_the_board(capsys):
+def test_command_shows_the_properties_of_the_board(capsys):
     with running_board(rate_hz=50, serial=0xC0FFEE, parts=BoardParts(supply_v=4.8)) as path:
         code, out, err = run_board(capsys, path)
     assert (code, err) == (0, "")
-    message = dict(line.split(maxsplit=1) for line in out.splitlines())
-    assert (message["firmware"], message["serial"], message["rate"]) == ("0.2.0", "00c0ffee", "50 Hz")
-    assert (message["voltage"], message["bandgap"]) == ("divider 6.1", "1.1000 V")
-    assert message["current"] == "0.1 V/A at 5 V, ratiometric, zero at 0.500000 of the reference"
-    assert float(message["reference"].split()[0]) == pytest.approx(4.8, rel=1e-3)
+    shown = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert (shown["firmware"], shown["serial"], shown["rate"]) == ("0.2.0", "00c0ffee", "50 Hz")
+    assert (shown["voltage"], shown["bandgap"]) == ("divider 6.1", "1.1000 V")
+    assert shown["current"] == "0.1 V/A at 5 V, ratiometric, zero at 0.500000 of the reference"
+    assert float(shown["reference"].split()[0]) == pytest.approx(4.8, rel=1e-3)
 
 
 @pytest.mark.usefixtures("long_timeouts")
-def test_voltage_at_aref_sets_bandgap_and_reference(capsys):
+def test_given_voltage_at_aref_sets_the_bandgap_and_so_the_reference(capsys):
     with running_board(rate_hz=50) as path:
         code, out, err = run_board(capsys, path, "--aref-v", "4.7", "--serial", "77")
         assert (code, err) == (0, "")
@@ -73,9 +73,9 @@ def test_voltage_at_aref_sets_bandgap_and_reference(capsys):
         assert float(bandgap.split()[-2]) == pytest.approx(1.1 * 4.7 / 5.0, rel=1e-3)
         assert serial == "serial: was 00000001, now 0000004d"
         _, out, _ = run_board(capsys, path)
-    message = dict(line.split(maxsplit=1) for line in out.splitlines())
-    assert message["serial"] == "0000004d"
-    assert float(message["reference"].split()[0]) == pytest.approx(4.7, rel=1e-3)
+    shown = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert shown["serial"] == "0000004d"
+    assert float(shown["reference"].split()[0]) == pytest.approx(4.7, rel=1e-3)
 
 
 @pytest.mark.usefixtures("long_timeouts")

@@ -19,6 +19,7 @@ from tests.patience import LONG_S
 
 @contextlib.asynccontextmanager
 async def demo(*arguments):
+    """Run ``demo`` as a process, which is killed at the end."""
     process = await asyncio.create_subprocess_exec(
         PROGRAM, "demo", *map(str, arguments), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
     )
@@ -31,7 +32,7 @@ async def demo(*arguments):
 
 
 async def connect_listener(port):
-    """Return a listener after the broker has started."""
+    """Connect to the broker of a demo as soon as it listens. Return the listener, which the test must close."""
     async with asyncio.timeout(LONG_S):
         while True:
             listener = Listener(SimpleNamespace(port=port))
@@ -80,7 +81,7 @@ async def test_client_receives_states_from_start_to_offline():
 
 
 @pytest.mark.thorough
-async def test_estimate_follows_a_board_with_a_faster_clock():
+async def test_estimate_follows_a_demo_that_runs_faster_than_the_wall_clock():
     port = free_port()
     async with demo("--speed", 5, "--port", port):
         listener = await connect_listener(port)

@@ -8,17 +8,19 @@ import pytest
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
 from tests.command_line import run
-from tests.store.test_history import at, record
+from tests.store.test_history import record_history, snapshot_at
 
 
 @pytest.fixture
 async def pack(tmp_path):
+    """Write a pack file, and a history of five minutes with two publications each."""
     (tmp_path / "pack.toml").write_text(f'[state]\nfolder = "{tmp_path}"\n')
-    await record(tmp_path / "pack.sqlite", [at(30.0 * s) for s in range(10)])
+    await record_history(tmp_path / "pack.sqlite", [snapshot_at(30.0 * s) for s in range(10)])
     return tmp_path / "pack.toml"
 
 
 def read_csv(text):
+    """Return the rows as dicts."""
     return list(csv.DictReader(io.StringIO(text)))
 
 
@@ -47,7 +49,7 @@ def test_events_are_printed(pack, capsys):
 
 async def test_history_is_read_while_the_service_runs(pack, capsys):
     async with Database(pack.with_name("pack.sqlite")) as database, History(database, days=1) as history:
-        history.publish(at(600.0))
+        history.publish(snapshot_at(600.0))  # its minute has not ended, and has no row yet
         await history._write()
         code, out, _ = run(capsys, "history", pack)
     assert (code, len(read_csv(out))) == (0, 5)

@@ -1,4 +1,4 @@
-"""Live view on a real pseudo-terminal: content by screen size, without blocking the service."""
+"""Live view on a real pseudo-terminal: its content on screens of any size; it does not block the service."""
 
 import asyncio
 import re
@@ -21,6 +21,7 @@ TEN_SCREENS = 300
 
 @pytest.fixture(scope="module")
 def demo() -> Iterator[PseudoTerminal]:
+    """Run ``demo`` on a terminal."""
     with PseudoTerminal("demo", "--port", str(free_port())) as terminal:
         yield terminal
 

@@ -20,7 +20,7 @@ def wide_terminal(monkeypatch):
 
 
 def run_ports(capsys, *arguments):
-    """Run the command and return exit code and stdout."""
+    """Run the command, which must not write to stderr. Return exit code and stdout."""
     with pytest.raises(SystemExit) as ended:
         main(["ports", *arguments])
     out, err = capsys.readouterr()
@@ -29,8 +29,8 @@ def run_ports(capsys, *arguments):
 
 
 @contextlib.contextmanager
-def simulated(*arguments):
-    """Run a simulated board and yield its path and process."""
+def simulated_board(*arguments):
+    """Run a simulated board as a process. Yield the path of its line and the process."""
     with subprocess.Popen([PROGRAM, "simulate", *arguments], stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process.stdout.readline().strip(), process
@@ -42,7 +42,7 @@ def test_existing_ports_are_listed(capsys):
     devices = [port.device for port in list_ports.comports()]
     code, out = run_ports(capsys)
     assert code == 0
-    if devices:
+    if devices:  # this machine may have ports
         assert len(re.findall(r"^ *(/dev/\S+)", out, re.MULTILINE)) == len(devices)
         assert "board" not in out.splitlines()[1]
     else:
@@ -58,7 +58,7 @@ def test_existing_ports_are_listed(capsys):
 )
 def test_probe_identifies_a_board_without_disturbing_it(capsys, monkeypatch, options, description):
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", LONG_S)
-    with simulated(*options) as (path, process):
+    with simulated_board(*options) as (path, process):
         for _ in range(2):
             code, out = run_ports(capsys, "--probe", path)
             assert code == 0

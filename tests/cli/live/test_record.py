@@ -1,4 +1,4 @@
-"""Process of command ``record``: the file has all received bytes, whatever ended the process."""
+"""Process of command ``record``: the file has all received bytes, however the process ended."""
 
 import contextlib
 import json
@@ -27,6 +27,7 @@ TEXT_LINE = b"3.900,1.000,25.0\r\n"
 
 @contextlib.contextmanager
 def program(*arguments, **options):
+    """Run ``bms-estimator`` as a process, which is killed at the end."""
     command = [PROGRAM, *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options) as process:
         try:
@@ -43,6 +44,7 @@ def board():
 
 
 def until(condition, awaited):
+    """Wait until the condition is true. ``awaited`` names it in the error."""
     end_s = time.monotonic() + LONG_S
     while not condition():
         assert time.monotonic() < end_s, f"{awaited} did not arrive"
@@ -50,26 +52,28 @@ def until(condition, awaited):
 
 
 def size_bytes(path):
+    """Return the size of a file; 0 if it does not exist."""
     return path.stat().st_size if path.exists() else 0
 
 
-def reads(path):
+def complete_reads(path):
+    """Return arrival time and bytes of each complete record."""
     return [read for batch in read_capture(path) for read in batch]
 
 
-def samples(path):
+def sample_count(path):
     """Return the number of samples in all complete reads."""
     decoder = FrameDecoder()
-    return sum(decoder.feed(arrival_s, data).size for arrival_s, data in reads(path))
+    return sum(decoder.feed(arrival_s, data).size for arrival_s, data in complete_reads(path))
 
 
 def has_a_second(path):
-    """Return True if a growing capture holds samples of a second."""
-    return size_bytes(path) > 1_000 and samples(path) >= 100
+    """Return True if a growing capture contains the samples of a second."""
+    return size_bytes(path) > 1_000 and sample_count(path) >= 100
 
 
 def replay(capsys, path):
-    """Replay a capture and return exit code, summary and stderr."""
+    """Replay a capture. Return exit code, summary and stderr."""
     with pytest.raises(SystemExit) as ended:
         main(["replay", str(path), "--cell", "chen_mora", "--json"])
     out, err = capsys.readouterr()
@@ -86,14 +90,14 @@ def test_all_bytes_are_recorded_until_ctrl_c(line: Line, tmp_path, capsys):
         for piece in 10 * (TEXT_LINE[:7], TEXT_LINE[7:]):  # each line is split over two reads
             line.write(piece)
             sent += piece
-            until(lambda sent=sent: b"".join(data for _, data in reads(out)) == sent, f"byte {len(sent)}")
+            until(lambda sent=sent: b"".join(data for _, data in complete_reads(out)) == sent, f"byte {len(sent)}")
         process.send_signal(signal.SIGINT)
         message, err = process.communicate(timeout=LONG_S)
     assert (process.returncode, message) == (0, "")
     assert re.search(r"^\d+\.\d s, 180 bytes, 10 frames, 0 lost, 0 CRC errors, 0 other faults$", err, re.MULTILINE)
     header = read_header(out)
     assert (header.mode, header.port, header.baud) == ("text", str(line.path), 115200)
-    arrivals_s = [arrival_s for arrival_s, _ in reads(out)]
+    arrivals_s = [arrival_s for arrival_s, _ in complete_reads(out)]
     assert arrivals_s == sorted(arrivals_s)
     code, result, err = replay(capsys, out)
     assert (code, err) == (0, "")
@@ -108,24 +112,24 @@ def test_killed_recorder_leaves_complete_records(board, tmp_path, capsys):
         process.wait(LONG_S)
     code, result, err = replay(capsys, out)
     assert (code, err) == (0, "")
-    assert result["samples"] == samples(out) >= 100
+    assert result["samples"] == sample_count(out) >= 100
     assert result["gaps"] == 0
 
-    all_reads = reads(out)
+    all_reads = complete_reads(out)
     for removed_bytes in (1, 3, len(all_reads[-1][1]) + 10):  # within the checksum, the data, and the record's header
         truncated.write_bytes(out.read_bytes()[:-removed_bytes])
-        assert reads(truncated) == all_reads[:-1]
+        assert complete_reads(truncated) == all_reads[:-1]
         code, result, err = replay(capsys, truncated)
         assert code == 0
         assert err.endswith(
             " bytes are no complete record: the file is truncated, or the length in a record is damaged\n"
         )
-        assert result["samples"] == samples(truncated) > 50
+        assert result["samples"] == sample_count(truncated) > 50
 
 
 @pytest.fixture(scope="module")
 def capture(board, tmp_path_factory):
-    """Record a capture of at least a second."""
+    """Record at least a second of the board."""
     out = tmp_path_factory.mktemp("recorded") / "one.bms"
     with program("record", out, "--port", board) as process:
         until(lambda: has_a_second(out), "a second")
@@ -134,7 +138,7 @@ def capture(board, tmp_path_factory):
     assert (process.returncode, message) == (0, "")
     counts = re.search(r" bytes, ([\d,]+) frames, 0 lost, 0 CRC errors, 0 other faults\n$", err)
     assert counts
-    assert int(counts[1].replace(",", "")) == samples(out) >= 100
+    assert int(counts[1].replace(",", "")) == sample_count(out) >= 100
     return out
 
 
@@ -143,7 +147,7 @@ def test_recording_ends_after_the_duration(board, tmp_path):
         _, err = process.communicate(timeout=LONG_S)
     assert process.returncode == 0
     assert re.search(r" 0 lost, 0 CRC errors, 0 other faults\n$", err)
-    assert reads(tmp_path / "short.bms")
+    assert complete_reads(tmp_path / "short.bms")
 
 
 def test_replayed_samples_have_the_period_of_the_board(capture, tmp_path, capsys):
@@ -152,25 +156,25 @@ def test_replayed_samples_have_the_period_of_the_board(capture, tmp_path, capsys
         main(["replay", str(capture), "--cell", "chen_mora", "--out", str(table)])
     capsys.readouterr()
     times = np.loadtxt(table, delimiter=",", skiprows=1, usecols=0)
-    assert times.size == samples(capture)
+    assert times.size == sample_count(capture)
     assert np.allclose(np.diff(times), 1 / 100, rtol=0.0, atol=1e-5)
 
 
 def test_damaged_record_is_reported_and_earlier_ones_are_read(capture, tmp_path, capsys):
-    damaged, all_reads = tmp_path / "damaged.bms", reads(capture)
+    damaged, all_reads = tmp_path / "damaged.bms", complete_reads(capture)
     middle = len(all_reads) // 2
     data = bytearray(capture.read_bytes())
     data[-sum(RECORD_OVERHEAD_BYTES + len(read) for _, read in all_reads[middle:]) + DATA_OFFSET] ^= 0xFF
     damaged.write_bytes(data)
-    assert reads(damaged) == all_reads[:middle]
+    assert complete_reads(damaged) == all_reads[:middle]
     code, result, err = replay(capsys, damaged)
     assert code == 0
     assert f"warning: {damaged}: damaged after" in err
-    assert result["samples"] == samples(damaged) > 10
+    assert result["samples"] == sample_count(damaged) > 10
 
 
 def test_damaged_length_is_reported(capture, tmp_path, capsys):
-    damaged, all_reads = tmp_path / "damaged.bms", reads(capture)
+    damaged, all_reads = tmp_path / "damaged.bms", complete_reads(capture)
     middle = len(all_reads) // 2
     data = bytearray(capture.read_bytes())
     unread = sum(RECORD_OVERHEAD_BYTES + len(read) for _, read in all_reads[middle:])
@@ -202,9 +206,9 @@ def test_full_disk_ends_the_recording_and_the_file_is_readable(board, tmp_path, 
     assert size_bytes(out) <= 4 * 1024
     code, result, err = replay(capsys, out)
     assert code == 0
-    assert result["samples"] == samples(out) > 10
+    assert result["samples"] == sample_count(out) > 10
     header_bytes = len(MAGIC) + 4 + int.from_bytes(out.read_bytes()[len(MAGIC) :][:4], "little") + 2
-    unread = size_bytes(out) - header_bytes - sum(RECORD_OVERHEAD_BYTES + len(data) for _, data in reads(out))
+    unread = size_bytes(out) - header_bytes - sum(RECORD_OVERHEAD_BYTES + len(data) for _, data in complete_reads(out))
     message = f"warning: {out}: the last {unread:,} bytes are no complete record"
     assert (message in err) == (unread > 0)  # the limit may lie between two records
 
@@ -216,4 +220,4 @@ def test_missing_board_is_reported(tmp_path):
         _, err = process.communicate(timeout=LONG_S)
     assert process.returncode == 0
     assert "0 bytes, 0 frames" in err
-    assert reads(tmp_path / "none.bms") == []
+    assert complete_reads(tmp_path / "none.bms") == []

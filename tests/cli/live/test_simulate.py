@@ -24,7 +24,7 @@ RATE_HZ = 50
 
 @contextlib.contextmanager
 def simulate(*arguments):
-    """Run the program and yield it with the path that it prints."""
+    """Run ``simulate`` as a process. Yield the process and the path that it prints."""
     command = [PROGRAM, "simulate", *arguments]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
@@ -35,6 +35,7 @@ def simulate(*arguments):
 
 @contextlib.contextmanager
 def open_line(path):
+    """Open the line at a path. Yield its file descriptor."""
     descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
     try:
         yield descriptor
@@ -43,7 +44,7 @@ def open_line(path):
 
 
 def read(descriptor, is_enough, data=b""):
-    """Read bytes and append them to ``data`` until ``is_enough(data)`` is True; return all."""
+    """Read bytes and append them to ``data`` until ``is_enough(data)`` is True. Return all of them."""
     end_s = time.monotonic() + LONG_S
     while not is_enough(data):
         assert time.monotonic() < end_s, f"{len(data)} bytes arrived, which are not enough"
@@ -53,6 +54,7 @@ def read(descriptor, is_enough, data=b""):
 
 
 def decode(data):
+    """Return the samples in the bytes, and the decoder with its counters."""
     decoder = FrameDecoder()
     return decoder.feed(0.0, data), decoder
 
@@ -62,7 +64,7 @@ def last_period_s(data):
     return np.diff(decode(data)[0]["time_s"])[-1]
 
 
-def test_frames_of_the_configured_pack_until_ctrl_c():
+def test_frames_of_the_configured_pack_are_sent_until_ctrl_c():
     arguments = ("--series", "6", "--load", "constant", "--current-a", "0.5", "--rate-hz", str(RATE_HZ))
     with simulate(*arguments) as (process, path):
         assert Path(path).is_char_device()

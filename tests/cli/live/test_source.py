@@ -18,7 +18,7 @@ def pack(tmp_path: Path) -> Path:
 
 
 def write_linux_settings(pack: Path) -> Path:
-    """Write settings of a pack with a simulated sensor chip of this machine."""
+    """Write a pack file with a sensor chip in a simulated folder of /sys: 53.12 V and -2.51 A. Return its path."""
     folder = hwmon(pack.parent / "sys", in1_input=53120, curr1_input=-2510)
     pack.write_text(f'[source]\nkind = "linux"\nchip = "{folder}"\ninterval_s = 0.01\n')
     return pack

@@ -12,21 +12,25 @@ from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.command_line import PROGRAM, run
 from tests.mosquitto import Broker, Listener
 from tests.pseudo_terminal import BACK, PseudoTerminal
-from tests.sinks.snapshots import NOW, ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT, NOW
 
 
 def snapshot_of(device: str, voltage_v: float) -> Snapshot:
-    assert ONE.estimate
-    info = ONE.info.model_copy(update={"device": device})
-    return ONE._replace(info=info, estimate=ONE.estimate.model_copy(update={"voltage_v": voltage_v}))
+    """Return a snapshot of a pack with this name and voltage."""
+    assert CELL_SNAPSHOT.estimate
+    info = CELL_SNAPSHOT.info.model_copy(update={"device": device})
+    return CELL_SNAPSHOT._replace(
+        info=info, estimate=CELL_SNAPSHOT.estimate.model_copy(update={"voltage_v": voltage_v})
+    )
 
 
 async def publish(client: Listener, device: str, voltage_v: float) -> None:
+    """Publish all messages of a pack with this name and voltage."""
     messages, snapshot = MessageBuilder("bms", device), snapshot_of(device, voltage_v)
     for message in (
         *messages.birth_messages(),
         *messages.live_messages(PublishedState(), snapshot, NOW)[0],
-        *messages.must_deliver(None, snapshot),
+        *messages.guaranteed_messages(None, snapshot),
     ):
         await client.publish(message.topic, message.payload, qos=1, retain=message.retain)
 

@@ -1,4 +1,4 @@
-"""Progress line about compiled kernels at a first start."""
+"""Line about the compilation of kernels at a first start."""
 
 import os
 import signal
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.options.compile_progress import TEXT, show_compile_progress
+from bms_estimator.cli.options.compile_progress import COMPILE_TEXT, show_compile_progress
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.numba_cache import njit
 from tests.command_line import PROGRAM
@@ -34,14 +34,14 @@ def test_first_start_reports_the_compilation_and_can_be_interrupted(command: str
     ) as process:
         try:
             assert process.stderr
-            first = next(line for line in process.stderr if TEXT in line)
+            first = next(line for line in process.stderr if COMPILE_TEXT in line)
             process.send_signal(signal.SIGINT)
             rest = process.stderr.read()
             assert process.wait(LONG_S) == 130
         finally:
             process.kill()
     assert "Traceback" not in rest
-    assert ('"level": "info"' in first) == (command == "run")
+    assert ('"level": "info"' in first) == (command == "run")  # a service logs JSON to a pipe
 
 
 def test_line_is_printed_once_and_only_if_a_kernel_is_compiled() -> None:
@@ -50,7 +50,7 @@ def test_line_is_printed_once_and_only_if_a_kernel_is_compiled() -> None:
     with show_compile_progress(lines.append):
         kernel(0.5, 1.0, 2.0)
         njit(chen_mora.delta.py_func)(0.5, 1.0, 2.0)
-    assert lines == [TEXT]
+    assert lines == [COMPILE_TEXT]
     with show_compile_progress(lines.append):
         kernel(0.6, 1.0, 2.0)
-    assert lines == [TEXT]
+    assert lines == [COMPILE_TEXT]

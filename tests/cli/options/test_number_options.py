@@ -30,7 +30,9 @@ def test_number_outside_its_limits_is_rejected(text: str, capsys: pytest.Capture
         *("thesis --resolution-v", "validate --soc"),
     ],
 )
-def test_python_number_formats_are_rejected(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_option_for_a_number_rejects_the_digit_separator_of_python(
+    option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     code, _, err = run(capsys, *f"{option}=0_1".split())
     assert code == 2
     assert "no decimal number" in err

@@ -40,7 +40,7 @@ REQUIRED_SETTINGS = {
 """Required settings of ``[source]``, by kind."""
 
 
-def test_file_contains_all_settings_and_accepts_them_uncommented(pack, capsys):
+def test_file_of_init_contains_all_settings_and_is_valid_with_all_of_them_uncommented(pack, capsys):
     run(capsys, "config", "init", pack)
     lines = pack.read_text().splitlines()
     for name, field in Settings.model_fields.items():
@@ -66,6 +66,7 @@ def test_file_contains_all_settings_and_accepts_them_uncommented(pack, capsys):
 
 @pytest.fixture
 def long_probe(monkeypatch):
+    """Let a probe decide soon that the device is no board, and then wait for the answers of other protocols."""
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.1)
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
 
@@ -102,7 +103,7 @@ def test_init_does_not_overwrite_a_file(pack, capsys):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "message_parts"),
     [
         ("[pack]\nseries = 0\n", ["pack.series = 0", "greater than or equal to 1"]),
         ("[pack]\nsereis = 2\n", ["pack.sereis", "unknown key"]),
@@ -144,13 +145,13 @@ def test_init_does_not_overwrite_a_file(pack, capsys):
         ('[pack]\ncell = "lfp"\ncapacity_ah = 0\n', ["pack.capacity_ah = 0", "greater than 0", "capacity of the cell"]),
     ],
 )
-def test_error_names_the_setting_and_the_allowed_values(text, message, pack, capsys):
+def test_error_names_the_setting_and_the_allowed_values(text, message_parts, pack, capsys):
     pack.write_text(text)
     for command in ("check", "show"):
         code, out, err = run(capsys, "config", command, pack)
         assert (code, out) == (2, "")
-        assert [part for part in message if part not in err] == [], err
-        if "nonsense" not in text and "generic" not in err:
+        assert [part for part in message_parts if part not in err] == [], err
+        if "nonsense" not in text and "generic" not in err:  # errors about cells do not name the file
             assert err.startswith(f"error: {pack}: ")
 
 
@@ -176,18 +177,18 @@ def test_show_prints_the_settings_in_effect_as_toml(pack, capsys):
     assert "# pack.series_count = 6\n" in out
 
 
-@pytest.mark.parametrize("gain", ['"never"', "-2.0"])
-def test_output_of_show_is_read_back(gain, pack, tmp_path, capsys):
-    pack.write_text(f'[observer]\nrearm_gain = {gain}\n[mqtt]\nbase_topic = "home/b"\n[state]\nfolder = "kept"\n')
+@pytest.mark.parametrize("rearm_gain", ['"never"', "-2.0"])
+def test_output_of_show_is_a_valid_file_with_the_same_settings(rearm_gain, pack, tmp_path, capsys):
+    pack.write_text(f'[observer]\nrearm_gain = {rearm_gain}\n[mqtt]\nbase_topic = "home/b"\n[state]\nfolder = "kept"\n')
     code, out, _ = run(capsys, "config", "show", pack)
     assert code == 0
-    assert f"rearm_gain = {gain}\n" in out
+    assert f"rearm_gain = {rearm_gain}\n" in out
     copy = tmp_path / "copy.toml"
     copy.write_text(out)
     assert load_settings(copy) == load_settings(pack) != Settings()
 
 
-def test_units_and_limits_are_written_in_full(pack, capsys):
+def test_file_of_init_contains_units_and_limits_of_settings(pack, capsys):
     run(capsys, "config", "init", pack)
     text = pack.read_text()
     assert "[h, at least 1]\n#map_memory_h = 336.0\n" in text
@@ -286,7 +287,7 @@ def test_generic_cell_has_the_capacity_of_the_pack(pack, capsys):
     assert "lfp, 4 in series, 13 V, 200 Ah" in out
 
 
-def test_check_reads_influxdb_files_and_warns_about_credentials(tmp_path, capsys):
+def test_check_fails_on_a_missing_token_file_and_warns_about_a_token_in_the_credentials(tmp_path, capsys):
     pack = tmp_path / "pack.toml"
     pack.write_text(f'[influx]\nbucket = "bms"\ntoken_file = "{tmp_path / "none"}"\n')
     code, _, err = run(capsys, "config", "check", pack)

@@ -1,8 +1,9 @@
 """Short simulated captures of typical loads and conditions, identical on every machine.
 
-The estimator starts in mid-load with an SOC 0.2 too low or 0.2 too high. The ladder of the cell file is fitted to the true
-impedance at the temperatures of the file. The file has errors of the size that it declares: an OCV error of some millivolts
-and some SOC, resistances of another cell of the same type, and a capacity error of one percent.
+The estimator starts in mid-load with an SOC 0.2 too low or 0.2 too high. The RC ladder of the cell file is fitted to
+the true impedance at the temperatures of the file. The file has errors of the size that it declares: an OCV that is off
+by some millivolts and along the SOC axis, resistances of another cell of the same type, and a capacity error of one
+percent.
 """
 
 from dataclasses import dataclass, replace
@@ -42,11 +43,11 @@ PHOSPHATE = Truth(
     ohm=resistances((12.0, 3.0, 5.0, 4.0, 4.0, 5.0, 6.0, 4.0)),
 )
 NODES = np.array([0, 20, 40, 60, 80, 120, 160, 200, 240, 280, 320, 360, 400])
-"""SOC nodes of the resistances in the cell file."""
+"""SOC nodes of the resistances in the cell file, as indices of ``GRID``."""
 OCV_NODES = np.concatenate([np.arange(0, 40, 4), np.arange(40, 401, 10)])
-"""SOC nodes of the OCV in the cell file."""
+"""SOC nodes of the OCV in the cell file, as indices of ``GRID``."""
 RAD_S = 1.0 / np.geomspace(0.1, 4000.0, 40)
-"""Frequencies at which the ladder is fitted to the impedance [1/s]."""
+"""Angular frequencies at which the ladder is fitted to the impedance [1/s]."""
 WEAK_SHARE = np.array([0.7, 0.3, 0.3, 0.4, 0.5, 0.5, 0.5])
 """Fractions of the resistances at 25 C with weak temperature dependence, if the cell file has no other temperature."""
 R_STD = 0.1
@@ -59,7 +60,10 @@ OCV_STD_SOC = 0.007
 """Std of the error of the cell file's OCV along the SOC axis."""
 OCV_LENGTH_SOC = 0.15
 """Correlation length of both errors [SOC]."""
-STEADY_C, PER_HOUR_S = 0.5, 3600
+STEADY_C = 0.5
+"""Current at which the ladder is fitted to the impedance [C]."""
+PER_HOUR_S = 3600
+"""Seconds per hour."""
 VOLT_STEP, AMPERE_STEP, KELVIN_STEP = 1e-3, 1e-3, 0.1
 """Resolution of the sensors [V], [A] and [K]."""
 
@@ -86,7 +90,9 @@ class Case:
     file_c: tuple[float, ...] | Literal["generic"] = (25.0, 10.0, 0.0, -10.0)
     """Temperatures of the cell file [C], or a generic cell file."""
     gain: float = 1.0
+    """Measured over true current."""
     offset_a: float = 0.0
+    """Offset of the current sensor [A]."""
     capacity: float = 1.01
     """Capacity in the cell file divided by the true capacity."""
     curve_error: float = 1.0
@@ -94,16 +100,20 @@ class Case:
     weak_cell: float = 1.0
     """Below 1: six cells in series, one with this fraction of the capacity of the others."""
     sensed: bool = True
+    """True: the samples contain a temperature."""
     warms_k: float = 0.0
     """Temperature rise for a loss of 1 W [K]."""
     after_s: float = 900.0
+    """Time after the first sample from which on the run is scored [s]."""
     seed: int = 1
 
 
 KNOWS_25 = {"file_c": (25.0,)}
+"""Cell file with data of 25 C only."""
 LFP = {"truth": PHOSPHATE, "file_c": (25.0, 5.0, -15.0)}
 CHARGES = {"load": "constant", "load_c": -0.2, "soc": 0.15, "hours": 3.0}
 WARMS = {"warms_k": 15.0, "temperature_c": 20.0, "hours": 0.4, "unseen_h": 0.2}
+"""Cell that warms itself in a room of 20 C."""
 CASES: tuple[Case, ...] = (
     Case("oxide 25C", seed=1),
     Case("oxide 25C again", seed=2),
@@ -147,13 +157,14 @@ CASES: tuple[Case, ...] = (
     Case("6S one cell -10%", weak_cell=0.9, seed=30),
     Case("6S one cell -20%", weak_cell=0.8, seed=35),
 )
-WRONG = (-0.2, 0.2)
+"""Cases of the summary. A cell that is called full has just been charged; a capture that is cut begins in mid-load."""
+SOC_ERRORS = (-0.2, 0.2)
 """Errors of the initial SOC."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Samples of the estimator, and the true values."""
+    """Samples for the estimator, its cell file, and the true SOC."""
 
     samples: SampleBlock
     soc: Floats
@@ -162,7 +173,8 @@ class Capture:
 
 
 def load_a(case: Case, seconds: int) -> Floats:
-    """Return the current at 1 Hz [A]: levels of some seconds, stops, and some regeneration in warm cells."""
+    """Return the current of a case at 1 Hz [A]: random levels of some seconds, stops, and regeneration in warm
+    cells."""
     rng = np.random.default_rng(case.seed)
     one_c = case.truth.capacity_ah
     if case.load == "constant":
@@ -179,7 +191,7 @@ def load_a(case: Case, seconds: int) -> Floats:
 
 
 def capture(case: Case, current_a: Floats | None = None) -> Capture:
-    """Simulate a capture of one case; under ``current_a`` at ``rate_hz`` [A] if given."""
+    """Simulate a capture of one case. Its load may be replaced by ``current_a``, sampled at ``case.rate_hz`` [A]."""
     assert not (case.sensed and case.warms_k), "a sensor would have the temperature of the room"
     rng = np.random.default_rng(1000 + case.seed)
     if current_a is None:
@@ -187,12 +199,12 @@ def capture(case: Case, current_a: Floats | None = None) -> Capture:
     dt_s = 1.0 / case.rate_hz
     time_s = dt_s * np.arange(current_a.size)
     temperature_c = case.temperature_c + case.rising_k * time_s / time_s[-1]
-    cells = 1 if case.weak_cell == 1.0 else 6
+    cells = 1 if case.weak_cell == 1.0 else 6  # in series
     voltage_v, soc = np.zeros(time_s.size), np.ones(time_s.size)
     for n in range(cells):
         t = replace(case.truth, capacity_ah=case.truth.capacity_ah * (case.weak_cell if n == 0 else 1.0))
         curves = t.ocv_v, t.per_kelvin_v, t.hysteresis_v, t.ohm
-        branch = 1.0 if case.soc == 1.0 else -1.0
+        branch = 1.0 if case.soc == 1.0 else -1.0  # a full cell was charged, others were discharged
         cell_v, cell_soc = simulate(
             dt_s, current_a, temperature_c, case.soc, branch, t.capacity_ah, *curves, case.warms_k
         )
@@ -222,7 +234,7 @@ def cell_file(case: Case) -> CellModel:
     std_v, std_soc_v = case.curve_error * OCV_STD_V[kind], case.curve_error * OCV_STD_SOC * slope_v
     ocv_error_v = std_v * smooth(rng, OCV_LENGTH_SOC) + std_soc_v * smooth(rng, OCV_LENGTH_SOC)
     file_ocv_v = rising((case.truth.ocv_v + ocv_error_v)[OCV_NODES])
-    hysteresis_v = case.truth.hysteresis_v[GRID.size // 2]  # constant over SOC, an error within the std of `ocv`
+    hysteresis_v = case.truth.hysteresis_v[GRID.size // 2]  # constant over SOC; this error is within ``error_v``
     table = {
         "soc": GRID[OCV_NODES],
         "ocv_v": file_ocv_v + 1e-6 * np.arange(OCV_NODES.size),
@@ -234,27 +246,32 @@ def cell_file(case: Case) -> CellModel:
 
 
 def rising(curve_v: Floats) -> Floats:
-    """Return the curve with falling parts made constant, from the middle outwards, so that errors of the ends stay
-    local."""
+    """Return the curve with its falling parts made constant.
+
+    It is corrected from the middle outwards, so that errors of the ends stay local.
+    """
     half = curve_v.size // 2
     return np.r_[np.minimum.accumulate(curve_v[half - 1 :: -1])[::-1], np.maximum.accumulate(curve_v[half:])]
 
 
 def ladder(truth: Truth, temperatures_c: tuple[float, ...], rng: np.random.Generator) -> Ladder:
-    """Return the ladder of another cell, fitted to the true impedance at each SOC by relative non-negative least
-    squares."""
+    """Return the RC ladder of another cell of the same type.
+
+    It is fitted to the true impedance at each SOC by relative non-negative least squares. Random factors then make it
+    that of another cell.
+    """
     branches = 1.0 / (1.0 + 1j * RAD_S[:, None] * np.array([0.0, *TAU_S]))
     common_factor = np.exp(R_STD * rng.standard_normal())
     weak_ohm, strong_ohm = [], []
     for node in NODES:
         rows, normalized_impedances = [], []
         for t in temperatures_c:
-            aim = impedance(truth, node, t, RAD_S, STEADY_C * truth.capacity_ah)
+            true_impedance = impedance(truth, node, t, RAD_S, STEADY_C * truth.capacity_ah)
             parts = [arrhenius(energy_j, t) * branches for energy_j in (WEAK_J, STRONG_J)]
-            rows.append((branches if len(temperatures_c) == 1 else np.hstack(parts)) / np.abs(aim)[:, None])
-            normalized_impedances.append(aim / np.abs(aim))
-        matrix, aim = np.concatenate(rows), np.concatenate(normalized_impedances)
-        ohm, _ = nnls(np.concatenate([matrix.real, matrix.imag]), np.concatenate([aim.real, aim.imag]))
+            rows.append((branches if len(temperatures_c) == 1 else np.hstack(parts)) / np.abs(true_impedance)[:, None])
+            normalized_impedances.append(true_impedance / np.abs(true_impedance))
+        matrix, target = np.concatenate(rows), np.concatenate(normalized_impedances)
+        ohm, _ = nnls(np.concatenate([matrix.real, matrix.imag]), np.concatenate([target.real, target.imag]))
         if len(temperatures_c) == 1:
             ohm = np.concatenate([WEAK_SHARE * ohm, (1.0 - WEAK_SHARE) * ohm])
         weak, strong = ohm.reshape(2, -1) * common_factor * np.exp(SHAPE_STD * rng.standard_normal(1 + len(TAU_S)))

@@ -1,4 +1,4 @@
-"""Full cycles and charges from empty: first day of a cell of which only chemistry and capacity are known.
+"""Full cycles and charges from empty on the first day of a cell of which only chemistry and capacity are known.
 
 The estimator has the generic cell file and no initial SOC. The true cell has the OCV of a measured cell (LG M50, NCR18650,
 Leaf, the LFP test cell) or a random OCV with errors up to 1.5 std (LCO, LTO). Its resistances are 0.7 to 3 times those of
@@ -33,19 +33,22 @@ REST_S = 900
 TAIL_S = 4 * 3600
 """Maximum duration of the drive after the charge [s]."""
 MAX_CHARGE_S = 8 * 3600
+"""Maximum duration of the charge [s]; the charger ends it earlier."""
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """One capture of a cell with ``resistance`` times the resistances of its generic cell."""
+    """Parameters of one capture."""
 
     chemistry: Literal["nmc", "nca", "lfp", "lmo", "lco", "lto"]
     begin: Literal["discharge", "charge"]
     """First phase: a discharge at 1 C to empty, or the charge of an empty cell."""
     resistance: float
+    """Resistance of the true cell over that of the generic cell."""
     soc: float
     """SOC at the first sample, from rest."""
     charge_c: float = 1.0
+    """Charge current [C]."""
     seed: int = 1
 
     @property
@@ -56,18 +59,18 @@ class Cycle:
 
 def cycles(chemistry: str) -> tuple[Cycle, ...]:
     """Return the cycles of one generic cell."""
-    down = [Cycle(chemistry, "discharge", r, s, seed=n) for n, (r, s) in enumerate(DISCHARGES)]
-    up = [Cycle(chemistry, "charge", r, s, c, seed=20 + n) for n, (r, s, c) in enumerate(CHARGES)]
-    return (*down, *up)
+    from_discharge = [Cycle(chemistry, "discharge", r, soc, seed=n) for n, (r, soc) in enumerate(DISCHARGES)]
+    from_charge = [Cycle(chemistry, "charge", r, soc, c, seed=20 + n) for n, (r, soc, c) in enumerate(CHARGES)]
+    return (*from_discharge, *from_charge)
 
 
 DISCHARGES = ((0.7, 0.41), (1.0, 0.7), (1.5, 0.41), (2.0, 0.55), (3.0, 0.41), (3.0, 0.8))
-"""Resistance and initial SOC of the full cycles."""
+"""Relative resistance and initial SOC of the full cycles."""
 CHARGES = ((0.7, 0.03, 1.0), (1.0, 0.05, 0.3), (2.0, 0.02, 0.5), (3.0, 0.05, 1.0))
-"""Resistance, initial SOC and current [C] of the charges from empty."""
-THREE_TIMES_PHOSPHATE = Cycle("lfp", "discharge", 1.815, 0.41)
+"""Relative resistance, initial SOC and current [C] of the charges from empty."""
+THREE_TIMES_PHOSPHATE = Cycle("lfp", "discharge", resistance=1.815, soc=0.41)
 """Cycle of a cell with three times the resistances of ``PHOSPHATE``, in proportion to its capacity."""
-WORST_STDS = 1.5
+MAX_CURVE_STDS = 1.5
 """Maximum error of a random true curve, in std of the generic one."""
 CHEMISTRIES = ("nmc", "nca", "lfp", "lmo", "lco", "lto")
 
@@ -78,29 +81,31 @@ def true_curve(cycle: Cycle) -> Floats:
         return measured_curve()
     if cycle.chemistry == "lfp":
         return PHOSPHATE.ocv_v
-    make = {"nca": "ncr18650", "lmo": "leaf"}.get(cycle.chemistry)
-    if make is not None:
-        ocv = load_cell(make).ocv
+    measured_cell = {"nca": "ncr18650", "lmo": "leaf"}.get(cycle.chemistry)
+    if measured_cell is not None:
+        ocv = load_cell(measured_cell).ocv
         assert isinstance(ocv, TableOcv)
         return PchipInterpolator(ocv.soc, ocv.ocv_v)(GRID)
     ocv = load_cell(cycle.chemistry, 1.0).ocv
     assert isinstance(ocv, TableOcv)
     assert ocv.error_v is not None
     shape = smooth(np.random.default_rng(cycle.seed), 0.6)
-    error_v = WORST_STDS * np.interp(GRID, ocv.soc, ocv.error_v) * shape / np.abs(shape).max()
+    error_v = MAX_CURVE_STDS * np.interp(GRID, ocv.soc, ocv.error_v) * shape / np.abs(shape).max()
     return rising(curve_of(cycle.chemistry) + error_v) + 1e-5 * GRID
 
 
 def load(cycle: Cycle, rng: np.random.Generator, charge_s: int) -> Floats:
-    """Return the requested current at 1 Hz [A]: a discharge to empty or a rest, a charge, and a drive, with rests
-    between."""
+    """Return the requested current at 1 Hz [A]: a discharge to empty or a rest, a charge, and a drive.
+
+    Rests lie between these phases. ``charge_s`` is the duration of the charge.
+    """
     one_c = CAPACITY_AH
     begin = np.r_[np.full(3600, one_c), np.zeros(REST_S)] if cycle.begin == "discharge" else np.zeros(REST_S)
     return np.r_[begin, np.full(charge_s, -cycle.charge_c * one_c), np.zeros(REST_S), drive(rng, one_c, 0.5, TAIL_S)]
 
 
 def capture(cycle: Cycle) -> tuple[SampleBlock, Floats]:
-    """Return samples at 1 Hz until the cell is empty again, and the true SOC at each."""
+    """Return samples at 1 Hz until the cell is empty after the charge, and the true SOC at each sample."""
     truth = PHOSPHATE if cycle.chemistry in ("lfp", "lto") else OXIDE
     ocv_v, generic = true_curve(cycle), load_cell(cycle.chemistry, CAPACITY_AH)
     scale = cycle.resistance * total_ohm(generic) / truth.ohm[GRID.size // 2].sum()
@@ -108,12 +113,16 @@ def capture(cycle: Cycle) -> tuple[SampleBlock, Floats]:
     limits = {"low_v": ocv_v[0], "high_v": ocv_v[-1]}
 
     def run(charge_s: int) -> tuple[Floats, Floats, Floats]:
+        """Return the current that flowed, the voltage and the SOC."""
         current_a = load(cycle, np.random.default_rng(3000 + cycle.seed), charge_s)
         room_c = np.full(current_a.size, 25.0)
-        return current_a, *simulate(1.0, current_a, room_c, cycle.soc, -1.0, CAPACITY_AH, *curves, **limits)
+        branch = -1.0  # the cell was discharged
+        return current_a, *simulate(1.0, current_a, room_c, cycle.soc, branch, CAPACITY_AH, *curves, **limits)
 
+    # The first run shows when the charger ends the charge. The second run has no rest beyond ``REST_S`` after it.
     current_a, _, _ = run(MAX_CHARGE_S)
-    current_a, voltage_v, soc = run(int(np.count_nonzero(current_a[: -REST_S - TAIL_S] < 0.0)))
+    charge_s = int(np.count_nonzero(current_a[: -REST_S - TAIL_S] < 0.0))
+    current_a, voltage_v, soc = run(charge_s)
     empty = np.flatnonzero((soc < EMPTY_SOC) & (np.arange(soc.size) > soc.argmax()))
     end = int(empty[0]) if empty.size else soc.size
     rng = np.random.default_rng(4000 + cycle.seed)
@@ -139,13 +148,13 @@ class CycleRow:
     cycle: Cycle
     score: Score
     capacity: float
-    """Learned over true capacity, less 1 [%]."""
+    """Relative error of the learned capacity [%]."""
     initializations: int
     """Number of re-initializations of the filter."""
 
     @property
     def line(self) -> list[str]:
-        """Return the line of the checked-in summary."""
+        """Return the columns ``HEAD`` of the checked-in summary."""
         values = (self.score.rmse, self.score.cover, self.score.std, self.score.score, self.capacity)
         return [self.cycle.name, *(f"{value:.1f}" for value in values)]
 
@@ -155,7 +164,7 @@ PATH = Path(__file__).with_name("cycles.csv")
 
 
 def row(cycle: Cycle) -> CycleRow:
-    """Run the estimator with the generic cell file and the default start."""
+    """Run the estimator with the generic cell file and without an initial SOC."""
     samples, soc = capture(cycle)
     estimator = Estimator(load_cell(cycle.chemistry, CAPACITY_AH))
     trace = estimator.run(samples)

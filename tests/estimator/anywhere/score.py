@@ -6,10 +6,11 @@ import numpy as np
 
 from bms_estimator.model.arrays import Floats
 
-MAX_S = 60.0
+MAX_WEIGHT_S = 60.0
 """Maximum weight of the time between two samples [s]."""
 LOWEST_SOC = 0.05
-MIN_ROWS = 10
+"""True SOC below which samples are not scored."""
+MIN_SAMPLES = 10
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Score:
     score: float
     """Interval score of soc +- 2 soc_std as a 95 % interval, by Gneiting and Raftery (2007), equation 43.
 
-    It is the width plus 40 times the distance of a true SOC outside.
+    It is the width of the interval, plus 40 (2 / 0.05) times the distance of a true SOC outside.
     """
     nees: float
     """Mean of (error / soc_std)^2; 1 for a correct std."""
@@ -38,8 +39,8 @@ def score(time_s: Floats, soc: Floats, soc_std: Floats, truth: Floats, after_s: 
         None if too few samples remain.
     """
     judged = (time_s - time_s[0] >= after_s) & (truth >= LOWEST_SOC)
-    weight = np.clip(np.diff(time_s, append=time_s[-1]), 0.0, MAX_S)[judged]
-    if judged.sum() < MIN_ROWS or weight.sum() == 0.0:
+    weight = np.clip(np.diff(time_s, append=time_s[-1]), 0.0, MAX_WEIGHT_S)[judged]
+    if judged.sum() < MIN_SAMPLES or weight.sum() == 0.0:
         return None
     weight /= weight.sum()
     error, std = (soc - truth)[judged], soc_std[judged]

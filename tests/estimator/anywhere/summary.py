@@ -1,4 +1,4 @@
-"""Results of the estimator for each case: a small table under version control, so that a change shows as a diff."""
+"""Table of the estimator's results for each case. It is under version control, so that a change shows as a diff."""
 
 import csv
 from collections.abc import Iterable
@@ -9,50 +9,58 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.records import LN_Q
-from tests.estimator.anywhere.cases import CASES, WRONG, Capture, Case, capture
+from tests.estimator.anywhere.cases import CASES, SOC_ERRORS, Capture, Case, capture
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import Score, score
 
 PATH = Path(__file__).with_name("summary.csv")
 DIGITS = 2
+"""Decimal digits of the table."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Result of one case with the initial SOC error ``wrong``."""
+    """Result of one case with one error of the initial SOC."""
 
     case: str
-    wrong: float
+    """Name of the case."""
+    soc_error: float
     score: Score
     nis: float
-    """``Run.nis``."""
+    """Normalized innovation squared, see ``Run.nis``."""
     capacity: float
-    """Learned over true capacity, less 1 [%]."""
+    """Relative error of the learned capacity [%]."""
     reopened: int
     """Number of re-initializations of the SOC."""
 
 
 def rows(cases: Iterable[Case] = CASES) -> list[Row]:
-    """Return the results of every case and start."""
-    return [row(case, seen, wrong) for case in cases for seen in [capture(case)] for wrong in WRONG]
+    """Return the results of every case, each with every error of the initial SOC."""
+    return [
+        row(case, recording, soc_error)
+        for case, recording in ((case, capture(case)) for case in cases)
+        for soc_error in SOC_ERRORS
+    ]
 
 
-def row(case: Case, seen: Capture, wrong: float) -> Row:
-    """Return the result of one run."""
-    estimator = Estimator(seen.cell, initial_soc=float(np.clip(seen.soc[0] + wrong, 0.0, 1.0)))
-    run = run_of(estimator, seen.samples)
-    result = score(seen.samples["time_s"], run.soc, run.soc_std, seen.soc, case.after_s)
+def row(case: Case, recording: Capture, soc_error: float) -> Row:
+    """Run the estimator over the capture of a case."""
+    estimator = Estimator(recording.cell, initial_soc=float(np.clip(recording.soc[0] + soc_error, 0.0, 1.0)))
+    run = run_of(estimator, recording.samples)
+    result = score(recording.samples["time_s"], run.soc, run.soc_std, recording.soc, case.after_s)
     assert result is not None
     f = estimator.record[0]["filter"]
-    capacity = case.capacity * np.exp(f["mean"][f["best"], LN_Q])
-    return Row(case.name, wrong, result, run.nis(case.after_s), 100.0 * (capacity - 1.0), int(f["reopened"]))
+    # LN_Q is ln of the learned over the file's capacity, and ``case.capacity`` is the file's over the true one.
+    learned_over_true = case.capacity * np.exp(f["mean"][f["best"], LN_Q])
+    capacity_error = 100.0 * (learned_over_true - 1.0)
+    return Row(case.name, soc_error, result, run.nis(case.after_s), capacity_error, int(f["reopened"]))
 
 
-HEAD = ("case", "wrong", *(f.name for f in fields(Score)), "nis", "capacity", "reopened")
+HEAD = ("case", "soc_error", *(f.name for f in fields(Score)), "nis", "capacity", "reopened")
 
 
 def numbers(r: Row) -> tuple[float, ...]:
-    """Return the numbers in the order of ``HEAD``, from the third on."""
+    """Return the values of the columns of ``HEAD`` after case and error."""
     return (*astuple(r.score), r.nis, r.capacity, float(r.reopened))
 
 
@@ -62,11 +70,11 @@ def write(table: list[Row]) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(HEAD)
         for r in table:
-            writer.writerow([r.case, f"{r.wrong:+.1f}", *(f"{v:.{DIGITS}f}" for v in numbers(r))])
+            writer.writerow([r.case, f"{r.soc_error:+.1f}", *(f"{v:.{DIGITS}f}" for v in numbers(r))])
 
 
 def read() -> dict[tuple[str, float], tuple[float, ...]]:
-    """Return the checked-in ``numbers`` by case and start."""
+    """Return the checked-in ``numbers`` by name of the case and error of the initial SOC."""
     with PATH.open() as file:
         lines = list(csv.reader(file))[1:]
     return {(line[0], float(line[1])): tuple(map(float, line[2:])) for line in lines}

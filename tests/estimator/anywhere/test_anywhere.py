@@ -1,4 +1,4 @@
-"""Accuracy of the SOC and its interval for any start, on cells that differ from the model."""
+"""Accuracy of the SOC and its interval from any starting point, on cells that differ from the model."""
 
 import numpy as np
 import pytest
@@ -59,31 +59,35 @@ LAST_DIGITS = 0.02
 """Tolerance of the numbers. They are rounded to 0.01, and exp and log of other processors differ in the last bit. A change of
 every voltage by 1e-9 V changes the numbers by at most 0.005."""
 NIS_BOUNDS = 0.2, 2.0
+"""Bounds of the mean NIS, which is 1 for a correct S."""
 
 
 @pytest.fixture(scope="module")
 def table() -> list[Row]:
+    """Return the results of all cases."""
     return rows()
 
 
-def test_the_summary_is_as_checked_in(table) -> None:
-    """After an intended change of the estimator ``python -m tests.estimator.anywhere`` rewrites the summary."""
+def test_the_results_equal_the_checked_in_summary(table) -> None:
+    """``python -m tests.estimator.anywhere`` rewrites the summary after an intended change of the estimator."""
     expected = read()
-    assert {(r.case, r.wrong) for r in table} == set(expected)
+    assert {(r.case, r.soc_error) for r in table} == set(expected)
     changes = [
-        f"{r.case} {r.wrong:+.1f} {name}: {value:.3f}, was {expected_value:.2f}"
+        f"{r.case} {r.soc_error:+.1f} {name}: {value:.3f}, was {expected_value:.2f}"
         for r in table
-        for name, value, expected_value in zip(HEAD[2:], numbers(r), expected[r.case, r.wrong], strict=True)
+        for name, value, expected_value in zip(HEAD[2:], numbers(r), expected[r.case, r.soc_error], strict=True)
         if not abs(value - expected_value) <= LAST_DIGITS
     ]
-    assert not changes, "\n".join(["python -m tests.estimator.anywhere writes the summary anew", *changes])
+    assert not changes, "\n".join(
+        ["if this is intended, rewrite the summary by python -m tests.estimator.anywhere", *changes]
+    )
 
 
 @pytest.mark.parametrize("case", LIMITS)
 def test_the_soc_error_coverage_and_std_are_within_their_limits(table, case: str) -> None:
     max_rmse, min_cover, max_std = LIMITS[case]
     scores = [r.score for r in table if r.case == case]
-    assert len(scores) == 2
+    assert len(scores) == 2  # one for each error of the initial SOC
     for score in scores:
         assert max_rmse is None or score.rmse <= max_rmse
         assert score.cover >= min_cover
@@ -92,25 +96,25 @@ def test_the_soc_error_coverage_and_std_are_within_their_limits(table, case: str
 
 @pytest.mark.parametrize("case", ["capacity +20%", "capacity -20%"])
 def test_a_capacity_wrong_by_20_percent_is_corrected(table, case: str) -> None:
-    assert [abs(r.capacity) < 3.0 for r in table if r.case == case] == [True, True]
+    errors = [r.capacity for r in table if r.case == case]
+    assert len(errors) == 2
+    assert max(map(abs, errors)) < 3.0
 
 
 def test_nees_matches_the_std(table) -> None:
     """Errors within one capture are correlated, so that each capture is one degree of freedom of the NEES.
 
-    Packs are excluded, because their weak cell is not a random draw. The lower bound is at 0.1 %, because too wide an
-    interval is a smaller fault, and the std covers effects that these captures do not contain.
+    Packs are excluded, because their weak cell is not a random draw. The lower bound is the 0.1 % quantile: an interval
+    that is too wide is a smaller fault, and the std covers effects that these captures do not contain.
     """
     nees = [np.mean([r.score.nees for r in table if r.case == case.name]) for case in CASES if case.weak_cell == 1.0]
     low, high = chi2.ppf([0.001, 0.975], len(nees))
     assert low <= np.sum(nees) <= high
 
 
-def test_nis_of_ten_minutes_matches_the_std(table) -> None:
-    """S must match the mean innovation of ten minutes.
-
-    R treats the error of the model, which persists for minutes, as white: 50 mV in a second correspond to 2 mV in ten
-    minutes. A single innovation is therefore far below its S.
+def test_the_innovation_variance_matches_the_mean_innovation_of_ten_minutes(table) -> None:
+    """The error of the model persists for minutes, but R treats it as white noise of 50 mV each second, or 2 mV in ten
+    minutes. A single innovation is therefore far below its std.
     """
     nis = np.mean([r.nis for r in table])
     assert NIS_BOUNDS[0] <= nis <= NIS_BOUNDS[1]

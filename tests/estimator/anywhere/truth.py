@@ -29,10 +29,11 @@ KINETIC_V = 0.051
 COOLING_S = 900.0
 """Thermal time constant of a cell [s]."""
 GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
+"""Gas constant [J/mol/K], 0 C and 25 C [K]."""
 TAPER_C = 0.05
 """Current at which a charger ends its charge [C]."""
-LOOPS_SOC, FAST_LOOP = (0.015, 0.15), 0.6
-"""Charge constants of the fast and the slow hysteresis [SOC], and fraction of the fast one.
+LOOPS_SOC, FAST_FRACTION = (0.015, 0.15), 0.6
+"""Charge constants of the fast and the slow hysteresis [SOC], and fraction of the hysteresis that is fast.
 
 Both are stop operators (Prandtl), so that regeneration moves the hysteresis only by its own charge.
 """
@@ -45,8 +46,9 @@ class Truth:
     capacity_ah: float
     ocv_v: Floats
     per_kelvin_v: Floats
+    """Change of the OCV per kelvin (entropy term) [V/K]."""
     hysteresis_v: Floats
-    """Half of the OCV after charge less the OCV after discharge [V]."""
+    """Half of the difference between the OCV after charge and the OCV after discharge [V]."""
     ohm: Floats
     """Resistances at 25 C and small currents, shape (401, 8) [ohm]."""
 
@@ -75,13 +77,15 @@ def simulate(
     low_v=-math.inf,
     high_v=math.inf,
 ):
-    """Return terminal voltage [V] and SOC at each sample, from rest. A current is constant until the next sample.
+    """Return terminal voltage [V] and SOC at each sample, from rest at ``soc``. A current is constant until the next
+    sample.
 
-    A constant loss of 1 W finally warms the cell by ``warms_k`` above ``room_c``. A charger limits the voltage to ``high_v`` [V]
-    and stops at C/20. A protection ends the discharge below ``low_v`` [V]. The function writes the current that flowed to
-    ``current_a`` [A].
+    ``branch`` is the initial hysteresis: -1 after a discharge, 1 after a charge. A constant loss of 1 W finally warms
+    the cell by ``warms_k`` above ``room_c``. A charger limits the voltage to ``high_v`` [V] and stops at C/20. A
+    protection ends the discharge below ``low_v`` [V]. The function writes the current that flowed to ``current_a`` [A].
     """
     voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
+    # x are the filtered currents of the processes [A], fast and slow the two parts of the hysteresis, -1..1.
     x, fast, slow, rise_k = np.zeros(len(TAU_S)), branch, branch, 0.0
     stopped = 0.0  # sign of the current that a limit has stopped
     for n in range(len(current_a)):
@@ -93,7 +97,7 @@ def simulate(
         cold = (1.0 / (celsius + KELVIN) - 1.0 / REFERENCE_K) / GAS_J
         x[0] = i
         open_v = along(soc, ocv_v) + (celsius - 25.0) * along(soc, per_kelvin_v)
-        v = open_v + along(soc, hysteresis_v) * (FAST_LOOP * fast + (1.0 - FAST_LOOP) * slow)
+        v = open_v + along(soc, hysteresis_v) * (FAST_FRACTION * fast + (1.0 - FAST_FRACTION) * slow)
         for k in range(len(TAU_S)):
             drop_v = x[k] * along(soc, ohm[:, k]) * math.exp(ENERGY_J[k] * cold)
             v -= KINETIC_V * math.asinh(drop_v / KINETIC_V) if k == KINETIC else drop_v
@@ -109,52 +113,57 @@ def simulate(
         current_a[n] = i
         voltage_v[n], true_soc[n] = v, soc
         rise_k += (warms_k * i * (open_v - v) - rise_k) * dt_s / COOLING_S
-        moved = i * dt_s / 3600.0 / capacity_ah
-        soc -= moved
+        drawn_soc = i * dt_s / 3600.0 / capacity_ah
+        soc -= drawn_soc
         for k in range(1, len(TAU_S)):
             x[k] = i + (x[k] - i) * math.exp(-dt_s / (TAU_S[k] * math.exp(0.5 * ENERGY_J[k] * cold)))
-        fast = min(max(fast - moved / LOOPS_SOC[0], -1.0), 1.0)
-        slow = min(max(slow - moved / LOOPS_SOC[1], -1.0), 1.0)
+        fast = min(max(fast - drawn_soc / LOOPS_SOC[0], -1.0), 1.0)
+        slow = min(max(slow - drawn_soc / LOOPS_SOC[1], -1.0), 1.0)
     return voltage_v, true_soc
 
 
 def impedance(truth: Truth, node: int, temperature_c: float, rad_s: Floats, current_a: float) -> Floats:
-    """Return the complex impedance at ``GRID[node]`` and ``rad_s`` [1/s], with the kinetics at ``current_a`` [ohm]."""
+    """Return the complex impedance at ``GRID[node]`` and angular frequencies ``rad_s`` [ohm].
+
+    The kinetic resistance is that at ``current_a``.
+    """
     cold = np.exp(ENERGY_J / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K))
     ohm = truth.ohm[node] * cold
-    at = ohm[KINETIC] * current_a / KINETIC_V
-    ohm[KINETIC] *= math.asinh(at) / at
+    drop = ohm[KINETIC] * current_a / KINETIC_V
+    ohm[KINETIC] *= math.asinh(drop) / drop
     return (ohm / (1.0 + 1j * rad_s[:, None] * TAU_S * np.sqrt(cold))).sum(axis=1)
 
 
 def rising(low: float, high: float) -> Floats:
-    """Return a factor over ``GRID`` that rises towards empty and full."""
+    """Return a factor over ``GRID`` that rises by ``low`` towards empty and by ``high`` towards full."""
     return 1.0 + low * np.exp(-GRID / 0.07) + high * np.exp((GRID - 1.0) / 0.05) + 0.15 * np.cos(5.0 * GRID)
 
 
 def resistances(milliohm: tuple[float, ...]) -> Floats:
-    """Return the resistances over SOC from those at mid SOC, shape (401, 8) [ohm]."""
+    """Return the resistances of the eight processes over SOC, shape (401, 8) [ohm], from those at mid SOC [mohm]."""
     shapes = [rising(0.4, 0.0), rising(1.0, 0.3), rising(2.5, 0.8), rising(2.0, 0.5), *4 * [rising(3.0, 0.2)]]
     return 1e-3 * np.array(milliohm) * np.column_stack(shapes)
 
 
 def smooth(rng: np.random.Generator, length_soc: float) -> Floats:
-    """Return a normal process of variance 1 over ``GRID`` with the correlation length ``length_soc``."""
+    """Return a random smooth curve over ``GRID``: a normal process of variance 1 with the correlation length
+    ``length_soc``."""
+    # Sum of waves with a Gaussian spectrum. Waves beyond k * length_soc = 4 are negligible.
     k = np.pi * np.arange(0.0, 4.0 / length_soc / np.pi)
-    part = np.exp(-0.25 * (k * length_soc) ** 2)
-    cosines, sines = rng.standard_normal((2, k.size)) * part / np.sqrt(np.sum(part**2))
+    amplitude = np.exp(-0.25 * (k * length_soc) ** 2)
+    cosines, sines = rng.standard_normal((2, k.size)) * amplitude / np.sqrt(np.sum(amplitude**2))
     angle = np.outer(GRID, k)
     return np.cos(angle) @ cosines + np.sin(angle) @ sines
 
 
 def curve_of(name: str) -> Floats:
-    """Return the curve of a generic cell at ``GRID`` [V]."""
+    """Return the OCV of a generic cell at ``GRID`` [V]."""
     ocv = load_cell(name, 1.0).ocv
     assert isinstance(ocv, TableOcv)
     return PchipInterpolator(ocv.soc, ocv.ocv_v)(GRID)
 
 
 def measured_curve() -> Floats:
-    """Return the curve of an LG M50, NMC811 with silicon in the graphite, at ``GRID`` [V]."""
+    """Return the measured OCV of an LG M50 (NMC811 with silicon in the graphite) at ``GRID`` [V]."""
     table = np.genfromtxt(Path(__file__).parents[2] / "data" / "lgm50" / "ocv_25c.csv", delimiter=",", names=True)
     return PchipInterpolator(table["soc"], table["ocv_v"])(GRID)

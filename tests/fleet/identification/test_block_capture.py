@@ -1,4 +1,4 @@
-"""Capture of a pack's blocks: in order, each block once."""
+"""Capture of the blocks of a pack: each block once, in order."""
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ STORE_ID_NS = 1_700_000_000 * 10**9
 
 
 def samples(first_s, count=60):
+    """Return samples at 1 Hz from ``first_s`` on, relative to the creation of the store."""
     block = np.zeros(count, dtype=SAMPLE)
     block["time_s"] = first_s + np.arange(count)
     block["current_a"] = np.sin(block["time_s"] / 100.0)
@@ -20,13 +21,15 @@ def samples(first_s, count=60):
     return block
 
 
-def encoded_block(number, store=STORE_ID_NS, first_s=None):
-    rows = samples(60.0 * number if first_s is None else first_s)
+def encoded_block(number, store=STORE_ID_NS):
+    """Return a block of 60 samples, which begins ``number`` minutes after the creation of the store."""
+    rows = samples(60.0 * number)
     arrival_s = store * 1e-9 + rows["time_s"][-1]
     return encode(Block(store=store, number=number, oldest=1, arrival_s=arrival_s, samples=rows))
 
 
 def make_capture(*blocks, **span):
+    """Return a capture that has received the blocks, limited to a time span."""
     capture = BlockCapture(**span)
     for data in blocks:
         capture.add(data)
@@ -34,21 +37,14 @@ def make_capture(*blocks, **span):
 
 
 def rows(capture):
+    """Return all samples of a capture."""
     return np.concatenate([*capture.samples(), np.zeros(0, dtype=SAMPLE)])
 
 
 def test_resent_and_late_blocks_appear_once_in_order():
-    capture = make_capture(
-        encoded_block(1),
-        encoded_block(2),
-        encoded_block(5),
-        encoded_block(3),
-        encoded_block(4),
-        encoded_block(5),
-        encoded_block(4),
-    )
+    capture = make_capture(*map(encoded_block, (1, 2, 5, 3, 4, 5, 4)))
     assert (rows(capture) == samples(60.0, 300)).all()
-    assert (capture.blocks, capture.again, capture.damaged, capture.missing) == (5, 2, 0, [])
+    assert (capture.blocks, capture.repeated, capture.damaged, capture.missing) == (5, 2, 0, [])
 
 
 def test_missing_and_damaged_blocks_are_counted():
@@ -56,7 +52,7 @@ def test_missing_and_damaged_blocks_are_counted():
     assert (capture.damaged, capture.missing) == (2, [(2, 3), (5, 8)])
 
 
-def test_time_span_is_cut_at_samples():
+def test_time_span_begins_and_ends_within_blocks():
     capture = make_capture(
         *map(encoded_block, range(1, 10)), since_s=STORE_ID_NS * 1e-9 + 130.0, until_s=STORE_ID_NS * 1e-9 + 200.0
     )
@@ -64,16 +60,16 @@ def test_time_span_is_cut_at_samples():
     assert capture.blocks == 2
 
 
-@pytest.mark.parametrize(("later_s", "first_s"), [(1000.0, 1060.0), (10.0, 179.0)])
-def test_time_continues_by_the_wall_clock_and_never_steps_back(later_s, first_s):
-    new_store = STORE_ID_NS + round(later_s * 1e9)
+@pytest.mark.parametrize(("created_after_s", "expected_first_s"), [(1000.0, 1060.0), (10.0, 179.0)])
+def test_time_of_a_new_store_follows_from_its_creation_and_never_steps_back(created_after_s, expected_first_s):
+    new_store = STORE_ID_NS + round(created_after_s * 1e9)
     capture = make_capture(encoded_block(1), encoded_block(2), encoded_block(1, new_store), encoded_block(3))
     time_s = rows(capture)["time_s"]
-    assert (time_s.size, time_s[119], time_s[120]) == (180, 179.0, first_s)
-    assert capture.again == 1, "a block of the former store"
+    assert (time_s.size, time_s[119], time_s[120]) == (180, 179.0, expected_first_s)
+    assert capture.repeated == 1  # block 3 of the former store
     assert (np.diff(time_s) >= 0.0).all()
 
 
-def test_empty_capture():
+def test_capture_without_blocks_has_no_samples_and_no_span():
     assert rows(make_capture()).size == 0
     assert np.isnan(make_capture().span_s).all()

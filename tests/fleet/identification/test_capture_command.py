@@ -1,4 +1,4 @@
-"""``fleet capture`` of blocks sent by MQTT to the real server."""
+"""``fleet capture`` of blocks that edges have sent to the real server over MQTT."""
 
 import asyncio
 from datetime import UTC, datetime
@@ -16,8 +16,8 @@ from tests.fleet.nats_cluster import running
 from tests.patience import LONG_S
 
 
-async def send(cluster):
-    """Send blocks of two packs: block 5 is missing, 3 and 4 are out of order, and 4 is repeated."""
+async def send_blocks(cluster):
+    """Send blocks of two packs. Block 5 is missing, 4 comes before 3 and again after it, and one message is no block."""
     async with await nats.connect(cluster.url) as nc:
         await make_streams(nc)
     async with aiomqtt.Client("127.0.0.1", cluster.mqtt_port, timeout=LONG_S) as client:
@@ -30,7 +30,7 @@ async def send(cluster):
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     with running(tmp_path_factory.mktemp("cluster")) as cluster:
-        asyncio.run(send(cluster))
+        asyncio.run(send_blocks(cluster))
         yield cluster
 
 
@@ -43,17 +43,17 @@ def test_capture_has_each_block_once_in_order(cluster, tmp_path, capsys, name):
         f"{out}: 300 samples in 5 blocks of house, 2023-11-14T22:14:20.000Z to 2023-11-14T22:20:19.000Z\n",
     )
     assert err.splitlines() == [
-        "warning: house: blocks 5 are missing: they are lost, or the edge has yet to send them again",
-        "warning: house: 1 messages are damaged and were skipped",
+        "warning: house: missing blocks: 5; they are lost, or the edge has yet to send them again",
+        "warning: house: damaged messages, which were skipped: 1",
     ]
-    expected = np.concatenate([samples(60.0, 240), samples(360.0)])
-    read = load_capture(out)
+    expected = np.concatenate([samples(60.0, 240), samples(360.0)])  # blocks 1 to 4, and 6
+    capture = load_capture(out)
     for column in ("time_s", "current_a", "voltage_v", "temperature_c"):
-        assert (read[column] == expected[column]).all()
+        assert (capture[column] == expected[column]).all()
     assert "exists already" in run(capsys, "fleet", "capture", "house", out, "--server", cluster.url)[2]
 
 
-def test_time_span_is_cut_and_missing_data_are_reported(cluster, tmp_path, capsys):
+def test_time_span_is_limited_and_missing_samples_are_reported(cluster, tmp_path, capsys):
     out = tmp_path / "out.csv"
     first = datetime.fromtimestamp(STORE_ID_NS * 1e-9 - 3600.0, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     last = datetime.fromtimestamp(STORE_ID_NS * 1e-9 + 100.0, UTC).strftime("%Y-%m-%dT%H:%M:%S")

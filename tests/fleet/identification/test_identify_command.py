@@ -1,4 +1,4 @@
-"""``fleet identify``: samples from the stream of the real server, new cells uploaded to it."""
+"""``fleet identify`` with the real server: it reads samples from the stream and uploads new cells."""
 
 import asyncio
 import csv
@@ -22,16 +22,16 @@ STORE_ID_NS = 1_700_000_000 * 10**9
 
 
 async def upload(url):
-    """Upload pack rows and a cell file, and publish 8 h of samples of ``house`` and less than 6 h of ``young``."""
+    """Upload pack rows and a cell file, and publish 8 h of samples of ``house`` and 0.7 h of ``young``."""
     samples = pack_samples(8, rests=False)  # a driving load without rests
     async with await nats.connect(url) as nc:
         await make_streams(nc, partitions=1)
         await put(nc, subjects.CELLS_BUCKET, {"own": WRONG_CELL_TOML.encode()})
-        rows = {name: encode_row(PACK_SPEC) for name in ("house", "silent", "young")}
-        await put(nc, subjects.PACKS_BUCKET, rows | {"wrong": b"{"})
-        for number, rows in enumerate(np.array_split(samples, 100), 1):
-            arrival_s = STORE_ID_NS * 1e-9 + rows["time_s"][-1]
-            data = encode(Block(store=STORE_ID_NS, number=number, oldest=1, arrival_s=arrival_s, samples=rows))
+        pack_rows = {name: encode_row(PACK_SPEC) for name in ("house", "silent", "young")}
+        await put(nc, subjects.PACKS_BUCKET, pack_rows | {"wrong": b"{"})
+        for number, part in enumerate(np.array_split(samples, 100), 1):
+            arrival_s = STORE_ID_NS * 1e-9 + part["time_s"][-1]
+            data = encode(Block(store=STORE_ID_NS, number=number, oldest=1, arrival_s=arrival_s, samples=part))
             await nc.publish(subjects.raw("house"), data)
             if number < 10:
                 await nc.publish(subjects.raw("young"), data)
@@ -88,6 +88,6 @@ def test_better_cells_are_written_and_uploaded(url, tmp_path, capsys):
         (["--from-file", "/nowhere"], "--from-file /nowhere: cannot be read"),
     ],
 )
-def test_errors_of_arguments(url, tmp_path, capsys, arguments, message):
+def test_invalid_arguments_are_rejected(url, tmp_path, capsys, arguments, message):
     code, _, err = run(capsys, "fleet", "identify", *arguments, "--out", tmp_path / "out", "--server", url)
     assert (code, message in err) == (2, True)

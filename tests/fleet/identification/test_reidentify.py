@@ -1,4 +1,4 @@
-"""Re-identification of a pack from its samples."""
+"""Re-identification of the cell of a pack from samples of the pack."""
 
 import numpy as np
 import pytest
@@ -23,29 +23,28 @@ CAPACITY_FADE = 0.88
 
 
 def cycles(hours, *, rests, seed=1):
-    """Return the current of one cell [A]: repeated cycles from SOC 0.93 in steps to 0.25."""
+    """Return the current of one cell at 1 Hz [A]: discharges in steps to 25 % SOC, and charges to 93 % with 2 A."""
     rng = np.random.default_rng(seed)
-    capacity_as, soc, parts = 3600.0 * TRUTH.cell.capacity_ah, 0.95, [np.zeros(600)]
-    while sum(map(len, parts)) < 3600 * hours:
+    capacity_as, soc, currents_a = 3600.0 * TRUTH.cell.capacity_ah, 0.95, [np.zeros(600)]
+    while sum(map(len, currents_a)) < 3600 * hours:
         while soc > 0.25:
             step_a, step_s = rng.choice([1.0, 2.0, 3.0]), rng.integers(20, 400)
             soc -= step_a * step_s / capacity_as
-            parts += [np.full(step_s, step_a), np.zeros(rng.integers(60, 600) if rests else 0)]
+            currents_a += [np.full(step_s, step_a), np.zeros(rng.integers(60, 600) if rests else 0)]
         charge_s = int((0.93 - soc) * capacity_as / 2.0)
         soc += 2.0 * charge_s / capacity_as
-        parts += [np.full(charge_s, -2.0), np.zeros(1200 if rests else 0)]
-    return CAPACITY_FADE * np.concatenate(parts)[: 3600 * hours]
+        currents_a += [np.full(charge_s, -2.0), np.zeros(1200 if rests else 0)]
+    return CAPACITY_FADE * np.concatenate(currents_a)[: 3600 * hours]
 
 
 def pack_samples(hours, *, rests=True):
-    """Return the samples of a pack of aged cells."""
+    """Return the samples of a pack whose cells have lost capacity."""
     aged = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": CAPACITY_FADE * 3.0})})
     samples = capture(cycles(hours, rests=rests), cell=aged, soc=0.95)
     samples["voltage_v"] *= SERIES
     samples["current_a"] *= PARALLEL
-    samples["temperature_c"] = (
-        25.0  # without a sensor self-heating would be estimated, which the simulated cell does not have
-    )
+    # without a measured temperature self-heating would be estimated, which the simulated cell does not have
+    samples["temperature_c"] = 25.0
     return samples[::PERIOD_S]
 
 
@@ -54,7 +53,7 @@ def samples():
     return pack_samples(10)
 
 
-def test_aged_pack_gets_a_better_cell(samples):
+def test_pack_of_aged_cells_gets_a_better_cell_file(samples):
     result = reidentify("house", samples, PACK_SPEC, WRONG_CELL_TOML)
     assert result.reason == ""
     assert result.rms_v < 0.3 * result.rms_before_v
@@ -63,18 +62,19 @@ def test_aged_pack_gets_a_better_cell(samples):
     cell = parse_toml(result.cell_file, CellModel, "new")
     assert (cell.cell.name, cell.cell.series_count) == ("of-house", 1)
     assert cell.cell.capacity_ah == pytest.approx(result.capacity_ah)
-    assert result.r_s_ohm == pytest.approx(TRUTH.a[13] * np.exp(-0.5 * TRUTH.a[14]) + TRUTH.a[15], rel=0.05)
+    r_s_at_half_soc = TRUTH.a[13] * np.exp(-0.5 * TRUTH.a[14]) + TRUTH.a[15]  # series resistance of Chen and Mora
+    assert result.r_s_ohm == pytest.approx(r_s_at_half_soc, rel=0.05)
 
 
 def test_cell_that_is_not_better_is_not_used(samples):
-    right = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": CAPACITY_FADE * 3.0})})
-    result = reidentify("house", samples, PACK_SPEC, cell_text(right))
+    true_cell = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": CAPACITY_FADE * 3.0})})
+    result = reidentify("house", samples, PACK_SPEC, cell_text(true_cell))
     assert (result.cell_file, result.reason) == ("", "not better than the present cell")
     assert result.rms_v > 0.97 * result.rms_before_v
 
 
 @pytest.mark.parametrize(
-    ("change", "kind", "reason"),
+    ("select", "spec", "reason"),
     [
         (lambda s: s[: 720 * 3], PACK_SPEC, "3.0 h of samples: at least 6 h are needed"),
         (lambda s: s[:0], PACK_SPEC, "0.0 h of samples"),
@@ -84,18 +84,18 @@ def test_cell_that_is_not_better_is_not_used(samples):
         (lambda s: s, PackSpec(cell="nowhere"), "nowhere: no cell file of this name was loaded"),
     ],
 )
-def test_reason_without_a_new_cell(samples, change, kind, reason):
-    text = WRONG_CELL_TOML if kind.cell == "own" else None
-    result = reidentify("house", change(samples), kind, text)
+def test_pack_without_a_new_cell_gets_the_reason(samples, select, spec, reason):
+    text = WRONG_CELL_TOML if spec.cell == "own" else None
+    result = reidentify("house", select(samples), spec, text)
     assert (result.cell_file, result.reason[: len(reason)]) == ("", reason)
 
 
-def test_rest_is_not_enough(samples):
+def test_samples_at_rest_are_not_enough(samples):
     resting = samples.copy()
     resting["current_a"] = 0.0
     assert "capacities were charged" in reidentify("house", resting, PACK_SPEC, WRONG_CELL_TOML).reason
 
 
-def test_gaps_and_time_steps_back(samples):
-    holes = np.concatenate([samples[:1800], samples[1860:3000], samples[2900:4000], samples[4200:]])
-    assert reidentify("house", holes, PACK_SPEC, WRONG_CELL_TOML).cell_file
+def test_samples_with_gaps_and_time_steps_back_give_a_cell(samples):
+    disordered = np.concatenate([samples[:1800], samples[1860:3000], samples[2900:4000], samples[4200:]])
+    assert reidentify("house", disordered, PACK_SPEC, WRONG_CELL_TOML).cell_file

@@ -1,4 +1,4 @@
-"""Connection of a fleet service to a real server with a wrong certificate, one that does not read, or a killed one."""
+"""Connection of a fleet service to a real server that has a wrong certificate, stops reading, or is killed."""
 
 import asyncio
 import os
@@ -16,11 +16,11 @@ from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
 
 BUFFERS_BYTES = 16 << 20
-"""More than the capacity of all buffers between client and server [bytes]."""
+"""Size of messages that exceeds the capacity of all buffers between client and server [bytes]."""
 
 
-class Links:
-    """Link changes reported by ``connect``."""
+class LinkChanges:
+    """Changes of the connection that ``connect`` reports."""
 
     def __init__(self) -> None:
         self._changes = asyncio.Queue[str | None]()
@@ -29,7 +29,7 @@ class Links:
         self._changes.put_nowait(reason)
 
     async def until(self, wanted: str | None) -> None:
-        """Wait for a reason with this beginning, or (None) for a restored connection."""
+        """Wait for a loss whose reason begins with ``wanted``; None: wait for a restored connection."""
         async with asyncio.timeout(LONG_S):
             while True:
                 reason = await self._changes.get()
@@ -38,25 +38,26 @@ class Links:
 
 
 def signed_by(authority: Authority) -> Tls:
+    """Return a certificate for the server, signed by an authority."""
     certificate, key = authority.sign("node")
     return Tls(certificate, key)
 
 
-async def test_waiting_client_connects_once_the_certificate_is_replaced(
+async def test_client_retries_and_connects_once_the_server_has_a_trusted_certificate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connection, "CLOSE_TIMEOUT_S", 0.2)
-    for name in ("ours", "other"):
+    for name in ("trusted", "other"):
         (tmp_path / name).mkdir()
-    ours, other = Authority(tmp_path / "ours"), Authority(tmp_path / "other")
-    links = Links()
+    trusted, other = Authority(tmp_path / "trusted"), Authority(tmp_path / "other")
+    changes = LinkChanges()
     with running(tmp_path, tls=signed_by(other)) as cluster:
         url = f"tls://{cluster.nodes[0].nats}"
-        connecting = asyncio.create_task(connect(url, "x", ca=ours.certificate, on_link_change=links))
+        connecting = asyncio.create_task(connect(url, "x", ca=trusted.certificate, on_link_change=changes))
         for _ in range(3):
-            await links.until("the server's certificate is not trusted")
+            await changes.until("the server's certificate is not trusted")
         cluster.kill(0)
-        cluster.nodes = [replace(cluster.nodes[0], tls=signed_by(ours))]
+        cluster.nodes = [replace(cluster.nodes[0], tls=signed_by(trusted))]
         cluster.start(0)
         async with asyncio.timeout(LONG_S):
             nc = await connecting
@@ -64,16 +65,18 @@ async def test_waiting_client_connects_once_the_certificate_is_replaced(
         await close(nc)
 
 
-async def test_reconnects_to_a_server_that_stopped_reading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_client_reconnects_to_a_server_that_stopped_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(connection, "PING_S", 1)
-    links = Links()
+    changes = LinkChanges()
     with running(tmp_path) as cluster:
-        nc = await connect(cluster.url, "x", on_link_change=links)
+        nc = await connect(cluster.url, "x", on_link_change=changes)
         os.kill(cluster.pid(0), signal.SIGSTOP)
         publishing = asyncio.create_task(_publish(nc, BUFFERS_BYTES))
-        await links.until("the connection is lost")
+        await changes.until("the connection is lost")
         os.kill(cluster.pid(0), signal.SIGCONT)
-        await links.until(None)
+        await changes.until(None)
         publishing.cancel()
         await asyncio.wait([publishing])
         await nc.flush()
@@ -81,17 +84,18 @@ async def test_reconnects_to_a_server_that_stopped_reading(tmp_path: Path, monke
         assert nc.is_closed
 
 
-async def test_closes_with_unsent_messages_after_the_server_was_killed(tmp_path: Path) -> None:
-    links = Links()
+async def test_client_with_unsent_messages_can_be_closed_after_the_server_was_killed(tmp_path: Path) -> None:
+    changes = LinkChanges()
     with running(tmp_path) as cluster:
-        nc = await connect(cluster.url, "x", on_link_change=links)
+        nc = await connect(cluster.url, "x", on_link_change=changes)
         cluster.kill(0)
-        await links.until("the connection is lost")
+        await changes.until("the connection is lost")
         await nc.publish("a.b", b"c")
         await close(nc)
         assert nc.is_closed
 
 
-async def _publish(nc, size: int) -> None:
-    for _ in range(size >> 16):
-        await nc.publish("a.b", bytes(1 << 16))
+async def _publish(nc, total_bytes: int) -> None:
+    message = bytes(1 << 16)
+    for _ in range(total_bytes // len(message)):
+        await nc.publish("a.b", message)

@@ -1,4 +1,4 @@
-"""Streams on the real server: created once, unchanged by a repeated call."""
+"""Streams on the real server: they are created once, and a second call keeps their messages."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from bms_estimator.model.errors import UserError
 from tests.fleet.nats_cluster import running
 
 
-async def test_streams_are_created_once_and_keep_their_partitions(tmp_path: Path) -> None:
+async def test_second_call_changes_limits_but_keeps_messages_and_partitions(tmp_path: Path) -> None:
     with running(tmp_path, partitions=8) as cluster:
         nc = await nats.connect(cluster.url)
         js = nc.jetstream()
@@ -31,7 +31,7 @@ async def test_streams_are_created_once_and_keep_their_partitions(tmp_path: Path
         await nc.close()
 
 
-async def test_missing_disk_space_is_reported(tmp_path: Path) -> None:
+async def test_stream_larger_than_the_disk_of_the_server_is_a_user_error(tmp_path: Path) -> None:
     with running(tmp_path) as cluster:
         nc = await nats.connect(cluster.url)
         with pytest.raises(UserError, match="rejects the stream RAW: insufficient storage"):

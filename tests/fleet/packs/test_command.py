@@ -15,10 +15,11 @@ from tests.command_line import run
 from tests.fleet.nats_cluster import running
 from tests.free_port import free_port
 
-TABLE = "pack,cell,capacity_ah,series,protocol\nboat,own.toml,,2,\nhouse,lfp,280.0,16,jk\n"
+TABLE_TEXT = "pack,cell,capacity_ah,series,protocol\nboat,own.toml,,2,\nhouse,lfp,280.0,16,jk\n"
 
 
 async def with_connection(url, use_connection):
+    """Connect to the server and await ``use_connection`` of the connection."""
     async with await nats.connect(url) as nc:
         await use_connection(nc)
 
@@ -32,14 +33,15 @@ def url(tmp_path_factory):
 
 @pytest.fixture
 def table(url, tmp_path):
+    """Return the path of a table of two packs, one with a cell file. The server's table of packs is empty."""
     asyncio.run(with_connection(url, lambda nc: write_bucket(nc, PACKS_BUCKET, {}, remove=True)))
     (tmp_path / "own.toml").write_text(cell_text(load_cell("ncr18650")))
     path = tmp_path / "packs.csv"
-    path.write_text(TABLE)
+    path.write_text(TABLE_TEXT)
     return path
 
 
-def test_table_round_trip(url, table, capsys):
+def test_printed_table_can_be_loaded_again_without_a_change(url, table, capsys):
     code, out, err = run(capsys, "fleet", "packs", "load", table, "--server", url)
     assert (code, err) == (0, "")
     assert out.startswith(f"{table}: 2 packs of 2 kinds: 2 new")
@@ -53,7 +55,7 @@ def test_table_round_trip(url, table, capsys):
     )
 
 
-def test_rows_are_removed_on_request_and_by_name(url, table, capsys):
+def test_rows_are_removed_with_option_remove_or_by_name(url, table, capsys):
     run(capsys, "fleet", "packs", "load", table, "--server", url)
     smaller_table = table.with_name("smaller_table.csv")
     smaller_table.write_text("pack,cell\nshed,ncr18650\n")
@@ -68,7 +70,7 @@ def test_rows_are_removed_on_request_and_by_name(url, table, capsys):
     assert run(capsys, "fleet", "packs", "list", "--server", url)[1] == "pack\n"
 
 
-def test_show_writes_a_pack_file_that_replay_reads(url, table, tmp_path, capsys):
+def test_show_writes_a_pack_file_that_other_commands_read(url, table, tmp_path, capsys):
     run(capsys, "fleet", "packs", "load", table, "--server", url)
     code, out, err = run(capsys, "fleet", "packs", "show", "house", "--server", url)
     assert (code, err) == (0, "")
@@ -80,10 +82,9 @@ def test_show_writes_a_pack_file_that_replay_reads(url, table, tmp_path, capsys)
     assert (settings.pack.name, model.cell.series_count) == ("boat", 2)
 
 
-def test_wrong_row_is_reported_and_the_others_are_listed(url, table, capsys):
-    asyncio.run(
-        with_connection(url, lambda nc: write_bucket(nc, PACKS_BUCKET, {"a": b"{", "b": b'{"cell":"ncr18650"}'}))
-    )
+def test_invalid_row_is_reported_and_the_other_rows_are_listed(url, table, capsys):
+    rows = {"a": b"{", "b": b'{"cell":"ncr18650"}'}
+    asyncio.run(with_connection(url, lambda nc: write_bucket(nc, PACKS_BUCKET, rows)))
     code, out, err = run(capsys, "fleet", "packs", "list", "--server", url)
     assert (code, out) == (0, "pack,cell\nb,ncr18650\n")
     assert err.startswith("warning: a: its row is wrong: Invalid JSON")
@@ -91,7 +92,7 @@ def test_wrong_row_is_reported_and_the_others_are_listed(url, table, capsys):
     assert (code, err.startswith("error: a: its row is wrong: ")) == (2, True)
 
 
-def test_errors_are_reported_before_anything_is_written(url, table, capsys):
+def test_invalid_table_server_or_credentials_are_reported(url, table, capsys):
     table.write_text("pack,cell\nhouse,lfp\n")
     code, _, err = run(capsys, "fleet", "packs", "load", table, "--server", url)
     assert (code, f"{table}: line 2: lfp is a generic cell: give its capacity" in err) == (2, True)

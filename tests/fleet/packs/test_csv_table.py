@@ -1,4 +1,4 @@
-"""Table of packs: parsing, printing and error texts."""
+"""Table of packs as CSV: parsing, printing and error texts; registry of the packs in it."""
 
 import pytest
 
@@ -9,12 +9,13 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.errors import UserError
 
-LFP = PackSpec(cell="lfp", capacity_ah=100.0, series=16, voltage_resolution_v=0.01)
+LFP_SPEC = PackSpec(cell="lfp", capacity_ah=100.0, series=16, voltage_resolution_v=0.01)
 ROW = "house,lfp,100,16"
 
 
 @pytest.fixture
-def table(tmp_path):
+def write_table(tmp_path):
+    """Return a function that writes a table and returns its path."""
     path = tmp_path / "packs.csv"
 
     def write(text, encoding="utf-8"):
@@ -25,6 +26,7 @@ def table(tmp_path):
 
 
 def error_of(path):
+    """Return the text of the error that reading a table raises, without the path."""
     with pytest.raises(UserError) as error_info:
         read_table(path)
     return str(error_info.value).replace(f"{path}: ", "")
@@ -32,11 +34,11 @@ def error_of(path):
 
 @pytest.mark.parametrize("separator", [",", ";"])
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
-@pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_separators_line_ends_and_byte_order_mark(table, separator, encoding, end):
+@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
+def test_table_may_have_either_separator_and_line_end_and_a_byte_order_mark(write_table, separator, encoding, line_end):
     text = "pack,cell,capacity_ah,series\nhouse,lfp,100,16\n\n boat , nmc ,1.5e2,\n"
-    parsed = read_table(table(text.replace(",", separator).replace("\n", end), encoding))
-    assert {name: line.kind for name, line in parsed.packs.items()} == {
+    parsed = read_table(write_table(text.replace(",", separator).replace("\n", line_end), encoding))
+    assert {name: line.spec for name, line in parsed.packs.items()} == {
         "house": PackSpec(cell="lfp", capacity_ah=100.0, series=16),
         "boat": PackSpec(cell="nmc", capacity_ah=150.0),
     }
@@ -64,8 +66,8 @@ def test_separators_line_ends_and_byte_order_mark(table, separator, encoding, en
         ("", "no row below the line of column names"),
     ],
 )
-def test_errors_name_line_and_column(table, row, message):
-    assert message in error_of(table(f"pack,cell,capacity_ah,series\n{row}\n"))
+def test_errors_name_line_and_column(write_table, row, message):
+    assert message in error_of(write_table(f"pack,cell,capacity_ah,series\n{row}\n"))
 
 
 @pytest.mark.parametrize(
@@ -78,39 +80,39 @@ def test_errors_name_line_and_column(table, row, message):
         ("", "line 1: column pack is missing"),
     ],
 )
-def test_errors_of_columns(table, header, message):
-    assert message in error_of(table(f"{header}\n{ROW}\n"))
+def test_invalid_column_names_are_reported_with_a_remedy(write_table, header, message):
+    assert message in error_of(write_table(f"{header}\n{ROW}\n"))
 
 
-def test_errors_of_the_file(table, tmp_path):
-    assert "not UTF-8 (byte 15); save it as CSV in UTF-8" in error_of(table("pack,cell\nhouseé,lfp\n", "latin-1"))
+def test_file_that_is_missing_or_not_utf_8_is_reported(write_table, tmp_path):
+    assert "not UTF-8 (byte 15); save it as CSV in UTF-8" in error_of(write_table("pack,cell\nhouseé,lfp\n", "latin-1"))
     assert "cannot be read: No such file" in error_of(tmp_path / "none.csv")
 
 
-def test_number_of_errors_is_limited(table):
-    lines = error_of(table("pack,cell\n" + "a b,lfp\n" * 100)).splitlines()
-    assert len(lines) == 21
+def test_number_of_errors_is_limited(write_table):
+    lines = error_of(write_table("pack,cell\n" + "a b,lfp\n" * 100)).splitlines()
+    assert len(lines) == 21  # 20 errors, and the number of the others
     assert lines[-1] == "and 80 more"
 
 
-def test_cell_file_beside_the_table(table, tmp_path):
+def test_cell_may_be_a_file_beside_the_table(write_table, tmp_path):
     (tmp_path / "own.toml").write_text(cell_text(load_cell("ncr18650")))
-    path = table("pack,cell\nhouse,own.toml\n")
+    path = write_table("pack,cell\nhouse,own.toml\n")
     parsed = read_table(path)
-    assert parsed.packs["house"].kind == PackSpec(cell="own")
+    assert parsed.packs["house"].spec == PackSpec(cell="own")
     assert parsed.cell_files == {"own": tmp_path / "own.toml"}
     check_models(path, parsed, {"own": (tmp_path / "own.toml").read_text()})
     with pytest.raises(UserError, match=r"packs\.csv: line 2: own: no cell file of this name was loaded"):
         check_models(path, parsed, {})
 
 
-def test_generic_cell_without_capacity_is_reported_once(table):
-    path = table("pack,cell\na,lfp\nb,lfp\nc,ncr18650\n")
+def test_generic_cell_without_capacity_is_reported_once(write_table):
+    path = write_table("pack,cell\na,lfp\nb,lfp\nc,ncr18650\n")
     with pytest.raises(UserError, match="line 2, and 1 more like this: lfp is a generic cell: give its capacity"):
         check_models(path, read_table(path), {})
 
 
-def test_settings_of_a_row():
+def test_row_of_the_table_gives_the_settings_of_a_pack():
     row = PackRow(pack="house", cell="lfp", capacity_ah=280.0, series=16, protocol="jk", current_dead_band_a=0.2)
     settings = settings_of(row)
     assert (settings.pack.name, settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == (
@@ -128,16 +130,16 @@ def test_all_shipped_cells_are_valid():
         assert PackSpec(cell=name).cell == name
 
 
-def test_table_round_trip(table):
-    kinds = {"b": LFP, "a": PackSpec(cell="ncr18650", protocol="jbd")}
-    parsed = read_table(table("".join(table_lines(kinds))))
-    assert {name: line.kind for name, line in parsed.packs.items()} == kinds
+def test_printed_table_is_read_as_it_was(write_table):
+    kinds = {"b": LFP_SPEC, "a": PackSpec(cell="ncr18650", protocol="jbd")}
+    parsed = read_table(write_table("".join(table_lines(kinds))))
+    assert {name: line.spec for name, line in parsed.packs.items()} == kinds
 
 
-def test_packs_of_one_kind_share_settings_and_model():
+def test_packs_with_equal_rows_share_settings_and_model():
     registry = PackRegistry()
     for i in range(1000):
-        registry.set_row(f"p{i}", encode_row(LFP.model_copy(update={"series": 14 + i % 5})))
+        registry.set_row(f"p{i}", encode_row(LFP_SPEC.model_copy(update={"series": 14 + i % 5})))
     entries = [registry(f"p{i}") for i in range(1000)]
     assert len({id(entry) for entry in entries}) == 5
     settings, model = entries[0]
@@ -164,7 +166,7 @@ def test_packs_of_one_kind_share_settings_and_model():
 )
 def test_invalid_row_makes_a_pack_unknown_with_a_reason(data, reason):
     registry = PackRegistry()
-    registry.set_cell("broken", b"= 1")
+    registry.set_cell("broken", b"= 1")  # no valid TOML
     registry.set_row("house", data)
     assert registry("house") is None or reason == ""
     assert registry.reason("house").startswith(reason)

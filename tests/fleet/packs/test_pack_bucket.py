@@ -1,4 +1,4 @@
-"""Table of packs on the real server, as a worker reads it."""
+"""Table of packs on the real server: how commands write it and workers read it."""
 
 import asyncio
 
@@ -8,14 +8,14 @@ import pytest
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.nats.stream_reader import BATCH_MESSAGES, StreamError
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.packs.pack_bucket import PackBucket, Written, read_bucket, remove_keys, write_bucket
+from bms_estimator.fleet.packs.pack_bucket import PackBucket, WriteCounts, read_bucket, remove_keys, write_bucket
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
 from tests.fleet.nats_cluster import connected, running
 from tests.patience import LONG_S
 
-LFP = encode_row(PackSpec(cell="lfp", capacity_ah=100.0, series=16))
+LFP_ROW = encode_row(PackSpec(cell="lfp", capacity_ah=100.0, series=16))
 
 
 @pytest.fixture(scope="module")
@@ -34,21 +34,25 @@ async def nc(cluster):
 
 
 async def test_only_differences_are_written_and_rows_are_removed_on_request(nc):
-    values = {f"p{i}": LFP for i in range(2 * BATCH_MESSAGES + 5)}
-    assert await write_bucket(nc, PACKS_BUCKET, values) == Written(len(values), 0, 0, 0, 0)
+    values = {f"p{i}": LFP_ROW for i in range(2 * BATCH_MESSAGES + 5)}
+    assert await write_bucket(nc, PACKS_BUCKET, values) == WriteCounts(
+        new=len(values), changed=0, same=0, removed=0, left=0
+    )
     assert await read_bucket(nc, PACKS_BUCKET) == values
-    other = {"p0": LFP, "p1": b"{}", "more": LFP}
-    assert await write_bucket(nc, PACKS_BUCKET, other) == Written(
+    other_values = {"p0": LFP_ROW, "p1": b"{}", "more": LFP_ROW}
+    assert await write_bucket(nc, PACKS_BUCKET, other_values) == WriteCounts(
         new=1, changed=1, same=1, removed=0, left=len(values) - 2
     )
-    assert await write_bucket(nc, PACKS_BUCKET, other, remove=True) == Written(0, 0, 3, len(values) - 2, 0)
-    assert await read_bucket(nc, PACKS_BUCKET) == other
+    assert await write_bucket(nc, PACKS_BUCKET, other_values, remove=True) == WriteCounts(
+        new=0, changed=0, same=3, removed=len(values) - 2, left=0
+    )
+    assert await read_bucket(nc, PACKS_BUCKET) == other_values
     await remove_keys(nc, PACKS_BUCKET, ["more"])
     assert (await read_bucket(nc, PACKS_BUCKET)).keys() == {"p0", "p1"}
 
 
-async def test_refresh_returns_all_rows_and_then_changes(nc):
-    await write_bucket(nc, PACKS_BUCKET, {"a": LFP, "b": b"{broken", "c": encode_row(PackSpec(cell="own"))})
+async def test_first_refresh_returns_all_packs_and_later_ones_return_the_changed_packs(nc):
+    await write_bucket(nc, PACKS_BUCKET, {"a": LFP_ROW, "b": b"{broken", "c": encode_row(PackSpec(cell="own"))})
     bucket = PackBucket(nc)
     assert await bucket.refresh() >= {"a", "b", "c"}
     assert await bucket.refresh() == set()
@@ -59,15 +63,15 @@ async def test_refresh_returns_all_rows_and_then_changes(nc):
     await write_bucket(nc, CELLS_BUCKET, {"own": cell_text(load_cell("ncr18650")).encode()})
     assert await bucket.refresh() == {"c"}
     assert bucket.packs("c")
-    await write_bucket(nc, PACKS_BUCKET, {"b": LFP})
+    await write_bucket(nc, PACKS_BUCKET, {"b": LFP_ROW})
     await remove_keys(nc, PACKS_BUCKET, ["a"])
     assert await bucket.refresh() == {"a", "b"}
     assert bucket.packs("a") is None
     assert bucket.packs("b")
 
 
-async def test_changes_are_reported_after_the_table_was_recreated(nc):
-    await write_bucket(nc, PACKS_BUCKET, {"a": encode_row(PackSpec(cell="own")), "b": LFP, "c": LFP})
+async def test_refresh_after_the_table_was_recreated_returns_the_changed_packs(nc):
+    await write_bucket(nc, PACKS_BUCKET, {"a": encode_row(PackSpec(cell="own")), "b": LFP_ROW, "c": LFP_ROW})
     bucket = PackBucket(nc)
     await bucket.refresh()
     await nc.jetstream().delete_stream(f"KV_{PACKS_BUCKET}")
@@ -87,19 +91,19 @@ async def test_follow_continues_after_the_server_was_killed(cluster, nc):
     await bucket.refresh()
     follower = asyncio.create_task(bucket.follow(changes.put_nowait))
     try:
-        await write_bucket(nc, PACKS_BUCKET, {"a": LFP})
+        await write_bucket(nc, PACKS_BUCKET, {"a": LFP_ROW})
         assert await asyncio.wait_for(changes.get(), LONG_S) == {"a"}
         cluster.kill(0)
         cluster.start(0)
         async with await nats.connect(cluster.url) as other:
-            await write_bucket(other, PACKS_BUCKET, {"b": LFP})
+            await write_bucket(other, PACKS_BUCKET, {"b": LFP_ROW})
         assert await asyncio.wait_for(changes.get(), LONG_S) == {"b"}
         assert bucket.packs("b")
     finally:
         follower.cancel()
 
 
-async def test_server_without_streams_raises(tmp_path):
+async def test_reading_from_a_server_without_streams_raises_an_error(tmp_path):
     with running(tmp_path) as cluster:
         async with await nats.connect(cluster.url) as nc:
             with pytest.raises(StreamError, match="rejects reading KV_packs"):

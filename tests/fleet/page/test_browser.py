@@ -26,20 +26,21 @@ from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.page import PageSettings
-from tests.fleet.hour_rows import BEGIN, FIRST_STD, capacities, write_fleet
+from tests.fleet.hour_rows import BEGIN, FIRST_STD, estimate_capacities, write_fleet
 from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.published_states import HOME, VAN, Pack, load, publish, publish_heartbeat, state
 from tests.free_port import free_port
 from tests.page.chromium import Tab, chromium, tab
 from tests.page.house import start_program
 from tests.patience import LONG_S
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 in_module = pytest.mark.asyncio(loop_scope="module")
 module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 
 PARTITIONS = 8
 STEP_S = 0.05
+"""Update interval of the page [s]."""
 MAX_BYTES = 60_000
 """Maximum total size of the served files [bytes]."""
 PACKS = [
@@ -48,7 +49,9 @@ PACKS = [
     Pack("van-1", VAN, state(soc=0.9, soc_std=0.071, stability_margin=0.8)),
 ]
 LISTED_ONLY = Pack("van-2", VAN, b"")
+"""Pack in the table of packs that publishes no state."""
 MARKUP_NAME = "<img/src=x>"
+"""Name of a pack that would be an image if the page did not escape it."""
 
 
 class Fleet(NamedTuple):
@@ -74,12 +77,16 @@ async def browser() -> AsyncIterator[Browser]:
 
 @pytest.fixture(scope="module")
 def hours(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with hours of twelve packs that lose 6 % of their capacity in a year; one has half the others' capacity."""
+    """Return a folder with hour rows of twelve packs that lose 6 % of their capacity in a year.
+
+    One pack has half the capacity of the others.
+    """
     folder, rng = tmp_path_factory.mktemp("hours"), np.random.default_rng(1)
-    truth = np.full((12, 1), -0.02) - 0.06 * np.arange(30) / 365.25
+    truth = np.full((12, 1), -0.02) - 0.06 * np.arange(30) / 365.25  # ln(capacity) of 30 days
     truth[0] -= 0.7
     ratio, variance = (
-        np.exp(values) if i == 0 else values for i, values in enumerate(capacities(rng, truth, 0.01, 1.0))
+        np.exp(values) if i == 0 else values
+        for i, values in enumerate(estimate_capacities(rng, truth, std=0.01, daily_throughput=1.0))
     )
     write_fleet(
         folder, BEGIN + 24 * np.arange(30) + 23, capacity_ratio=ratio, capacity_ratio_std=ratio * np.sqrt(variance),
@@ -105,7 +112,7 @@ async def fleet(cluster: NatsCluster, hours: Path) -> AsyncIterator[Fleet]:
 
 
 async def work(nc: Client) -> None:
-    """Publish as two workers with all partitions except one, and states of packs, one of them unknown."""
+    """Publish what two workers would that hold all partitions but one, until cancelled. One pack is unknown."""
     blocks = 0
     while True:
         with contextlib.suppress(nats.errors.Error, OSError):
@@ -118,12 +125,13 @@ async def work(nc: Client) -> None:
                 await publish(nc, pack.name, pack.state)
             await nc.publish(subjects.unknown(MARKUP_NAME), b"no <b>row</b>")
             await nc.publish(subjects.hours("van-1"), json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
-            await nc.publish("bms.home-1.parameters", ONE.parameters.model_dump_json().encode())
+            await nc.publish("bms.home-1.parameters", CELL_SNAPSHOT.parameters.model_dump_json().encode())
         await asyncio.sleep(0.1)
 
 
 @contextlib.asynccontextmanager
 async def open_page(browser: Browser, fleet: Fleet, fragment: str = "") -> AsyncIterator[Tab]:
+    """Open the page in a tab, and wait until it shows all packs."""
     async with tab(browser, f"{fleet.url}{fragment}") as browser_tab:
         await browser_tab.until_status("live")
         await browser_tab.until_text("known", "of 4")
@@ -141,7 +149,7 @@ async def test_overview_has_counts_and_distributions(browser: Browser, fleet: Fl
         await browser_tab.until_text("lag", "0.4 s")
         page = browser_tab.page
         await page.locator('[data-q="silent"]', has_text="1 not heard yet").wait_for()
-        await page.get_by_role("img", name="8 partitions: 7 held by nobody").wait_for()
+        await page.get_by_role("img", name="8 partitions: 7 not held").wait_for()
         await page.get_by_role(
             "img", name="State of charge: 1 pack 0 to 5 %, 1 pack 65 to 70 %, 1 pack 90 to 95 %"
         ).wait_for()
@@ -189,7 +197,7 @@ async def test_packs_with_concerns_are_ranked_and_names_are_escaped(browser: Bro
 
 
 @in_module
-async def test_search_by_prefix_with_the_keyboard(browser: Browser, fleet: Fleet) -> None:
+async def test_pack_is_found_by_its_prefix_and_opened_with_the_keyboard(browser: Browser, fleet: Fleet) -> None:
     async with open_page(browser, fleet) as browser_tab:
         page = browser_tab.page
         await page.keyboard.press("Tab")
@@ -201,24 +209,24 @@ async def test_search_by_prefix_with_the_keyboard(browser: Browser, fleet: Fleet
         await page.get_by_text("State of charge65.3 %").wait_for()
         assert page.url.endswith("#home-1")
         details = await page.inner_text("#packwhat")
-        assert details.startswith("lfp 16s1p 280 Ah · heard")
+        assert details.startswith("lfp 16s1p 280 Ah · last message")
         await browser_tab.until(
             "rows => document.querySelectorAll('#parameters tr').length === rows",
-            len(ONE.parameters.elements) + len(ONE.parameters.state_of_health),
+            len(CELL_SNAPSHOT.parameters.elements) + len(CELL_SNAPSHOT.parameters.state_of_health),
         )
         await page.keyboard.press("Escape")
         await page.get_by_role("dialog").wait_for(state="hidden")
         await browser_tab.until("() => location.hash === ''")
         await page.fill("#prefix", "nobody")
-        await page.get_by_text("No pack's name begins so.").wait_for()
+        await page.get_by_text("No pack has this prefix.").wait_for()
         await page.fill("#prefix", LISTED_ONLY.name)
         await page.locator("#found button").click()
-        await page.get_by_text("ncr18650 14s10p · not heard yet since this page is served").wait_for()
+        await page.get_by_text("ncr18650 14s10p · no message since the start of this page").wait_for()
         assert browser_tab.errors == []
 
 
 @in_module
-async def test_query_results_are_shown(browser: Browser, fleet: Fleet) -> None:
+async def test_results_of_the_queries_are_shown_and_lead_to_packs(browser: Browser, fleet: Fleet) -> None:
     async with open_page(browser, fleet) as browser_tab:
         answers = browser_tab.page.locator("#answers")
         text = await answers.locator("[data-answer=soh] tbody").inner_text()
@@ -244,7 +252,7 @@ async def test_no_element_is_wider_than_the_screen(browser: Browser, fleet: Flee
 
 
 @in_module
-async def test_page_is_stale_without_the_server_and_reconnects(browser: Browser, fleet: Fleet) -> None:
+async def test_page_is_stale_without_the_nats_server_and_live_after_its_restart(browser: Browser, fleet: Fleet) -> None:
     async with open_page(browser, fleet) as browser_tab:
         fleet.cluster.kill(0)
         await browser_tab.until_status("stale since")
@@ -262,7 +270,7 @@ async def test_page_is_stale_without_the_server_and_reconnects(browser: Browser,
 
 
 @in_module
-async def test_foreign_host_names_are_rejected(fleet: Fleet) -> None:
+async def test_requests_with_another_host_name_are_rejected_and_files_are_served(fleet: Fleet) -> None:
     async with aiohttp.ClientSession(fleet.url) as session:
         for path in (*FILES, "/events", "/packs?prefix=h", "/pack?name=home-1"):
             async with session.get(path, headers={"Host": "evil.example.org"}) as response:
@@ -294,7 +302,7 @@ async def test_command_serves_until_sigterm(fleet: Fleet, tmp_path: Path) -> Non
 
 
 @in_module
-async def test_missing_credentials_raise() -> None:
+async def test_missing_credentials_file_is_a_user_error() -> None:
     with pytest.raises(UserError, match=r"--creds no\.creds: cannot be read: No such file"):
         FleetFeed(Server("nats://127.0.0.1:1", Path("no.creds")), FleetView(1, 0.0), lambda _: None)
 
@@ -332,7 +340,9 @@ async def test_feed_ends_although_the_library_swallows_a_cancellation(
 
 
 @in_module
-async def test_end_of_the_feed_is_reported(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_closed_connection_and_internal_error_of_the_feed_are_reported(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     changes = asyncio.Queue[str | None]()
 
     async def until(expected: str) -> None:
@@ -344,7 +354,7 @@ async def test_end_of_the_feed_is_reported(fleet: Fleet, monkeypatch: pytest.Mon
         raise KeyError
 
     async with FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), changes.put_nowait) as feed:
-        while await changes.get() is not None:
+        while await changes.get() is not None:  # until it is connected
             pass
         assert feed._nc
         await feed._nc.close()  # as if the server had closed the connection permanently
@@ -355,7 +365,7 @@ async def test_end_of_the_feed_is_reported(fleet: Fleet, monkeypatch: pytest.Mon
 
 
 @in_module
-async def test_summaries_before_the_start_are_read(fleet: Fleet) -> None:
+async def test_hour_rows_published_before_the_start_of_the_page_are_read(fleet: Fleet) -> None:
     hour = json.dumps({"suspects": int(InputFault.OCV)}).encode()
     other_connection = await nats.connect(fleet.cluster.url)
     await other_connection.jetstream(timeout=LONG_S).publish(subjects.hours("early-1"), hour)

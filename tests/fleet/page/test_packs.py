@@ -11,7 +11,7 @@ from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.fleet.page.workers import FleetWorkers
 from bms_estimator.model.input_faults import InputFault
 from tests.fleet.published_states import HOME, make_packs, state
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 
 def healthy(**values: object) -> bytes:
@@ -20,6 +20,7 @@ def healthy(**values: object) -> bytes:
 
 
 def receive_states(states: dict[str, bytes], now_s: float = 0.0) -> FleetPacks:
+    """Return packs of one type that are in the table of packs and have published these states."""
     packs = FleetPacks()
     for name, data in states.items():
         packs.list_pack(name, "lfp 16s1p")
@@ -27,7 +28,7 @@ def receive_states(states: dict[str, bytes], now_s: float = 0.0) -> FleetPacks:
     return packs
 
 
-def test_packs_are_alive_for_three_minutes_then_silent():
+def test_pack_without_a_state_or_with_none_for_three_minutes_is_silent():
     packs = receive_states({"a": healthy(), "b": healthy()})
     packs.list_pack("c", "lfp 16s1p")
     packs.receive_state("b", healthy(), 100.0)
@@ -37,13 +38,13 @@ def test_packs_are_alive_for_three_minutes_then_silent():
     assert overview["attention"] == 2
 
 
-def test_pack_is_not_silent_soon_after_the_start():
+def test_pack_is_not_silent_within_three_minutes_after_the_start_of_the_page():
     packs = receive_states({"a": healthy()})
     overview = packs.overview(1000.0, 1000.0 - ALIVE_S)
     assert (overview["packs"]["alive"], overview["packs"]["silent"], overview["attention"]) == (0, 0, 0)
 
 
-def test_unlisted_pack_counts_after_its_first_state_and_a_removed_one_does_not():
+def test_pack_outside_the_table_counts_after_its_first_state_and_a_removed_pack_does_not():
     packs = FleetPacks()
     packs.receive_parameters("guest", b"{}")
     assert packs.overview(1.0, 0.0)["packs"]["known"] == 0
@@ -55,13 +56,14 @@ def test_unlisted_pack_counts_after_its_first_state_and_a_removed_one_does_not()
     assert [t["type"] for t in overview["types"]] == [UNLISTED]
 
 
-def test_distribution_of_soc_and_its_uncertainty_by_type():
+def test_soc_and_its_std_are_counted_in_bins_for_each_type():
     packs = receive_states(
         {"a": healthy(soc=-0.01), "b": healthy(soc=0.05), "c": healthy(soc=1.0), "d": healthy(soc=None, soc_std=None)}
     )
     packs.receive_state("e", healthy(soc_std=0.7), 0.0)
     home, unlisted = packs.overview(1.0, 0.0)["types"]
     assert (home["packs"], home["alive"]) == (4, 4)
+    # by index of the bin of 5 %: -0.01 is in the first bin, 1.0 in the last one
     assert {i: n for i, n in enumerate(home["soc"]) if n} == {0: 1, 1: 1, 19: 1}
     assert home["soc_median"] == 0.05
     assert home["soc_std_median"] == 0.01
@@ -70,7 +72,7 @@ def test_distribution_of_soc_and_its_uncertainty_by_type():
     assert unlisted["soc_std"][-1] == 1
 
 
-def test_rare_types_are_combined():
+def test_types_beyond_the_eight_most_frequent_are_combined():
     packs = FleetPacks()
     for number in range(12):
         packs.list_pack(f"p{number}", f"type {number}")
@@ -78,7 +80,7 @@ def test_rare_types_are_combined():
     assert (len(types), types[-1]["type"], types[-1]["packs"]) == (9, OTHER, 4)
 
 
-def test_packs_with_concerns_are_ranked_and_counted_once():
+def test_packs_with_concerns_are_ranked_and_count_once_for_attention():
     packs = receive_states(
         {
             "low": healthy(soc=0.04, stability_margin=-0.02),
@@ -107,7 +109,7 @@ def test_packs_with_concerns_are_ranked_and_counted_once():
     assert overview["attention"] == 4
 
 
-def test_worst_of_many_packs_are_listed():
+def test_only_the_packs_with_the_lowest_soc_are_listed():
     fleet = make_packs(5000)
     packs = receive_states({pack.name: pack.state for pack in fleet})
     overview = packs.overview(1.0, 0.0)
@@ -126,17 +128,17 @@ def test_packs_are_found_by_prefix():
     assert len(packs.find("")) == MAX_LISTED
 
 
-def test_details_of_a_pack_have_state_parameters_and_suspicions():
+def test_details_of_a_pack_have_its_state_parameters_and_suspected_faults():
     packs = receive_states({"a": healthy()}, 5.0)
-    packs.receive_parameters("a", ONE.parameters.model_dump_json().encode())
+    packs.receive_parameters("a", CELL_SNAPSHOT.parameters.model_dump_json().encode())
     packs.receive_hour("a", json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
-    details = packs.one("a", 7.0)
+    details = packs.details("a", 7.0)
     assert details
     assert (details["pack"], details["type"], details["heard_s"]) == ("a", "lfp 16s1p", 2.0)
     assert details["state"] == json.loads(healthy())
-    assert details["parameters"] == json.loads(ONE.parameters.model_dump_json())
+    assert details["parameters"] == json.loads(CELL_SNAPSHOT.parameters.model_dump_json())
     assert "zero of the current sensor" in details["suspects"]
-    assert packs.one("b", 7.0) is None
+    assert packs.details("b", 7.0) is None
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"[]", b"1", b'{"soc": NaN}', b"\xff", b"[" * 60_000])
@@ -147,7 +149,7 @@ def test_invalid_messages_are_counted_and_skipped(data: bytes) -> None:
     packs.receive_parameters("b", data)
     assert packs.damaged == 1
     assert packs.overview(0.0, 0.0)["packs"]["known"] == 0
-    assert packs.one("b", 0.0)["parameters"] is None
+    assert packs.details("b", 0.0)["parameters"] is None
 
 
 @pytest.mark.parametrize("value", ["x", True, [], 1e400])
@@ -159,29 +161,31 @@ def test_value_that_is_not_a_number_is_unknown(value: object) -> None:
 
 
 def heartbeat(worker: str, *partitions: int, **values: object) -> Heartbeat:
+    """Return the heartbeat of a worker that holds these partitions."""
     return Heartbeat.model_validate({"id": worker, "started_s": 0.0, "partitions": partitions, **values})
 
 
-def test_unheld_and_twice_held_partitions_are_found():
+def test_partitions_without_a_worker_or_with_two_are_found_until_a_worker_is_dead():
     workers = FleetWorkers(4)
-    workers.receive(heartbeat("b", 2, 9, lag_s=3.0), 0.0)
+    workers.receive(heartbeat("b", 2, 9, lag_s=3.0), 0.0)  # there is no partition 9
     workers.receive(heartbeat("a", 0, 2, lag_s=1.0), 1.0)
     overview = workers.overview(2.0)
     assert [each["id"] for each in overview["workers"]] == ["a", "b"]
     assert overview["holders"] == [0, -1, 1, -1]
     assert (overview["unheld"], overview["twice"], overview["lag_s"]) == ([1, 3], [2], 3.0)
-    overview = workers.overview(5.5)
+    overview = workers.overview(5.5)  # the heartbeat of b is too old
     assert [(each["id"], each["alive"]) for each in overview["workers"]] == [("a", True), ("b", False)]
     assert (overview["holders"], overview["lag_s"]) == ([0, -1, 0, -1], 1.0)
     assert workers.overview(400.0)["workers"] == []
 
 
-def test_rates_are_recent_and_reset_by_a_restart():
+def test_rates_of_a_worker_are_those_of_the_last_seconds_and_unknown_after_its_restart():
     workers = FleetWorkers(1)
     for second in range(30):
-        faster = max(second - 15, 0)
+        seconds_at_10_blocks = max(second - 15, 0)  # at first one block a second
         workers.receive(
-            heartbeat("a", 0, blocks=second + 9 * faster, samples=60 * second, cpu_s=0.5 * second), float(second)
+            heartbeat("a", 0, blocks=second + 9 * seconds_at_10_blocks, samples=60 * second, cpu_s=0.5 * second),
+            float(second),
         )
     (row,) = workers.overview(29.0)["workers"]
     assert (row["blocks_per_s"], row["samples_per_s"], row["cpu"]) == (10.0, 60.0, 0.5)
@@ -204,7 +208,7 @@ def test_unknown_packs_are_listed_until_they_are_known_or_no_worker_has_any():
     assert view.overview(4.0, 0.0)["concerns"]["unknown"] == {"count": 0, "packs": []}
 
 
-def test_rate_of_states_is_measured():
+def test_rate_of_received_states_is_measured():
     view = FleetView(1, 0.0)
     for second in range(20):
         for _ in range(5):
@@ -219,7 +223,7 @@ def test_invalid_heartbeats_are_counted_and_skipped():
     assert view.overview(0.0, 0.0)["damaged"] == 1
 
 
-def test_reconnecting_clears_workers_but_not_packs():
+def test_new_connection_clears_workers_but_not_packs():
     view = FleetView(1, 0.0)
     view.receive_worker(heartbeat("w", 0).model_dump_json().encode(), 0.0)
     view.packs.receive_state("a", healthy(), 0.0)

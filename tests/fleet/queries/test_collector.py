@@ -1,4 +1,4 @@
-"""Collector from the real server to Parquet files: no row is lost, and files are merged."""
+"""Collector, which writes the hour rows of the real server to Parquet files: no row is lost, and files are merged."""
 
 import asyncio
 import contextlib
@@ -17,7 +17,7 @@ from bms_estimator.fleet.queries.parquet_files import (
     UNFINISHED_SUFFIX,
     compact,
     complete_files,
-    to_compact,
+    days_to_compact,
     write,
 )
 from bms_estimator.model.errors import UserError
@@ -47,12 +47,14 @@ async def nc(cluster):
 
 
 async def publish(nc, rows):
+    """Publish hour rows, as workers do."""
     for row in rows:
         await nc.publish(subjects.hours(row.pack), row.model_dump_json().encode())
     await nc.flush()
 
 
 def rows_of(folder: Path):
+    """Return the rows of all complete files."""
     with duckdb.connect() as database:
         files = [str(file) for day in folder.glob("date=*") for file in complete_files(day)]
         return database.read_parquet(files).fetchall() if files else []
@@ -66,6 +68,7 @@ async def until(condition):
 
 @contextlib.asynccontextmanager
 async def running_collector(collector):
+    """Run a collector and shut it down at the end."""
     stop = asyncio.Event()
     task = asyncio.create_task(collector.run(stop))
     try:
@@ -75,7 +78,7 @@ async def running_collector(collector):
         await task
 
 
-async def test_permanently_closed_connection_raises(cluster, tmp_path):
+async def test_permanently_closed_connection_is_a_user_error(cluster, tmp_path):
     nc = await nats.connect(cluster.url)
     await make_streams(nc, partitions=1)
     await nc.close()
@@ -96,7 +99,7 @@ async def test_rows_are_written_by_day_and_acknowledged(nc, tmp_path):
             unprocessed = info.num_ack_pending, info.num_pending
 
 
-async def test_waiting_rows_are_written_at_shutdown_and_invalid_rows_are_counted(nc, tmp_path):
+async def test_rows_in_memory_are_written_at_shutdown_and_invalid_rows_are_counted(nc, tmp_path):
     collector = Collector(nc, tmp_path, period_s=3600.0)
     async with running_collector(collector):
         await nc.publish(subjects.hours("x"), b"{}")
@@ -123,36 +126,36 @@ async def test_unacknowledged_rows_of_a_killed_collector_are_redelivered(cluster
         async with running_collector(collector):
             await until(lambda: collector._subscription)
             config = (await nc.jetstream().consumer_info(subjects.HOURS_STREAM, "collector")).config
-            config.ack_wait = 0.5  # shorter than the collector's 60 s
+            config.ack_wait = 0.5  # the collector's 60 s would delay the redelivery
             await nc.jetstream().add_consumer(subjects.HOURS_STREAM, config)
             await until(lambda: len({row[:2] for row in rows_of(tmp_path)}) == len(rows))
 
 
-async def test_missing_stream_raises(nc, tmp_path):
+async def test_missing_stream_is_a_user_error(nc, tmp_path):
     await nc.jetstream().delete_stream(subjects.HOURS_STREAM)
     with pytest.raises(UserError, match="no stream HOURS: `bms-estimator fleet serve` creates it"):
         await Collector(nc, tmp_path).run(asyncio.Event())
 
 
-def test_files_of_a_day_are_merged_after_its_end_or_if_many(tmp_path):
+def test_files_of_a_day_are_merged_after_the_end_of_the_day_or_if_they_are_many(tmp_path):
     for n in range(3):
         write(tmp_path, [make_hour("b", MIDNIGHT), make_hour("a", MIDNIGHT + n)])
-    after_day_s = (MIDNIGHT + 27) * 3600.0
-    assert to_compact(tmp_path, after_day_s - 7200.0) == []
-    (day,) = to_compact(tmp_path, after_day_s)
+    after_day_s = (MIDNIGHT + 27) * 3600.0  # 3 h after the end of the day
+    assert days_to_compact(tmp_path, after_day_s - 7200.0) == []
+    (day,) = days_to_compact(tmp_path, after_day_s)
     (day / f".x.parquet{UNFINISHED_SUFFIX}").touch()
-    (day / "half.parquet").write_bytes(b"PAR1 and no more")
+    (day / "half.parquet").write_bytes(b"PAR1 and no more")  # only the magic bytes are valid
     compact(day)
     assert [row[:2] for row in rows_of(tmp_path)] == [("a", MIDNIGHT + n) for n in range(3)] + [("b", MIDNIGHT)]
     assert len(complete_files(day)) == 1
-    assert to_compact(tmp_path, after_day_s) == []
+    assert days_to_compact(tmp_path, after_day_s) == []
     (file,) = write(tmp_path, [make_hour("c", MIDNIGHT)])
     for n in range(MAX_FILES_PER_DAY - 2):
         shutil.copy(file, day / f"batch-{n}.parquet")
-    assert to_compact(tmp_path, after_day_s) == [day]
+    assert days_to_compact(tmp_path, after_day_s) == [day]
 
 
-async def test_disk_error_loses_no_row(nc, tmp_path, monkeypatch):
+async def test_row_that_cannot_be_written_is_not_acknowledged(nc, tmp_path, monkeypatch):
     folder = tmp_path / "hours"
     folder.touch()  # a file where the folder should be
     await publish(nc, [make_hour("a", MIDNIGHT)])

@@ -10,10 +10,10 @@ from bms_estimator.fleet.queries.parquet_files import SCHEMA, compact, write
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
-from tests.fleet.hour_rows import BEGIN, FIRST_STD, capacities, make_hour, states_of_charge, write_fleet
+from tests.fleet.hour_rows import BEGIN, FIRST_STD, estimate_capacities, estimate_soc, make_hour, write_fleet
 
 
-def test_process_noise_equals_that_of_the_filter():
+def test_process_noise_of_the_queries_equals_that_of_the_filter():
     assert (Noise.aged_soc, Noise.charge_error) == (AGED_SOC, CHARGE_ERROR)
 
 
@@ -27,7 +27,7 @@ def ageing_fleet(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("ageing_fleet"), np.random.default_rng(1)
     slopes = SLOPE_PER_YEAR + 0.02 * rng.standard_normal(PACKS)
     truth = -0.1 + slopes[:, None] * np.arange(DAYS) / 365.25
-    estimates, variance = capacities(rng, truth, 0.01, through=1.0)
+    estimates, variance = estimate_capacities(rng, truth, std=0.01, daily_throughput=1.0)
     ratio = np.exp(estimates)
     write_fleet(
         folder, BEGIN + 24 * np.arange(DAYS) + 23, capacity_ratio=ratio, capacity_ratio_std=ratio * np.sqrt(variance),
@@ -36,22 +36,23 @@ def ageing_fleet(tmp_path_factory):
     return folder, slopes
 
 
-def test_true_trends_are_within_their_95_percent_bands(ageing_fleet):
+def test_95_percent_bands_contain_the_true_trend_and_capacity_of_95_percent_of_the_packs(ageing_fleet):
     folder, slopes = ageing_fleet
     packs = {row["pack"]: row for row in run_query(folder, "soh").records if row["pack"]}
-    inside = [
+    is_slope_inside = [
         packs[f"p{n}"]["percent_per_year_low"] < 100 * slope < packs[f"p{n}"]["percent_per_year_high"]
         for n, slope in enumerate(slopes)
     ]
-    assert 0.93 < np.mean(inside) < 0.98  # 95 %; its std with 400 packs is 1.1 %
-    level = np.exp(-0.1 + slopes * (DAYS - 1) / 365.25)
-    level_inside = [
-        packs[f"p{n}"]["capacity_ratio_low"] < level[n] < packs[f"p{n}"]["capacity_ratio_high"] for n in range(PACKS)
+    assert 0.93 < np.mean(is_slope_inside) < 0.98  # 95 %; its std with 400 packs is 1.1 %
+    last_ratio = np.exp(-0.1 + slopes * (DAYS - 1) / 365.25)
+    is_ratio_inside = [
+        packs[f"p{n}"]["capacity_ratio_low"] < last_ratio[n] < packs[f"p{n}"]["capacity_ratio_high"]
+        for n in range(PACKS)
     ]
-    assert 0.93 < np.mean(level_inside) < 0.98
+    assert 0.93 < np.mean(is_ratio_inside) < 0.98
 
 
-def test_trend_and_spread_of_a_type(ageing_fleet):
+def test_mean_trend_of_a_type_and_its_spread_over_the_packs_are_found(ageing_fleet):
     (row,) = [row for row in run_query(ageing_fleet[0], "soh").records if not row["pack"]]
     assert (row["type"], row["packs"], row["days"]) == ("ncr18650 1s1p 3 Ah", PACKS, DAYS)
     assert row["percent_per_year_low"] < 100 * SLOPE_PER_YEAR < row["percent_per_year_high"]
@@ -59,13 +60,13 @@ def test_trend_and_spread_of_a_type(ageing_fleet):
     assert row["percent_per_year_spread"] == pytest.approx(2.0, abs=0.7)
 
 
-def test_repeated_estimates_give_no_trend(tmp_path):
-    """Use a filter that has learned once. For two months its estimate does not change, and its variance does not fall."""
+def test_estimate_without_new_measurements_gives_no_trend(tmp_path):
+    """The filter has learned the capacity once. Since then it has measured nothing, so that only the variance grows."""
     days = 60
     variance = 0.02**2 * np.ones(days)
-    retained = np.exp(-1.0 / AGED_SOC) ** 2
+    retained_variance = np.exp(-1.0 / AGED_SOC) ** 2
     for day in range(1, days):
-        variance[day] = retained * variance[day - 1] + (1.0 - retained) * FIRST_STD**2
+        variance[day] = retained_variance * variance[day - 1] + (1.0 - retained_variance) * FIRST_STD**2
     ratio = 0.9 * np.ones((3, days))
     write_fleet(
         tmp_path, BEGIN + 24 * np.arange(days), capacity_ratio=ratio, capacity_ratio_std=ratio * np.sqrt(variance),
@@ -74,7 +75,7 @@ def test_repeated_estimates_give_no_trend(tmp_path):
     assert run_query(tmp_path, "soh").rows == []
 
 
-def test_only_certain_outliers_are_found(tmp_path):
+def test_outliers_are_found_except_those_with_a_large_uncertainty(tmp_path):
     rng = np.random.default_rng(2)
     packs = 1000
     capacity, std = 0.9 + 0.02 * rng.standard_normal((packs, 1)), np.full((packs, 1), 0.01)
@@ -82,8 +83,8 @@ def test_only_certain_outliers_are_found(tmp_path):
     estimates = capacity + std * rng.standard_normal((packs, 1))
     estimates[:300] = 1.0
     r_s = np.exp(0.3 + 0.05 * rng.standard_normal((packs, 1)))
-    estimates[500], estimates[501], r_s[502] = 0.7, 1.1, 2.5
-    estimates[10], std[10] = 0.7, 0.3
+    estimates[500], estimates[501], r_s[502] = 0.7, 1.1, 2.5  # outliers
+    estimates[10], std[10] = 0.7, 0.3  # as far off, but uncertain
     write_fleet(
         tmp_path, np.array([BEGIN]), capacity_ratio=estimates, capacity_ratio_std=std, capacity_first_std=FIRST_STD,
         r_s_ratio=r_s, r_s_ratio_std=0.02 * r_s, r_s_unlearned_s=10.0,
@@ -96,7 +97,7 @@ def test_only_certain_outliers_are_found(tmp_path):
     assert [row["spread_of_type"] for row in result if row["pack"] == "p500"] == [pytest.approx(0.02, abs=0.01)]
 
 
-def test_type_of_few_packs_has_no_outliers(tmp_path):
+def test_type_of_four_packs_has_no_outliers(tmp_path):
     estimates = np.array([[0.9], [0.9], [0.9], [0.2]])
     write_fleet(
         tmp_path, np.array([BEGIN]), capacity_ratio=estimates, capacity_ratio_std=0.01, capacity_first_std=FIRST_STD
@@ -104,19 +105,19 @@ def test_type_of_few_packs_has_no_outliers(tmp_path):
     assert run_query(tmp_path, "outliers").rows == []
 
 
-def test_failing_packs_are_found(tmp_path):
+def test_packs_whose_capacity_resistance_margin_or_suspects_get_worse_are_found_with_the_days_left(tmp_path):
     rng, days = np.random.default_rng(3), 60
     slopes = np.zeros(500)
     slopes[7] = -0.9  # reaches 0.8 from 0.9 in 48 days after two months
     truth = np.log(0.9) + slopes[:, None] * (np.arange(days) - days + 1) / 365.25
-    estimates, variance = capacities(rng, truth, 0.01, through=1.0)
+    estimates, variance = estimate_capacities(rng, truth, std=0.01, daily_throughput=1.0)
     r_s = 1.2 * np.exp(0.05 * rng.standard_normal((500, days)))
     r_s[8] *= np.exp(2.0 * (np.arange(days) - days + 1) / 365.25) * 1.3  # 1.56 now; 2.0 in 45 days
     margin = 0.3 + 0.05 * rng.standard_normal((500, days))
-    margin[9] -= 0.27 * np.arange(days) / days  # 0.03 left, 7 days
+    margin[9] -= 0.27 * np.arange(days) / days  # 0.03 now; 0 in 7 days
     suspects = np.zeros((500, days), int)
-    suspects[10, -4:] = InputFault.CAPACITY
-    suspects[11, :] = InputFault.OFFSET  # present from the beginning
+    suspects[10, -4:] = InputFault.CAPACITY  # new
+    suspects[11, :] = InputFault.OFFSET  # present from the beginning, and therefore not reported
     write_fleet(
         tmp_path, BEGIN + 24 * np.arange(days), capacity_ratio=np.exp(estimates), charge_out_ah=3.0,
         capacity_ratio_std=np.exp(estimates) * np.sqrt(variance), capacity_first_std=FIRST_STD, r_s_ratio=r_s,
@@ -131,9 +132,13 @@ def test_failing_packs_are_found(tmp_path):
     assert result["p9"]["days_left_low"] < 7 < result["p9"]["days_left_high"]
 
 
-@pytest.mark.parametrize(("factor", "minimum", "maximum"), [(1.0, 0.94, 0.97), (0.5, 0.62, 0.8), (2.0, 0.99, 1.0)])
-def test_coverage_of_correct_narrow_and_wide_bands(tmp_path, factor, minimum, maximum):
-    columns = states_of_charge(np.random.default_rng(4), 300, 96)
+@pytest.mark.parametrize(
+    ("factor", "minimum", "maximum"),
+    [(1.0, 0.94, 0.97), (0.5, 0.62, 0.8), (2.0, 0.99, 1.0)],
+    ids=["correct band", "too narrow band", "too wide band"],
+)
+def test_coverage_of_soc_bands_is_estimated_without_the_true_soc(tmp_path, factor, minimum, maximum):
+    columns = estimate_soc(np.random.default_rng(4), 300, 96)
     columns["soc_mean_std"] = factor * columns["soc_mean_std"]
     write_fleet(
         tmp_path, BEGIN + np.arange(96), capacity_ratio=1.0, capacity_ratio_std=1e-6, capacity_first_std=1e-6,
@@ -169,7 +174,7 @@ def test_duplicate_rows_count_once_before_and_after_a_merge(tmp_path):
     assert select(tmp_path, "SELECT count(*) AS n FROM hours", days=1).rows == [(1,)]
 
 
-def test_files_of_an_earlier_version_are_read(tmp_path):
+def test_files_that_lack_columns_are_read_unless_pack_and_hour_are_missing(tmp_path):
     write(tmp_path, [make_hour("a", BEGIN)])
     (file,) = tmp_path.glob("*/*.parquet")
     pq.write_table(pq.read_table(file).drop_columns(["capacity_first_std", "r_s_ratio"]), file)

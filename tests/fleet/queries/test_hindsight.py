@@ -9,13 +9,14 @@ from bms_estimator.fleet.queries.parquet_files import write
 from tests.benchmarks.hindsight import judged, limits, slots
 
 SLOT_S = 60.0
+"""Duration of a slot of a capture, which stands for an hour of a fleet [s]."""
 
 
 @pytest.fixture(scope="module")
 def packs(data):
-    """Return estimates of a Nissan Leaf from four starts, each with SOC errors of 0.2 and -0.2.
+    """Return estimates of a Nissan Leaf. They begin at four samples, each with initial SOC errors of 0.2 and -0.2.
 
-    The true SOC is counted from full.
+    The true SOC is counted from the full battery.
     """
     cell, capture = load_cell("leaf"), load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
     discharged_as = np.r_[0.0, np.cumsum(capture["current_a"][:-1] * np.diff(capture["time_s"]))]
@@ -29,12 +30,13 @@ def packs(data):
     ]
 
 
-def test_coverage_in_hindsight_agrees_with_the_truth(packs, tmp_path):
+def test_coverage_estimated_in_hindsight_agrees_with_the_true_coverage(packs, tmp_path):
     write(tmp_path, [slot.hour for pack in packs for slot in pack])
     (overall, *_) = run_query(tmp_path, "honest", limits=limits(SLOT_S)).records
-    inside = np.abs([x for pack in packs for x in judged(pack)]) <= 2.0
+    errors_in_stds = [error for pack in packs for error in judged(pack)]
+    is_inside = np.abs(errors_in_stds) <= 2.0
     assert overall["packs"] == len(packs)
-    assert overall["within_2_std"] == pytest.approx(inside.mean(), abs=0.1)
+    assert overall["within_2_std"] == pytest.approx(is_inside.mean(), abs=0.1)
     assert overall["low"] > 0.5
 
 

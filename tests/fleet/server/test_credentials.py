@@ -1,4 +1,4 @@
-"""Permissions, tested on the real server: edges, workers and readers of two tenants, and others."""
+"""Permissions on the real server: what edges, workers, readers and dashboards of two tenants may do."""
 
 import asyncio
 import os
@@ -43,15 +43,17 @@ class Fleet:
     keys: Path
 
     def token(self, pack: str, tenant: str = "acme", issued: datetime = NOW, expires: datetime | None = None) -> str:
+        """Return the token of an edge."""
         return credentials.edge_token(self.keys, tenant, pack, issued, expires)
 
     def edge(self, token: str, **options: object) -> aiomqtt.Client:
+        """Return an MQTT client that authenticates with a token."""
         port = self.cluster.mqtt_port
         return aiomqtt.Client("127.0.0.1", port, username="any", password=token, timeout=LONG_S, **options)  # type: ignore[arg-type]
 
     @asynccontextmanager
     async def program(self, role: Role, tenant: str = "acme") -> AsyncIterator[tuple[Client, list[str]]]:
-        """Connect with credentials; yield the connection and the list of its errors."""
+        """Connect with the credentials of a program. Yield the connection and the list of the server's rejections."""
         rejections: list[str] = []
 
         async def on_error(error: Exception) -> None:
@@ -73,7 +75,7 @@ class Fleet:
         os.kill(self.cluster.pid(0), signal.SIGHUP)
 
     async def stored(self, tenant: str = "acme") -> list[tuple[str, bytes]]:
-        """Return the blocks in the stream of a tenant: (pack, block)."""
+        """Return pack and data of each block in the stream of a tenant."""
         async with self.program(Role.READER, tenant) as (nc, _):
             js = nc.jetstream(timeout=LONG_S)
             last = (await js.stream_info(subjects.RAW_STREAM)).state.last_seq
@@ -100,6 +102,7 @@ async def _make_streams(fleet: Fleet) -> None:
 
 
 async def is_accepted(client: aiomqtt.Client) -> bool:
+    """Return True if the server accepts the connection."""
     try:
         async with client:
             return True
@@ -108,7 +111,7 @@ async def is_accepted(client: aiomqtt.Client) -> bool:
 
 
 async def connect_with(url: str, token: str) -> None:
-    """Connect by the protocol of programs, with the token of an edge."""
+    """Connect over the NATS protocol, which programs use, with the token of an edge."""
     nc = Client()
     try:
         await nc.connect(
@@ -136,13 +139,13 @@ async def is_disconnected(client: aiomqtt.Client, act: Callable[[], None]) -> bo
 
 
 async def assert_rejected(nc: Client, rejections: list[str], *publications: str) -> None:
-    """Publish forbidden messages until the server has rejected each."""
+    """Publish to forbidden subjects, and check that the server rejects each."""
     for subject in publications:
         await nc.publish(subject, b"evil")
     async with asyncio.timeout(LONG_S):
         while len(rejections) < len(publications):
             await nc.flush()
-    await nc.flush()
+    await nc.flush()  # further rejections would have arrived with its response
     assert len(rejections) == len(publications), rejections
 
 
@@ -190,7 +193,7 @@ async def test_edge_publishes_its_own_subject_and_receives_replies(fleet: Fleet)
             message = await all_messages.next_msg(LONG_S)
             received.append((message.subject, message.data))
         assert [pair for pair in received if b"evil" in pair[1]] == []
-        await admin.publish(subjects.awaits("p1"), b"yours")
+        await admin.publish(subjects.block_request("p1"), b"yours")
         async with asyncio.timeout(LONG_S):
             message = await anext(edge.messages)
         assert (message.topic.value, message.payload) == ("edge/p1/awaits", b"yours")
@@ -198,15 +201,15 @@ async def test_edge_publishes_its_own_subject_and_receives_replies(fleet: Fleet)
 
 
 async def test_will_on_a_forbidden_topic_is_dropped(fleet: Fleet) -> None:
-    before = await fleet.stored()
+    blocks_before = await fleet.stored()
     will = aiomqtt.Will("raw/p2", b"evil", qos=1)
     client = fleet.edge(fleet.token("p1"), will=will)
-    if await is_accepted(client):
+    if await is_accepted(client):  # the server may also reject the connection
         async with fleet.edge(fleet.token("p1"), will=will) as edge:
-            edge._client._sock_close()
+            edge._client._sock_close()  # without DISCONNECT, so that the server publishes the will
     async with fleet.edge(fleet.token("p3")) as edge:
         await edge.publish("raw/p3", b"later", qos=1)
-    assert await fleet.stored() == [*before, ("p3", b"later")]
+    assert await fleet.stored() == [*blocks_before, ("p3", b"later")]
 
 
 async def test_tenants_are_isolated(fleet: Fleet) -> None:
@@ -224,7 +227,7 @@ async def test_tenants_are_isolated(fleet: Fleet) -> None:
     assert b"theirs" not in [data for _, data in await fleet.stored()]
 
 
-async def test_permissions_of_a_worker(fleet: Fleet) -> None:
+async def test_worker_can_do_its_work_and_nothing_else(fleet: Fleet) -> None:
     async with fleet.edge(fleet.token("work")) as edge, fleet.program(Role.WORKER) as (nc, rejections):
         await edge.publish("raw/work", b"block", qos=1)
         js = nc.jetstream()
@@ -256,12 +259,13 @@ def test_real_worker_needs_no_further_permissions(
     (tmp_path / "packs.csv").write_text("pack,cell\nreal,ncr18650\n")
     server = ("--server", fleet.cluster.url, "--creds", credentials.credentials_file(fleet.keys, "acme", Role.ADMIN))
     assert run(capsys, "fleet", "packs", "load", tmp_path / "packs.csv", *server)[::2] == (0, "")
-    before = fleet.cluster.log(0).read_text().count("Violation")
+    violations_before = fleet.cluster.log(0).read_text().count("Violation")
     asyncio.run(_run_worker(fleet))
-    assert fleet.cluster.log(0).read_text().count("Violation") == before
+    assert fleet.cluster.log(0).read_text().count("Violation") == violations_before
 
 
 async def _run_worker(fleet: Fleet) -> None:
+    """Run a worker that processes a block, publishes a state and a reply, and writes a checkpoint."""
     samples = np.zeros(60, dtype=SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(60), 3.9, 25.0
     block = encode(Block(store=1, number=1, oldest=1, arrival_s=60.0, samples=samples))
@@ -312,35 +316,35 @@ async def test_dashboard_reads_estimates_over_mqtt(fleet: Fleet) -> None:
 
 async def test_invalid_tokens_are_rejected(fleet: Fleet, tmp_path: Path) -> None:
     credentials.make_accounts(tmp_path, TENANTS, NOW)
-    day, good = timedelta(days=1), fleet.token("p1")
-    head, _, signature = good.split(".")
-    worker = credentials.credentials_file(fleet.keys, "acme", Role.WORKER).read_text().splitlines()[1]
+    day, valid_token = timedelta(days=1), fleet.token("p1")
+    head, _, signature = valid_token.split(".")
+    worker_token = credentials.credentials_file(fleet.keys, "acme", Role.WORKER).read_text().splitlines()[1]
     tokens = {
         "none": "",
         "expired": fleet.token("p1", issued=NOW - 2 * day, expires=NOW - day),
-        "of another operator": credentials.edge_token(tmp_path, "acme", "p1", NOW),
-        "of another pack": f"{head}.{fleet.token('p2').split('.')[1]}.{signature}",
-        "a worker's": worker,
+        "signed by another operator": credentials.edge_token(tmp_path, "acme", "p1", NOW),
+        "claims of another pack": f"{head}.{fleet.token('p2').split('.')[1]}.{signature}",
+        "a worker's": worker_token,
     }
     assert {name: await is_accepted(fleet.edge(token)) for name, token in tokens.items()} == dict.fromkeys(
         tokens, False
     )
     assert await is_accepted(fleet.edge(fleet.token("p1", expires=datetime.now(UTC) + day)))
     with pytest.raises(NatsError, match="Authorization"):
-        await connect_with(fleet.cluster.url, good)
+        await connect_with(fleet.cluster.url, valid_token)
 
 
 async def test_revoked_edge_is_disconnected_and_connects_with_a_new_token(fleet: Fleet) -> None:
-    stolen, others = fleet.token("stolen"), fleet.token("p1")
-    revoked = TENANTS | {
+    stolen_token, other_token = fleet.token("stolen"), fleet.token("p1")
+    changed_tenants = TENANTS | {
         "acme": TenantSettings(revoked={"stolen": NOW + timedelta(seconds=1)}),
         "new": TenantSettings(),
     }
-    accounts = credentials.make_accounts(fleet.keys, revoked, NOW)
-    assert await is_disconnected(fleet.edge(stolen), lambda: fleet.reload(accounts))
-    assert not await is_accepted(fleet.edge(stolen))
+    accounts = credentials.make_accounts(fleet.keys, changed_tenants, NOW)
+    assert await is_disconnected(fleet.edge(stolen_token), lambda: fleet.reload(accounts))
+    assert not await is_accepted(fleet.edge(stolen_token))
     assert await is_accepted(fleet.edge(fleet.token("stolen", issued=NOW + timedelta(seconds=2))))
-    assert await is_accepted(fleet.edge(others))
+    assert await is_accepted(fleet.edge(other_token))
     assert await is_accepted(fleet.edge(fleet.token("p1", "new")))
 
 
@@ -377,6 +381,6 @@ def test_errors_do_not_show_keys(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="there are acme, other"):
         credentials.edge_token(tmp_path, "nobody", "p1", NOW)
     (tmp_path / "acme" / "edge.nk").write_text("SAADEFECT")
-    with pytest.raises(UserError, match=r"edge\.nk: not a key") as wrong:
+    with pytest.raises(UserError, match=r"edge\.nk: not a key") as raised:
         credentials.edge_token(tmp_path, "acme", "p1", NOW)
-    assert "DEFECT" not in str(wrong.value)
+    assert "DEFECT" not in str(raised.value)

@@ -1,4 +1,4 @@
-"""Attacks with the token of one edge on the real server: they harm only that edge's own pack."""
+"""Attacks on the real server with the token of one edge. They harm only the pack of that edge."""
 
 import asyncio
 import time
@@ -28,15 +28,18 @@ PARTITIONS = 4
 RAW_BYTES = 8 << 20
 """Size limit of the stream [bytes]; small, so that a test can fill it."""
 FLOOD_BLOCKS = 40
-"""Number of blocks, each of which takes a worker a tenth of a second."""
+"""Number of blocks that an attacker sends. Each of them takes a worker a tenth of a second."""
 FLOOD_BYTES = 715_000
-"""Total size of the blocks that an attacker sends [bytes]."""
+"""Total size of the blocks with too many samples that an attacker sends [bytes]."""
+MQTT_FAILURE = 0x80
+"""Return code of a rejected MQTT subscription."""
 FORMER_SUBJECT = "p.*.raw.*"
 """Subject of ``RAW`` in the previous version, in which the server mapped the edges' subjects before storing."""
 
 
 @pytest.fixture
 def fleet(tmp_path: Path) -> Iterator[Tenant]:
+    """Return a running server with one tenant that has streams."""
     with one_tenant(tmp_path) as tenant:
         asyncio.run(tenant.make_streams(PARTITIONS, 1 << 30))
         yield tenant
@@ -58,10 +61,11 @@ async def stored_counts(nc: Client, last: bytes) -> dict[str, int]:
 
 
 def subject(pack: str) -> str:
+    """Return the subject of a pack's blocks in ``RAW``."""
     return subjects.stored_raw(subjects.partition_of(pack, PARTITIONS), pack)
 
 
-async def test_other_subjects_and_partitions_are_rejected(fleet: Tenant) -> None:
+async def test_edge_cannot_write_to_other_packs_or_choose_the_partition(fleet: Tenant) -> None:
     reader = await fleet.program(Role.READER)
     async with fleet.edge("attacker") as edge:
         for partition in (*range(PARTITIONS), "x", "invented", "64"):
@@ -72,11 +76,11 @@ async def test_other_subjects_and_partitions_are_rejected(fleet: Tenant) -> None
         codes = [(await edge.subscribe(f"edge/attacker/{i}", qos=1))[0].value for i in range(20)]
         await edge.publish("raw/attacker", b"own", qos=1)
     assert await stored_counts(reader, b"own") == {subject("attacker"): 1}
-    assert set(codes) == {0x80}
+    assert set(codes) == {MQTT_FAILURE}
     await reader.close()
 
 
-async def test_junk_evicts_no_block_of_another_pack(fleet: Tenant) -> None:
+async def test_blocks_of_an_attacker_evict_no_block_of_another_pack(fleet: Tenant) -> None:
     await fleet.make_streams(PARTITIONS, RAW_BYTES)
     reader = await fleet.program(Role.READER)
     async with fleet.edge("honest") as edge:
@@ -101,7 +105,7 @@ async def test_too_large_message_is_not_stored(fleet: Tenant) -> None:
     await reader.close()
 
 
-async def test_rejected_block_counts_as_lost_after_some_resends(fleet: Tenant) -> None:
+async def test_block_that_the_server_rejects_each_time_counts_as_lost(fleet: Tenant) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
     await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": PACK_ROW})
     states = await reader.subscribe(subjects.published("p1", "state"))
@@ -113,7 +117,7 @@ async def test_rejected_block_counts_as_lost_after_some_resends(fleet: Tenant) -
             await edge.publish("raw/p1", bytes(MAX_BLOCK_BYTES + 1), qos=1)
             await edge.publish("raw/p1", block("p1", 3), qos=1)
         await states.next_msg(LONG_S)
-        await until_counted(heartbeats, "lost_blocks", 1)
+        await wait_for_count(heartbeats, "lost_blocks", 1)
     await admin.close()
     await reader.close()
 
@@ -133,7 +137,7 @@ async def test_stream_of_the_previous_version_is_updated_and_keeps_its_blocks(tm
 
 @asynccontextmanager
 async def worker(fleet: Tenant) -> AsyncIterator[None]:
-    """Run a worker while the context lasts."""
+    """Run a worker with the tenant's credentials, and shut it down at the end."""
     stop = asyncio.Event()
     working = asyncio.create_task(work(Options(fleet.cluster.url, "w", fleet.file(Role.WORKER)), stop))
     try:
@@ -143,8 +147,8 @@ async def worker(fleet: Tenant) -> AsyncIterator[None]:
         await working
 
 
-async def until_counted(heartbeats: Heartbeats, name: str, count: int) -> None:
-    """Wait until the worker's counter has reached a value."""
+async def wait_for_count(heartbeats: Heartbeats, name: str, count: int) -> None:
+    """Wait until a counter of the worker has reached a value."""
     await heartbeats.until(lambda last: any(each.counters.get(name, 0) >= count for each in last.values()))
 
 
@@ -155,23 +159,23 @@ async def until_counted(heartbeats: Heartbeats, name: str, count: int) -> None:
         (20_000, 3.0, "20000 samples in 3 s: at most 1000 a second, and 7000 more"),
     ],
 )
-async def test_dense_blocks_are_rejected_and_other_packs_are_not_delayed(
+async def test_blocks_with_too_many_samples_are_rejected_and_other_packs_are_not_delayed(
     fleet: Tenant, samples: int, seconds: float, reason: str
 ) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
     await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": PACK_ROW, "attacker": PACK_ROW})
     states = await reader.subscribe(subjects.published("*", "state"))
     await reader.flush()
-    dense = heavy_block(samples, seconds / samples)
-    count = FLOOD_BYTES // len(dense)
+    dense_block = heavy_block(samples, seconds / samples)
+    count = FLOOD_BYTES // len(dense_block)
     async with fleet.edge("attacker") as attacker, fleet.edge("p1") as other_edge:
         for number in range(1, count + 1):
-            await attacker.publish("raw/attacker", numbered(dense, number), qos=1)
+            await attacker.publish("raw/attacker", numbered(dense_block, number), qos=1)
         await other_edge.publish("raw/p1", block("p1", 1), qos=1)
     with capture_logs() as logs:
         async with Heartbeats(reader) as heartbeats, worker(fleet):
             assert (await states.next_msg(LONG_S)).subject == subjects.published("p1", "state")
-            await until_counted(heartbeats, "too_dense", count)
+            await wait_for_count(heartbeats, "too_dense", count)
     rejections = [line for line in logs if line["event"] == "a block is rejected"]
     assert [(line["pack"], line["reason"]) for line in rejections] == [("attacker", reason)]
     await admin.close()
@@ -181,22 +185,23 @@ async def test_dense_blocks_are_rejected_and_other_packs_are_not_delayed(
 async def test_flood_of_blocks_delays_only_its_own_pack(fleet: Tenant) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
     registry = await load_packs(admin, ["p1", "attacker"])
-    assert subject("p1").split(".")[1] == subject("attacker").split(".")[1]
+    partitions = {subjects.partition_of(pack, PARTITIONS) for pack in ("p1", "attacker")}
+    assert len(partitions) == 1  # both packs are in one partition
     states = await reader.subscribe(subjects.published("*", "state"))
     await reader.flush()
-    heavy = heavy_block(20_000, 1.0)
+    heavy = heavy_block(samples=20_000, period_s=1.0)
     async with fleet.edge("attacker") as attacker, fleet.edge("p1") as other_edge:
         for number in range(1, FLOOD_BLOCKS + 1):
             await attacker.publish("raw/attacker", numbered(heavy, number), qos=1)
         await other_edge.publish("raw/p1", block("p1", 1), qos=1)
     async with worker(fleet):
-        before = 0
+        earlier_states = 0
         while (await states.next_msg(LONG_S)).subject != subjects.published("p1", "state"):
-            before += 1
-        assert before < FLOOD_BLOCKS // 2
+            earlier_states += 1
+        assert earlier_states < FLOOD_BLOCKS // 2
     async with Heartbeats(reader) as heartbeats, worker(fleet):  # continues from the checkpoint of the first worker
-        await until_counted(heartbeats, "blocks", FLOOD_BLOCKS + 1)
-        await until_counted(heartbeats, "deferred", FLOOD_BLOCKS // 2)
+        await wait_for_count(heartbeats, "blocks", FLOOD_BLOCKS + 1)
+        await wait_for_count(heartbeats, "deferred", FLOOD_BLOCKS // 2)
     state = (await end_states(admin, registry, PARTITIONS))[subjects.partition_of("attacker", PARTITIONS)].state(
         "attacker"
     )
@@ -209,11 +214,12 @@ async def test_flood_of_blocks_delays_only_its_own_pack(fleet: Tenant) -> None:
     await reader.close()
 
 
-async def test_worker_rejects_a_block_in_the_wrong_partition(fleet: Tenant) -> None:
+async def test_worker_rejects_a_block_of_a_pack_that_belongs_to_another_partition(fleet: Tenant) -> None:
     admin = await fleet.program(Role.ADMIN)
     await write_bucket(admin, subjects.PACKS_BUCKET, {"p1": PACK_ROW})
     wrong_partition = (subjects.partition_of("p1", PARTITIONS) + 1) % PARTITIONS
-    await admin.jetstream().update_stream(  # the stream of the previous version, which accepts any partition
+    # the stream of the previous version accepts any partition
+    await admin.jetstream().update_stream(
         name=subjects.RAW_STREAM,
         subjects=[FORMER_SUBJECT],
         metadata={"bms.partitions": str(PARTITIONS)},

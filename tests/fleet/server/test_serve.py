@@ -42,6 +42,7 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
 
 
 def settings_text(authority: Authority, options: str = "", ports: tuple[int, ...] = ()) -> str:
+    """Return the settings of a server with TLS and the tenant ``acme``, by default on free ports."""
     listen, mqtt, monitor = ports or (free_port(), free_port(), free_port())
     certificate, key = authority.certificate.with_name("node.crt"), authority.certificate.with_name("node.key")
     if not certificate.exists():
@@ -63,8 +64,8 @@ ca_file = "{authority.certificate}"
 """
 
 
-class Serving:
-    """Process of ``fleet serve FILE``."""
+class ServeProcess:
+    """Process of ``fleet serve FILE``, which starts at once."""
 
     def __init__(self, file: Path, folder: Path) -> None:
         self._errors = folder.with_suffix(".err")
@@ -77,7 +78,7 @@ class Serving:
             )
 
     def wait(self, text: str) -> None:
-        """Wait for a line with ``text``."""
+        """Wait for a line on stdout that contains ``text``."""
         assert self.process.stdout
         timeout = threading.Timer(LONG_S, self.process.kill)
         timeout.start()
@@ -90,13 +91,16 @@ class Serving:
         raise AssertionError(f"ended without {text!r}: {self.errors()}")
 
     def errors(self) -> str:
+        """Return its stderr."""
         return self._errors.read_text()
 
     def end(self) -> int:
+        """Send SIGTERM and return the exit code."""
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(LONG_S)
 
     def close(self) -> None:
+        """Kill the process if it still runs, and close its pipe."""
         self.process.kill()
         self.process.wait(LONG_S)
         assert self.process.stdout
@@ -104,10 +108,10 @@ class Serving:
 
 
 @pytest.fixture(scope="module")
-def serve(tmp_path_factory: pytest.TempPathFactory, authority: Authority) -> Iterator[tuple[Serving, Path]]:
+def serve(tmp_path_factory: pytest.TempPathFactory, authority: Authority) -> Iterator[tuple[ServeProcess, Path]]:
     folder = tmp_path_factory.mktemp("serve")
     (folder / "fleet.toml").write_text(settings_text(authority))
-    server = Serving(folder / "fleet.toml", folder / "state")
+    server = ServeProcess(folder / "fleet.toml", folder / "state")
     try:
         server.wait("tenant acme: streams ready, 4 partitions")
         yield server, folder
@@ -126,6 +130,7 @@ def port_of(listen: str) -> int:
 
 
 async def send_block(folder: Path, context: ssl.SSLContext, tenant: str = "acme") -> None:
+    """Send a block with the token of an edge."""
     token = credentials.edge_token(folder / "state" / "keys", tenant, "p1", datetime.now(UTC))
     port = port_of(settings_of(folder).server.mqtt)
     async with (
@@ -135,7 +140,8 @@ async def send_block(folder: Path, context: ssl.SSLContext, tenant: str = "acme"
         await edge.publish(subjects.raw("p1").replace(".", "/"), b"block", qos=1)
 
 
-async def blocks(folder: Path, context: ssl.SSLContext, tenant: str = "acme") -> int:
+async def count_blocks(folder: Path, context: ssl.SSLContext, tenant: str = "acme") -> int:
+    """Return the number of blocks in the stream of a tenant, read with the credentials of a worker."""
     file = credentials.credentials_file(folder / "state" / "keys", tenant, Role.WORKER)
     nc = await nats.connect(f"tls://{settings_of(folder).server.listen}", tls=context, user_credentials=file)
     try:
@@ -144,11 +150,11 @@ async def blocks(folder: Path, context: ssl.SSLContext, tenant: str = "acme") ->
         await nc.close()
 
 
-async def test_edges_and_workers_need_tls(serve: tuple[Serving, Path], authority: Authority) -> None:
+async def test_edges_and_workers_need_tls(serve: tuple[ServeProcess, Path], authority: Authority) -> None:
     _, folder = serve
     context = ssl.create_default_context(cafile=str(authority.certificate))
     await send_block(folder, context)
-    assert await blocks(folder, context) == 1
+    assert await count_blocks(folder, context) == 1
     for port in (port_of(settings_of(folder).server.mqtt), port_of(settings_of(folder).server.listen)):
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(b"\x10\x0d\x00\x04MQTT\x04\x02\x00\x3c\x00\x01a")  # a CONNECT without TLS
@@ -158,24 +164,24 @@ async def test_edges_and_workers_need_tls(serve: tuple[Serving, Path], authority
         writer.close()
 
 
-async def test_tenant_is_added_without_a_restart(serve: tuple[Serving, Path], authority: Authority) -> None:
+async def test_tenant_is_added_without_a_restart(serve: tuple[ServeProcess, Path], authority: Authority) -> None:
     server, folder = serve
     file, context = folder / "fleet.toml", ssl.create_default_context(cafile=str(authority.certificate))
-    before = file.read_text()
-    file.write_text(before + "[tenants.wrong]\nraw_gb = -1\n")
+    valid_settings = file.read_text()
+    file.write_text(valid_settings + "[tenants.wrong]\nraw_gb = -1\n")
     server.process.send_signal(signal.SIGHUP)
     await until(lambda: "tenants.wrong.raw_gb = -1" in server.errors())
-    file.write_text(before + "[tenants.later]\n")
+    file.write_text(valid_settings + "[tenants.later]\n")
     server.process.send_signal(signal.SIGHUP)
     await asyncio.to_thread(server.wait, "tenant later: streams ready")
     await send_block(folder, context, "later")
-    assert await blocks(folder, context, "later") == 1
-    assert await blocks(folder, context) == 1
+    assert await count_blocks(folder, context, "later") == 1
+    assert await count_blocks(folder, context) == 1
 
 
-def test_exit_codes_of_a_second_server_and_of_the_first(serve: tuple[Serving, Path]) -> None:
+def test_second_server_on_the_same_ports_fails_and_sigterm_ends_the_first(serve: tuple[ServeProcess, Path]) -> None:
     server, folder = serve
-    second = Serving(folder / "fleet.toml", folder / "second")
+    second = ServeProcess(folder / "fleet.toml", folder / "second")
     try:
         assert second.process.wait(LONG_S) == 1
         assert "address already in use" in second.errors()
@@ -185,12 +191,12 @@ def test_exit_codes_of_a_second_server_and_of_the_first(serve: tuple[Serving, Pa
     assert not is_listening(port_of(settings_of(folder).server.listen))
 
 
-async def test_server_ends_when_fleet_serve_is_killed(tmp_path: Path) -> None:
+async def test_nats_server_ends_when_fleet_serve_is_killed(tmp_path: Path) -> None:
     listen, mqtt, monitor = free_port(), free_port(), free_port()
     addresses = f'listen = "127.0.0.1:{listen}"\nmqtt = "127.0.0.1:{mqtt}"\nmonitor = "127.0.0.1:{monitor}"\n'
     (tmp_path / "fleet.toml").write_text(f"[server]\npartitions = 4\nraw_gb = 0.1\n{addresses}")
-    for _ in range(2):  # the second one starts with the streams of the killed one
-        server = Serving(tmp_path / "fleet.toml", tmp_path / "state")
+    for _ in range(2):  # the second process starts with the streams of the killed one
+        server = ServeProcess(tmp_path / "fleet.toml", tmp_path / "state")
         await asyncio.to_thread(server.wait, "streams ready")
         server.close()
         await until(lambda: not any(map(is_listening, (listen, mqtt, monitor))))
@@ -207,14 +213,16 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.02)
 
 
-async def test_late_server_is_retried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls, make_streams = [], nats_server.make_streams
+async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_answer_at_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, original_make_streams = [], nats_server.make_streams
 
     async def fail_once(nc, **options) -> None:
         calls.append(options)
         if len(calls) == 1:
-            raise NoAnswerError("nothing")
-        await make_streams(nc, **options)
+            raise NoAnswerError("no answer")
+        await original_make_streams(nc, **options)
 
     monkeypatch.setattr(nats_server, "make_streams", fail_once)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
@@ -227,7 +235,9 @@ async def test_late_server_is_retried(tmp_path: Path, monkeypatch: pytest.Monkey
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_three_nodes_have_three_replicas(tmp_path: Path, authority: Authority) -> None:
+async def test_three_nodes_form_a_cluster_whose_streams_have_three_replicas(
+    tmp_path: Path, authority: Authority
+) -> None:
     nodes = tuple(f"127.0.0.1:{free_port()}" for _ in range(3))
     locations = [NodeLocation(tmp_path / str(i), i, nodes) for i in (1, 2, 3)]
     lines: list[str] = []
@@ -279,7 +289,7 @@ async def test_three_nodes_have_three_replicas(tmp_path: Path, authority: Author
         (["none.toml"], "none.toml: cannot be read"),
     ],
 )
-def test_errors_of_options(
+def test_invalid_options_are_rejected(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, _, err = run(capsys, "fleet", "serve", *arguments, "--folder", tmp_path)
@@ -298,7 +308,7 @@ def test_errors_of_options(
         ),
     ],
 )
-def test_errors_of_certificates(
+def test_missing_certificate_or_another_key_is_rejected(
     certificate: str, key: str, message: str, authority: Authority, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = authority.certificate.parent
@@ -314,7 +324,9 @@ def test_every_setting_is_documented() -> None:
     assert [name for name in names if f"{name}`" not in text] == []
 
 
-def test_token_needs_a_valid_pack_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_token_is_made_only_for_a_valid_pack_name_and_an_existing_tenant(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     code, _, err = run(capsys, "fleet", "user", "acme", "p1.>", "--folder", tmp_path)
     assert (code, err) == (2, "error: 'p1.>': not a pack name: at most 64 letters, digits, _ and -\n")
     code, _, err = run(capsys, "fleet", "user", "acme", "p1", "--folder", tmp_path)
@@ -330,7 +342,7 @@ def test_token_needs_a_valid_pack_name(tmp_path: Path, capsys: pytest.CaptureFix
         (None, "neither in"),
     ],
 )
-def test_missing_or_old_server_binary_raises(
+def test_missing_or_old_nats_server_is_reported_with_a_remedy(
     script: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if script:

@@ -9,7 +9,7 @@ import nats
 import pytest
 
 from bms_estimator.edge.block import decode
-from bms_estimator.edge.subjects import RAW_STREAM, BlockRequest, awaits, raw
+from bms_estimator.edge.subjects import RAW_STREAM, BlockRequest, block_request, raw
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.simulation.block_publisher import Report, run_edges
 from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEdges
@@ -24,7 +24,7 @@ PACKS, BLOCKS, RESENT_NUMBER = 20, 4, 3
 
 
 async def send_blocks(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, int]], int]:
-    """Publish the blocks of all edges; request the third block of one edge again.
+    """Publish the blocks of all edges, and request block ``RESENT_NUMBER`` of the first edge again.
 
     Returns:
         The report, the number of arrivals of each block, and the number of requests.
@@ -40,6 +40,7 @@ async def send_blocks(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, i
     publisher_task = asyncio.create_task(
         run_edges(fleet, edges, MqttSettings(url=mqtt), connections=2, stop=stop, report=str, quiet_s=LONG_S)
     )
+    first_pack = fleet.names[0]
     request = BlockRequest(store=int(fleet.store[0]), number=RESENT_NUMBER, resend=True).model_dump_json().encode()
 
     async def receive_one(timeout_s: float) -> None:
@@ -48,14 +49,14 @@ async def send_blocks(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, i
 
     while len(received) < PACKS * BLOCKS:
         await receive_one(LONG_S)
-    before, requests = received[fleet.names[0], RESENT_NUMBER], 0  # above 1 if an acknowledgment was late
+    arrivals_before, requests = received[first_pack, RESENT_NUMBER], 0  # above 1 if an acknowledgment was late
     async with asyncio.timeout(LONG_S):
-        while received[fleet.names[0], RESENT_NUMBER] == before or not edges.again:
-            await nc.publish(awaits(fleet.names[0]), b"no answer")
-            await nc.publish(awaits(fleet.names[0]), request)
+        while received[first_pack, RESENT_NUMBER] == arrivals_before or not edges.repeated:
+            await nc.publish(block_request(first_pack), b"no valid request")
+            await nc.publish(block_request(first_pack), request)
             requests += 1
             with contextlib.suppress(TimeoutError):  # an edge may miss a request, and ignores repetitions for RESEND_S
-                while received[fleet.names[0], RESENT_NUMBER] == before or not edges.again:
+                while received[first_pack, RESENT_NUMBER] == arrivals_before or not edges.repeated:
                     await receive_one(RESEND_S)
     stop.set()
     report = await publisher_task
@@ -67,13 +68,13 @@ async def send_blocks(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, i
     return report, received, requests
 
 
-def test_every_block_reaches_the_stream_and_a_requested_one_again(tmp_path: Path) -> None:
+def test_every_block_reaches_the_stream_and_a_requested_block_arrives_again(tmp_path: Path) -> None:
     with running(tmp_path, partitions=4) as cluster:
         report, received, requests = asyncio.run(send_blocks(cluster.url, f"mqtt://127.0.0.1:{cluster.mqtt_port}"))
     assert set(received) == {(f"sim-{i:06d}", n) for i in range(PACKS) for n in range(1, BLOCKS + 1)}
     assert received["sim-000000", RESENT_NUMBER] >= 2
     assert 1 <= report.resends <= requests  # several requests are sent only if a busy machine delays or loses one
-    assert report.again >= 1
+    assert report.repeated >= 1
 
 
 def test_command_writes_table_and_truth_and_rejects_invalid_options(
@@ -90,7 +91,7 @@ def test_command_writes_table_and_truth_and_rejects_invalid_options(
         ((), "--mqtt mqtt://host:port"),
         (("--mqtt", "http://nowhere"), "--mqtt http://nowhere"),
         (("--table", tmp_path / "no" / "packs.csv"), "cannot be written"),
-        (("--prefix", "a b", "--table", table), "--prefix a b: only letters"),
+        (("--prefix", "a b", "--table", table), "--prefix a b: must consist of letters, digits, _ and -"),
     ):
         code, _, err = run(capsys, *simulate, *arguments)
         assert (code, message in err) == (2, True), err

@@ -6,7 +6,7 @@ from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
 
-def test_demo_ends_and_reports_its_progress() -> None:
+def test_demo_ends_and_reports_workers_a_kill_and_no_lost_block() -> None:
     arguments = ["--packs", "20", "--seconds", "3", "--no-browser"]
     command = [PROGRAM, "fleet", "demo", *arguments]
     process = subprocess.run(command, capture_output=True, text=True, timeout=2 * LONG_S, check=False)

@@ -20,29 +20,30 @@ def fleet(packs: int, seed: int = 1) -> SimulatedFleet:
 
 
 def test_block_depends_only_on_seed_pack_and_number() -> None:
-    many, one = np.array([0, 5, 6, 7]), np.array([6])
+    four_packs, pack_6 = np.array([0, 5, 6, 7]), np.array([6])
     arrival_s = np.full(4, 1.8e9)
-    together = list(fleet(8).blocks(many, np.array([3, 1, 900, 2]), arrival_s))
-    alone = next(fleet(1000).blocks(one, np.array([900]), arrival_s[:1]))
-    assert together[2] == alone
+    with_others = list(fleet(8).blocks(four_packs, np.array([3, 1, 900, 2]), arrival_s))
+    alone = next(fleet(1000).blocks(pack_6, np.array([900]), arrival_s[:1]))
+    assert with_others[2] == alone
     block = decode(alone)
     assert (block.number, block.oldest, block.samples.size, block.store) == (900, 1, BLOCK_S, fleet(8).store[6])
-    assert next(fleet(8, seed=2).blocks(one, np.array([900]), arrival_s[:1])) != alone
+    assert next(fleet(8, seed=2).blocks(pack_6, np.array([900]), arrival_s[:1])) != alone
 
 
-def test_successive_blocks_are_continuous() -> None:
+def test_time_and_true_soc_are_continuous_between_successive_blocks() -> None:
     packs = np.arange(8)
     first, second = (fleet(8).samples(packs, np.full(8, number)) for number in (41, 42))
     time_s = np.concatenate((first["time_s"], second["time_s"]), axis=1)
     assert (np.diff(time_s, axis=1) > 0.9).all()
     assert np.abs(time_s[:, 0] - 40 * BLOCK_S).max() < 1.0
-    before, after = (fleet(8).soc(packs, np.full(8, 41.0 * BLOCK_S - ahead)) for ahead in (1e-6, -1e-6))
+    boundary_s = 41.0 * BLOCK_S
+    before, after = (fleet(8).soc(packs, np.full(8, boundary_s + offset_s)) for offset_s in (-1e-6, 1e-6))
     assert before == pytest.approx(after, abs=1e-8)
 
 
-def test_charge_agrees_with_the_true_soc() -> None:
+def test_charge_of_the_samples_agrees_with_the_change_of_the_true_soc() -> None:
     simulated = fleet(len(KINDS))
-    packs, begin, end = np.arange(len(KINDS)), 7, 127
+    packs, begin, end = np.arange(len(KINDS)), 7, 127  # numbers of blocks
     charge_as = sum(
         simulated.samples(packs, np.full(packs.size, n))["current_a"].sum(axis=1) for n in range(begin, end)
     )
@@ -52,23 +53,23 @@ def test_charge_agrees_with_the_true_soc() -> None:
 
 def test_estimator_with_the_settings_of_the_table_converges_to_the_true_soc() -> None:
     simulated = fleet(len(KINDS))
-    inside = []
+    is_inside_band = []
     for pack, kind in enumerate(KINDS):
         cell = load_cell(kind.cell, kind.capacity_ah).pack(kind.series, kind.parallel)
-        sampling = Sampling(kind.current_resolution_a, 0.0, 1.0)
+        sampling = Sampling(kind.current_resolution_a, 0.0, 1.0)  # without a dead band, at 1 Hz
         estimator = Estimator(cell, voltage_resolution_v=kind.voltage_resolution_v, sampling=sampling)
         for number in range(1, HOURS * 60 + 1):
             samples = simulated.samples(np.array([pack]), np.array([number]))[0]
             row = estimator.run(samples)[-1]
             truth = simulated.soc(np.array([pack]), samples["time_s"][-1:])[0]
-            inside.append(abs(row["soc"] - truth) < 3.0 * row["soc_std"])
+            is_inside_band.append(abs(row["soc"] - truth) < 3.0 * row["soc_std"])
         assert row["soc"] == pytest.approx(truth, abs=0.1)
-    assert np.mean(inside) > 0.9
+    assert np.mean(is_inside_band) > 0.9
 
 
-def test_edges_send_each_complete_block_once_oldest_first() -> None:
+def test_edges_send_the_blocks_that_are_complete_once_and_the_oldest_first() -> None:
     simulated = fleet(50)
-    edges = SimulatedEdges(simulated, start_s=1000.0, speed=60.0)
+    edges = SimulatedEdges(simulated, start_s=1000.0, speed=60.0)  # a block of a minute takes one second
     assert edges.due(1000.9, 100).packs.size == 0
     first_due = edges.due(1003.0, 7)
     assert first_due.packs.size == 7
@@ -76,13 +77,13 @@ def test_edges_send_each_complete_block_once_oldest_first() -> None:
     remaining = edges.due(1003.0, 100)
     assert set(remaining.packs[remaining.numbers == 1]) | set(first_due.packs) == set(range(50))
     assert (remaining.arrival_s <= 1003.0).all()
-    assert edges.again == 0
+    assert edges.repeated == 0
 
 
 def test_edges_resend_from_the_requested_block() -> None:
     simulated = fleet(2)
     edges = SimulatedEdges(simulated, start_s=0.0, speed=60.0, last=4)
-    while edges.due(100.0, 10).packs.size:
+    while edges.due(100.0, 10).packs.size:  # send all blocks
         pass
     assert edges.done
     assert edges.sent == 8
@@ -93,7 +94,7 @@ def test_edges_resend_from_the_requested_block() -> None:
     assert not edges.done
     resent = [edges.due(100.0, 10) for _ in range(3)]
     assert [list(zip(due.packs, due.numbers, strict=True)) for due in resent] == [[(1, 3)], [(1, 4)], []]
-    assert (edges.again, edges.resends, edges.safe[1]) == (2, 1, 3)
+    assert (edges.repeated, edges.resends, edges.confirmed_below[1]) == (2, 1, 3)
     # A request is ignored if its block was resent recently, or is confirmed.
     edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S / 2.0)
     edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=2, resend=True), RESEND_S)

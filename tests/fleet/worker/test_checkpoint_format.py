@@ -1,4 +1,4 @@
-"""Checkpoint format: intact, damaged, and of another version."""
+"""Format of checkpoints: intact, damaged, and written by another version."""
 
 import json
 from dataclasses import replace
@@ -21,7 +21,7 @@ from bms_estimator.fleet.worker.checkpoint_format import (
     read_checkpoint,
 )
 from bms_estimator.fleet.worker.deferred import Span
-from bms_estimator.fleet.worker.pack_state import PACK_STATE, WorkRecord
+from bms_estimator.fleet.worker.pack_state import PACK_STATE, UnpackedRecord
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.payloads import Estimate
 from tests.estimator.simulated_cell import pulses
@@ -42,15 +42,16 @@ snapshots = st.builds(
 
 
 def to_bytes(snapshot: PartitionCheckpoint) -> bytes:
+    """Return the encoded checkpoint."""
     return b"".join(snapshot.chunks())
 
 
 @given(snapshots)
-def test_snapshot_round_trip(snapshot: PartitionCheckpoint) -> None:
+def test_checkpoint_is_read_as_it_was_written(snapshot: PartitionCheckpoint) -> None:
     assert read_checkpoint(to_bytes(snapshot)) == snapshot
 
 
-def test_many_packs_are_split_into_chunks() -> None:
+def test_checkpoint_of_many_packs_is_split_into_chunks() -> None:
     packs = {f"pack{n}": bytes([n % 256]) * 1000 for n in range(3000)}
     snapshot = PartitionCheckpoint(0, 9, packs=packs)
     chunks = list(snapshot.chunks())
@@ -61,16 +62,16 @@ def test_many_packs_are_split_into_chunks() -> None:
 
 @given(snapshots, st.data())
 @settings(max_examples=200)
-def test_any_damage_raises_checkpoint_error(snapshot: PartitionCheckpoint, data) -> None:
+def test_damaged_checkpoint_raises_checkpoint_error(snapshot: PartitionCheckpoint, data) -> None:
     intact = to_bytes(snapshot)
     damaged = bytearray(intact)
     position = data.draw(st.integers(0, len(intact) - 1))
-    change = data.draw(st.sampled_from(["flip", "cut", "append", "drop"]))
-    if change == "flip":
+    change = data.draw(st.sampled_from(["flip a bit", "cut the end", "append", "drop bytes"]))
+    if change == "flip a bit":
         damaged[position] ^= 1 << data.draw(st.integers(0, 7))
-    elif change == "cut":
+    elif change == "cut the end":
         del damaged[position:]
-    elif change == "drop":
+    elif change == "drop bytes":
         del damaged[position : position + data.draw(st.integers(1, 20))]
     else:
         damaged += data.draw(st.binary(min_size=1))
@@ -78,7 +79,7 @@ def test_any_damage_raises_checkpoint_error(snapshot: PartitionCheckpoint, data)
         read_checkpoint(bytes(damaged))
 
 
-def test_any_changed_byte_is_detected() -> None:
+def test_each_single_changed_byte_is_detected() -> None:
     intact = to_bytes(PartitionCheckpoint(3, 7, {"blocks": 1}, {"a": b"12345678"}, deferred={"b": Span(5, 7)}))
     for position in range(len(intact)):
         with pytest.raises(CheckpointError):
@@ -86,14 +87,18 @@ def test_any_changed_byte_is_detected() -> None:
 
 
 def test_blocks_stored_by_an_earlier_version_are_read_from_the_stream_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = [checkpoint_format._entry(0, "known", b"12345678"), checkpoint_format._entry(255, "unknown", b"block")]
+    layout_index, stored_block = 0, 255  # an earlier version stored the blocks of unknown packs themselves
+    entries = [
+        checkpoint_format._entry(layout_index, "known", b"12345678"),
+        checkpoint_format._entry(stored_block, "unknown", b"block"),
+    ]
     monkeypatch.setattr(PartitionCheckpoint, "_entries", lambda *_: iter(entries))
     checkpoint = read_checkpoint(to_bytes(PartitionCheckpoint(3, 7, packs={"known": b"", "unknown": b""})))
     assert (checkpoint.packs, checkpoint.deferred) == ({"known": b"12345678"}, {"unknown": Span(1, 7)})
 
 
 @pytest.mark.parametrize("data", [b"", b"BMSFLEET", b"x" * 100])
-def test_other_bytes_are_rejected(data: bytes) -> None:
+def test_bytes_that_are_no_checkpoint_are_rejected(data: bytes) -> None:
     with pytest.raises(CheckpointError, match="checkpoint"):
         Partition.restore(0, table, data)
 
@@ -111,7 +116,7 @@ def test_error_of_a_newer_format_names_a_remedy(monkeypatch: pytest.MonkeyPatch)
         read_checkpoint(newer_format)
 
 
-def test_layout_round_trip() -> None:
+def test_layout_is_restored_to_the_dtype_of_a_pack_state() -> None:
     dtype = dtype_of(CURRENT_LAYOUT)
     assert layout_of(dtype) == CURRENT_LAYOUT
     assert dtype == PACK_STATE
@@ -129,65 +134,65 @@ def samples():
 
 
 class TestPreviousLayout:
-    """Layout without ``fit_age_s``, with an additional counter, and with another order of fields."""
+    """Checkpoint with records of another layout: no ``fit_age_s``, one more counter, and another order of fields."""
 
     @pytest.fixture
     def previous_layout(self, samples):
-        """Return a partition of this version, and its checkpoint as the other version would have written it."""
+        """Return a stream after 150 blocks, and its checkpoint as the other version would have written it."""
         stream = Stream(Partition(5, table))
         deliver(stream, "a", blocks_of(samples[:3000]))
         state = stream.partition.state("a")
         layout = json.loads(CURRENT_LAYOUT)
-        (estimator,) = (part for name, part, _ in layout if name == "estimator")
-        estimator[:] = [each for each in reversed(estimator) if each[0] != "fit_age_s"]
-        layout[0][1].append(["once_known", "<i8", []])
+        fields_of = {name: fields for name, fields, _ in layout}
+        fields_of["estimator"][:] = [each for each in reversed(fields_of["estimator"]) if each[0] != "fit_age_s"]
+        fields_of["delivery"].append(["once_known", "<i8", []])
         dtype = np.dtype(checkpoint_format._dtype_fields(layout))
-        work = WorkRecord(dtype)
+        work = UnpackedRecord(dtype)
         for part in dtype.names:
             for name in set(dtype[part].names) & set(PACK_STATE[part].names):
                 work.record[part][name] = state[part][name]
         work.record["delivery"]["once_known"] = 7
         previous_state = PreviousLayoutState(layout_of(dtype), work.packed_bytes())
         snapshot = stream.partition.snapshot()
-        return stream, to_bytes(replace(snapshot, packs={}, former={"a": previous_state}))
+        return stream, to_bytes(replace(snapshot, packs={}, unmigrated={"a": previous_state}))
 
     def test_next_block_migrates_the_record_by_field_names(self, previous_layout, samples) -> None:
         stream, data = previous_layout
-        same_version = stream.partition
-        other_version = Partition.restore(5, table, data)
+        unmigrated = stream.partition
+        migrated = Partition.restore(5, table, data)
         next_block = blocks_of(samples)[150]
-        sequence = other_version.sequence + 1
-        expected, migrated = (
-            Estimate.model_validate_json(each.take("a", next_block, sequence).state)
-            for each in (same_version, other_version)
+        sequence = migrated.sequence + 1
+        expected, estimate = (
+            Estimate.model_validate_json(partition.take("a", next_block, sequence).state)
+            for partition in (unmigrated, migrated)
         )
-        assert migrated.soc == pytest.approx(expected.soc, abs=0.005)
-        assert migrated.soc_std < 0.05
-        assert migrated.charge_out_ah == pytest.approx(expected.charge_out_ah)
-        assert other_version.counters["taken_over"] == 1
-        assert other_version.snapshot().former == {}
+        assert estimate.soc == pytest.approx(expected.soc, abs=0.005)
+        assert estimate.soc_std < 0.05
+        assert estimate.charge_out_ah == pytest.approx(expected.charge_out_ah)
+        assert migrated.counters["taken_over"] == 1
+        assert migrated.snapshot().unmigrated == {}
 
-    def test_record_stays_unchanged_until_a_block_is_processed(self, previous_layout, samples) -> None:
+    def test_record_keeps_its_layout_until_a_block_is_processed(self, previous_layout, samples) -> None:
         _, data = previous_layout
         partition = Partition.restore(5, table, data)
         blocks = blocks_of(samples)
-        assert partition.take("a", blocks[3], partition.sequence + 1).state is None
+        assert partition.take("a", blocks[3], partition.sequence + 1).state is None  # it was processed before
         assert partition.take("a", blocks[155], partition.sequence + 1).reply.number == 3000 // SAMPLES + 1
         assert partition.counters["packs"] == 1
-        assert partition.snapshot().former == read_checkpoint(data).former
+        assert partition.snapshot().unmigrated == read_checkpoint(data).unmigrated
         restored = Partition.restore(5, table, to_bytes(partition.snapshot()))
         assert restored.take("a", blocks[150], restored.sequence + 1).state
 
-    def test_continues_after_a_lost_block(self, previous_layout, samples) -> None:
+    def test_record_is_migrated_after_a_lost_block(self, previous_layout, samples) -> None:
         _, data = previous_layout
         partition = Partition.restore(5, table, data)
         early_block = blocks_of(samples)[151]
         states = [partition.take("a", early_block, partition.sequence + 1).state for _ in range(MAX_EARLY_REPEATS)]
         assert [state is None for state in states] == (MAX_EARLY_REPEATS - 1) * [True] + [False]
         assert partition.counters["lost_blocks"] == 1
-        assert partition.snapshot().former == {}
+        assert partition.snapshot().unmigrated == {}
 
-    def test_continues_after_a_lost_and_a_rejected_block(self, previous_layout, samples, monkeypatch) -> None:
+    def test_record_is_migrated_after_a_lost_and_a_rejected_block(self, previous_layout, samples, monkeypatch) -> None:
         _, data = previous_layout
         partition = Partition.restore(5, table, data)
         early_block, following = blocks_of(samples)[151:153]
@@ -198,8 +203,8 @@ class TestPreviousLayout:
         assert partition.take("a", following, partition.sequence + 1).state
         assert (partition.counters["lost_blocks"], partition.counters["too_dense"]) == (1, 1)
 
-    def test_invalid_record_is_reset(self, samples) -> None:
+    def test_record_that_does_not_fit_its_layout_is_reset(self, samples) -> None:
         previous_state = PreviousLayoutState(layout_of(np.dtype([("x", "<f8")])), b"1234567")
-        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, former={"a": previous_state})))
+        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, unmigrated={"a": previous_state})))
         assert partition.take("a", blocks_of(samples)[0], 1).state
         assert partition.counters["damaged_states"] == 1

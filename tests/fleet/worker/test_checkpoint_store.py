@@ -1,4 +1,4 @@
-"""Checkpoints on the real server: damaged, old, and written by a worker that lost the partition."""
+"""Checkpoints on the real server: the last two, damaged ones, and those of a worker that lost the partition."""
 
 import asyncio
 import json
@@ -43,6 +43,7 @@ async def _checkpoint_store(nc: Client, worker: str) -> CheckpointStore:
 
 
 async def _load(store: CheckpointStore, claim: Claim) -> list[bytes]:
+    """Return the intact checkpoints, the newest first."""
     return [data async for _, data in store.load(claim)]
 
 
@@ -53,6 +54,7 @@ async def _chunk_subject(nc: Client, name: str) -> str:
 
 
 async def _objects(nc: Client, partition: int) -> set[str]:
+    """Return the names of the stored checkpoints of a partition."""
     return {
         each.name
         for each in await (await nc.jetstream().object_store(subjects.STATES_BUCKET)).list()
@@ -60,48 +62,48 @@ async def _objects(nc: Client, partition: int) -> set[str]:
     }
 
 
-async def test_last_two_are_stored_and_damaged_ones_are_logged_and_skipped(nc):
+async def test_last_two_checkpoints_are_stored_and_damaged_ones_are_logged_and_skipped(nc):
     store = await _checkpoint_store(nc, "a")
     claim = await store.claim(7)
     written = [bytes([i]) * CHECKPOINT_BYTES for i in range(3)]
     for i, data in enumerate(written):
         claim = await store.write(claim, i, iter([data[:1], b"", data[1:]]))
     assert await _load(store, claim) == [written[2], written[1]]
-    newest, oldest = claim.pointer.kept
-    assert await _objects(nc, 7) == {newest.object, oldest.object}
+    newest, previous = claim.pointer.kept
+    assert await _objects(nc, 7) == {newest.object, previous.object}
 
     subject = await _chunk_subject(nc, newest.object)
-    await nc.jetstream().purge_stream(STATES_STREAM, subject=subject, keep=1)  # a chunk is missing
+    await nc.jetstream().purge_stream(STATES_STREAM, subject=subject, keep=1)  # only the last chunk remains
     with capture_logs() as logs:
         assert await _load(store, claim) == [written[1]]
     assert logs[0]["event"].startswith("a checkpoint is damaged")
     assert logs[0]["object"] == newest.object
-    subject = await _chunk_subject(nc, oldest.object)
+    subject = await _chunk_subject(nc, previous.object)
     await nc.jetstream().purge_stream(STATES_STREAM, subject=subject)  # all chunks are replaced
     await nc.jetstream().publish(subject, b"x" * CHECKPOINT_BYTES)
     assert await _load(store, claim) == []
 
 
-async def test_fenced_worker_cannot_write_and_leaves_no_object(nc):
-    slow, quick = await _checkpoint_store(nc, "slow"), await _checkpoint_store(nc, "quick")
-    claim = await slow.write(await slow.claim(8), 1, iter([b"1"]))
-    other_claim = await quick.claim(8)
-    assert await quick.confirm_claim(other_claim) == other_claim
-    with pytest.raises(FencedError, match="quick"):
-        await slow.confirm_claim(claim)
-    with pytest.raises(FencedError, match="quick"):
-        await slow.write(claim, 2, iter([b"2"]))
+async def test_worker_whose_partition_another_one_claimed_cannot_write_and_leaves_no_object(nc):
+    former, owner = await _checkpoint_store(nc, "former"), await _checkpoint_store(nc, "owner")
+    claim = await former.write(await former.claim(8), 1, iter([b"1"]))
+    other_claim = await owner.claim(8)
+    assert await owner.confirm_claim(other_claim) == other_claim
+    with pytest.raises(FencedError, match="owner"):
+        await former.confirm_claim(claim)
+    with pytest.raises(FencedError, match="owner"):
+        await former.write(claim, 2, iter([b"2"]))
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
-    assert await _load(quick, other_claim) == [b"1"]
-    # A worker was killed between two chunks of an object.
+    assert await _load(owner, other_claim) == [b"1"]
+    # a worker was killed between two chunks of an object; the next claim removes them
     await nc.jetstream().publish(f"$O.{subjects.STATES_BUCKET}.C.{other_claim.pointer.next}", b"3")
-    assert await _load(slow, await slow.claim(8)) == [b"1"]
+    assert await _load(former, await former.claim(8)) == [b"1"]
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
     remaining_subjects = (await nc.jetstream().stream_info(STATES_STREAM, subjects_filter=">")).state.subjects
     assert sum(".C.p8-" in subject for subject in remaining_subjects) == 1
 
 
-async def test_write_with_a_lost_response_is_recognized(nc):
+async def test_own_write_whose_response_was_lost_does_not_count_as_one_of_another_worker(nc):
     store, other = await _checkpoint_store(nc, "a"), await _checkpoint_store(nc, "b")
     claim = await store.claim(9)
     await store.write(claim, 1, iter([b"1"]))
@@ -115,7 +117,7 @@ async def test_write_with_a_lost_response_is_recognized(nc):
     assert await _load(other, other_claim) == [b"3", b"2"]
 
 
-async def test_worker_waits_for_streams_and_rows_and_continues_from_an_intact_checkpoint(tmp_path):
+async def test_worker_waits_for_streams_and_table_rows_and_continues_from_the_newest_intact_checkpoint(tmp_path):
     with running(tmp_path, partitions=1) as cluster:
         nc = await nats.connect(cluster.url)
         stop = asyncio.Event()
@@ -137,10 +139,10 @@ async def test_worker_waits_for_streams_and_rows_and_continues_from_an_intact_ch
         late_states = await nc.subscribe(subjects.published("p2", "state"))
         registry = await load_packs(nc, ["p1", "p2"])
         number = 1
-        for damaged in (0, 1, 2):
+        for damaged_count in (0, 1, 2):
             number += 1
             store = await _checkpoint_store(nc, "test")
-            for kept in (await store.claim(0)).pointer.kept[:damaged]:
+            for kept in (await store.claim(0)).pointer.kept[:damaged_count]:
                 await nc.jetstream().purge_stream(STATES_STREAM, subject=await _chunk_subject(nc, kept.object))
             stop = asyncio.Event()
             with capture_logs() as logs:
@@ -150,8 +152,8 @@ async def test_worker_waits_for_streams_and_rows_and_continues_from_an_intact_ch
                 stop.set()
                 await worker_task
             # a damaged checkpoint may be logged again when the worker is fenced and starts again
-            assert len({line["object"] for line in logs if "is damaged" in line["event"]}) == damaged
-            assert any("from its beginning" in line["event"] for line in logs) == (damaged == 2)
+            assert len({line["object"] for line in logs if "is damaged" in line["event"]}) == damaged_count
+            assert any("from its beginning" in line["event"] for line in logs) == (damaged_count == 2)
         await _until_block(late_states, 1)  # although no block arrived after the pack became known
         state = (await end_states(nc, registry, 1))[0].state("p1")
         assert state is not None
@@ -161,5 +163,6 @@ async def test_worker_waits_for_streams_and_rows_and_continues_from_an_intact_ch
 
 async def _until_block(states: Subscription, number: int) -> None:
     """Wait until the state after a block is published."""
-    while json.loads((await states.next_msg(LONG_S)).data)["board_time_s"] < PERIOD_S * (SAMPLES * number - 1):
+    last_sample_s = PERIOD_S * (SAMPLES * number - 1)
+    while json.loads((await states.next_msg(LONG_S)).data)["board_time_s"] < last_sample_s:
         pass

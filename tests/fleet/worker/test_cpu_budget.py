@@ -1,4 +1,4 @@
-"""Processor-time budget of each pack."""
+"""Budget of processor time of each pack."""
 
 import pytest
 
@@ -26,7 +26,8 @@ def test_only_the_pack_that_exhausted_its_budget_waits() -> None:
         budget.charge("flood", 100.0)  # counts as MAX_CHARGE_S
     assert budget.is_exhausted("flood")
     assert not budget.is_exhausted("honest")
-    clock.now_s = (CHARGES * MAX_CHARGE_S - BURST_S) / MAX_CPU_FRACTION + 0.1
+    excess_s = CHARGES * MAX_CHARGE_S - BURST_S
+    clock.now_s = excess_s / MAX_CPU_FRACTION + 0.1  # just after the budget has recovered
     assert not budget.is_exhausted("flood")
 
 
@@ -34,12 +35,12 @@ def test_source_at_1000_hz_stays_within_its_budget() -> None:
     clock = ManualClock()
     budget = CpuBudget(clock)
     for number in range(600):
-        clock.now_s = 7.0 * number
+        clock.now_s = 7.0 * number  # a block every 7 s
         assert not budget.is_exhausted("fast")
         budget.charge("fast", 0.035)  # 7,000 samples of 5 us each
 
 
-def test_idle_packs_are_not_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_stored_packs_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cpu_budget, "MAX_PACKS", 10)
     clock = ManualClock()
     budget = CpuBudget(clock)

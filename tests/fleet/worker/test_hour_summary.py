@@ -1,4 +1,4 @@
-"""Summary of a pack's hour in one row."""
+"""Row that summarizes an hour of a pack."""
 
 import json
 import math
@@ -22,6 +22,7 @@ PACK = PackSettings(name="p1", cell="ncr18650", series=1, parallel=2)
 
 
 def block(samples, number=1, store=STORE_ID_NS):
+    """Return a block that arrives at the time of its last sample."""
     last_s = float(samples["time_s"][-1])
     return Block(store=store, number=number, oldest=1, arrival_s=store / 1e9 + last_s, samples=samples)
 
@@ -29,8 +30,8 @@ def block(samples, number=1, store=STORE_ID_NS):
 def add_blocks(sums, estimator, samples, store=STORE_ID_NS):
     """Run the estimator over ``samples`` in blocks of 60, and add the results to ``sums``."""
     for first in range(0, samples.size, 60):
-        part = block(samples[first : first + 60], first // 60 + 1, store)
-        add(sums, estimator.run(part.samples), part, estimator)
+        minute_block = block(samples[first : first + 60], first // 60 + 1, store)
+        add(sums, estimator.run(minute_block.samples), minute_block, estimator)
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +43,11 @@ def hour():
     return sums, estimator, samples
 
 
-def test_row_has_the_measured_values(hour):
+def test_row_has_sums_means_and_extremes_of_the_measured_values(hour):
     sums, estimator, samples = hour
     summary = row(PACK, STORE_HOUR, sums, estimator)
     current, voltage = samples["current_a"], samples["voltage_v"]
-    steps = 0.5 * (current[1:] + current[:-1]) / 3600
+    steps_ah = 0.5 * (current[1:] + current[:-1]) / 3600  # charge between two samples, which are 1 s apart
     assert (summary.pack, summary.hour, summary.cell, summary.series, summary.parallel) == (
         "p1",
         STORE_HOUR,
@@ -55,15 +56,16 @@ def test_row_has_the_measured_values(hour):
         2,
     )
     assert (summary.samples, summary.dropped, summary.gaps, summary.seen_s) == (3600, 0, 0, 3599.0)
-    assert summary.charge_out_ah == pytest.approx(steps[steps > 0].sum())
-    assert summary.charge_in_ah == pytest.approx(-steps[steps < 0].sum())
+    assert summary.charge_out_ah == pytest.approx(steps_ah[steps_ah > 0].sum())
+    assert summary.charge_in_ah == pytest.approx(-steps_ah[steps_ah < 0].sum())
     watts = current * voltage
     assert summary.energy_out_wh - summary.energy_in_wh == pytest.approx(0.5 * (watts[1:] + watts[:-1]).sum() / 3600)
     assert summary.voltage_v == pytest.approx(voltage.mean())
     assert (summary.voltage_min_v, summary.voltage_max_v) == (voltage.min(), voltage.max())
     assert (summary.current_min_a, summary.current_max_a) == (current.min(), current.max())
     assert (summary.temperature_c, summary.temperature_min_c, summary.temperature_max_c) == (25.0, 25.0, 25.0)
-    assert summary.rest_s == (0.0 if current[-1] else pytest.approx(3599 - np.flatnonzero(current)[-1], abs=1))
+    time_since_last_load_s = 0.0 if current[-1] else pytest.approx(3599 - np.flatnonzero(current)[-1], abs=1)
+    assert summary.rest_s == time_since_last_load_s
 
 
 def test_row_has_the_estimates_at_the_end_of_the_hour(hour):
@@ -77,17 +79,17 @@ def test_row_has_the_estimates_at_the_end_of_the_hour(hour):
     assert abs(summary.soc_offset_correlation) <= 1.0
 
 
-def test_json_round_trip(hour):
+def test_row_is_restored_from_json(hour):
     text = row(PACK, STORE_HOUR, hour[0], hour[1]).model_dump_json()
     assert Hour.model_validate_json(text).model_dump_json() == text
     assert "NaN" not in text
 
 
-def test_row_does_not_depend_on_block_size(hour):
+def test_row_does_not_depend_on_the_size_of_the_blocks(hour):
     sums, estimator, samples = hour
-    one_block, other = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
-    add(one_block, other.run(samples), block(samples), other)
-    assert row(PACK, 1, one_block, other) == row(PACK, 1, sums, estimator)
+    one_block_sums, other_estimator = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
+    add(one_block_sums, other_estimator.run(samples), block(samples), other_estimator)
+    assert row(PACK, 1, one_block_sums, other_estimator) == row(PACK, 1, sums, estimator)
 
 
 def test_next_hour_starts_at_zero_and_includes_the_step_from_the_last_sample():
@@ -99,24 +101,24 @@ def test_next_hour_starts_at_zero_and_includes_the_step_from_the_last_sample():
     add_blocks(sums, estimator, samples[180:])
     second = row(PACK, 2, sums, estimator)
     assert (first.samples, second.samples, first.seen_s, second.seen_s) == (180, 180, 179.0, 180.0)
-    whole, other = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
-    add_blocks(whole, other, samples)
-    assert first.charge_out_ah + second.charge_out_ah == pytest.approx(row(PACK, 1, whole, other).charge_out_ah)
+    whole_sums, other_estimator = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
+    add_blocks(whole_sums, other_estimator, samples)
+    whole = row(PACK, 1, whole_sums, other_estimator)
+    assert first.charge_out_ah + second.charge_out_ah == pytest.approx(whole.charge_out_ah)
 
 
-def test_nothing_is_counted_across_gaps_and_clock_changes():
+def test_time_and_charge_across_gaps_and_changes_of_the_store_are_not_counted():
     samples, _ = pulses(soc=0.8, hours=0.1)
     samples["current_a"] = 1.0
     sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
     add_blocks(sums, estimator, samples[:60])
     add_blocks(sums, estimator, samples[120:180])  # a gap of 61 s
     estimator.resume(unseen_s=100.0)
-    add_blocks(
-        sums, estimator, samples[180:240], STORE_ID_NS + 1
-    )  # the time stamps of another store have another origin
+    # the timestamps of another store have another origin
+    add_blocks(sums, estimator, samples[180:240], STORE_ID_NS + 1)
     summary = row(PACK, 1, sums, estimator)
-    assert (summary.gaps, summary.seen_s) == (2, 3 * 59.0)
-    assert summary.charge_out_ah == pytest.approx(3 * 59.0 / 3600)
+    assert (summary.gaps, summary.seen_s) == (2, 3 * 59.0)  # 60 samples of each block span 59 s
+    assert summary.charge_out_ah == pytest.approx(3 * 59.0 / 3600)  # at 1 A
 
 
 def test_dropped_samples_are_counted_and_unknown_values_are_none():
@@ -126,17 +128,11 @@ def test_dropped_samples_are_counted_and_unknown_values_are_none():
     add(sums, estimator.run(samples), block(samples), estimator)
     summary = row(PACK, 1, sums, estimator)
     assert (summary.samples, summary.dropped) == (0, 3)
-    assert (
-        summary.soc
-        is summary.voltage_v
-        is summary.temperature_c
-        is summary.r_s_ratio
-        is summary.stability_margin_min
-        is None
-    )
+    unknown_values = (summary.soc, summary.voltage_v, summary.temperature_c, summary.r_s_ratio)
+    assert (*unknown_values, summary.stability_margin_min) == (None,) * 5
 
 
-def test_fuel_cell_has_no_soc():
+def test_row_of_a_fuel_cell_has_no_soc_and_capacity():
     samples = np.zeros(60, SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["current_a"] = range(60), 30.0, 1.0
     sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(load_any("pem_30w"))

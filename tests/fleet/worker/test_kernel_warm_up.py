@@ -6,26 +6,33 @@ import sys
 from bms_estimator.fleet.worker import kernel_warm_up
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 
-COUNT_SIGNATURES = """
+COUNT_SIGNATURES_SCRIPT = """
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.kernels import packed_record
 from bms_estimator.kernels.accumulators import charge_energy, hour, publish_window
 load_fleet_kernels()
-kernels = packed_record.pack, packed_record.unpack, charge_energy.accumulate_charge_energy, hour.accumulate_hour, publish_window.accumulate_window
+kernels = [packed_record.pack, packed_record.unpack]
+kernels += [charge_energy.accumulate_charge_energy, hour.accumulate_hour, publish_window.accumulate_window]
 print([len(kernel.signatures) for kernel in kernels])
 """
 
 
-def test_warm_up_processes_a_block_and_an_hour(monkeypatch) -> None:
-    results = []
-    take = kernel_warm_up.Partition.take
-    monkeypatch.setattr(kernel_warm_up.Partition, "take", lambda *args: results.append(take(*args)) or results[-1])
+def test_warm_up_processes_blocks_and_completes_an_hour(monkeypatch) -> None:
+    results, original_take = [], kernel_warm_up.Partition.take
+
+    def take(*args):
+        results.append(original_take(*args))
+        return results[-1]
+
+    monkeypatch.setattr(kernel_warm_up.Partition, "take", take)
     load_fleet_kernels()
     assert all(each.state and each.parameters for each in results)
     assert len(results[-1].hours) == 1
 
 
 def test_each_kernel_is_compiled_for_one_signature() -> None:
-    """Count the signatures in a separate process, because other tests may have called the kernels with other array types."""
-    process = subprocess.run([sys.executable, "-c", COUNT_SIGNATURES], check=True, capture_output=True, text=True)
+    """A separate process counts them, because other tests may have called the kernels with other array types."""
+    process = subprocess.run(
+        [sys.executable, "-c", COUNT_SIGNATURES_SCRIPT], check=True, capture_output=True, text=True
+    )
     assert process.stdout == "[1, 1, 1, 1, 1]\n"

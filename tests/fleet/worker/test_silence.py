@@ -1,4 +1,4 @@
-"""Partition lease without deliveries: messages of a dead worker, an intermediate owner, and an internal error."""
+"""Partition lease that gets no deliveries: after the death of another worker, another owner, or an internal error."""
 
 import asyncio
 from pathlib import Path
@@ -11,7 +11,7 @@ from structlog.testing import capture_logs
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
-from bms_estimator.fleet.worker.partition import Table
+from bms_estimator.fleet.worker.partition import PackLookup
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.worker import Options, work
@@ -36,7 +36,7 @@ async def test_messages_delivered_to_a_dead_worker_are_processed_without_further
             for pack in PACKS:
                 await send(nc, pack, block(pack, number))
         for number in used_partitions:
-            await _receive_and_die(nc, number, (BLOCKS - 1) * _packs_of(number))
+            await _receive_and_die(nc, number, (BLOCKS - 1) * _pack_count(number))
         stop = asyncio.Event()
         worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
         async with Heartbeats(nc) as heartbeats:
@@ -53,18 +53,20 @@ async def test_messages_delivered_to_a_dead_worker_are_processed_without_further
             state = partition.state(pack)
             assert state is not None
             assert state["estimator"].tobytes() == estimated(registry, pack, BLOCKS)
-            assert partition.counters["blocks"] == BLOCKS * _packs_of(partition.number)
+            assert partition.counters["blocks"] == BLOCKS * _pack_count(partition.number)
         await nc.close()
 
 
-async def test_internal_error_skips_its_block_and_is_counted(tmp_path: Path) -> None:
+async def test_block_with_an_internal_error_is_skipped_and_counted_as_a_fault(tmp_path: Path) -> None:
     with running(tmp_path, partitions=1) as cluster:
         nc = await nats.connect(cluster.url)
         await make_streams(nc, partitions=1)
         registry = await load_packs(nc, PACKS)
 
         def table(pack: str):
-            return registry(pack) if pack != "p1" else {}[pack]
+            if pack == "p1":
+                raise KeyError(pack)  # as by a bug
+            return registry(pack)
 
         lease, running_lease = await _lease_after_first_blocks(nc, table)
         assert lease.faults == 1
@@ -74,7 +76,7 @@ async def test_internal_error_skips_its_block_and_is_counted(tmp_path: Path) -> 
         await nc.close()
 
 
-async def test_fenced_worker_that_owns_the_partition_again_continues_from_the_checkpoint(
+async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_the_checkpoint(
     tmp_path: Path,
 ) -> None:
     with running(tmp_path, partitions=1) as cluster:
@@ -92,6 +94,7 @@ async def test_fenced_worker_that_owns_the_partition_again_continues_from_the_ch
 
         with capture_logs() as logs:
             await until(is_fenced, lambda: logs)
+            # the checkpoint has no block yet, so that the first block of each pack is processed again
             await until(lambda: lease.blocks >= 2 * len(PACKS), lambda: lease.blocks)
         assert lease.partition
         assert lease.partition.counters["blocks"] == len(PACKS)
@@ -103,12 +106,13 @@ async def test_fenced_worker_that_owns_the_partition_again_continues_from_the_ch
         await nc.close()
 
 
-def _packs_of(partition: int) -> int:
+def _pack_count(partition: int) -> int:
+    """Return the number of packs in a partition."""
     return sum(subjects.partition_of(pack, PARTITIONS) == partition for pack in PACKS)
 
 
-async def _lease_after_first_blocks(nc: Client, table: Table) -> tuple[PartitionLease, asyncio.Task[None]]:
-    """Return the running lease of the only partition after the first block of each pack."""
+async def _lease_after_first_blocks(nc: Client, table: PackLookup) -> tuple[PartitionLease, asyncio.Task[None]]:
+    """Run a lease of the only partition, and send it the first block of each pack. Return the lease and its task."""
     inbox = nc.new_inbox()
     lease = PartitionLease(
         nc, 0, table, await _checkpoint_store(nc, "w"), inbox, asyncio.Lock(), partitions=1, is_busy=lambda: False
@@ -123,16 +127,18 @@ async def _lease_after_first_blocks(nc: Client, table: Table) -> tuple[Partition
 
 
 async def _receive_and_die(nc: Client, partition: int, messages: int) -> None:
-    """Receive all messages of a partition without an acknowledgment, as a worker that dies."""
+    """Receive all messages of a partition and acknowledge none, as a worker that dies."""
     inbox = nc.new_inbox()
     consumer = PinnedConsumer(nc, partition, inbox)
     await _subscribe(nc, f"{inbox}.*", consumer.receive)
     await consumer.renew()
     await until(lambda: len(consumer.waiting) == messages, lambda: len(consumer.waiting))
-    assert consumer.pinned
+    assert consumer.has_pin
 
 
 async def _subscribe(nc: Client, subject: str, receive) -> None:
+    """Call ``receive`` with each message of a subject."""
+
     async def on_message(message: Msg) -> None:
         receive(message)
 

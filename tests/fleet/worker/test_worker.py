@@ -1,4 +1,4 @@
-"""Workers and server nodes kills while simulated edges send: no block is lost or counted twice.
+"""Workers and server nodes that are killed while simulated edges send: no block is lost or counted twice.
 
 ``make fleet-kills`` sets the numbers of kills, nodes and packs by ``KILLS``, ``NODES`` and ``PACKS``.
 """
@@ -46,10 +46,13 @@ MEAN_UPTIME_S = 1.0
 MAX_DOWNTIME_S = 2.0
 """Maximum delay of the restart after a kill [s]."""
 BLOCKS_AFTER_KILLS = 5
-"""Number of blocks of each edge after the last kill. They are needed because a worker requests a missing block when the next one arrives."""
+"""Number of blocks of each edge after the last kill.
+
+They are needed because a worker requests a missing block when the next one arrives.
+"""
 
 
-async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path) -> None:
+async def test_states_and_hour_rows_after_kills_are_those_of_one_run(tmp_path: Path) -> None:
     with running(tmp_path, NODES, partitions=PARTITIONS) as cluster, ExitStack() as stack:
         nc = await connected(cluster.urls)
         await make_streams(nc, partitions=PARTITIONS, replicas=NODES)
@@ -59,17 +62,18 @@ async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path)
         await bucket.refresh()
         workers, names = dict[str, Process](), (f"w{number}" for number in itertools.count(1))
 
-        def start() -> None:
+        def start_worker() -> None:
             name = next(names)
             workers[name] = Process(tmp_path, ",".join(cluster.urls), name, "--checkpoint-s", 1)
             stack.callback(workers[name].kill)
 
-        def blocks(last: Mapping[str, Heartbeat]) -> int:
+        def count_blocks(last: Mapping[str, Heartbeat]) -> int:
+            """Return the number of blocks that the partitions of the running workers have processed."""
             return sum(last[name].counters.get("blocks", 0) for name in workers if name in last)
 
-        start()
-        start()
-        speed = BLOCKS_PER_S * BLOCK_S / PACKS
+        start_worker()
+        start_worker()
+        speed = BLOCKS_PER_S * BLOCK_S / PACKS  # simulated seconds per second
         edges, stop = SimulatedEdges(fleet, start_s=time.time(), speed=speed), asyncio.Event()
         settings = MqttSettings(url=tuple(f"mqtt://127.0.0.1:{port}" for port in cluster.mqtt_ports))
         publisher_task = asyncio.create_task(
@@ -77,29 +81,29 @@ async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path)
         )
         async with Heartbeats(nc) as heartbeats:
             await heartbeats.until_held(PARTITIONS, *workers)
-            await heartbeats.until(blocks)
-            dice, kills = random.Random(SEED), Counter[str]()
+            await heartbeats.until(count_blocks)
+            rng, kills = random.Random(SEED), Counter[str]()
             for kill in range(KILLS):
-                await asyncio.sleep(dice.expovariate(1.0 / MEAN_UPTIME_S))
+                await asyncio.sleep(rng.expovariate(1.0 / MEAN_UPTIME_S))
                 if kill % 2:
-                    kills[await kill_node(cluster, dice)] += 1
+                    kills[await kill_node(cluster, rng)] += 1
                 else:
-                    workers.pop(dice.choice(sorted(workers))).kill()
-                    await asyncio.sleep(dice.uniform(0.0, MAX_DOWNTIME_S))
-                    start()
+                    workers.pop(rng.choice(sorted(workers))).kill()
+                    await asyncio.sleep(rng.uniform(0.0, MAX_DOWNTIME_S))
+                    start_worker()
                     kills["worker"] += 1
             await heartbeats.until_held(PARTITIONS, *workers)
-            suspended, other = workers
+            suspended, other = workers  # a suspended worker loses its partitions, and is fenced out when it continues
             workers[suspended].signal(signal.SIGSTOP)
             await heartbeats.until_held(PARTITIONS, other)
             workers[suspended].signal(signal.SIGCONT)
             await workers[suspended].logged("fenced out")
             await heartbeats.until_held(PARTITIONS, *workers)
-            edges.last = int(edges.next.max()) + BLOCKS_AFTER_KILLS
+            edges.last = int(edges.next_number.max()) + BLOCKS_AFTER_KILLS
             processed_blocks = 0
             while processed_blocks < edges.last * PACKS:  # a busy machine may take longer than the limit of one wait
-                await heartbeats.until(lambda last, before=processed_blocks: blocks(last) > before)
-                processed_blocks = blocks(heartbeats.last)
+                await heartbeats.until(lambda last, before=processed_blocks: count_blocks(last) > before)
+                processed_blocks = count_blocks(heartbeats.last)
         assert processed_blocks == edges.last * PACKS
         stop.set()
         sys.stdout.write(f"{NODES} nodes, kills: {dict(kills)}; {await publisher_task}\n")
@@ -113,7 +117,7 @@ async def test_states_and_hours_after_kills_are_those_of_one_run(tmp_path: Path)
             for samples in fleet.samples(np.full(edges.last, i), np.arange(1, edges.last + 1)):
                 estimator.run(samples)
             assert state["estimator"].tobytes() == estimator.record.tobytes()
-        assert await hours(nc) == expected_hours(bucket.packs, fleet, edges)
+        assert await stored_hours(nc) == expected_hours(bucket.packs, fleet, edges)
         await nc.close()
 
 
@@ -123,18 +127,18 @@ def pack_rows(fleet: SimulatedFleet, path: Path) -> dict[str, bytes]:
     return {pack: row.data for pack, row in read_table(path).packs.items()}
 
 
-async def kill_node(cluster: NatsCluster, dice: random.Random) -> str:
+async def kill_node(cluster: NatsCluster, rng: random.Random) -> str:
     """Kill and restart a node, in half of the cases the leader of the blocks' stream. Return its role."""
     leader = cluster.leader(subjects.RAW_STREAM)
-    node = leader if leader >= 0 and dice.random() < 0.5 else dice.randrange(NODES)
+    node = leader if leader >= 0 and rng.random() < 0.5 else rng.randrange(NODES)
     cluster.kill(node)
-    await asyncio.sleep(dice.uniform(0.0, MAX_DOWNTIME_S))
+    await asyncio.sleep(rng.uniform(0.0, MAX_DOWNTIME_S))
     await asyncio.to_thread(cluster.start, node)
     return "leader" if node == leader else "node"
 
 
-async def hours(nc: Client) -> dict[str, bytes]:
-    """Return all hour rows by their ids, without duplicates."""
+async def stored_hours(nc: Client) -> dict[str, bytes]:
+    """Return all stored hour rows by their ids, after a check that none is stored twice."""
     js = nc.jetstream(timeout=LONG_S)
     rows = {}
     state = (await js.stream_info(subjects.HOURS_STREAM)).state
@@ -156,10 +160,10 @@ def expected_hours(registry: PackRegistry, fleet: SimulatedFleet, edges: Simulat
     return rows
 
 
-def test_partitions_are_shared_evenly_and_few_move() -> None:
+def test_partitions_are_shared_evenly_and_few_move_when_a_worker_joins() -> None:
     before, after = assign_partitions(64, ["a", "b"]), assign_partitions(64, ["a", "b", "c"])
     assert sorted(Counter(before).values()) == [32, 32]
-    assert max(Counter(after).values()) == 22
+    assert max(Counter(after).values()) == 22  # of 64 partitions among three workers
     moved = sum(old != new for old, new in zip(before, after, strict=True))
-    assert moved <= 28  # the minimum is 20
+    assert moved <= 28  # the third worker gets at least 20
     assert assign_partitions(3, ["a", "b"]) == assign_partitions(3, ["b", "a"])

@@ -18,11 +18,11 @@ from tests import mann_stack
 
 PEM = load_fuel_cell("pem_30w")
 THETA = np.array([0.1, -0.05, 0.03, 0.2, 0.1, 0.05, 0.3, 0.0])
-"""Logarithms of the parameters relative to those of the file."""
+"""Logarithms of seven parameters relative to those of the file, and an unused value."""
 STEPS = ((3.0, 0.01), (3.0, 0.02), (6.0, 0.005), (9.0, 0.1), (12.0, 0.1), (0.5, 0.03), (0.0, 0.5))
 """Currents [A], one beyond the limiting current, and durations [s]."""
-currents_a = st.floats(0.0, 8.0)
-durations_s = st.floats(1e-4, 10.0)
+currents_a, durations_s = st.floats(0.0, 8.0), st.floats(1e-4, 10.0)
+"""Strategies of currents [A] and durations [s]."""
 
 
 def file_constants() -> np.ndarray:
@@ -33,14 +33,14 @@ def file_constants() -> np.ndarray:
 
 
 def steady_state(current_a: float, theta: np.ndarray = THETA) -> tuple[np.ndarray, np.ndarray]:
-    """Return the states after a long time at ``current_a``, and their derivatives."""
+    """Return the states after a long time at ``current_a``, and their derivatives by theta."""
     x, dx = np.zeros(2), np.zeros((2, LEARNABLE))
     fuel_cell.steady_state(x, dx, theta, file_constants(), current_a)
     return x, dx
 
 
 def voltages(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the voltage after each of ``STEPS`` and its derivatives."""
+    """Return the voltage after each of ``STEPS``, and its derivatives by theta."""
     (x, dx), voltages_v, slopes = steady_state(0.0, theta), [], []
     for current_a, dt_s in STEPS:
         fuel_cell.advance(x, dx, theta, file_constants(), current_a, dt_s)
@@ -50,15 +50,16 @@ def voltages(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(voltages_v), np.array(slopes)
 
 
-def test_reversible_voltage_is_that_of_the_standard_state() -> None:
-    assert fuel_cell.nernst(298.15, 1.0, 1.0) == 1.229
+def test_the_reversible_voltage_depends_on_temperature_and_pressures() -> None:
+    """The arguments are the temperature [K] and the pressures of hydrogen and oxygen [atm]."""
+    assert fuel_cell.nernst(298.15, 1.0, 1.0) == 1.229  # standard state
     # Larminie and Dicks, Fuel Cell Systems Explained, section 2.2: 1.19 V at 70 C
     assert fuel_cell.nernst(343.15, 1.0, 1.0) == pytest.approx(1.191, abs=5e-4)
     assert fuel_cell.nernst(343.15, 1.0, 0.21) < fuel_cell.nernst(343.15, 1.0, 1.0) < fuel_cell.nernst(343.15, 2.0, 1.0)
 
 
 @pytest.mark.parametrize("j", range(len(fuel_cell.NAMES)), ids=fuel_cell.NAMES)
-def test_sensitivities_are_those_of_finite_differences(j: int) -> None:
+def test_sensitivities_of_the_voltage_agree_with_finite_differences(j: int) -> None:
     step = 1e-6 * np.eye(LEARNABLE)[j]
     differences = (voltages(THETA + step)[0] - voltages(THETA - step)[0]) / 2e-6
     np.testing.assert_allclose(voltages(THETA)[1][:, j], differences, atol=1e-7)
@@ -69,12 +70,12 @@ def test_sensitivities_are_those_of_finite_differences(j: int) -> None:
 def test_two_steps_under_one_current_equal_one_step(
     before_a: float, current_a: float, first_s: float, second_s: float
 ) -> None:
-    (x, dx), (y, dy) = steady_state(before_a), steady_state(before_a)
+    (x, dx), (x_once, dx_once) = steady_state(before_a), steady_state(before_a)
     for dt_s in (first_s, second_s):
         fuel_cell.advance(x, dx, THETA, file_constants(), current_a, dt_s)
-    fuel_cell.advance(y, dy, THETA, file_constants(), current_a, first_s + second_s)
-    np.testing.assert_allclose(x, y, rtol=1e-9)
-    np.testing.assert_allclose(dx, dy, rtol=1e-7, atol=1e-9)
+    fuel_cell.advance(x_once, dx_once, THETA, file_constants(), current_a, first_s + second_s)
+    np.testing.assert_allclose(x, x_once, rtol=1e-9)
+    np.testing.assert_allclose(dx, dx_once, rtol=1e-7, atol=1e-9)
 
 
 def test_the_step_agrees_with_an_independent_integration() -> None:
@@ -84,6 +85,7 @@ def test_the_step_agrees_with_an_independent_integration() -> None:
     end_v = steady_state(5.0, np.zeros(LEARNABLE))[0][0]
 
     def voltage_rate(_: float, v: np.ndarray) -> np.ndarray:
+        """Return the rate of the activation loss [V/s]."""
         return (5.0 + internal_a) * -np.expm1((v - end_v) / tafel_v) / farad
 
     expected_v = solve_ivp(voltage_rate, (0.0, 0.02), [x[0]], rtol=1e-11, atol=1e-12).y[0, -1]
@@ -97,19 +99,19 @@ def test_a_small_step_decays_with_the_charge_transfer_resistance_of_tafel(curren
     """The time constant is C A / I, because the charge transfer resistance is A / I, with A of Tafel's equation."""
     values = file_constants()
     values[fuel_cell.B] = 1e-9  # almost no concentration loss
-    step = 1e-3
+    relative_step = 1e-3
     reaction_a = current_a + values[fuel_cell.INTERNAL]
     tau_s = values[fuel_cell.C_DL] * values[fuel_cell.TAFEL] / reaction_a
     x, dx = np.zeros(2), np.zeros((2, LEARNABLE))
     fuel_cell.steady_state(x, dx, np.zeros(LEARNABLE), values, current_a)
     start_v = x[0]
-    fuel_cell.advance(x, dx, np.zeros(LEARNABLE), values, (1.0 + step) * current_a, tau_s)
-    response = (x[0] - start_v) / (values[fuel_cell.TAFEL] / reaction_a * step * current_a)
+    fuel_cell.advance(x, dx, np.zeros(LEARNABLE), values, (1.0 + relative_step) * current_a, tau_s)
+    response = (x[0] - start_v) / (values[fuel_cell.TAFEL] / reaction_a * relative_step * current_a)
     assert response == pytest.approx(1.0 - np.exp(-1.0), rel=2e-3)
 
 
 @given(st.lists(st.floats(-0.4, 0.4), min_size=7, max_size=7))
-def test_a_polarisation_curve_always_falls(parameters: list[float]) -> None:
+def test_a_polarisation_curve_falls_for_all_parameters(parameters: list[float]) -> None:
     theta = np.array([*parameters, 0.0])
     current_a = np.linspace(0.0, 15.0, 200)
     voltage_v, _ = polarisation(PEM.a, theta, current_a, np.full(200, np.nan))
@@ -143,7 +145,7 @@ def test_the_model_is_finite_under_charge_and_overload() -> None:
         assert np.isfinite(dx).all()
 
 
-def test_cell_and_fuel_cell_models_define_the_same_functions() -> None:
+def test_cell_and_fuel_cell_models_define_the_functions_that_the_learning_law_calls() -> None:
     for function in ("load_constants", "steady_state", "advance", "output", "write"):
         parameter_names = [
             tuple(inspect.signature(getattr(m, function).py_func).parameters)

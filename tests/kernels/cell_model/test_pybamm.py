@@ -1,4 +1,4 @@
-"""Comparison of the simulated cell with PyBaMM's Thevenin model, which has independent equations and an own solver.
+"""Comparison of the simulated cell with PyBaMM's Thevenin model, which has equations and a solver of its own.
 
 Numbers in parentheses are equations of the thesis.
 """
@@ -23,7 +23,7 @@ START_SOC = 0.95
 LOAD = ((0.4, 60), (0.0, 60), (-0.25, 60), (0.0, 60), (0.4, 600), (0.0, 600), (0.15, 300))
 """Currents [A], positive on discharge, and durations [s]. Some are shorter and some longer than the time constants."""
 ROUNDS = 3
-"""Number of repetitions of the load. They end at an SOC of 0.06, at which every element is nonlinear."""
+"""Number of repetitions of the load. They end at an SOC of 0.06, at which every element depends strongly on the SOC."""
 MAX_ERROR_V = 1e-4
 
 
@@ -40,9 +40,11 @@ def thevenin_voltages(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     import pybamm  # noqa: PLC0415 - takes seconds, and only the worker that runs this test needs it
 
     def over_soc(amplitude: float, exponent: float, offset: float) -> Callable[..., Any]:
+        """Return an element as a function of the SOC."""
         return lambda _temperature, _current, soc: amplitude * pybamm.exp(-exponent * soc) + offset
 
     def emf(soc: Any) -> Any:
+        """Return the open-circuit voltage [V]."""
         return -a[16] * pybamm.exp(-a[17] * soc) + a[18] + a[19] * soc - a[20] * soc**2 + a[21] * soc**3  # (2.10)
 
     model = pybamm.equivalent_circuit.Thevenin(options={"number of rc elements": 2})

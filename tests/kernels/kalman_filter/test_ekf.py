@@ -1,4 +1,8 @@
-"""Kalman filter: Jacobians, update and mixtures compared with their definitions, and operation over hours."""
+"""Kalman filter: comparison of Jacobians, update and mixtures with their definitions, and operation over hours.
+
+``s`` is a record of EKF_STATE and ``p`` of EKF_SETTINGS. x_k are the currents through the RC pairs, and h is the
+derivative of the predicted voltage by the state.
+"""
 
 from itertools import pairwise
 
@@ -21,8 +25,8 @@ from bms_estimator.settings.observer import IdentifierSettings
 from tests.estimator.anywhere.cases import CASES, Case, capture
 
 CELL = load_cell("nmc", 3.0)
-BRANCH = slice(X, X + BRANCHES)
-"""States of the currents through the RC pairs."""
+RC_CURRENTS = slice(X, X + BRANCHES)
+"""Indices of the RC pairs' currents in the state vector."""
 MIDDLE_SOC = 0.55
 COOL_C = 12.0
 """Temperature between two of the cell file [C]."""
@@ -31,7 +35,7 @@ MEASUREMENT_V2 = 0.05**2
 
 
 def make_settings(**changes):
-    """Return the settings of a generic NMC cell with changed fields."""
+    """Return the filter settings of a generic NMC cell, with ``changes`` of their fields."""
     p = filter_settings(CELL, ocv_grid(CELL), IdentifierSettings(), 1e-3, None)[0]
     for name, value in changes.items():
         p[name] = value
@@ -39,16 +43,19 @@ def make_settings(**changes):
 
 
 def make_state(p, seed=1, time_s=1.0):
-    """Return a state during a drive with random mean and covariance and a window of five samples in ``time_s``."""
+    """Return a state during a drive: one hypothesis with random mean and covariance, and a window of five samples.
+
+    ``time_s`` is the duration of the window.
+    """
     rng = np.random.default_rng(seed)
     s = np.zeros(1, EKF_STATE)[0]
     hypotheses.initialize_filter(s, p, MIDDLE_SOC, 1.5, COOL_C)
     s["count"], s["best"] = 1, 0
-    s["mean"][0] = 0.3 * rng.standard_normal(STATES) * np.sqrt(np.diag(s["covariance"][3]))
+    std = np.sqrt(np.diag(s["covariance"][3]))  # initial std of one of the hypotheses
+    s["mean"][0] = 0.3 * rng.standard_normal(STATES) * std
     s["mean"][0, SOC] = MIDDLE_SOC
-    mixed = rng.standard_normal((STATES, STATES))
-    std = np.sqrt(np.diag(s["covariance"][3]))
-    s["covariance"][0] = (mixed @ mixed.T / STATES) * std[:, None] * std
+    root = rng.standard_normal((STATES, STATES))
+    s["covariance"][0] = (root @ root.T / STATES) * std[:, None] * std
     s["x_a"] = rng.normal(1.0, 0.5, BRANCHES)
     for current_a, voltage_v in zip(rng.normal(1.5, 0.5, 5), rng.normal(3.6, 0.01, 5), strict=True):
         window.integrate_current(s, p, time_s / 5, False, current_a, COOL_C)
@@ -57,12 +64,16 @@ def make_state(p, seed=1, time_s=1.0):
 
 
 def linearise(s, p):
-    """Linearise about the first hypothesis; return its predicted voltage and its std from the curvature [V]."""
+    """Linearise about the first hypothesis.
+
+    Returns:
+        Predicted voltage [V], and std of the error due to the curvature of the OCV [V].
+    """
     return ekf.linearise(s, p, 0, s["mean"][0, SOC], s["covariance"][0, SOC, SOC])
 
 
 def predict_voltage(s, p, mean):
-    """Return the predicted voltage for the mean ``mean`` of the first hypothesis [V]."""
+    """Return the predicted voltage if the first hypothesis has the mean ``mean`` [V]."""
     s["mean"][0] = mean
     return linearise(s, p)[0]
 
@@ -82,7 +93,7 @@ def test_h_is_the_derivative_of_the_voltage_by_every_state_except_the_soc() -> N
         assert h[j] == pytest.approx(by_difference, rel=1e-6, abs=1e-9), j
 
 
-def test_h_by_the_soc_is_the_secant_of_the_ocv_over_one_std() -> None:
+def test_h_of_the_soc_is_the_secant_of_the_ocv_between_plus_and_minus_one_std() -> None:
     p = make_settings(sensor_v2=0.0)
     s = make_state(p)
     soc_std = 0.1
@@ -94,14 +105,16 @@ def test_h_by_the_soc_is_the_secant_of_the_ocv_over_one_std() -> None:
     assert s["h"][SOC] == pytest.approx((above_v - below_v) / (2 * soc_std), rel=1e-3)
 
 
-def test_p_is_propagated_by_the_derivative_of_the_mean() -> None:
-    """F P F' of the kernel is the prediction from P minus that from 0. It is compared with F by finite differences.
+def test_the_covariance_is_propagated_by_the_derivative_of_the_mean() -> None:
+    """Without Q, the predicted covariance is F P F'. F is computed by finite differences.
 
-    ``curve_soc`` is large enough that the error of the OCV does not depend on the SOC, a dependence that F omits.
+    Q is the prediction from a covariance of 0. ``curve_soc`` is so large that the error of the OCV hardly depends on
+    the SOC, because F omits this dependence.
     """
     p = make_settings(curve_soc=0.3)
 
     def predict(mean, covariance):
+        """Return the predicted mean and covariance."""
         s = make_state(p, time_s=20.0)
         s["mean"][0], s["covariance"][0] = mean, covariance
         ekf.transition_diagonal(s, p)
@@ -119,12 +132,12 @@ def test_p_is_propagated_by_the_derivative_of_the_mean() -> None:
     assert f[SOC, OFFSET] > 0.0
     assert f[SOC, LN_Q] > 0.0
     assert f[X, OFFSET] < -0.9
-    by_kernel = predict(mean, covariance)[1] - predict(mean, zero)[1]
+    without_q = predict(mean, covariance)[1] - predict(mean, zero)[1]
     expected, nodes = f @ covariance @ f.T, np.arange(NODE, STATES)
-    # Q of the nodes depends on P, so that their variances are compared with a tolerance.
-    assert by_kernel[nodes, nodes] == pytest.approx(expected[nodes, nodes], abs=1.0 / ekf_noise.AGED_SOC)
-    by_kernel[nodes, nodes] = expected[nodes, nodes]
-    assert by_kernel == pytest.approx(expected, rel=1e-6, abs=1e-12)
+    # Q of the OCV nodes depends on P, so that their variances are compared with a tolerance.
+    assert without_q[nodes, nodes] == pytest.approx(expected[nodes, nodes], abs=1.0 / ekf_noise.AGED_SOC)
+    without_q[nodes, nodes] = expected[nodes, nodes]
+    assert without_q == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
 def test_the_update_equals_the_kalman_update() -> None:
@@ -133,6 +146,7 @@ def test_the_update_equals_the_kalman_update() -> None:
     _, curvature_v = linearise(s, p)
     mean, covariance, h = (np.array(x) for x in (s["mean"][0], s["covariance"][0], s["h"]))
     innovation_variance_v2 = h @ covariance @ h + MEASUREMENT_V2 + curvature_v**2
+    # The mean voltage of the window is 0.3 std above the prediction.
     s["window"]["sum_v"] = s["window"]["samples"] * (linearise(s, p)[0] + 0.3 * np.sqrt(innovation_variance_v2))
     innovation_v, variance_v2, linear_variance_v2 = ekf.update(s, p, 0, MEASUREMENT_V2)
     gain = covariance @ h / innovation_variance_v2
@@ -144,9 +158,9 @@ def test_the_update_equals_the_kalman_update() -> None:
 
 @pytest.mark.parametrize(
     ("name", "prior_soc", "prior_std", "true_soc"),
-    [*(("chen_mora", 0.045, 0.035, true) for true in (0.06, 0.08, 0.1, 0.13)), ("lfp", 0.037, 0.1, 0.21)],
+    [*(("chen_mora", 0.045, 0.035, true_soc) for true_soc in (0.06, 0.08, 0.1, 0.13)), ("lfp", 0.037, 0.1, 0.21)],
 )
-def test_an_update_over_the_knee_near_empty_agrees_with_bayes(
+def test_an_update_of_the_soc_over_the_ocv_knee_near_empty_agrees_with_bayes(
     name: str, prior_soc: float, prior_std: float, true_soc: float
 ) -> None:
     """The update of the SOC alone is compared with the posterior on a grid.
@@ -173,7 +187,7 @@ def test_an_update_over_the_knee_near_empty_agrees_with_bayes(
 
 
 def test_an_innovation_of_many_std_is_limited_to_two() -> None:
-    """Its effect on the slow bias is as large as that of an innovation of two std."""
+    """The effect of an innovation of 8 std on the slow bias is compared with that of 2 std."""
     p = make_settings()
     corrections_v = []
     for stds in (2.0, 8.0):
@@ -189,8 +203,8 @@ def test_an_innovation_of_many_std_is_limited_to_two() -> None:
     assert corrections_v[1] == pytest.approx(corrections_v[0] * 2.0 / 8.0)
 
 
-def test_the_load_before_switch_on_is_a_stationary_random_load() -> None:
-    """Its covariance is compared with the solution of the Lyapunov equation of load and RC pairs, given a current of 2 A."""
+def test_rc_currents_at_switch_on_are_those_of_a_stationary_random_load() -> None:
+    """Mean and covariance are those of the Lyapunov equation of load and RC pairs, given a first current of 2 A."""
     p = make_settings()
     s = np.zeros(1, EKF_STATE)[0]
     mean, covariance = s["mean"][0], s["covariance"][0]
@@ -200,16 +214,17 @@ def test_the_load_before_switch_on_is_a_stationary_random_load() -> None:
     a[1:, 0] = 1.0 / TAUS
     noise = np.zeros((size, size))
     noise[0, 0] = 2.0 * (p["load_c"] * one_c) ** 2 / p["load_s"]
+    # The load is a Gauss-Markov process plus a constant random level.
     joint = solve_continuous_lyapunov(a, -noise) + (p["load_level_c"] * one_c) ** 2
     gain = joint[1:, 0] / joint[0, 0]
     expected_a = p["load_mean_c"] * one_c + gain * (2.0 - p["load_mean_c"] * one_c)
-    assert mean[BRANCH] == pytest.approx(expected_a)
-    assert covariance[BRANCH, BRANCH] == pytest.approx(joint[1:, 1:] - np.outer(gain, joint[0, 1:]))
+    assert mean[RC_CURRENTS] == pytest.approx(expected_a)
+    assert covariance[RC_CURRENTS, RC_CURRENTS] == pytest.approx(joint[1:, 1:] - np.outer(gain, joint[0, 1:]))
 
 
 @pytest.mark.parametrize(("first_c", "rms_c"), [(0.0, 0.3), (-0.2, 0.3), (1.0, 1.0), (2.5, 1.285), (-6.0, 1.285)])
-def test_the_first_sample_of_a_drive_may_be_a_peak(first_c: float, rms_c: float) -> None:
-    """The model's error follows the RMS of the load. The first sample increases it at most to the RMS before switch-on."""
+def test_the_first_sample_of_a_drive_is_treated_as_a_possible_peak(first_c: float, rms_c: float) -> None:
+    """The RMS of the load, on which the model's error depends, starts at most at the long-term RMS of 1.285 C."""
     p = make_settings()
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
@@ -219,7 +234,7 @@ def test_the_first_sample_of_a_drive_may_be_a_peak(first_c: float, rms_c: float)
 
 
 @pytest.mark.parametrize("first_c", [1.5, 3.0, 6.0])
-def test_the_load_in_a_gap_after_a_peak_may_have_continued_or_ended(first_c: float) -> None:
+def test_the_load_assumed_in_a_gap_after_a_peak_may_have_continued_or_ended(first_c: float) -> None:
     """The std of the unknown current includes that of the long-term RMS load, 1.285 C."""
     p = make_settings()
     one_c = p["capacity_as"] / 3600.0
@@ -235,11 +250,12 @@ def test_measurement_variance_grows_outside_the_temperatures_of_the_cell_file() 
     variances = []
     for s["temperature_c"] in (10.0, 30.0, 60.0, -60.0):
         variances.append(ekf_noise.measurement_variance(s, p, 1.0, 5) / p["model_v"] ** 2)
+    # The std doubles within ``OUTSIDE_K`` (30 K) of the range.
     assert variances == pytest.approx([1.0, 1.0, 4.0, 9.0])
 
 
 def test_errors_do_not_decrease_above_the_temperatures_of_the_cell_file() -> None:
-    """Resistances decrease at high temperatures, but errors of the model do not."""
+    """Resistances decrease at high temperatures, but errors of the model increase by half of their value in 15 K."""
     p = make_settings(low_c=0.0, high_c=30.0)
     s = make_state(p)
     variances = []
@@ -250,47 +266,47 @@ def test_errors_do_not_decrease_above_the_temperatures_of_the_cell_file() -> Non
     assert variances[2] == pytest.approx(2.0**2 * np.array(variances[0]), rel=0.01)
 
 
-def test_inflation_is_one_for_white_innovations_and_grows_for_persistent_ones() -> None:
+def test_bias_inflation_is_near_one_for_white_innovations_and_grows_for_persistent_ones() -> None:
     s = np.zeros(1, EKF_STATE)[0]
     s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
     rng, slow_inflations = np.random.default_rng(3), []
-    for u in rng.standard_normal(20_000):
-        ekf.adapt_bias_inflation(s, 0, 1.0, u)
+    for normalized_innovation in rng.standard_normal(20_000):
+        ekf.adapt_bias_inflation(s, 0, 1.0, normalized_innovation)
         slow_inflations.append(s["slow_inflation"][0])
     # The mean is above 1, because ratios below 1 count as 1.
     assert np.mean(slow_inflations) == pytest.approx(1.3, abs=0.3)
     for _ in range(7200):
-        ekf.adapt_bias_inflation(s, 0, 1.0, 0.2)
+        ekf.adapt_bias_inflation(s, 0, 1.0, 0.2)  # small, but always of the same sign
     assert s["slow_inflation"][0] > 30.0
     assert s["fast_inflation"][0] > 3.0
 
 
 @pytest.mark.parametrize("dt_s", [1.0, 10.0, 60.0, 600.0])
-def test_inflation_of_white_innovations_is_small_for_any_sample_period(dt_s: float) -> None:
+def test_bias_inflation_for_white_innovations_is_small_at_any_sample_period(dt_s: float) -> None:
     s = np.zeros(1, EKF_STATE)[0]
     s["fast_inflation"][0] = s["slow_inflation"][0] = 1.0
     rng, inflations = np.random.default_rng(4), []
-    for u in rng.standard_normal(20_000):
-        ekf.adapt_bias_inflation(s, 0, dt_s, u)
+    for normalized_innovation in rng.standard_normal(20_000):
+        ekf.adapt_bias_inflation(s, 0, dt_s, normalized_innovation)
         inflations.append((s["fast_inflation"][0], s["slow_inflation"][0]))
     assert np.mean(inflations, axis=0) == pytest.approx([1.3, 1.3], abs=0.3)
 
 
-def test_a_single_innovation_after_a_gap_causes_no_inflation(drive) -> None:
+def test_a_single_innovation_after_a_gap_causes_no_bias_inflation(drive) -> None:
     estimator = make_estimator(drive)
     f = estimator.record[0]["filter"]
     estimator.run(drive.samples[:1800])
     assert f["count"] == 1
     names = "fast_inflation", "slow_inflation", "minute_u", "ten_minutes_u"
     before, seeded_s = [float(f[name][0]) for name in names], float(f["seeded_s"])
-    estimator.run(drive.samples[1980:1981])
+    estimator.run(drive.samples[1980:1981])  # three minutes later
     assert [float(f[name][0]) for name in names] == before
     assert f["seeded_s"] == seeded_s + 181.0  # the sample was processed
     assert estimator.state["gaps"][0] == 1
 
 
-def test_rc_pairs_after_a_gap_have_the_covariance_of_an_unknown_load() -> None:
-    """The covariance is compared with 4000 draws of a load with a level and a Gauss-Markov process over three minutes."""
+def test_rc_currents_after_a_gap_have_the_std_of_an_unknown_load() -> None:
+    """The std is that of 4000 draws of a load, a constant level plus a Gauss-Markov process, over three minutes."""
     p, rng = make_settings(), np.random.default_rng(6)
     load_a, correlation_s, gap_s, draws = 2.0, p["load_s"], 180, 4000
     level_a = load_a * rng.standard_normal(draws)
@@ -300,22 +316,22 @@ def test_rc_pairs_after_a_gap_have_the_covariance_of_an_unknown_load() -> None:
         process_a += -process_a * (1.0 - np.exp(-1.0 / correlation_s))
         process_a += load_a * np.sqrt(1.0 - np.exp(-2.0 / correlation_s)) * rng.standard_normal(draws)
     covariance, f = np.zeros((STATES, STATES)), np.ones(STATES)
-    f[BRANCH] = np.exp(-gap_s / TAUS)
+    f[RC_CURRENTS] = np.exp(-gap_s / TAUS)
     ekf_noise.add_gap_noise(p, covariance, f, load_a, gap_s / p["capacity_as"])
-    assert np.sqrt(np.diag(covariance)[BRANCH]) == pytest.approx(x.std(axis=1), rel=0.15)
+    assert np.sqrt(np.diag(covariance)[RC_CURRENTS]) == pytest.approx(x.std(axis=1), rel=0.15)
 
 
 @pytest.mark.parametrize("gap_s", [1.0, 6.0, 10.0, 30.0, 180.0, 3600.0])
-def test_the_noise_of_a_gap_is_a_covariance(gap_s: float) -> None:
+def test_the_covariance_added_in_a_gap_is_symmetric_and_positive_semidefinite(gap_s: float) -> None:
     p, covariance, f = make_settings(), np.zeros((STATES, STATES)), np.ones(STATES)
-    f[BRANCH] = np.exp(-gap_s / TAUS)
+    f[RC_CURRENTS] = np.exp(-gap_s / TAUS)
     ekf_noise.add_gap_noise(p, covariance, f, 2.0, gap_s / p["capacity_as"])
     assert covariance == pytest.approx(covariance.T)
     assert np.linalg.eigvalsh(covariance).min() > -1e-12
 
 
-def mixture(mean, covariance, weight):
-    """Return mean and covariance of a mixture of normal distributions."""
+def moments_of_mixture(mean, covariance, weight):
+    """Return mean and covariance of a mixture of normal distributions with these means, covariances and weights."""
     weight = weight / weight.sum()
     mixture_mean = weight @ mean
     deviation = mean - mixture_mean
@@ -324,24 +340,24 @@ def mixture(mean, covariance, weight):
 
 
 def make_hypotheses(p, count=3):
-    """Return a state with several random hypotheses, 0.1 of SOC socs, and their weights."""
+    """Return a state with several random hypotheses, whose SOCs differ by 0.1, and their weights."""
     s = make_state(p)
     rng = np.random.default_rng(4)
     for q in range(count):
-        mixed = rng.standard_normal((STATES, STATES))
-        s["mean"][q], s["covariance"][q] = rng.standard_normal(STATES), mixed @ mixed.T
+        root = rng.standard_normal((STATES, STATES))
+        s["mean"][q], s["covariance"][q] = rng.standard_normal(STATES), root @ root.T / 400.0
         s["mean"][q, SOC] = 0.3 + 0.1 * q
-        s["covariance"][q] /= 400.0
         s["ln_weight"][q] = -0.4 * q
     s["count"], s["best"] = count, 0
     return s, np.exp(s["ln_weight"][:count])
 
 
 @pytest.mark.parametrize("series", [1.0, 6.0])
-def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
+def test_the_published_soc_and_std_are_those_of_the_mixture(series: float) -> None:
+    """In a pack of several cells in series, the std also covers the imbalance of the cells."""
     p = make_settings(series=series)
     s, weight = make_hypotheses(p)
-    mean, covariance = mixture(s["mean"][:3], s["covariance"][:3], weight)
+    mean, covariance = moments_of_mixture(s["mean"][:3], s["covariance"][:3], weight)
     mixture_moments(s)
     assert s["soc"] == pytest.approx(mean[SOC])
     assert s["soc_std"] == pytest.approx(np.sqrt(covariance[SOC, SOC]))
@@ -351,7 +367,7 @@ def test_the_soc_is_mean_and_std_of_the_mixture(series: float) -> None:
 
 def test_merging_preserves_mean_and_covariance() -> None:
     s, weight = make_hypotheses(make_settings(), 2)
-    mean, covariance = mixture(s["mean"][:2], s["covariance"][:2], weight)
+    mean, covariance = moments_of_mixture(s["mean"][:2], s["covariance"][:2], weight)
     merge_pair(s, 0, 1)
     assert s["mean"][0] == pytest.approx(mean)
     assert s["covariance"][0] == pytest.approx(covariance)
@@ -368,39 +384,40 @@ def test_unlikely_hypotheses_are_removed_and_similar_ones_merged() -> None:
     assert s["mean"][:2, SOC] == pytest.approx([0.3, 0.5025])
 
 
-@pytest.mark.parametrize("true", [0, 1])
-def test_a_hypothesis_with_a_large_bias_loses_weight(true: int) -> None:
-    """The biases of the wrong hypothesis, 0.2 V, have absorbed its error, so that its innovations are small."""
+@pytest.mark.parametrize("right", [0, 1])
+def test_a_hypothesis_with_a_large_bias_loses_weight(right: int) -> None:
+    """The bias of the wrong hypothesis, 0.2 V, has absorbed its error, so that its innovations are small."""
     p, socs = make_settings(), (0.4, 0.7)
     s, _ = make_hypotheses(p, 2)
     voltage_v = 0.0
-    for q in (1 - true, true):
+    wrong = 1 - right
+    for q in (wrong, right):
         s["mean"][q], s["covariance"][q] = 0.0, 1e-6 * np.eye(STATES)
         s["mean"][q, SOC] = socs[q]
         voltage_v = ekf.linearise(s, p, q, socs[q], 1e-6)[0]
-    s["mean"][1 - true, B_SLOW] = voltage_v - ekf.linearise(s, p, 1 - true, socs[1 - true], 1e-6)[0]
+    s["mean"][wrong, B_SLOW] = voltage_v - ekf.linearise(s, p, wrong, socs[wrong], 1e-6)[0]
     s["ln_weight"][:2] = 0.0
-    assert abs(s["mean"][1 - true, B_SLOW]) > 0.2
+    assert abs(s["mean"][wrong, B_SLOW]) > 0.2
     for _ in range(60):
         window.integrate_current(s, p, 1.0, False, s["current_a"], 25.0)
         s["window"]["samples"] = 0
         window.add_to_window(s, s["current_a"], voltage_v)
         hypotheses.update_hypotheses(s, p)
     likely = s["mean"][: s["count"], SOC][s["ln_weight"][: s["count"]] > -3.0]
-    assert likely == pytest.approx([socs[true]], abs=0.05)
+    assert likely == pytest.approx([socs[right]], abs=0.05)
 
 
-DRIVE = next(case for case in CASES if case.name == "oxide 25C")
-FAST = Case("100 Hz", rate_hz=100.0, hours=0.25, unseen_h=0.3, seed=5)
+DRIVE_CASE = next(case for case in CASES if case.name == "oxide 25C")
+FAST_CASE = Case("100 Hz", rate_hz=100.0, hours=0.25, unseen_h=0.3, seed=5)
 
 
 def make_estimator(drive, soc_error=0.2):
-    """Return an estimator with a wrong initial SOC."""
+    """Return an estimator for a capture, whose initial SOC is wrong by ``soc_error``."""
     return Estimator(drive.cell, initial_soc=float(drive.soc[0] + soc_error))
 
 
 @pytest.mark.parametrize("dt_s", [1.0, 10.0, 60.0])
-def test_calibration_interpolates_the_current_as_the_filter_does(dt_s: float) -> None:
+def test_rc_currents_of_the_calibration_equal_those_of_the_filter(dt_s: float) -> None:
     current_a = np.repeat(np.random.default_rng(0).uniform(0.0, 3.0, 50), 4)
     samples = np.zeros(current_a.size, dtype=SAMPLE)
     samples["time_s"], samples["current_a"] = dt_s * np.arange(current_a.size), current_a
@@ -414,17 +431,19 @@ def test_calibration_interpolates_the_current_as_the_filter_does(dt_s: float) ->
 
 @pytest.fixture(scope="module")
 def drive():
-    return capture(DRIVE)
+    """Return the capture of a drive at 1 Hz."""
+    return capture(DRIVE_CASE)
 
 
 @pytest.fixture(scope="module")
 def fast():
-    return capture(FAST)
+    """Return the capture of a drive at 100 Hz."""
+    return capture(FAST_CASE)
 
 
 @pytest.mark.parametrize("rate_hz", [0.1, 1.0, 100.0, 1000.0])
 def test_the_covariance_stays_valid_at_any_rate(drive, fast, rate_hz: float) -> None:
-    """The covariance is exactly symmetric, has no variance below 0 beyond rounding, and is finite."""
+    """At 1000 Hz, the time stamps of the capture at 100 Hz are changed."""
     samples = {0.1: drive.samples[::10], 1.0: drive.samples, 100.0: fast.samples, 1000.0: fast.samples.copy()}[rate_hz]
     if rate_hz == 1000.0:
         samples["time_s"] = samples["time_s"][0] + np.arange(samples.size) / rate_hz
@@ -433,6 +452,7 @@ def test_the_covariance_stays_valid_at_any_rate(drive, fast, rate_hz: float) -> 
 
 @pytest.mark.parametrize("gap_s", [2, 6, 12, 60])
 def test_the_covariance_stays_valid_through_gaps(drive, gap_s: int) -> None:
+    # Each part is 30 s of samples, and ``gap_s`` without samples follow.
     parts = [part[: part.size - gap_s] for part in np.split(drive.samples[:3600], range(gap_s + 30, 3600, gap_s + 30))]
     assert_covariance_stays_valid(make_estimator(drive), parts)
 
@@ -460,13 +480,12 @@ def assert_valid_covariances(f) -> None:
 
 def test_100_samples_a_second_give_the_result_of_one_sample_a_second(fast) -> None:
     """The mean of all samples of a second is used in a single update."""
-    slow = fast.samples[::100]
-    many, few = (make_estimator(fast).run(samples).copy() for samples in (fast.samples, slow))
-    many = many[::100]
-    assert many["time_s"] == pytest.approx(few["time_s"])
+    at_100_hz = make_estimator(fast).run(fast.samples)[::100].copy()
+    at_1_hz = make_estimator(fast).run(fast.samples[::100])
+    assert at_100_hz["time_s"] == pytest.approx(at_1_hz["time_s"])
     late = slice(300, None)
-    assert np.abs(many["soc"] - few["soc"])[late].max() < 0.004
-    assert many["soc_std"][late] == pytest.approx(few["soc_std"][late], rel=0.1)
+    assert np.abs(at_100_hz["soc"] - at_1_hz["soc"])[late].max() < 0.004
+    assert at_100_hz["soc_std"][late] == pytest.approx(at_1_hz["soc_std"][late], rel=0.1)
 
 
 def test_hypotheses_converge_to_one(drive) -> None:
@@ -483,7 +502,7 @@ def test_hypotheses_converge_to_one(drive) -> None:
 
 
 def test_rows_of_removed_hypotheses_are_zero(drive) -> None:
-    """The rows of merged and removed hypotheses are zero. After convergence these are all rows except one."""
+    """Hypotheses are merged or removed during convergence, and when new ones are spawned."""
     estimator = make_estimator(drive)
     f = estimator.record[0]["filter"]
     rows = "mean", "covariance", "ln_weight", "minute_u", "ten_minutes_u", "fast_inflation", "slow_inflation"
@@ -549,7 +568,7 @@ def test_a_non_finite_temperature_is_replaced_by_the_next_sample(drive) -> None:
     assert f["temperature_c"] == 8.0
 
 
-def test_single_temperatures_of_85_degrees_are_limited(drive) -> None:
+def test_short_readings_of_85_degrees_have_a_limited_effect_on_the_temperature(drive) -> None:
     estimator, samples = make_estimator(drive), drive.samples[:1200].copy()
     samples["temperature_c"] = 25.0
     samples["temperature_c"][[0, 1]] = samples["temperature_c"][600:630] = 85.0
@@ -563,7 +582,7 @@ def test_single_temperatures_of_85_degrees_are_limited(drive) -> None:
 
 @pytest.mark.parametrize("downtime_s", [7200.0, np.inf])
 def test_the_measured_temperature_is_used_at_once_after_a_restart(drive, downtime_s: float) -> None:
-    """The bias std after the restart is that of the cold cell, whatever the temperature was before."""
+    """After the restart the std of the bias is that of a cold cell, also if the cell was warm before."""
     bias_v = []
     for before_c in (25.0, -15.0):
         estimator, samples = make_estimator(drive), drive.samples[:602].copy()
@@ -592,7 +611,9 @@ def test_non_finite_values_are_reset_and_counted(drive, field: str) -> None:
 
 
 @pytest.mark.parametrize(("soc", "is_limited"), [(1.02, True), (-0.02, True), (0.6, False)])
-def test_a_limited_soc_does_not_update_offset_capacity_and_curve(soc: float, is_limited: bool) -> None:
+def test_an_soc_outside_0_to_1_is_limited_and_does_not_update_offset_capacity_and_ocv(
+    soc: float, is_limited: bool
+) -> None:
     p = make_settings()
     s = make_state(p)
     s["mean"][0, SOC] = soc

@@ -1,4 +1,4 @@
-"""Correction of the OCV by states at nodes over SOC."""
+"""Correction of the cell file's OCV by states of the filter, one for each node of the SOC."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ CURVE_GRID = np.linspace(0.0, 1.0, 41)
 """SOC grid of the declared error of the OCV."""
 
 
-def test_the_initial_variance_equals_that_of_the_curve_at_and_between_nodes() -> None:
+def test_the_initial_variance_of_the_correction_equals_that_of_the_ocv_at_and_between_nodes() -> None:
     p = Estimator(GENERIC).settings_record[0]["filter"]
     x, covariance = np.ones(STATES), np.ones((STATES, STATES))  # values that the reset must replace
     reset_ocv_correction(x, covariance)
@@ -35,7 +35,7 @@ def test_the_initial_variance_equals_that_of_the_curve_at_and_between_nodes() ->
         assert np.isclose(h @ covariance @ h, p["learned"] * error_v**2, rtol=1e-12)
 
 
-def test_the_correction_is_interpolated_in_units_of_the_error() -> None:
+def test_the_correction_is_interpolated_between_nodes_in_units_of_the_ocv_error() -> None:
     p = Estimator(GENERIC).settings_record[0]["filter"]
     x = np.zeros(STATES)
     x[NODE:] = np.arange(NODES)
@@ -46,7 +46,7 @@ def test_the_correction_is_interpolated_in_units_of_the_error() -> None:
     assert ocv_correction(p, x, 1.1) == ocv_correction(p, x, 1.0)
 
 
-def test_a_curve_with_a_plateau_is_not_learned() -> None:
+def test_an_ocv_with_a_plateau_is_not_learned() -> None:
     """On a plateau the voltage determines neither SOC nor OCV. Therefore the error of the OCV stays that of the cell file."""
     estimator = Estimator(load_cell("lfp", 2.0), initial_soc=0.5)
     for second in range(1200):
@@ -59,13 +59,14 @@ def test_a_curve_with_a_plateau_is_not_learned() -> None:
 
 
 def simulate_partial_cycles(cell: CellModel, cycles: int) -> tuple[np.ndarray, np.ndarray, Estimator]:
-    """Return the error of the SOC, its std, and the estimator, for an initial SOC 0.1 too high.
+    """Run an estimator whose initial SOC is 0.1 too high; return the error of the SOC, its std, and the estimator.
 
     Each cycle is a drive from SOC 0.85 to about 0.35, a rest, a charge and a rest.
     """
     pieces, soc, charge_c, rest_s = [], 0.85, 0.35, 2400
     for n in range(cycles):
         drive = load_a(Case("", seed=n), seconds=3600)
+        # The drive ends after half of the capacity.
         drive = drive[: int(np.argmax(np.cumsum(drive) > 0.5 * 3600.0 * OXIDE.capacity_ah)) or drive.size]
         charge_a = charge_c * OXIDE.capacity_ah
         charge = np.full(round(drive.sum() / charge_a), -charge_a)
@@ -74,7 +75,10 @@ def simulate_partial_cycles(cell: CellModel, cycles: int) -> tuple[np.ndarray, n
     samples = np.zeros(current_a.size, dtype=SAMPLE)
     samples["time_s"], samples["current_a"], samples["temperature_c"] = np.arange(current_a.size), current_a, 25.0
     curves = OXIDE.ocv_v, OXIDE.per_kelvin_v, OXIDE.hysteresis_v, OXIDE.ohm
-    samples["voltage_v"], true_soc = simulate(1.0, current_a, samples["temperature_c"], soc, 1.0, 3.0, *curves)
+    branch = 1.0  # the cell was charged
+    samples["voltage_v"], true_soc = simulate(
+        1.0, current_a, samples["temperature_c"], soc, branch, OXIDE.capacity_ah, *curves
+    )
     estimator = Estimator(cell, initial_soc=soc + 0.1)
     trace = estimator.run(samples)
     return trace["soc"] - true_soc, trace["soc_std"].copy(), estimator
@@ -91,10 +95,9 @@ def test_repeated_cycles_do_not_make_the_soc_overconfident() -> None:
     assert np.mean(nees) < 1.5
 
 
-def test_a_generic_curve_is_learned_within_the_accuracy_of_the_soc() -> None:
-    """Between SOC 0.35 and 0.85 no voltage determines the SOC on a wrong curve.
-
-    Therefore neither SOC nor curve becomes certain.
+def test_the_ocv_of_a_generic_cell_is_learned_as_far_as_the_soc_is_known() -> None:
+    """The cycles between SOC 0.35 and 0.85 reach no steep part of the OCV that would determine the SOC. Therefore
+    neither SOC nor OCV becomes certain.
     """
     error, std, estimator = simulate_partial_cycles(GENERIC, cycles=6)
     assert (np.abs(error[900:]) < 2.0 * std[900:]).mean() > 0.95

@@ -1,4 +1,4 @@
-"""Mittag-Leffler function E_a(-r^a): comparison with its series in many digits, and the Nussbaum property."""
+"""Mittag-Leffler function E_a(-r^a): comparison with its series in many digits, and the property of a Nussbaum gain."""
 
 import math
 
@@ -9,7 +9,7 @@ import pytest
 from bms_estimator.kernels.observer.mittag_leffler import SERIES_LIMIT, decay_table, mittag_leffler, series_coefficients
 
 MAX_R = 60.0
-"""Maximum of the tested arguments."""
+"""Maximum of the tested arguments r."""
 
 
 def sum_series(alpha: float, r: float) -> float:
@@ -23,25 +23,26 @@ def sum_series(alpha: float, r: float) -> float:
 
 
 @pytest.mark.parametrize("alpha", [2.05, 2.5, 2.9, 2.999, 3.0])
-def test_error_is_below_1e_10_of_the_envelope_for_r_in_0_to_60(alpha: float) -> None:
+def test_the_error_is_below_1e_10_of_the_amplitude_for_r_in_0_to_60(alpha: float) -> None:
     series, (value, slope) = series_coefficients(alpha), decay_table(alpha)
     for r in np.concatenate([[0.0, SERIES_LIMIT - 1e-3, SERIES_LIMIT + 1e-3], np.linspace(0.05, MAX_R, 40)]):
-        envelope = max(1.0, 2.0 / alpha * math.exp(r * math.cos(math.pi / alpha)))
-        assert abs(mittag_leffler(r, alpha, series, value, slope) - sum_series(alpha, r)) < 1e-10 * envelope
+        # The function oscillates with an exponentially growing amplitude.
+        amplitude = max(1.0, 2.0 / alpha * math.exp(r * math.cos(math.pi / alpha)))
+        assert abs(mittag_leffler(r, alpha, series, value, slope) - sum_series(alpha, r)) < 1e-10 * amplitude
 
 
-def test_value_at_zero_is_one() -> None:
+def test_the_value_at_zero_is_one() -> None:
     assert mittag_leffler(0.0, 2.5, series_coefficients(2.5), *decay_table(2.5)) == 1.0
 
 
 @pytest.mark.parametrize("alpha", [2.0, 3.01, 0.5, math.nan])
-def test_alpha_without_nussbaum_property_is_rejected(alpha: float) -> None:
+def test_an_alpha_without_the_nussbaum_property_is_rejected(alpha: float) -> None:
     with pytest.raises(ValueError, match=r"must be in \(2, 3\]"):
         decay_table(alpha)
 
 
-def test_the_running_mean_is_unbounded_in_both_directions() -> None:
-    """Definition 2.2.2.1 of the thesis: the mean of N over 0..k is unbounded above and below, because its swings grow."""
+def test_the_swings_of_the_mean_over_0_to_k_grow_in_both_directions() -> None:
+    """By definition 2.2.2.1 of the thesis, the mean of a Nussbaum gain N over 0..k is unbounded above and below."""
     series, (value, slope) = series_coefficients(2.5), decay_table(2.5)
     k = np.linspace(0.0, 40.0, 40_001)
     n = np.array([mittag_leffler(x, 2.5, series, value, slope) for x in k])

@@ -1,6 +1,8 @@
-"""Observer of the thesis: exact steps, limit of Lemma 4.1.3, tracking, and lock.
+"""Observer of the thesis: exact steps, limits of the parameters, tracking of the voltage, and lock.
 
-Numbers in parentheses are equations of the thesis. docs/theory/thesis.md lists where the observer differs from it.
+Numbers in parentheses are equations of the thesis. docs/theory/thesis.md lists the differences between observer and
+thesis. k is the adaptive gain, and N(k) the Nussbaum gain. The lock is lost while the error of the voltage is too
+large.
 """
 
 import numpy as np
@@ -30,7 +32,7 @@ def make_samples(time_s: np.ndarray, current_a: np.ndarray, voltage_v: np.ndarra
 
 
 def simulate_discharge(cell: CellModel, hours: float, rate_hz: float, current_a: float) -> SampleBlock:
-    """Return samples of ``cell`` under a constant current, from full."""
+    """Return samples of ``cell`` from full under the constant current ``current_a`` [A]."""
     time_s = np.arange(int(hours * 3600 * rate_hz)) / rate_hz
     current = np.full(len(time_s), current_a)
     voltage_v, _ = simulate_cell((1.0, 0.0, 0.0), time_s, current, cell.cell.capacity_ah * 3600, cell.a)
@@ -38,7 +40,7 @@ def simulate_discharge(cell: CellModel, hours: float, rate_hz: float, current_a:
 
 
 @given(st.floats(0.0, 50.0), st.floats(-1.0, 1.0), st.floats(0.05, 1e3), st.floats(0.05, 1e4), st.floats(1e-4, 3600.0))
-def test_states_step_equals_the_matrix_exponential(
+def test_a_step_of_the_rc_voltages_equals_the_matrix_exponential(
     gain: float, drop_v: float, tau_ts: float, tau_tl: float, dt_s: float
 ) -> None:
     state = np.zeros(1, dtype=OBSERVER_STATE)
@@ -47,14 +49,17 @@ def test_states_step_equals_the_matrix_exponential(
     matrix = np.array(
         [[-1 / tau_ts - gain, -gain, -gain * drop_v], [-gain, -1 / tau_tl - gain, -gain * drop_v], [0.0, 0.0, 0.0]]
     )
+    # The third state is the constant 1.
     exact = expm(matrix * dt_s) @ [0.03, -0.02, 1.0]
     assert state["v_ts"][0] == pytest.approx(exact[0], abs=1e-9)
     assert state["v_tl"][0] == pytest.approx(exact[1], abs=1e-9)
 
 
 @pytest.mark.parametrize("rate_hz", [0.1, 1.0, 10.0, 100.0])
-def test_parameters_converge_to_the_limit_of_lemma_4_1_3_at_every_sample_rate(rate_hz: float) -> None:
-    """The parameters converge at rates of 100 to 130 per second, so that explicit Euler would diverge at 10 Hz and below."""
+def test_parameters_converge_to_the_limits_of_the_thesis_at_every_sample_rate(rate_hz: float) -> None:
+    """The limits are those of Lemma 4.1.3. The parameters converge at rates of 100 to 130 per second, so that explicit
+    Euler would diverge at 10 Hz and below.
+    """
     cell = load_cell("chen_mora")
     estimator = Estimator(cell, initial_soc=1.0, identifier=None)
     estimator.run(simulate_discharge(cell, hours=0.1, rate_hz=rate_hz, current_a=0.05))
@@ -62,14 +67,17 @@ def test_parameters_converge_to_the_limit_of_lemma_4_1_3_at_every_sample_rate(ra
         assert estimator.state["a"][0, i] == pytest.approx(cell.bounds(i).limit, rel=1e-4)
 
 
-def test_limits_are_those_of_table_5() -> None:
+def test_limits_of_the_parameters_are_those_of_table_5_of_the_thesis() -> None:
     cell = load_cell("chen_mora")
     printed_limits = [0.55, 30.0, 0.055, 5.5, 150.0, 0.055, 760.8696, 10.6667, 684.6154, 6000.0, 27.5, 3666.6667]
     assert [cell.bounds(i).limit for i in range(1, 13)] == pytest.approx(printed_limits, rel=1e-4)
 
 
-def test_tracking_error_falls_below_ten_microvolts_within_seconds() -> None:
-    """Theorem 4.1.2 of the thesis claims more than is true (erratum 3). Its valid part is that the output is tracked."""
+def test_the_voltage_error_falls_below_ten_microvolts_within_20_seconds() -> None:
+    """Theorem 4.1.2 of the thesis is partly wrong (erratum 3).
+
+    The test checks the right part, that the output is tracked.
+    """
     cell = load_cell("chen_mora")
     trace = Estimator(cell, THESIS_LAW, initial_soc=1.0, identifier=None).run(
         simulate_discharge(cell, hours=0.2, rate_hz=100.0, current_a=1e-4)
@@ -78,7 +86,7 @@ def test_tracking_error_falls_below_ten_microvolts_within_seconds() -> None:
     assert np.abs(trace["innovation_v"][settled]).max() < 1e-5
 
 
-def test_dead_zone_of_zero_is_the_printed_law_for_k() -> None:
+def test_without_a_dead_zone_k_grows_by_the_printed_law() -> None:
     """By (3.13), k' = e^2. The integral of the squared error is computed from the trace by the trapezoidal rule."""
     cell = load_cell("chen_mora")
     trace = Estimator(cell, THESIS_LAW, initial_soc=0.98, identifier=None).run(
@@ -90,17 +98,18 @@ def test_dead_zone_of_zero_is_the_printed_law_for_k() -> None:
 
 DIVIDER_V = 25.0
 """Voltage range of the ADC with its divider [V]."""
+SAMPLES_PER_HOUR = 360_000
 
 
 def simulate_thesis_pack_on_an_adc(bits: int, hours: int = 16) -> SampleBlock:
     """Return samples at 100 Hz of the thesis's pack, measured by a real converter (erratum 2).
 
-    The pack has 22.2 V and 6.6 Ah and is discharged with 0.416 A. A divider for 0 to 25 V and an ADC with half a step of
-    noise measure its voltage. The load ends before the SOC falls below the margins, at which the simulated pack would
-    become unstable (erratum 14).
+    The pack has 22.2 V and 6.6 Ah and is discharged with 0.416 A. A divider for 0 to 25 V and an ADC with half a step
+    of noise measure its voltage. The load ends before the SOC falls below delta1 and delta2, at which the simulated
+    pack would become unstable (erratum 14).
     """
     cell = load_cell("thunder_power_6s")
-    time_s = np.arange(hours * 360_000) * 0.01
+    time_s = np.arange(hours * SAMPLES_PER_HOUR) * 0.01
     load_end_s = 15.5 * 3600
     current_a = np.where(time_s < load_end_s, 0.416, 0.0)
     voltage_v, _ = simulate_cell((1.0, 0.0, 0.0), time_s, current_a, 6.6 * 3600, cell.a)
@@ -109,12 +118,12 @@ def simulate_thesis_pack_on_an_adc(bits: int, hours: int = 16) -> SampleBlock:
     return make_samples(time_s, current_a, step_v * np.round(voltage_v / step_v + noise))
 
 
-def test_lock_is_held_for_16_hours_with_a_10_bit_adc() -> None:
+def test_the_lock_is_held_for_16_hours_with_a_10_bit_adc() -> None:
     estimator = Estimator(
         load_cell("thunder_power_6s"), voltage_resolution_v=DIVIDER_V / 1024, initial_soc=1.0, identifier=None
     )
     trace = estimator.run(simulate_thesis_pack_on_an_adc(bits=10))
-    assert len(trace) == 16 * 360_000
+    assert len(trace) == 16 * SAMPLES_PER_HOUR
     assert trace["lock"].all()
     assert estimator.state["gain_rearms"][0] == 0
     after_start = trace["k"][trace["time_s"] > 60.0]
@@ -122,7 +131,7 @@ def test_lock_is_held_for_16_hours_with_a_10_bit_adc() -> None:
     assert trace["nussbaum_gain"].min() > 0.99
 
 
-def test_without_a_dead_zone_lock_is_lost_reported_and_regained() -> None:
+def test_without_a_dead_zone_the_lock_is_lost_and_regained_and_losses_are_counted() -> None:
     estimator = Estimator(
         load_cell("thunder_power_6s"),
         THESIS_LAW,
@@ -139,11 +148,14 @@ def test_without_a_dead_zone_lock_is_lost_reported_and_regained() -> None:
     assert np.isfinite(trace["voltage_estimate_v"]).all()
 
 
-def test_gain_is_rearmed_before_its_sign_changes() -> None:
-    """Load steps also increase k. A service that runs for months must not lose lock because of load steps."""
+def test_the_gain_is_rearmed_before_its_sign_changes() -> None:
+    """Load steps also increase k, on which the sign of N(k) depends.
+
+    They must not cause a loss of lock within months.
+    """
     cell = load_cell("chen_mora")
     time_s = np.arange(0.0, 40_000.0, 1.0)
-    current_a = np.where(time_s // 20 % 2 == 0, 0.5, -0.5)
+    current_a = np.where(time_s // 20 % 2 == 0, 0.5, -0.5)  # a step every 20 s
     voltage_v, _ = simulate_cell((0.5, 0.0, 0.0), time_s, current_a, 0.275 * 3600, cell.a)
     estimator = Estimator(cell, ObserverSettings(**{"lambda": 50.0}), initial_soc=0.5, identifier=None)
     trace = estimator.run(make_samples(time_s, current_a, voltage_v))
@@ -152,8 +164,8 @@ def test_gain_is_rearmed_before_its_sign_changes() -> None:
     assert trace["lock"].all()
 
 
-def test_a_gain_of_the_wrong_sign_changes_and_the_error_decays() -> None:
-    """N(k0) < 0 has the effect of a wrong sign of the input gain b. The error grows until N(k) has changed its sign."""
+def test_a_gain_with_the_wrong_sign_changes_its_sign_and_the_error_decays() -> None:
+    """N(k0) < 0 has the effect of a wrong sign of the input gain. The error grows until N(k) has changed its sign."""
     cell = load_cell("chen_mora")
     time_s = np.arange(0.0, 4_000.0, 1.0)
     current_a = np.full(time_s.size, 0.1)
@@ -181,8 +193,10 @@ def test_a_gain_that_starts_at_zero_is_not_rearmed(nussbaum: str) -> None:
     assert estimator.state["k"][0] > 0.0
 
 
-def test_a_capacitance_is_not_evaluated_at_an_soc_with_a_negative_capacitance() -> None:
-    """A new target of a7 moves delta1 above the SOC within one sample. The margins are updated before the states."""
+def test_the_estimate_stays_finite_when_a_new_target_makes_a_capacitance_negative() -> None:
+    """A new target of a7 moves delta1, below which C_ts is negative, above the SOC within one sample. The deltas are
+    updated before the states.
+    """
     cell = load_cell("chen_mora")
     estimator = Estimator(cell, initial_soc=0.5, identifier=None)
     samples = simulate_discharge(cell, hours=0.02, rate_hz=1.0, current_a=0.0)
@@ -195,7 +209,7 @@ def test_a_capacitance_is_not_evaluated_at_an_soc_with_a_negative_capacitance() 
     assert np.isfinite(trace["voltage_estimate_v"]).all()
 
 
-def test_adaptation_stops_below_the_margin_and_the_stop_is_reported() -> None:
+def test_adaptation_stops_below_delta1_and_delta2_and_the_stop_is_reported() -> None:
     cell = load_cell("chen_mora")
     estimator = Estimator(cell, initial_soc=1.0, identifier=None)
     samples = simulate_discharge(cell, hours=0.95, rate_hz=1.0, current_a=0.275)
@@ -209,7 +223,7 @@ def test_adaptation_stops_below_the_margin_and_the_stop_is_reported() -> None:
 
 
 @pytest.mark.parametrize("law", ["scheme-1", "scheme-2", "scheme-3"])
-def test_schemes_of_the_thesis_track_the_cell_that_they_start_from(law: str) -> None:
+def test_schemes_of_the_thesis_track_a_cell_with_their_initial_parameters(law: str) -> None:
     cell = load_cell("chen_mora").model_copy(update={"adaptation": {}})
     settings = ObserverSettings(law=law, dead_zone_v=0.0, rearm_gain=None)  # type: ignore[arg-type]
     estimator = Estimator(cell, settings, initial_soc=1.0, identifier=None)

@@ -19,27 +19,33 @@ from bms_estimator.protocols.devices.text import TextProtocol
         ([(10, 7.0), (11, 8.0), (12, 0.5), (13, 1.5)], [0, 1, 2, 3], 1),
         ([(10, 7.0), (11, 3608.0), (12, 3609.0)], [0, 1, 2], 1),
         ([(10, nan), (12, nan), (13, 5.0), (14, 6.0)], [0, 2, 3, 4], 0),
+        # arrival times are used once a timestamp has been constant for 10 s
         ([(10, 0.0), (15, 0.0), (21, 0.0), (25, 0.0)], [0, 0, 11, 11], 1),
     ],
     ids=["delayed by 0.5 s", "delayed by a minute", "restarted", "set ahead", "without timestamps", "constant"],
 )
-def test_sample_times(arrivals_and_stamps: list[tuple[float, float]], times_s: list[float], jumps: int):
+def test_sample_times_follow_the_timestamps_unless_those_are_implausible(
+    arrivals_and_stamps: list[tuple[float, float]], times_s: list[float], jumps: int
+):
     clock = DeviceClock()
     assert [clock.sample_time(arrival_s, stamp_s) for arrival_s, stamp_s in arrivals_and_stamps] == times_s
     assert clock.jumps == jumps
 
 
-def test_slow_clock_loses_no_time():
-    """The device counts milliseconds as seconds."""
+def test_time_lost_by_a_slow_clock_is_added():
+    """The device's clock counts one millisecond in each second."""
     clock = DeviceClock()
     times_s = [clock.sample_time(float(second), 1e-3 * second) for second in range(200)]
     assert times_s[-1] == pytest.approx(199.0)
-    assert max(b - a for a, b in itertools.pairwise(times_s)) <= LAG_S + 2.0  # the lost time, and two samples
+    assert (
+        max(b - a for a, b in itertools.pairwise(times_s)) <= LAG_S + 2.0
+    )  # one step adds the lost time, with up to two more sample periods
     assert clock.jumps == 1
 
 
-def test_samples_in_bursts_do_not_look_like_a_slow_clock():
+def test_clock_of_samples_that_arrive_in_bursts_does_not_count_as_slow():
     clock = DeviceClock()
+    # a burst of 100 samples arrives every 100 s
     times_s = [clock.sample_time(100.0 * (second // 100 + 1), float(second)) for second in range(1000)]
     assert times_s == [float(second) for second in range(1000)]
     assert clock.jumps == 0
@@ -55,7 +61,7 @@ def test_sample_time_never_decreases(arrival_steps_and_stamps: list[tuple[float,
         last_s = time_s
 
 
-def test_time_of_a_text_line_is_used():
+def test_timestamp_of_a_text_line_gives_the_sample_time():
     decoder = TextProtocol()
     times_s = [
         decoder.feed(arrival_s, b'{"voltage":1,"current":0,"time_s":%.1f}\n' % stamp_s)["time_s"][0]

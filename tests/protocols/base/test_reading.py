@@ -1,4 +1,4 @@
-"""Values of a printed line."""
+"""Formats of printed lines from which voltage, current, temperature and cell voltages are read."""
 
 import math
 
@@ -30,10 +30,10 @@ from bms_estimator.protocols.base.reading import Reading, read_line
         b' {"name": "pack", "pack_voltage": 13.3, "current_mA": 2e3, "ok": true, "t": 17}\r',
     ],
 )
-def test_formats_of_voltage_and_current(line: bytes) -> None:
+def test_voltage_and_current_are_read_from_common_formats(line: bytes) -> None:
     reading = read_line(line)
     assert reading is not None
-    assert reading[:2] == pytest.approx((13.3, 2.0))
+    assert (reading.voltage_v, reading.current_a) == pytest.approx((13.3, 2.0))
     assert math.isnan(reading.temperature_c)
     assert reading.cells_v == ()
 
@@ -41,15 +41,15 @@ def test_formats_of_voltage_and_current(line: bytes) -> None:
 @pytest.mark.parametrize(
     "line", [b"6.6,-2,25.5", b"6,6;-2;25,5", b"V=6.6 I=-2 T=25.5C", b'{"volts": 6.6, "amps": -2, "temperature": 25.5}']
 )
-def test_formats_with_temperature(line: bytes) -> None:
-    assert read_line(line) == Reading(6.6, -2.0, 25.5)
+def test_temperature_is_read_from_common_formats(line: bytes) -> None:
+    assert read_line(line) == Reading(voltage_v=6.6, current_a=-2.0, temperature_c=25.5)
 
 
 @pytest.mark.parametrize(
     "line",
     [b"V=6.6 I=2 cells=3.31,3.29", b'{"V": 6.6, "I": 2, "cells": [3.31, 3.29]}', b"cells_mV=3310,3290 V=6.6 I=2"],
 )
-def test_formats_of_cell_voltages(line: bytes) -> None:
+def test_cell_voltages_are_read_from_common_formats(line: bytes) -> None:
     reading = read_line(line)
     assert reading is not None
     assert reading.cells_v == pytest.approx((3.31, 3.29))
@@ -77,7 +77,7 @@ def test_formats_of_cell_voltages(line: bytes) -> None:
         b"nan,2.0",
         b"13.3,inf",
         b"1e999,2.0",
-        "١٣.٣,2".encode(),
+        "١٣.٣,2".encode(),  # 13.3 in Arabic digits, which float() accepts
         b"V=3_9 I=2",
         b"V=13.3.1 I=2",
         b"V=0x1F I=2",
@@ -92,14 +92,14 @@ def test_line_without_valid_voltage_and_current_is_rejected(line: bytes) -> None
 
 
 @pytest.mark.parametrize("line", [b"13.3,2.0,nan", b"13.3 2.0 NaN", b"13.3;2.0;-inf", b"13.3,2.0,ovf"])
-def test_word_for_a_missing_temperature_is_nan(line: bytes) -> None:
+def test_temperature_is_nan_if_the_line_has_a_word_for_a_missing_value(line: bytes) -> None:
     reading = read_line(line)
     assert reading is not None
     assert math.isnan(reading.temperature_c)
 
 
 def test_invalid_list_of_cells_is_ignored() -> None:
-    assert read_line(b"V=6.6 I=2 cells=3.31,3_2") == Reading(6.6, 2.0)
+    assert read_line(b"V=6.6 I=2 cells=3.31,3_2") == Reading(voltage_v=6.6, current_a=2.0)
 
 
 fragments = st.sampled_from(

@@ -1,4 +1,4 @@
-"""Polled BMS: values of published responses, counters of damaged ones, and times of the requests."""
+"""Polled BMS: values of published responses, counters of damaged responses, and times of the requests."""
 
 import itertools
 import math
@@ -21,13 +21,15 @@ from bms_estimator.protocols.devices.daly import with_checksum
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from tests.protocols import bms_frames as frames
-from tests.protocols.bms_frames import PUBLISHED, Published
+from tests.protocols.bms_frames import PUBLISHED, PublishedCycle
 
 PROTOCOLS = ("jbd", "daly", "jk")
 ERROR_COUNTERS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs", "implausible")
 POLL_CYCLES = {name: PUBLISHED[name].frames for name in ("jbd", "daly", "jk_old", "jk_newer")}
-"""Responses of one poll cycle by device."""
+"""Responses of one poll cycle, by device."""
 DALY_FRAME_BYTES = 13
+LAST_RESPONSE_BYTES = 12
+"""Number of bytes at the end of a poll cycle that belong to its last response, for all devices but the newer JK."""
 PROTOCOL_OF = {"jbd": "jbd", "daly": "daly", "jk_old": "jk", "jk_newer": "jk"}
 
 all_frames = st.sampled_from([published.frames for published in PUBLISHED.values()])
@@ -47,6 +49,7 @@ streams = st.lists(
 
 
 def make_decoder(protocol: str, **options: object) -> PolledProtocol:
+    """Return the decoder for a protocol and further options of ``SensorSettings``."""
     return cast("PolledProtocol", make_protocol(SensorSettings.model_validate({"protocol": protocol, **options})))
 
 
@@ -65,7 +68,7 @@ def error_counts(decoder: PolledProtocol) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("published", PUBLISHED.values(), ids=list(PUBLISHED))
-def test_published_response_is_decoded_as_by_its_publisher(published: Published) -> None:
+def test_published_response_is_decoded_to_the_values_of_its_publisher(published: PublishedCycle) -> None:
     device = make_decoder(published.protocol)
     (sample,), cells = decode(device, published.frames)
     assert sample["voltage_v"] == published.voltage_v
@@ -101,21 +104,21 @@ def test_response_with_one_changed_byte_is_rejected_and_the_next_one_decoded(nam
     valid = POLL_CYCLES[name]
     # Only bytes of the last response are changed, because it completes the sample. On the newer JK a record follows it.
     is_newer_jk = name == "jk_newer"
-    response_bytes = len(frames.JK_NEWER_FRAME) if is_newer_jk else 12
+    response_bytes = len(frames.JK_NEWER_FRAME) if is_newer_jk else LAST_RESPONSE_BYTES
     response_end = len(valid) - (len(frames.JK_RECORD_OF_PACK_2) if is_newer_jk else 0)
-    for distance in range(2, response_bytes):
+    for distance_from_end in range(2, response_bytes):
         device = make_decoder(PROTOCOL_OF[name])
         damaged = bytearray(valid)
-        damaged[response_end - distance] ^= 0x55
+        damaged[response_end - distance_from_end] ^= 0x55
         assert decode(device, bytes(damaged))[0].size == 0
         assert device.counters["crc_errors"] + device.counters["length_errors"] + device.counters["noise_bytes"] > 0
         assert decode(device, valid)[0].size == 1
         assert device.fault is None
 
 
-def test_wrong_checksum_is_counted_and_reported() -> None:
+def test_wrong_checksum_is_counted_and_reported_until_a_valid_response() -> None:
     device = make_decoder("jbd")
-    decode(device, frames.JBD_BASIC[:-3] + b"\0\0\x77")
+    decode(device, frames.JBD_BASIC[:-3] + b"\0\0\x77")  # checksum 0, and the end byte
     assert device.counters["crc_errors"] == 1
     assert "wrong checksums" in (device.fault or "")
     decode(device, frames.JBD_BASIC)
@@ -137,7 +140,7 @@ def test_truncated_response_is_dropped_when_the_next_one_arrives(name: str) -> N
     ("name", "response"),
     [("jbd", b"\xdd\x03\x00\xff"), ("daly", b"\xa5\x01\x90\x09"), ("jk_old", b"NW\x7f\xff" + bytes(8))],
 )
-def test_responses_after_an_invalid_length_are_decoded(name: str, response: bytes) -> None:
+def test_invalid_length_is_reported_and_the_next_response_decoded(name: str, response: bytes) -> None:
     device = make_decoder(PROTOCOL_OF[name])
     decode(device, response)
     assert device.counters["length_errors"] == 1
@@ -170,7 +173,7 @@ def test_echoed_requests_are_not_decoded_as_responses(protocol: str) -> None:
     assert device.counters["crc_errors"] == 0
 
 
-def test_old_cells_are_not_attached() -> None:
+def test_cell_voltages_received_long_before_a_sample_are_not_attached_to_it() -> None:
     device = make_decoder("jbd")
     assert decode(device, frames.JBD_CELLS, frames.JBD_BASIC)[1] == [frames.JBD.cells_v]
     device.feed(10.0, frames.JBD_BASIC)
@@ -179,7 +182,8 @@ def test_old_cells_are_not_attached() -> None:
 
 def test_request_rejected_by_jbd_is_reported() -> None:
     device = make_decoder("jbd")
-    decode(device, bytes((0xDD, 0x03, 0x80, 0)) + jbd.checksum(b"\x80\0") + b"\x77")
+    status_error, no_data = b"\x80", b"\0"
+    decode(device, b"\xdd\x03" + status_error + no_data + jbd.checksum(status_error + no_data) + b"\x77")
     assert device.counters["refused"] == 1
     assert "rejects a request of register 0x03" in (device.fault or "")
 
@@ -190,7 +194,7 @@ def test_temperature_of_a_jbd_without_probes_is_nan() -> None:
     assert sample["voltage_v"] == 0.0
 
 
-def test_only_the_three_cells_of_a_lost_daly_frame_are_nan() -> None:
+def test_without_one_daly_frame_only_its_three_cells_are_nan() -> None:
     device = make_decoder("daly")
     without_second_frame = frames.DALY_CELLS[:DALY_FRAME_BYTES] + frames.DALY_CELLS[2 * DALY_FRAME_BYTES :]
     device.feed(1.0, frames.DALY_STATUS + without_second_frame + frames.DALY_PACK)
@@ -210,7 +214,7 @@ def test_daly_frames_numbered_from_zero_are_decoded() -> None:
     assert cells == [frames.DALY.cells_v]
 
 
-def test_daly_without_cell_count_reports_its_cells() -> None:
+def test_daly_whose_cell_count_was_not_received_reports_its_cells() -> None:
     assert decode(make_decoder("daly"), frames.DALY_CELLS + frames.DALY_PACK)[1] == [frames.DALY.cells_v]
 
 
@@ -219,39 +223,40 @@ def test_daly_without_cell_count_reports_its_cells() -> None:
     [(1, 0x07D0, 20.0), (1, 0x87D0, -20.0), (0, 11000, 10.0), (0, 9500, -5.0)],
     ids=["discharge of 20 A", "charge of 20 A", "version 0, discharge of 10 A", "version 0, charge of 5 A"],
 )
-def test_older_jk_current_encodings(version: int, raw: int, current_a: float) -> None:
+def test_older_jk_current_is_decoded_by_the_version_of_its_protocol(version: int, raw: int, current_a: float) -> None:
     """The values are the four examples in JK's description of the protocol."""
-    frame = frames.JK_OLD.frames[:-4].replace(b"\x84\x80\xd0", b"\x84" + raw.to_bytes(2, "big"))
-    frame = frame.replace(b"\xc0\x01", bytes((0xC0, version)))
+    frame = frames.JK_OLD.frames[:-4].replace(b"\x84\x80\xd0", b"\x84" + raw.to_bytes(2, "big"))  # register 0x84
+    frame = frame.replace(b"\xc0\x01", bytes((0xC0, version)))  # register 0xC0: version of the protocol
     (sample,), _ = decode(make_decoder("jk"), jk.with_old_checksum(frame))
     assert sample["current_a"] == current_a
 
 
-def test_older_jk_encodes_negative_temperatures_above_100() -> None:
-    frame = (
-        frames.JK_OLD.frames[:-4].replace(b"\x81\x00\x1e", b"\x81\x00\x69").replace(b"\x82\x00\x1c", b"\x82\x00\x8c")
-    )
+def test_older_jk_temperature_above_100_is_negative() -> None:
+    raw_of_registers = {b"\x81\x00\x1e": b"\x81\x00\x69", b"\x82\x00\x1c": b"\x82\x00\x8c"}  # 105 and 140
+    frame = frames.JK_OLD.frames[:-4]
+    for published, changed in raw_of_registers.items():
+        frame = frame.replace(published, changed)
     (sample,), _ = decode(make_decoder("jk"), jk.with_old_checksum(frame))
-    assert sample["temperature_c"] == -5.0  # raw 105; raw 140 of the other probe means that it is not connected
+    assert sample["temperature_c"] == -5.0  # 105 means -5 degC; 140 means that the other probe is not connected
 
 
 def newer_jk_response(address: int, **values: int) -> bytes:
-    """Return the newer response of the pack with this address. ``values`` are its ``millivolts`` or ``milliamperes``."""
+    """Return the newer response of the pack with this address, with its ``millivolts`` or ``milliamperes`` if given."""
     frame = bytearray(frames.JK_NEWER_FRAME)
-    for name, at in (("millivolts", 150), ("milliamperes", 158)):
+    for name, offset in (("millivolts", 150), ("milliamperes", 158)):
         if name in values:
-            frame[at : at + 4] = values[name].to_bytes(4, "little", signed=True)
+            frame[offset : offset + 4] = values[name].to_bytes(4, "little", signed=True)
     frame[-1] = sum(frame[:-1]) & 0xFF
-    record = bytes((address, 0x10, 0x16, 0x20, 0, 1))
+    record = bytes((address, 0x10, 0x16, 0x20, 0, 1))  # as JK_RECORD_OF_PACK_2, with this address
     return bytes(frame) + record + jk.crc16(record)
 
 
 def test_current_of_the_newer_jk_is_positive_on_charge() -> None:
     (sample,), _ = decode(make_decoder("jk"), newer_jk_response(0, milliamperes=-9241))
-    assert sample["current_a"] == 9.241
+    assert sample["current_a"] == 9.241  # samples are positive on discharge
 
 
-def test_first_or_configured_pack_of_a_line_is_used() -> None:
+def test_of_several_packs_on_a_line_the_configured_one_or_else_the_first_is_used() -> None:
     responses = newer_jk_response(0, millivolts=51_000) + newer_jk_response(2, millivolts=52_000)
     without_address, with_address = make_decoder("jk"), make_decoder("jk", address=2)
     assert decode(without_address, responses, responses)[0]["voltage_v"].tolist() == [51.0, 51.0]
@@ -267,10 +272,10 @@ def test_configured_sign_of_the_current_is_used(protocol: str) -> None:
     default_sign = SensorSettings(protocol=protocol).current_sign
     opposite_sign = "charge_positive" if default_sign == "discharge_positive" else "discharge_positive"
     published = {"jbd": frames.JBD_DISCHARGING, "daly": frames.DALY, "jk": frames.JK_OLD}[protocol]
-    (sample,), _ = decode(make_decoder(protocol), published.frames)
-    assert sample["current_a"] == published.current_a
-    (sample,), _ = decode(make_decoder(protocol, current_sign=opposite_sign), published.frames)
-    assert sample["current_a"] == -published.current_a
+    (default_sample,), _ = decode(make_decoder(protocol), published.frames)
+    assert default_sample["current_a"] == published.current_a
+    (opposite_sample,), _ = decode(make_decoder(protocol, current_sign=opposite_sign), published.frames)
+    assert opposite_sample["current_a"] == -published.current_a
 
 
 @pytest.mark.parametrize(("protocol", "baud"), [("jbd", 9600), ("daly", 9600), ("jk", 115_200), ("binary", 500_000)])
@@ -280,7 +285,10 @@ def test_baud_rate_is_that_of_the_protocol_unless_configured(protocol: str, baud
 
 
 def poll(device: PolledProtocol, seconds: float, response: bytes = b"") -> list[tuple[float, bytes]]:
-    """Return the requests and their times [s], checked 20 times a second. Each request gets ``response``."""
+    """Poll a device, with 20 ticks a second, and respond to each request with ``response``.
+
+    Return the times of the requests [s], and the requests.
+    """
     times_and_requests = []
     for tick in range(round(20 * seconds)):
         now_s = tick / 20.0
@@ -291,25 +299,26 @@ def poll(device: PolledProtocol, seconds: float, response: bytes = b"") -> list[
 
 
 def poll_requests(device: PolledProtocol, seconds: float, response: bytes = b"") -> list[bytes]:
-    """Return the requests without their times."""
+    """Poll a device as ``poll`` does, and return the requests without their times."""
     return [request for _, request in poll(device, seconds, response)]
 
 
 @pytest.mark.parametrize("name", ["jbd", "daly", "jk_old"])
-def test_devices_are_polled_each_second_even_if_silent(name: str) -> None:
+def test_device_is_polled_each_second_whether_it_responds_or_not(name: str) -> None:
     times_s, requests = zip(*poll(make_decoder(PROTOCOL_OF[name]), 20.0, POLL_CYCLES[name]), strict=True)
     assert min(np.diff(times_s)) >= QUERY_INTERVAL_S
     assert requests.count(requests[-1]) == 20
-    assert len(poll(make_decoder(PROTOCOL_OF[name]), 20.0)) >= 20
+    requests_to_silent_device = poll(make_decoder(PROTOCOL_OF[name]), 20.0)
+    assert len(requests_to_silent_device) >= 20
 
 
-def test_known_properties_are_not_requested_again() -> None:
+def test_name_of_a_jbd_is_requested_only_once() -> None:
     requests = poll_requests(make_decoder("jbd"), 10.0, POLL_CYCLES["jbd"])
     assert requests.count(jbd.request(jbd.NAME)) == 1
     assert requests.count(jbd.request(jbd.BASIC)) == 10
 
 
-def test_number_of_cells_is_requested_again_after_reopening() -> None:
+def test_number_of_cells_of_a_daly_is_requested_once_and_again_after_reopening() -> None:
     device = make_decoder("daly")
     status_request = daly.request(daly.HOSTS[0], daly.STATUS)
     assert poll_requests(device, 5.0, POLL_CYCLES["daly"]).count(status_request) == 1
@@ -317,7 +326,7 @@ def test_number_of_cells_is_requested_again_after_reopening() -> None:
     assert poll_requests(device, 5.0, POLL_CYCLES["daly"]).count(status_request) == 1
 
 
-def test_silence_selects_the_next_query_variant() -> None:
+def test_next_request_variant_is_tried_after_unanswered_poll_cycles() -> None:
     requests = poll_requests(make_decoder("jk"), 20.0)
     assert requests[: MAX_UNANSWERED_CYCLES + 1] == [jk.OLD_REQUEST] * (MAX_UNANSWERED_CYCLES + 1)
     assert {jk.request(1), jk.request(0)} < set(requests)
@@ -325,13 +334,15 @@ def test_silence_selects_the_next_query_variant() -> None:
     assert {request[1] for request in poll_requests(make_decoder("daly"), 20.0)} == set(daly.HOSTS)
 
 
-def test_query_variant_with_a_response_is_used_from_then_on() -> None:
+def test_request_variant_that_got_a_response_is_used_from_then_on() -> None:
     device = make_decoder("jk")
     poll(device, (MAX_UNANSWERED_CYCLES + 1.5) * POLL_CYCLE_S)
-    requests = [
-        device.next_output(100.0 + tick) for tick in range(20) if device.feed(100.0 + tick, newer_jk_response(1)).size
-    ]
-    assert set(requests) == {jk.request(1)}
+    requests = set[bytes]()
+    for second in range(20):
+        now_s = 100.0 + second
+        assert device.feed(now_s, newer_jk_response(1)).size
+        requests.add(device.next_output(now_s))
+    assert requests == {jk.request(1)}
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -339,7 +350,12 @@ def test_probing_sends_no_request_that_changes_a_device(protocol: str) -> None:
     device = make_decoder(protocol)
     device.probing = True
     for request in poll_requests(device, 60.0):
-        assert request[:2] in (b"\xdd\xa5", b"\xa5\x40", b"\xa5\x80", b"NW")
+        assert request[:2] in (
+            b"\xdd\xa5",
+            b"\xa5\x40",
+            b"\xa5\x80",
+            b"NW",
+        )  # reads of JBD, Daly (two hosts) and old JK
         assert request[:2] != b"NW" or request == jk.OLD_REQUEST
 
 
@@ -354,10 +370,10 @@ def test_line_with_another_master_is_not_polled() -> None:
             assert device.feed(now_s, newer_jk_response(0)).size == 1
     assert not any(requests)
     assert device.allowed_silence_s > 6.0
-    assert device.next_output(60.0) == jk.OLD_REQUEST
+    assert device.next_output(60.0) == jk.OLD_REQUEST  # the other master has been silent for 36 s
 
 
-def test_batch_of_reads_gives_the_same_samples_and_cells() -> None:
+def test_reads_decoded_as_a_batch_give_the_same_samples_as_one_by_one() -> None:
     for name, data in POLL_CYCLES.items():
         reads = [data[i : i + 50] for i in range(0, len(data), 50)] * 2
         single_reads_decoder, batch_decoder = make_decoder(PROTOCOL_OF[name]), make_decoder(PROTOCOL_OF[name])
@@ -367,3 +383,11 @@ def test_batch_of_reads_gives_the_same_samples_and_cells() -> None:
         batch_block = batch_decoder.feed_reads(arrivals_s, ends, np.frombuffer(2 * data, dtype=np.uint8))
         np.testing.assert_array_equal(batch_block, np.concatenate(blocks))
         assert single_reads_decoder.counters == batch_decoder.counters
+
+
+def test_daly_without_probe_count_averages_probes_at_and_below_zero() -> None:
+    temperatures_c = (21, 0, -9)
+    raw = bytes(daly.ZERO_C + celsius for celsius in temperatures_c)
+    probes = with_checksum(bytes((daly.START, 0x01, daly.PROBES, 8, 1)) + raw + bytes(daly.PROBES_PER_FRAME - len(raw)))
+    [sample], _ = decode(make_decoder("daly"), probes + frames.DALY_PACK)
+    assert sample["temperature_c"] == 4.0

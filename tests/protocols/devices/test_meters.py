@@ -1,4 +1,4 @@
-"""Battery monitors and batteries with manufacturers' protocols: recorded frames, damaged frames, simulated devices."""
+"""Battery monitors (VE.Direct, Junctek) and Pylontech batteries: recorded and damaged frames, simulated devices."""
 
 import asyncio
 import itertools
@@ -24,32 +24,33 @@ from tests.patience import LONG_S
 
 
 def vedirect_block(text: str) -> bytes:
-    """Return a VE.Direct block from lines of a name and a value."""
-    return text.replace(" ", "\t").replace("\n", "\r\n").encode("latin-1")
+    """Return a VE.Direct block. Each line of ``text`` is a name, a space and a value; ~ is a space in a value."""
+    return text.replace(" ", "\t").replace("~", " ").replace("\n", "\r\n").encode("latin-1")
 
 
 # test/bvm702.dump of github.com/karioja/vedirect: a BMV-700 with a load of 7.6 A
-BMV_NOW = vedirect_block(
+BMV_DISCHARGING = vedirect_block(
     "\nPID 0x203\nV 12065\nI -7625\nP -92\nCE -65473\nSOC 839\nTTG 942\nAlarm OFF\nRelay OFF\nAR 0\nBMV 700\nFW 0308\nChecksum q"
 )
 BMV_HISTORY = vedirect_block(
     "\nH1 -149322\nH2 -82854\nH3 0\nH4 0\nH5 0\nH6 -5526294\nH7 11733\nH8 16161\nH9 368003\nH10 26\nH11 0\nH12 0\n"
     "H17 6843\nH18 8527\nChecksum \xbc"
 )
-BMV_NEXT = vedirect_block(
+BMV_NEXT_SECOND = vedirect_block(
     "\nPID 0x203\nV 12065\nI -7626\nP -92\nCE -65476\nSOC 839\nTTG 942\nAlarm OFF\nRelay OFF\nAR 0\nBMV 700\nFW 0308\nChecksum m"
 )
 # test/test_ved.py of github.com/jblance/mpp-solar: a SmartShunt without load
 SMART_SHUNT = vedirect_block(
     "\nPID 0xA389\nV 12868\nVS -12\nI 0\nP 0\nCE 0\nSOC 1000\nTTG -1\nAlarm OFF\nAR 0\nBMV SmartShunt~500A/50mV\nFW 0405\n"
     "Checksum K"
-).replace(b"~", b" ")
+)
 # CUnit test of a VE.Direct parser in C on GitHub (test__parse_block__bmv_001): a BMV-712 with a sensor, charging
-BMV_WARM = vedirect_block(
+BMV_CHARGING = vedirect_block(
     "\nPID 0xA381\nV 13043\nT 23\nI 3856\nP 50\nCE 0\nSOC 1000\nTTG -1\nAlarm OFF\nRelay OFF\nAR 0\nBMV 712~Smart\nFW 0403\n"
     "Checksum \xb5"
-).replace(b"~", b" ")
-HEX = b":7F0ED0071\n"
+)
+VEDIRECT_HEX_MESSAGE = b":7F0ED0071\n"
+"""Message of VE.Direct's second protocol, which a device may send between and within blocks."""
 
 # Manual of the KH-F, page 29; Potoonite/juntek-rs485 and mysystem32/juntek_kg on GitHub: a KG140F
 KH_CHARGING = b":r50=1,123,1198,1090,7421,2749,437,298,113,0,0,1,69,100,230208,112418,\r\n"
@@ -76,18 +77,18 @@ US2000_PWR = (
     b"3     -      -      -      -      -      -      -      Absent   -        -        -        -        -    "
     b"                -        -       \r\n\rCommand completed successfully\r\n\r$$\r\n\rpylon>"
 )
-TAIL = b"\r\n\rCommand completed successfully\r\n\r$$\r\n\rpylon>"
+US2000_END = b"\r\n\rCommand completed successfully\r\n\r$$\r\n\rpylon>"
 
 
-def bat(battery: int, cells_mv: list[int]) -> bytes:
-    """Return the response to ``bat N`` in the format of a US2000."""
+def bat_response(battery: int, cells_mv: list[int]) -> bytes:
+    """Return the response to command ``bat N``, which lists the cells of battery N, in the format of a US2000."""
     rows = b"\r\r\n".join(
         b"%-8d %-8d 4076     14000    Charge       Normal       Normal       Normal        89%%      42586 mAH"
         % (n, mv)
         for n, mv in enumerate(cells_mv)
     )
     head = b"Battery  Volt     Curr     Tempr    Base State   Volt. State  Curr. State  Temp. State  Coulomb     \r\r\n"
-    return b"bat %d\n\r@\r\r\n" % battery + head + rows + TAIL
+    return b"bat %d\n\r@\r\r\n" % battery + head + rows + US2000_END
 
 
 US2000_CELLS_MV = [3379, 3379, 3379, 3379, 3381, 3378, 3378, 3378, 3380, 3379, 3380, 3380, 3378, 3380, 3380]
@@ -104,23 +105,25 @@ def voltages_and_currents(block: SampleBlock) -> list[tuple[float, float]]:
 
 
 @pytest.mark.parametrize(
-    ("name", "data", "expected"),
+    ("name", "data", "volts_amperes_celsius"),
     [
-        ("vedirect", BMV_NOW, (12.065, 7.625, math.nan)),
+        ("vedirect", BMV_DISCHARGING, (12.065, 7.625, math.nan)),
         ("vedirect", SMART_SHUNT, (12.868, 0.0, math.nan)),
-        ("vedirect", BMV_WARM, (13.043, -3.856, 23.0)),
+        ("vedirect", BMV_CHARGING, (13.043, -3.856, 23.0)),
         ("junctek", KH_CHARGING, (11.98, -10.90, 13.0)),
         ("junctek", KG_DISCHARGING, (51.66, 10.30, 25.0)),
         ("junctek", KG_CHARGING, (53.66, -54.10, 28.0)),
-        ("pylontech", US5000_PWR, (49.874, 0.642, 17.3)),
-        ("pylontech", US2000_PWR, (50.682, -7.893, 13.5)),
+        ("pylontech", US5000_PWR, (49.874, 0.642, 17.3)),  # mean of the lowest and highest temperature
+        ("pylontech", US2000_PWR, (50.682, -7.893, 13.5)),  # mean voltage and total current of two batteries
     ],
 )
-def test_recorded_frames_are_decoded(name: str, data: bytes, expected: tuple[float, float, float]) -> None:
+def test_recorded_frames_are_decoded_with_a_current_that_is_positive_on_discharge(
+    name: str, data: bytes, volts_amperes_celsius: tuple[float, float, float]
+) -> None:
     decoder = make_protocol(SensorSettings.model_validate({"protocol": name}))
     block = decoder.feed(1.0, data)
-    assert [block[name].item() for name in ("voltage_v", "current_a", "temperature_c")] == pytest.approx(
-        expected, nan_ok=True
+    assert [block[column].item() for column in ("voltage_v", "current_a", "temperature_c")] == pytest.approx(
+        volts_amperes_celsius, nan_ok=True
     )
     assert decoder.fault is None
     assert decoder.description is not None
@@ -128,10 +131,10 @@ def test_recorded_frames_are_decoded(name: str, data: bytes, expected: tuple[flo
 
 def test_current_sign_setting_corrects_a_reversed_shunt() -> None:
     sensor = SensorSettings.model_validate({"protocol": "vedirect", "current_sign": "discharge_positive"})
-    assert make_protocol(sensor).feed(1.0, BMV_NOW)["current_a"].item() == pytest.approx(-7.625)
+    assert make_protocol(sensor).feed(1.0, BMV_DISCHARGING)["current_a"].item() == pytest.approx(-7.625)
 
 
-def test_defaults_of_a_protocol_can_be_overridden() -> None:
+def test_protocol_sets_defaults_of_the_sensor_which_settings_override() -> None:
     shunt = SensorSettings.model_validate({"protocol": "vedirect"})
     assert (shunt.baud, shunt.current_sign, shunt.voltage_resolution_v) == (19_200, "charge_positive", 0.01)
     assert SensorSettings.model_validate({"protocol": "junctek", "baud": 9600}).baud == 9600
@@ -140,8 +143,17 @@ def test_defaults_of_a_protocol_can_be_overridden() -> None:
 
 def test_history_and_hex_messages_between_blocks_are_ignored() -> None:
     decoder = VeDirectProtocol()
-    cut_in_two = BMV_NEXT.replace(b"\r\nSOC", HEX + b"\r\nSOC")
-    block = decoder.feed(1.0, BMV_NOW[9:] + BMV_HISTORY + HEX + BMV_NEXT + BMV_HISTORY + cut_in_two)
+    block_with_hex_message = BMV_NEXT_SECOND.replace(b"\r\nSOC", VEDIRECT_HEX_MESSAGE + b"\r\nSOC")
+    incomplete_first_block = BMV_DISCHARGING[9:]
+    block = decoder.feed(
+        1.0,
+        incomplete_first_block
+        + BMV_HISTORY
+        + VEDIRECT_HEX_MESSAGE
+        + BMV_NEXT_SECOND
+        + BMV_HISTORY
+        + block_with_hex_message,
+    )
     assert voltages_and_currents(block) == [(12.065, 7.626)] * 2
     assert decoder.counters["checksum_errors"] == 0  # the incomplete first block does not count
 
@@ -149,8 +161,8 @@ def test_history_and_hex_messages_between_blocks_are_ignored() -> None:
 @pytest.mark.parametrize(
     ("name", "valid", "damaged", "counter", "message"),
     [
-        ("vedirect", BMV_NOW, BMV_NOW.replace(b"7625", b"7635"), "checksum_errors", "wrong checksum"),
-        ("vedirect", BMV_NOW, bytes(range(128, 256)) * 20, "length_errors", "19200 baud"),
+        ("vedirect", BMV_DISCHARGING, BMV_DISCHARGING.replace(b"7625", b"7635"), "checksum_errors", "wrong checksum"),
+        ("vedirect", BMV_DISCHARGING, bytes(range(128, 256)) * 20, "length_errors", "19200 baud"),
         ("junctek", KG_CHARGING, KG_CHARGING.replace(b"5410", b"5411"), "checksum_errors", "wrong checksum"),
         ("junctek", KG_CHARGING, KG_CHARGING[:30] + b"\r\n", "length_errors", "cut off"),
         ("junctek", KG_CHARGING, KG_CHARGING.replace(b"=1,", b"=2,"), "other_address", "address 2"),
@@ -168,7 +180,7 @@ def test_history_and_hex_messages_between_blocks_are_ignored() -> None:
         ("pylontech", US2000_PWR, bytes(range(128, 256)) * 200, "length_errors", "baud rate is 115200"),
     ],
 )
-def test_damaged_frame_is_reported_until_a_valid_one(
+def test_damaged_frame_is_counted_and_reported_until_a_valid_frame(
     name: str, valid: bytes, damaged: bytes, counter: str, message: str
 ) -> None:
     decoder = PROTOCOLS[name]()
@@ -187,27 +199,26 @@ def test_vedirect_charger_is_rejected() -> None:
     assert "product 0xA042 is no battery monitor" in (decoder.fault or "")
 
 
-def test_cells_are_attached_once_all_batteries_reported_them() -> None:
+def test_cell_voltages_are_attached_once_all_batteries_have_reported_theirs() -> None:
     decoder = PylontechProtocol()
-    decoder.feed(1.0, bat(1, US2000_CELLS_MV) + US2000_PWR)
+    decoder.feed(1.0, bat_response(1, US2000_CELLS_MV) + US2000_PWR)
     assert decoder.cells.size == 0
-    block = decoder.feed(2.0, bat(2, [mv - 1 for mv in US2000_CELLS_MV]) + US2000_PWR)
+    block = decoder.feed(2.0, bat_response(2, [mv - 1 for mv in US2000_CELLS_MV]) + US2000_PWR)
     assert block.size == 1
     assert decoder.cells.shape == (1, 30)
+    # cells 0 and 4 of the first battery, cell 0 of the second one, 1 mV lower
     assert decoder.cells[0, [0, 4, 15]].tolist() == pytest.approx([3.379, 3.381, 3.378])
 
 
-def test_console_is_polled_for_the_stack_and_each_battery_in_turn() -> None:
+def test_pylontech_console_is_polled_for_the_stack_and_for_each_battery_in_turn() -> None:
     decoder = PylontechProtocol()
     assert [decoder.next_output(now) for now in (0.0, 0.25)] == [b"pwr\n", b""]
     decoder.feed(0.3, US2000_PWR)
     assert decoder.next_output(0.5) == b"bat 2\n"
-    decoder.feed(0.6, bat(2, US2000_CELLS_MV))
+    decoder.feed(0.6, bat_response(2, US2000_CELLS_MV))
     assert [decoder.next_output(now) for now in (0.75, 2.0)] == [b"", b"pwr\n"]
-    assert [decoder.next_output(now) for now in (6.0, 7.0)] == [
-        b"",
-        b"pwr\n",
-    ]  # the request without a response is repeated
+    # the request of 2 s gets no response and is repeated
+    assert [decoder.next_output(now) for now in (6.0, 7.0)] == [b"", b"pwr\n"]
 
 
 def test_junctek_is_polled_each_second_and_after_reopening() -> None:
@@ -217,11 +228,11 @@ def test_junctek_is_polled_each_second_and_after_reopening() -> None:
     assert decoder.next_output(1.1) == QUERY
 
 
-def test_old_cells_are_not_attached() -> None:
+def test_cell_voltages_received_long_before_a_sample_are_not_attached_to_it() -> None:
     decoder = PylontechProtocol()
-    decoder.feed(1.0, bat(1, US2000_CELLS_MV) + bat(2, US2000_CELLS_MV) + US2000_PWR)
+    decoder.feed(1.0, bat_response(1, US2000_CELLS_MV) + bat_response(2, US2000_CELLS_MV) + US2000_PWR)
     assert decoder.cells.shape == (1, 30)
-    decoder.feed(60.0, bat(1, US2000_CELLS_MV) + US2000_PWR)
+    decoder.feed(60.0, bat_response(1, US2000_CELLS_MV) + US2000_PWR)
     assert decoder.cells.shape == (1, 30)
     assert decoder.feed(100.0, US2000_PWR).size == 1
     assert decoder.cells.size == 0
@@ -230,15 +241,15 @@ def test_old_cells_are_not_attached() -> None:
 @pytest.mark.parametrize(
     ("name", "data"),
     [
-        ("vedirect", BMV_NOW[40:] + BMV_NEXT),
+        ("vedirect", BMV_DISCHARGING[40:] + BMV_NEXT_SECOND),
         ("junctek", KH_CHARGING[20:] + KG_DISCHARGING),
-        ("pylontech", bat(1, US2000_CELLS_MV) + bat(2, US2000_CELLS_MV) + b"\rpyl" + US2000_PWR),
+        ("pylontech", bat_response(1, US2000_CELLS_MV) + bat_response(2, US2000_CELLS_MV) + b"\rpyl" + US2000_PWR),
     ],
 )
-def test_reopening_the_port_changes_no_sample(name: str, data: bytes) -> None:
+def test_samples_do_not_depend_on_reopenings_of_the_port(name: str, data: bytes) -> None:
     reads = [(0.01 * n, data[n : n + 7]) for n in range(0, len(data), 7)]
     sensor = SensorSettings.model_validate({"protocol": name})
-    live, replayed = make_protocol(sensor), make_protocol(sensor)
+    live, replayed = make_protocol(sensor), make_protocol(sensor)  # a replay knows nothing of reopenings
     for arrival_s, read in reads:
         live.on_port_opened()
         blocks = live.feed(arrival_s, read), replayed.feed(arrival_s, read)
@@ -249,9 +260,9 @@ def test_reopening_the_port_changes_no_sample(name: str, data: bytes) -> None:
 
 
 FRAMES = {
-    "vedirect": [BMV_NOW, BMV_HISTORY, BMV_WARM, HEX],
+    "vedirect": [BMV_DISCHARGING, BMV_HISTORY, BMV_CHARGING, VEDIRECT_HEX_MESSAGE],
     "junctek": [KH_CHARGING, KG_CHARGING, b":R50=1,2,1,\r\n", b":r00=1,217,2140,110,6,\r\n"],
-    "pylontech": [US5000_PWR, US2000_PWR, bat(1, US2000_CELLS_MV), b"\n\rpylon>"],
+    "pylontech": [US5000_PWR, US2000_PWR, bat_response(1, US2000_CELLS_MV), b"\n\rpylon>"],
 }
 cases = st.sampled_from(sorted(FRAMES)).flatmap(
     lambda name: st.tuples(
@@ -276,32 +287,34 @@ def test_no_bytes_raise_and_chunk_boundaries_do_not_change_the_values(
     whole_decoder, cut_decoder = PROTOCOLS[name](), PROTOCOLS[name]()
     block, cells = whole_decoder.feed(1.0, bytes(damaged)), whole_decoder.cells
     edges = [0, *sorted(min(at, len(damaged)) for at in cuts), len(damaged)]
-    blocks, rows = [], 0
+    blocks, cell_rows = [], 0
     for n, (a, b) in enumerate(itertools.pairwise(edges)):
         blocks.append(cut_decoder.feed(1.0 + n, bytes(damaged[a:b])))
-        rows += cut_decoder.cells.shape[0]
+        cell_rows += cut_decoder.cells.shape[0]
         cut_decoder.next_output(1.0 + n)
     assert voltages_and_currents(np.concatenate(blocks)) == voltages_and_currents(block)
-    assert rows <= cells.shape[0]
+    # a block with any cell voltages has a row of them for each sample; a block without has no rows
+    assert cell_rows <= cells.shape[0]
     assert whole_decoder.counters["frames_received"] == block.size
     assert (whole_decoder.fault is None) == (cut_decoder.fault is None)
 
 
-@pytest.mark.parametrize(("name", "cells"), [("vedirect", 0), ("junctek", 0), ("pylontech", 15)])
-async def test_simulated_device_is_read_by_the_serial_source(name: str, cells: int) -> None:
-    with METERS[name](lambda _: Reading(-3.25, 49.87, 21.0), 1.0) as meter:
+@pytest.mark.parametrize(("name", "cell_count"), [("vedirect", 0), ("junctek", 0), ("pylontech", 15)])
+async def test_simulated_device_is_read_by_the_serial_source(name: str, cell_count: int) -> None:
+    with METERS[name](lambda _: Reading(current_a=-3.25, voltage_v=49.87, temperature_c=21.0), 1.0) as meter:
         sensor = SensorSettings.model_validate({"protocol": name, "port": meter.path})
         running = asyncio.create_task(meter.run())
         async with asyncio.timeout(LONG_S), SerialSource(sensor) as source:
-            async for block in source:
+            async for block, cells_v in source:
                 assert voltages_and_currents(block) == [(49.87, -3.25)] * block.size
                 assert set(block["temperature_c"]) == {21.0}
-                if source.cells.shape[1] == cells:
+                if cells_v.shape[1] == cell_count:
                     break
-            assert source.message is None
+            assert source.silence_reason is None
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
-        assert source.cells.sum() == pytest.approx(49.87 * source.cells.shape[0] * (cells > 0), abs=0.01 * cells)
+        voltage_of_cells_v = 49.87 * cells_v.shape[0] if cell_count else 0.0
+        assert cells_v.sum() == pytest.approx(voltage_of_cells_v, abs=0.01 * cell_count)
 
 
 def test_silence_does_not_count_as_a_protocol_fault() -> None:

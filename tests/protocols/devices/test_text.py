@@ -23,7 +23,7 @@ cut_positions = st.lists(st.integers(0, 8 * MAX_LINE_BYTES), max_size=12)
 
 
 def decode(data: bytes, cuts: list[int]) -> tuple[TextProtocol, SampleBlock, list[list[float]]]:
-    """Return the decoder after ``data``, which is cut into chunks, and the samples and their cell voltages."""
+    """Decode ``data``, cut into chunks at ``cuts``. Return the decoder, the samples and their cell voltages."""
     decoder = TextProtocol()
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     blocks, cells = [], []
@@ -45,7 +45,7 @@ def test_no_bytes_raise_and_chunk_boundaries_do_not_change_the_result(data: byte
     assert decoder.counters["frames_received"] == whole_block.size
 
 
-def test_end_of_a_line_above_the_maximum_length_is_not_decoded() -> None:
+def test_end_of_a_line_that_exceeds_the_maximum_length_is_not_decoded_as_a_line() -> None:
     data = b"\n" + MAX_LINE_BYTES * b"x" + b"3.3,0.1\n3.4,0.2\n"
     _, block, _ = decode(data, [MAX_LINE_BYTES + 1])
     assert block["voltage_v"].tolist() == [3.4]
@@ -60,8 +60,10 @@ def test_end_of_a_line_above_the_maximum_length_is_not_decoded() -> None:
         (200 * b"x" + b"\n", f"the first: '{60 * 'x'}'..."),
     ],
 )
-def test_first_invalid_line_is_reported_verbatim(data: bytes, message: str) -> None:
-    incomplete_first_line = b"half\n"
+def test_first_invalid_line_is_reported_in_full_or_with_60_characters_until_a_valid_line(
+    data: bytes, message: str
+) -> None:
+    incomplete_first_line = b"half\n"  # which is never reported
     decoder, _, _ = decode(incomplete_first_line + data, [])
     assert decoder.fault is not None
     assert message in decoder.fault
@@ -70,12 +72,12 @@ def test_first_invalid_line_is_reported_verbatim(data: bytes, message: str) -> N
     assert decoder.fault is None
 
 
-def test_binary_bytes_are_reported_as_wrong_baud_rate() -> None:
+def test_bytes_that_are_no_text_are_reported_as_a_wrong_baud_rate() -> None:
     decoder, _, _ = decode(bytes(range(128, 256)) * (MAX_LINE_BYTES // 100), [])
     assert "wrong baud rate" in (decoder.fault or "")
 
 
-def test_cells_are_attached_to_their_samples() -> None:
+def test_cell_voltages_belong_to_the_sample_of_their_line() -> None:
     decoder = TextProtocol()
     block = decoder.feed(1.0, b"V=6.6 I=2 cells=3.31,3.29\n6.6,2\nV=6.6 I=2 cells=3.3\n")
     assert block.size == 3
@@ -85,7 +87,7 @@ def test_cells_are_attached_to_their_samples() -> None:
     assert decoder.cells is NO_CELLS
 
 
-def test_batch_of_reads_gives_the_same_samples_and_cells() -> None:
+def test_reads_decoded_as_a_batch_give_the_same_samples_as_one_by_one() -> None:
     reads = [b"6.6,2,25\nV=6.6 I=2 T=25 ce", b"lls=3.31,3.29\n", b"6.7,2,25\n"]
     single_reads_decoder, batch_decoder = TextProtocol(), TextProtocol()
     blocks = [single_reads_decoder.feed(float(i), read) for i, read in enumerate(reads)]

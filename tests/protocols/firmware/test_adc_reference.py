@@ -7,9 +7,12 @@ from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from tests.protocols.firmware.board_messages import NTC_STATUS, POWER_ON_STATUS, encode_hello, encode_sample
 
 FULL_SCALE = 1024
+"""ADC count of the reference voltage."""
 BANDGAP_AT_5_V = 1.1 / 5.0 * FULL_SCALE
+"""ADC count of the bandgap of 1.1 V at a reference of 5 V."""
 BANDGAP_AT_4_V = 1.1 / 4.0 * FULL_SCALE
 BOOT_READINGS = 256
+"""Number of bandgap readings at boot."""
 MAX_AUX_RATE_HZ = 100
 """Maximum rate of the samples with an auxiliary reading [Hz]."""
 MEAN_READINGS = 512
@@ -17,11 +20,12 @@ MEAN_READINGS = 512
 TIME_CONSTANT_S = 5
 """Rounded time constant of the bandgap [s]: 512 readings at 100 Hz."""
 OVERSAMPLING = 38
+"""Number of ADC readings in a sample."""
 MID_SCALE = FULL_SCALE // 2
 
 
 def hello(bandgap: float = BANDGAP_AT_5_V, **fields: int) -> bytes:
-    """Return the hello of a board that measured a mean bandgap of ``bandgap`` at boot."""
+    """Return the hello of a board whose bandgap readings at boot had the mean ``bandgap`` [ADC count]."""
     sums = {"bandgap_sum": round(bandgap * BOOT_READINGS), "bandgap_count": BOOT_READINGS}
     return encode_hello(**(sums | fields))
 
@@ -35,7 +39,7 @@ def samples(count: int, rate_hz: int, bandgap: float, first: int = 0, *, ntc: bo
     frames = []
     samples_per_reading = max(rate_hz // MAX_AUX_RATE_HZ, 1)
     for number in range(first, first + count):
-        is_ntc = ntc and (number // samples_per_reading) % 2 == 1
+        is_ntc = ntc and (number // samples_per_reading) % 2 == 1  # every second reading
         frames.append(
             encode_sample(
                 number,
@@ -70,12 +74,12 @@ def test_time_constant_of_the_reference_is_independent_of_the_sample_rate(rate_h
     assert response == pytest.approx(1.0 - np.exp(-1.0), abs=0.1)
 
 
-def test_reference_of_another_board_is_used_after_its_hello() -> None:
+def test_reference_after_the_hello_of_another_board_is_that_of_the_hello() -> None:
     decoder = FrameDecoder()
     decoder.feed(0.0, hello(serial=1) + samples(1000, 100, BANDGAP_AT_5_V))
     decoder.feed(10.0, hello(BANDGAP_AT_4_V, serial=2, sequence=5000))
     assert decoder.reference_v == pytest.approx(4.0, rel=1e-3)
-    bandgap_sample = decoder.feed(11.0, samples(1, 100, BANDGAP_AT_4_V, 5000))
+    bandgap_sample = decoder.feed(11.0, samples(1, 100, BANDGAP_AT_4_V, first=5000))
     assert np.isnan(bandgap_sample["temperature_c"][0])  # no NTC reading of the other board has arrived
     assert decoder.counters.resets == 1
 
@@ -87,7 +91,7 @@ def test_reference_after_a_reset_is_that_of_the_hello() -> None:
     assert decoder.reference_v == pytest.approx(4.0, rel=1e-3)
 
 
-def test_requested_hello_does_not_change_the_reference() -> None:
+def test_hello_without_a_reset_does_not_change_the_reference() -> None:
     decoder = FrameDecoder()
     decoder.feed(0.0, hello(BANDGAP_AT_4_V) + samples(6000, 100, BANDGAP_AT_5_V))
     before_v = decoder.reference_v
@@ -104,5 +108,5 @@ def test_reference_at_100_hz_is_an_exponential_mean_of_512_readings() -> None:
     for i, reading in enumerate(readings):
         weight = min(weight + 1.0, MEAN_READINGS)
         mean += (reading - mean) / weight
-        decoder.feed(0.0, samples(2, 100, reading, 2 * i))
-        assert decoder.reference_v == 1_100_000 * 1e-6 * FULL_SCALE / mean
+        decoder.feed(0.0, samples(2, 100, reading, first=2 * i))  # the second sample reads the NTC
+        assert decoder.reference_v == 1_100_000 * 1e-6 * FULL_SCALE / mean  # bandgap_uv of the hello

@@ -1,4 +1,4 @@
-"""Rate error of the board's clock, and rejection of jumps of this clock, from the arrival times of the samples."""
+"""Board's clock, compared with the arrival times of the samples: its rate error is measured, its jumps are rejected."""
 
 import itertools
 import subprocess
@@ -61,7 +61,7 @@ def decoder_after(*reads: Iterator[Read]) -> FrameDecoder:
 
 
 def measured_ppm(decoder: FrameDecoder | Replay) -> float:
-    """Return the rate error, which must be known."""
+    """Return the rate error [ppm] after a check that it has been measured."""
     assert decoder.clock_ppm is not None
     return decoder.clock_ppm
 
@@ -73,18 +73,18 @@ def test_fast_clock_is_measured_despite_delays(seconds: float, seed: int) -> Non
     assert measured_ppm(decoder) == pytest.approx(CLOCK_PPM, abs=TOLERANCE_PPM)
 
 
-def test_rate_is_unknown_in_the_first_minute() -> None:
+def test_rate_error_is_unknown_in_the_first_minute() -> None:
     assert decoder_after(generate_reads(55.0)).clock_ppm is None
     assert FrameDecoder().clock_ppm is None
 
 
-def test_rate_is_unknown_if_all_samples_arrive_together() -> None:
+def test_rate_error_is_unknown_if_all_samples_arrive_together() -> None:
     decoder = FrameDecoder()
     decoder.feed(START_S, b"".join(data for _, data in generate_reads(90.0)))
     assert decoder.clock_ppm is None
 
 
-def test_implausible_rate_is_none() -> None:
+def test_implausible_rate_error_is_not_reported() -> None:
     """The host's clock advances only 0.9 s in one second."""
     reads_with_slow_host_clock = (
         (START_S + 0.9 * (arrival_s - START_S), data) for arrival_s, data in generate_reads(120.0)
@@ -92,7 +92,7 @@ def test_implausible_rate_is_none() -> None:
     assert decoder_after(reads_with_slow_host_clock).clock_ppm is None
 
 
-def test_measurement_restarts_after_a_board_reset() -> None:
+def test_rate_error_is_measured_from_the_start_after_a_board_reset() -> None:
     reset_s = START_S + 300.0
     soon_after_reset = decoder_after(generate_reads(120.0), generate_reads(50.0, boot_id=2, start_s=reset_s))
     assert soon_after_reset.clock_ppm is None
@@ -100,7 +100,7 @@ def test_measurement_restarts_after_a_board_reset() -> None:
     assert measured_ppm(long_after_reset) == pytest.approx(CLOCK_PPM, abs=TOLERANCE_PPM)
 
 
-def test_outage_does_not_change_the_rate() -> None:
+def test_rate_error_is_the_same_after_an_outage() -> None:
     received = (read for read in generate_reads(300.0) if not 60.0 < read[0] - START_S < 200.0)
     assert measured_ppm(decoder_after(received)) == pytest.approx(CLOCK_PPM, abs=TOLERANCE_PPM)
 
@@ -135,19 +135,19 @@ def decoder_with_clock(set_clock: SetClock, seconds: int = 60) -> FrameDecoder:
     ids=["one ahead", "ahead from now on", "back", "at random for 3 s"],
 )
 def test_jump_of_the_clock_is_rejected(set_clock: SetClock, min_jumps: int, max_jumps: int) -> None:
-    """After a jump, sample times follow the arrival times, so that no charge is integrated over time that did not pass."""
+    """Sample times then follow the arrival times, so that no charge is integrated over time that did not pass."""
     decoder = decoder_with_clock(set_clock)
-    last_sample = decoder.feed(START_S + 60.1, encode_with_clock(600, set_clock))
+    last_sample = decoder.feed(START_S + 60.1, encode_with_clock(600, set_clock))  # follows 600 samples
     assert last_sample["time_s"][0] == pytest.approx(60.0, abs=1e-3)
     assert min_jumps <= decoder.counters.clock_jumps <= max_jumps
 
 
 def test_clock_jitter_does_not_accumulate() -> None:
-    """The jitter is at most 80 % of ``MAX_LEAD_S``. The time error at the end is at most ``MAX_LEAD_S``."""
+    """The clock runs ahead by up to 80 % of ``MAX_LEAD_S``, and the time error at the end is at most ``MAX_LEAD_S``."""
     jitter_step_us = round(0.2e6 * MAX_LEAD_S)
 
     def add_jitter(number: int, us: int) -> int:
-        steps = -number % 5 if 100 <= number < 500 else 0  # 0, 4, 3, 2, 1, 0, 4, ...
+        steps = -number % 5 if 100 <= number < 500 else 0  # the remainder is 0, 4, 3, 2, 1, 0, 4, ...
         return us + jitter_step_us * steps
 
     decoder = decoder_with_clock(add_jitter)
@@ -156,7 +156,7 @@ def test_clock_jitter_does_not_accumulate() -> None:
     assert last_sample["time_s"][0] == pytest.approx(60.0, abs=MAX_LEAD_S)
 
 
-def test_wrong_clock_after_a_reset_is_rejected() -> None:
+def test_clock_that_is_ahead_by_40_minutes_after_a_reset_is_rejected() -> None:
     decoder = decoder_with_clock(lambda _, us: us)
     decoder.feed(START_S + 70.0, encode_hello(boot_id=99))
     block = decoder.feed(START_S + 70.0, encode_sample(0, 2_400_000_000))
@@ -165,12 +165,13 @@ def test_wrong_clock_after_a_reset_is_rejected() -> None:
 
 
 def test_clock_set_back_during_an_outage_is_rejected() -> None:
-    """By the sequence numbers 100 s of samples are lost, but the board's clock advances by 20 s. No hello reports a reset."""
+    """The sequence numbers show a loss of 100 s, but the board's clock advances by 20 s. No hello reports a reset."""
     decoder = FrameDecoder()
     decoder.feed(START_S, encode_hello(period_ns=1000 * PERIOD_US))
+    outage_end, clock_error_us = 1300, 80_000_000
     times_s: list[float] = []
-    for number in (*range(300), *range(1300, 1400)):
-        board_us = PERIOD_US * (number + 1) - (80_000_000 if number >= 1300 else 0)
+    for number in (*range(300), *range(outage_end, 1400)):
+        board_us = PERIOD_US * (number + 1) - (clock_error_us if number >= outage_end else 0)
         block = decoder.feed(START_S + PERIOD_S * (number + 1), encode_sample(number, board_us))
         times_s.extend(block["time_s"])
     assert times_s[-1] == pytest.approx(139.9)  # the first sample, at 0.1 s, has time 0
@@ -190,13 +191,13 @@ def test_board_clock_is_used_after_a_host_stall() -> None:
     assert last_sample["time_s"][0] == pytest.approx(90.0)
 
 
-def test_sample_times_are_those_of_the_board() -> None:
+def test_sample_times_follow_the_clock_of_the_board() -> None:
     decoder = FrameDecoder()
     time_s = np.concatenate([decoder.feed(*read)["time_s"] for read in generate_reads(90.0)])
     assert np.array_equal(time_s, 1e-6 * (PERIOD_US * np.arange(900)))
 
 
-async def test_replay_gives_the_same_rate_bit_for_bit(tmp_path: Path) -> None:
+async def test_replay_measures_the_same_rate_error_bit_for_bit(tmp_path: Path) -> None:
     reads = list(generate_reads(90.0))
     with CaptureWriter(tmp_path / "line.bms", CaptureHeader()) as writer:
         for read in reads:
@@ -208,8 +209,10 @@ async def test_replay_gives_the_same_rate_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_clock_kernels_are_compiled_before_samples_arrive() -> None:
-    program = (
-        "from bms_estimator.protocols.firmware.clock_drift import clock_ppm; from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder; "
-        "FrameDecoder(); assert clock_ppm.signatures"
-    )
+    program = """
+from bms_estimator.protocols.firmware.clock_drift import clock_ppm
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
+FrameDecoder()
+assert clock_ppm.signatures
+"""
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -1,4 +1,4 @@
-"""Decoder of the firmware protocol with arbitrary bytes, compared with a simple, independent one."""
+"""Decoder of the firmware protocol with arbitrary bytes, compared with a simple, independent decoder."""
 
 import binascii
 import itertools
@@ -29,7 +29,7 @@ NTC_SAMPLE = encode_sample(1, 20_000, aux_sum=512, status=NTC_STATUS)
 
 
 def decode_independently(data: bytes) -> list[bytes]:
-    """Return the packets with a valid CRC, without the CRC, by the libraries cobs and binascii."""
+    """Return the packets with a valid CRC, without the CRC, decoded with the libraries cobs and binascii."""
     packets = []
     for frame in data.split(b"\0")[:-1]:
         try:
@@ -49,7 +49,7 @@ def count_samples(packets: list[bytes]) -> int:
 
 
 def decode(data: bytes, cuts: list[int]) -> tuple[SampleBlock, FrameCounters]:
-    """Return samples and counters after ``data``, which is cut into chunks that arrive at one time."""
+    """Decode ``data``, cut into chunks that arrive at one time. Return the samples and the counters."""
     decoder = FrameDecoder()
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     blocks = [decoder.feed(1.0, data[a:b]) for a, b in itertools.pairwise(edges)]
@@ -68,7 +68,9 @@ frames = st.builds(
     status=st.integers(0, 255),
 ).map(SampleMessage.encode)
 bits_by_format = {"B": 8, "H": 16, "I": 32}
-hello_fields = [st.integers(0, 2 ** bits_by_format[code] - 1) for code in "BBBBHIIIHIBBIIIIIHIIH"]
+hello_format = "BBBBHIIIHIBBIIIIIHIIH"
+"""Format of the fields of a hello, as in module struct."""
+hello_fields = [st.integers(0, 2 ** bits_by_format[code] - 1) for code in hello_format]
 hellos = st.builds(Hello, *hello_fields).map(Hello.encode)
 random_packets = st.binary(max_size=80).map(seal)
 frames_with_a_changed_byte = st.builds(
@@ -86,7 +88,7 @@ cut_positions = st.lists(st.integers(0, 1000), max_size=12)
 
 @settings(max_examples=300)
 @given(streams, cut_positions)
-def test_no_bytes_raise_and_chunk_boundaries_do_not_change_the_result(data: bytes, cuts: list[int]) -> None:
+def test_no_bytes_raise_an_error_and_chunk_boundaries_do_not_change_the_result(data: bytes, cuts: list[int]) -> None:
     whole_block, whole_counters = decode(data, [])
     cut_block, cut_counters = decode(data, cuts)
     for name in whole_block.dtype.names or ():  # the padding between the fields is not compared
@@ -121,11 +123,12 @@ def test_all_frames_between_garbage_are_decoded(garbage: list[bytes]) -> None:
 @settings(max_examples=200)
 @given(st.integers(0, 23), st.integers(1, 255))
 def test_sample_with_one_changed_byte_is_rejected(at: int, change: int) -> None:
-    """CRC-16 detects every burst of up to 16 bits, and a byte of a COBS frame affects at most two bytes of the packet."""
+    """CRC-16 detects bursts of up to 16 bits, and a byte of a COBS frame affects at most two bytes of the packet."""
     frame = sample(1)
     changed_frame = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
     block, counters = decode(HELLO + sample(0) + changed_frame + sample(2), [])
-    assert list(block["time_s"]) == [block["time_s"][0], block["time_s"][0] + 0.02]
+    first_s, last_s = block["time_s"]
+    assert last_s == first_s + 0.02
     assert counters.frames_lost == 1
     assert sum(getattr(counters, name) for name in ERROR_COUNTERS) >= 1
 

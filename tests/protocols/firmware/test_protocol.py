@@ -22,88 +22,88 @@ from bms_estimator.protocols.firmware.messages import (
 from bms_estimator.protocols.firmware.protocol import RETRY_S, BoardProtocol
 from tests.service.test_bad_line import HELLO, frames, sample
 
-ZERO = MessageType.COMMAND_ZERO_CURRENT
+ZERO_CURRENT = MessageType.COMMAND_ZERO_CURRENT
 ASH_RESET = b"\x1a\xc1\x02\x0b\x0a\x52\x7e"
 """Bytes that a Zigbee stick sends after its reset."""
 
 
 def protocol_after_hello(hello: Hello = HELLO, rate_hz: int = 100) -> BoardProtocol:
     """Return a protocol that has received the board's hello."""
-    decoder = BoardProtocol(rate_hz=rate_hz)
-    decoder.feed(0.0, b"\0" + hello.encode())
-    return decoder
+    protocol = BoardProtocol(rate_hz=rate_hz)
+    protocol.feed(0.0, b"\0" + hello.encode())
+    return protocol
 
 
-def test_nothing_is_sent_before_a_complete_frame() -> None:
-    decoder = BoardProtocol(rate_hz=100)
-    assert decoder.next_output(0.0) == b""
-    decoder.feed(1.0, ASH_RESET + sample(0).encode()[:-4])
-    assert decoder.next_output(1.0) == b""
-    decoder.feed(2.0, b"\0" + sample(1).encode())
-    assert decoder.next_output(2.0) == hello_command()
+def test_nothing_is_sent_to_a_device_before_its_first_valid_frame() -> None:
+    protocol = BoardProtocol(rate_hz=100)
+    assert protocol.next_output(0.0) == b""
+    protocol.feed(1.0, ASH_RESET + sample(0).encode()[:-4])
+    assert protocol.next_output(1.0) == b""
+    protocol.feed(2.0, b"\0" + sample(1).encode())
+    assert protocol.next_output(2.0) == hello_command()
 
 
 def test_unanswered_request_is_repeated_after_the_retry_interval() -> None:
-    decoder = BoardProtocol(rate_hz=100)
-    decoder.feed(0.0, b"\0" + sample(0).encode())
-    assert decoder.next_output(0.0) == hello_command()
-    assert decoder.next_output(0.9 * RETRY_S) == b""
-    assert decoder.next_output(1.1 * RETRY_S) == hello_command()
+    protocol = BoardProtocol(rate_hz=100)
+    protocol.feed(0.0, b"\0" + sample(0).encode())
+    assert protocol.next_output(0.0) == hello_command()
+    assert protocol.next_output(0.9 * RETRY_S) == b""
+    assert protocol.next_output(1.1 * RETRY_S) == hello_command()
 
 
 def test_rate_is_set_if_the_board_reports_another_rate() -> None:
     assert protocol_after_hello(rate_hz=100).next_output(0.0) == b""
-    decoder = protocol_after_hello(rate_hz=250)
-    assert decoder.next_output(0.0) == set_rate_command(250) + hello_command()
-    decoder.feed(0.1, replace(HELLO, rate_hz=250).encode())
-    assert decoder.next_output(10.0) == b""
+    protocol = protocol_after_hello(rate_hz=250)
+    assert protocol.next_output(0.0) == set_rate_command(250) + hello_command()
+    protocol.feed(0.1, replace(HELLO, rate_hz=250).encode())
+    assert protocol.next_output(10.0) == b""
 
 
-def test_nothing_is_sent_after_reopening_before_a_frame() -> None:
-    decoder = protocol_after_hello()
-    decoder.on_port_opened()
-    assert decoder.next_output(1.0) == b""
-    assert decoder.board == {}
-    decoder.feed(2.0, sample(0).encode())
-    assert decoder.next_output(2.0) == hello_command()
-    decoder.feed(2.1, replace(HELLO, serial=7).encode())
-    assert decoder.board["serial"] == "00000007"
+def test_after_reopening_nothing_is_sent_before_a_valid_frame() -> None:
+    protocol = protocol_after_hello()
+    protocol.on_port_opened()
+    assert protocol.next_output(1.0) == b""
+    assert protocol.board == {}
+    protocol.feed(2.0, sample(0).encode())
+    assert protocol.next_output(2.0) == hello_command()
+    protocol.feed(2.1, replace(HELLO, serial=7).encode())
+    assert protocol.board["serial"] == "00000007"
 
 
-def test_command_is_done_when_the_hello_after_it_arrives() -> None:
-    decoder = protocol_after_hello()
-    command = decoder.command("current_zero")
-    assert decoder.next_output(0.0) == zero_current_command()
-    assert decoder.next_output(3.0) == b""  # the board still measures and would reject a second command as busy
-    decoder.feed(3.0, Ack(ZERO, AckResult.OK, 510_000).encode())
-    assert (command.done, decoder.next_output(3.0)) == (False, hello_command())
-    decoder.feed(3.1, replace(HELLO, current_zero_ppm=510_000).encode())
+def test_command_is_done_when_a_hello_arrives_after_its_acknowledgement() -> None:
+    protocol = protocol_after_hello()
+    command = protocol.command("current_zero")
+    assert protocol.next_output(0.0) == zero_current_command()
+    assert protocol.next_output(3.0) == b""  # the board still measures and would reject a second command as busy
+    protocol.feed(3.0, Ack(ZERO_CURRENT, AckResult.OK, 510_000).encode())
+    assert (command.done, protocol.next_output(3.0)) == (False, hello_command())
+    protocol.feed(3.1, replace(HELLO, current_zero_ppm=510_000).encode())
     assert (command.done, command.refusal) == (True, None)
 
 
-def test_rejected_command_has_a_reason() -> None:
-    decoder = protocol_after_hello()
-    command = decoder.command("current_zero")
-    decoder.feed(1.0, Ack(ZERO, AckResult.BAD_VALUE, 0).encode())
+def test_rejected_command_gives_the_reason_of_the_board() -> None:
+    protocol = protocol_after_hello()
+    command = protocol.command("current_zero")
+    protocol.feed(1.0, Ack(ZERO_CURRENT, AckResult.BAD_VALUE, 0).encode())
     assert command.done
     assert command.refusal == "the board refuses: bad value; is the sensor connected, and no current flowing?"
 
 
 def test_cancelled_command_is_not_sent() -> None:
-    decoder = BoardProtocol()
-    command = decoder.command("current_zero")
+    protocol = BoardProtocol()
+    command = protocol.command("current_zero")
     command.done = True
-    decoder.feed(0.0, b"\0" + HELLO.encode())
-    assert decoder.next_output(0.0) == b""
+    protocol.feed(0.0, b"\0" + HELLO.encode())
+    assert protocol.next_output(0.0) == b""
 
 
 def test_command_is_cancelled_when_the_line_is_lost() -> None:
-    decoder = protocol_after_hello()
-    command = decoder.command("current_zero")
-    decoder.next_output(0.0)
-    decoder.on_port_opened()
-    decoder.feed(1.0, b"\0" + HELLO.encode())
-    assert decoder.next_output(1.0) == b""
+    protocol = protocol_after_hello()
+    command = protocol.command("current_zero")
+    protocol.next_output(0.0)
+    protocol.on_port_opened()
+    protocol.feed(1.0, b"\0" + HELLO.encode())
+    assert protocol.next_output(1.0) == b""
     assert (command.done, "the line was lost" in (command.refusal or "")) == (True, True)
 
 
@@ -116,35 +116,35 @@ messages = (
     st.binary(max_size=80)
     | st.integers(0, 9).map(lambda n: frames(n, 1))
     | st.just(HELLO.encode())
-    | st.sampled_from(AckResult).map(lambda result: Ack(ZERO, result, 1).encode())
+    | st.sampled_from(AckResult).map(lambda result: Ack(ZERO_CURRENT, result, 1).encode())
 )
 
 
 @given(st.lists(messages, max_size=20))
-def test_no_bytes_raise(reads: list[bytes]) -> None:
-    decoder = BoardProtocol(rate_hz=250)
+def test_no_bytes_raise_an_error(reads: list[bytes]) -> None:
+    protocol = BoardProtocol(rate_hz=250)
     for second, data in enumerate(reads):
-        if second % 5 == 2:
-            decoder.command("current_zero")
-        decoder.feed(float(second), data)
-        decoder.next_output(float(second))
-    assert decoder.counters["bytes_received"] <= sum(map(len, reads))
+        if second % 5 == 2:  # a command every five seconds
+            protocol.command("current_zero")
+        protocol.feed(float(second), data)
+        protocol.next_output(float(second))
+    assert protocol.counters["bytes_received"] <= sum(map(len, reads))
 
 
 def test_relay_command_is_repeated_until_acknowledged() -> None:
-    decoder, relay = protocol_after_hello(), Relay(high=True, high_when_silent=False, silent_s=30)
-    command = decoder.relay(relay)
-    assert decoder.next_output(0.0) == set_relay_command(relay)
-    assert decoder.next_output(1.1 * RETRY_S) == set_relay_command(relay)
-    decoder.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, relay_word(relay)).encode())
+    protocol, relay = protocol_after_hello(), Relay(high=True, high_when_silent=False, silent_s=30)
+    command = protocol.relay(relay)
+    assert protocol.next_output(0.0) == set_relay_command(relay)
+    assert protocol.next_output(1.1 * RETRY_S) == set_relay_command(relay)
+    protocol.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, relay_word(relay)).encode())
     assert (command.done, command.refusal) == (True, None)
-    assert decoder.next_output(2.0) == b""
-    assert decoder.hello == HELLO
+    assert protocol.next_output(2.0) == b""
+    assert protocol.hello == HELLO
 
 
-def test_firmware_without_relay_is_reported() -> None:
-    decoder = protocol_after_hello()
-    command = decoder.relay(Relay(high=True, high_when_silent=None))
-    decoder.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.UNKNOWN_COMMAND, 0).encode())
+def test_relay_command_to_a_firmware_without_relay_gives_the_reason() -> None:
+    protocol = protocol_after_hello()
+    command = protocol.relay(Relay(high=True, high_when_silent=None))
+    protocol.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.UNKNOWN_COMMAND, 0).encode())
     assert command.done
     assert command.refusal == "the board refuses: unknown command; firmware before 0.2.0 has no relay pin"

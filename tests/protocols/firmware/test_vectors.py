@@ -31,6 +31,7 @@ from bms_estimator.protocols.firmware.messages import (
 
 VECTORS = json.loads((Path(__file__).parents[3] / "firmware" / "test_vectors.json").read_text())
 MAX_FRAME_BYTES = 66
+"""Maximum size of a COBS frame without its delimiter [bytes]."""
 COMMANDS: dict[str, Callable[..., bytes]] = {
     "hello": hello_command,
     "zero_current": zero_current_command,
@@ -49,7 +50,7 @@ Vector = dict[str, Any]
 
 
 def vector_id(vector: Vector) -> str:
-    """Return the id of a test case."""
+    """Return the id of a test vector, from the fields that describe it."""
     return "-".join(str(vector[key]) for key in ("message", "command", "argument", "what") if key in vector)
 
 
@@ -76,7 +77,7 @@ def test_command_is_encoded_byte_for_byte(vector: Vector) -> None:
 
 
 @pytest.mark.parametrize("vector", VECTORS["bad_frames"], ids=vector_id)
-def test_invalid_frame_is_rejected_by_codec_and_decoder(vector: Vector) -> None:
+def test_invalid_frame_is_rejected_by_unseal_and_decoder(vector: Vector) -> None:
     frame = bytes.fromhex(vector["frame"])
     if len(frame) <= MAX_FRAME_BYTES:  # unseal does not check the length, which depends on the message type
         with pytest.raises(ProtocolError):
@@ -88,7 +89,7 @@ def test_invalid_frame_is_rejected_by_codec_and_decoder(vector: Vector) -> None:
 
 
 @pytest.mark.parametrize("vector", VECTORS["messages"], ids=vector_id)
-def test_decoder_accepts_every_message(vector: Vector) -> None:
+def test_decoder_accepts_every_message_after_a_hello(vector: Vector) -> None:
     decoder = FrameDecoder()
     hello = next(v for v in VECTORS["messages"] if v["what"] == "of a fresh board")
     decoder.feed(0.0, bytes.fromhex(hello["frame"]))

@@ -18,17 +18,18 @@ from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.influx import BATCH, MAX_WAITING, InfluxSink
 from bms_estimator.sinks.exports.line_protocol import lines
 from tests.influxdb import INFLUXD, InfluxDB
-from tests.sinks.service import until
-from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW
+from tests.sinks.sink_helpers import until
+from tests.sinks.snapshots import CELL_SNAPSHOT, SNAPSHOT_WITHOUT_SAMPLES, SOC_LOW_ALARM
 
-LOW_SOC_ALARM = SOC_LOW.model_copy(update={"text": 'charge "it" soon, \\now\nor never'})
+ALARM_TO_ESCAPE = SOC_LOW_ALARM.model_copy(update={"text": 'charge "it" soon, \\now\nor never'})
+"""Alarm whose text has characters that the line protocol escapes or cannot carry."""
 
 
-def at(second: int, **changes: Any) -> Snapshot:
-    """Return a snapshot ``second`` seconds after 12:00:00.250."""
-    assert ONE.estimate
+def snapshot_at(second: int, **changes: Any) -> Snapshot:
+    """Return a snapshot with changed values of its estimate, ``second`` seconds after 12:00:00.250."""
+    assert CELL_SNAPSHOT.estimate
     time = f"2024-05-01T12:{second // 60:02}:{second % 60:02}.250Z"
-    return ONE._replace(estimate=ONE.estimate.model_copy(update={"time": time} | changes))
+    return CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update={"time": time} | changes))
 
 
 @pytest.fixture(scope="module")
@@ -41,17 +42,19 @@ def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
 
 
 def sink(url: str, **options: Any) -> InfluxSink:
+    """Return a sink that writes ten times a second, unless ``options`` change its settings."""
     settings_values = {"url": url, "database": "bms", "every_s": 0.1} | options
     return InfluxSink(InfluxSettings(**settings_values), first_delay_s=0.1)
 
 
 async def test_written_lines_can_be_queried(influxdb: InfluxDB) -> None:
     async with sink(influxdb.url) as influx:
-        state = at(0, voltage_v=51.25, cells_v=[3.25, None, 3.5])
-        influx.publish(state._replace(alarms=(LOW_SOC_ALARM,)))
+        state = snapshot_at(0, voltage_v=51.25, cells_v=[3.25, None, 3.5])
+        influx.publish(state._replace(alarms=(ALARM_TO_ESCAPE,)))
         await until(lambda: not influx.waiting)
         [row] = await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_state")
         assert row["device"] == "pack"
+        # the server returns its times in milliseconds
         assert row["time"] == 1000 * datetime.fromisoformat("2024-05-01T12:00:00.250Z").timestamp()
         assert (row["voltage_v"], row["lock"], row["crc_errors"]) == (51.25, state.estimate.lock, 3.0)
         assert (row["cells_v_0"], row["cells_v_2"]) == (3.25, 3.5)
@@ -67,7 +70,7 @@ async def test_lines_of_an_outage_are_written_afterwards(influxdb: InfluxDB) -> 
         await asyncio.to_thread(influxdb.stop)
         with structlog.testing.capture_logs() as logs:
             for second in range(100, 110):
-                influx.publish(at(second))
+                influx.publish(snapshot_at(second))
             await until(lambda: logs)
             await asyncio.to_thread(influxdb.start)
             await until(lambda: not influx.waiting)
@@ -81,13 +84,13 @@ async def test_lines_of_an_outage_are_written_afterwards(influxdb: InfluxDB) -> 
 
 async def test_queued_lines_are_written_at_shutdown(influxdb: InfluxDB) -> None:
     async with sink(influxdb.url, every_s=3600.0) as influx:
-        influx.publish(at(600, frames_received=777))
+        influx.publish(snapshot_at(600, frames_received=777))
     assert influx.waiting == 0
     assert await asyncio.to_thread(influxdb.ask, "SELECT * FROM bms_state WHERE frames_received = 777")
 
 
 class ConfiguredHandler(BaseHTTPRequestHandler):
-    """HTTP handler that gives configured responses and stores the requests."""
+    """HTTP handler that stores the requests, and gives the responses of a list in turn and the last of them forever."""
 
     def do_POST(self) -> None:
         server: Any = self.server
@@ -105,6 +108,7 @@ class ConfiguredHandler(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server() -> Iterator[Any]:
+    """Start an HTTP server. Its list ``responses`` has pairs of status and text, and is changed by the tests."""
     with ThreadingHTTPServer(("127.0.0.1", 0), ConfiguredHandler) as server:
         configured: Any = server
         configured.requests, configured.responses = [], [(204, b"")]
@@ -121,21 +125,21 @@ async def test_influxdb_2_request_has_bucket_and_token(server: Any, tmp_path: Pa
     token.write_text("secret\n")
     settings = InfluxSettings(url=server.url + "/in/", bucket="b c", org="home", token_file=token, every_s=0.1)
     async with InfluxSink(settings) as influx:
-        influx.publish(at(0))
+        influx.publish(snapshot_at(0))
         await until(lambda: server.requests)
     path, headers, body = server.requests[0]
     assert path == "/in/api/v2/write?bucket=b+c&org=home&precision=ms"
     assert headers["Authorization"] == "Token secret"
-    assert body.decode() == "\n".join(lines(None, at(0)))
+    assert body.decode() == "\n".join(lines(None, snapshot_at(0)))
 
 
-async def test_permanently_rejected_lines_are_dropped_and_others_retried(server: Any) -> None:
+async def test_lines_rejected_by_status_400_are_dropped_and_by_302_or_503_retried(server: Any) -> None:
     server.responses = [(302, b""), (503, b"busy"), (400, b"bad \x1b line"), (204, b"")]
     async with sink(server.url) as influx:
         with structlog.testing.capture_logs() as logs:
-            influx.publish(at(0))
+            influx.publish(snapshot_at(0))
             await until(lambda: influx.dropped)
-            influx.publish(at(1))
+            influx.publish(snapshot_at(1))
             await until(lambda: not influx.waiting)
     bodies = [body for _, _, body in server.requests]
     assert bodies[0] == bodies[1] == bodies[2] != bodies[3]
@@ -148,10 +152,10 @@ async def test_permanently_rejected_lines_are_dropped_and_others_retried(server:
 async def test_queue_is_bounded_and_sent_in_batches(server: Any) -> None:
     server.responses = [(503, b"")]
     async with sink(server.url) as influx:
-        influx.publish(at(0))
+        influx.publish(snapshot_at(0))
         await until(lambda: server.requests)
         for second in range(1, MAX_WAITING + 2 * BATCH):
-            influx.publish(at(second % 3600))
+            influx.publish(snapshot_at(second % 3600))
         assert influx.waiting <= MAX_WAITING + BATCH
         assert influx.dropped >= BATCH - 1
         server.responses = [(204, b"")]
@@ -160,19 +164,20 @@ async def test_queue_is_bounded_and_sent_in_batches(server: Any) -> None:
 
 
 async def test_server_without_response_does_not_block_shutdown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)
+    monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)  # the last lines cannot be written
     with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel accepts connections, but no program responds
         async with sink(f"http://127.0.0.1:{silent.getsockname()[1]}") as influx:
             for second in range(20):
-                influx.publish(at(second))
+                influx.publish(snapshot_at(second))
         assert influx.waiting == 20
 
 
 async def test_truncated_response_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)
+    monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)  # the last lines cannot be written
     with socket.create_server(("127.0.0.1", 0)) as listening:
 
-        def answer() -> None:
+        def send_truncated_response() -> None:
+            """Announce chunks, and end within the length of the first."""
             connection, _ = listening.accept()
             with connection:
                 connection.sendall(b"HTTP/1.1 503 Busy\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n")
@@ -182,11 +187,11 @@ async def test_truncated_response_is_retried(monkeypatch: pytest.MonkeyPatch) ->
 
         with structlog.testing.capture_logs() as logs:
             async with sink(f"http://127.0.0.1:{listening.getsockname()[1]}") as influx:
-                response_sent = asyncio.create_task(asyncio.to_thread(answer))
-                influx.publish(at(0))
+                response_sent = asyncio.create_task(asyncio.to_thread(send_truncated_response))
+                influx.publish(snapshot_at(0))
                 await response_sent
                 await until(lambda: logs)
-                influx.publish(at(1))
+                influx.publish(snapshot_at(1))
         assert logs[0]["reason"].startswith("503 Busy")
         assert influx.waiting == 2
 
@@ -194,9 +199,9 @@ async def test_truncated_response_is_retried(monkeypatch: pytest.MonkeyPatch) ->
 async def test_invalid_host_name_is_reported() -> None:
     with structlog.testing.capture_logs() as logs:
         async with sink("http://influx..local:8086") as influx:
-            influx.publish(at(0))
+            influx.publish(snapshot_at(0))
             await until(lambda: logs)
-            influx.publish(at(1))
+            influx.publish(snapshot_at(1))
     assert "label empty or too long" in logs[0]["reason"]
 
 
@@ -226,9 +231,9 @@ def test_unusable_file_raises_an_error_at_start(tmp_path: Path) -> None:
 
 
 def test_snapshot_without_changes_has_no_lines() -> None:
-    assert lines(None, NOTHING_YET) == []
-    raised = NOTHING_YET._replace(alarms=(LOW_SOC_ALARM,))
-    [line] = lines(NOTHING_YET, raised)
+    assert lines(None, SNAPSHOT_WITHOUT_SAMPLES) == []
+    raised = SNAPSHOT_WITHOUT_SAMPLES._replace(alarms=(ALARM_TO_ESCAPE,))
+    [line] = lines(SNAPSHOT_WITHOUT_SAMPLES, raised)
     assert line.startswith(
         "bms_alarm,device=pack,name=soc_low,severity=warning active=true,watched=true,value=9.5,limit=10.0,text="
     )

@@ -15,7 +15,7 @@ from bms_estimator.model.payloads import Estimate, Health, Snapshot
 from bms_estimator.settings.exports import PrometheusSettings
 from tests.free_port import free_port
 from tests.patience import LONG_S
-from tests.sinks.snapshots import NOTHING_YET, ONE, SOC_LOW, STACK, snapshot
+from tests.sinks.snapshots import CELL_SNAPSHOT, SNAPSHOT_WITHOUT_SAMPLES, SOC_LOW_ALARM, STACK_SNAPSHOT, snapshot
 
 pytest.importorskip("prometheus_client", reason="prometheus-client is not installed: pip install prometheus-client")
 
@@ -23,7 +23,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from bms_estimator.sinks.exports.prometheus import PrometheusSink
 from bms_estimator.sinks.exports.prometheus_metrics import (
-    KINDS,
+    COUNTER_FIELDS,
     LIST_ITEMS,
     name_and_factor,
 )
@@ -33,12 +33,13 @@ PROMTOOL = shutil.which("promtool")
 
 def snapshot_with_all_values() -> Snapshot:
     """Return a snapshot with cells, energy and an alarm."""
-    assert ONE.estimate
+    assert CELL_SNAPSHOT.estimate
     values = {"cells_v": [3.25, None, 3.5], "energy_out_kwh": 1.5, "time_to_empty_s": 60.0, "temperature_c": 21.5}
-    return ONE._replace(estimate=ONE.estimate.model_copy(update=values), alarms=(SOC_LOW,))
+    return CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=values), alarms=(SOC_LOW_ALARM,))
 
 
 async def scrape(*snapshots: Snapshot) -> str:
+    """Publish the snapshots. Return the text that Prometheus then scrapes."""
     settings = PrometheusSettings(listen=f"127.0.0.1:{free_port()}")
     async with PrometheusSink(settings) as sink:
         for snapshot in snapshots:
@@ -52,7 +53,7 @@ async def scrape(*snapshots: Snapshot) -> str:
 
 
 def values(text: str) -> dict[tuple[str, ...], float]:
-    """Return the values by name and labels other than the device."""
+    """Return the values of a scrape by the metric's name and its labels other than the device."""
     metrics = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
@@ -62,8 +63,8 @@ def values(text: str) -> dict[tuple[str, ...], float]:
     return metrics
 
 
-async def test_a_snapshot_without_an_estimate_leaves_the_last_one_in_the_scrape() -> None:
-    assert values(await scrape(ONE, ONE._replace(estimate=None)))["bms_voltage_volts",] == 3.8
+async def test_a_snapshot_without_an_estimate_leaves_the_last_estimate_in_the_scrape() -> None:
+    assert values(await scrape(CELL_SNAPSHOT, CELL_SNAPSHOT._replace(estimate=None)))["bms_voltage_volts",] == 3.8
 
 
 async def test_a_scrape_has_the_values_in_base_units() -> None:
@@ -71,7 +72,7 @@ async def test_a_scrape_has_the_values_in_base_units() -> None:
     metrics = values(text)
     assert metrics["bms_voltage_volts",] == 3.8
     assert metrics["bms_soc_ratio",] == pytest.approx(0.5)
-    assert metrics["bms_energy_out_joules_total",] == 1.5 * 3.6e6
+    assert metrics["bms_energy_out_joules_total",] == 1.5 * 3.6e6  # 1.5 kWh
     assert metrics["bms_temperature_celsius",] == 21.5
     assert metrics["bms_crc_errors_total",] == 3.0
     assert metrics["bms_line_total", "frames_received"] == 2.0
@@ -89,12 +90,12 @@ async def test_a_scrape_has_the_values_in_base_units() -> None:
 
 async def test_unknown_and_stale_values_have_no_metrics() -> None:
     assert values(await scrape()) == {}
-    for stale in (NOTHING_YET, snapshot("no board")):
+    for stale in (SNAPSHOT_WITHOUT_SAMPLES, snapshot(sensor_message="no board")):
         metrics = values(await scrape(stale))
         assert not {"bms_voltage_volts", "bms_soc_ratio"} & {name for name, *_ in metrics}
         assert ("bms_uptime_seconds",) in metrics
-    assert values(await scrape(snapshot("no board")))["bms_sensor_online",] == 0.0
-    assert ("bms_soc_ratio",) not in values(await scrape(STACK))
+    assert values(await scrape(snapshot(sensor_message="no board")))["bms_sensor_online",] == 0.0
+    assert ("bms_soc_ratio",) not in values(await scrape(STACK_SNAPSHOT))
 
 
 async def test_occupied_address_raises_an_error() -> None:
@@ -104,9 +105,9 @@ async def test_occupied_address_raises_an_error() -> None:
             await PrometheusSink(settings).__aenter__()
 
 
-def test_tables_contain_only_existing_fields() -> None:
+def test_metric_tables_contain_only_fields_of_the_payloads() -> None:
     fields = set(Estimate.model_fields) | set(Health.model_fields)
-    assert {*KINDS, *LIST_ITEMS} <= fields
+    assert {*COUNTER_FIELDS, *LIST_ITEMS} <= fields
 
 
 def test_units_are_converted_to_base_units() -> None:
@@ -131,16 +132,16 @@ def test_ipv4_and_ipv6_addresses_are_accepted() -> None:
 
 
 async def test_slow_name_lookup_does_not_block_the_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    called, may_return, original = threading.Event(), threading.Event(), socket.getaddrinfo
+    called, may_return, getaddrinfo = threading.Event(), threading.Event(), socket.getaddrinfo
 
-    def slow(*arguments: Any, **options: Any) -> Any:
+    def slow_getaddrinfo(*arguments: Any, **options: Any) -> Any:
         called.set()
         assert may_return.wait(LONG_S)
-        return original(*arguments, **options)
+        return getaddrinfo(*arguments, **options)
 
-    monkeypatch.setattr(socket, "getaddrinfo", slow)
+    monkeypatch.setattr(socket, "getaddrinfo", slow_getaddrinfo)
 
-    async def release() -> None:
+    async def release() -> None:  # a blocked event loop would never run it
         await asyncio.to_thread(called.wait, LONG_S)
         may_return.set()
 

@@ -14,175 +14,184 @@ from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
-from tests.sinks.snapshots import ONE, STACK
+from tests.sinks.snapshots import CELL_SNAPSHOT, STACK_SNAPSHOT
 
-ROOT = "bms/pack"
+TOPIC_ROOT = "bms/pack"
 SETTINGS = HomeAssistantSettings()
 
 
 def components_of(message: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the components of a discovery message, without removed ones."""
+    """Return the components of a discovery message, without removed ones, which have only their platform."""
     return {key: component for key, component in message["components"].items() if set(component) != {"platform"}}
 
 
-COMPONENTS = components_of(discovery(SETTINGS, DiscoveryInputs(ONE.info), ROOT, 0.0))
-SHOWN = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
+COMPONENTS = components_of(discovery(SETTINGS, DiscoveryInputs(CELL_SNAPSHOT.info), TOPIC_ROOT, 0.0))
+ENABLED_BY_DEFAULT = {key for key, component in COMPONENTS.items() if component.get("enabled_by_default", True)}
 MAX_ROWS_PER_MIN = 20
-"""Maximum number of recorder rows per minute."""
+"""Maximum number of rows that Home Assistant's recorder may write per minute for one pack."""
+CAPACITY_AH = 2.7
+"""Capacity of the cell in ``noisy_cell``."""
 
 
-STACK_COMPONENTS = components_of(discovery(SETTINGS, DiscoveryInputs(STACK.info), ROOT, 0.0))
+STACK_COMPONENTS = components_of(discovery(SETTINGS, DiscoveryInputs(STACK_SNAPSHOT.info), TOPIC_ROOT, 0.0))
 
 
-def with_values(**values: float | None) -> Snapshot:
-    assert ONE.estimate
-    return ONE._replace(estimate=ONE.estimate.model_copy(update=values))
+def cell_snapshot_with(**values: float | None) -> Snapshot:
+    """Return the cell's snapshot with changed values of its estimate."""
+    assert CELL_SNAPSHOT.estimate
+    return CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=values))
 
 
 def noisy_cell(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, Snapshot]]:
-    """Yield noisy measurements of an 18650 cell under a load that changes every 20 s."""
+    """Yield times and snapshots of an 18650 cell with noise, under a load that changes every 20 s."""
     rng, soc, load_a = np.random.default_rng(5), 0.9, 0.0
     for i in range(round(seconds / period_s)):
         now_s = i * period_s
         if i % round(20.0 / period_s) == 0:
             load_a = float(rng.uniform(0.0, 3.0))
-        soc -= load_a * period_s / 3600.0 / 2.7
+        soc -= load_a * period_s / 3600.0 / CAPACITY_AH
         current_a = load_a + float(rng.normal(0.0, 0.02))
         voltage_v = 3.2 + soc - 0.07 * load_a + float(rng.normal(0.0, 0.003))
         yield (
             now_s,
-            with_values(
+            cell_snapshot_with(
                 voltage_v=voltage_v,
                 current_a=current_a,
                 power_w=voltage_v * current_a,
                 temperature_c=25.0 + float(rng.normal(0.0, 0.1)),
                 soc_percent=100.0 * soc + float(rng.normal(0.0, 0.05)),
-                remaining_capacity_ah=2.7 * soc,
-                remaining_energy_wh=2.7 * soc * 3.6,
-                time_to_empty_s=3600.0 * 2.7 * soc / current_a if current_a > 0.0 else None,
+                remaining_capacity_ah=CAPACITY_AH * soc,
+                remaining_energy_wh=CAPACITY_AH * soc * 3.6,
+                time_to_empty_s=3600.0 * CAPACITY_AH * soc / current_a if current_a > 0.0 else None,
                 innovation_v=float(rng.normal(0.0, 0.003)),
                 frames_lost=i // 50,
             ),
         )
 
 
-CELLS = 4
-"""Number of cells with a voltage."""
+CELL_COUNT = 4
+"""Number of cells with a voltage in ``all_values_changing``."""
 SOURCE_FIELDS = ("soc_std", "time_to_empty_s", "time_to_full_s", "cell_lowest", "cell_lowest_v")
-"""Fields of the estimate whose entities have other names."""
+"""Fields of the estimate from which entities with other names are computed."""
 
 
-def all_changing(seconds: float, period_s: float = 0.1, base: Snapshot = ONE) -> Iterator[tuple[float, Snapshot]]:
-    """Yield snapshots in which every value changes."""
+def all_values_changing(
+    seconds: float, period_s: float = 0.1, base: Snapshot = CELL_SNAPSHOT
+) -> Iterator[tuple[float, Snapshot]]:
+    """Yield times and snapshots. Every value changes with each snapshot."""
     assert base.estimate
-    names = [key for key in (*SHOWN, *SOURCE_FIELDS) if hasattr(base.estimate, key)]
+    names = [key for key in (*ENABLED_BY_DEFAULT, *SOURCE_FIELDS) if hasattr(base.estimate, key)]
     for i in range(round(seconds / period_s)):
         elements = {key: e.model_copy(update={"value": float(i)}) for key, e in base.parameters.elements.items()}
         health = {"capacity": Parameter(value=float(i), std=float(i), valid=True, source="identified")}
         parameters = base.parameters.model_copy(update={"elements": elements, "state_of_health": health})
-        estimate = base.estimate.model_copy(update=dict.fromkeys(names, i) | {"cells_v": [float(i)] * CELLS})
+        estimate = base.estimate.model_copy(update=dict.fromkeys(names, i) | {"cells_v": [float(i)] * CELL_COUNT})
         yield i * period_s, base._replace(estimate=estimate, parameters=parameters)
 
 
 def home_assistant_messages(stream: Iterator[tuple[float, Snapshot]]) -> Iterator[tuple[float, str, dict[str, object]]]:
-    """Yield time, topic and content of the messages to Home Assistant."""
+    """Yield time, topic and payload of the messages to Home Assistant."""
     messages, sent = MessageBuilder("bms", "pack"), PublishedState()
     for now_s, each in stream:
         due, sent = messages.live_messages(sent, each, now_s)
         for message in due:
-            if message.topic.startswith(f"{ROOT}/home_assistant"):
+            if message.topic.startswith(f"{TOPIC_ROOT}/home_assistant"):
                 yield now_s, message.topic, json.loads(message.payload)
 
 
-def rows(
+def row_times(
     stream: Iterator[tuple[float, Snapshot]], components: dict[str, dict[str, object]] = COMPONENTS
 ) -> list[float]:
     """Return the times at which Home Assistant's recorder writes a row, for changed states or attributes of entities."""
-    last: dict[str, object] = {}
+    last_values: dict[str, object] = {}
     row_times_s = []
     enabled = {key for key, component in components.items() if component.get("enabled_by_default", True)}
     for now_s, topic, payload in home_assistant_messages(stream):
         for key in enabled & set(payload):
             assert components[key]["state_topic"] == topic
-            if key in last and last[key] != payload[key]:
+            if key in last_values and last_values[key] != payload[key]:
                 row_times_s.append(now_s)
-            last[key] = payload[key]
-    assert enabled <= set(last)
+            last_values[key] = payload[key]
+    assert enabled <= set(last_values)
     return row_times_s
 
 
-@pytest.mark.parametrize("stream", [noisy_cell, all_changing])
+@pytest.mark.parametrize("stream", [noisy_cell, all_values_changing])
 def test_home_assistant_records_at_most_20_rows_in_any_minute(
     stream: Callable[[float], Iterator[tuple[float, Snapshot]]],
 ) -> None:
     components = (
-        components_of(discovery(SETTINGS, DiscoveryInputs(ONE.info, CELLS), ROOT, 0.0))
-        if stream is all_changing
+        components_of(discovery(SETTINGS, DiscoveryInputs(CELL_SNAPSHOT.info, CELL_COUNT), TOPIC_ROOT, 0.0))
+        if stream is all_values_changing
         else COMPONENTS
     )
-    row_times_s = np.array(rows(stream(900.0), components))
+    row_times_s = np.array(row_times(stream(900.0), components))
     assert row_times_s.size > 100
     assert max(np.count_nonzero((row_times_s >= t) & (row_times_s < t + 60.0)) for t in row_times_s) <= MAX_ROWS_PER_MIN
 
 
 def test_fuel_cell_causes_at_most_20_rows_in_any_minute() -> None:
-    row_times_s = np.array(rows(all_changing(900.0, base=STACK), STACK_COMPONENTS))
+    row_times_s = np.array(row_times(all_values_changing(900.0, base=STACK_SNAPSHOT), STACK_COMPONENTS))
     assert row_times_s.size > 100
     assert max(np.count_nonzero((row_times_s >= t) & (row_times_s < t + 60.0)) for t in row_times_s) <= MAX_ROWS_PER_MIN
 
 
 def test_fuel_cell_has_its_own_entities() -> None:
-    values = next(payload for _, topic, payload in home_assistant_messages(iter([(0.0, STACK)])))
-    numbers = {key for key, component in STACK_COMPONENTS.items() if component["platform"] == "sensor"}
-    assert numbers == set(values)
+    values = next(payload for _, topic, payload in home_assistant_messages(iter([(0.0, STACK_SNAPSHOT)])))
+    sensors = {key for key, component in STACK_COMPONENTS.items() if component["platform"] == "sensor"}
+    assert sensors == set(values)
     assert {key for key, value in values.items() if value is None} == {"temperature_c"}
-    assert set(KEYS) <= numbers
-    assert values["r_ohm"] == pytest.approx(0.1677, abs=1e-3)
+    assert set(KEYS) <= sensors
+    assert values["r_ohm"] == pytest.approx(0.1677, abs=1e-3)  # r_ohm of the model pem_30w
     assert STACK_COMPONENTS["r_ohm"]["unit_of_measurement"] == "Ω"
 
 
-def test_noise_causes_no_rows() -> None:
+def test_noise_at_rest_causes_no_rows() -> None:
     rng = np.random.default_rng(2)
     stream = (
-        (float(i), with_values(voltage_v=3.705 + float(rng.normal(0.0, 0.002)), current_a=float(rng.normal(0.0, 0.01))))
+        (
+            float(i),
+            cell_snapshot_with(voltage_v=3.705 + float(rng.normal(0.0, 0.002)), current_a=float(rng.normal(0.0, 0.01))),
+        )
         for i in range(600)
     )
-    assert rows(stream) == []
+    assert row_times(stream) == []
 
 
 @pytest.mark.parametrize("rate_hz", [0.1, 0.7, 1.0, 4.0, 10.0])
-def test_values_never_expire_while_estimates_come(rate_hz: float) -> None:
-    info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
-    components = discovery(SETTINGS, DiscoveryInputs(info), ROOT, 0.0)["components"].values()
+def test_values_never_expire_while_estimates_arrive_up_to_a_period_late(rate_hz: float) -> None:
+    info = CELL_SNAPSHOT.info.model_copy(update={"publish_rate_hz": rate_hz})
+    components = discovery(SETTINGS, DiscoveryInputs(info), TOPIC_ROOT, 0.0)["components"].values()
     expiry_s = min(c["expire_after"] for c in components if "expire_after" in c)
     rng = np.random.default_rng(3)
-    late_s = [float(rng.uniform(0.0, 0.9 / rate_hz)) for _ in range(round(600 * rate_hz))]
-    stream = ((i / rate_hz + late, ONE) for i, late in enumerate(late_s))
-    times_s = [now_s for now_s, topic, _ in home_assistant_messages(stream) if topic == f"{ROOT}/home_assistant"]
-    assert times_s[-1] > 550.0
+    delays_s = [float(rng.uniform(0.0, 0.9 / rate_hz)) for _ in range(round(600 * rate_hz))]
+    stream = ((i / rate_hz + delay_s, CELL_SNAPSHOT) for i, delay_s in enumerate(delays_s))
+    times_s = [now_s for now_s, topic, _ in home_assistant_messages(stream) if topic == f"{TOPIC_ROOT}/home_assistant"]
+    assert times_s[-1] > 550.0  # of 600 s
     assert max(np.diff(times_s)) < expiry_s
 
 
-def test_values_expire_without_estimates() -> None:
-    silent = ONE._replace(estimate=None)
-    times_s = [t for t, _, _ in home_assistant_messages((float(i), silent if i else ONE) for i in range(60))]
+def test_values_are_not_repeated_without_estimates_so_that_they_expire() -> None:
+    silent = CELL_SNAPSHOT._replace(estimate=None)
+    times_s = [t for t, _, _ in home_assistant_messages((float(i), silent if i else CELL_SNAPSHOT) for i in range(60))]
     assert times_s == [0.0]
 
 
 def test_rare_change_is_published_within_five_seconds() -> None:
-    stream = ((float(i), with_values(current_a=0.0 if i < 43 else 3.0)) for i in range(60))
-    changed_s = next(t for t, _, payload in home_assistant_messages(stream) if payload.get("current_a") == 3.0)
-    assert changed_s <= 48.0
+    change_s = 43.0
+    stream = ((t, cell_snapshot_with(current_a=0.0 if t < change_s else 3.0)) for t in map(float, range(60)))
+    published_s = next(t for t, _, payload in home_assistant_messages(stream) if payload.get("current_a") == 3.0)
+    assert published_s <= change_s + 5.0
 
 
 def test_values_are_rounded_to_their_resolution() -> None:
-    values = with_values(voltage_v=3.7049999, soc_percent=56.7890123, remaining_energy_wh=1.23456789)
+    values = cell_snapshot_with(voltage_v=3.7049999, soc_percent=56.7890123, remaining_energy_wh=1.23456789)
     payload = next(p for _, _, p in home_assistant_messages(iter([(0.0, values)])))
     assert (payload["voltage_v"], payload["soc_percent"], payload["remaining_energy_wh"]) == (3.7, 56.8, 1.2)
     assert payload["temperature_c"] is None
 
 
-def test_only_alarms_have_attributes() -> None:
+def test_only_alarms_and_signed_values_have_attributes() -> None:
     for component in COMPONENTS.values():
         assert not component["state_topic"].endswith(("/health", "/state", "/parameters"))
         if "json_attributes_template" in component:
@@ -205,13 +214,13 @@ def test_observer_values_are_disabled_by_default() -> None:
         "sample_rate_hz",
         "r_ts_ohm",
     }
-    assert not SHOWN & observer_values
+    assert not ENABLED_BY_DEFAULT & observer_values
     assert observer_values < set(COMPONENTS)
-    assert {"voltage_v", "current_a", "soc_percent", "time_to_empty_h", "r_s_ohm"} <= SHOWN
+    assert {"voltage_v", "current_a", "soc_percent", "time_to_empty_h", "r_s_ohm"} <= ENABLED_BY_DEFAULT
 
 
 def test_discovery_describes_every_entity_with_both_availabilities() -> None:
-    message = discovery(SETTINGS, DiscoveryInputs(ONE.info), ROOT, 0.0)
+    message = discovery(SETTINGS, DiscoveryInputs(CELL_SNAPSHOT.info), TOPIC_ROOT, 0.0)
     assert (message["device"]["identifiers"], message["device"]["serial_number"]) == (["bms_pack"], "A1")
     assert message["origin"]["name"] == "bms_estimator"
     assert message["availability_mode"] == "all"
@@ -225,13 +234,13 @@ def test_discovery_describes_every_entity_with_both_availabilities() -> None:
 
 @pytest.mark.parametrize(("rate_hz", "sample_period_s", "expire_s"), [(0.1, 1.0, 30), (10.0, 1.0, 30), (1.0, 25.0, 75)])
 def test_values_expire_after_three_periods_or_30_s(rate_hz: float, sample_period_s: float, expire_s: int) -> None:
-    info = ONE.info.model_copy(update={"publish_rate_hz": rate_hz})
-    components = discovery(SETTINGS, DiscoveryInputs(info), ROOT, sample_period_s)["components"].values()
+    info = CELL_SNAPSHOT.info.model_copy(update={"publish_rate_hz": rate_hz})
+    components = discovery(SETTINGS, DiscoveryInputs(info), TOPIC_ROOT, sample_period_s)["components"].values()
     assert {c["expire_after"] for c in components if "expire_after" in c} == {expire_s}
 
 
 def discoveries(*snapshots: Snapshot, commands: tuple[str, ...] = (), **settings: Any) -> list[dict[str, Any]]:
-    """Return the discovery messages for ``snapshots``."""
+    """Publish the snapshots, 10 s apart. Return the payloads of the discovery messages."""
     messages, sent = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(**settings)), PublishedState()
     messages.commands = commands
     payloads = []
@@ -242,8 +251,8 @@ def discoveries(*snapshots: Snapshot, commands: tuple[str, ...] = (), **settings
 
 
 def test_cells_are_added_with_their_first_voltages_and_never_removed() -> None:
-    cells = with_values(cells_v=[3.3, None, 3.31], cell_lowest=1, cell_lowest_v=3.3)
-    before, after = discoveries(ONE, cells, ONE)
+    cells = cell_snapshot_with(cells_v=[3.3, None, 3.31], cell_lowest=1, cell_lowest_v=3.3)
+    before, after = discoveries(CELL_SNAPSHOT, cells, CELL_SNAPSHOT)
     new = set(after["components"]) - set(before["components"])
     assert new == {
         "cell_lowest",
@@ -257,10 +266,12 @@ def test_cells_are_added_with_their_first_voltages_and_never_removed() -> None:
 
 
 def test_allowed_commands_have_controls() -> None:
-    [none] = discoveries(ONE)
-    assert {c["platform"] for c in components_of(none).values()} == {"sensor"}
-    [some] = discoveries(ONE, commands=("set_soc", "current_zero", "acknowledge_alarm", "publish_rate"))
-    platforms = {key: c["platform"] for key, c in some["components"].items() if "command_topic" in c}
+    [without_commands] = discoveries(CELL_SNAPSHOT)
+    assert {c["platform"] for c in components_of(without_commands).values()} == {"sensor"}
+    [with_commands] = discoveries(
+        CELL_SNAPSHOT, commands=("set_soc", "current_zero", "acknowledge_alarm", "publish_rate")
+    )
+    platforms = {key: c["platform"] for key, c in with_commands["components"].items() if "command_topic" in c}
     assert platforms == {
         "set_soc": "number",
         "current_zero": "button",
@@ -272,7 +283,7 @@ def test_allowed_commands_have_controls() -> None:
 def test_entities_of_an_earlier_configuration_are_removed() -> None:
     messages = MessageBuilder("bms", "pack", alarms=[name for name in ALARMS if name != "soc_low"])
     messages.commands = ("set_soc",)
-    due, _ = messages.live_messages(PublishedState(), ONE, 0.0)
+    due, _ = messages.live_messages(PublishedState(), CELL_SNAPSHOT, 0.0)
     [message] = [json.loads(m.payload) for m in due if m.topic.endswith("/device/bms_pack/config")]
     removed = {key: c["platform"] for key, c in message["components"].items() if key not in components_of(message)}
     assert removed == {
@@ -295,18 +306,20 @@ def test_monitored_alarms_stay_available_while_the_sensor_is_silent() -> None:
         unit=None,
         text="",
     )
-    [message] = discoveries(ONE._replace(alarms=(alarm,)))
+    [message] = discoveries(CELL_SNAPSHOT._replace(alarms=(alarm,)))
     component = message["components"]["alarm_soc_low"]
     assert (component["platform"], component["device_class"]) == ("binary_sensor", "battery")
     assert component["state_topic"] == "bms/pack/alarm/soc_low"
-    of_service, of_alarm = component["availability"]
-    assert of_service == {"topic": "bms/pack/availability"}
-    assert (of_alarm["topic"], component["availability_mode"]) == ("bms/pack/alarm/soc_low", "all")
-    assert of_alarm["value_template"] == ("{{ 'online' if value_json.watched or value_json.active else 'offline' }}")
+    service_availability, alarm_availability = component["availability"]
+    assert service_availability == {"topic": "bms/pack/availability"}
+    assert (alarm_availability["topic"], component["availability_mode"]) == ("bms/pack/alarm/soc_low", "all")
+    assert alarm_availability["value_template"] == (
+        "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
+    )
 
 
-def test_ids_do_not_depend_on_names() -> None:
-    cells = with_values(cells_v=[3.3])
+def test_entity_ids_do_not_depend_on_configured_names() -> None:
+    cells = cell_snapshot_with(cells_v=[3.3])
     [english] = discoveries(cells)
     [german] = discoveries(cells, name="Hausbatterie", names={"voltage_v": "Klemmenspannung", "cell_v": "Zelle"})
     english_components, german_components = components_of(english), components_of(german)
@@ -333,13 +346,15 @@ def test_error_on_an_unknown_name_lists_the_entities() -> None:
 
 def test_current_sign_is_configurable() -> None:
     messages = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(current_sign="charge_positive"))
-    due, _ = messages.live_messages(PublishedState(), with_values(current_a=2.0, power_w=8.0, voltage_v=4.0), 0.0)
-    values = next(json.loads(m.payload) for m in due if m.topic == f"{ROOT}/home_assistant")
+    due, _ = messages.live_messages(
+        PublishedState(), cell_snapshot_with(current_a=2.0, power_w=8.0, voltage_v=4.0), 0.0
+    )
+    values = next(json.loads(m.payload) for m in due if m.topic == f"{TOPIC_ROOT}/home_assistant")
     assert (values["current_a"], values["power_w"], values["voltage_v"]) == (-2.0, -8.0, 4.0)
 
 
 def test_disabled_discovery_removes_the_device() -> None:
     messages = MessageBuilder("bms", "pack", home_assistant=HomeAssistantSettings(enabled=False, discovery_prefix="ha"))
-    due, _ = messages.live_messages(PublishedState(), ONE, 0.0)
+    due, _ = messages.live_messages(PublishedState(), CELL_SNAPSHOT, 0.0)
     discovery_messages = [m for m in due if "home_assistant" in m.topic or not m.topic.startswith("bms/")]
     assert [(m.topic, m.payload, m.retain) for m in discovery_messages] == [("ha/device/bms_pack/config", b"", True)]

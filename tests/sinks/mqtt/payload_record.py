@@ -11,7 +11,7 @@ from bms_estimator.sinks.mqtt.topics import schema
 RECORD = Path(__file__).with_name("payloads.json")
 
 
-def current() -> dict[str, Any]:
+def current_record() -> dict[str, Any]:
     """Return version and fields of the payloads that the service publishes now."""
     schemas = schema()
     version = schemas.pop("payload_version")
@@ -19,6 +19,7 @@ def current() -> dict[str, Any]:
 
 
 def read_record() -> dict[str, Any]:
+    """Return version and fields at the last time that the file was written."""
     return json.loads(RECORD.read_text(encoding="utf-8"))
 
 
@@ -38,6 +39,7 @@ def find_broken(before: dict[str, str], after: dict[str, str]) -> list[str]:
 
 
 def _walk(path: str, node: dict[str, Any], models: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield path and types of a part of a JSON schema, and of all parts inside it."""
     parts = [_resolve(part, models) for part in node.get("anyOf", [node])]
     yield path, ", ".join(sorted({part.get("type", "any") for part in parts}))
     for part in parts:
@@ -49,11 +51,13 @@ def _walk(path: str, node: dict[str, Any], models: dict[str, Any]) -> Iterator[t
 
 
 def _resolve(node: dict[str, Any], models: dict[str, Any]) -> dict[str, Any]:
+    """Return the schema to which ``node`` refers, or ``node`` itself."""
     return models[node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node
 
 
 def main() -> int:
-    after = current()
+    """Write the record, unless the fields have changed in a way that needs a new version. Return the exit code."""
+    after = current_record()
     before = read_record() if RECORD.exists() else after
     violations = find_broken(before["fields"], after["fields"])
     if violations and before["payload_version"] >= after["payload_version"]:

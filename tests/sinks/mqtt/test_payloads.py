@@ -11,15 +11,15 @@ from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.mqtt.requests import COMMANDS
 from bms_estimator.sinks.mqtt.topics import TOPICS
 from tests.command_line import run
-from tests.sinks.mqtt.payload_record import current, find_broken, read_record
-from tests.sinks.snapshots import NOW, ONE, SOC_LOW
+from tests.sinks.mqtt.payload_record import current_record, find_broken, read_record
+from tests.sinks.snapshots import CELL_SNAPSHOT, NOW, SOC_LOW_ALARM
 
 DOCUMENT = document("bms")
-HOW_TO_WRITE = "make payloads writes tests/sinks/mqtt/payloads.json anew"
+HOW_TO_UPDATE = "run `make payloads`, which rewrites tests/sinks/mqtt/payloads.json"
 
 
 def test_no_field_is_removed_or_changes_its_type_without_a_new_version() -> None:
-    before, after = read_record(), current()
+    before, after = read_record(), current_record()
     violations = find_broken(before["fields"], after["fields"])
     if after["payload_version"] == before["payload_version"]:
         assert violations == [], "readers rely on these: raise PAYLOAD_VERSION in bms_estimator/model/payloads.py"
@@ -27,13 +27,13 @@ def test_no_field_is_removed_or_changes_its_type_without_a_new_version() -> None
 
 
 def test_record_contains_all_fields() -> None:
-    before, after = read_record(), current()
-    assert after["payload_version"] == before["payload_version"], HOW_TO_WRITE
-    assert sorted(set(after["fields"]) - set(before["fields"])) == [], HOW_TO_WRITE
+    before, after = read_record(), current_record()
+    assert after["payload_version"] == before["payload_version"], HOW_TO_UPDATE
+    assert sorted(set(after["fields"]) - set(before["fields"])) == [], HOW_TO_UPDATE
 
 
 def test_removed_and_changed_fields_are_detected() -> None:
-    fields = current()["fields"]
+    fields = current_record()["fields"]
     assert find_broken(fields, fields | {"state.new": "number"}) == []
     assert find_broken(fields, fields | {"state.voltage_v": "string"}) == ["state.voltage_v: was number, is string"]
     assert find_broken(fields, {name: kind for name, kind in fields.items() if name != "parameters.a.*.std"}) == [
@@ -41,21 +41,24 @@ def test_removed_and_changed_fields_are_detected() -> None:
     ]
 
 
-def test_the_version_is_published() -> None:
+def test_the_payload_version_is_published_in_info_and_schema() -> None:
     messages = MessageBuilder("bms", "pack")
-    message = {
+    payloads = {
         m.topic.removeprefix("bms/pack/"): m.payload
-        for m in (*messages.birth_messages(), *messages.live_messages(PublishedState(), ONE, NOW)[0])
+        for m in (*messages.birth_messages(), *messages.live_messages(PublishedState(), CELL_SNAPSHOT, NOW)[0])
     }
-    assert json.loads(message["info"])["payload_version"] == PAYLOAD_VERSION
-    assert json.loads(message["schema"])["payload_version"] == PAYLOAD_VERSION
+    assert json.loads(payloads["info"])["payload_version"] == PAYLOAD_VERSION
+    assert json.loads(payloads["schema"])["payload_version"] == PAYLOAD_VERSION
 
 
 def test_messages_have_qos_and_retain_of_the_topic_table() -> None:
-    messages, snapshot = MessageBuilder("bms", "pack"), ONE._replace(alarms=(SOC_LOW,))
+    messages, snapshot = MessageBuilder("bms", "pack"), CELL_SNAPSHOT._replace(alarms=(SOC_LOW_ALARM,))
     messages_by_topic = {
         m.topic.removeprefix("bms/pack/"): m
-        for m in (*messages.must_deliver(None, snapshot), *messages.live_messages(PublishedState(), snapshot, NOW)[0])
+        for m in (
+            *messages.guaranteed_messages(None, snapshot),
+            *messages.live_messages(PublishedState(), snapshot, NOW)[0],
+        )
     }
     assert messages_by_topic["alarm/soc_low"].qos == TOPICS["alarm"].qos
     assert messages_by_topic["alarm/soc_low"].retain
@@ -68,6 +71,7 @@ def test_messages_have_qos_and_retain_of_the_topic_table() -> None:
 
 
 def references(node: Any) -> list[str]:
+    """Return all references in a part of a JSON document."""
     if isinstance(node, dict):
         return (
             [node["$ref"]]

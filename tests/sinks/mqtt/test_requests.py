@@ -24,14 +24,16 @@ from bms_estimator.sinks.mqtt.requests import (
 class RecordingDispatcher:
     """Dispatcher with a clock set by the test, and handlers that record their calls.
 
+    Calling it sends a request, and returns the decoded response, or None without one.
+
     Attributes:
         granted: Names of the requests that reached a handler.
         now_s: Time of the clock [s].
     """
 
-    def __init__(self, *commands: Any) -> None:
+    def __init__(self, *allowed_commands: Any) -> None:
         self.delivery, self.now_s, self.granted = DeliveryStats(), 0.0, list[str]()
-        self.requests = RequestDispatcher(self.delivery, commands, monotonic=lambda: self.now_s)
+        self.requests = RequestDispatcher(self.delivery, allowed_commands, monotonic=lambda: self.now_s)
         for name in COMMANDS:
             self.requests.register(name, self._handler(name))
 
@@ -68,7 +70,7 @@ class RecordingDispatcher:
         (b'{"transaction": {"a": 1}}', "error", None),
     ],
 )
-async def test_request_gets_a_response(payload: bytes, status: str, transaction: object) -> None:
+async def test_request_gets_a_response_with_its_transaction(payload: bytes, status: str, transaction: object) -> None:
     dispatcher = RecordingDispatcher("publish_rate")
     response = await dispatcher("publish_rate", payload)
     assert set(response) == {"status", "data", "error", "transaction"}
@@ -104,14 +106,14 @@ async def test_unknown_name_is_counted_and_gets_no_response(name: str) -> None:
     assert len(str(logs)) < 300
 
 
-async def test_payload_above_4_kb_is_rejected() -> None:
+async def test_payload_above_4096_bytes_is_rejected() -> None:
     dispatcher = RecordingDispatcher("publish_rate")
     padded = b'{"x": 1}' + b" " * MAX_PAYLOAD_BYTES
     assert (await dispatcher("publish_rate", padded[:MAX_PAYLOAD_BYTES]))["status"] == "ok"
     assert "4096 bytes" in (await dispatcher("publish_rate", padded))["error"]
 
 
-async def test_command_needs_a_permission_in_the_settings() -> None:
+async def test_command_is_granted_only_if_the_settings_allow_it() -> None:
     for name in ("set_soc", "current_zero"):
         dispatcher = RecordingDispatcher()
         assert "mqtt.commands" in (await dispatcher(name))["error"]
@@ -132,7 +134,8 @@ async def test_rate_of_commands_is_limited_and_former_requests_do_not_count() ->
     dispatcher.now_s = 30.0
     for _ in range(1000):
         await dispatcher("set_soc")
-    assert dispatcher.granted.count("set_soc") == 1.5 * REQUESTS_PER_MIN
+    assert dispatcher.granted.count("set_soc") == 1.5 * REQUESTS_PER_MIN  # after half a minute
+    # of 3000 requests in all, "state" has used a budget of its own
     assert dispatcher.delivery.requests["too_many"] == 3000 - len(dispatcher.granted) - REQUESTS_PER_MIN
 
 
@@ -145,7 +148,7 @@ async def test_each_burst_is_logged_once() -> None:
         assert [line["kind"] for line in logs] == ["refused", "unknown", "too_many"]
         dispatcher.now_s = LOG_S
         await dispatcher("nonsense")
-    assert logs[-1]["so_far"] == 10_001
+    assert logs[-1]["so_far"] == 10_001  # all unknown requests
 
 
 @given(name=st.sampled_from(COMMANDS + FORMER_READS) | st.text(), payload=st.binary() | st.text().map(str.encode))

@@ -13,19 +13,21 @@ from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.terminal.screen import MAX_MESSAGES, build_screen
 from bms_estimator.sinks.terminal.text_line import text_line
 from bms_estimator.sinks.terminal.view_state import BrokerOutage, PackView, ViewState
-from tests.sinks.snapshots import NOTHING_YET, NOW, ONE, STACK
+from tests.sinks.snapshots import CELL_SNAPSHOT, NOW, SNAPSHOT_WITHOUT_SAMPLES, STACK_SNAPSHOT
 
 LOG = [f"12:00:0{n}Z [warning] faults on the line frames_lost={n} crc_errors={n} overruns={n}" for n in range(5)]
 HINT = "live page: http://127.0.0.1:8765/; in a second terminal: mosquitto_sub -p 18833 -t 'bms/#' -v"
 ESTIMATE = {"soc_percent": 50.0, "soc_std": 0.02, "voltage_v": 24.123, "current_a": 12.5, "power_w": 301.54}
 
 
-def pack_view(topics: dict[str, Any] | None = None, device: str = "pack", snapshot: Snapshot = ONE) -> PackView:
-    """Return the pack as a subscriber sees it, with some topics changed."""
+def pack_view(
+    topics: dict[str, Any] | None = None, device: str = "pack", snapshot: Snapshot = CELL_SNAPSHOT
+) -> PackView:
+    """Return a pack as a subscriber sees it, with some payloads changed. ``topics`` has the changes by topic."""
     published, messages = TopicCache("bms"), MessageBuilder("bms", device)
     for message in (
         *messages.birth_messages(),
-        *messages.must_deliver(None, snapshot),
+        *messages.guaranteed_messages(None, snapshot),
         *messages.live_messages(PublishedState(), snapshot, NOW)[0],
     ):
         published.take(message.topic, message.payload, NOW)
@@ -33,6 +35,7 @@ def pack_view(topics: dict[str, Any] | None = None, device: str = "pack", snapsh
 
 
 def alarm(name: str, severity: str, *, active: bool = True) -> dict[str, Any]:
+    """Return topic and payload of an alarm."""
     payload = {"name": name, "severity": severity, "active": active, "since": "2024-05-01T12:00:00.000Z"}
     return {f"alarm/{name}": payload | {"text": f"{name}: 12.3 % is below the limit; charge the pack soon"}}
 
@@ -46,12 +49,13 @@ def lines_of(view: ViewState, columns: int = 100, rows: int = 40) -> list[str]:
 
 
 def text_of(*packs: PackView, now_s: float = NOW, outage: BrokerOutage | None = None) -> str:
+    """Return the text of the screen, with one space between words."""
     return " ".join(" ".join(lines_of(ViewState(now_s, packs, outage))).split())
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(32, 8), (60, 20), (80, 12), (80, 24), (200, 60)])
 def test_a_screen_of_any_size_shows_the_soc_and_no_line_is_too_long(columns: int, rows: int) -> None:
-    lines = lines_of(ViewState(NOW, [pack_view({"state": ESTIMATE})], None, LOG, HINT, 0.5), columns, rows)
+    lines = lines_of(ViewState(NOW, [pack_view({"state": ESTIMATE})], None, LOG, HINT, true_soc=0.5), columns, rows)
     assert len(lines) == rows
     assert max(map(cell_len, lines)) <= columns
     assert "pack 50.00 ± 4.00" in " ".join(" ".join(lines).split())
@@ -60,19 +64,21 @@ def test_a_screen_of_any_size_shows_the_soc_and_no_line_is_too_long(columns: int
 def test_80_by_24_cells_show_a_pack_with_three_alarms_and_the_log_and_the_hint() -> None:
     alarms = alarm("soc_low", "warning") | alarm("cell_over_voltage", "critical") | alarm("cell_imbalance", "warning")
     topics = alarms | alarm("link_lost", "critical", active=False) | {"state": ESTIMATE}
-    view = ViewState(NOW, [pack_view(topics)], None, LOG, HINT, 0.497)
+    view = ViewState(NOW, [pack_view(topics)], None, LOG, HINT, true_soc=0.497)
     text = " ".join(" ".join(lines_of(view, 80, 24)).split())
     assert "pack 50.00 ± 4.00 49.70 live 24.123 +12.500 +301.54 - NO LOCK" in text
     assert LOG[-1][:50] in text
     assert HINT in text
-    critical = text.index("pack: critical since 2024-05-01T12:00:00.000Z: cell_over_voltage: 12.3 % is below the limit")
-    assert critical < text.index("pack: warning since 2024-05-01T12:00:00.000Z: soc_low:") < text.index("imbalance:")
+    critical_at = text.index(
+        "pack: critical since 2024-05-01T12:00:00.000Z: cell_over_voltage: 12.3 % is below the limit"
+    )
+    assert critical_at < text.index("pack: warning since 2024-05-01T12:00:00.000Z: soc_low:") < text.index("imbalance:")
     assert "link_lost" not in text
 
 
 def test_unknown_values_are_dashes() -> None:
-    assert "pack - live 13.000" in text_of(pack_view(snapshot=STACK))
-    assert "pack - live - - - - -" in text_of(pack_view(snapshot=NOTHING_YET))
+    assert "pack - live 13.000" in text_of(pack_view(snapshot=STACK_SNAPSHOT))
+    assert "pack - live - - - - -" in text_of(pack_view(snapshot=SNAPSHOT_WITHOUT_SAMPLES))
 
 
 def test_stale_values_have_a_reason_and_a_time() -> None:

@@ -17,21 +17,28 @@ from dbus_fast.aio import MessageBus
 from tests.protocols.bms_frames import JBD_DISCHARGING
 
 ADDRESS, NAME = "A5:C2:37:00:00:00", "DP04S007L4S100A"
-ADAPTER = "/org/bluez/hci0"
-DEVICE = f"{ADAPTER}/dev_{ADDRESS.replace(':', '_')}"
-SERVICE, NOTIFY, WRITE = f"{DEVICE}/service0010", f"{DEVICE}/service0010/char0011", f"{DEVICE}/service0010/char0013"
+ADAPTER_PATH = "/org/bluez/hci0"
+DEVICE_PATH = f"{ADAPTER_PATH}/dev_{ADDRESS.replace(':', '_')}"
+SERVICE_PATH, NOTIFY_PATH, WRITE_PATH = (
+    f"{DEVICE_PATH}/service0010",
+    f"{DEVICE_PATH}/service0010/char0011",
+    f"{DEVICE_PATH}/service0010/char0013",
+)
 CELLS, BASIC = JBD_DISCHARGING.frames[:15], JBD_DISCHARGING.frames[15:]
+"""Responses to the requests of registers 0x04 (cell voltages) and 0x03 (pack values)."""
 ADVERTISE_S = 0.02
 """Interval of the advertisements [s]."""
 PACKET_BYTES = 20
-"""Maximum size of a notification [bytes]."""
+"""Maximum size of a notification [bytes], which is the MTU without the 3 bytes of its header."""
 
 
 def uuid(short: str) -> str:
+    """Return the full UUID of a 16-bit UUID."""
     return f"0000{short}-0000-1000-8000-00805f9b34fb"
 
 
 def variants(**values: Any) -> dict[str, Variant]:
+    """Return D-Bus values with the types of the Python values."""
     signatures = {str: "s", bool: "b", int: "n", list: "as", bytes: "ay"}
     return {name: Variant(signatures[type(value)], value) for name, value in values.items()}
 
@@ -51,31 +58,37 @@ class BlueZ:
         bus.add_message_handler(self._handle)
 
     def objects(self) -> dict[str, dict[str, dict[str, Variant]]]:
+        """Return the properties of each interface of each object, by object path and interface."""
         device = variants(Address=ADDRESS, Alias=NAME, Name=NAME, UUIDs=[uuid("ff00")], Connected=False)
         device |= variants(Paired=False, Trusted=False, ServicesResolved=False, AddressType="public")
-        service = {"Device": Variant("o", DEVICE), "UUID": Variant("s", uuid("ff00")), "Primary": Variant("b", True)}
+        service = {
+            "Device": Variant("o", DEVICE_PATH),
+            "UUID": Variant("s", uuid("ff00")),
+            "Primary": Variant("b", True),
+        }
         characteristics = {
             path: {
                 "org.bluez.GattCharacteristic1": {
-                    "Service": Variant("o", SERVICE),
-                    "MTU": Variant("q", 23),
+                    "Service": Variant("o", SERVICE_PATH),
+                    "MTU": Variant("q", PACKET_BYTES + 3),
                     **variants(UUID=uuid(short), Flags=flags, Value=b""),
                 }
             }
             for path, short, flags in (
-                (NOTIFY, "ff01", ["read", "notify"]),
-                (WRITE, "ff02", ["write", "write-without-response"]),
+                (NOTIFY_PATH, "ff01", ["read", "notify"]),
+                (WRITE_PATH, "ff02", ["write", "write-without-response"]),
             )
         }
         adapter = variants(Address="00:00:00:00:00:01", Name="hci0", Powered=True, Roles=["central"])
         return {
-            ADAPTER: {"org.bluez.Adapter1": adapter},
-            DEVICE: {"org.bluez.Device1": {**device, "Adapter": Variant("o", ADAPTER)}},
-            SERVICE: {"org.bluez.GattService1": service},
+            ADAPTER_PATH: {"org.bluez.Adapter1": adapter},
+            DEVICE_PATH: {"org.bluez.Device1": {**device, "Adapter": Variant("o", ADAPTER_PATH)}},
+            SERVICE_PATH: {"org.bluez.GattService1": service},
             **characteristics,
         }
 
     def send_properties(self, path: str, interface: str, **values: Any) -> None:
+        """Signal changed properties of an object."""
         body = [interface, variants(**values), []]
         self._bus.send(
             Message.new_signal(path, "org.freedesktop.DBus.Properties", "PropertiesChanged", "sa{sv}as", body)
@@ -85,15 +98,16 @@ class BlueZ:
         """Advertise the BMS periodically during a discovery."""
         if self._discovering:
             if self.in_range:
-                self.send_properties(DEVICE, "org.bluez.Device1", RSSI=-50)
+                self.send_properties(DEVICE_PATH, "org.bluez.Device1", RSSI=-50)
             asyncio.get_running_loop().call_later(ADVERTISE_S, self._advertise)
 
     def leave(self) -> None:
         """Move the BMS out of range."""
         self.in_range = False
-        self.send_properties(DEVICE, "org.bluez.Device1", Connected=False, ServicesResolved=False)
+        self.send_properties(DEVICE_PATH, "org.bluez.Device1", Connected=False, ServicesResolved=False)
 
     def _handle(self, message: Message) -> Message | None:
+        """Return the response to a method call; its effects follow in the next cycle of the event loop."""
         if message.message_type != MessageType.METHOD_CALL or not (message.path or "").startswith(("/org/bluez", "/")):
             return None
         if message.member == "GetManagedObjects":
@@ -107,19 +121,21 @@ class BlueZ:
         """Change the properties as BlueZ does after a method call."""
         if message.member == "StartDiscovery":
             self._discovering = True
-            self.send_properties(ADAPTER, "org.bluez.Adapter1", Discovering=True)
+            self.send_properties(ADAPTER_PATH, "org.bluez.Adapter1", Discovering=True)
             self._advertise()
         elif message.member == "StopDiscovery":
             self._discovering = False
-            self.send_properties(ADAPTER, "org.bluez.Adapter1", Discovering=False)
+            self.send_properties(ADAPTER_PATH, "org.bluez.Adapter1", Discovering=False)
         elif message.member in ("Connect", "Disconnect"):
             connected = message.member == "Connect"
-            self.send_properties(DEVICE, "org.bluez.Device1", Connected=connected, ServicesResolved=connected)
+            self.send_properties(DEVICE_PATH, "org.bluez.Device1", Connected=connected, ServicesResolved=connected)
         elif message.member == "WriteValue":
             self.requests.append(bytes(message.body[0]))
-            answer = {0x03: BASIC, 0x04: CELLS}.get(self.requests[-1][2], b"")
-            for at in range(0, len(answer), PACKET_BYTES):
-                self.send_properties(NOTIFY, "org.bluez.GattCharacteristic1", Value=answer[at : at + PACKET_BYTES])
+            register = self.requests[-1][2]
+            answer = {0x03: BASIC, 0x04: CELLS}.get(register, b"")
+            for start in range(0, len(answer), PACKET_BYTES):
+                packet = answer[start : start + PACKET_BYTES]
+                self.send_properties(NOTIFY_PATH, "org.bluez.GattCharacteristic1", Value=packet)
 
 
 @asynccontextmanager

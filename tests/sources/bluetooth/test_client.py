@@ -15,14 +15,14 @@ from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 from tests.patience import LONG_S
 
-WHY = "aiobmsble is not installed: it needs Python 3.12 and the extra ble"
-ble_bms = pytest.importorskip("bms_estimator.sources.bluetooth.client", reason=WHY)
-bluez = pytest.importorskip("tests.sources.bluetooth.bluez", reason=WHY)
+SKIP_REASON = "aiobmsble is not installed: it needs Python 3.12 and the extra ble"
+ble_bms = pytest.importorskip("bms_estimator.sources.bluetooth.client", reason=SKIP_REASON)
+bluez = pytest.importorskip("tests.sources.bluetooth.bluez", reason=SKIP_REASON)
 if shutil.which("dbus-daemon") is None:
     pytest.skip("dbus-daemon is not installed", allow_module_level=True)
 
 JBD_SAMPLE = {"voltage_v": 15.6, "current_a": -2.87, "temperature_c": 22.133, "cells_v": [3.43, 3.425, 3.432, 3.417]}
-"""Values of the simulated BMS. The current is positive on charge."""
+"""Values of the simulated BMS. aiobmsble's current is positive on charge."""
 
 
 def make_producer(**options: object) -> LineProducer:
@@ -35,27 +35,29 @@ async def read_to_end(lines: AsyncGenerator[bytes, None]) -> None:
         pass
 
 
-async def test_bms_is_polled_and_reconnected_after_a_loss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_bms_is_polled_and_can_be_reconnected_after_it_was_out_of_range(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async with asyncio.timeout(LONG_S), bluez.system_bus(tmp_path) as bus:
-        stack = bluez.BlueZ(bus)
+        simulated = bluez.BlueZ(bus)
         await bus.request_name("org.bluez")
         producer = make_producer(address=bluez.ADDRESS.lower())
         async with aclosing(producer.iter_lines()) as lines:
             assert await anext(lines) == CONNECTED
             assert [json.loads(await anext(lines)) for _ in range(2)] == 2 * [JBD_SAMPLE]
-            stack.leave()
+            simulated.leave()
             with pytest.raises(SourceUnavailableError):
                 await read_to_end(lines)
-        monkeypatch.setattr(ble_bms, "SCAN_S", 0.2)
+        monkeypatch.setattr(ble_bms, "SCAN_S", 0.2)  # the scan finds no BMS
         with pytest.raises(SourceUnavailableError, match="does not advertise"):
             await read_to_end(producer.iter_lines())
         monkeypatch.undo()
-        stack.in_range = True
+        simulated.in_range = True
         async with aclosing(make_producer(name=bluez.NAME, bms="jbd").iter_lines()) as lines:
             assert await anext(lines) == CONNECTED
             assert json.loads(await anext(lines)) == JBD_SAMPLE
 
 
-def test_unsupported_bms_is_rejected() -> None:
+def test_bms_type_that_aiobmsble_does_not_support_is_rejected() -> None:
     with pytest.raises(UserError, match=r"source\.bms = 'jbdd': aiobmsble supports abc, .*jbd"):
         make_producer(address=bluez.ADDRESS, bms="jbdd")

@@ -1,7 +1,11 @@
-"""Readings from samples of aiobmsble. The samples are those of its tests of JBD and Jikong BMS."""
+"""Readings from samples of aiobmsble, and settings of a Bluetooth source.
+
+The samples are those of aiobmsble's tests of JBD and Jikong BMS.
+"""
 
 import math
 import sys
+from types import SimpleNamespace
 
 import pytest
 from pydantic import ValidationError
@@ -15,10 +19,10 @@ from bms_estimator.sources.factory import open_line_source
 
 
 class Sensor:
-    """Replacement of aiobmsble's ``TempSensor``: a temperature with the type of the sensor's place."""
+    """Replacement of aiobmsble's ``TempSensor``: a temperature and the place of its sensor."""
 
-    def __init__(self, value: float, on: str = "GENERIC") -> None:
-        self.value, self.type = value, type("T", (), {"name": on})
+    def __init__(self, value: float, place: str = "GENERIC") -> None:
+        self.value, self.type = value, SimpleNamespace(name=place)  # aiobmsble's type is an enum
 
     def __float__(self) -> float:
         return self.value
@@ -42,12 +46,15 @@ JBD = {
 def test_current_of_a_reading_is_positive_on_charge() -> None:
     reading = convert_sample(JBD)
     assert reading is not None
-    assert reading[:4] == Reading(15.6, -2.87, 22.133, (3.43, 3.425, 3.432, 3.417))[:4]
+    expected = Reading(
+        voltage_v=15.6, current_a=-2.87, temperature_c=22.133, cells_v=(3.43, 3.425, 3.432, 3.417), time_s=0.0
+    )
+    assert reading._replace(time_s=0.0) == expected  # without a timestamp, time_s is NaN
     settings = Settings.model_validate({"source": {"kind": "ble", "name": "DP04S007L4S100A"}})
     assert settings.sensor.current_sign == "charge_positive"
 
 
-def test_temperature_is_the_mean_of_cell_sensors() -> None:
+def test_temperature_is_the_mean_of_the_sensors_on_cells() -> None:
     sensors = [Sensor(18.1, "CELL"), Sensor(18.3, "CELL"), Sensor(31.0, "MOSFET")]
     reading = convert_sample(JBD | {"temp_values": sensors})
     assert reading is not None
@@ -55,7 +62,9 @@ def test_temperature_is_the_mean_of_cell_sensors() -> None:
 
 
 @pytest.mark.parametrize(("sensors", "mean_c"), [([18.0, 19.0], 18.5), ([], math.nan), ([math.nan, 19.0], 19.0)])
-def test_temperature_without_cell_sensors_and_bms_is_the_mean(sensors: list[float], mean_c: float) -> None:
+def test_without_sensors_on_cells_and_a_temperature_of_the_bms_all_sensors_are_averaged(
+    sensors: list[float], mean_c: float
+) -> None:
     reading = convert_sample({"voltage": 13.2, "current": 0, "temp_values": sensors})
     assert reading is not None
     assert reading.temperature_c == pytest.approx(mean_c, nan_ok=True)

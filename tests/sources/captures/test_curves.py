@@ -1,4 +1,4 @@
-"""Files of OCV curves: order of the rows, hysteresis, and rejection of other files and invalid values."""
+"""Files of OCV curves: order of the rows, hysteresis, other files, and rejection of invalid values."""
 
 import gzip
 
@@ -8,18 +8,18 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.curves import read_curve
 
 
-def test_rows_of_a_curve_are_sorted_by_soc(tmp_path):
+def test_curve_is_read_sorted_by_soc_from_plain_and_compressed_files(tmp_path):
     path = tmp_path / "c.csv"
-    path.write_text("# a book\nocv_v,soc\n4.2,1\n3.0,0\n3.7,0.5\n")
+    path.write_text("# a comment\nocv_v,soc\n4.2,1\n3.0,0\n3.7,0.5\n")
     soc, ocv_v, hysteresis_v = read_curve(path)
     assert (soc.tolist(), ocv_v.tolist(), hysteresis_v) == ([0.0, 0.5, 1.0], [3.0, 3.7, 4.2], None)
-    packed = tmp_path / "c.csv.gz"
-    packed.write_bytes(gzip.compress(b"soc,ocv_v,hysteresis_v\n0,3.0,0.01\n1,4.2,0.02\n"))
-    assert read_curve(packed).hysteresis_v.tolist() == [0.01, 0.02]
+    compressed = tmp_path / "c.csv.gz"
+    compressed.write_bytes(gzip.compress(b"soc,ocv_v,hysteresis_v\n0,3.0,0.01\n1,4.2,0.02\n"))
+    assert read_curve(compressed).hysteresis_v.tolist() == [0.01, 0.02]
 
 
 @pytest.mark.parametrize("name", ["time.csv", "absent.csv", "raw.bms", "broken.csv.gz"])
-def test_other_files_give_none(tmp_path, name):
+def test_file_that_is_no_curve_gives_none(tmp_path, name):
     (tmp_path / "time.csv").write_text("time_s,current_a,voltage_v\n0,1,3.7\n")
     (tmp_path / "raw.bms").write_bytes(b"\x00\xff")
     (tmp_path / "broken.csv.gz").write_bytes(b"soc,ocv_v")

@@ -1,4 +1,4 @@
-"""Simulated Modbus devices: pymodbus's server with registers that a test sets, over TCP or a serial line."""
+"""Simulated Modbus devices over TCP or a serial line: pymodbus's server with registers that a test sets."""
 
 import asyncio
 import os
@@ -14,6 +14,9 @@ from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 Table = dict[int, int]
+"""Register values by address."""
+READ_INPUT_REGISTERS = 4
+"""Code of the Modbus function that reads input registers."""
 
 
 class Registers:
@@ -40,13 +43,16 @@ class Registers:
     async def answer(
         self, function: int, start: int, address: int, count: int, registers: list[int], _: object
     ) -> ExcCodes | None:
-        """Write the requested values into ``registers``, whose first address is ``start``: an action of pymodbus."""
+        """Write the requested values into ``registers``, whose first address is ``start``.
+
+        pymodbus calls this for each request. Return the exception code of the response, or None to return the values.
+        """
         self.requests.append((function, address, count))
         async with self._new_request:
             self._new_request.notify_all()
         if self.refusal is not None:
             return self.refusal
-        table = self.input if function == 4 else self.holding
+        table = self.input if function == READ_INPUT_REGISTERS else self.holding
         for i in range(address, address + count):
             if i not in table:
                 return ExcCodes.ILLEGAL_ADDRESS
@@ -54,11 +60,13 @@ class Registers:
         return None
 
     def device(self, unit: int) -> SimDevice:
-        block = SimData(0, count=0x10000, values=0, datatype=DataType.REGISTERS)
-        return SimDevice(unit, simdata=[block], action=self.answer)
+        """Return a device of pymodbus that has these registers."""
+        all_addresses = SimData(0, count=0x10000, values=0, datatype=DataType.REGISTERS)
+        return SimDevice(unit, simdata=[all_addresses], action=self.answer)
 
 
 def float_words(value: float) -> tuple[int, int]:
+    """Return the two registers of a float32, the high word first."""
     high, low = struct.unpack(">HH", struct.pack(">f", value))
     return high, low
 
@@ -87,7 +95,7 @@ async def serial_device(registers: Registers, unit: int, folder: Path) -> AsyncI
 
     def forward(reader: int, writer: int) -> None:
         data = os.read(reader, 4096)
-        if reader == device or data[0] == unit:
+        if reader == device or data[0] == unit:  # a request begins with the unit
             os.write(writer, data)
 
     for reader, writer, port in ((host, device, host_port), (device, host, device_port)):

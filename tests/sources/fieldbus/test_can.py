@@ -1,4 +1,4 @@
-"""CAN source on python-can's virtual bus, on a simulated slcan adapter (a PTY), and on the kernel's vcan."""
+"""CAN source on python-can's virtual bus, on a simulated slcan adapter behind a PTY, and on the kernel's vcan."""
 
 import asyncio
 import json
@@ -15,16 +15,17 @@ from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.factory import open_line_source
-from bms_estimator.sources.fieldbus.can import BUS_OFF, CanProducer
+from bms_estimator.sources.fieldbus.can import BUS_OFF_BIT, CanProducer
 from bms_estimator.sources.line_source import SourceUnavailableError
 from tests.patience import LONG_S
 from tests.serial_line import Line
 
-PYLONTECH = can.Message(arbitration_id=0x356, is_extended_id=False, data=bytes.fromhex("721485ffd700"))
+PYLONTECH_FRAME = can.Message(arbitration_id=0x356, is_extended_id=False, data=bytes.fromhex("721485ffd700"))
 """Frame with 52.34 V, -12.3 A (charge is positive) and 21.5 degC."""
-SLCAN = b"t3566721485FFD700\r"
-"""Frame ``PYLONTECH`` in the format of an slcan adapter."""
+SLCAN_FRAME = b"t3566721485FFD700\r"
+"""Frame ``PYLONTECH_FRAME`` in the format of an slcan adapter."""
 PYLONTECH_SAMPLE = {"voltage_v": 52.34, "current_a": -12.3, "temperature_c": 21.5}
+"""Content of the line that the source yields for the frame."""
 
 
 def source(**options: object) -> CanSource:
@@ -53,7 +54,9 @@ def sender(channel: str) -> Iterator[can.BusABC]:
         yield bus
 
 
-async def test_each_valid_frame_gives_a_line(channel: str, sender: can.BusABC) -> None:
+async def test_of_several_frames_only_the_valid_one_with_the_identifier_of_the_profile_gives_a_line(
+    channel: str, sender: can.BusABC
+) -> None:
     producer = CanProducer(source(interface="virtual", channel=channel))
     async with aclosing(producer.iter_lines()) as lines:
         assert await next_line(lines) == CONNECTED
@@ -61,32 +64,33 @@ async def test_each_valid_frame_gives_a_line(channel: str, sender: can.BusABC) -
         assert "source.voltage (frame 0x356)" in producer.fault
         for message in (
             can.Message(arbitration_id=0x355, is_extended_id=False, data=b"\x64\x00\x63\x00"),
-            can.Message(arbitration_id=0x356, is_extended_id=True, data=PYLONTECH.data),
+            can.Message(arbitration_id=0x356, is_extended_id=True, data=PYLONTECH_FRAME.data),
             can.Message(arbitration_id=0x356, is_extended_id=False, is_remote_frame=True, dlc=6),
             can.Message(arbitration_id=0x356, is_extended_id=False, data=b"\x72\x14"),
-            PYLONTECH,
+            PYLONTECH_FRAME,
         ):
             sender.send(message)
         assert json.loads(await next_line(lines)) == PYLONTECH_SAMPLE
     assert producer.counters == {"short_frames": 1, "not_measured": 0, "error_frames": 0, "junk": 0}
 
 
-async def test_bus_off_is_reported_until_the_next_frame(channel: str, sender: can.BusABC) -> None:
+async def test_bus_off_is_reported_until_the_next_valid_frame(channel: str, sender: can.BusABC) -> None:
     producer = CanProducer(source(interface="virtual", channel=channel))
     async with aclosing(producer.iter_lines()) as lines:
         assert await next_line(lines) == CONNECTED
-        assert PYLONTECH.arbitration_id & BUS_OFF  # the virtual bus filters error frames, too
+        # the virtual bus also filters error frames by identifier; this identifier includes the bit that means bus off
+        assert PYLONTECH_FRAME.arbitration_id & BUS_OFF_BIT
         sender.send(can.Message(arbitration_id=0x356, is_extended_id=False, is_error_frame=True))
         async with asyncio.timeout(LONG_S):
             while producer.counters["error_frames"] == 0:  # noqa: ASYNC110 - it has no event for it
                 await asyncio.sleep(0.001)
         assert "bus off" in (producer.fault or "")
-        sender.send(PYLONTECH)
+        sender.send(PYLONTECH_FRAME)
         await next_line(lines)
         assert "bus off" not in (producer.fault or "")
 
 
-async def test_unplugged_adapter_is_reopened(line: Line) -> None:
+async def test_unplugged_adapter_is_reported_as_lost_and_can_be_reopened(line: Line) -> None:
     producer = CanProducer(slcan_source(line))
     with pytest.raises(SourceUnavailableError, match=r"cannot be opened: .*No such file"):
         async with aclosing(producer.iter_lines()) as lines:
@@ -95,43 +99,47 @@ async def test_unplugged_adapter_is_reopened(line: Line) -> None:
         line.plug()
         async with aclosing(producer.iter_lines()) as lines:
             assert await next_line(lines) == CONNECTED
-            line.write(SLCAN)
+            line.write(SLCAN_FRAME)
             assert json.loads(await next_line(lines)) == PYLONTECH_SAMPLE
             line.unplug()
             with pytest.raises(SourceUnavailableError, match="lost: "):
                 await next_line(lines)
 
 
-async def test_invalid_bytes_of_an_adapter_are_counted_or_reopen_it(line: Line) -> None:
+async def test_invalid_frames_of_an_adapter_are_counted_and_bytes_that_are_no_text_end_the_connection(
+    line: Line,
+) -> None:
     line.plug()
     producer = CanProducer(slcan_source(line))
     async with aclosing(producer.iter_lines()) as lines:
         assert await next_line(lines) == CONNECTED
-        line.write(b"t35z6zz\r\a" + b"t3568721485FF\r" + SLCAN)  # an invalid, a truncated and a valid frame
+        line.write(b"t35z6zz\r\a" + b"t3568721485FF\r" + SLCAN_FRAME)  # an invalid, a truncated and a valid frame
         assert json.loads(await next_line(lines)) == PYLONTECH_SAMPLE
         assert producer.counters["junk"] == 2
-        line.write(b"\xff\xfe\r")
+        line.write(b"\xff\xfe\r")  # no text
         with pytest.raises(SourceUnavailableError, match="lost: "):
             await next_line(lines)
     async with aclosing(producer.iter_lines()) as lines:
         assert await next_line(lines) == CONNECTED
-        line.write(SLCAN)
+        line.write(SLCAN_FRAME)
         assert json.loads(await next_line(lines)) == PYLONTECH_SAMPLE
 
 
-async def test_current_of_the_samples_is_positive_on_discharge(channel: str, sender: can.BusABC) -> None:
+async def test_samples_of_a_profile_have_a_current_that_is_positive_on_discharge(
+    channel: str, sender: can.BusABC
+) -> None:
     table = {"kind": "can", "profile": "pylontech-can", "interface": "virtual", "channel": channel}
     line_source = open_line_source(Settings.model_validate({"source": table}))
     assert line_source is not None
     async with asyncio.timeout(LONG_S), line_source:
         blocks = aiter(line_source)
         next_block = asyncio.ensure_future(anext(blocks))
-        while "connected" not in (line_source.message or ""):  # noqa: ASYNC110 - it has no event for it
+        while "connected" not in (line_source.silence_reason or ""):  # noqa: ASYNC110 - it has no event for it
             await asyncio.sleep(0.001)
-        sender.send(PYLONTECH)
-        block = await next_block
+        sender.send(PYLONTECH_FRAME)
+        block, _ = await next_block
         assert block[["current_a", "voltage_v", "temperature_c"]].tolist() == [(12.3, 52.34, 21.5)]
-        assert line_source.message is None
+        assert line_source.silence_reason is None
 
 
 async def test_unknown_option_of_the_interface_is_reported() -> None:
@@ -165,7 +173,7 @@ async def test_kernel_interface_that_goes_down_is_reported_as_lost(vcan: str) ->
     async with aclosing(producer.iter_lines()) as lines:
         assert await next_line(lines) == CONNECTED
         with can.Bus(interface="socketcan", channel=vcan, ignore_config=True) as bus:
-            bus.send(PYLONTECH)
+            bus.send(PYLONTECH_FRAME)
             assert json.loads(await next_line(lines)) == PYLONTECH_SAMPLE
         await asyncio.to_thread(subprocess.run, ["ip", "link", "set", vcan, "down"], check=True)
         with pytest.raises(SourceUnavailableError, match="lost: "):

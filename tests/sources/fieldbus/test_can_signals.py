@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.can_source import PROFILES, CanSource, CellSignals
-from bms_estimator.sources.fieldbus.can_signals import MAX_AGE_S, CanMap, FrameId
+from bms_estimator.sources.fieldbus.can_signals import MAX_AGE_S, CanDecoder, FrameId
 
-PYLONTECH = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])
+PYLONTECH_DATA = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])
 """Data of frame 0x356 with 52.34 V, -12.3 A (charge is positive) and 21.5 degC."""
-DBC = """
+DBC_TEXT = """
 VERSION ""
 BU_: BMS
 BO_ 1280 Pack: 8 BMS
@@ -44,20 +45,21 @@ BO_ 2566848512 Other: 8 BMS
  SG_ Fast : 0|8@1+ (1,0) [0|0] "" X
  SG_ Temp : 8|8@1+ (1,-40) [0|0] "degC" X
 """
-"""DBC file for these tests, with a multiplexer, an identifier of 29 bits, and frames of one value each."""
+"""DBC file with a multiplexer, an identifier of 29 bits (2566848512 is 0x18FF0000 with the flag of DBC), and frames of
+one value each."""
 
 
 @pytest.fixture(scope="module")
-def dbc(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dbc_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("dbc") / "pack.dbc"
-    path.write_text(DBC)
+    path.write_text(DBC_TEXT)
     return path
 
 
 @pytest.fixture(scope="module")
-def dbc_source(dbc: Path) -> CanSource:
+def dbc_source(dbc_path: Path) -> CanSource:
     return source(
-        dbc=str(dbc),
+        dbc=str(dbc_path),
         voltage={"signal": "PackVoltage"},
         current={"signal": "Pack.PackCurrent"},
         temperature={"signal": "Temp"},
@@ -70,88 +72,95 @@ def source(**options: object) -> CanSource:
 
 
 @given(st.lists(st.tuples(st.sampled_from([0x355, 0x356, 0x357]), st.booleans(), st.binary(max_size=64)), max_size=20))
-def test_no_frames_raise_with_a_profile(frames: list[tuple[int, bool, bytes]]) -> None:
-    map_ = CanMap(source(profile="pylontech-can"))
+def test_no_frames_raise_an_error_with_a_profile(frames: list[tuple[int, bool, bytes]]) -> None:
+    can_map = CanDecoder(source(profile="pylontech-can"))
     for identifier, extended, data in frames:
-        reading = map_.feed(0.0, identifier, extended, data)
+        reading = can_map.feed(0.0, identifier, extended, data)
         assert (reading is not None) == ((identifier, extended) == (0x356, False) and len(data) >= 4)
 
 
 @given(st.lists(st.tuples(st.sampled_from([0x500, 0x501]), st.binary(max_size=64)), max_size=20))
-def test_no_frames_raise_with_a_dbc_file(dbc_source: CanSource, frames: list[tuple[int, bytes]]) -> None:
-    map_ = CanMap(dbc_source)
+def test_no_frames_raise_an_error_with_a_dbc_file(dbc_source: CanSource, frames: list[tuple[int, bytes]]) -> None:
+    can_map = CanDecoder(dbc_source)
     for identifier, data in frames:
-        map_.feed(0.0, identifier, False, data)
+        can_map.feed(0.0, identifier, extended=False, data=data)
 
 
-def test_frame_of_a_profile_is_decoded() -> None:
+def test_only_the_frame_of_the_profile_is_decoded() -> None:
     source_settings = source(profile="pylontech-can")
-    steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
-    assert source_settings.sensor == {"current_sign": "charge_positive", **steps}
-    map_ = CanMap(source_settings)
-    assert map_.frame_ids == (FrameId(0x356, False),)
-    assert map_.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
-    assert map_.feed(0.0, 0x355, False, bytes(4)) is None
-    reading = map_.feed(0.0, 0x356, False, PYLONTECH)
+    resolutions = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
+    assert source_settings.sensor_defaults == {"current_sign": "charge_positive", **resolutions}
+    can_map = CanDecoder(source_settings)
+    assert can_map.frame_ids == (FrameId(0x356, False),)
+    assert can_map.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
+    assert can_map.feed(0.0, 0x355, extended=False, data=bytes(4)) is None
+    reading = can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA)
     assert reading is not None
     assert reading[:4] == (52.34, -12.3, 21.5, ())
 
 
 def test_truncated_frame_gives_the_values_that_it_contains() -> None:
-    map_ = CanMap(source(profile="pylontech-can"))
-    reading = map_.feed(0.0, 0x356, False, PYLONTECH[:4])
+    can_map = CanDecoder(source(profile="pylontech-can"))
+    reading = can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:4])
     assert reading is not None
     assert reading[:2] == (52.34, -12.3)
     assert math.isnan(reading.temperature_c)
-    assert map_.feed(0.0, 0x356, False, PYLONTECH[:2]) is None
-    assert map_.counters["short_frames"] == 2
+    assert can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:2]) is None
+    assert can_map.counters["short_frames"] == 2
 
 
-def test_reading_needs_recent_voltage_and_current_and_contains_the_newest_other_values(dbc: Path) -> None:
-    map_ = CanMap(
+def test_reading_needs_voltage_and_current_of_about_one_time_and_contains_recent_other_values(dbc_path: Path) -> None:
+    can_map = CanDecoder(
         source(
-            dbc=str(dbc),
+            dbc=str(dbc_path),
             voltage={"signal": "Volts"},
             current={"signal": "Amperes", "absent": 25.5},
             temperature={"signal": "Degrees"},
             cells=[{"signal": "C{}", "count": 2}, {"signal": "Last"}],
         )
     )
-    assert map_.feed(0.0, 3, False, b"\xd2") is None
-    assert map_.feed(0.0, 4, False, b"\x20\x21") is None
-    assert map_.feed(0.0, 2, False, b"\x05") is None
-    assert map_.missing == "source.voltage (frame 0x001)"
-    reading = map_.feed(1.0, 1, False, b"\x82")
+    volts, amperes, degrees, two_cells = 1, 2, 3, 4  # identifiers of the frames; each byte is in units of 0.1
+
+    def feed(arrival_s: float, identifier: int, data: bytes) -> Reading | None:
+        return can_map.feed(arrival_s, identifier, extended=False, data=data)
+
+    assert feed(0.0, degrees, b"\xd2") is None
+    assert feed(0.0, two_cells, b"\x20\x21") is None
+    assert feed(0.0, amperes, b"\x05") is None
+    assert can_map.missing == "source.voltage (frame 0x001)"
+    reading = feed(1.0, volts, b"\x82")
     assert reading is not None
     assert reading[:3] == (13.0, 0.5, 21.0)
     assert reading.cells_v[:2] == (3.2, 3.3)
     assert math.isnan(reading.cells_v[2])
-    assert map_.feed(2.0, 1, False, b"\x83") is None
-    assert map_.feed(2.0, 2, False, b"\xff") is None
-    assert map_.counters["not_measured"] == 1
-    assert map_.feed(3.0, 1, False, b"\x83") is None
-    assert map_.feed(6.1, 2, False, b"\x05") is None  # voltage and current are more than three periods apart
-    assert map_.feed(7.0, 1, False, b"\x83") is None
-    assert map_.feed(10.0, 2, False, b"\x05") is not None
-    assert map_.feed(11.0, 1, False, b"\x83") is None
-    assert map_.feed(12.0 + MAX_AGE_S, 2, False, b"\x05") is None
-    assert map_.feed(13.0 + MAX_AGE_S, 1, False, b"\x83") is None
-    late = map_.feed(13.5 + MAX_AGE_S, 2, False, b"\x05")
-    assert late is not None
-    assert (late.voltage_v, late.cells_v) == (13.1, ())
-    assert math.isnan(late.temperature_c)
+    assert feed(2.0, volts, b"\x83") is None
+    assert feed(2.0, amperes, b"\xff") is None  # 25.5 A means that the current is not measured
+    assert can_map.counters["not_measured"] == 1
+    assert feed(3.0, volts, b"\x83") is None
+    assert feed(6.1, amperes, b"\x05") is None  # voltage and current are more than three periods apart
+    assert feed(7.0, volts, b"\x83") is None
+    assert feed(10.0, amperes, b"\x05") is not None
+    assert feed(11.0, volts, b"\x83") is None
+    assert feed(12.0 + MAX_AGE_S, amperes, b"\x05") is None
+    assert feed(13.0 + MAX_AGE_S, volts, b"\x83") is None
+    late_reading = feed(13.5 + MAX_AGE_S, amperes, b"\x05")
+    assert late_reading is not None
+    assert (late_reading.voltage_v, late_reading.cells_v) == (13.1, ())
+    assert math.isnan(late_reading.temperature_c)
 
 
 def test_signals_of_a_dbc_file_are_decoded(dbc_source: CanSource) -> None:
-    map_ = CanMap(dbc_source)
-    assert set(map_.frame_ids) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
-    assert map_.feed(0.0, 0x18FF0000, True, bytes([1, 65])) is None
-    assert map_.feed(0.0, 0x501, False, bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
-    assert map_.feed(0.0, 0x501, False, bytes([1, 0xE6, 0x0C])) is None
-    assert map_.counters["short_frames"] == 0  # a multiplexed frame contains only some of the signals
-    assert map_.feed(0.0, 0x501, False, bytes([7, 0, 0])) is None
-    assert map_.counters["short_frames"] == 1
-    reading = map_.feed(0.0, 0x500, False, (4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
+    can_map = CanDecoder(dbc_source)
+    assert set(can_map.frame_ids) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
+    assert can_map.feed(0.0, 0x18FF0000, extended=True, data=bytes([1, 65])) is None
+    assert can_map.feed(0.0, 0x501, extended=False, data=bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
+    assert can_map.feed(0.0, 0x501, extended=False, data=bytes([1, 0xE6, 0x0C])) is None
+    assert can_map.counters["short_frames"] == 0  # a multiplexed frame contains only some of the signals
+    assert (
+        can_map.feed(0.0, 0x501, extended=False, data=bytes([7, 0, 0])) is None
+    )  # no signal has the multiplexer value 7
+    assert can_map.counters["short_frames"] == 1
+    reading = can_map.feed(0.0, 0x500, extended=False, data=(4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
     assert reading is not None
     assert reading[:4] == (400.1, 12.3, 25.0, (3.3, 3.301, 3.302))
 
@@ -167,25 +176,25 @@ def test_signals_of_a_dbc_file_are_decoded(dbc_source: CanSource) -> None:
         ("Cells.PackVoltage", "no such signal"),
     ],
 )
-def test_unknown_or_ambiguous_signal_is_rejected(dbc: Path, name: str, reason: str) -> None:
+def test_unknown_or_ambiguous_signal_is_rejected(dbc_path: Path, name: str, reason: str) -> None:
     with pytest.raises(UserError) as raised:
-        CanMap(source(dbc=str(dbc), voltage={"signal": name}, current={"signal": "PackCurrent"}))
+        CanDecoder(source(dbc=str(dbc_path), voltage={"signal": name}, current={"signal": "PackCurrent"}))
     assert reason in str(raised.value)
 
 
 def test_missing_or_invalid_dbc_file_is_rejected(tmp_path: Path) -> None:
     signals = {"voltage": {"signal": "V"}, "current": {"signal": "I"}}
     with pytest.raises(UserError, match="cannot be read: No such file"):
-        CanMap(source(dbc=str(tmp_path / "none.dbc"), **signals))
+        CanDecoder(source(dbc=str(tmp_path / "none.dbc"), **signals))
     junk = tmp_path / "junk.dbc"
     junk.write_bytes(bytes(range(256)))
     with pytest.raises(UserError, match=f"source.dbc = {junk}: "):
-        CanMap(source(dbc=str(junk), **signals))
+        CanDecoder(source(dbc=str(junk), **signals))
 
 
-def test_cells_are_numbered() -> None:
-    members = CellSignals(signal="C{}", count=2, first=0).members()
-    assert [signal.signal for signal in members] == ["C0", "C1"]
+def test_name_of_a_cell_signal_is_numbered_from_the_first_number_on() -> None:
+    signals = CellSignals(signal="C{}", count=2, first=0).cell_signals()
+    assert [signal.signal for signal in signals] == ["C0", "C1"]
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -195,14 +204,14 @@ def test_resolutions_of_a_profile_are_the_factors_of_its_dbc_file(profile: str) 
     assert isinstance(database, Database)
     factors = {signal.name: signal.conversion.scale for message in database.messages for signal in message.signals}
     source_settings = source(profile=profile)
-    assert source_settings.sensor["voltage_resolution_v"] == factors[source_settings.voltage.signal]
-    assert source_settings.sensor["current_resolution_a"] == factors[source_settings.current.signal]
+    assert source_settings.sensor_defaults["voltage_resolution_v"] == factors[source_settings.voltage.signal]
+    assert source_settings.sensor_defaults["current_resolution_a"] == factors[source_settings.current.signal]
 
 
-def test_configured_dbc_file_replaces_that_of_the_profile(dbc: Path) -> None:
-    source_settings = source(profile="pylontech-can", dbc=str(dbc), temperature={"signal": "Temp"})
-    assert source_settings.sensor == {"current_sign": "charge_positive"}
-    assert set(CanMap(source_settings).frame_ids) == {FrameId(0x500, False), FrameId(0x18FF0000, True)}
+def test_configured_dbc_file_replaces_that_of_the_profile(dbc_path: Path) -> None:
+    source_settings = source(profile="pylontech-can", dbc=str(dbc_path), temperature={"signal": "Temp"})
+    assert source_settings.sensor_defaults == {"current_sign": "charge_positive"}
+    assert set(CanDecoder(source_settings).frame_ids) == {FrameId(0x500, False), FrameId(0x18FF0000, True)}
 
 
 V, I = {"signal": "V"}, {"signal": "I"}  # noqa: E741

@@ -24,13 +24,14 @@ UNIT = 5
 
 
 def source(**options: object) -> ModbusSource:
+    """Return validated settings with a short poll interval and a timeout that only a hang reaches."""
     defaults = {"kind": "modbus", "unit": UNIT, "poll_s": 0.02, "timeout_s": LONG_S / 4}
     return ModbusSource.model_validate(defaults | options)
 
 
-def victron() -> Registers:
+def victron_registers() -> Registers:
     """Return the registers of a GX device that measures 52.34 V, 12.3 A of discharge and 21.5 degC."""
-    return Registers({259: 5234, 260: 1200, 261: 0x10000 - 123, 262: 215})
+    return Registers({259: 5234, 260: 1200, 261: 0x10000 - 123, 262: 215})  # 260 is not read; 261 is negative
 
 
 async def read_lines(producer: ModbusProducer, count: int) -> list[dict[str, object]]:
@@ -48,7 +49,7 @@ async def failure_reason(producer: ModbusProducer) -> str:
 
 
 async def test_device_with_a_profile_is_read_over_tcp_in_one_request() -> None:
-    registers, port = victron(), free_port()
+    registers, port = victron_registers(), free_port()
     producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
     async with tcp_device(registers, UNIT, port):
         assert await read_lines(producer, 3) == 3 * [{"voltage_v": 52.34, "current_a": -12.3, "temperature_c": 21.5}]
@@ -68,19 +69,20 @@ async def test_device_with_a_profile_is_read_over_a_serial_line(tmp_path: Path) 
 
 async def test_rtu_frames_over_tcp_are_read() -> None:
     port = free_port()
-    async with tcp_device(victron(), UNIT, port, FramerType.RTU):
+    async with tcp_device(victron_registers(), UNIT, port, FramerType.RTU):
         producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port, framing="rtu"))
         assert (await read_lines(producer, 1))[0]["voltage_v"] == 52.34
 
 
-async def test_missing_registers_are_reported_or_omitted() -> None:
-    registers, port = victron(), free_port()
+async def test_missing_register_of_the_temperature_is_omitted_and_of_the_current_is_reported() -> None:
+    registers, port = victron_registers(), free_port()
     del registers.holding[260], registers.holding[262]  # 260 is not needed, and 262 is the temperature
     source_settings = source(profile="victron-gx", host="127.0.0.1", tcp_port=port)
     async with tcp_device(registers, UNIT, port):
         producer = ModbusProducer(source_settings)
         assert await read_lines(producer, 2) == 2 * [{"voltage_v": 52.34, "current_a": -12.3}]
         assert producer.counters["refused"] == 2
+        # the rejected request of all registers is split into one for each value; afterwards the temperature is left out
         assert registers.requests == [(3, 259, 4), (3, 259, 1), (3, 261, 1), (3, 262, 1), (3, 259, 1), (3, 261, 1)]
         del registers.holding[261]
         reason = await failure_reason(ModbusProducer(source_settings))
@@ -89,7 +91,7 @@ async def test_missing_registers_are_reported_or_omitted() -> None:
 
 async def test_wrong_unit_behind_a_gateway_is_reported() -> None:
     port = free_port()
-    async with tcp_device(victron(), UNIT, port):
+    async with tcp_device(victron_registers(), UNIT, port):
         reason = await failure_reason(
             ModbusProducer(source(profile="victron-gx", unit=9, host="127.0.0.1", tcp_port=port))
         )
@@ -97,7 +99,7 @@ async def test_wrong_unit_behind_a_gateway_is_reported() -> None:
 
 
 async def test_wrong_unit_on_a_serial_line_is_reported_as_a_timeout(tmp_path: Path) -> None:
-    async with serial_device(victron(), UNIT, tmp_path) as path:
+    async with serial_device(victron_registers(), UNIT, tmp_path) as path:
         source_settings = source(profile="victron-gx", unit=9, port=str(path), timeout_s=0.2)
         reason = await failure_reason(ModbusProducer(source_settings))
     assert reason == (
@@ -106,7 +108,7 @@ async def test_wrong_unit_on_a_serial_line_is_reported_as_a_timeout(tmp_path: Pa
     )
 
 
-async def test_missing_device_and_port_are_reported(tmp_path: Path) -> None:
+async def test_missing_device_or_serial_port_is_reported(tmp_path: Path) -> None:
     absent = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=free_port()))
     assert await failure_reason(absent) == "no connection"
     assert await failure_reason(ModbusProducer(source(profile="victron-gx", port=str(tmp_path / "none")))) == (
@@ -125,9 +127,17 @@ async def test_missing_device_and_port_are_reported(tmp_path: Path) -> None:
         b"\0\1\0\0\0\3\5\x83\x2a",  # an undefined exception code
         b"",
     ],
-    ids=["noise", "web", "short", "few", "coils", "exception", "closed"],
+    ids=[
+        "noise",
+        "HTTP",
+        "no registers",
+        "too few registers",
+        "coils",
+        "undefined exception",
+        "closed connection",
+    ],
 )
-async def test_invalid_response_gives_no_sample(answer: bytes) -> None:
+async def test_invalid_response_makes_the_source_unavailable(answer: bytes) -> None:
     served = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -154,21 +164,21 @@ async def read_until(lines: AsyncGenerator[bytes, None], condition: Callable[[],
             await anext(lines)
 
 
-async def test_device_is_reconnected() -> None:
-    registers, port = victron(), free_port()
+async def test_lost_device_can_be_reconnected() -> None:
+    registers, port = victron_registers(), free_port()
     producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
     async with aclosing(producer.iter_lines()) as lines:
         async with tcp_device(registers, UNIT, port):
             await read_until(lines, lambda: len(registers.requests) > 2)
         with pytest.raises(SourceUnavailableError):
-            await read_until(lines, lambda: False)
+            await read_until(lines, lambda: False)  # until the loss is noticed
     assert await failure_reason(producer) == "no connection"
     async with tcp_device(registers, UNIT, port):
         assert (await read_lines(producer, 1))[0]["voltage_v"] == 52.34
 
 
 async def test_requests_to_a_busy_device_are_not_split() -> None:
-    registers, port = victron(), free_port()
+    registers, port = victron_registers(), free_port()
     registers.refusal = ExcCodes.DEVICE_BUSY
     async with tcp_device(registers, UNIT, port):
         reason = await failure_reason(ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port)))
@@ -176,7 +186,7 @@ async def test_requests_to_a_busy_device_are_not_split() -> None:
     assert len(registers.requests) == 1
 
 
-async def test_nan_registers_give_no_sample() -> None:
+async def test_register_with_nan_as_current_gives_no_sample_until_it_has_a_value() -> None:
     port = free_port()
     registers = Registers(dict(enumerate((*float_words(13.25), *float_words(float("nan"))))))
     current = {"address": 2, "type": "float32"}
@@ -196,21 +206,21 @@ async def test_nan_registers_give_no_sample() -> None:
         assert producer.fault is None
 
 
-async def test_current_is_positive_on_discharge_and_samples_continue_after_a_reconnection() -> None:
-    registers, port = victron(), free_port()
+async def test_samples_have_a_current_that_is_positive_on_discharge_and_continue_after_a_reconnection() -> None:
+    registers, port = victron_registers(), free_port()
     table = {"kind": "modbus", "profile": "victron-gx", "host": "127.0.0.1", "tcp_port": port, "unit": UNIT}
     settings = Settings.model_validate({"source": table | {"poll_s": 0.02, "timeout_s": 1.0}})
     assert settings.sensor.voltage_resolution_v == 0.01
-    source = open_line_source(settings)
-    assert source is not None
-    async with asyncio.timeout(LONG_S), source:
-        blocks = aiter(source)
+    line_source = open_line_source(settings)
+    assert line_source is not None
+    async with asyncio.timeout(LONG_S), line_source:
+        blocks = aiter(line_source)
         async with tcp_device(registers, UNIT, port):
-            block = await anext(blocks)
+            block, _ = await anext(blocks)
         assert block[["current_a", "voltage_v", "temperature_c"]].tolist() == [(12.3, 52.34, 21.5)]
-        assert source.message is None
+        assert line_source.silence_reason is None
         async with tcp_device(registers, UNIT, port):
-            while source.counters["reconnects"] == 0:
+            while line_source.counters["reconnects"] == 0:
                 await anext(blocks)
             await anext(blocks)
-        assert source.counters["frames_received"] >= 2
+        assert line_source.counters["frames_received"] >= 2

@@ -16,11 +16,11 @@ from bms_estimator.sources.fieldbus.modbus_registers import (
     decode,
     decode_reading,
     list_values,
-    plan,
-    split,
+    plan_requests,
+    split_request,
 )
 
-FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
+STRUCT_FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
 RANGES = {
     "int16": st.integers(-(1 << 15), (1 << 15) - 1),
     "uint16": st.integers(0, (1 << 16) - 1),
@@ -34,26 +34,33 @@ def source(**options: object) -> ModbusSource:
     return ModbusSource.model_validate({"kind": "modbus", "host": "127.0.0.1"} | options)
 
 
-def words(raw: float, kind: str, *, low_word_first: bool = False, address: int = 0) -> dict[tuple[str, int], int]:
-    data = struct.pack(FORMATS[kind], raw)
-    values = [int.from_bytes(data[i : i + 2], "big") for i in range(0, len(data), 2)]
-    return {("holding", address + i): word for i, word in enumerate(values[::-1] if low_word_first else values)}
+def words(
+    raw: float, register_type: str, *, low_word_first: bool = False, address: int = 0
+) -> dict[tuple[str, int], int]:
+    """Return the words of a value in holding registers, by table and address."""
+    data = struct.pack(STRUCT_FORMATS[register_type], raw)
+    high_first = [int.from_bytes(data[i : i + 2], "big") for i in range(0, len(data), 2)]
+    ordered = high_first[::-1] if low_word_first else high_first
+    return {("holding", address + i): word for i, word in enumerate(ordered)}
 
 
-@given(st.data(), st.sampled_from(list(FORMATS)), st.booleans())
-def test_packed_values_are_decoded(data: st.DataObject, kind: str, low_word_first: bool) -> None:
-    raw = data.draw(RANGES[kind])
-    register = Register(address=7, type=kind, low_word_first=low_word_first, scale=0.01, offset=-2.0)
-    assert decode(register, words(raw, kind, low_word_first=low_word_first, address=7)) == round(raw * 0.01 - 2.0, 5)
+@given(st.data(), st.sampled_from(list(STRUCT_FORMATS)), st.booleans())
+def test_value_of_each_type_and_word_order_is_decoded(
+    data: st.DataObject, register_type: str, low_word_first: bool
+) -> None:
+    raw = data.draw(RANGES[register_type])
+    register = Register(address=7, type=register_type, low_word_first=low_word_first, scale=0.01, offset=-2.0)
+    words_read = words(raw, register_type, low_word_first=low_word_first, address=7)
+    assert decode(register, words_read) == round(raw * 0.01 - 2.0, 5)
 
 
-@given(st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(FORMATS)), st.booleans()), max_size=60))
-def test_requests_cover_every_register_once_within_the_maximum_length(wanted: list[tuple[int, str, bool]]) -> None:
+@given(st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(STRUCT_FORMATS)), st.booleans()), max_size=60))
+def test_requests_cover_every_register_once_within_the_maximum_length(registers: list[tuple[int, str, bool]]) -> None:
     values = [
-        Value("cells", Register(address=address, type=kind, table="input" if is_input else "holding"))
-        for address, kind, is_input in wanted
+        Value("cells", Register(address=address, type=register_type, table="input" if is_input else "holding"))
+        for address, register_type, is_input in registers
     ]
-    requests = plan(values)
+    requests = plan_requests(values)
     assert sorted((v for request in requests for v in request.values), key=repr) == sorted(values, key=repr)
     for request in requests:
         assert 1 <= request.words <= MAX_WORDS
@@ -68,24 +75,24 @@ def test_requests_cover_every_register_once_within_the_maximum_length(wanted: li
 
 
 def test_device_with_a_profile_is_read_in_as_few_requests_as_possible() -> None:
-    (request,) = plan(list_values(source(profile="victron-gx")))
+    (request,) = plan_requests(list_values(source(profile="victron-gx")))
     assert (request.table, request.address, request.words) == ("holding", 259, 4)
     assert request.described == "source.voltage, source.current, source.temperature (holding registers 259 to 262)"
-    seplos = plan(list_values(source(profile="seplos-v3")))
+    seplos = plan_requests(list_values(source(profile="seplos-v3")))
     assert [(r.table, r.address, r.words) for r in seplos] == [("input", 0x1000, 10), ("input", 0x1100, 16)]
 
 
 def test_rejected_request_is_split_by_quantity_and_without_gaps() -> None:
-    (request,) = plan(list_values(source(profile="victron-gx")))
-    assert [(r.address, r.words) for r in split(request)] == [(259, 1), (261, 1), (262, 1)]
-    (single_value_request,) = split(split(request)[0])
-    assert split(single_value_request) == (single_value_request,)
+    (request,) = plan_requests(list_values(source(profile="victron-gx")))
+    assert [(r.address, r.words) for r in split_request(request)] == [(259, 1), (261, 1), (262, 1)]
+    single_value_request = split_request(request)[0]
+    assert split_request(single_value_request) == (single_value_request,)
 
 
-def test_readings_of_devices_with_profiles() -> None:
+def test_registers_of_devices_with_a_profile_are_decoded() -> None:
     victron = source(profile="victron-gx")
-    steps = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
-    assert victron.sensor == {"current_sign": "charge_positive", **steps}
+    resolutions = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
+    assert victron.sensor_defaults == {"current_sign": "charge_positive", **resolutions}
     words_read = (
         words(5234, "uint16", address=259) | words(-123, "int16", address=261) | words(-25, "int16", address=262)
     )
@@ -116,12 +123,12 @@ def test_nan_and_infinity_count_as_not_measured(raw: float) -> None:
     assert decode_reading(list_values(source_settings), words_read | words(raw, "float32", address=2)) is None
 
 
-def test_infinite_value_is_not_measured() -> None:
+def test_value_that_the_scale_makes_infinite_counts_as_not_measured() -> None:
     register = Register(address=0, type="float32", scale=1e300)
     assert math.isnan(decode(register, words(1e30, "float32")))
 
 
-def test_absent_value_is_not_measured() -> None:
+def test_configured_absent_value_counts_as_not_measured() -> None:
     source_settings = source(
         voltage={"address": 0, "scale": 0.01},
         current={"address": 1, "type": "int16"},
@@ -134,12 +141,12 @@ def test_absent_value_is_not_measured() -> None:
     assert (reading.current_a, reading.cells_v[0]) == (-1.0, 3.3)
     assert math.isnan(reading.temperature_c)
     assert math.isnan(reading.cells_v[1])
-    none = decode_reading(list_values(source_settings), words_read | {("holding", 3): 0})
-    assert none is not None
-    assert none.cells_v == ()
+    reading_without_cells = decode_reading(list_values(source_settings), words_read | {("holding", 3): 0})
+    assert reading_without_cells is not None
+    assert reading_without_cells.cells_v == ()
 
 
-def test_cells_may_have_gaps_between_registers() -> None:
+def test_registers_of_cells_may_have_gaps_between_them() -> None:
     cells = CellRegisters(address=100, count=3, step=4)
     assert [cells.cell(number).address for number in range(3)] == [100, 104, 108]
 
@@ -174,8 +181,8 @@ def test_settings_override_the_profile() -> None:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_profile_is_complete(profile: str) -> None:
-    assert source(profile=profile).sensor["current_sign"] == "charge_positive"
+def test_profile_sets_the_sign_of_the_current(profile: str) -> None:
+    assert source(profile=profile).sensor_defaults["current_sign"] == "charge_positive"
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Linux sensors in a simulated sysfs: values in SI units, and files that fail, vanish, hang or contain no number."""
 
+import math
 import os
 import threading
 from collections.abc import AsyncGenerator
@@ -17,18 +18,20 @@ from tests.patience import LONG_S
 from tests.sources.linux.sysfs_folder import hwmon, iio
 
 INA226 = {"in0_input": 25, "in1_input": 13280, "curr1_input": -2510, "shunt_resistor": 10000, "update_interval": 2}
-EIO = Path("/proc/self/mem")
+"""Files of an INA226: shunt and bus voltage [mV], current [mA], shunt [uohm], update interval [ms]."""
+UNREADABLE_FILE = Path("/proc/self/mem")
 """File whose beginning gives an input/output error when it is read."""
 
 
 def sensor(root: Path, **settings: Any) -> LinuxSensor:
+    """Return a sensor in the simulated /sys ``root``, polled every 10 ms."""
     return LinuxSensor(
         LinuxSource.model_validate({"kind": "linux", "interval_s": 0.01} | settings), root, read_timeout_s=0.05
     )
 
 
 async def read_first(lines: AsyncGenerator[bytes, None]) -> Reading:
-    """Return the first sample after the line ``CONNECTED``."""
+    """Return the first reading, after a check that ``CONNECTED`` precedes it."""
     async with aclosing(lines):
         assert await anext(lines) == CONNECTED
         return _reading(await anext(lines))
@@ -58,7 +61,7 @@ async def test_ina226_is_found_by_name_or_bus_address(chip: str, tmp_path: Path)
     [
         ({"voltage_scale": 4.0, "voltage_offset_v": 0.1}, 53.22, -2.51),
         ({"shunt_ohm": 0.0005}, 13.28, -50.2),  # the driver assumes 10 mohm
-        ({"current": "in0_input", "shunt_ohm": 0.0005}, 13.28, 50.0),
+        ({"current": "in0_input", "shunt_ohm": 0.0005}, 13.28, 50.0),  # 25 mV
         ({"current_scale": 1.02, "current_offset_a": 0.01}, 13.28, -2.5502),
     ],
 )
@@ -85,7 +88,8 @@ async def test_voltage_and_current_of_an_ads1115_and_temperature_of_another_chip
             shunt_ohm=0.00075,
         ).iter_lines()
     )
-    assert reading == Reading(53.12, -6.666667, 21.5)
+    # 26,560 of 0.125 mV by the divider of 16; -640 of 7.8125 uV across 0.75 mohm
+    assert reading == Reading(voltage_v=53.12, current_a=-6.666667, temperature_c=21.5)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +115,7 @@ async def test_missing_chip_or_file_is_reported_with_a_remedy(settings: dict[str
     assert str(caught.value).endswith(reason)
 
 
-async def test_unreadable_file_loses_a_sample_and_is_reported(tmp_path: Path):
+async def test_file_without_a_number_loses_a_sample_and_is_reported_until_it_has_one(tmp_path: Path):
     folder = hwmon(tmp_path, **INA226)
     ina = sensor(tmp_path)
     voltage, current = folder / "in1_input", folder / "curr1_input"
@@ -119,7 +123,7 @@ async def test_unreadable_file_loses_a_sample_and_is_reported(tmp_path: Path):
         "no number: b'busy'": lambda: current.write_text("busy"),
         "no number: b''": lambda: current.write_text(""),
         "no number: b'\\xff\\x00": lambda: current.write_bytes(b"\xff\x00" * 4000),
-        "curr1_input: Input/output error": lambda: (current.unlink(), current.symlink_to(EIO)),
+        "curr1_input: Input/output error": lambda: (current.unlink(), current.symlink_to(UNREADABLE_FILE)),
         "curr1_input: Is a directory": lambda: (current.unlink(), current.mkdir()),
     }
     async with aclosing(ina.iter_lines()) as lines:
@@ -127,7 +131,8 @@ async def test_unreadable_file_loses_a_sample_and_is_reported(tmp_path: Path):
         await anext(lines)
         for reason, make_fault in faults.items():
             make_fault()
-            assert ina._sample(await ina._read(ina._find_channels)) == b""
+            no_line = b""
+            assert ina._sample(await ina._read(ina._find_channels)) == no_line
             assert reason in (ina.fault or "")
         current.rmdir()
         current.write_text("1500\n")
@@ -143,16 +148,16 @@ async def test_unreadable_file_loses_a_sample_and_is_reported(tmp_path: Path):
             await _drain(lines)
 
 
-async def test_hung_bus_blocks_nothing_and_is_not_read_again_until_it_answers(tmp_path: Path):
+async def test_hung_bus_is_reported_and_not_read_by_a_second_thread_until_it_answers(tmp_path: Path):
     folder = hwmon(tmp_path, **INA226)
     (folder / "curr1_input").unlink()
     os.mkfifo(folder / "curr1_input")  # opening a FIFO blocks until another process opens it for writing
     ina = sensor(tmp_path)
-    before = set(threading.enumerate())
+    threads_before = set(threading.enumerate())
     for _ in range(3):
         with pytest.raises(SourceUnavailableError, match=r"the bus has not answered for 0.05 s"):
             await read_first(ina.iter_lines())
-    assert len(set(threading.enumerate()) - before) == 1
+    assert len(set(threading.enumerate()) - threads_before) == 1
     writer = os.open(folder / "curr1_input", os.O_RDWR | os.O_NONBLOCK)
     (folder / "curr1_input").unlink()
     (folder / "curr1_input").write_text("1500\n")
@@ -161,21 +166,23 @@ async def test_hung_bus_blocks_nothing_and_is_not_read_again_until_it_answers(tm
     assert (await read_first(ina.iter_lines())).current_a == 1.5
 
 
-async def test_unreadable_temperature_loses_no_sample(tmp_path: Path):
+async def test_temperature_that_is_no_number_loses_no_sample(tmp_path: Path):
     hwmon(tmp_path, **INA226, temp1_input="nonsense")
     ina = sensor(tmp_path, temperature="temp1_input")
     reading = await read_first(ina.iter_lines())
-    assert reading.temperature_c != reading.temperature_c
+    assert math.isnan(reading.temperature_c)
     assert ina.counters == {"read_errors": 0, "value_errors": 1}
 
 
-@pytest.mark.parametrize(("update_interval", "interval_s"), [("2", 0.1), ("2253", 2.253), ("none", 1.0)])
-def test_poll_interval_is_that_of_the_chip_within_limits(update_interval: str, interval_s: float, tmp_path: Path):
+@pytest.mark.parametrize(("update_interval", "interval_s"), [("2", 0.1), ("2253", 2.253), ("no number", 1.0)])
+def test_poll_interval_is_the_update_interval_of_the_chip_of_at_least_0_1_s(
+    update_interval: str, interval_s: float, tmp_path: Path
+):
     hwmon(tmp_path, **INA226 | {"update_interval": update_interval})
     assert sensor(tmp_path, interval_s=None)._find_channels().interval_s == interval_s
 
 
-async def test_chip_slower_than_expected_is_reported_with_the_setting(tmp_path: Path):
+async def test_chip_slower_than_the_sample_period_is_reported_with_the_setting(tmp_path: Path):
     hwmon(tmp_path, **INA226 | {"update_interval": "17000"})
     with pytest.raises(SourceUnavailableError, match=r"measures only every 17 s; .*source\.interval_s = 17$"):
         await read_first(sensor(tmp_path, interval_s=None).iter_lines())

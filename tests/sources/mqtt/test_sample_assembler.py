@@ -18,9 +18,11 @@ from bms_estimator.sources.mqtt.payload_value import MAX_CELL_NUMBER, InvalidVal
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 
 Messages = list[tuple[str, str]]
+"""Topics and payloads."""
 
 
 def source(**settings: Any) -> MqttSource:
+    """Return validated settings of an MQTT source."""
     return MqttSource.model_validate({"kind": "mqtt"} | settings)
 
 
@@ -30,26 +32,34 @@ def json_source(**settings: Any) -> MqttSource:
 
 
 def feed(
-    assembly: SampleAssembler, messages: Messages, at_s: float = 0.0, *, retained: bool = False
+    assembler: SampleAssembler, messages: Messages, at_s: float = 0.0, *, retained: bool = False
 ) -> list[dict[str, Any]]:
     """Feed messages that arrive together. Return the samples, including the one that is complete 0.5 s later."""
     lines = []
     for topic, payload in messages:
-        assembly.add_message(topic, payload.encode(), at_s, retained=retained)
-        lines.append(assembly.line(at_s))
-    lines.append(assembly.line(at_s + 0.5))
+        assembler.add_message(topic, payload.encode(), at_s, retained=retained)
+        lines.append(assembler.line(at_s))
+    lines.append(assembler.line(at_s + 0.5))
     return [json.loads(line) for line in lines if line]
 
 
 def esphome(node: str, voltage: str, current: str, temperature: str, cell: str) -> Messages:
-    """Return the messages of an ESPHome node, which publishes its sensors one after the other."""
+    """Return the messages of an ESPHome node, which publishes its 16 cells and then its other sensors.
+
+    Args:
+        node: Name of the node.
+        voltage: Name of the sensor of the pack voltage.
+        current: Name of the sensor of the current.
+        temperature: Name of a temperature sensor.
+        cell: Name of a sensor of a cell voltage, with {} for the number of the cell.
+    """
     cells = [(cell.format(n), f"3.3{n:02}") for n in range(1, 17)]
     values = [*cells, (temperature, "21.5"), (voltage, "52.98"), (current, "-12.34"), ("balancing_current", "0.000")]
     return [(f"{node}/sensor/{node}_{name}/state", value) for name, value in values]
 
 
 SIXTEEN_CELLS_V = [round(3.3 + n / 1000, 3) for n in range(1, 17)]
-# Settings, messages, their sample, and the sign of the current, by project
+# By project: settings of the source, messages, the sample that they give, and the sign of its current
 PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
     "batmon-ha": (
         {"profile": "batmon-ha", "prefix": "jk_bms"},
@@ -151,22 +161,22 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("project", PROJECTS)
-def test_messages_of_a_project_give_one_sample(project: str) -> None:
+def test_messages_of_a_project_are_assembled_to_one_sample(project: str) -> None:
     table, messages, sample, sign = PROJECTS[project]
-    assembly = SampleAssembler(source(**table))
-    assert feed(assembly, messages) == [sample]
-    assert feed(assembly, messages, 10.0)[0]["current_a"] == sample["current_a"]
-    assert assembly.fault is None
-    assert set(assembly.counters.values()) == {0}
+    assembler = SampleAssembler(source(**table))
+    assert feed(assembler, messages) == [sample]
+    assert feed(assembler, messages, 10.0)[0]["current_a"] == sample["current_a"]
+    assert assembler.fault is None
+    assert set(assembler.counters.values()) == {0}
     settings = Settings.model_validate({"source": {"kind": "mqtt"} | table})
     assert settings.sensor.current_sign == sign
 
 
-def test_cells_at_the_end_of_a_batch_belong_to_the_next_sample() -> None:
+def test_cell_voltages_published_after_the_current_belong_to_the_next_sample() -> None:
     table, messages, _, _ = PROJECTS["batmon-ha"]
-    assembly = SampleAssembler(source(**table))
-    feed(assembly, messages)
-    assert feed(assembly, messages, 5.0)[0]["cells_v"] == [3.301, 3.302]
+    assembler = SampleAssembler(source(**table))
+    feed(assembler, messages)
+    assert feed(assembler, messages, 5.0)[0]["cells_v"] == [3.301, 3.302]
 
 
 @pytest.mark.parametrize(
@@ -200,57 +210,59 @@ def test_cells_at_the_end_of_a_batch_belong_to_the_next_sample() -> None:
         ),
     ],
 )
-def test_paths_units_scales_and_times(settings: dict[str, Any], payload: str, sample: dict[str, Any]) -> None:
+def test_values_are_read_by_configured_path_unit_scale_and_time(
+    settings: dict[str, Any], payload: str, sample: dict[str, Any]
+) -> None:
     assert feed(SampleAssembler(json_source(**settings)), [("home/pack", payload)]) == [sample]
 
 
-def test_pack_with_the_maximum_number_of_cells_is_decoded() -> None:
-    assembly, decoder = SampleAssembler(json_source(cells="c")), TextProtocol()
+def test_line_of_a_pack_with_the_maximum_number_of_cells_is_decoded() -> None:
+    assembler, decoder = SampleAssembler(json_source(cells="c")), TextProtocol()
     payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MAX_CELL_NUMBER})
-    assembly.add_message("home/pack", payload.encode(), 0.0, retained=False)
-    assert decoder.feed(0.0, assembly.line(0.0)).size == 1
+    assembler.add_message("home/pack", payload.encode(), 0.0, retained=False)
+    assert decoder.feed(0.0, assembler.line(0.0)).size == 1
     assert decoder.cells.shape == (1, MAX_CELL_NUMBER)
 
 
-def test_unchanged_topic_keeps_its_value_up_to_the_maximum_age() -> None:
-    assembly = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, max_age_s=30.0))
-    assert feed(assembly, [("v", "52")]) == []
-    assert assembly.fault == "current: no message on i"
-    assert feed(assembly, [("i", "1"), ("v", "51")], 1.0) == [{"voltage_v": 51.0, "current_a": 1.0}]
-    assembly.add_message("i", b"2", 20.0, retained=False)
-    assert assembly.line(20.4) == b""
-    assert assembly.wait_s(20.4) == pytest.approx(0.1)
-    assert json.loads(assembly.line(20.5)) == {"voltage_v": 51.0, "current_a": 2.0}
-    assert assembly.wait_s(20.5) is None
-    assert feed(assembly, [("i", "3")], 40.0) == []
-    assert assembly.counters["stale"] == 2
-    assert assembly.fault == "voltage: no message on v for 30 s"
-    assert feed(assembly, [("v", "50")], 41.0) == [{"voltage_v": 50.0, "current_a": 3.0}]
-    assert assembly.fault is None
+def test_value_of_a_silent_topic_is_used_up_to_the_maximum_age() -> None:
+    assembler = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, max_age_s=30.0))
+    assert feed(assembler, [("v", "52")]) == []
+    assert assembler.fault == "current: no message on i"
+    assert feed(assembler, [("i", "1"), ("v", "51")], 1.0) == [{"voltage_v": 51.0, "current_a": 1.0}]
+    assembler.add_message("i", b"2", 20.0, retained=False)
+    assert assembler.line(20.4) == b""
+    assert assembler.wait_s(20.4) == pytest.approx(0.1)
+    assert json.loads(assembler.line(20.5)) == {"voltage_v": 51.0, "current_a": 2.0}
+    assert assembler.wait_s(20.5) is None
+    assert feed(assembler, [("i", "3")], 40.0) == []
+    assert assembler.counters["stale"] == 2
+    assert assembler.fault == "voltage: no message on v for 30 s"
+    assert feed(assembler, [("v", "50")], 41.0) == [{"voltage_v": 50.0, "current_a": 3.0}]
+    assert assembler.fault is None
 
 
-def test_temperature_and_cells_may_be_older() -> None:
-    assembly = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature={"topic": "t"}))
-    both = [("v", "52"), ("i", "1")]
-    feed(assembly, [("t", "21.5")])
-    assert feed(assembly, both, 299.0)[0]["temperature_c"] == 21.5
-    assert "temperature_c" not in feed(assembly, both, 301.0)[0]
+def test_temperature_is_used_for_five_minutes() -> None:
+    assembler = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature={"topic": "t"}))
+    voltage_and_current = [("v", "52"), ("i", "1")]
+    feed(assembler, [("t", "21.5")])
+    assert feed(assembler, voltage_and_current, 299.0)[0]["temperature_c"] == 21.5
+    assert "temperature_c" not in feed(assembler, voltage_and_current, 301.0)[0]
 
 
-def test_retained_messages_are_ignored() -> None:
-    assembly = SampleAssembler(json_source(availability_topic="home/status"))
-    assert feed(assembly, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []
-    assert assembly.counters["retained"] == 1
-    assert assembly.fault == "no message on home/pack but retained messages"
-    feed(assembly, [("home/status", "offline")], retained=True)
-    assert assembly.fault == "the publisher reports offline on home/status"
-    feed(assembly, [("home/status", '{"state":"online"}')])
-    assert feed(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
-    assert assembly.fault is None
+def test_retained_values_are_ignored_but_a_retained_availability_is_reported() -> None:
+    assembler = SampleAssembler(json_source(availability_topic="home/status"))
+    assert feed(assembler, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []
+    assert assembler.counters["retained"] == 1
+    assert assembler.fault == "no message on home/pack but retained messages"
+    feed(assembler, [("home/status", "offline")], retained=True)
+    assert assembler.fault == "the publisher reports offline on home/status"
+    feed(assembler, [("home/status", '{"state":"online"}')])
+    assert feed(assembler, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+    assert assembler.fault is None
 
 
 @pytest.mark.parametrize(
-    ("payload", "kind", "reason"),
+    ("payload", "counter", "reason"),
     [
         ('{"i": 1}', "missing", "voltage: home/pack: u: not in {'i': 1}"),
         ('{"u": "unavailable", "i": 1}', "no_number", "no number: 'unavailable'"),
@@ -267,21 +279,21 @@ def test_retained_messages_are_ignored() -> None:
         (5000 * "[", "no_number", "no JSON: '[[["),
     ],
 )
-def test_invalid_payload_is_counted_and_reported(payload: str, kind: str, reason: str) -> None:
-    assembly = SampleAssembler(json_source())
-    assert feed(assembly, [("home/pack", payload)]) == []
-    assert assembly.counters[kind] >= 1
-    assert reason in (assembly.fault or "")
-    assert feed(assembly, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+def test_invalid_payload_is_counted_and_reported(payload: str, counter: str, reason: str) -> None:
+    assembler = SampleAssembler(json_source())
+    assert feed(assembler, [("home/pack", payload)]) == []
+    assert assembler.counters[counter] >= 1
+    assert reason in (assembler.fault or "")
+    assert feed(assembler, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
 
 
 @given(st.binary() | st.recursive(st.none() | st.floats() | st.text(), st.lists).map(json.dumps).map(str.encode))
-def test_no_payload_raises(payload: bytes) -> None:
+def test_no_payload_raises_another_error(payload: bytes) -> None:
     settings = json_source(cells="c.{cell}", temperature={"path": "0.1"}, time={"path": "t", "unit": "iso"})
-    assembly = SampleAssembler(settings)
-    assembly.add_message("home/pack", payload, 0.0, retained=False)
-    assembly.line(1.0)
-    for name, place in settings.places():
+    assembler = SampleAssembler(settings)
+    assembler.add_message("home/pack", payload, 0.0, retained=False)
+    assembler.line(1.0)
+    for name, place in settings.locations():
         for read in (read_value, read_cells):
             try:
                 read(payload, place, name)
@@ -293,14 +305,16 @@ def test_no_payload_raises(payload: bytes) -> None:
     ("prefix", "instance", "name_prefix"),
     [("jk-bms", "", "jk-bms_"), ("jk-bms", "", ""), ("home/bms", "jk-bms", "jk-bms_")],
 )
-def test_node_with_another_prefix_or_without_name(prefix: str, instance: str, name_prefix: str) -> None:
-    assembly = SampleAssembler(source(profile="esphome-jk", prefix=prefix, instance=instance))
+def test_esphome_node_may_have_a_prefix_of_its_own_and_sensors_without_the_name_of_the_node(
+    prefix: str, instance: str, name_prefix: str
+) -> None:
+    assembler = SampleAssembler(source(profile="esphome-jk", prefix=prefix, instance=instance))
     values = [("total_voltage", "52.98"), ("current", "-12.34"), ("balancing_current", "1")]
-    sample = feed(assembly, [(f"{prefix}/sensor/{name_prefix}{name}/state", value) for name, value in values])
+    sample = feed(assembler, [(f"{prefix}/sensor/{name_prefix}{name}/state", value) for name, value in values])
     assert sample == [{"voltage_v": 52.98, "current_a": -12.34}]
 
 
-def test_no_topic_is_subscribed_twice() -> None:
+def test_topics_of_several_values_are_subscribed_once() -> None:
     jk = source(profile="esphome-jk", prefix="jk-bms")
     assert SampleAssembler(jk).topics == ["jk-bms/sensor/+/state", "jk-bms/status"]
     assert SampleAssembler(json_source()).topics == ["home/pack"]
@@ -332,7 +346,7 @@ def test_settings_override_the_profile() -> None:
     assert merged.current.topics == ("{prefix}/info{instance}",)
     assert (merged.current.path, merged.current.scale) == ("battery_current", -1.0)
     assert merged.temperature.path == "temperature_min"
-    assert (merged.prefix, merged.period_s) == ("BE", 2.0)
+    assert (merged.prefix, merged.period_s) == ("BE", 2.0)  # the prefix is that of the profile
 
 
 class _Publisher(NamedTuple):
@@ -355,50 +369,58 @@ def _merge_publishers(*publishers: _Publisher) -> list[tuple[float, float]]:
 
 
 def _conflict_times(messages: list[tuple[float, float]]) -> tuple[SampleAssembler, list[float]]:
-    """Return the assembler and the times of the messages that were counted as those of two publishers [s]."""
-    assembly, times_s = SampleAssembler(json_source()), list[float]()
+    """Feed the times and currents of messages.
+
+    Return the assembler, and the times of the messages at which two publishers were detected [s].
+    """
+    assembler, times_s = SampleAssembler(json_source()), list[float]()
     for at_s, current_a in messages:
-        before = assembly.counters["publisher_errors"]
-        assembly.add_message("home/pack", json.dumps({"u": 52.0, "i": current_a}).encode(), at_s, retained=False)
-        times_s += [at_s] * (assembly.counters["publisher_errors"] - before)
-    return assembly, times_s
+        errors_before = assembler.counters["publisher_errors"]
+        assembler.add_message("home/pack", json.dumps({"u": 52.0, "i": current_a}).encode(), at_s, retained=False)
+        times_s += [at_s] * (assembler.counters["publisher_errors"] - errors_before)
+    return assembler, times_s
 
 
 @pytest.mark.parametrize("period_s", [0.2, 1.0, 2.7])
 def test_second_publisher_of_a_topic_is_reported_until_it_stops(period_s: float) -> None:
     publisher = _Publisher(period_s=1.0, first_s=0.0, last_s=160.0, current_a=5.0)
     second_publisher = _Publisher(period_s, first_s=100.3, last_s=160.0, current_a=-80.0)
-    assembly, times_s = _conflict_times(_merge_publishers(publisher, second_publisher))
+    assembler, times_s = _conflict_times(_merge_publishers(publisher, second_publisher))
     assert 100.3 < times_s[0] < 115.0
     assert times_s[-1] > 158.0
-    assert set(assembly.conflict.removeprefix("home/pack: current ").split(" and ")) == {"5", "-80"}
-    assembly, times_s = _conflict_times(_merge_publishers(publisher._replace(last_s=400.0), second_publisher))
-    assert assembly.conflict == ""
+    assert set(assembler.conflict.removeprefix("home/pack: current ").split(" and ")) == {"5", "-80"}
+    assembler, times_s = _conflict_times(_merge_publishers(publisher._replace(last_s=400.0), second_publisher))
+    assert assembler.conflict == ""
     assert times_s[-1] < 160.0 + 64.0
 
 
 @pytest.mark.parametrize("on_s", [1, 2, 3, 10])
-def test_switching_load_is_no_second_publisher(on_s: int) -> None:
+def test_load_that_switches_regularly_does_not_count_as_a_second_publisher(on_s: int) -> None:
     messages = [(float(second), 80.0 if second // on_s % 2 else -5.0) for second in range(1000)]
-    assembly, times_s = _conflict_times(messages)
-    assert (assembly.conflict, times_s) == ("", [])
+    assembler, times_s = _conflict_times(messages)
+    assert (assembler.conflict, times_s) == ("", [])
 
 
 @pytest.mark.parametrize(("on_s", "off_s", "spread"), [(3, 60, 0.0), (600, 1800, 0.1), (5, 15, 0.9)])
-def test_load_published_on_change_is_no_second_publisher(on_s: int, off_s: int, spread: float) -> None:
-    """The loads are a short pulse each minute, a refrigerator, and a load that is switched by hand."""
+def test_current_published_only_on_change_does_not_count_as_a_second_publisher(
+    on_s: int, off_s: int, spread: float
+) -> None:
+    """The loads are a short pulse each minute, a refrigerator, and a load that is switched by hand.
+
+    ``spread`` is the maximum relative deviation of a time from ``on_s`` and ``off_s``.
+    """
     rng, messages, at_s = random.Random(1), list[tuple[float, float]](), 0.0
     for _ in range(200):
         for pause_s, current_a in ((off_s, 80.0), (on_s, 5.0)):
             at_s += pause_s * rng.uniform(1.0 - spread, 1.0 + spread)
             messages.append((at_s, current_a))
-    assembly, times_s = _conflict_times(messages)
-    assert (assembly.conflict, times_s) == ("", [])
+    assembler, times_s = _conflict_times(messages)
+    assert (assembler.conflict, times_s) == ("", [])
 
 
 @pytest.mark.parametrize("restarts", [False, True])
-def test_publisher_of_changes_and_regular_messages_is_no_second_publisher(*, restarts: bool) -> None:
-    """The load is on for 3 s of every 61 s. A message every 10 s is counted from the last change (``restarts``) or not."""
+def test_publisher_of_changes_and_of_regular_messages_does_not_count_as_two(*, restarts: bool) -> None:
+    """The load is on for 3 s of every 61 s. The regular interval of 10 s restarts at each change, or not."""
     messages: list[tuple[float, float]] = []
     for cycle in range(30):
         on_s = 61.0 * cycle
@@ -407,8 +429,8 @@ def test_publisher_of_changes_and_regular_messages_is_no_second_publisher(*, res
             messages += [(on_s + 3.0 + 10.0 * i, 5.0) for i in range(1, 6)]
     if not restarts:
         messages += [(10.0 * i + 0.5, 80.0 if (10.0 * i + 0.5) % 61.0 < 3.0 else 5.0) for i in range(183)]
-    assembly, times_s = _conflict_times(sorted(messages))
-    assert (assembly.conflict, times_s) == ("", [])
+    assembler, times_s = _conflict_times(sorted(messages))
+    assert (assembler.conflict, times_s) == ("", [])
 
 
 def test_slower_second_publisher_is_detected() -> None:
@@ -429,7 +451,7 @@ def test_second_publisher_at_random_times_is_detected() -> None:
     assert 100.0 < times_s[0] < 115.0
 
 
-def test_cells_no_longer_measured_are_removed() -> None:
+def test_cell_voltages_that_become_null_or_unavailable_are_removed_from_the_sample() -> None:
     one_topic = SampleAssembler(json_source(cells="cells"))
     payloads = ('{"u": 52.0, "i": 1.0, "cells": [3.3, 3.4]}', '{"u": 52.0, "i": 1.0, "cells": null}')
     first, lost = feed(one_topic, [("home/pack", payload) for payload in payloads])

@@ -1,4 +1,4 @@
-"""Check of the board: nothing is sent to other devices, and ``port = "auto"`` stays with one board.
+"""Check of the board: nothing is sent to other devices, and with ``port = "auto"`` only one board is read.
 
 More tests of the check are in ``test_pinned_board``.
 """
@@ -37,8 +37,8 @@ async def run_source(source: SerialSource, blocks: list[SampleBlock]):
     """Run the source. Append its blocks to ``blocks``."""
 
     async def store_blocks() -> None:
-        async for block in source:
-            blocks.append(block.copy())  # noqa: PERF401 - others read the list meanwhile
+        async for block, _ in source:
+            blocks.append(block.copy())
 
     async with source:
         task = asyncio.create_task(store_blocks())
@@ -49,14 +49,14 @@ async def run_source(source: SerialSource, blocks: list[SampleBlock]):
             await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_nothing_is_sent_to_a_device_with_another_protocol(line: Line) -> None:
+async def test_nothing_is_sent_to_a_device_that_is_silent_or_has_another_protocol(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05, silent_s=0.3)
     async with run_source(source, []):
-        await until(lambda: source.message and "silent" in source.message)
+        await until(lambda: source.silence_reason and "silent" in source.silence_reason)
         assert line.received() == b""
         line.write(100 * ASH_RESET)
-        await until(lambda: source.message and "no valid frame" in source.message)
+        await until(lambda: source.silence_reason and "no valid frame" in source.silence_reason)
         assert line.received() == b""
 
 
@@ -64,7 +64,7 @@ async def test_hello_is_requested_after_the_first_frame(line: Line) -> None:
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
     async with run_source(source, []):
-        await until(lambda: source.message and "no frame yet" in source.message)
+        await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
         line.write(b"\0" + hello_command())  # any frame with a valid CRC
         received = b""
 
@@ -87,6 +87,7 @@ def only_port(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]
 
 @contextlib.contextmanager
 def symlink(path: Path, target: str):
+    """Create a link, and remove it at the end."""
     path.symlink_to(target)
     try:
         yield
@@ -97,7 +98,8 @@ def symlink(path: Path, target: str):
 @contextlib.asynccontextmanager
 async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
     """Run a board that is plugged in at ``path``."""
-    with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial) as board, symlink(path, board.path):
+    reading = Reading(current_a=0.5, voltage_v=voltage_v, temperature_c=25.0)
+    with VirtualBoard(lambda _: reading, serial=serial) as board, symlink(path, board.path):
         task = asyncio.create_task(board.run())
         try:
             yield
@@ -112,10 +114,10 @@ async def test_auto_rejects_another_board_and_reopens_its_own(only_port: Path) -
     async with run_source(source, blocks):
         async with plugged_in(only_port, serial=1):
             await until(lambda: source._board_check.serial)
-        await until(lambda: source.message)
+        await until(lambda: source.silence_reason)
         async with plugged_in(only_port, serial=2, voltage_v=11.1):
-            await until(lambda: source.message and "refused" in source.message)
-            assert "board 00000002 is not the pack's, 00000001" in (source.message or "")
+            await until(lambda: source.silence_reason and "refused" in source.silence_reason)
+            assert "board 00000002 is not the pack's, 00000001" in (source.silence_reason or "")
             await until(lambda: source.counters["reconnects"] >= 2)  # the board is checked a second time
         blocks_before = len(blocks)
         async with plugged_in(only_port, serial=1):
@@ -124,14 +126,14 @@ async def test_auto_rejects_another_board_and_reopens_its_own(only_port: Path) -
     assert np.concatenate(blocks)["voltage_v"] == pytest.approx(22.2, abs=0.1)
 
 
-async def test_auto_reports_what_replaced_its_board(only_port: Path) -> None:
+async def test_auto_reports_a_board_that_prints_text_in_place_of_its_own(only_port: Path) -> None:
     source = SerialSource(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
     async with run_source(source, []):
         async with plugged_in(only_port, serial=1):
             await until(lambda: source._board_check.serial)
-        await until(lambda: source.message)
+        await until(lambda: source.silence_reason)
         with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, symlink(only_port, other.path):
             task = asyncio.create_task(other.run())
-            await until(lambda: source.message and "prints text" in source.message)
+            await until(lambda: source.silence_reason and "prints text" in source.silence_reason)
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)

@@ -1,4 +1,7 @@
-"""Replacement of the board on the open port by a running board with another scaling, without a reset."""
+"""Replacement of the pack's board by another running board, while the port stays open.
+
+The other board scales the voltage differently and sends no hello by itself, because it is not reset.
+"""
 
 import asyncio
 
@@ -21,6 +24,9 @@ from tests.sources.serial.test_pinned_board import until
 PACK_V = 22.2
 PERIOD_S = 0.01
 BEGIN_S = 1_700_000_000.0
+OUR_SERIAL, OTHER_SERIAL = 1, 2
+OUR_DIVIDER, OTHER_DIVIDER = 6.1, 9.0
+"""Ratio of the voltage divider of each board, with which the host scales its samples."""
 
 
 class RunningBoard:
@@ -28,31 +34,35 @@ class RunningBoard:
 
     def __init__(self, serial: int, divider: float, sequence: int = 0, age_s: float = 0.0) -> None:
         self._board = VirtualBoard(
-            lambda _: Reading(0.5, PACK_V, 25.0), serial=serial, parts=BoardParts(divider=divider)
+            lambda _: Reading(current_a=0.5, voltage_v=PACK_V, temperature_c=25.0),
+            serial=serial,
+            parts=BoardParts(divider=divider),
         )
-        self._board._sequence, self._board._ns = sequence, int(age_s * 1e9)
+        self._board._sequence, self._board._clock_ns = sequence, int(age_s * 1e9)
 
     def hello(self) -> bytes:
+        """Return the frame of the board's hello."""
         hello: Hello = self._board._hello()
         return hello.encode()
 
     def frames(self, count: int) -> list[bytes]:
-        """Return the next ``count`` samples."""
+        """Return the frames of the next ``count`` samples."""
         frames = []
         for _ in range(count):
-            self._board._line.clear()
+            self._board._unsent.clear()
             self._board._take_sample()
-            frames.append(bytes(self._board._line))
+            frames.append(bytes(self._board._unsent))
         return frames
 
 
 def feed_frames(decoder: FrameDecoder, begin_s: float, frames: list[bytes]) -> SampleBlock:
+    """Feed frames that arrive at the sample period from ``begin_s`` on. Return the samples."""
     return np.concatenate([decoder.feed(begin_s + PERIOD_S * i, frame) for i, frame in enumerate(frames)])
 
 
 def decoder_of_our_board() -> FrameDecoder:
     """Return a decoder that has received samples of our board for a second."""
-    decoder, board = FrameDecoder(), RunningBoard(1, 6.1)
+    decoder, board = FrameDecoder(), RunningBoard(OUR_SERIAL, OUR_DIVIDER)
     decoder.feed(BEGIN_S, board.hello())
     assert feed_frames(decoder, BEGIN_S + PERIOD_S, board.frames(100))["voltage_v"] == pytest.approx(PACK_V, abs=0.1)
     return decoder
@@ -61,10 +71,19 @@ def decoder_of_our_board() -> FrameDecoder:
 @pytest.mark.parametrize(
     ("sequence", "age_s", "away_s"),
     [(50_000, 900.0, 1.0), (101, 900.0, 1.0), (50_000, 2.0, 1.0), (700_000, 3500.0, 3600.0), (3000, 30.0, 3600.0)],
-    ids=["ahead", "by its clock alone", "by its sequence alone", "after an hour", "begun within that hour"],
+    ids=[
+        "sequence and clock ahead",
+        "only its clock ahead",
+        "only its sequence ahead",
+        "ahead, after an hour",
+        "started in the hour without samples",
+    ],
 )
-def test_inconsistent_samples_wait_for_a_hello(sequence: int, age_s: float, away_s: float) -> None:
-    decoder, other = decoder_of_our_board(), RunningBoard(2, 9.0, sequence, age_s)
+def test_samples_that_do_not_continue_those_of_the_board_are_dropped_until_a_hello(
+    sequence: int, age_s: float, away_s: float
+) -> None:
+    """The other board is connected ``away_s`` after the last sample of ours."""
+    decoder, other = decoder_of_our_board(), RunningBoard(OTHER_SERIAL, OTHER_DIVIDER, sequence, age_s)
     begin_s = BEGIN_S + 1.0 + away_s
     assert feed_frames(decoder, begin_s, other.frames(100)).size == 0
     assert decoder.hello is None
@@ -75,24 +94,24 @@ def test_inconsistent_samples_wait_for_a_hello(sequence: int, age_s: float, away
     assert decoder.board["serial"] == "00000002"
 
 
-def test_lost_samples_do_not_require_a_hello() -> None:
-    decoder, board = decoder_of_our_board(), RunningBoard(1, 6.1, 100, 1.0)
+def test_samples_of_the_same_board_after_a_loss_are_decoded_without_a_hello() -> None:
+    decoder, board = decoder_of_our_board(), RunningBoard(OUR_SERIAL, OUR_DIVIDER, 100, 1.0)
     board.frames(12_345)
-    block = feed_frames(decoder, BEGIN_S + 1.0 + 123.46, board.frames(10))
+    block = feed_frames(decoder, BEGIN_S + 1.0 + 123.46, board.frames(10))  # 12,345 samples take 123.45 s
     assert block.size == 10
     assert decoder.hello
     assert decoder.counters.frames_lost == 12_345
 
 
-def test_board_without_hello_is_accepted_after_a_timeout() -> None:
+def test_samples_that_do_not_continue_are_accepted_after_a_time_without_a_hello() -> None:
     """The line may have no direction to the board, so that a hello cannot be requested."""
-    decoder, board = decoder_of_our_board(), RunningBoard(1, 6.1, 100, 900.0)
+    decoder, board = decoder_of_our_board(), RunningBoard(OUR_SERIAL, OUR_DIVIDER, 100, 900.0)
     block = feed_frames(decoder, BEGIN_S + 2.0, board.frames(1000))
     assert block.size == decoder.counters.frames_received - 100 == 1000 - MAX_DOUBT_S / PERIOD_S
     assert decoder.counters.before_hello == MAX_DOUBT_S / PERIOD_S
     assert decoder.hello is None
-    lost = decoder_of_our_board()
-    block = feed_frames(lost, BEGIN_S + 2.0, RunningBoard(1, 6.1, 50_000, 900.0).frames(1000))
+    new_decoder = decoder_of_our_board()
+    block = feed_frames(new_decoder, BEGIN_S + 2.0, RunningBoard(OUR_SERIAL, OUR_DIVIDER, 50_000, 900.0).frames(1000))
     assert block["status"][0] & SampleStatus.GAP
     assert not block["status"][1:].any()
 
@@ -101,16 +120,16 @@ async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Li
     line.plug()
     source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
     blocks: list[SampleBlock] = []
-    ours, other = RunningBoard(1, 6.1), RunningBoard(2, 9.0, 50_000, 900.0)
+    ours, other = RunningBoard(OUR_SERIAL, OUR_DIVIDER), RunningBoard(OTHER_SERIAL, OTHER_DIVIDER, 50_000, 900.0)
 
     async def store_blocks() -> None:
-        async for block in source:
-            blocks.append(block)  # noqa: PERF401 - the test reads the list meanwhile
+        async for block, _ in source:
+            blocks.append(block)
 
     async with source:
         task = asyncio.create_task(store_blocks())
         try:
-            await until(lambda: source.message and "no frame yet" in source.message)
+            await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
             line.write(ours.hello() + b"".join(ours.frames(10)))
             await until(lambda: source._board_check.serial)
             received = line.received()
@@ -123,7 +142,9 @@ async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Li
 
             await until(is_requested)
             line.write(other.hello() + b"".join(other.frames(10)))
-            await until(lambda: source.message and "board 00000002 is not the pack's, 00000001" in source.message)
+            await until(
+                lambda: source.silence_reason and "board 00000002 is not the pack's, 00000001" in source.silence_reason
+            )
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
@@ -133,14 +154,14 @@ async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Li
 def check_of_our_board() -> tuple[BoardCheck, BoardProtocol]:
     """Return a check that accepts our board only, and a protocol that has received its hello."""
     protocol, check = BoardProtocol(), BoardCheck(BoardProtocol)
-    protocol.feed(BEGIN_S, RunningBoard(1, 6.1).hello())
+    protocol.feed(BEGIN_S, RunningBoard(OUR_SERIAL, OUR_DIVIDER).hello())
     check.remember_board(protocol.board, 0.0)
     return check, protocol
 
 
 def test_rejected_board_is_blocked_until_the_port_is_reopened() -> None:
-    """The reads after the hello of the rejected board contain no hello, and are rejected, too."""
-    own, other = RunningBoard(1, 6.1), RunningBoard(2, 9.0)
+    """Reads of the rejected board that contain no hello are rejected, too."""
+    own, other = RunningBoard(OUR_SERIAL, OUR_DIVIDER), RunningBoard(OTHER_SERIAL, OTHER_DIVIDER)
     check, protocol = check_of_our_board()
     with pytest.raises(OtherBoardError):
         check.accept((BEGIN_S, other.hello()), protocol)
@@ -151,8 +172,8 @@ def test_rejected_board_is_blocked_until_the_port_is_reopened() -> None:
     assert len(check.accept((BEGIN_S, own.hello()), protocol)) == 1
 
 
-def test_each_pending_byte_is_passed_once_or_counted() -> None:
-    board = RunningBoard(1, 6.1)
+def test_each_byte_received_before_the_hello_is_passed_on_once_or_counted_as_rejected() -> None:
+    board = RunningBoard(OUR_SERIAL, OUR_DIVIDER)
     check, protocol = check_of_our_board()
     reads = [(BEGIN_S, frame) for frame in board.frames(MAX_PENDING_READS + 5)]
     check.on_port_opened()
@@ -161,6 +182,7 @@ def test_each_pending_byte_is_passed_once_or_counted() -> None:
     assert check.rejected_bytes == sum(len(data) for _, data in reads[:7])
     assert not any(check.accept(read, protocol) for read in reads)
     hello = BEGIN_S, board.hello()
+    # of MAX_PENDING_READS + 6 reads, including the hello, the first six are dropped
     assert check.accept(hello, protocol) == [*reads[6:], hello]
     check.on_port_opened()
     assert check.rejected_bytes == sum(len(data) for _, data in reads[:7] + reads[:6])

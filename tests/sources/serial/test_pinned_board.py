@@ -1,4 +1,4 @@
-"""Pack with one board, which is recognized by its serial number on any port. Other boards are rejected."""
+"""Board of a pack. It is recognized by its serial number on any port, and other boards are rejected."""
 
 import asyncio
 import contextlib
@@ -20,6 +20,7 @@ from structlog.testing import capture_logs
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads import Snapshot
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.protocols.firmware.messages import MessageType
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
@@ -34,6 +35,9 @@ from tests.patience import LONG_S
 from tests.serial_line import usb_port
 
 OURS_V, OTHERS_V = 22.2, 11.1
+"""Voltages that the pack's board and another board measure [V]. By default they have serial numbers 1 and 2."""
+BOARD_42 = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
+"""Stored fields of a board with serial number 42."""
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -43,7 +47,7 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def port_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Return the folder of the ports. Each link in the folder is a USB port with the chip of a board."""
     ports = tmp_path / "dev"
     ports.mkdir()
@@ -55,6 +59,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def memory(tmp_path: Path) -> KnownBoardFile:
+    """Return the file that stores the board of pack ``house``; it does not exist yet."""
     return KnownBoardFile(tmp_path, "house")
 
 
@@ -73,13 +78,14 @@ class RecordingSource(SerialSource):
 async def source(
     port: Path | str, memory: KnownBoardFile | None = None, **settings: Any
 ) -> AsyncIterator[RecordingSource]:
+    """Run a source that stores its blocks."""
     reader = RecordingSource(
-        SensorSettings(port=str(port), **settings), memory=memory, first_retry_s=0.05, silent_s=0.3
+        SensorSettings(port=str(port), **settings), board_file=memory, first_retry_s=0.05, silent_s=0.3
     )
     reader.blocks = []
 
     async def store_blocks() -> None:
-        async for block in reader:
+        async for block, _ in reader:
             reader.blocks.append(block.copy())
 
     async with reader:
@@ -94,7 +100,9 @@ async def source(
 @contextlib.asynccontextmanager
 async def board(path: Path, serial: int = 1, voltage_v: float = OURS_V, **options: Any) -> AsyncIterator[VirtualBoard]:
     """Run a board that is plugged in at ``path``."""
-    with VirtualBoard(lambda _: Reading(0.5, voltage_v, 25.0), serial=serial, **options) as virtual:
+    with VirtualBoard(
+        lambda _: Reading(current_a=0.5, voltage_v=voltage_v, temperature_c=25.0), serial=serial, **options
+    ) as virtual:
         path.symlink_to(virtual.path)  # noqa: ASYNC240 - at once
         task = asyncio.create_task(virtual.run())
         try:
@@ -106,81 +114,90 @@ async def board(path: Path, serial: int = 1, voltage_v: float = OURS_V, **option
 
 
 async def wait_until_stored(memory: KnownBoardFile, serial: str) -> None:
+    """Wait until the file contains the board with this serial number."""
     await until(lambda: memory.load().get("serial") == serial)
 
 
 async def test_other_board_on_the_configured_port_is_rejected_after_a_restart(
-    folder: Path, memory: KnownBoardFile
+    port_folder: Path, memory: KnownBoardFile
 ) -> None:
-    port = folder / "ttyUSB0"
+    port = port_folder / "ttyUSB0"
     async with source(port, memory), board(port):
         await wait_until_stored(memory, "00000001")
     async with source(port, memory) as reader, board(port, serial=2, voltage_v=OTHERS_V):
-        await until(lambda: reader.message and "refused" in reader.message)
-        message = f"{port}: refused: board 00000002 is not the pack's, 00000001: connect that one, or, to use this board instead, run"
-        assert message in (reader.message or "")
-        assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (reader.message or "")
+        await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
+        reason = "refused: board 00000002 is not the pack's, 00000001"
+        remedy = "connect that one, or, to use this board instead, run"
+        assert f"{port}: {reason}: {remedy}" in (reader.silence_reason or "")
+        assert f"`bms-estimator board --folder {memory.path.parent} --accept`" in (reader.silence_reason or "")
         await until(lambda: reader.counters["reconnects"] >= 1)
         assert reader.blocks == []
 
 
-async def test_other_board_on_the_configured_port_is_rejected_within_a_run(folder: Path) -> None:
-    port = folder / "ttyUSB0"
+async def test_other_board_on_the_configured_port_is_rejected_until_the_own_board_is_back(port_folder: Path) -> None:
+    port = port_folder / "ttyUSB0"
     async with source(port) as reader:
         async with board(port):
             await until(lambda: reader._board_check.serial)
-        await until(lambda: reader.message)
+        await until(lambda: reader.silence_reason)
         async with board(port, serial=2, voltage_v=OTHERS_V):
-            await until(lambda: reader.message and "refused" in reader.message)
+            await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
         blocks_before = len(reader.blocks)
         async with board(port):
             await until(lambda: len(reader.blocks) > blocks_before)
     assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_first_board_is_rejected_if_another_is_configured(folder: Path, memory: KnownBoardFile) -> None:
-    port = folder / "ttyUSB0"
+async def test_first_board_is_rejected_if_the_settings_name_another_serial_number(
+    port_folder: Path, memory: KnownBoardFile
+) -> None:
+    port = port_folder / "ttyUSB0"
     async with source(port, memory, serial="0000002a") as reader:
         async with board(port, voltage_v=OTHERS_V):
-            await until(lambda: reader.message and "refused" in reader.message)
-            assert "board 00000001 is not the pack's, 0000002a" in (reader.message or "")
-            assert "set sensor.serial" in (reader.message or "")
+            await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
+            assert "board 00000001 is not the pack's, 0000002a" in (reader.silence_reason or "")
+            assert "set sensor.serial" in (reader.silence_reason or "")
         async with board(port, serial=42):
             await until(lambda: reader.blocks)
         assert reader.voltage_v == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_board_without_serial_number_is_rejected(folder: Path, memory: KnownBoardFile) -> None:
-    port = folder / "ttyUSB0"
+async def test_board_without_serial_number_is_accepted_with_a_warning_unless_one_is_configured(
+    port_folder: Path, memory: KnownBoardFile
+) -> None:
+    port = port_folder / "ttyUSB0"
     with capture_logs() as logs:
         async with source(port, memory) as reader, board(port, serial=0):
             await until(lambda: [line for line in logs if "no serial number" in line["event"]])
             assert reader.board["serial"] == ""
     assert memory.load() == {}
     async with source(port, memory, serial="00000001") as reader, board(port, serial=0):
-        await until(lambda: "board without a serial number is not the pack's" in (reader.message or ""))
+        await until(lambda: "board without a serial number is not the pack's" in (reader.silence_reason or ""))
 
 
-async def test_other_board_behind_the_open_adapter_is_rejected(folder: Path) -> None:
+async def test_other_board_plugged_into_the_adapter_of_the_open_port_is_rejected(port_folder: Path) -> None:
     """The port remains open. Only the hello shows that the board was replaced."""
-    port = folder / "ttyUSB0"
+    port = port_folder / "ttyUSB0"
     async with source(port) as reader, board(port) as virtual:
         await until(lambda: reader._board_check.serial)
-        virtual._stored[20] = 2
-        virtual._converter = VirtualBoard(lambda _: Reading(0.5, 1.0), parts=BoardParts(divider=9.0))._converter
+        virtual._stored[MessageType.COMMAND_SET_SERIAL] = 2
+        other_board = VirtualBoard(lambda _: Reading(current_a=0.5, voltage_v=1.0), parts=BoardParts(divider=9.0))
+        virtual._converter = other_board._converter
         virtual.reset()
-        await until(lambda: reader.message and "board 00000002 is not the pack's, 00000001" in reader.message)
+        await until(
+            lambda: reader.silence_reason and "board 00000002 is not the pack's, 00000001" in reader.silence_reason
+        )
     assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_board_is_found_on_another_port(folder: Path, memory: KnownBoardFile) -> None:
-    port = folder / "ttyUSB0"
+async def test_own_board_is_found_on_another_port_among_other_boards(port_folder: Path, memory: KnownBoardFile) -> None:
+    port = port_folder / "ttyUSB0"
     async with source(port, memory) as reader:
         async with board(port):
             await until(lambda: reader._board_check.serial)
-        await until(lambda: reader.message)
+        await until(lambda: reader.silence_reason)
         blocks_before = len(reader.blocks)
-        async with board(folder / "ttyUSB1", serial=2, voltage_v=OTHERS_V), board(folder / "ttyUSB2"):
+        async with board(port_folder / "ttyUSB1", serial=2, voltage_v=OTHERS_V), board(port_folder / "ttyUSB2"):
             await until(lambda: len(reader.blocks) > blocks_before)
         blocks_before = len(reader.blocks)
         async with board(port):  # back on the first port
@@ -188,8 +205,8 @@ async def test_board_is_found_on_another_port(folder: Path, memory: KnownBoardFi
     assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
 
 
-async def test_swapped_boards_are_found_by_their_packs(folder: Path, tmp_path: Path) -> None:
-    first_port, second_port = folder / "ttyUSB0", folder / "ttyUSB1"
+async def test_two_packs_find_their_boards_after_the_ports_were_swapped(port_folder: Path, tmp_path: Path) -> None:
+    first_port, second_port = port_folder / "ttyUSB0", port_folder / "ttyUSB1"
     memories = [KnownBoardFile(tmp_path, name) for name in ("house", "shed")]
     async with (
         source(first_port, memories[0]),
@@ -210,27 +227,27 @@ async def test_swapped_boards_are_found_by_their_packs(folder: Path, tmp_path: P
     assert np.concatenate(shed.blocks)["voltage_v"] == pytest.approx(OTHERS_V, abs=0.1)
 
 
-async def test_two_packs_find_their_boards_among_all_ports(folder: Path) -> None:
+async def test_two_packs_find_their_boards_among_all_ports(port_folder: Path) -> None:
     async with (
         source("auto", serial="00000001") as house,
         source("auto", serial="00000002") as shed,
-        board(folder / "a", serial=2, voltage_v=OTHERS_V),
-        board(folder / "b", serial=1),
+        board(port_folder / "a", serial=2, voltage_v=OTHERS_V),
+        board(port_folder / "b", serial=1),
     ):
         await until(lambda: house.blocks and shed.blocks)
     assert np.concatenate(house.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
     assert np.concatenate(shed.blocks)["voltage_v"] == pytest.approx(OTHERS_V, abs=0.1)
 
 
-async def test_search_sends_nothing_to_a_silent_device(folder: Path) -> None:
+async def test_search_for_the_board_sends_nothing_to_a_silent_device(port_folder: Path) -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
-    (folder / "ttyUSB0").symlink_to(os.ttyname(slave))
+    (port_folder / "ttyUSB0").symlink_to(os.ttyname(slave))
     os.set_blocking(master, False)
     try:
-        async with source(folder / "gone", serial="00000001") as reader:
-            await until(lambda: reader._discovery._skipped)
-            async with board(folder / "ttyUSB1"):
+        async with source(port_folder / "gone", serial="00000001") as reader:
+            await until(lambda: reader._discovery._skipped)  # the silent device was tried
+            async with board(port_folder / "ttyUSB1"):
                 await until(lambda: reader.blocks)
         with pytest.raises(BlockingIOError):
             os.read(master, 1)
@@ -239,30 +256,30 @@ async def test_search_sends_nothing_to_a_silent_device(folder: Path) -> None:
         os.close(master)
 
 
-async def test_changed_calibration_is_stored_and_logged(folder: Path, memory: KnownBoardFile) -> None:
-    port = folder / "ttyUSB0"
+async def test_changed_calibration_is_stored_and_logged(port_folder: Path, memory: KnownBoardFile) -> None:
+    port = port_folder / "ttyUSB0"
     async with source(port, memory), board(port):
         await wait_until_stored(memory, "00000001")
     with capture_logs() as logs:
         async with source(port, memory) as reader, board(port, parts=BoardParts(divider=5.4)):
             await until(lambda: memory.load().get("divider") == "5.4")
             assert reader.blocks
-    message = [line for line in logs if line["event"] == "the board is calibrated differently"]
-    assert [line["divider"] for line in message] == ["6.1 to 5.4"]
-    assert "serial" not in message[0]
+    (line,) = [line for line in logs if line["event"] == "the board is calibrated differently"]
+    assert line["divider"] == "6.1 to 5.4"  # the default divider is 6.1
+    assert "serial" not in line
 
 
 async def test_running_service_uses_a_newly_accepted_board(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    port_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    memory, port = KnownBoardFile(tmp_path, "house"), folder / "ttyUSB0"
+    memory, port = KnownBoardFile(tmp_path, "house"), port_folder / "ttyUSB0"
     pack = tmp_path / "pack.toml"
     pack.write_text(f'[pack]\nname = "house"\n[state]\nfolder = "{tmp_path}"\n')
     async with source(port, memory) as reader:
         async with board(port):
             await wait_until_stored(memory, "00000001")
         async with board(port, serial=2, voltage_v=OTHERS_V):
-            await until(lambda: reader.message and "refused" in reader.message)
+            await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
             code, text, _ = run(capsys, "board", "--accept", pack)
             assert code == 0
             assert f"{memory.path}: board 00000001 removed; the service accepts the next board that connects\n" in text
@@ -270,28 +287,31 @@ async def test_running_service_uses_a_newly_accepted_board(
             assert reader.voltage_v == pytest.approx(OTHERS_V, abs=0.1)
 
 
-async def test_deleted_board_file_accepts_no_other_board(folder: Path, memory: KnownBoardFile) -> None:
-    port = folder / "ttyUSB0"
+async def test_other_board_is_rejected_after_the_board_file_was_deleted_within_a_run(
+    port_folder: Path, memory: KnownBoardFile
+) -> None:
+    port = port_folder / "ttyUSB0"
     async with source(port, memory) as reader:
         async with board(port):
             await wait_until_stored(memory, "00000001")
         memory.path.unlink()
         async with board(port, serial=2):
-            await until(lambda: reader.message and "refused" in reader.message)
-            refused = reader.counters["reconnects"]
-            await until(lambda: reader.counters["reconnects"] > refused)
-            assert "refused" in (reader.message or "")
+            await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
+            reconnects_before = reader.counters["reconnects"]
+            await until(lambda: reader.counters["reconnects"] > reconnects_before)
+            assert "refused" in (reader.silence_reason or "")
 
 
 async def test_other_board_after_a_restart_is_reported_in_health(
-    folder: Path, tmp_path: Path, memory: KnownBoardFile
+    port_folder: Path, tmp_path: Path, memory: KnownBoardFile
 ) -> None:
-    port = folder / "ttyUSB0"
+    port = port_folder / "ttyUSB0"
     settings = Settings(
         pack=PackSettings(name="house", cell="ncr18650", series=6), sensor=SensorSettings(port=str(port))
     )
 
     async def serve_until(condition: Callable[[Snapshot], bool]) -> Snapshot:
+        """Run the service of the pack until a snapshot fulfills the condition. Return this snapshot."""
         stop, sink = asyncio.Event(), Collector()
         cell = load_cell("ncr18650").pack(6, 1)
         running = asyncio.create_task(run_pack_service(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
@@ -309,44 +329,48 @@ async def test_other_board_after_a_restart_is_reported_in_health(
     assert snapshot.health.samples["samples"] <= 1  # the sample of the checkpoint
 
 
-async def test_text_board_is_accepted_regardless_of_the_stored_board(folder: Path, memory: KnownBoardFile) -> None:
-    port = folder / "ttyUSB0"
-    memory.save({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
+async def test_board_that_prints_text_is_accepted_although_another_board_is_stored(
+    port_folder: Path, memory: KnownBoardFile
+) -> None:
+    port = port_folder / "ttyUSB0"
+    memory.save(BOARD_42)
     async with source(port, memory, protocol="text") as reader, board(port, mode="text"):
         await until(lambda: reader.blocks)
 
 
 async def test_storing_the_board_is_retried_after_a_disk_error(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    port_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05, raising=False)
-    memory, message = KnownBoardFile(tmp_path / "gone", "house"), "the board cannot be stored"
+    monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05)
+    memory, event = KnownBoardFile(tmp_path / "gone", "house"), "the board cannot be stored"
     memory.path.parent.touch()  # a file where the folder should be
     with capture_logs() as logs:
-        async with source(folder / "ttyUSB0", memory) as reader, board(folder / "ttyUSB0"):
-            await until(lambda: [line for line in logs if message in line["event"]])
+        async with source(port_folder / "ttyUSB0", memory) as reader, board(port_folder / "ttyUSB0"):
+            await until(lambda: [line for line in logs if event in line["event"]])
             blocks_before = len(reader.blocks)
             await until(lambda: len(reader.blocks) > blocks_before + 3)
             memory.path.parent.unlink()
             await wait_until_stored(memory, "00000001")
-    assert len([line for line in logs if message in line["event"]]) == 1
+    assert len([line for line in logs if event in line["event"]]) == 1
     assert stat.S_IMODE(memory.path.parent.stat().st_mode) == 0o700
 
 
-async def test_deleted_state_folder_is_recreated(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_deleted_folder_of_the_board_file_is_recreated(
+    port_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05)
     memory = KnownBoardFile(tmp_path / "state", "house")
-    async with source(folder / "ttyUSB0", memory), board(folder / "ttyUSB0"):
+    async with source(port_folder / "ttyUSB0", memory), board(port_folder / "ttyUSB0"):
         await wait_until_stored(memory, "00000001")
         shutil.rmtree(memory.path.parent)
         await wait_until_stored(memory, "00000001")
 
 
-async def test_reset_board_file_is_not_overwritten(
-    folder: Path, memory: KnownBoardFile, monkeypatch: pytest.MonkeyPatch
+async def test_board_file_that_was_reset_by_accept_is_not_overwritten(
+    port_folder: Path, memory: KnownBoardFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.0)
-    async with source(folder / "ttyUSB0", memory) as reader, board(folder / "ttyUSB0"):
+    async with source(port_folder / "ttyUSB0", memory) as reader, board(port_folder / "ttyUSB0"):
         await wait_until_stored(memory, "00000001")
         memory.save(NO_BOARD)
         blocks_before = len(reader.blocks)
@@ -355,12 +379,11 @@ async def test_reset_board_file_is_not_overwritten(
 
 
 def test_board_file_is_private_and_follows_no_link(memory: KnownBoardFile) -> None:
-    board_fields = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
     other_file = memory.path.with_name("other_file")
     other_file.write_text("theirs")
     memory.path.with_suffix(".new").symlink_to(other_file)
-    memory.save(board_fields)
-    assert memory.load() == board_fields
+    memory.save(BOARD_42)
+    assert memory.load() == BOARD_42
     assert stat.S_IMODE(memory.path.stat().st_mode) == 0o600
     assert other_file.read_text() == "theirs"
     link_file = KnownBoardFile(memory.path.parent, "link_file")
@@ -389,9 +412,9 @@ def test_damaged_board_file_is_ignored_and_logged(memory: KnownBoardFile, text: 
 
 def test_configured_serial_number_must_have_the_format_of_the_board_command() -> None:
     assert SensorSettings(serial="0000002a").serial == "0000002a"
-    for wrong in ("42", "0000002A", 42):
+    for invalid in ("42", "0000002A", 42):
         with pytest.raises(ValidationError):
-            SensorSettings.model_validate({"serial": wrong})
+            SensorSettings.model_validate({"serial": invalid})
     with pytest.raises(ValidationError, match="only a binary board reports its serial number"):
         SensorSettings(serial="0000002a", protocol="text")
 
@@ -412,7 +435,7 @@ def test_accept_uses_the_given_folder_and_requires_a_stored_board(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "mine"))
     pack = tmp_path / "pack.toml"
     pack.write_text('[pack]\nname = "house"\n')
-    memory.save({"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"})
+    memory.save(BOARD_42)
     code, _, err = run(capsys, "board", "--accept", pack)
     assert code == 2
     assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is stored in this file" in err
@@ -423,12 +446,12 @@ def test_accept_uses_the_given_folder_and_requires_a_stored_board(
     assert "requires --accept" in err
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root writes for others")
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
 def test_file_written_by_root_belongs_to_the_owner_of_the_folder(tmp_path: Path) -> None:
-    theirs = tmp_path / "theirs"
-    theirs.mkdir(mode=0o700)
-    os.chown(theirs, 65534, 65533)
-    memory = KnownBoardFile(theirs, "house")
+    folder, owner, group = tmp_path / "folder", 65534, 65533
+    folder.mkdir(mode=0o700)
+    os.chown(folder, owner, group)
+    memory = KnownBoardFile(folder, "house")
     memory.save(NO_BOARD)
     file_status = memory.path.stat()
-    assert (file_status.st_uid, file_status.st_gid, stat.S_IMODE(file_status.st_mode)) == (65534, 65533, 0o600)
+    assert (file_status.st_uid, file_status.st_gid, stat.S_IMODE(file_status.st_mode)) == (owner, group, 0o600)

@@ -32,7 +32,9 @@ def ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[ListPortInfo]
         (0x2A03, 0x0043, "Arduino Uno"),
     ],
 )
-def test_auto_selects_usb_chips_of_boards(ports: list[ListPortInfo], vid: int, pid: int, product: str) -> None:
+def test_auto_selects_a_port_with_a_usb_chip_of_boards(
+    ports: list[ListPortInfo], vid: int, pid: int, product: str
+) -> None:
     ports.append(usb_port("/dev/ttyUSB7", vid, pid, product))
     assert resolve_port("auto") == "/dev/ttyUSB7"
 
@@ -50,7 +52,7 @@ def test_auto_selects_usb_chips_of_boards(ports: list[ListPortInfo], vid: int, p
         (0x0658, 0x0200, "n/a"),
     ],
 )
-def test_auto_ignores_radio_sticks_and_unknown_chips(
+def test_auto_ignores_ports_of_radio_sticks_and_of_unknown_chips(
     ports: list[ListPortInfo], vid: int, pid: int, product: str
 ) -> None:
     ports.append(usb_port("/dev/ttyUSB0", vid, pid, product))
@@ -59,7 +61,9 @@ def test_auto_ignores_radio_sticks_and_unknown_chips(
     assert f"/dev/ttyUSB0 ({product})" in str(raised.value)
 
 
-def test_auto_selects_the_board_next_to_a_radio_stick(ports: list[ListPortInfo], tmp_path: Path) -> None:
+def test_auto_selects_the_stable_link_of_the_board_next_to_a_radio_stick(
+    ports: list[ListPortInfo], tmp_path: Path
+) -> None:
     ports += [usb_port("/dev/ttyUSB0", 0x10C4, 0xEA60, "SkyConnect v1.0"), usb_port("/dev/ttyUSB1")]
     stable_link = tmp_path / "usb-1a86_USB_Serial-if00-port0"
     stable_link.symlink_to("/dev/ttyUSB1")

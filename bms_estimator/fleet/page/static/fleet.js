@@ -1,29 +1,39 @@
-// The page of a fleet: pictures of it come each 2 s, and are drawn as they come; a pack is asked for when it is chosen.
+// Page of a fleet. An overview arrives every 2 s and is drawn at once. Details of a pack are requested when the user
+// chooses it.
 import * as f from "./format.js";
 import { attribute, changed, hide, listen, node, text } from "./live.js";
 
-const REFRESH_MS = 5000; // of the pack that is shown
-const LAG_S = 60, LISTED = 20, COLOURS = 8;
+const REFRESH_MS = 5000; // refresh interval of the displayed pack
+const MAX_LAG_S = 60; // a larger lag is marked as wrong
+const MAX_LISTED = 20; // packs in a list
+const COLORS = 8; // classes c0 to c7 of fleet.css
 const $ = (id) => document.getElementById(id);
 const number = (x) => typeof x === "number";
 const count = (n) => n.toLocaleString("en");
-const many = (n, one, more = `${one}s`) => `${count(n)} ${n === 1 ? one : more}`;
-const ago = (s) => (number(s) ? f.duration(s) : "");
-const short = (s) => (number(s) ? (s < 9.95 ? `${f.fixed(s, 1)} s` : f.duration(s)) : "–");
+const counted = (n, one, more = `${one}s`) => `${count(n)} ${n === 1 ? one : more}`;
+// missing values give an empty text or a dash
+const duration = (s) => (number(s) ? f.duration(s) : "");
+const seconds = (s) => (number(s) ? (s < 9.95 ? `${f.fixed(s, 1)} s` : f.duration(s)) : "–");
 const rate = (x) => (number(x) ? count(x < 9.95 ? Math.round(10 * x) / 10 : Math.round(x)) : "");
 
-const ui = { fleet: null, link: null, at: 0, upAt: 0, since: null, type: null, kind: "all", pack: null, answers: null };
+// last messages, their arrival [ms], and the user's choices
+const ui = {
+	fleet: null, fleetAt: 0, // overview
+	link: null, linkUpAt: 0, // state of the connection between page server and fleet server
+	answers: null, // query results
+	staleSince: null, type: null, kind: "all", pack: null,
+};
 
-function take(message) {
+function receive(message) {
 	if (message.link) {
-		if (message.link.up && !ui.link?.up) ui.upAt = Date.now();
+		if (message.link.up && !ui.link?.up) ui.linkUpAt = Date.now();
 		ui.link = message.link;
 	}
 	if (message.answers) ui.answers = message.answers;
-	if (message.fleet) [ui.fleet, ui.at] = [message.fleet, Date.now()];
+	if (message.fleet) [ui.fleet, ui.fleetAt] = [message.fleet, Date.now()];
 }
 
-/** Why the values are not what is now; "" when they are. */
+/** Reason for which the displayed values are outdated; "" if they are current. */
 function trouble() {
 	if (!stream.open) return ui.fleet ? "the page's server does not answer" : "";
 	if (ui.link && !ui.link.up) return ui.link.reason;
@@ -42,7 +52,7 @@ function draw() {
 	hide($("fleet"), !ui.fleet);
 	if (!ui.fleet) return;
 	const { packs, types, soc_std_edges, concerns, time } = ui.fleet;
-	text($("what"), `${many(packs.known, "pack")} of ${many(types.length, "type")} · as of ${f.clock(new Date(time))}`);
+	text($("what"), `${counted(packs.known, "pack")} of ${counted(types.length, "type")} · as of ${f.clock(new Date(time))}`);
 	drawTiles(ui.fleet);
 	drawTypes(types);
 	drawSpread(types, soc_std_edges);
@@ -52,20 +62,20 @@ function draw() {
 }
 
 function drawStatus() {
-	const why = trouble(), waits = !why && (!ui.fleet || ui.at < ui.upAt);
-	let kind = waits ? "wait" : "live", said = !stream.open ? "connecting" : waits ? "waiting" : "live";
+	const why = trouble(), waits = !why && (!ui.fleet || ui.fleetAt < ui.linkUpAt);
+	let state = waits ? "wait" : "live", label = !stream.open ? "connecting" : waits ? "waiting" : "live";
 	if (why) {
-		kind = "stale";
-		if (ui.fleet) ui.since ??= new Date(ui.fleet.time);
-		said = ui.since ? `stale since ${f.clock(ui.since)}` : "no value yet";
-	} else if (!waits) ui.since = null;
-	else if (ui.fleet) kind = "stale"; // greyed until a new value has come
-	text($("status").lastElementChild, said);
-	attribute($("status"), "data-state", kind);
-	attribute(document.body, "data-state", kind);
+		state = "stale";
+		if (ui.fleet) ui.staleSince ??= new Date(ui.fleet.time);
+		label = ui.staleSince ? `stale since ${f.clock(ui.staleSince)}` : "no value yet";
+	} else if (!waits) ui.staleSince = null;
+	else if (ui.fleet) state = "stale"; // gray until a new overview arrives
+	text($("status").lastElementChild, label);
+	attribute($("status"), "data-state", state);
+	attribute(document.body, "data-state", state);
 	text($("why"), why);
 	hide($("why"), !why);
-	const known = ui.fleet?.packs, title = [kind === "stale" && "stale", known && `${count(known.alive)} of ${count(known.known)} alive`, "Fleet"];
+	const known = ui.fleet?.packs, title = [state === "stale" && "stale", known && `${count(known.alive)} of ${count(known.known)} alive`, "Fleet"];
 	if (changed(document.head, title.join())) document.title = title.filter(Boolean).join(" · ");
 }
 
@@ -75,35 +85,35 @@ function drawTiles({ packs, holders, unheld, twice, lag_s, workers, states_per_s
 	const missing = packs.known - packs.alive, unsure = missing - packs.silent;
 	put("alive", count(packs.alive));
 	put("known", `of ${count(packs.known)}`);
-	put("silent", packs.silent ? `${count(packs.silent)} silent for 3 min or more` : unsure ? `${count(unsure)} not heard yet, listening for ${ago(listening_s)}` : packs.known ? "none is silent" : "none was heard of yet");
+	put("silent", packs.silent ? `${count(packs.silent)} silent for 3 min or more` : unsure ? `${count(unsure)} not heard yet, listening for ${duration(listening_s)}` : packs.known ? "none is silent" : "none was heard of yet");
 	$("aliveshare").style.transform = `scaleX(${packs.known ? packs.alive / packs.known : 0})`;
 	tile("alive", packs.silent > 0.01 * packs.known ? "wrong" : packs.silent ? "low" : unsure || !packs.known ? "" : "fine");
 
 	const alive = workers.filter((w) => w.alive).length;
 	put("held", count(holders.length - unheld.length));
 	put("partitions", `of ${holders.length}`);
-	put("unheld", unheld.length ? `unheld: ${ranges(unheld)}` : twice.length ? `held twice: ${ranges(twice)}` : `by ${many(alive, "worker")}`);
+	put("unheld", unheld.length ? `unheld: ${rangesText(unheld)}` : twice.length ? `held twice: ${rangesText(twice)}` : `by ${counted(alive, "worker")}`);
 	tile("held", unheld.length ? "wrong" : twice.length ? "low" : "fine");
 
-	put("lag", short(lag_s));
+	put("lag", seconds(lag_s));
 	const samples = workers.map((w) => w.samples_per_s).filter(number);
 	put("rates", [`${rate(states_per_s) || 0} states/s`, samples.length && `${rate(samples.reduce((a, b) => a + b))} samples/s`].filter(Boolean).join(" · "));
-	tile("lag", !number(lag_s) ? "" : lag_s > LAG_S ? "wrong" : "fine");
+	tile("lag", !number(lag_s) ? "" : lag_s > MAX_LAG_S ? "wrong" : "fine");
 
-	const counted = KINDS.filter(([kind]) => concerns[kind]?.count).map(([kind, name]) => [concerns[kind].count, name]);
+	const present = KINDS.filter(([kind]) => concerns[kind]?.count).map(([kind, name]) => [concerns[kind].count, name]);
 	put("attention", count(attention));
-	put("attentionwhy", counted.length ? counted.sort((a, b) => b[0] - a[0]).map(([n, name]) => `${count(n)} ${name.toLowerCase().replace("soc", "SOC")}`).join(" · ") : "no pack does");
-	tile("attention", concerns.margin?.count || concerns.suspects?.count ? "wrong" : counted.length ? "low" : "fine");
+	put("attentionwhy", present.length ? present.sort((a, b) => b[0] - a[0]).map(([n, name]) => `${count(n)} ${name.toLowerCase().replace("soc", "SOC")}`).join(" · ") : "no pack does");
+	tile("attention", concerns.margin?.count || concerns.suspects?.count ? "wrong" : present.length ? "low" : "fine");
 }
 
-/** 1, 2, 3, 7 as 1–3, 7. */
-function ranges(numbers) {
-	const found = [];
+/** Ascending numbers as ranges: "1–3, 7" for 1, 2, 3, 7. */
+function rangesText(numbers) {
+	const ranges = [];
 	for (const n of numbers) {
-		if (found.length && n === found.at(-1)[1] + 1) found.at(-1)[1] = n;
-		else found.push([n, n]);
+		if (ranges.length && n === ranges.at(-1)[1] + 1) ranges.at(-1)[1] = n;
+		else ranges.push([n, n]);
 	}
-	return found.map(([a, b]) => (a === b ? a : `${a}–${b}`)).join(", ");
+	return ranges.map(([a, b]) => (a === b ? a : `${a}–${b}`)).join(", ");
 }
 
 // types and spreads
@@ -115,12 +125,12 @@ function drawTypes(types) {
 		const button = node("button", { type: "button", "data-type": t.type, "aria-pressed": String(t.type === ui.type) }, t.type);
 		button.onclick = () => { ui.type = ui.type === t.type ? null : t.type; draw(); };
 		return node("tr", t.type === ui.type ? { class: "chosen" } : {}, node("td", {}, button),
-			...[count(t.packs), count(t.alive), pc(t.soc_median), pc(2 * t.soc_std_median, t.soc_std_median)].map((said) => node("td", {}, said)));
+			...[count(t.packs), count(t.alive), percentText(t.soc_median), percentText(2 * t.soc_std_median, t.soc_std_median)].map((value) => node("td", {}, value)));
 	}));
 	if (focused) [...$("types").querySelectorAll("button")].find((b) => b.dataset.type === focused)?.focus();
 }
 
-const pc = (x, known = x) => (number(known) ? `${f.percent(x)} %` : "–");
+const percentText = (x, known = x) => (number(known) ? `${f.percent(x)} %` : "–");
 function drawSpread(types, edges) {
 	const shown = types.find((t) => t.type === ui.type), some = shown ? [shown] : types, of = shown ? ` · ${shown.type}` : "";
 	const sum = (name) => some.reduce((all, t) => all.map((n, i) => n + t[name][i]), some[0]?.[name].map(() => 0) ?? []);
@@ -132,7 +142,7 @@ function drawSpread(types, edges) {
 	put("stdmedian", std.some(Boolean) ? `median ± ${f.fixed(median(std, at), 1)} %${of}` : "");
 }
 
-/** Of what is in bins with such edges, as if each were evenly filled. */
+/** Median of binned values, which are assumed to be evenly distributed within each bin. */
 function median(counts, edge) {
 	let rest = counts.reduce((a, b) => a + b, 0) / 2;
 	const i = counts.findIndex((n) => (rest -= n) <= 0);
@@ -146,33 +156,33 @@ function bins(list, counts, name, kind, title) {
 		const item = list.children[i], height = n ? `${Math.max((100 * n) / most, 1.5).toFixed(1)}%` : "0";
 		if (changed(item.firstChild, height)) item.firstChild.style.height = height;
 		attribute(item, "class", kind(i));
-		attribute(item, "title", `${name(i)}: ${many(n, "pack")}`);
+		attribute(item, "title", `${name(i)}: ${counted(n, "pack")}`);
 	});
 	const top = counts.map((n, i) => [n, i]).filter(([n]) => n).sort((a, b) => b[0] - a[0]).slice(0, 3);
-	attribute(list, "aria-label", `${title}: ${top.length ? top.map(([n, i]) => `${many(n, "pack")} ${name(i)}`).join(", ") : "no pack"}`);
+	attribute(list, "aria-label", `${title}: ${top.length ? top.map(([n, i]) => `${counted(n, "pack")} ${name(i)}`).join(", ") : "no pack"}`);
 }
 
-// who needs attention
+// packs that need attention
 
 const KINDS = [
 	["margin", "Small margin", (v) => `stability margin ${f.percent(v)} %`],
 	["suspects", "Suspected", (v) => v],
 	["uncertain", "Uncertain", (v) => `SOC known to ± ${f.percent(2 * v)} %`],
 	["soc", "Low SOC", (v) => `SOC ${f.percent(v)} %`],
-	["silent", "Silent", (v) => (number(v) ? `not heard for ${ago(v)}` : "never heard")],
+	["silent", "Silent", (v) => (number(v) ? `not heard for ${duration(v)}` : "never heard")],
 	["unknown", "Unknown", (v) => `its blocks are held${v ? `: ${v}` : ""}`],
 ];
 const NOTES = {
-	all: "The worst of each kind in turn.", margin: "Of packs alive, the smallest first; counted below 5 %: there the model is about to lose its meaning, stop discharging.",
-	suspects: "What the identifier suspects of the input, by the summary of the last hour.", uncertain: "Of packs alive, the widest band first; counted above ± 10 %.",
-	soc: "Of packs alive, the lowest first; counted below 10 %.", silent: "Not heard for three minutes or more.", unknown: "Packs that send, and that the table does not know.",
+	all: "The worst packs of each kind.", margin: "Live packs, smallest margin first; counted below 5 %. The model is about to become invalid: stop discharging.",
+	suspects: "Input faults that the identifier suspected in the last hour.", uncertain: "Live packs, widest band first; counted above ± 10 %.",
+	soc: "Live packs, lowest SOC first; counted below 10 %.", silent: "No message for three minutes or more.", unknown: "Packs that send blocks but are not in the table.",
 };
 const beyond = (kind, c, v) => !("limit" in c) || (kind === "uncertain" ? v > c.limit : v < c.limit);
 
-/** Rows of [pack, [kind, value] ...]: the worst of each kind in turn, each pack once with all its reasons. */
+/** Rows of [pack, [[kind, value], ...]]. The worst packs of each kind alternate; a pack has one row with all its reasons. */
 function ranked(concerns) {
 	const rows = new Map();
-	for (let rank = 0; rank < LISTED; rank += 1) {
+	for (let rank = 0; rank < MAX_LISTED; rank += 1) {
 		for (const [kind] of KINDS) {
 			const c = concerns[kind], [pack, value] = c?.packs[rank] ?? [];
 			if (pack === undefined || !beyond(kind, c, value)) continue;
@@ -180,7 +190,7 @@ function ranked(concerns) {
 			rows.get(pack).push([kind, value]);
 		}
 	}
-	return [...rows].slice(0, LISTED);
+	return [...rows].slice(0, MAX_LISTED);
 }
 
 function drawConcerns(concerns) {
@@ -191,11 +201,11 @@ function drawConcerns(concerns) {
 	const focused = document.activeElement?.dataset.pack;
 	$("concerns").replaceChildren(...rows.map(([pack, reasons]) => {
 		const mild = !reasons.some(([kind, value]) => beyond(kind, concerns[kind], value));
-		const said = reasons.map(([kind, value]) => {
-			const [, name, say] = KINDS.find(([k]) => k === kind);
-			return node("p", {}, node("span", { class: `tag ${mild ? "" : kind}` }, name), " ", say(value));
+		const texts = reasons.map(([kind, value]) => {
+			const [, name, describe] = KINDS.find(([k]) => k === kind);
+			return node("p", {}, node("span", { class: `tag ${mild ? "" : kind}` }, name), " ", describe(value));
 		});
-		return node("tr", mild ? { class: "mild" } : {}, node("th", { scope: "row" }, chooser(pack)), node("td", {}, ...said));
+		return node("tr", mild ? { class: "mild" } : {}, node("th", { scope: "row" }, chooser(pack)), node("td", {}, ...texts));
 	}));
 	if (focused) [...$("concerns").querySelectorAll("button")].find((b) => b.dataset.pack === focused)?.focus();
 }
@@ -219,60 +229,61 @@ function chooser(pack) {
 function drawWorkers({ workers, holders, unheld }) {
 	const alive = workers.filter((w) => w.alive).length;
 	put("workers", `${count(alive)} alive${workers.length > alive ? `, ${count(workers.length - alive)} gone` : ""}`);
-	attribute($("holders"), "aria-label", `${holders.length} partitions: ${unheld.length ? `${ranges(unheld)} held by nobody` : "all held"}`);
+	attribute($("holders"), "aria-label", `${holders.length} partitions: ${unheld.length ? `${rangesText(unheld)} not held` : "all held"}`);
 	if (changed($("holders"), JSON.stringify([holders, workers.map((w) => w.id)]))) {
-		$("holders").replaceChildren(...holders.map((place, n) => node("li", {
-			class: place < 0 ? "unheld" : `c${place % COLOURS}`, title: `partition ${n}: ${place < 0 ? "nobody" : workers[place].id}`,
+		$("holders").replaceChildren(...holders.map((index, n) => node("li", {
+			class: index < 0 ? "unheld" : `c${index % COLORS}`, title: `partition ${n}: ${index < 0 ? "no worker" : workers[index].id}`,
 		})));
 	}
 	if (!changed($("workers"), JSON.stringify(workers))) return;
 	$("workers").replaceChildren(...workers.map((w, i) => {
-		const said = w.alive ? [count(w.partitions), count(w.packs), short(w.lag_s), rate(w.samples_per_s) || "–"] : ["–", "–", `gone ${ago(w.heard_s)}`, "–"];
-		const name = node("td", {}, node("i", { class: `swatch c${i % COLOURS}` }), w.id, w.leaving ? " (leaving)" : "");
+		const values = w.alive ? [count(w.partitions), count(w.packs), seconds(w.lag_s), rate(w.samples_per_s) || "–"] : ["–", "–", `gone ${duration(w.heard_s)}`, "–"];
+		const name = node("td", {}, node("i", { class: `swatch c${i % COLORS}` }), w.id, w.leaving ? " (leaving)" : "");
 		if (w.trouble) name.append(node("p", { class: "bad" }, w.trouble));
-		return node("tr", w.alive ? {} : { class: "gone" }, name, ...said.map((s) => node("td", {}, s)));
+		return node("tr", w.alive ? {} : { class: "gone" }, name, ...values.map((value) => node("td", {}, value)));
 	}));
 }
 
-// over time
+// query results
 
 const percents = (x) => (number(x) ? `${f.percent(x)} %` : "");
-const between = (low, high, say) => (number(low) && number(high) ? `${say(low)} to ${say(high)}` : "");
+const between = (low, high, format) => (number(low) && number(high) ? `${format(low)} to ${format(high)}` : "");
+// by query: title, note, text without rows, and columns as [heading, cell of a row]
 const QUESTIONS = {
-	soh: ["Capacity by the year", "By type, with the 95 % band of its trend.", "No trend can be told yet: seven days are needed.", [
+	soh: ["Capacity trend", "Change a year by type, with its 95 % band.", "No trend yet: seven days are needed.", [
 		["Type", (r) => r.type], ["Packs", (r) => count(r.packs)], ["Capacity", (r) => percents(r.capacity_ratio)],
 		["A year", (r) => `${f.fixed(r.percent_per_year, 1)} %`], ["Band", (r) => between(r.percent_per_year_low, r.percent_per_year_high, (x) => `${f.fixed(x, 1)} %`)]]],
-	failing: ["About to fail", "A limit is reached within 90 days, or the input is suspected of late.", "No pack is.", [
+	failing: ["About to fail", "Packs that reach a limit within 90 days, or have had suspected input faults recently.", "No pack.", [
 		["Pack", (r) => chooser(r.pack)], ["What", (r) => r.quantity.replaceAll("_", " ")], ["Value", (r) => f.digits(r.value, 3)], ["Limit", (r) => f.digits(r.limit, 3)],
 		["Days left", (r) => (number(r.days_left) ? f.fixed(r.days_left, 0) : "")]]],
-	outliers: ["Not as their type", "Capacity or Rₛ far from those of the same type.", "No pack is.", [
+	outliers: ["Outliers of their type", "Packs whose capacity or Rₛ deviates from those of their type.", "No pack.", [
 		["Pack", (r) => chooser(r.pack)], ["What", (r) => r.quantity.replaceAll("_", " ")], ["Value", (r) => f.digits(r.value, 3)], ["Type's median", (r) => f.digits(r.median_of_type, 3)],
 		["Deviations", (r) => f.fixed(r.score, 1)]]],
-	honest: ["Is the band honest?", "How often the SOC was within ± two standard deviations, in hindsight; 95 % is right.", "Nothing can be judged yet.", [
-		["Of", (r) => [r.of, r.which].filter(Boolean).join(" ")], ["Packs", (r) => count(r.packs)], ["Within", (r) => percents(r.within_2_std)], ["Surely", (r) => between(r.low, r.high, percents)],
+	honest: ["Is the band correct?", "Fraction of hours in which the SOC was within ± two standard deviations, judged by later estimates; 95 % is correct.", "No hour can be judged yet.", [
+		["Of", (r) => [r.of, r.which].filter(Boolean).join(" ")], ["Packs", (r) => count(r.packs)], ["Within", (r) => percents(r.within_2_std)], ["95 % interval", (r) => between(r.low, r.high, percents)],
 		["Std should be", (r) => (number(r.std_should_be_times) ? `× ${f.fixed(r.std_should_be_times, 2)}` : "")]]],
 };
 
 function drawAnswers(answers) {
 	hide($("timecard"), !answers);
 	if (!answers || !changed($("answers"), JSON.stringify(answers))) return;
-	$("answers").replaceChildren(...Object.entries(QUESTIONS).filter(([name]) => answers[name]).map(([name, [title, note, none, columns]]) => {
+	$("answers").replaceChildren(...Object.entries(QUESTIONS).filter(([name]) => answers[name]).map(([name, [title, note, noRows, columns]]) => {
 		const { reason, columns: names = [], rows = [], count: all } = answers[name];
 		const records = rows.map((row) => Object.fromEntries(row.map((value, i) => [names[i], value])));
 		const table = node("table", {}, node("thead", {}, node("tr", {}, ...columns.map(([head]) => node("th", { scope: "col" }, head)))),
-			node("tbody", {}, ...records.map((r) => node("tr", {}, ...columns.map(([, say]) => node("td", {}, say(r) ?? ""))))));
-		const said = reason ?? (rows.length ? note + (all > rows.length ? ` The first ${rows.length} of ${count(all)}.` : "") : none);
-		return node("div", { "data-answer": name }, node("h3", {}, title), node("p", { class: "note" }, said), ...(rows.length ? [node("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": title }, table)] : []));
+			node("tbody", {}, ...records.map((r) => node("tr", {}, ...columns.map(([, cell]) => node("td", {}, cell(r) ?? ""))))));
+		const message = reason ?? (rows.length ? note + (all > rows.length ? ` The first ${rows.length} of ${count(all)}.` : "") : noRows);
+		return node("div", { "data-answer": name }, node("h3", {}, title), node("p", { class: "note" }, message), ...(rows.length ? [node("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": title }, table)] : []));
 	}));
 }
 
-// a pack
+// details of one pack
 
 const STATE = [
-	["State of charge", (s) => pc(s.soc)], ["±, two standard deviations", (s) => pc(2 * s.soc_std, s.soc_std)], ["Stability margin", (s) => pc(s.stability_margin)],
+	["State of charge", (s) => percentText(s.soc)], ["±, two standard deviations", (s) => percentText(2 * s.soc_std, s.soc_std)], ["Stability margin", (s) => percentText(s.stability_margin)],
 	["Voltage", (s) => f.volts(s.voltage_v)], ["estimated", (s) => f.volts(s.voltage_estimate_v)], ["Current", (s) => f.amperes(s.current_a)], ["Power", (s) => f.watts(s.power_w)],
 	["Temperature", (s) => f.celsius(s.temperature_c)], ["Charge left", (s) => f.ampereHours(s.remaining_capacity_ah)], ["Energy left", (s) => f.wattHours(s.remaining_energy_wh)],
-	["To empty", (s) => ago(s.time_to_empty_s)], ["To full", (s) => ago(s.time_to_full_s)], ["Innovation", (s) => f.millivolts(s.innovation_v)],
+	["To empty", (s) => duration(s.time_to_empty_s)], ["To full", (s) => duration(s.time_to_full_s)], ["Innovation", (s) => f.millivolts(s.innovation_v)],
 	["Energy out", (s) => (number(s.energy_out_kwh) ? f.wattHours(1e3 * s.energy_out_kwh) : "")], ["Energy in", (s) => (number(s.energy_in_kwh) ? f.wattHours(1e3 * s.energy_in_kwh) : "")],
 	["Cycles", (s) => f.digits(s.equivalent_cycles, 3)], ["Measured", (s) => (s.time ? f.when(new Date(s.time)) : "")],
 ];
@@ -290,23 +301,23 @@ async function choose(name) {
 
 async function refresh() {
 	const name = ui.pack;
-	let found = null, said = "The page's server does not answer.";
+	let details = null, reason = "The page's server does not answer.";
 	try {
 		const answer = await fetch(`/pack?name=${encodeURIComponent(name)}`);
-		if (answer.ok) found = await answer.json();
-		else if (answer.status === 404) said = "Nothing was heard of this pack yet, and it is not in the table.";
-	} catch { /* said */ }
+		if (answer.ok) details = await answer.json();
+		else if (answer.status === 404) reason = "Nothing was heard of this pack yet, and it is not in the table.";
+	} catch { /* the reason above is displayed */ }
 	if (ui.pack !== name) return;
-	text($("packwhat"), found ? [found.type, number(found.heard_s) ? `heard ${ago(found.heard_s)} ago` : "not heard yet since this page is served"].join(" · ") : said);
-	text($("packsuspects"), found?.suspects ?? "");
-	if (!found) return;
-	drawFacts(found.state ?? {});
-	drawParameters(found.parameters, !!found.state);
+	text($("packwhat"), details ? [details.type, number(details.heard_s) ? `last message ${duration(details.heard_s)} ago` : "no message since the start of this page"].join(" · ") : reason);
+	text($("packsuspects"), details?.suspects ?? "");
+	if (!details) return;
+	drawFacts(details.state ?? {});
+	drawParameters(details.parameters, !!details.state);
 }
 
 function drawFacts(state) {
-	const facts = STATE.map(([name, say]) => [name, say(state)]).filter(([, said]) => said && said !== "–");
-	$("packstate").replaceChildren(...facts.map(([name, said]) => node("div", {}, node("dt", {}, name), node("dd", {}, said))));
+	const facts = STATE.map(([name, format]) => [name, format(state)]).filter(([, value]) => value && value !== "–");
+	$("packstate").replaceChildren(...facts.map(([name, value]) => node("div", {}, node("dt", {}, name), node("dd", {}, value))));
 }
 
 const NAMES = {
@@ -329,23 +340,23 @@ $("one").onclose = () => {
 	ui.pack = null;
 	history.replaceState(null, "", location.pathname);
 };
-$("one").onclick = (event) => { if (event.target === $("one")) $("one").close(); }; // beside it
+$("one").onclick = (event) => { if (event.target === $("one")) $("one").close(); }; // a click beside the dialog
 
-// what people do
+// search for a pack, and choices of the user
 
-let asked = 0;
+let requestCount = 0;
 async function find() {
-	const prefix = $("prefix").value.trim(), mine = (asked += 1);
+	const prefix = $("prefix").value.trim(), request = (requestCount += 1);
 	if (!prefix) return hide($("found"), true);
 	let names = null;
 	try {
 		const answer = await fetch(`/packs?prefix=${encodeURIComponent(prefix)}`);
 		names = answer.ok ? await answer.json() : null;
-	} catch { /* said below */ }
-	if (mine !== asked) return; // somebody types on
-	if (changed($("found"), JSON.stringify(names))) { // else who has gone down the list stays there
+	} catch { /* a message is displayed below */ }
+	if (request !== requestCount) return; // the user has typed more meanwhile
+	if (changed($("found"), JSON.stringify(names))) { // an unchanged list keeps the focus of the user
 		const rows = names?.map((name) => node("li", {}, chooser(name))) ?? [];
-		$("found").replaceChildren(...(rows.length ? rows : [node("li", {}, node("p", {}, names ? "No pack's name begins so." : "The page's server does not answer."))]));
+		$("found").replaceChildren(...(rows.length ? rows : [node("li", {}, node("p", {}, names ? "No pack has this prefix." : "The page's server does not answer."))]));
 	}
 	hide($("found"), false);
 }
@@ -356,19 +367,19 @@ $("find").onsubmit = (event) => {
 	$("found").querySelector("button")?.click();
 };
 $("find").onkeydown = (event) => {
-	const places = [$("prefix"), ...$("found").querySelectorAll("button")], here = places.indexOf(document.activeElement);
-	const next = { ArrowDown: here + 1, ArrowUp: here - 1 }[event.key];
+	const targets = [$("prefix"), ...$("found").querySelectorAll("button")], focused = targets.indexOf(document.activeElement);
+	const next = { ArrowDown: focused + 1, ArrowUp: focused - 1 }[event.key];
 	if (event.key === "Escape") hide($("found"), true);
-	if (next === undefined || !places[next]) return;
+	if (next === undefined || !targets[next]) return;
 	event.preventDefault();
-	places[next].focus();
+	targets[next].focus();
 };
 document.addEventListener("click", (event) => { if (!$("find").contains(event.target)) hide($("found"), true); });
 $("found").addEventListener("click", () => hide($("found"), true));
 $("kinds").onchange = (event) => { ui.kind = event.target.value; draw(); };
 setInterval(() => { if (ui.pack !== null) refresh(); }, REFRESH_MS);
 
-const stream = listen(take, () => draw());
+const stream = listen(receive, () => draw());
 draw();
-const wanted = decodeURIComponent(location.hash.slice(1));
-if (wanted) choose(wanted);
+const linkedPack = decodeURIComponent(location.hash.slice(1));
+if (linkedPack) choose(linkedPack);

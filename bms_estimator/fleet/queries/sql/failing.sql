@@ -1,9 +1,9 @@
--- Packs that will soon t_quantile a limit, or have recent input faults. Needs: packs, days, fits.
+-- Packs that will soon reach a limit, or have recent input faults. Needs: packs, days, fits.
 WITH limits(quantity, limit_value, shown, sense) AS (
     VALUES ('capacity', ln($capacity_limit), 'capacity_ratio', -1), ('r_s', ln($r_s_limit), 'r_s_ratio', 1),
         ('margin', 0.0, 'stability_margin_min', -1)
 ),
--- x: years from the weighted mean time of the points, at which the errors of level and slope are independent. The
+-- sense: -1 if the quantity falls towards its limit, 1 if it rises. x: years from the weighted mean time of the points, at which the errors of level and slope are independent. The
 -- confidence band of the line reaches the limit at the roots of a x^2 + 2 b x + c = 0 (Fieller's theorem).
 bands AS (
     SELECT

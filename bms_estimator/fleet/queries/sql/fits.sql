@@ -31,6 +31,7 @@ points AS (
     UNION ALL
     SELECT pack, day, 'margin', 1, margin FROM days WHERE margin IS NOT NULL
 ),
+-- t: years from today; dt, dv: change of time and value since the previous point
 stepped AS (
     SELECT
         *,
@@ -50,7 +51,7 @@ sums AS (
         sum(w * dv * dv) AS dvdv, sum(w * dv * dt) AS dvdt, sum(w * dt * dt) AS dtdt
     FROM stepped
     GROUP BY pack, quantity
-    HAVING count(*) >= $least_days
+    HAVING count(*) >= $min_days
 ),
 lines AS (
     SELECT

@@ -2,8 +2,10 @@
 -- counted in between. For an optimal filter, the variance of their difference is P1 + Q - P2. P1 is the variance of the
 -- estimate, Q that of the counted charge, and P2 that of the later estimate, brought back. Needs: hours, packs.
 WITH chosen AS (
-    SELECT pack FROM packs ORDER BY hash(pack) LIMIT $most_packs
+    SELECT pack FROM packs ORDER BY hash(pack) LIMIT $max_packs
 ),
+-- s_l, s_o: covariances of SOC with ln(capacity) and with the current offset, divided by the standard deviation of the
+-- latter; l_o: correlation of ln(capacity) and current offset
 rows AS (
     SELECT
         pack, hour, soc, soc_mean_std ^ 2 AS variance, ln(capacity_ratio) AS ln_q,
@@ -20,6 +22,7 @@ rows AS (
     WHERE soc_mean_std > 0
     WINDOW w AS (PARTITION BY pack ORDER BY hour)
 ),
+-- a: an hour; b: a later hour, without a gap in between
 pairs AS (
     SELECT
         a.pack, a.hour, a.soc, a.variance, a.temperature_c,
@@ -33,13 +36,13 @@ pairs AS (
             + 2 * per_a * soc_change * b.offset_std_a * b.ln_q_std * b.l_o AS projected_variance
     FROM rows a CROSS JOIN (VALUES (1), (3), (6), (12), (24)) AS later(hours)
     JOIN rows b ON b.pack = a.pack AND b.hour = a.hour + later.hours
-    WHERE a.gap_count = b.gap_count AND b.seen_s - a.seen_s > $least_seen_s * (b.hour - a.hour)
+    WHERE a.gap_count = b.gap_count AND b.seen_s - a.seen_s > $min_seen_s * (b.hour - a.hour)
 ),
 -- The most precise of the later estimates, if it is much more precise than the estimate. Otherwise the comparison would
 -- test the counted charge and not the filter.
 most_precise AS (
     SELECT pack, hour, arg_min(p, projected_variance + noise) AS p FROM pairs p GROUP BY pack, hour
-    HAVING min(projected_variance + noise) < $surer * any_value(variance)
+    HAVING min(projected_variance + noise) < $max_variance_ratio * any_value(variance)
 ),
 judged AS (
     SELECT
@@ -78,10 +81,11 @@ effective AS (
             ELSE any_value(s.packs) END AS m
     FROM clusters JOIN shares s USING (place, of, which) GROUP BY place, of, which
 ),
+-- 95.45 % of a normal distribution is within 2 standard deviations
 factors AS (
     SELECT place, of, which, quantile_cont(stds, 0.9545) / 2 AS factor FROM groups GROUP BY place, of, which
 )
--- Wilson's score interval of the fraction, 95 %
+-- Wilson's 95 % score interval of the fraction: z = 1.96, z^2 = 3.8416, z^2 / 2 = 1.9208, z^2 / 4 = 0.9604
 SELECT
     of, which, packs, judgements, share AS within_2_std,
     (share + 1.9208 / m - 1.96 * sqrt(share * (1 - share) / m + 0.9604 / m ^ 2)) / (1 + 3.8416 / m) AS low,

@@ -18,12 +18,12 @@ middles AS (
     SELECT type, quantity, count(*) AS packs, median(value) AS middle, median(variance) AS median_variance
     FROM estimates WHERE is_precise GROUP BY type, quantity
 ),
--- The median deviation includes the errors of the estimates. Their median variance is subtracted here; the score of a
--- pack adds the variance of its own estimate.
+-- The median deviation times 1.4826 is the standard deviation of a normal distribution. It includes the errors of the
+-- estimates. Their median variance is subtracted here; the score of a pack adds the variance of its own estimate.
 spreads AS (
     SELECT
         type, quantity, any_value(middle) AS middle, any_value(packs) AS packs,
-        greatest((1.4826 * median(abs(value - middle))) ^ 2 - any_value(median_variance), $least_spread ^ 2) AS spread_variance
+        greatest((1.4826 * median(abs(value - middle))) ^ 2 - any_value(median_variance), $min_spread ^ 2) AS spread_variance
     FROM estimates JOIN middles USING (type, quantity) WHERE is_precise
     GROUP BY type, quantity
 )
@@ -31,5 +31,5 @@ SELECT
     type, pack, quantity, exp(value) AS value, exp(value) * sqrt(variance) AS value_std, exp(middle) AS median_of_type,
     sqrt(spread_variance) * exp(middle) AS spread_of_type, (value - middle) / sqrt(spread_variance + variance) AS score
 FROM estimates JOIN spreads USING (type, quantity)
-WHERE packs >= $least_packs AND abs(value - middle) / sqrt(spread_variance + variance) > $stds
+WHERE packs >= $min_packs AND abs(value - middle) / sqrt(spread_variance + variance) > $stds
 ORDER BY abs(score) DESC, pack

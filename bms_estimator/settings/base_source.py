@@ -1,4 +1,4 @@
-"""Base class of all kinds of ``[source]``."""
+"""Base class of all kinds of ``[source]``, and the merging of their profiles."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -10,27 +10,31 @@ from bms_estimator.model.config_file import Strict
 Name = Annotated[str, Field(min_length=1)]
 
 
-class PolledSource(Strict):
-    """Base class of all kinds of ``[source]``."""
+class BaseSource(Strict):
+    """Base class of all kinds of ``[source]``, which are the devices and programs that are not on a serial port."""
 
     @property
     def period_s(self) -> float:
-        """Expected time between two samples [s]; values count as fresh for three periods."""
+        """Expected time between two samples [s]; a value is stale after three such periods."""
         raise NotImplementedError
 
     @property
-    def described(self) -> str:
+    def short_description(self) -> str:
         """Description in a few words."""
         raise NotImplementedError
 
     @property
-    def sensor(self) -> Mapping[str, object]:
+    def sensor_defaults(self) -> Mapping[str, object]:
         """Return the ``[sensor]`` defaults of the source: resolution, sign of the current."""
         return {}
 
 
-def with_profile(table: object, profiles: Mapping[str, Mapping[str, object]]) -> object:
-    """Add the defaults of its ``profile`` to a settings section.
+def merge_profile(table: object, profiles: Mapping[str, Mapping[str, object]]) -> object:
+    """Return a table ``[source]`` with the defaults of the profile that it names; other tables are returned unchanged.
+
+    Args:
+        table: Table before its validation.
+        profiles: Defaults of ``[source]`` by the name of the profile.
 
     Raises:
         ValueError: The profile is unknown.

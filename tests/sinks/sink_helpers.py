@@ -1,4 +1,4 @@
-"""MQTT sink with the counters of a service, and numbered states for it."""
+"""Helpers for tests of the MQTT sink: a sink with the counters of a service, and numbered states to publish."""
 
 import asyncio
 import itertools
@@ -15,13 +15,13 @@ from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import Listener
 from tests.patience import LONG_S
-from tests.sinks.snapshots import ONE
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
-STATE = "bms/pack/state"
+STATE_TOPIC = "bms/pack/state"
 
 
 class Sink:
-    """MQTT sink of a pack with its counters. The response to each request has the request's name.
+    """MQTT sink of a pack with its counters. It allows all requests, and answers each with the request's name.
 
     Attributes:
         requested: Names of the received requests.
@@ -35,7 +35,7 @@ class Sink:
             self.requests.register(name, self._handler(name))
         # short delays, so that tests do not wait
         options = {"first_delay_s": 0.1, "birth_delay_s": 0.1} | options
-        outbox = Outbox(None, most=max_queued)
+        outbox = Outbox(None, max_messages=max_queued)
         self.mqtt = MqttSink(MqttSettings(url=url), "pack", self.requests, self.delivery, outbox, **options)
 
     def _handler(self, name: str) -> Any:
@@ -53,25 +53,26 @@ class Sink:
         await self.mqtt.__aexit__(None, None, None)
 
 
-def state(number: int) -> Snapshot:
-    """Return a snapshot whose ``frames_received`` is ``number``."""
-    assert ONE.estimate
-    return ONE._replace(estimate=ONE.estimate.model_copy(update={"frames_received": number}))
+def numbered_state(number: int) -> Snapshot:
+    """Return a snapshot that has ``number`` as its ``frames_received``, so that a test recognizes it."""
+    assert CELL_SNAPSHOT.estimate
+    return CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update={"frames_received": number}))
 
 
-def numbers(live: Listener) -> list[int]:
-    """Return the numbers of the received states."""
-    return [json.loads(payload)["frames_received"] for payload in live.all(STATE)]
+def state_numbers(live: Listener) -> list[int]:
+    """Return the numbers of the received states, in the order of their arrival."""
+    return [json.loads(payload)["frames_received"] for payload in live.all(STATE_TOPIC)]
 
 
 def assert_all_in_order(received: list[int], count: int) -> None:
-    """Check that all states from 0 on arrived in order. Only states in flight at a disconnect may arrive twice."""
+    """Check that the states 0 to ``count`` - 1 arrived in order. Those in flight at a disconnect may arrive twice."""
     assert list(dict.fromkeys(received)) == list(range(count))
     for before, after in itertools.pairwise(received):
         assert before - WINDOW < after <= before + 1, f"{before}, then {after}"
 
 
 async def until(condition: Callable[[], Any]) -> None:
+    """Wait until the condition is true."""
     async with asyncio.timeout(LONG_S):
         while not condition():  # noqa: ASYNC110 - counters have no event
             await asyncio.sleep(0.01)
