@@ -47,7 +47,7 @@ LONG_FILES = (
     "tests/deploy/test_service.py",
     "tests/fleet/page/test_browser.py",
 )
-"""Test files that take longest. They run first, so that no worker begins one when the others have ended."""
+"""Test files that take longest. They run first, because otherwise one worker could still run one of them at the end."""
 
 DATA = Path(__file__).parent / "data"
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -60,8 +60,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile kernels before each worker would, and before a test reads a program's output about it."""
-    if not hasattr(session.config, "workerinput"):
+    """Compile the kernels once, before the workers and programs under test need them.
+
+    Otherwise each worker would compile them, and the programs would print that they do, which no test expects.
+    """
+    if not hasattr(session.config, "workerinput"):  # in the main process of pytest-xdist, or without it
         load_kernels()
 
 
@@ -81,7 +84,7 @@ def data() -> Path:
 
 @pytest.fixture(autouse=True)
 def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Set the state folder of programs: neither the user's home nor another test's folder."""
+    """Give programs a state folder that belongs to this test, and return it."""
     folder = tmp_path / "state-home"
     monkeypatch.setenv("XDG_STATE_HOME", str(folder))
     return folder

@@ -11,7 +11,7 @@ from tests.patience import LONG_S
 
 @contextmanager
 def running_device(device: SimulatedMeter) -> Iterator[str]:
-    """Run a device in a thread; yield the path of its line."""
+    """Run a device in the event loop of a new thread; yield the path of its line."""
 
     async def run_until_stopped() -> None:
         nonlocal loop, stop
@@ -22,7 +22,9 @@ def running_device(device: SimulatedMeter) -> Iterator[str]:
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
 
-    loop, stop, ready = asyncio.new_event_loop(), asyncio.Event(), threading.Event()
+    ready = threading.Event()
+    # Placeholders: ``run_until_stopped`` replaces both before it sets ``ready``.
+    loop, stop = asyncio.new_event_loop(), asyncio.Event()
     loop.close()
     with device:
         thread = threading.Thread(target=lambda: asyncio.run(run_until_stopped()))

@@ -12,7 +12,7 @@ An outgoing connection could otherwise occupy a port before its server listens o
 
 
 def _ports_of_worker() -> range:
-    """Return the ports of this worker. Other workers have other ports, so that they cannot take that of a restarted server."""
+    """Return the ports of this worker. No other worker has them, so that none can take the port of a stopped server."""
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     # After a crash of a worker, the next worker has a number above the count.
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % workers

@@ -20,9 +20,9 @@ from tests.patience import LONG_S
 
 DESCRIPTORS = 1024
 """Soft limit of open files of a process on most systems."""
-IDLE = DESCRIPTORS
+IDLE_CONNECTIONS = DESCRIPTORS
 """Number of idle connections to each listener, which equals the limit of descriptors."""
-ATTACK = """
+ATTACKER_PROGRAM = """
 import resource, socket, sys
 hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
 resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
@@ -30,8 +30,11 @@ idle = [socket.create_connection(("127.0.0.1", int(port))) for port in sys.argv[
 print("open", flush=True)
 sys.stdin.read()
 """
-"""Program of the attacker, a separate process with its own descriptors. Arguments: number of connections, ports."""
-BOARD = {"voltage": 13.276, "current": 2.5, "temperature": 21.5, "cells": [3.311, 3.325, 3.318, 3.322]}
+"""Program of the attacker, which runs as a process with its own limit of descriptors.
+
+Its arguments are the number of connections to each port, and the ports. It prints "open" once all connections are open.
+"""
+BOARD_VALUES = {"voltage": 13.276, "current": 2.5, "temperature": 21.5, "cells": [3.311, 3.325, 3.318, 3.322]}
 PACK = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
 
 
@@ -39,14 +42,14 @@ class Outcome(NamedTuple):
     """Behavior of a program while idle connections are open."""
 
     answers: list[int]
-    """HTTP status of each listener."""
+    """HTTP status that each listener answered."""
     tracebacks: int
     log_lines: int
 
 
 @contextlib.contextmanager
 def few_descriptors() -> Iterator[None]:
-    """Limit the descriptors of this process and of those that it starts."""
+    """Limit the descriptors of this process, and of processes that it starts, to ``DESCRIPTORS``."""
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, before[1]))
     try:
@@ -57,12 +60,12 @@ def few_descriptors() -> Iterator[None]:
 
 @contextlib.asynccontextmanager
 async def hold_idle_connections(*ports: int) -> AsyncIterator[None]:
-    """Hold ``IDLE`` connections to each port."""
+    """Hold ``IDLE_CONNECTIONS`` connections to each port."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-c",
-        ATTACK,
-        str(IDLE),
+        ATTACKER_PROGRAM,
+        str(IDLE_CONNECTIONS),
         *map(str, ports),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
@@ -83,8 +86,9 @@ async def attack_service(folder: Path, broker: Broker) -> Outcome:
     Return after the service has saved checkpoints and reconnected to the restarted broker.
     """
     port, exporter = free_port(), free_port()
+    # The first line belongs to the section [state], which precedes it in the settings of ``Service``.
     extra_toml = f'checkpoint_s = 1\n[prometheus]\nlisten = "127.0.0.1:{exporter}"\n'
-    service = Service(folder, broker, port, lambda _: BOARD, pack=PACK, more=extra_toml)
+    service = Service(folder, broker, port, lambda _: BOARD_VALUES, pack=PACK, more=extra_toml)
     async with service:
         async with Listener(broker) as live:
             await live.wait_json("bms/attic/state")
@@ -119,6 +123,7 @@ async def attack_fleet_page(folder: Path, engine: NatsCluster) -> Outcome:
 async def _attack_page(
     folder: Path, port: int, program: tuple[object, ...], stop: Callable[[], object], start: Callable[[], object]
 ) -> Outcome:
+    """Attack the page that ``program`` serves; ``stop`` and ``start`` act on the server to which it is connected."""
     process = await start_program(folder, *program, port=port)
     url = f"http://127.0.0.1:{port}/"
     try:
@@ -138,7 +143,7 @@ async def _wait_for_link(url: str, *, up: bool) -> None:
     """Read the page's stream until it reports the link to be up or down."""
     async with asyncio.timeout(LONG_S), aiohttp.ClientSession() as session, session.get(f"{url}events") as response:
         async for line in response.content:
-            event = json.loads(line[6:]) if line.startswith(b"data: ") else {}
+            event = json.loads(line.removeprefix(b"data: ")) if line.startswith(b"data: ") else {}
             if event.get("link", {}).get("up") is up:
                 return
 
@@ -156,6 +161,7 @@ def _checkpoint_time_s(folder: Path) -> float:
 
 
 async def _measure_outcome(folder: Path, port: int, *urls: str) -> Outcome:
+    """Request each URL, and count tracebacks and lines in the log of the program on ``port``."""
     answers = list[int]()
     async with aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(LONG_S)) as session:
         for url in urls:

@@ -22,11 +22,17 @@ MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/
 
 
 class Broker:
-    """Mosquitto server. A restart uses the same port and loses the retained messages."""
+    """Mosquitto server. A restart uses the same port and loses the retained messages.
+
+    Args:
+        folder: Folder of its configuration.
+        extra: Further lines of its configuration.
+    """
 
     def __init__(self, folder: Path, extra: str = "allow_anonymous true") -> None:
         self.port = free_port()
         self._config = folder / "mosquitto.conf"
+        # Mosquitto started by root would change to the user mosquitto, who cannot read the folder of a test.
         self._config.write_text(
             f"listener {self.port} 127.0.0.1\nuser {getpass.getuser()}\npersistence false\n{extra}\n"
         )
@@ -70,17 +76,13 @@ class Broker:
                 assert time.monotonic() < deadline, "mosquitto did not end"
 
 
-def _running(folder: Path) -> Iterator[Broker]:
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
-    broker = Broker(folder).start()
-    yield broker
-    broker.stop()
-
-
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:
-    yield from _running(tmp_path)
+    if MOSQUITTO is None:
+        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
+    broker = Broker(tmp_path).start()
+    yield broker
+    broker.stop()
 
 
 class Listener:
@@ -117,6 +119,7 @@ class Listener:
         await self._client.publish(topic, payload, **options)
 
     def all(self, topic: str) -> list[bytes]:
+        """Return the payloads received on ``topic``."""
         return [payload for name, payload, _ in self.messages if name == topic]
 
     async def wait(self, topic: str, accepts: Callable[[bytes], bool] = lambda _: True, skip: int = 0) -> bytes:
@@ -136,10 +139,10 @@ class Listener:
         raise AssertionError(f"{topic} received no accepted message; last on each topic: {seen}")
 
     async def wait_json(self, topic: str, accepts: Callable[[Any], bool] = lambda _: True, skip: int = 0) -> Any:
-        """Decode the result of ``wait``; a NaN in the payload is a failure."""
+        """Wait like ``wait``, but for a JSON payload, and return it decoded. Fail if the payload has a NaN."""
 
-        def nan(token: str) -> None:
+        def reject_nan(token: str) -> None:
             raise AssertionError(f"{topic} holds {token}")
 
-        decoded = await self.wait(topic, lambda p: bool(p) and accepts(json.loads(p, parse_constant=nan)), skip)
-        return json.loads(decoded)
+        payload = await self.wait(topic, lambda p: bool(p) and accepts(json.loads(p, parse_constant=reject_nan)), skip)
+        return json.loads(payload)

@@ -69,7 +69,8 @@ class PseudoTerminal:
         return self.process.poll() is not None
 
     def screen(self) -> list[str]:
-        """Return the lines of the last complete screen without colours; empty before the first one."""
+        """Return the lines of the last complete screen without control sequences; empty before the first screen."""
+        # Only the text before the last HOME is complete: the program may still be drawing the screen after it.
         screens = self.output.split(HOME)
         return re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", screens[-2]).split("\r\n") if len(screens) > 2 else []
 

@@ -21,13 +21,12 @@ ROOT = Path(__file__).parents[1]
 FIRMWARE = ROOT / "firmware"
 ELF = FIRMWARE / "build" / "bms_board.elf"
 SIMULATOR = FIRMWARE / "build" / "board_sim"
-
-
 READINGS_HZ = 50
 """Rate of the readings of the pack model [Hz]. Each reading holds until the next."""
 LINES_AT_ONCE = 50
 """Number of readings that are written to the simulator at a time."""
 STOP_S = 5.0
+"""Time for the simulator to end after SIGTERM, before it is killed [s]."""
 
 
 class FirmwareBoard:
@@ -35,7 +34,7 @@ class FirmwareBoard:
 
     Args:
         build: Folder of the built firmware.
-        readings: Signal at the pins: a function of time [s], or a file with
+        readings: Pack at the pins of the board: a function of time [s], or a file with
             ``time_s,current_a,voltage_v[,temperature_c]``. Each line holds until the next.
         speed: Board seconds per second; ``math.inf``: as fast as the host reads.
         avcc_mv: Supply voltage, which is the reference of the ADC [mV].
@@ -61,7 +60,7 @@ class FirmwareBoard:
         relay: bool = False,
         seed: int = 1,
     ) -> None:
-        self._readings, self._fed = readings, 0
+        self._readings, self._lines_written = readings, 0
         self._command = [
             *(str(build / "board_sim"), str(build / "bms_board.elf")),
             *("--readings", str(readings) if isinstance(readings, Path) else "-"),
@@ -110,12 +109,12 @@ class FirmwareBoard:
         self._process.stdout.close()
 
     async def run(self) -> None:
-        """Write the readings of a signal until the simulator ends. The pipe blocks while the simulator needs none."""
+        """Write the values of the function ``readings`` until the simulator ends. The pipe blocks while it is full."""
         while await asyncio.to_thread(self._feed):
             pass
 
     def _feed(self) -> bool:
-        """Write the next readings of a signal. Return False if the simulator accepts no more."""
+        """Write the next values of the function ``readings``. Return False if the simulator accepts no more."""
         if isinstance(self._readings, Path):
             return False
         lines = b"".join(self._line(self._readings) for _ in range(LINES_AT_ONCE))
@@ -126,10 +125,10 @@ class FirmwareBoard:
             return False
         return True
 
-    def _line(self, signal: Callable[[float], Reading]) -> bytes:
-        self._fed += 1
-        time_s = self._fed / READINGS_HZ
-        return b"%.4f,%.6f,%.6f,%.2f\n" % (time_s, *signal(time_s))
+    def _line(self, pack: Callable[[float], Reading]) -> bytes:
+        self._lines_written += 1
+        time_s = self._lines_written / READINGS_HZ
+        return b"%.4f,%.6f,%.6f,%.2f\n" % (time_s, *pack(time_s))
 
 
 @functools.cache

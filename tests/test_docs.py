@@ -14,9 +14,9 @@ ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(ROOT.glob("*.md"))
 EQUATIONS = (ROOT / "docs" / "theory" / "equations.md").read_text(encoding="utf-8")
 
-QUICK = {"NO_MKDOCS_2_WARNING": "1", "WITHOUT_THESIS": "1"}
-"""Environment without the advertisement of the theme, and without the tables that take half a minute."""
-NUMBERED = {"2": 13, "3": 19, "4": 2, "5": 2, "7": 1}
+QUICK_BUILD = {"NO_MKDOCS_2_WARNING": "1", "WITHOUT_THESIS": "1"}
+"""Environment of a build without the advertisement of the theme, and without tables that take half a minute."""
+LAST_EQUATION = {"2": 13, "3": 19, "4": 2, "5": 2, "7": 1}
 """Number of the last equation with code, by chapter of the thesis. Later equations of chapter 4 are steps of proofs."""
 
 
@@ -32,29 +32,29 @@ def table_rows(text: str) -> list[list[str]]:
 @cache
 def defined_names(path: Path) -> set[str]:
     """Return the names that a module defines: functions, classes, and methods as Class.method."""
-    found = set()
+    names = set()
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found.add(node.name)
+            names.add(node.name)
         if isinstance(node, ast.ClassDef):
-            found |= {f"{node.name}.{child.name}" for child in node.body if isinstance(child, ast.FunctionDef)}
-    return found
+            names |= {f"{node.name}.{child.name}" for child in node.body if isinstance(child, ast.FunctionDef)}
+    return names
 
 
 def code_references() -> list[tuple[str, str]]:
     """Return path and name of each code reference in docs/theory/equations.md.
 
-    A name belongs to the path before it.
+    References are in the last column of the tables. A name belongs to the path before it.
     """
-    found = []
+    references = []
     for cells in table_rows(EQUATIONS):
         path = ""
         for word in re.findall(r"`([^`]+)`", cells[-1]):
             if word.endswith(".py"):
                 path = word
             else:
-                found.append((path, word))
-    return found
+                references.append((path, word))
+    return references
 
 
 @pytest.mark.parametrize(("path", "name"), sorted(set(code_references())))
@@ -63,10 +63,10 @@ def test_the_code_of_an_equation_exists(path: str, name: str) -> None:
 
 
 def test_every_equation_has_a_row_with_its_code() -> None:
-    given = {cells[0]: cells[-1] for cells in table_rows(EQUATIONS)}
-    for chapter, last in NUMBERED.items():
+    code_of_equation = {cells[0]: cells[-1] for cells in table_rows(EQUATIONS)}
+    for chapter, last in LAST_EQUATION.items():
         for number in range(1, last + 1):
-            assert re.search(r"`[\w/]+\.py`: `\w+`", given[f"({chapter}.{number})"])
+            assert re.search(r"`[\w/]+\.py`: `\w+`", code_of_equation[f"({chapter}.{number})"])
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
@@ -78,5 +78,7 @@ def test_relative_links_lead_to_files(document: Path) -> None:
 
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path / "site"]
-    process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ | QUICK)
+    process = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ | QUICK_BUILD
+    )
     assert (process.returncode, process.stderr) == (0, "")

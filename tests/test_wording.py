@@ -20,9 +20,11 @@ PRIVATE_WORD = re.compile(
 
 
 def docstrings(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Line and text of every docstring, also of those after constants and attributes."""
+    """Yield line number and text of every docstring, also of docstrings after constants and attributes."""
     for node in ast.walk(tree):
-        for child in getattr(node, "body", None) or [] if not isinstance(node, ast.Lambda | ast.IfExp) else []:
+        if isinstance(node, ast.Lambda | ast.IfExp):  # their body is one expression
+            continue
+        for child in getattr(node, "body", []):
             if (
                 isinstance(child, ast.Expr)
                 and isinstance(child.value, ast.Constant)
@@ -32,26 +34,26 @@ def docstrings(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def comments(source: str) -> Iterator[tuple[int, str]]:
-    """Line and text of every comment."""
+    """Yield line number and text of every comment."""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
             yield token.start[0], token.string.lstrip("# ")
 
 
-def faults(source: str) -> list[str]:
-    """Each docstring or comment with one of the habits, with its line."""
+def find_habits(source: str) -> list[str]:
+    """Return each docstring or comment that has one of the habits, with its line number."""
     texts = [*docstrings(ast.parse(source)), *comments(source)]
     return [f"line {line}: {text}" for line, text in texts if RELATIVE_CLAUSE.match(text) or PRIVATE_WORD.search(text)]
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_docstrings_and_comments_are_plain(path: Path) -> None:
-    assert faults(path.read_text(encoding="utf-8")) == []
+    assert find_habits(path.read_text(encoding="utf-8")) == []
 
 
 @pytest.mark.parametrize(
     "source",
     ['"""What was."""', 'LIMIT_S = 1.0\n"""So often it is tried [s]."""', "x = 1  # Of the pack", '"""It is told."""'],
 )
-def test_check_finds_the_habits(source: str) -> None:
-    assert len(faults(source)) == 1
+def test_each_habit_is_found_in_an_example(source: str) -> None:
+    assert len(find_habits(source)) == 1

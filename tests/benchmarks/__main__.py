@@ -10,7 +10,7 @@ import packs
 import partition
 from table import show
 
-GROUPS = {
+GROUPS = {  # each function yields the rows of the table
     "kernel": kernel.rows,
     "capture": capture.rows,
     "live": live.rows,

@@ -1,7 +1,7 @@
 """Ablation study of the filter: scores of ``make anywhere`` without one part of the filter, by kinds of groups.
 
 One part at a time is disabled in the settings of the filter, in its first state or in its samples. The cell files are not
-changed. A cell of the table has RMSE, fraction of time inside two std, and interval score, all in %.
+changed. A cell of the table has RMSE of the SOC, fraction of time inside two std, and interval score, all in %.
 """
 
 import sys
@@ -46,7 +46,7 @@ KINDS = {
 
 
 def change_settings(**values: float) -> Change:
-    """Return a function that changes settings of the filter, ``p``."""
+    """Return a function that changes these settings of the filter."""
 
     def change(p: np.void) -> None:
         for name, value in values.items():
@@ -56,7 +56,7 @@ def change_settings(**values: float) -> Change:
 
 
 def use_resistances_of_mid_soc(p: np.void) -> None:
-    """Make the resistances independent of SOC, with their values at mid SOC."""
+    """Use the resistances at SOC 0.5 for all SOCs."""
     for name in ("weak_ohm", "strong_ohm"):
         p[name] = p[name][GRID // 2]
 
@@ -84,7 +84,9 @@ PARTS: dict[str, Change] = {
     "reduced innovation variance in weights": change_settings(min_innovation_scale=1.0),
     "penalty for large biases": change_settings(inconsistency_penalty=0.0),
 }
+"""Part of the filter, and the change of the settings that disables it."""
 ONE_FILTER, NO_TEMPERATURE = "filter bank (one hypothesis)", "temperature"
+"""Parts that are disabled in the first state, and in the samples."""
 
 
 def main() -> None:
@@ -103,7 +105,7 @@ def main() -> None:
 
 
 def belongs(group: Group, prefix: str) -> bool:
-    """Return True if a group's name begins with ``prefix``, which is not the full name of another group."""
+    """Return True if ``prefix`` is the name of a group, or begins it and is not the full name of another group."""
     return group.name == prefix or (group.name.startswith(prefix) and prefix not in {g.name for g in GROUPS})
 
 
@@ -128,14 +130,14 @@ def score_without(part: str, cell: CellModel, samples: SampleBlock, truth: Float
     return score(trace["time_s"], trace["soc"], trace["soc_std"], true_soc)
 
 
-def merge_all_hypotheses(s: np.void, p: np.void) -> None:
-    """Replace all hypotheses by the middle one, with the standard deviation of all."""
-    if s["count"] == HYPOTHESES:
-        copy_hypothesis(s, HYPOTHESES // 2, 0)
-        s["count"], s["best"] = 1, 0
-        s["ln_weight"][0] = 0.0
-        s["covariance"][0, SOC, SOC] = p["soc_std"] ** 2
-        mixture_moments(s)
+def merge_all_hypotheses(state: np.void, settings: np.void) -> None:
+    """Replace all hypotheses by the middle one, with the SOC's standard deviation of all."""
+    if state["count"] == HYPOTHESES:
+        copy_hypothesis(state, HYPOTHESES // 2, 0)
+        state["count"], state["best"] = 1, 0
+        state["ln_weight"][0] = 0.0
+        state["covariance"][0, SOC, SOC] = settings["soc_std"] ** 2
+        mixture_moments(state)
 
 
 if __name__ == "__main__":

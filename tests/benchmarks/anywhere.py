@@ -1,14 +1,14 @@
 """Error of the SOC after a start at any point of real captures, compared with other methods.
 
-Cell files come from `ocv` and `identify`. The estimator starts in mid-load, or at the start of the capture for some groups,
+Cell files come from the commands `ocv` and `identify`. The estimator starts in mid-load, or at the start of the capture for some groups,
 with an initial SOC 0.2 too low or 0.2 too high. Results are scored from 15 min after the start on, above SOC 0.05, weighted
 by time:
 
-- RMSE: error of the SOC, with the true SOC by counting or by a counter of the capture; mean and worst run [%]
+- RMSE: error of the SOC; mean and worst run [%]. The true SOC is counted, or comes with the capture
 - inside: fraction of time with the true SOC inside soc +- 2 soc_std; mean and worst run [%]
 - std: mean of soc_std [%]
 - score: interval score of this interval as a 95 % interval: width plus 40 times the distance outside; smaller is better [%]
-- NIS: of means of the innovation over ten minutes; 1 if their variance S is correct
+- NIS: normalized innovation squared, of means of the innovation over ten minutes; 1 if the variance of the filter is correct
 
 "Its own file" marks groups whose capture was also used for the cell file, because the cell has no other capture.
 
@@ -49,8 +49,8 @@ class Outcome:
 
     ours: Score
     nis: float
-    run_textbook_ekf: Score
-    run_five_tau_ekf: Score
+    textbook_ekf: Score
+    five_tau_ekf: Score
     counting: Score
 
 
@@ -97,10 +97,10 @@ def table_cells(outcomes_of_group: list[Outcome]) -> Iterator[str]:
     yield f"{mean([s.std for s in ours]):.2f}"
     yield f"{mean([s.score for s in ours]):.2f}"
     yield f"{mean([o.nis for o in outcomes_of_group]):.2f}"
-    for estimate in ([o.textbook for o in outcomes_of_group], [o.five for o in outcomes_of_group]):
-        yield f"{mean([s.rmse for s in estimate]):.2f}"
-        yield f"{mean([s.cover for s in estimate]):.0f}"
-        yield f"{mean([s.score for s in estimate]):.1f}"
+    for scores in ([o.textbook_ekf for o in outcomes_of_group], [o.five_tau_ekf for o in outcomes_of_group]):
+        yield f"{mean([s.rmse for s in scores]):.2f}"
+        yield f"{mean([s.cover for s in scores]):.0f}"
+        yield f"{mean([s.score for s in scores]):.1f}"
     yield f"{mean([o.counting.rmse for o in outcomes_of_group]):.2f}"
 
 

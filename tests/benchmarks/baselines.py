@@ -11,9 +11,9 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 EKF_VOLTAGE_SIGMA_V = 0.005
-"""Measurement noise of the textbook filter [V]."""
+"""Standard deviation of the measurement noise of the textbook filter, and minimum of the joint filter's [V]."""
 ELEMENT_STD = 0.7
-"""Joint filter: initial std of ln of each element, a factor of two."""
+"""Joint filter: initial standard deviation of ln of each element; 0.7 is a factor of two."""
 ELEMENT_WALK = 1e-6
 """Joint filter: variance of the random walk of ln of each element [1/s].
 
@@ -25,11 +25,28 @@ LN_SPAN = math.log(4.0)
 """Joint filter: bound of the change of ln of each element. Elements stay between a quarter and four times their start, as
 those of the observer."""
 FIVE_SIGMA_V = 0.1
-"""Filter with five time constants: measurement noise of the mean of a second [V]. Of 5, 20, 50, 100 and 200 mV this value has
-the best result."""
+"""Filter with five time constants: measurement noise of the voltage averaged over a second [V].
+
+Of 5, 20, 50, 100 and 200 mV this value has the best result.
+"""
 FIVE_TAU_S = np.array([2.0, 15.0, 80.0, 400.0, 2000.0])
+"""Time constants of this filter [s]."""
+INITIAL_VARIANCE = np.array([0.2**2, 0.01**2, 0.01**2])
+"""Initial variance of the SOC, and of both RC voltages [V^2], of each filter."""
+WALK = np.array([1e-10, 1e-9, 1e-9])
+"""Variance per second that is added to the SOC, and to both RC voltages [V^2], of each filter."""
+SOC_STEP = 1e-4
+"""Half of the SOC interval over which the slope of the OCV is computed."""
+MAX_RLS_TRACE = 1e6
+"""Recursive least squares: maximum trace of the covariance."""
 COLD_C = 0.0
-"""Temperature at which a single activation energy for each resistance has the effect of the cell file's two [C]."""
+"""Temperature at which one activation energy per resistance has the same effect as the two of the cell file [C]."""
+
+
+@njit
+def _ocv_slope(soc: float, grid: Floats) -> float:
+    """Return the slope of the OCV by a central difference [V]."""
+    return (ocv(soc + SOC_STEP, grid[0], grid[1]) - ocv(soc - SOC_STEP, grid[0], grid[1])) / (2.0 * SOC_STEP)
 
 
 @njit
@@ -51,8 +68,7 @@ def fixed_ekf(
     """
     capacity_as, r_s, r1, tau1, r2, tau2 = cell
     x = np.array([soc0, 0.0, 0.0])
-    p = np.diag(np.array([0.2**2, 0.01**2, 0.01**2]))
-    q = np.array([1e-10, 1e-9, 1e-9])
+    p = np.diag(INITIAL_VARIANCE)
     soc, std = np.empty(len(time_s)), np.empty(len(time_s))
     h = np.array([0.0, -1.0, -1.0])
     for k in range(len(time_s)):
@@ -61,8 +77,8 @@ def fixed_ekf(
             decay = np.array([1.0, math.exp(-dt / tau1), math.exp(-dt / tau2)])
             gain = np.array([-dt / capacity_as, r1 * (1.0 - decay[1]), r2 * (1.0 - decay[2])])
             x = decay * x + gain * current_a[k - 1]
-            p = decay.reshape(3, 1) * p * decay + np.diag(q * dt)
-        h[0] = (ocv(x[0] + 1e-4, grid[0], grid[1]) - ocv(x[0] - 1e-4, grid[0], grid[1])) / 2e-4
+            p = decay.reshape(3, 1) * p * decay + np.diag(WALK * dt)
+        h[0] = _ocv_slope(x[0], grid)
         innovation = voltage_v[k] - (ocv(x[0], grid[0], grid[1]) - x[1] - x[2] - current_a[k] * r_s)
         ph = p @ h
         s = h @ ph + EKF_VOLTAGE_SIGMA_V**2
@@ -85,7 +101,7 @@ def joint_ekf(
         current_a: Shape (n,), positive on discharge [A].
         voltage_v: Shape (n,) [V].
         soc0: SOC at the first sample, 0..1.
-        cell: Start: capacity [A s], R_s, R_1 [ohm], tau_1 [s], R_2 [ohm], tau_2 [s].
+        cell: Initial values: capacity [A s], R_s, R_1 [ohm], tau_1 [s], R_2 [ohm], tau_2 [s].
         grid: Shape (2, m): OCV and its slope over SOC 0..1 [V].
 
     Returns:
@@ -93,10 +109,8 @@ def joint_ekf(
     """
     x = np.zeros(8)
     x[0], x[3:] = soc0, np.log(cell[1:])
-    p = np.diag(np.array([0.2**2, 0.01**2, 0.01**2, 1.0, 1.0, 1.0, 1.0, 1.0]) * np.ones(8))
-    p[3:, 3:] *= ELEMENT_STD**2
-    q = np.array([1e-10, 1e-9, 1e-9, 0.0, 0.0, 0.0, 0.0, 0.0])
-    q[3:] = ELEMENT_WALK
+    p = np.diag(np.concatenate((INITIAL_VARIANCE, np.full(5, ELEMENT_STD**2))))
+    q = np.concatenate((WALK, np.full(5, ELEMENT_WALK)))
     soc, elements = np.empty(len(time_s)), np.empty((len(time_s), 5))
     noise_v2, h = EKF_VOLTAGE_SIGMA_V**2, np.zeros(8)
     h[1], h[2] = -1.0, -1.0
@@ -116,17 +130,18 @@ def joint_ekf(
                 x[1 + branch] = decay * v + r * (1.0 - decay) * i
             p = f @ p @ f.T + np.diag(q * dt)
         ohmic_v = current_a[k] * math.exp(x[3])
-        h[0] = (ocv(x[0] + 1e-4, grid[0], grid[1]) - ocv(x[0] - 1e-4, grid[0], grid[1])) / 2e-4
+        h[0] = _ocv_slope(x[0], grid)
         h[3] = -ohmic_v
         innovation = voltage_v[k] - (ocv(x[0], grid[0], grid[1]) - x[1] - x[2] - ohmic_v)
         ph = p @ h
         model_v2 = h @ ph
+        # The expected square of the innovation is the model's variance plus that of the noise.
         noise_v2 += min(dt / NOISE_WINDOW_S, 1.0) * (innovation**2 - model_v2 - noise_v2)
         noise_v2 = max(noise_v2, EKF_VOLTAGE_SIGMA_V**2)
         s = model_v2 + noise_v2
         x = x + ph / s * innovation
         x[0] = min(max(x[0], 0.0), 1.0)
-        for j in range(5):  # bounds that every method has
+        for j in range(5):  # every method of the comparison has these bounds
             start = math.log(cell[1 + j])
             x[3 + j] = min(max(x[3 + j], start - LN_SPAN), start + LN_SPAN)
         p = p - np.outer(ph, ph) / s
@@ -136,7 +151,7 @@ def joint_ekf(
 
 
 def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]:
-    """Convert a cell file's ladder to the time constants ``FIVE_TAU_S``.
+    """Convert the RC ladder of a cell file to the time constants ``FIVE_TAU_S``.
 
     The resistance of each RC pair is shared between the two nearest time constants, linearly in their logarithm.
 
@@ -145,10 +160,11 @@ def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]
         strong_ohm: Resistances with strong temperature dependence, shape (GRID, RESISTANCES) [ohm].
 
     Returns:
-        Resistances at 25 C, shape (GRID, 6) [ohm], and an activation energy of each, shape (6,) [J/mol].
+        R_s and five resistances at 25 C, shape (GRID, 6) [ohm], and an activation energy of each, shape (6,) [J/mol].
     """
 
     def share_between_nearest(ohm: Floats) -> Floats:
+        """Return R_s and the resistances of the five time constants."""
         five = np.zeros((len(ohm), 6))
         five[:, 0] = ohm[:, 0]
         for k, tau_s in enumerate(TAU_S):
@@ -199,8 +215,8 @@ def ladder_ekf(
     """
     x = np.zeros(6)
     x[0] = soc0
-    p = np.diag(np.array([0.2**2, 0.01**2, 0.01**2, 0.01**2, 0.01**2, 0.01**2]))
-    q = np.array([1e-10, 1e-9, 1e-9, 1e-9, 1e-9, 1e-9])
+    p = np.diag(np.append(INITIAL_VARIANCE, np.full(3, INITIAL_VARIANCE[1])))
+    q = np.append(WALK, np.full(3, WALK[1]))
     soc, std = np.empty(len(time_s)), np.empty(len(time_s))
     h = -np.ones(6)
     r, decay = np.empty(6), np.ones(6)
@@ -216,9 +232,10 @@ def ladder_ekf(
             x = decay * x + (1.0 - decay) * r * current_a[k - 1]
             x[0] -= dt / capacity_as * current_a[k - 1]
             p = decay.reshape(6, 1) * p * decay + np.diag(q * dt)
-        h[0] = (ocv(x[0] + 1e-4, grid[0], grid[1]) - ocv(x[0] - 1e-4, grid[0], grid[1])) / 2e-4
+        h[0] = _ocv_slope(x[0], grid)
         innovation = voltage_v[k] - (ocv(x[0], grid[0], grid[1]) - x[1:].sum() - current_a[k] * r[0])
         ph = p @ h
+        # Several samples within a second together have the weight of one.
         s = h @ ph + FIVE_SIGMA_V**2 / min(max(dt, 0.01), 1.0)
         x = x + ph / s * innovation
         p = p - np.outer(ph, ph) / s
@@ -252,8 +269,8 @@ def rls_arx(current_a: Floats, overpotential_v: Floats, forgetting: float) -> Fl
         theta = theta + gain * (overpotential_v[k] - phi @ theta)
         p = (p - np.outer(gain, pp)) / forgetting
         trace = np.trace(p)
-        if trace > 1e6:  # limits the wind-up without excitation
-            p *= 1e6 / trace
+        if trace > MAX_RLS_TRACE:  # without excitation, forgetting would let the covariance grow without limit
+            p *= MAX_RLS_TRACE / trace
         history[k] = theta
     return history
 

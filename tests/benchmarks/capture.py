@@ -22,12 +22,12 @@ from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWri
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 HOURS = (4, 16)
-"""Durations of a short and a long capture [h]. Their replays must take equal memory."""
+"""Durations of a short and a long capture [h]. The replay of the long one must not take more memory."""
 GROWTH_MIB = 16.0
 """Permitted difference of memory, which the allocator may retain [MiB]."""
 RECORDS_PER_WRITE = 1_000_000
 RECORD = np.dtype([("arrival_s", "<f8"), ("length", "<u4"), ("data", "u1", SAMPLE_FRAME_BYTES), ("crc", "<u2")])
-"""Record of a capture with one frame, as received live at 100 Hz."""
+"""Record of a raw capture that contains one frame, as a recording at 100 Hz does."""
 
 
 @dataclass(frozen=True)
@@ -42,16 +42,16 @@ class Replay:
 
 
 def rows() -> Iterator[Row]:
-    """Measure sixteen hours at 100 Hz, and the additional memory compared with four."""
+    """Measure the replay of the long capture, and how much more memory it takes than that of the short one."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pack.raw"
-        samples = [hours * 3600 * RATE_HZ for hours in HOURS]
-        block = pulses(samples[-1])
+        sample_counts = [hours * 3600 * RATE_HZ for hours in HOURS]
+        block = pulses(sample_counts[-1])
         replays = []
-        for count in samples:
+        for count in sample_counts:
             path.unlink(missing_ok=True)
             write_capture(path, block[:count])
-            replay(path, Path(folder), count)  # fills the disk cache and the cache of kernels
+            replay(path, Path(folder), count)  # not measured: fills the disk cache and the cache of kernels
             replays.append(replay(path, Path(folder), count))
         megabytes = path.stat().st_size / 1e6
     short, long = replays
@@ -69,7 +69,7 @@ def rows() -> Iterator[Row]:
 def write_capture(path: Path, block: SampleBlock) -> None:
     """Write a capture of a block with one frame in each record, received a millisecond after its sample."""
     with CaptureWriter(path, CaptureHeader()) as writer:
-        writer.write(0.0, b"\0" + hello(RATE_HZ))
+        writer.write(0.0, b"\0" + hello(RATE_HZ))  # the delimiter ends a frame that began before the recording
     with path.open("ab") as file:
         for first in range(0, block.size, RECORDS_PER_WRITE):
             part = block[first : first + RECORDS_PER_WRITE]
@@ -83,6 +83,7 @@ def write_capture(path: Path, block: SampleBlock) -> None:
 
 @njit
 def _write_checksums(records):
+    """Write the CRC at the end of each record; shape (n, bytes)."""
     for j in range(records.shape[0]):
         crc = crc16(records[j], 0, records.shape[1] - 2)
         records[j, -2], records[j, -1] = crc & 0xFF, crc >> 8

@@ -24,6 +24,7 @@ from bms_estimator.sources.captures.replay import load_capture
 from tests.benchmarks.recipes import DATA, LFP, NCR, PF, charge_ah, path_of
 
 WIDTH = 150
+"""Width of the printed tables [characters]."""
 RELAXATION, CONSTANT, STEPS = Kind
 
 
@@ -49,10 +50,10 @@ class Experiment:
 def _panasonic(name: str, index: str, *captures: tuple[str, Kind]) -> Experiment:
     """Return the experiment of the Panasonic cell at one temperature.
 
-    Its HPPC, discharges with a rest after each, is the relaxation test.
+    Its HPPC (pulses and discharges, with a rest after each) is the relaxation test.
     """
-    result = tuple((f"{PF}{index}_{capture}", kind) for capture, kind in (("hppc", RELAXATION), *captures))
-    return Experiment(f"18650PF {name}", "nca", 2.9, result, room=index == "25")
+    all_captures = tuple((f"{PF}{index}_{capture}", kind) for capture, kind in (("hppc", RELAXATION), *captures))
+    return Experiment(f"18650PF {name}", "nca", 2.9, all_captures, room=index == "25")
 
 
 def _a123(name: str, index: str) -> Experiment:
@@ -99,40 +100,47 @@ EXPERIMENTS = (
     _a123("-15 C", "n15"),
 )
 """Experiments. The LG M50 is not among them, because it has no relaxation test for step 1."""
-CONSTANT_C = 0.01
-"""Minimum C-rate of a charge or discharge."""
+MIN_LOAD_C = 0.01
+"""Minimum current of a charge or discharge [C-rate]."""
 VOLTAGE_STEP_V = 1e-3
+"""Resolution of the voltage in the captures [V]."""
 ROOM = [experiment.name for experiment in EXPERIMENTS if experiment.room]
+"""Names of the experiments at room temperature."""
 R_S_SOC = (0.98, 0.9, 0.7, 0.5, 0.3, 0.1, 0.05)
 """SOC values at which R_s is printed."""
 MIDDLE_SOC = 0.5
-"""SOC near which the residual of the fit of (2.10) is printed."""
+"""SOC near which the residual of the OCV fit (2.10) is printed."""
 
 
 def make_procedure(experiment: Experiment) -> Procedure:
-    """Return the procedure on one cell. Of a constant load only the discharge is used."""
-    result = load_cell(experiment.cell, experiment.capacity_ah)
+    """Return the procedure of the thesis on one cell. Of a capture of a constant load only the discharge is used."""
+    cell = load_cell(experiment.cell, experiment.capacity_ah)
     captures = [
         Capture(name.split("/")[1], kind, _samples(name, kind, experiment)) for name, kind in experiment.captures
     ]
-    return Procedure(result, captures, VOLTAGE_STEP_V)
+    return Procedure(cell, captures, VOLTAGE_STEP_V)
 
 
 def _samples(name: str, kind: Kind, experiment: Experiment) -> SampleBlock:
+    """Return the used samples of a capture."""
     rows = load_capture(path_of(name)).rows
-    return discharge(rows, CONSTANT_C * experiment.capacity_ah) if kind is Kind.CONSTANT else rows
+    return discharge(rows, MIN_LOAD_C * experiment.capacity_ah) if kind is Kind.CONSTANT else rows
 
 
 def discharge(rows: SampleBlock, min_a: float) -> SampleBlock:
-    """Return the discharge between two charges with the largest charge, until its last sample under load [A]."""
+    """Return the largest discharge between two charges, until its last sample under load.
+
+    A current below ``min_a`` is neither charge nor discharge [A].
+    """
+    # The rows are split at the begin and at the end of each charge.
     edges = np.r_[0, np.flatnonzero(np.diff((rows["current_a"] < -min_a).astype(np.int8))) + 1, rows.size]
-    parts_between_charges = [rows[first_cell:last] for first_cell, last in itertools.pairwise(edges)]
-    largest_discharge = max(parts_between_charges, key=lambda stretch: charge_ah(stretch)[-1])
+    parts_between_charges = [rows[first:end] for first, end in itertools.pairwise(edges)]
+    largest_discharge = max(parts_between_charges, key=lambda part: charge_ah(part)[-1])
     return largest_discharge[: int(np.flatnonzero(largest_discharge["current_a"] > min_a)[-1]) + 1]
 
 
 def load_rows(name: str, p: Procedure) -> Iterator[tuple[str, ...]]:
-    """Yield a table row for each load."""
+    """Yield a row of the table of errors for each load of a cell."""
     validating = [capture.name for capture in p.validating]
     for load, run in p.dynamic.items():
         aligned, above = run.aligned, run.above(KNEE_SOC)
@@ -170,7 +178,7 @@ def main() -> None:
 
 
 def errors(procedures: dict[str, Procedure]) -> Table:
-    """Return the errors of Tables 11 and 13."""
+    """Return the table of voltage errors, which the thesis prints in its Tables 11 and 13."""
     printed_means = ", ".join(f"{load} {value}" for load, value in printed_values.TABLE_11.items())
     table = Table(
         title=f"error of the voltage in %; printed means: {printed_means}; largest {printed_values.MAX_CONSTANT} (constant), "
@@ -196,14 +204,14 @@ def errors(procedures: dict[str, Procedure]) -> Table:
 
 
 def parameters(procedures: dict[str, Procedure]) -> Table:
-    """Return the table of the results of the three steps."""
+    """Return the table of the results of steps 1 to 3 of the procedure."""
     table = Table(title="steps 1 to 3")
     residual = f"residual in mV, nearest SOC {MIDDLE_SOC}"
     heads = ("cell", "step 1: points", residual, "step 2 on", "outcome", "a13..a15 in ohm, -, ohm")
     for column in (*heads, "RC products in s", "of the rests in s"):
         table.add_column(column, overflow="fold")
     for name, p in procedures.items():
-        residual_v, result = p.joint_fit.residual_v, list(products(p))
+        residual_v, rc_products = p.joint_fit.residual_v, list(products(p))
         middle_v = residual_v[np.argmin(np.abs(pooled(p.tests).soc - MIDDLE_SOC))]
         table.add_row(
             name,
@@ -212,8 +220,8 @@ def parameters(procedures: dict[str, Procedure]) -> Table:
             p.smallest.name,
             p.adaptive.outcome,
             ", ".join(f"{value:.4g}" for value in p.r_s_fit.a),
-            ", ".join(f"{estimated_s:.3g}" for _, estimated_s, _ in result),
-            ", ".join(f"{seen_s:.3g}" for _, _, seen_s in result),
+            ", ".join(f"{estimated_s:.3g}" for _, estimated_s, _ in rc_products),
+            ", ".join(f"{rest_s:.3g}" for _, _, rest_s in rc_products),
         )
     return table
 
@@ -237,16 +245,16 @@ def outcomes(procedures: list[Procedure]) -> Iterator[tuple[str, str, str, str]]
 
 
 class FastInStep3(Procedure):
-    """Procedure in which constant loads of any current contribute to R_s."""
+    """Procedure in which constant loads of any current contribute to R_s in step 3."""
 
     @property
     def step_3(self) -> list[Capture]:
-        """Return all loads."""
+        """Return all constant loads and the relaxation tests."""
         return self.captures_of(Kind.CONSTANT, Kind.RELAXATION)
 
 
 class OwnInStep3(FastInStep3):
-    """Procedure in which a validating load also contributes to its own R_s."""
+    """Procedure in which a load also contributes to the R_s with which it is validated."""
 
     def r_s_without(self, name: str) -> SeriesResistanceFit:  # noqa: ARG002 - none is left out
         """Return the fit that includes the load."""
@@ -290,7 +298,7 @@ def variants(experiment: Experiment, default_procedure: Procedure) -> dict[str, 
     }
 
 
-STEP_3 = {
+STEP_3_VARIANTS = {
     AS_IT_IS: Procedure,
     UNWEIGHTED: Unweighted,
     "(4.2) as printed: its sign, not weighted": PrintedSign,
@@ -304,13 +312,10 @@ def steps_met(procedures: dict[str, Procedure]) -> Iterator[tuple[str, str, str]
 
     The first number is over all captures, the second over those at room temperature.
     """
-    for variant_name, variant in STEP_3.items():
-        default_procedure = {name: variant(p.cell, p.captures, VOLTAGE_STEP_V) for name, p in procedures.items()}
-        result = (
-            claim("steps, mean", [default_procedure[name] for name in names])
-            for names in (list(default_procedure), ROOM)
-        )
-        yield variant_name, *(f"{claim_result.captures_met} of {len(claim_result.results)}" for claim_result in result)
+    for variant_name, variant in STEP_3_VARIANTS.items():
+        changed = {name: variant(p.cell, p.captures, VOLTAGE_STEP_V) for name, p in procedures.items()}
+        claims = (claim("steps, mean", [changed[name] for name in names]) for names in (list(changed), ROOM))
+        yield variant_name, *(f"{each_claim.captures_met} of {len(each_claim.results)}" for each_claim in claims)
 
 
 def steps_by_variant(procedures: dict[str, Procedure]) -> Table:
@@ -330,8 +335,8 @@ def ablation(name: str, variants_of_first: dict[str, Procedure]) -> Table:
     for column in ("", *loads):
         table.add_column(column, justify="right")
     for variant_name, p in variants_of_first.items():
-        result = (p.dynamic[load] for load in loads)
-        table.add_row(variant_name, *(f"{run.mean_percent:.2f} / {run.max_percent:.1f}" for run in result))
+        load_runs = (p.dynamic[load] for load in loads)
+        table.add_row(variant_name, *(f"{run.mean_percent:.2f} / {run.max_percent:.1f}" for run in load_runs))
     return table
 
 
@@ -340,14 +345,14 @@ def resistances(name: str, variants_of_first: dict[str, Procedure]) -> Table:
     table = Table(title=f"{name}: R_s by (4.2) in mohm, by SOC; its fit (2.9)")
     for column in ("load", "its current in A", *map(str, R_S_SOC)):
         table.add_column(column, justify="right")
-    min_a = CONSTANT_C * variants_of_first[FAST].cell.cell.capacity_ah
-    loaded = {c.name: c.samples["current_a"][c.samples["current_a"] > min_a] for c in variants_of_first[FAST].step_3}
+    min_a = MIN_LOAD_C * variants_of_first[FAST].cell.cell.capacity_ah
+    loaded_a = {c.name: c.samples["current_a"][c.samples["current_a"] > min_a] for c in variants_of_first[FAST].step_3}
     for load, curve in variants_of_first[FAST].r_s_curves.items():
-        index = np.interp(R_S_SOC, curve.soc, curve.r_s_ohm)
-        table.add_row(load, f"{np.median(loaded[load]):.3f}", *(f"{1e3 * ohm:.0f}" for ohm in index))
+        r_s_ohm = np.interp(R_S_SOC, curve.soc, curve.r_s_ohm)
+        table.add_row(load, f"{np.median(loaded_a[load]):.3f}", *(f"{1e3 * ohm:.0f}" for ohm in r_s_ohm))
     for variant_name in (AS_IT_IS, UNWEIGHTED):
-        fitted = variants_of_first[variant_name].r_s_fit(np.array(R_S_SOC))
-        table.add_row(f"fit, {variant_name}", "", *(f"{1e3 * ohm:.0f}" for ohm in fitted))
+        fitted_ohm = variants_of_first[variant_name].r_s_fit(np.array(R_S_SOC))
+        table.add_row(f"fit, {variant_name}", "", *(f"{1e3 * ohm:.0f}" for ohm in fitted_ohm))
     return table
 
 

@@ -1,4 +1,4 @@
-"""Attack with the token of one edge, and its effect on the latency of estimates of other packs of the tenant.
+"""Attack with the token of one edge device, and its effect on the latency of estimates of the tenant's other packs.
 
 make load ARGS="--minutes 0 --hours 0 --attack-s 30"
 
@@ -36,9 +36,10 @@ from tests.patience import LONG_S
 ATTACKER = "attacker"
 PACKS = [f"p{i}" for i in range(20)]
 PARTITIONS = 4
-PERIOD_OF_BLOCKS_S = 0.5
+BLOCK_PERIOD_S = 0.5
+"""Interval between two blocks of an honest pack [s]."""
 MAX_RATIO = 15.0
-"""Target for the longest wait in an attack divided by the longest one without."""
+"""Maximum of the longest latency in an attack divided by the longest latency without an attack."""
 IN_FLIGHT = 64
 """Maximum number of the attacker's unacknowledged messages."""
 ATTACKS = {
@@ -46,20 +47,21 @@ ATTACKS = {
     "blocks of 20,000 samples, 1 Hz": lambda: heavy_block(20_000, 1.0, store=2),
     "junk of 256 KiB": lambda: bytes(MAX_BLOCK_BYTES - 1024),
 }
+"""Name of each attack, and function that returns its message."""
 
 
 def run_attacker(port: int, token: str, name: str) -> None:
-    """Send one kind of message until the process is killed."""
+    """Send the message of the attack ``name`` until the process is killed."""
     asyncio.run(_flood(port, token, ATTACKS[name]()))
 
 
 async def _flood(port: int, token: str, data: bytes) -> None:
-    number = 0
+    last_number = 0
     async with mqtt_client(port, token) as edge:
-        edge.pending_calls_threshold = IN_FLIGHT
+        edge.pending_calls_threshold = IN_FLIGHT  # aiomqtt would warn about so many pending messages
         while True:
-            numbers = range(number + 1, number + IN_FLIGHT + 1)
-            number += IN_FLIGHT
+            numbers = range(last_number + 1, last_number + IN_FLIGHT + 1)
+            last_number += IN_FLIGHT
             await asyncio.gather(*(edge.publish(f"raw/{ATTACKER}", numbered(data, n), qos=1) for n in numbers))
 
 
@@ -81,7 +83,7 @@ class Latencies:
     """Latencies of the blocks of the honest packs.
 
     Attributes:
-        published_s: Monotonic time of the publication of a block [s], by pack and time of its last sample.
+        published_s: Monotonic time of the publication of each block without a state [s], by pack and time of its last sample.
         latencies_s: Latencies of the blocks whose state has arrived [s].
     """
 
@@ -113,7 +115,7 @@ class HonestEdges:
     Attributes:
         edges: Connections by pack.
         latencies: Latencies of their blocks.
-        number: Number of the last block of each pack.
+        number: Number of the last block, which is the same for all packs.
     """
 
     edges: dict[str, Edge]
@@ -135,7 +137,7 @@ class HonestEdges:
         last_s = PERIOD_S * (SAMPLES * self.number - 1)
         self.latencies.published_s[pack, last_s] = time.monotonic()
         await edge.publish(f"raw/{pack}", block(pack, self.number), qos=1)
-        await asyncio.sleep(PERIOD_OF_BLOCKS_S)
+        await asyncio.sleep(BLOCK_PERIOD_S)
 
 
 @contextlib.asynccontextmanager
@@ -157,7 +159,7 @@ async def measure(folder: Path, seconds: float) -> list[Row]:
         try:
             async with Heartbeats(reader) as heartbeats, connect_honest_edges(tenant, reader) as packs:
                 await heartbeats.until_held(PARTITIONS, "w")
-                await packs.send(2.0)  # kernels are loaded
+                await packs.send(2.0)  # not measured: the worker loads its kernels
                 without_attack = await packs.send(seconds)
                 rows = [Row(f"{len(PACKS)} packs of a fleet, without an attack", "", _format(without_attack), None)]
                 for name in ATTACKS:
@@ -181,7 +183,7 @@ def _format(result: tuple[float, float, int]) -> str:
 
 
 async def _stream_row(reader: Client, number: int) -> Row:
-    """Return the row of the honest packs' blocks that the stream contains."""
+    """Return the row that compares the honest packs' blocks in the stream with the number of sent blocks."""
     info = await reader.jetstream().stream_info(subjects.RAW_STREAM, subjects_filter=">")
     counts = dict(info.state.subjects or {})
     stored = sum(count for subject, count in counts.items() if not subject.endswith(f".{ATTACKER}"))

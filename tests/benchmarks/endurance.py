@@ -1,7 +1,7 @@
-"""Load test: thousands of frames a second over a PTY, a day of serial bytes, and attacks.
+"""Load test: thousands of frames a second over a PTY, a day of serial bytes, attacks, and a lost sensor.
 
 The attacks are idle connections to the HTTP listeners of service, dashboard and fleet page while their broker or server is
-restarted, a lost sensor, and the token of one edge of a fleet.
+restarted, and an edge of a fleet that misuses its token.
 
 make load ARGS="--rate 5000 --minutes 10 --hours 24 --no-idle --lost 10 --attack-s 20"
 """
@@ -35,7 +35,7 @@ from tests.benchmarks.wire import hello, sample_frames
 from tests.fleet.nats_cluster import running
 from tests.idle_connections import (
     DESCRIPTORS,
-    IDLE,
+    IDLE_CONNECTIONS,
     Outcome,
     attack_dashboard,
     attack_fleet_page,
@@ -48,20 +48,21 @@ from tests.patience import LONG_S
 BOARD_RATE_HZ = 1000
 """Rate in the hello message [Hz], the highest of the protocol. The timestamps show the true rate."""
 SEND_S = 0.002
-"""Interval at which the board's bytes leave, as on USB [s]."""
+"""Interval at which the board sends its bytes, as on USB [s]."""
 BURST_S = 0.006
-"""Maximum duration of frames sent in one burst [s]."""
+"""Maximum duration of the frames that are sent at once after a delay of the sender [s]."""
 CHUNK_S = 10.0
-"""Duration that the sender prepares at a time [s]."""
+"""Duration of the frames that the sender prepares at a time [s]."""
 WARM_S = 20.0
 """Warm-up time before CPU time and memory are measured [s]."""
-HALF_DAY_S = 8.0 * 3600.0
-"""Duration of the discharge pulses before the charge pulses [s]."""
+DIRECTION_S = 8.0 * 3600.0
+"""Duration of discharge pulses, and of the charge pulses after them [s]."""
 MAX_CPU = 0.20
 """Limit of the CPU time of the service as a fraction of a core."""
 MAX_GROWTH_MIB = 2.0
 """Limit of the growth of the resident memory [MiB]."""
 READ_BYTES = 4096
+"""Number of bytes of a read in the day of serial bytes."""
 PACK_TOML = """
 [pack]
 name = "load"
@@ -77,14 +78,14 @@ folder = "{folder}"
 
 
 def simulate_load(first: int, count: int, rate_hz: int, soc: float) -> tuple[SampleBlock, float]:
-    """Return ``count`` samples from ``first`` on of a pack under pulses, and the SOC at their end.
+    """Return samples ``first`` to ``first + count - 1`` of a pack under a pulsed load, and the SOC after them.
 
     The RC voltages are zero at the first sample.
     """
     cell = load_cell(CELL)
     block = np.zeros(count, dtype=SAMPLE)
     time_s = np.arange(first, first + count) / rate_hz
-    direction = 1.0 - 2.0 * (time_s // HALF_DAY_S % 2.0)
+    direction = 1.0 - 2.0 * (time_s // DIRECTION_S % 2.0)
     current_a = ON_A * direction * (time_s % (2.0 * HALF_PERIOD_S) < HALF_PERIOD_S)
     voltage_v, socs = simulate_cell((soc, 0.0, 0.0), time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
     noise = np.random.default_rng(first).uniform(-0.5, 0.5, (2, count))
@@ -105,14 +106,14 @@ def chunks(rate_hz: int, seconds: float, chunk_s: float) -> Iterator[bytes]:
 
 
 def send(master: int, rate_hz: int, seconds: float, results: "mp.Queue[tuple[int, int, int]]") -> None:
-    """Send frames in time, as a board does, in a process of its own.
+    """Send frames at ``rate_hz``, as a board does. This function runs in a process of its own.
 
-    Frames for which the line has no space are lost. Numbers of all frames, of lost frames, and of written bytes are put into the
-    queue. After a delay of the process, pending frames are sent in small bursts.
+    Frames for which the line has no space are lost. At the end the numbers of all frames, of lost frames and of written bytes
+    are put into ``results``. After a delay of the process, pending frames are sent in small bursts.
     """
     os.set_blocking(master, False)
     frame_bytes = len(next(chunks(rate_hz, 1.0 / rate_hz, 1.0)))
-    begin_s, frames, lost, received = time.monotonic(), 0, 0, 0
+    begin_s, frames, lost, written = time.monotonic(), 0, 0, 0
     for chunk in chunks(rate_hz, seconds, CHUNK_S):
         position = 0
         while position < len(chunk):
@@ -122,24 +123,28 @@ def send(master: int, rate_hz: int, seconds: float, results: "mp.Queue[tuple[int
             frames += (end - position) // frame_bytes
             while position < end:
                 try:
-                    written_bytes = os.write(master, chunk[position:end])
-                    position, received = position + written_bytes, received + written_bytes
+                    accepted = os.write(master, chunk[position:end])
+                    position, written = position + accepted, written + accepted
                 except BlockingIOError:
                     lost += (end - position + frame_bytes - 1) // frame_bytes
                     position = end
-    results.put((frames, lost, received))
+    results.put((frames, lost, written))
 
 
 @dataclass(frozen=True)
 class Run:
-    """Counters of the service."""
+    """Results of the load over the PTY."""
 
     sent: int
+    """Number of frames of the board."""
     no_room: int
-    """Number of frames dropped by the full line, because the service did not read."""
+    """Number of frames for which the line had no space, because the service did not read."""
     line: dict[str, int]
+    """Counters of the line, by the health message of the service."""
     samples: dict[str, int]
+    """Counters of the samples, by the same message."""
     cpu: float
+    """CPU time of the service as a fraction of a core."""
     rss_mib: tuple[float, float]
     """Mean resident memory of the first and of the second half [MiB]."""
 
@@ -158,7 +163,7 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
             service = await asyncio.create_subprocess_exec(program, "run", "--no-view", pack, stdout=log, stderr=log)
         try:
             await live.wait_json("bms/load/health", lambda h: "no frame yet" in (h["sensor_message"] or ""))
-            os.write(master, b"\0" + hello(BOARD_RATE_HZ))
+            os.write(master, b"\0" + hello(BOARD_RATE_HZ))  # the delimiter ends what may be left of an earlier frame
             spawn = mp.get_context("spawn")
             results: mp.Queue[tuple[int, int, int]] = spawn.Queue()
             sender = spawn.Process(
@@ -171,14 +176,14 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
             started_s = time.monotonic()
             while sender.is_alive() and service.returncode is None:
                 await asyncio.sleep(1.0)
-                live.messages.clear()
+                live.messages.clear()  # they would fill the memory
                 if time.monotonic() - started_s < min(WARM_S, 0.2 * seconds):
                     begin_s, before_s = time.monotonic(), sum(process.cpu_times()[:2])
                     continue
                 rss_mib.append(process.memory_info().rss / 2**20)
             cpu = (sum(process.cpu_times()[:2]) - before_s) / (time.monotonic() - begin_s)
-            frames, no_room, received = results.get(timeout=LONG_S)
-            end = await live.wait_json("bms/load/health", lambda h: h["line"]["bytes_received"] >= received)
+            frames, no_room, written = results.get(timeout=LONG_S)
+            health = await live.wait_json("bms/load/health", lambda h: h["line"]["bytes_received"] >= written)
             service.send_signal(signal.SIGINT)
             await service.wait()
         finally:
@@ -189,10 +194,11 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
             os.close(master)
     half = len(rss_mib) // 2
     means = float(np.mean(rss_mib[:half])), float(np.mean(rss_mib[half:]))
-    return Run(frames, no_room, end["line"], end["samples"], cpu, means)
+    return Run(frames, no_room, health["line"], health["samples"], cpu, means)
 
 
 def _send_over(master: "mp.reduction.DupFd", *arguments: object) -> None:
+    """Call ``send`` with the descriptor that another process has passed."""
     send(master.detach(), *arguments)  # type: ignore[arg-type]
 
 
@@ -216,7 +222,7 @@ def process_bytes(rate_hz: int, seconds: float) -> tuple[BoardProtocol, Estimato
 
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
-    """Measure the load and the day of serial bytes."""
+    """Measure all requested parts."""
     if options.idle:
         yield from idle_rows()
     if options.lost:
@@ -236,15 +242,15 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         quantity = f"{options.rate:,} frames/s for {options.minutes:g} min over a PTY"
         is_met = received == run.sent == run.samples["samples"] and not any(faults.values()) and not run.no_room
         fault_counts = ", ".join(f"{n} {name}" for name, n in (faults | {"without room": run.no_room}).items() if n)
-        yield Row(quantity, "none lost", f"{received:,} of {run.sent:,} taken {fault_counts}", is_met)
+        yield Row(quantity, "none lost", f"{received:,} of {run.sent:,} received {fault_counts}", is_met)
         yield Row("  service's processor time", f"below {MAX_CPU:.0%} of a core", f"{run.cpu:.1%}", run.cpu < MAX_CPU)
         first, second = run.rss_mib
         growth = f"{first:.1f} MiB in the first half, {second:.1f} in the second"
         yield Row("  resident memory", "flat", growth, second - first < MAX_GROWTH_MIB)
     if options.hours:
-        decoder, estimator, elapsed_s, rss_mib = process_bytes(100, 3600.0 * options.hours)
+        decoder, estimator, elapsed_s, rss_mib = process_bytes(rate_hz=100, seconds=3600.0 * options.hours)
         received, samples = decoder.counters["frames_received"], int(estimator.state["samples"][0])
-        sent_frames = round(360_000 * options.hours)
+        sent_frames = round(100 * 3600 * options.hours)
         quantity = f"{options.hours:g} h of 100 Hz as serial bytes"
         yield Row(
             quantity,
@@ -274,7 +280,7 @@ def idle_rows() -> Iterator[Row]:
 
 
 def _idle_row(program: str, attack: Coroutine[None, None, Outcome]) -> Row:
-    quantity = f"{IDLE:,} idle connections each, {DESCRIPTORS:,} descriptors: {program}"
+    quantity = f"{IDLE_CONNECTIONS:,} idle connections each, {DESCRIPTORS:,} descriptors: {program}"
     target = "reconnects, answers, no traceback"
     try:
         outcome = asyncio.run(attack)
@@ -298,13 +304,22 @@ def main() -> None:
     """Measure the requested parts; return 1 if a target was not met."""
     parser = argparse.ArgumentParser(prog="make load", description=__doc__)
     parser.add_argument("--rate", type=int, default=5000, help="frames per second over the PTY")
-    parser.add_argument("--minutes", type=float, default=10.0, help="for so long; 0: not at all")
-    parser.add_argument("--attack-s", type=float, default=20.0, help="each attack on a fleet; 0: none")
-    parser.add_argument("--hours", type=float, default=24.0, help="of serial bytes at 100 Hz, at once; 0: not at all")
     parser.add_argument(
-        "--idle", action=argparse.BooleanOptionalAction, default=True, help="attack by idle connections"
+        "--minutes", type=float, default=10.0, help="duration of the load over the PTY [min]; 0: skip it"
     )
-    parser.add_argument("--lost", type=float, default=10.0, help="delay of a lost sensor [s]; 0: none is lost")
+    parser.add_argument(
+        "--attack-s", type=float, default=20.0, help="duration of each attack on a fleet [s]; 0: skip them"
+    )
+    parser.add_argument(
+        "--hours",
+        type=float,
+        default=24.0,
+        help="hours of serial bytes at 100 Hz, processed as fast as possible; 0: skip them",
+    )
+    parser.add_argument(
+        "--idle", action=argparse.BooleanOptionalAction, default=True, help="attack with idle connections"
+    )
+    parser.add_argument("--lost", type=float, default=10.0, help="delay of the alarm for a lost sensor [s]; 0: skip it")
     sys.exit(not show(rows(parser.parse_args())))
 
 

@@ -1,8 +1,8 @@
-"""Benchmark of a fleet of processes: server, workers and simulated edges. ``make fleet ARGS="--packs 10000"``.
+"""Benchmark of a fleet of processes: server, workers and simulated edge devices. ``make fleet ARGS="--packs 10000"``.
 
 The lag is the time from the arrival of a block's last sample at the edge to the arrival of ``bms.<pack>.state`` at a listener.
-Quantiles are of some packs. The maximum is of all packs, by the heartbeats of the workers. The first minutes, in which every
-pack starts, are not measured.
+Quantiles are those of ``OBSERVED_PACKS`` packs. The maximum over all packs comes from the heartbeats of the workers. The first
+minutes, in which every pack starts, are not measured.
 """
 
 import argparse
@@ -28,12 +28,12 @@ from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker.worker import CHECKPOINT_S
 from bms_estimator.service.kernel_warm_up import load_kernels
-from tests.benchmarks.fleet_rig import Rig, cpu_s, make, rig, rss_mib
+from tests.benchmarks.fleet_rig import Rig, cpu_s, create_streams, rig, rss_mib
 from tests.patience import LONG_S
 
 SEED, DAY_S, PARTITIONS = 1, 86_400.0, 64
 OBSERVED_PACKS = 256
-"""Number of packs whose estimates are received, evenly spread."""
+"""Number of packs whose estimates are received; they are evenly spread over the fleet."""
 
 
 @dataclass
@@ -80,26 +80,26 @@ def main() -> None:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="make fleet ARGS=...", description=__doc__)
     parser.add_argument("--packs", type=int, nargs="+", default=[1000, 10_000, 100_000])
-    parser.add_argument("--minutes", type=float, default=3.0, help="measured, after the first two")
-    parser.add_argument("--warm-up", type=float, default=2.0, help="minutes before")
+    parser.add_argument("--minutes", type=float, default=3.0, help="measured time [min]")
+    parser.add_argument("--warm-up", type=float, default=2.0, help="time before the measurement [min]")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--speed", type=float, default=1.0, help="the packs' seconds per second")
-    parser.add_argument("--json", type=Path, help="write the rows here, too")
+    parser.add_argument("--speed", type=float, default=1.0, help="speed of the packs relative to real time")
+    parser.add_argument("--json", type=Path, help="file to which the rows are also written")
     return parser.parse_args()
 
 
 async def _measure(packs: int, arguments: argparse.Namespace) -> dict[str, str]:
-    with tempfile.TemporaryDirectory() as folder, rig(Path(folder), 1, partitions=PARTITIONS) as fleet_rig:
-        await make(fleet_rig, partitions=PARTITIONS)
+    with tempfile.TemporaryDirectory() as folder, rig(Path(folder), nodes=1, partitions=PARTITIONS) as fleet_rig:
+        await create_streams(fleet_rig, partitions=PARTITIONS)
         return await _run(fleet_rig, packs, arguments)
 
 
 async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dict[str, str]:
     begin_s = int(time.time())
     fleet = SimulatedFleet(packs, seed=SEED, begin_ns=begin_s * 10**9)
-    load_time_s = time.monotonic()
+    load_begin_s = time.monotonic()
     await asyncio.to_thread(fleet_rig.load, fleet)
-    load_time_s = time.monotonic() - load_time_s
+    load_time_s = time.monotonic() - load_begin_s
     names = [fleet_rig.start_worker(checkpoint_s=CHECKPOINT_S) for _ in range(arguments.workers)]
     received = await _listen(fleet_rig, fleet)
     await _wait_until(lambda: len(received.workers) == len(names))
@@ -111,43 +111,43 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     pids = {"server": fleet_rig.engine.pid(0), "edges": edges.pid} | {
         name: fleet_rig.workers[name].pid for name in names
     }
-    cpu_time_s = {name: cpu_s(pid) for name, pid in pids.items()}
+    cpu_before_s = {name: cpu_s(pid) for name, pid in pids.items()}
     measure_begin_s, blocks_before = time.monotonic(), received.blocks
     received.lags_s.clear()
     received.worst_s = 0.0
     await asyncio.sleep(60.0 * arguments.minutes)
     elapsed_s, processed_blocks = time.monotonic() - measure_begin_s, received.blocks - blocks_before
-    cpu_time_s = {name: cpu_s(pid) - cpu_time_s[name] for name, pid in pids.items()}
-    memory = {name: rss_mib(pid) for name, pid in pids.items()}
-    wire = _wire_bytes(fleet_rig)
-    lags = np.sort(received.lags_s) if received.lags_s else np.array([np.nan])
+    cpu_time_s = {name: cpu_s(pid) - cpu_before_s[name] for name, pid in pids.items()}
+    memory_mib = {name: rss_mib(pid) for name, pid in pids.items()}
+    wire_bytes = _wire_bytes(fleet_rig)
+    lags_s = np.sort(received.lags_s) if received.lags_s else np.array([np.nan])
     worst_s = received.worst_s
     await asyncio.to_thread(edges.wait, LONG_S + 120.0 * minutes)
-    stop_time_s = time.monotonic()
+    stop_begin_s = time.monotonic()
     await asyncio.to_thread(fleet_rig.stop_workers)
-    stop_time_s = time.monotonic() - stop_time_s
+    stop_time_s = time.monotonic() - stop_begin_s
     raw_bytes, raw_messages, states_bytes = await _stream_sizes(fleet_rig)
     pack_days = max(1, processed_blocks) * BLOCK_S / DAY_S  # of the processed blocks, even if some are missing
-    work_s = sum(cpu_time_s[name] for name in names)
+    workers_cpu_s = sum(cpu_time_s[name] for name in names)
     blocks_per_day = DAY_S / BLOCK_S
     sys.stderr.write((fleet_rig.folder / "edges.log").read_text().splitlines()[-1] + "\n")
     return {
         "blocks/s": f"{processed_blocks / elapsed_s:,.1f}",
         "samples/s": f"{processed_blocks * BLOCK_S / elapsed_s:,.0f}",
-        "lag p50, s": f"{np.quantile(lags, 0.5):.2f}",
-        "lag p99, s": f"{np.quantile(lags, 0.99):.2f}",
-        "lag max of those heard, s": f"{lags[-1]:.2f} of {lags.size:,}",
+        "lag p50, s": f"{np.quantile(lags_s, 0.5):.2f}",
+        "lag p99, s": f"{np.quantile(lags_s, 0.99):.2f}",
+        "lag max of those received, s": f"{lags_s[-1]:.2f} of {lags_s.size:,}",
         "lag max of all, s": f"{worst_s:.2f}",
-        "workers, CPU, cores": f"{work_s / elapsed_s:.3f}",
+        "workers, CPU, cores": f"{workers_cpu_s / elapsed_s:.3f}",
         "server, CPU, cores": f"{cpu_time_s['server'] / elapsed_s:.3f}",
         "edges simulated, CPU, cores": f"{cpu_time_s['edges'] / elapsed_s:.3f}",
-        "workers, CPU per pack-day, s": f"{work_s / pack_days:.3f}",
+        "workers, CPU per pack-day, s": f"{workers_cpu_s / pack_days:.3f}",
         "server, CPU per pack-day, s": f"{cpu_time_s['server'] / pack_days:.3f}",
-        "wire per pack-day, kB": f"{wire / raw_messages * blocks_per_day / 1e3:,.0f}",
+        "wire per pack-day, kB": f"{wire_bytes / raw_messages * blocks_per_day / 1e3:,.0f}",
         "stream per pack-day, kB": f"{raw_bytes / raw_messages * blocks_per_day / 1e3:,.0f}",
         "checkpoint per pack, kB": f"{states_bytes / packs / 1e3:.1f}",
-        "workers, memory each, MiB": f"{max(memory[name] for name in names):,.0f}",
-        "server, memory, MiB": f"{memory['server']:,.0f}",
+        "workers, memory each, MiB": f"{max(memory_mib[name] for name in names):,.0f}",
+        "server, memory, MiB": f"{memory_mib['server']:,.0f}",
         "table loaded in, s": f"{load_time_s:.1f}",
         "clean stop, with checkpoints, s": f"{stop_time_s:.1f}",
         "resends, gaps, lost blocks": " ".join(

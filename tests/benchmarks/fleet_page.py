@@ -38,15 +38,15 @@ def print_line(text: str) -> None:
 
 async def publish_fleet(nc: Client, packs: int) -> None:
     """Publish the state of every pack once a minute, evenly spread, and the heartbeats of two workers, until cancelled."""
-    fleet, sent_count, begin_s, last_heartbeat_s = make_packs(packs), 0, time.monotonic(), 0.0
+    fleet, sent_count, begin_s, heartbeat_s = make_packs(packs), 0, time.monotonic(), 0.0
     while True:
         now_s = time.monotonic()
         while sent_count < packs * (now_s - begin_s) / MINUTE_S:
             pack = fleet[sent_count % packs]
             await publish(nc, pack.name, pack.state)
             sent_count += 1
-        if now_s > last_heartbeat_s + 1.0:
-            last_heartbeat_s = now_s
+        if now_s > heartbeat_s + 1.0:
+            heartbeat_s = now_s
             for name, partitions in (("alpha", range(32)), ("beta", range(32, 64))):
                 await publish_heartbeat(
                     nc, name, partitions, packs=packs // 2, blocks=sent_count // 2, samples=30 * sent_count, lag_s=0.4
@@ -64,13 +64,13 @@ async def read_events(url: str, received: dict[str, float]) -> None:
             if line.startswith(b"data: "):
                 received["events"] = received.get("events", 0) + 1
                 received["bytes"] = received.get("bytes", 0) + len(line)
-                fleet = json.loads(line[6:]).get("fleet")
+                fleet = json.loads(line.removeprefix(b"data: ")).get("fleet")
                 if fleet:
                     received["alive"], received["states_per_s"] = fleet["packs"]["alive"], fleet["states_per_s"] or 0.0
 
 
 async def measure(packs: int, minutes: float) -> None:
-    """Load the table of packs, publish for 1.5 minutes to settle, then measure the page's process for ``minutes``."""
+    """Publish the states of ``packs`` packs; after ``SETTLE_S`` measure the process of the page for ``minutes``."""
     with tempfile.TemporaryDirectory() as temporary, running(Path(temporary)) as cluster:
         nc = await nats.connect(cluster.url)
         await make_streams(nc)
@@ -89,7 +89,7 @@ async def measure(packs: int, minutes: float) -> None:
         cpu_after, elapsed_s = process.cpu_times(), time.monotonic() - begin_s
         cpu = (cpu_after.user + cpu_after.system - cpu_before.user - cpu_before.system) / elapsed_s
         print_line(
-            f"{packs} packs, {received['states_per_s']:.0f} states/s heard, {received['alive']:.0f} alive, over {elapsed_s:.0f} s"
+            f"{packs} packs, {received['states_per_s']:.0f} states/s received, {received['alive']:.0f} alive, over {elapsed_s:.0f} s"
         )
         print_line(
             f"page's process: {100.0 * cpu:.1f} % of a core, {process.memory_info().rss / 2**20:.0f} MiB resident"

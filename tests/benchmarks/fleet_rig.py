@@ -1,4 +1,4 @@
-"""Fleet of processes on the loopback interface for benchmarks: server, workers and simulated edges."""
+"""Fleet of processes on the loopback interface for benchmarks: server, workers and simulated edge devices."""
 
 import contextlib
 import signal
@@ -29,12 +29,12 @@ class Rig:
         self.server = ",".join(engine.urls)
         self._mqtt = ",".join(f"mqtt://127.0.0.1:{port}" for port in engine.mqtt_ports)
         self.workers: dict[str, subprocess.Popen[bytes]] = {}
-        self._names = 0
+        self._started_workers = 0
 
     def start_worker(self, *, checkpoint_s: float) -> str:
         """Start a worker under a new name, and return the name."""
-        self._names += 1
-        name = f"w{self._names}"
+        self._started_workers += 1
+        name = f"w{self._started_workers}"
         arguments = ["--server", self.server, "--name", name, "--checkpoint-s", str(checkpoint_s)]
         self.workers[name] = self.run("worker", *arguments, log=name)
         return name
@@ -64,7 +64,7 @@ class Rig:
         return self.run("simulate", "--mqtt", self._mqtt, *map(str, arguments), log="edges")
 
     def run(self, *arguments: str, log: str) -> subprocess.Popen[bytes]:
-        """Start a command of ``fleet``."""
+        """Start a subcommand of ``bms-estimator fleet``; its output goes to ``log``."""
         with (self.folder / f"{log}.log").open("ab") as file:
             return subprocess.Popen([PROGRAM, "fleet", *arguments], stdout=file, stderr=file)
 
@@ -81,7 +81,7 @@ class Rig:
 
 @contextlib.contextmanager
 def rig(folder: Path, nodes: int, *, partitions: int) -> Iterator[Rig]:
-    """Run a server without workers."""
+    """Run a server of ``nodes`` nodes without workers, and yield its rig."""
     with running(folder, nodes, partitions=partitions) as engine:
         fleet_rig = Rig(folder, engine)
         try:
@@ -90,7 +90,7 @@ def rig(folder: Path, nodes: int, *, partitions: int) -> Iterator[Rig]:
             fleet_rig.end()
 
 
-async def make(rig: Rig, *, partitions: int) -> None:
+async def create_streams(rig: Rig, *, partitions: int) -> None:
     """Create the streams, with a replica on each node."""
     nc = await rig.connected()
     await make_streams(nc, partitions=partitions, replicas=len(rig.engine.nodes))

@@ -1,7 +1,11 @@
 """Numbers of docs/theory/fuel-cell.md: ``make fuelcell`` prints them in half a minute.
 
-The data are of the simulated stack of ``tests.mann_stack``, which has effects that the model omits, and two measured curves in
-tests/data/fuel_cell.
+The data come from the simulated stack of ``tests.mann_stack``, which has effects that the model omits, and from two measured
+curves in tests/data/fuel_cell.
+
+Parameters: r is the resistance [ohm], A the Tafel slope [V], a the activation loss at 1 A [V], C the double-layer capacitance
+[F], B the factor of the concentration loss [V], i_L the limiting current and i_n the internal current [A]; e is the error of
+the voltage.
 """
 
 import itertools
@@ -15,20 +19,25 @@ from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, f
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.fuel_cell_settings import MEMORY_S
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop
-from bms_estimator.model.arrays import Record
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.captures.curves import read_polarisation
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from tests import mann_stack
-from tests.mann_stack import CURVE_A
+from tests.mann_stack import CURVE_A, Record
 
 PEM = load_fuel_cell("pem_30w")
 DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
 MIN_A = 0.1
-"""Minimum current of used points of the measured curves, by docs/theory/fuel-cell.md [A/cm2]."""
+"""Minimum current of the measured points that are used; the measured cells have 1 cm2 [A]."""
 WRONG_FACTORS = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])
-"""Initial parameters of the fit, divided by those of ``pem_30w``."""
+"""Initial values of the kernel constants in the fit, divided by those of ``pem_30w``."""
+LEARNING_HZ = 100
+"""Sample rate at which parameters are learned in operation [Hz]."""
+LAST_SAMPLES = 30 * LEARNING_HZ
+"""Number of samples at the end of a part over which values are averaged: those of 30 s."""
+R, LOSSES = 1, slice(5, 8)
+"""Indices of the kernel constants r, and B, i_L and i_n."""
 PRINTED_PARAMETERS = "r_ohm", "tafel_slope_v", "exchange_current_a", "c_dl_farad"
 
 
@@ -37,6 +46,7 @@ def print_line(text: str) -> None:
 
 
 def make_source(name: str, record: Record, *, timed: bool = True) -> Source:
+    """Return data of a fit: samples in time, or points of a polarization curve."""
     return Source(name, record.time_s if timed else None, record.current_a, record.voltage_v, record.temperature_c)
 
 
@@ -56,6 +66,7 @@ def prediction_rms_mv(model: FuelCellModel, held_back: Source) -> float:
 
 
 def format_parameters(fit: FuelCellFit) -> str:
+    """Return each parameter with its standard deviation; "kept" marks those that the data do not determine."""
     texts = []
     for key in KEYS:
         value, std = getattr(fit.model.fuel_cell, key), fit.model.std.get(key)
@@ -65,47 +76,51 @@ def format_parameters(fit: FuelCellFit) -> str:
 
 def print_identification() -> None:
     print_line(
-        "## Identified from a curve and 60 s of steps, begun at a wrong file, judged on 60 s that were held back"
+        "## Identified from a curve and 60 s of steps, from a wrong initial file, evaluated on 60 s that were held back"
     )
     start = PEM.identified(PEM.a * WRONG_FACTORS, {})
     measured_curve = mann_stack.curve(CURVE_A)
-    first, second = (mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=s), seed=s) for s in (1, 5))
+    learned, evaluated = (mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=s), seed=s) for s in (1, 5))
     for rate_hz, every in ((500, 2), (100, 10)):
-        held_back = make_source("held back", second.every(every))
+        held_back = make_source("held back", evaluated.every(every))
         for name, sources in (
             (
                 "curve and steps",
-                [make_source("curve", measured_curve, timed=False), make_source("steps", first.every(every))],
+                [make_source("curve", measured_curve, timed=False), make_source("steps", learned.every(every))],
             ),
             ("curve alone", [make_source("curve", measured_curve, timed=False)]),
-            ("steps alone", [make_source("steps", first.every(every))]),
+            ("steps alone", [make_source("steps", learned.every(every))]),
         ):
             fit = fit_fuel_cell(sources, start)
             residuals = ", ".join(f"{k} {1e3 * v:.1f} mV" for k, v in fit.rms_v.items())
             print_line(
-                f"{rate_hz} Hz, {name}: held back {prediction_rms_mv(fit.model, held_back):.1f} mV; left of {residuals}"
+                f"{rate_hz} Hz, {name}: held back {prediction_rms_mv(fit.model, held_back):.1f} mV; residuals {residuals}"
             )
             print_line(f"    {format_parameters(fit)}")
         print_line(
             f"    the wrong file {prediction_rms_mv(start, held_back):.1f} mV, pem_30w {prediction_rms_mv(PEM, held_back):.1f} mV"
         )
-    kelvin = first.temperature_c.mean() + 273.15
+    kelvin = learned.temperature_c.mean() + 273.15
     print_line(
-        f"    truth: r_ohm {first.r_ohm.mean():.4f} on the mean at {kelvin - 273.15:.1f} C, c_dl_farad 0.067, B 0.224 V, i_L 9.38 A"
+        f"    truth: r_ohm {learned.r_ohm.mean():.4f} on the mean at {kelvin - 273.15:.1f} C, c_dl_farad 0.067, B 0.224 V, i_L 9.38 A"
     )
 
 
 def print_temperature_effect() -> None:
-    print_line("## Temperature left out: what the held-back minute then has")
-    second = make_source(
+    print_line("## Voltage error of the held-back minute with and without the temperature")
+    held_back = make_source(
         "held back", mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=5), seed=5).every(2)
     )
     fit = fit_fuel_cell([make_source("curve", mann_stack.curve(CURVE_A), timed=False)], PEM)
     without_temperature = Source(
-        second.name, second.time_s, second.current_a, second.voltage_v, np.full(second.voltage_v.size, np.nan)
+        held_back.name,
+        held_back.time_s,
+        held_back.current_a,
+        held_back.voltage_v,
+        np.full(held_back.voltage_v.size, np.nan),
     )
     print_line(
-        f"with {prediction_rms_mv(fit.model, second):.1f} mV, without {prediction_rms_mv(fit.model, without_temperature):.1f} mV"
+        f"with {prediction_rms_mv(fit.model, held_back):.1f} mV, without {prediction_rms_mv(fit.model, without_temperature):.1f} mV"
     )
 
 
@@ -127,13 +142,13 @@ def print_learning() -> None:
     record = mann_stack.measured(time_s, current_a, seed=4, more_ohm=np.where(time_s < 300.0, 0.0, 0.06)).every(5)
     estimator, block = Estimator(PEM), make_samples(record)
     estimator.run(block[:1])
-    edges = [1, *(100 * s for s in (60, 150, 300, 310, 360, 450, 600, 900, 1200))]
+    edges = [1, *(LEARNING_HZ * s for s in (60, 150, 300, 310, 360, 450, 600, 900, 1200))]
     for low, high in itertools.pairwise(edges):
         innovation_v = estimator.run(block[low:high])["innovation_v"]
         p = fuel_cell_parameters(estimator, 0.0)
         values = ", ".join(f"{k} {p[k].value:.4g} +- {p[k].std:.1g}" for k in PRINTED_PARAMETERS)
-        true_ohm = record.r_ohm[max(low, high - 3000) : high].mean()
-        print_line(f"{high / 100:6.0f} s: e {rms_mv(innovation_v):6.1f} mV, true r {true_ohm:.4f}; {values}")
+        true_ohm = record.r_ohm[max(low, high - LAST_SAMPLES) : high].mean()
+        print_line(f"{high / LEARNING_HZ:6.0f} s: e {rms_mv(innovation_v):6.1f} mV, true r {true_ohm:.4f}; {values}")
 
 
 def print_wrong_start() -> None:
@@ -144,45 +159,46 @@ def print_wrong_start() -> None:
         print_line(f"memory {memory_s:.0f} s")
         estimator = Estimator(PEM)
         estimator.settings_record["learning"]["memory_s"] = memory_s
-        for low, high in itertools.pairwise((0, 3000, 6000, 12000, 30000, 60000)):
+        for low, high in itertools.pairwise(LEARNING_HZ * s for s in (0, 30, 60, 120, 300, 600)):
             innovation_v = estimator.run(block[low:high])["innovation_v"]
             error_percent = 100.0 * (estimator.state["a"][0][1:5] / (PEM.a * factors)[1:5] - 1.0)
             texts = ", ".join(f"{x:+.1f} %" for x in error_percent)
-            print_line(f"{high / 100:6.0f} s: e {rms_mv(innovation_v):6.1f} mV; r, A, a, C off by {texts}")
+            print_line(f"{high / LEARNING_HZ:6.0f} s: e {rms_mv(innovation_v):6.1f} mV; r, A, a, C off by {texts}")
 
 
 def print_ablation() -> None:
     print_line(
-        "## What is learned, and how long it is remembered: a jump of r at 300 s by 60 mohm; over the truth at 450, 600, 900 s"
+        "## Number of learned parameters, and memory: r increases by 60 mohm at 300 s; learned over true values at 450, 600, 900 s"
     )
     time_s, current_a = mann_stack.random_steps(900.0, 500.0, seed=4)
     more_ohm = np.where(time_s < 300.0, 0.0, 0.06)
     no_temperature, grown_a = np.full(time_s.size, np.nan), PEM.a.copy()
-    grown_a[1] += 0.06
+    grown_a[R] += 0.06
     before_v, after_v = (open_loop(a, np.zeros(8), time_s, current_a, no_temperature)[0] for a in (PEM.a, grown_a))
     own_v = np.where(time_s < 300.0, before_v, after_v) + np.random.default_rng(0).normal(0.0, 0.003, time_s.size)
     records = {
         "Mann's stack": mann_stack.measured(time_s, current_a, seed=4, more_ohm=more_ohm).every(5),
-        "the model itself": Record(time_s, current_a, own_v, no_temperature, PEM.a[1] + more_ohm).every(5),
+        "the model itself": Record(time_s, current_a, own_v, no_temperature, PEM.a[R] + more_ohm).every(5),
     }
     for count, memory_s in ((4, 60.0), (4, 600.0), (7, 60.0), (7, 600.0)):
         for name, record in records.items():
             print_line(
-                f"{count} learned, memory {memory_s:3.0f} s, {name}: {_format_after_jump(record, count, memory_s)}"
+                f"{count} learned, memory {memory_s:3.0f} s, {name}: {_format_after_step(record, count, memory_s)}"
             )
 
 
-def _format_after_jump(record: Record, count: int, memory_s: float) -> str:
+def _format_after_step(record: Record, count: int, memory_s: float) -> str:
+    """Return the learned values, divided by the true ones, and the error of the voltage after the step of r at 300 s."""
     estimator, block = Estimator(PEM), make_samples(record)
     q = estimator.settings_record["learning"]
     q["count"], q["memory_s"] = count, memory_s
     texts = []
-    for low, high in ((0, 30000), (30000, 45000), (45000, 60000), (60000, 90000)):
-        innovation_v = estimator.run(block[low:high])["innovation_v"][-3000:]
+    for low, high in itertools.pairwise(LEARNING_HZ * s for s in (0, 300, 450, 600, 900)):
+        innovation_v = estimator.run(block[low:high])["innovation_v"][-LAST_SAMPLES:]
         a = estimator.state["a"][0]
-        r, others = a[1] / record.r_ohm[high - 3000 : high].mean(), a[5:8] / PEM.a[5:8]
-        texts.append(f"r {r:.2f} B, i_L, i_n {' '.join(f'{x:.2f}' for x in others)} e {rms_mv(innovation_v):.0f} mV")
-    return "; ".join(texts[1:])
+        r, losses = a[R] / record.r_ohm[high - LAST_SAMPLES : high].mean(), a[LOSSES] / PEM.a[LOSSES]
+        texts.append(f"r {r:.2f} B, i_L, i_n {' '.join(f'{x:.2f}' for x in losses)} e {rms_mv(innovation_v):.0f} mV")
+    return "; ".join(texts[1:])  # without the time before the step
 
 
 def print_speed() -> None:

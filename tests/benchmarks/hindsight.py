@@ -1,16 +1,16 @@
 """Interval coverage of SOC estimates, relative to later estimates and to the true SOC, for docs/fleet/questions.md.
 
-An estimate is covered if it differs by at most 2 std from the reference. The reference of `fleet ask honest` is a later
-estimate with a smaller std.
+An estimate is covered if it differs by at most 2 std from the reference. The command `fleet ask honest` has no true SOC: its
+reference is a later estimate with a smaller std.
 
 The captures last only a few hours. Therefore a slot of six minutes replaces an hour of the fleet. The estimator starts at
 the points of a capture at which `make anywhere` starts. Each run counts as a pack. Columns of the table:
 
-- judged: number of estimates that `honest` compares
-- hindsight: fraction of these estimates that a later estimate covers
-- truth, there: fraction that the true SOC covers, of the estimates that have a more certain later one
-- truth, all: fraction that the true SOC covers, of all estimates
-- offset: mean of error over std of the estimates of "truth, there". Later estimates have the same error, and cannot show it
+- judged: number of comparisons of an estimate with a later one
+- hindsight: fraction of these in which the later estimate is covered
+- truth, there: fraction of the estimates with a more certain later one that cover the true SOC
+- truth, all: fraction of all estimates that cover the true SOC
+- offset: mean of error over std of the estimates of "truth, there". Later estimates share this error and cannot show it
 """
 
 import sys
@@ -36,9 +36,9 @@ from tests.benchmarks.recipes import GROUPS, Group, chosen, runs
 
 SLOT_S = 360.0
 """Duration of a slot [s]."""
-MIN_SEEN_FRACTION = 0.97
+MIN_SAMPLED_FRACTION = 0.97
 """Minimum fraction of a slot with samples. A slot may lack 11 s; an hour of the fleet may lack 10 s."""
-LATER = (1, 3, 6, 12, 24)
+LATER_SLOTS = (1, 3, 6, 12, 24)
 """Distances of the later estimates with which `honest` compares [slots]."""
 STORE_ID = 10**9
 """Identifier of the edge's block store: its creation time [ns since 1970]."""
@@ -46,14 +46,16 @@ STORE_ID = 10**9
 
 def limits(slot_s: float = SLOT_S) -> Limits:
     """Return the limits with slots in place of hours."""
-    return replace(LIMITS, min_seen_s=MIN_SEEN_FRACTION * slot_s)
+    return replace(LIMITS, min_seen_s=MIN_SAMPLED_FRACTION * slot_s)
 
 
 class SlotEstimate(NamedTuple):
     """Estimate at the end of a slot, with its true error."""
 
     hour: Hour
+    """Summary of the slot, in the form of the summary of an hour."""
     error: float
+    """Estimated minus true SOC."""
 
 
 def main() -> None:
@@ -68,6 +70,7 @@ def main() -> None:
 
 
 def _outcome(group: Group, folder: Path) -> list[str]:
+    """Return the cells of a group's table row."""
     packs = [slots(f"p{n}", *run) for n, run in enumerate(runs(group, folder))]
     hours = folder / group.name.replace("/", " ")
     write(hours, [estimate.hour for pack in packs for estimate in pack])
@@ -97,7 +100,7 @@ def judged(pack: list[SlotEstimate]) -> list[float]:
     return [
         estimate.error / std[n]
         for n, estimate in enumerate(pack)
-        if any(n + k < std.size and std[n + k] ** 2 < LIMITS.max_variance_ratio * std[n] ** 2 for k in LATER)
+        if any(n + k < std.size and std[n + k] ** 2 < LIMITS.max_variance_ratio * std[n] ** 2 for k in LATER_SLOTS)
     ]
 
 
@@ -106,9 +109,9 @@ def slots(
 ) -> list[SlotEstimate]:
     """Return the estimates at intervals of ``slot_s`` [s], and the errors of their SOC."""
     estimator, sums, estimates = Estimator(cell, initial_soc=start_soc), np.zeros(1, HOUR_SUMS), list[SlotEstimate]()
-    number = ((samples["time_s"] - samples["time_s"][0]) // slot_s).astype(int)
-    for slot in range(number[-1]):
-        first, end = np.searchsorted(number, [slot, slot + 1])
+    slot_of_sample = ((samples["time_s"] - samples["time_s"][0]) // slot_s).astype(int)
+    for slot in range(slot_of_sample[-1]):  # without the last one, which is incomplete
+        first, end = np.searchsorted(slot_of_sample, [slot, slot + 1])
         if first == end:
             continue
         begin(sums, estimator.record[0])

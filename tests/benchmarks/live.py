@@ -34,11 +34,11 @@ MEASURE_S = 20.0
 PATIENCE_S = 30.0
 """Timeout of the first estimate, and of the end of the service [s]."""
 BARE_MESSAGES = 100
-"""Number of messages of the publish without the service."""
+"""Number of messages that are published without the service, for comparison."""
 BARE_BYTES = 945
-"""Size of these messages, which is that of a state [bytes]."""
+"""Size of these messages, which equals that of a state message [bytes]."""
 MAX_S = 120
-"""Duration of a prepared signal [s]."""
+"""Duration of the readings that are prepared for a board [s]."""
 
 PACK_TOML = """
 [pack]
@@ -82,11 +82,13 @@ class Run:
     latency_s: NDArray[np.float64]
     """Time from the bytes of a sample to the reception of its estimate [s]."""
     sent: int
+    """Number of frames that the board has sent."""
     last: State
+    """Last received state."""
 
 
 class TimedBoard(VirtualBoard):
-    """Board with a signal of current pulses.
+    """Board that measures a pack under current pulses, and records when it sends.
 
     Attributes:
         sent_s: Monotonic time of each frame so far, just before its bytes are written [s].
@@ -105,7 +107,7 @@ class TimedBoard(VirtualBoard):
 
 
 def rows() -> Iterator[Row]:
-    """Measure CPU time with a fast board, and latency, CPU time and start with a board at 100 Hz."""
+    """Measure CPU time with a board at 1,000 Hz, and latency, CPU time and start with a board at 100 Hz."""
     if MOSQUITTO is None:
         yield Row("live over a PTY", "-", "mosquitto is not installed", None)
         return
@@ -133,7 +135,7 @@ def rows() -> Iterator[Row]:
 
 
 def measure(rate_hz: int) -> Run:
-    """Run board, broker, service and subscriber."""
+    """Run board, broker, service and subscriber, and return the results."""
     folder = tempfile.TemporaryDirectory()
     with folder as path, TimedBoard(rate_hz) as board, broker(Path(path)) as server:
         return asyncio.run(_measure(Path(path), board, rate_hz, server))
@@ -202,8 +204,9 @@ async def _measure(folder: Path, board: TimedBoard, rate_hz: int, server: Broker
             service.send_signal(signal.SIGINT)
             await asyncio.wait_for(service.wait(), PATIENCE_S)
             listening.cancel()
-    samples = np.rint(np.array([s.board_time_s for s in published]) * rate_hz).astype(int)
-    latency_s = np.array([s.arrival_s for s in published]) - np.array(board.sent_s)[samples]
+    # The index of a frame of the board follows from the time of its sample, because a frame has one sample.
+    frames = np.rint(np.array([s.board_time_s for s in published]) * rate_hz).astype(int)
+    latency_s = np.array([s.arrival_s for s in published]) - np.array(board.sent_s)[frames]
     return Run(states[0].arrival_s - started_s, cpu, latency_s, len(board.sent_s), states[-1])
 
 

@@ -1,4 +1,4 @@
-"""Simulated load of the benchmarks: current pulses of the thesis's pack behind a board."""
+"""Simulated load of the benchmarks: the pack of the thesis under current pulses, measured by a board."""
 
 import numpy as np
 
@@ -29,7 +29,8 @@ def pulses(samples: int, rate_hz: int = RATE_HZ) -> SampleBlock:
     block = np.zeros(samples, dtype=SAMPLE)
     time_s = np.arange(samples) / rate_hz
     current_a = ON_A * (time_s % (2.0 * HALF_PERIOD_S) < HALF_PERIOD_S)
-    voltage_v, _ = simulate_cell((0.9, 0.0, 0.0), time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
+    initial_state = (0.9, 0.0, 0.0)  # SOC and both RC voltages
+    voltage_v, _ = simulate_cell(initial_state, time_s, current_a, cell.cell.capacity_ah * 3600.0, cell.a)
     noise = np.random.default_rng(1).uniform(-0.5, 0.5, (2, samples))
     block["time_s"] = time_s
     block["current_a"] = np.round(current_a / CURRENT_STEP_A + noise[0]) * CURRENT_STEP_A

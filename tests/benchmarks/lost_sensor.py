@@ -1,6 +1,7 @@
-"""Attack by a lost sensor: while a pack is charged, its temperature and later its cell voltages become null.
+"""Lost sensor: while a pack is charged, its temperature and later its cell voltages become null.
 
-Service and Mosquitto are separate processes. A hook that lists one critical alarm, and not ``sensor_fault``, must run.
+Service and Mosquitto are separate processes. The critical alarm that needs the lost quantity can then no longer be raised.
+Its hook must run nevertheless, although the hook does not list ``sensor_fault``.
 """
 
 import asyncio
@@ -22,10 +23,11 @@ from tests.patience import LONG_S
 
 CHARGE_A = -30.0
 PERIOD_S = 0.1
+"""Interval of the publisher [s]."""
 LATE_S = 3.0
 """Maximum time from the end of the delay to the hook's program [s]."""
-LOSSES = {"t": "over_temperature", "cells": "cell_over_voltage"}
-"""Quantities of the publisher, and the alarm that needs each."""
+ALARM_OF_QUANTITY = {"t": "over_temperature", "cells": "cell_over_voltage"}
+"""Quantities that become null, by their names in the publisher's messages, and the alarm that needs each."""
 PACK_TOML = """
 [pack]
 name = "attack"
@@ -63,47 +65,55 @@ class Loss:
         alarm: Alarm that needs the quantity.
         fault_s: Time until ``sensor_fault`` [s].
         hook_s: Time until the hook's program ran [s].
-        runs_before: Alarm and state of each run of the program, until the quantity was restored.
+        runs: Alarm and state of each run of the program.
     """
 
     alarm: str
     fault_s: float
     hook_s: float
-    runs_before: tuple[str, ...]
+    runs: tuple[str, ...]
 
 
-async def attack(broker: Broker, folder: Path, lost_s: float) -> list[Loss]:
-    """Run the service; remove and restore one quantity after the other."""
+async def lose_quantities(broker: Broker, folder: Path, lost_s: float) -> list[Loss]:
+    """Run the service; remove and restore one quantity after the other.
+
+    ``lost_s`` is the delay of the alarm, as in the settings [s].
+    """
     out, program = folder / "ran", folder / "hook"
     out.touch()
     program.write_text(f'#!/bin/sh\necho "$BMS_NAME $BMS_STATE" >> {out}\n')
     program.chmod(0o700)
     text = PACK_TOML.format(url=broker.url, folder=folder, lost_s=lost_s)
     pack = folder / "attack.toml"
-    pack.write_text(text + "".join(HOOK_TOML.format(alarm=alarm, program=program) for alarm in LOSSES.values()))
+    pack.write_text(
+        text + "".join(HOOK_TOML.format(alarm=alarm, program=program) for alarm in ALARM_OF_QUANTITY.values())
+    )
     values: dict[str, object] = {"u": 13.4, "i": CHARGE_A, "t": 25.0, "cells": [3.35] * 4}
     async with Listener(broker, "bms/attack/alarm/#") as live, _service(pack, folder), _publisher(broker, values):
-        return [await _lose_quantity(live, out, values, quantity, alarm) for quantity, alarm in LOSSES.items()]
+        return [
+            await _lose_quantity(live, out, values, quantity, alarm) for quantity, alarm in ALARM_OF_QUANTITY.items()
+        ]
 
 
 async def _lose_quantity(live: Listener, out: Path, values: dict[str, object], quantity: str, alarm: str) -> Loss:
-    """Publish null for a quantity until its alarm's hook has run; then restore the quantity."""
+    """Publish null for a quantity until the hook of ``alarm`` has run; then restore the quantity."""
     fault, topic, runs_before = "bms/attack/alarm/sensor_fault", f"bms/attack/alarm/{alarm}", len(_lines(out))
     await live.wait_json(topic, lambda message: message["watched"] and not message["active"])
-    before, lost_at_s, begin = values[quantity], time.monotonic(), len(live.messages)
+    value, lost_at_s, messages_before = values[quantity], time.monotonic(), len(live.messages)
     values[quantity] = None
-    await live.wait_json(fault, lambda message: message["active"] and alarm in message["text"], begin)
+    await live.wait_json(fault, lambda message: message["active"] and alarm in message["text"], messages_before)
     fault_s = time.monotonic() - lost_at_s
     await _wait_for_lines(out, runs_before + 1)
     hook_s = time.monotonic() - lost_at_s
-    values[quantity], restored = before, len(live.messages)
-    await _wait_for_lines(out, runs_before + 2)
-    await live.wait_json(fault, lambda message: not message["active"], restored)
+    values[quantity], messages_before = value, len(live.messages)
+    await _wait_for_lines(out, runs_before + 2)  # the run for the cleared alarm
+    await live.wait_json(fault, lambda message: not message["active"], messages_before)
     return Loss(alarm, fault_s, hook_s, tuple(_lines(out)[runs_before:]))
 
 
 @contextlib.asynccontextmanager
 async def _service(pack: Path, folder: Path) -> AsyncIterator[None]:
+    """Run the service while the context lasts."""
     program = Path(sys.executable).with_name("bms-estimator")
     with (folder / "log").open("w") as log:
         service = await asyncio.create_subprocess_exec(program, "run", "--no-view", pack, stdout=log, stderr=log)
@@ -117,6 +127,8 @@ async def _service(pack: Path, folder: Path) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def _publisher(broker: Broker, values: dict[str, object]) -> AsyncIterator[None]:
+    """Publish ``values``, which may change meanwhile, while the context lasts."""
+
     async def publish() -> None:
         async with aiomqtt.Client("127.0.0.1", broker.port) as client:
             while True:
@@ -144,9 +156,9 @@ def _lines(out: Path) -> list[str]:
 def rows(broker: Broker, folder: Path, lost_s: float) -> Iterator[Row]:
     """Measure the reaction to each lost quantity."""
     latest_s = lost_s + LATE_S
-    for loss in asyncio.run(attack(broker, folder, lost_s)):
+    for loss in asyncio.run(lose_quantities(broker, folder, lost_s)):
         in_time = lost_s <= loss.fault_s <= latest_s and lost_s <= loss.hook_s <= latest_s
-        ran_as_expected = loss.runs_before == (f"{loss.alarm} raised", f"{loss.alarm} cleared")
+        ran_as_expected = loss.runs == (f"{loss.alarm} raised", f"{loss.alarm} cleared")
         yield Row(
             f"a charged pack loses what {loss.alarm} needs",
             f"alarm and hook after {lost_s:g} to {latest_s:g} s",

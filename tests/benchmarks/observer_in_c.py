@@ -1,4 +1,4 @@
-"""Observer step in C, compiled from uas_step.c. It works on the records of the kernels."""
+"""Observer step in C, compiled from uas_step.c. It works on the same records as the kernels."""
 
 import ctypes
 import subprocess
@@ -20,7 +20,7 @@ C_TYPES = {"f8": "double", "i8": "int64_t", "u4": "uint32_t"}
 
 
 class ObserverInC:
-    """``run`` of the kernels in C.
+    """``kernels.step.run`` in C, for the observer alone.
 
     Args:
         folder: Folder in which the library is built.
@@ -44,7 +44,7 @@ class ObserverInC:
 
 
 def header() -> str:
-    """Return the record types as C structures with the alignment of numpy."""
+    """Return the text of records.h: constants, and the record types as C structures with the alignment of numpy."""
     constants = {
         "OCV_POINTS": OCV_POINTS,
         "INVERSE_ERROR_V": INVERSE_ERROR_V,

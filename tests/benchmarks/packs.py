@@ -17,6 +17,7 @@ from table import Row
 
 PACKS, RATE_HZ, PUBLISH_RATE_HZ = 20, 10, 1.0
 MAX_CPU, MAX_MIB = 0.25, 400.0
+"""Limits of CPU time, as a fraction of a core, and of resident memory [MiB]."""
 
 
 def rows() -> Iterator[Row]:
@@ -38,7 +39,7 @@ def rows() -> Iterator[Row]:
 
 
 async def _measure(folder: Path, boards: list[TimedBoard], server: Broker) -> tuple[float, dict[str, Any]]:
-    """Return the CPU time of the service as a fraction of a core once all packs are live, and the last health of each."""
+    """Measure the service once all packs are live. Return its CPU time as a fraction of a core, and the last health messages."""
     packs = [
         pack_file(folder, f"pack{i}", board.path, RATE_HZ, server, PUBLISH_RATE_HZ) for i, board in enumerate(boards)
     ]
@@ -67,6 +68,7 @@ async def _measure(folder: Path, boards: list[TimedBoard], server: Broker) -> tu
 
 
 async def _listen(client: aiomqtt.Client, health: dict[str, Any], all_live: asyncio.Event) -> None:
+    """Store the last health message by topic, and set ``all_live`` once every sensor is online."""
     async for message in client.messages:
         health[message.topic.value] = json.loads(message.payload)
         if sum(h["sensor_online"] for h in health.values()) == PACKS:

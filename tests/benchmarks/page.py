@@ -19,14 +19,15 @@ from tests.page.house import Service, simulated
 MINUTES = 5.0
 SETTLE_S = 20.0
 """Time from the first paint to the measurement [s]."""
-STEP_S = 30.0
+HEAP_INTERVAL_S = 30.0
 """Interval of the heap measurements [s]."""
 MAX_CPU = 0.15
 """Limit of the CPU time of Chromium as a fraction of a core."""
 MAX_PAINT_S = 1.0
 MAX_GROWTH_MIB = 4.0
 """Limit of the growth of the JavaScript heap [MiB]."""
-FIRST_PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
+FIRST_PAINT_MS = "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
+"""JavaScript that returns the time of the first paint [ms]."""
 
 
 def process_tree(pid: int) -> list[psutil.Process]:
@@ -53,13 +54,14 @@ def print_line(text: str) -> None:
 
 
 async def measure(service: Service, minutes: float) -> None:
-    """Measure one page for ``minutes``."""
+    """Show the page of ``service`` in Chromium for ``minutes``, and print first paint, CPU time and heap."""
     async with chromium() as browser, tab(browser, service.url) as page_tab:
         await page_tab.until_status("live")
         await page_tab.until("() => performance.getEntriesByName('first-contentful-paint').length")
-        print_line(f"first paint {await page_tab.page.evaluate(FIRST_PAINT) / 1e3:.2f} s (below {MAX_PAINT_S:g} s)")
+        print_line(f"first paint {await page_tab.page.evaluate(FIRST_PAINT_MS) / 1e3:.2f} s (below {MAX_PAINT_S:g} s)")
         session = await page_tab.page.context.new_cdp_session(page_tab.page)
         await asyncio.sleep(SETTLE_S)
+        # Chromium is a descendant of this process.
         chromium_processes = [p for p in process_tree(psutil.Process().pid) if "chrom" in p.name()]
         renderers = [p for p in chromium_processes if "--type=renderer" in p.cmdline()]
         begin_s, chromium_before_s, renderer_before_s, service_before_s = (
@@ -70,7 +72,7 @@ async def measure(service: Service, minutes: float) -> None:
         )
         heaps_mib = []
         while time.monotonic() - begin_s < 60.0 * minutes:
-            await asyncio.sleep(STEP_S)
+            await asyncio.sleep(HEAP_INTERVAL_S)
             await session.send("HeapProfiler.collectGarbage")
             heaps_mib.append((await session.send("Runtime.getHeapUsage"))["usedSize"] / 2**20)
         elapsed_s = time.monotonic() - begin_s

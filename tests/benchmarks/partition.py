@@ -1,4 +1,4 @@
-"""Benchmark of a worker: CPU time of a block, in total and by part, and memory and checkpoint size of a pack."""
+"""Benchmark of a fleet worker: CPU time of a block, in total and by part, and memory and checkpoint size of a pack."""
 
 import sys
 import time
@@ -20,11 +20,13 @@ from bms_estimator.telemetry.remaining_charge import remaining_charge
 from bms_estimator.telemetry.state import make_state_payload
 
 PACKS, MINUTES, SAMPLES = 100, 90, 60
+"""Number of packs, number of blocks (one a minute) of each pack, and number of samples of a block."""
 HOUR = 480_000
 """Hour of the blocks [h since 1970]."""
 STORE_ID = HOUR * 3600 * 10**9
 """Identifier of the edge's block store: its creation time [ns since 1970]."""
 ROUNDS, CALLS = 5, 400
+"""Number of measurements of a part, of which the shortest counts, and number of calls in each."""
 MAX_US = 250.0
 """Limit of the CPU time of a block [us]."""
 SETTINGS, CELL_MODEL = Settings(), load_cell(CELL)
@@ -35,8 +37,10 @@ def rows() -> Iterator[Row]:
     samples = pulses(MINUTES * SAMPLES, rate_hz=1)
     blocks = [_block(samples, minute) for minute in range(MINUTES)]
     partition = Partition(0, lambda _: (SETTINGS, CELL_MODEL))
-    each_us = _block_us(partition, blocks)
-    yield Row(f"a block of {SAMPLES} samples, all in", f"below {MAX_US:.0f} us", f"{each_us:.0f} us", each_us < MAX_US)
+    block_us = _block_us(partition, blocks)
+    yield Row(
+        f"a block of {SAMPLES} samples, in total", f"below {MAX_US:.0f} us", f"{block_us:.0f} us", block_us < MAX_US
+    )
     for part_name, us in _part_us(partition, samples, blocks):
         yield Row(f"  {part_name}", "-", f"{us:.1f} us", None)
     packs = partition.snapshot().packs
@@ -54,8 +58,10 @@ def rows() -> Iterator[Row]:
 
 
 def _block(samples: SampleBlock, minute: int) -> bytes:
+    """Return the encoded block of one minute."""
     part = samples[minute * SAMPLES : (minute + 1) * SAMPLES]
-    return encode(Block(STORE_ID, minute + 1, 1, STORE_ID / 1e9 + float(part["time_s"][-1]), part))
+    arrival_s = STORE_ID / 1e9 + float(part["time_s"][-1])
+    return encode(Block(store=STORE_ID, number=minute + 1, oldest=1, arrival_s=arrival_s, samples=part))
 
 
 def _block_us(partition: Partition, blocks: list[bytes]) -> float:
@@ -71,16 +77,17 @@ def _block_us(partition: Partition, blocks: list[bytes]) -> float:
             partition.take(f"pack{pack}", data, sequence)
         minutes_s.append(time.process_time() - begin_s)
     median_s = np.median(minutes_s[1:])
+    # The first block after the full hour also completes the summary of the hour.
     hourly_s = max(minutes_s[60] - median_s, 0.0) / 60
     return float(1e6 * (median_s + hourly_s) / PACKS)
 
 
 def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
     """Yield the time of each part, on the state before the last block [us]."""
-    work_record, pack_type = partition._unpacked, partition._type_by_pack["pack0"]
+    unpacked, pack_type = partition._unpacked, partition._type_by_pack["pack0"]
     estimator, wall_s = pack_type.estimator, STORE_ID / 1e9 + samples.size
     packed, block, window = partition._packs["pack0"], decode(blocks[-1]), Window()
-    work_record.put(packed)
+    unpacked.load(packed)
     before, trace = estimator.record.copy(), estimator.run(block.samples).copy()
 
     def state() -> bytes:
@@ -98,22 +105,23 @@ def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) ->
         estimator.record[...] = before
         estimator.run(block.samples)
 
-    put_back_us = _call_us(lambda: estimator.record.__setitem__(..., before))
-    yield "its bytes", _call_us(lambda: decode(blocks[-1]))
-    yield "the state unpacked", _call_us(lambda: work_record.put(packed))
-    yield "the estimator", _call_us(step) - put_back_us
-    yield "the hour's sums", _call_us(lambda: hour_summary.add(work_record.record["hour"], trace, block, estimator))
-    yield "what has flowed", _call_us(lambda: (pack_type.meter.add(trace), pack_type.meter.update_totals()))
+    restore_us = _call_us(lambda: estimator.record.__setitem__(..., before))
+    yield "decoding its bytes", _call_us(lambda: decode(blocks[-1]))
+    yield "unpacking the state of the pack", _call_us(lambda: unpacked.load(packed))
+    yield "the estimator", _call_us(step) - restore_us
+    yield "the hour's sums", _call_us(lambda: hour_summary.add(unpacked.record["hour"], trace, block, estimator))
+    yield "charge and energy", _call_us(lambda: (pack_type.meter.add(trace), pack_type.meter.update_totals()))
     yield "topic state", _call_us(state)
-    yield "the state packed", _call_us(work_record.take)
+    yield "packing the state of the pack", _call_us(unpacked.packed_bytes)
     parameters_us = _call_us(lambda: make_parameters_payload(estimator, wall_s).model_dump_json())
     row_us = _call_us(
-        lambda: hour_summary.row(pack_type.settings, HOUR, work_record.record["hour"], estimator).model_dump_json()
+        lambda: hour_summary.row(pack_type.settings, HOUR, unpacked.record["hour"], estimator).model_dump_json()
     )
     yield "topic parameters and the row of an hour, a 60th of it", (parameters_us + row_us) / 60
 
 
 def _call_us(call: Callable[[], object]) -> float:
+    """Return the CPU time of a call [us]."""
     min_s = float("inf")
     for _ in range(ROUNDS):
         begin_s = time.process_time()

@@ -10,16 +10,15 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 
 LOWEST_SOC = 0.1
+"""SOC below which samples are not used."""
 MAX_INITIAL_SOC = 1.0 - 1e-3
 """Maximum initial SOC. At an SOC nearer to 1 the current noise at rest would end the simulation."""
-SPAN = 4.0
-"""Factor of the bounds around the start, as for the observer's parameters."""
-
-
+BOUND_FACTOR = 4.0
+"""Ratio of upper bound to initial value, and of initial value to lower bound, as for the observer's parameters."""
 UNREACHED_V = 1e3
 """Voltage limit that no simulation reaches, not even with the extreme values that the optimizer tries [V]."""
 CHANGE_C = 0.02
-"""Minimum current change of which both rows are used [C]."""
+"""Minimum change of the current before and after which the rows are always used [C-rate]."""
 EVERY_S = 10.0
 """Maximum interval between used rows [s]."""
 MAX_ROWS = 7_000
@@ -27,7 +26,7 @@ MAX_ROWS = 7_000
 
 
 def thin_out(samples: SampleBlock, change_a: float) -> SampleBlock:
-    """Return about a tenth of the rows of a test at 1 Hz, with all current steps.
+    """Return about a tenth of the rows of a test at 1 Hz, with all steps of the current by more than ``change_a``.
 
     A fit to them takes one minute instead of five.
     """
@@ -76,7 +75,9 @@ def fit(
         }
         | {
             name: pybop.Parameter(
-                initial_value=value, bounds=[value / SPAN, SPAN * value], transformation=pybop.LogTransformation()
+                initial_value=value,
+                bounds=[value / BOUND_FACTOR, BOUND_FACTOR * value],
+                transformation=pybop.LogTransformation(),
             )
             for name, value in start.items()
         },
@@ -89,14 +90,14 @@ def fit(
             "Voltage [V]": np.ascontiguousarray(samples["voltage_v"]),
         }
     )
-    solver = pybamm.IDAKLUSolver(  # PyBOP's recommended one steps over short pulses
+    solver = pybamm.IDAKLUSolver(  # the solver that PyBOP recommends skips short pulses
         atol=1e-6, rtol=1e-6, on_failure="ignore", options={"dt_max": EVERY_S}
     )
     problem = pybop.Problem(
         pybop.pybamm.Simulator(model, parameter_values=values, protocol=dataset, solver=solver),
         pybop.SumSquaredError(dataset),
     )
-    np.random.seed(seed)  # noqa: NPY002 - the generator that pints draws CMA-ES's own seed from
+    np.random.seed(seed)  # noqa: NPY002 - pints draws the seed of CMA-ES from this generator
     result = pybop.CMAES(problem, options=pybop.PintsOptions(max_iterations=100)).run()
     best = result.best_inputs
     return tuple(float(best[name]) for name in ("R0 [Ohm]", "R1 [Ohm]", "C1 [F]", "R2 [Ohm]", "C2 [F]"))  # type: ignore[return-value]

@@ -16,24 +16,26 @@ from bms_estimator.sources.captures.replay import load_capture
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
-WRONG = (-0.2, 0.2)
+SOC_ERRORS = (-0.2, 0.2)
+"""Errors of the initial SOC; each run is done with both."""
 IN_MID_LOAD, FROM_START = 0.35, 0.0
-"""Fraction of the charge before the first used sample."""
+"""Fraction of the charge of a capture that has flowed before the first used sample."""
 LOWEST_V, HIGHEST_V = 1.5, 4.5
 """Range of valid cell voltages [V]."""
 PF, NCR, LFP = "panasonic18650pf/", "ncr18650/", "a123/"
+"""Folders of the captures of the Panasonic 18650PF, NCR18650 and A123 cells."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Captures from which `ocv` and `identify` compute a cell file, or the generic cell that is used instead."""
+    """Captures from which the commands `ocv` and `identify` compute a cell file, or a generic cell in its place."""
 
     capacity_ah: float
     ocv: tuple[str, ...] = ()
     identify: tuple[str, ...] = ()
     generic: str = ""
-    measured: bool = False
-    """True if `ocv` measures the capacity."""
+    measures_capacity: bool = False
+    """True if `ocv` measures the capacity, so that it is not declared."""
 
 
 PF_HPPC = tuple(PF + f"{t}_hppc" for t in ("25", "10", "0", "n10"))
@@ -51,7 +53,7 @@ LFP_CELL = Recipe(
     2.05,
     tuple(LFP + f"c30_{way}_{t}" for way in ("dis", "chg") for t in ("p25", "p05", "n15")),
     tuple(LFP + f"dyn_{t}" for t in ("p25", "p05", "n15")),
-    measured=True,
+    measures_capacity=True,
 )
 LFP_PAIR = replace(LFP_CELL, ocv=(LFP + "c30_dis_p25", LFP + "c30_chg_p25"), identify=())
 LFP_WITHOUT_5 = replace(LFP_CELL, identify=(LFP + "dyn_p25", LFP + "dyn_n15"))
@@ -59,15 +61,19 @@ LFP_WITHOUT_5 = replace(LFP_CELL, identify=(LFP + "dyn_p25", LFP + "dyn_n15"))
 
 @dataclass(frozen=True)
 class Group:
-    """Captures of one kind: name, capacity for the true SOC [Ah], SOC at the first sample."""
+    """Captures of one kind, with one cell file."""
 
     name: str
     recipe: Recipe
     captures: tuple[tuple[str, float, float], ...]
+    """Name, capacity for the true SOC [Ah] and SOC at the first sample of each capture."""
     cut: float = IN_MID_LOAD
+    """Fraction of the charge that has flowed when the estimator starts."""
     gain: float = 1.0
+    """Gain error of the current sensor: measured divided by true current."""
     offset_a: float = 0.0
-    capacity: float = 1.0
+    """Offset of the current sensor [A]."""
+    capacity_ratio: float = 1.0
     """Declared divided by true capacity."""
     charging: bool = False
     """True: the estimator starts in the charge after the lowest SOC, and ``cut`` is a fraction of that charge."""
@@ -95,13 +101,13 @@ LFP_FILES = (
     ("5", "", LFP_WITHOUT_5),
     ("-15", " (its own file)", LFP_CELL),
 )
-"""The capture at 5 C is not used for the file."""
+"""Temperature [C], note and recipe of each group. The file for the capture at 5 C does not use this capture."""
 LFP_CHARGES = {
     t: ((LFP + name, 2.05, soc),)
     for t, name, soc in (("25", "c30_chg_p25", -0.006), ("5", "c30_chg_p05", 0.011), ("-15", "c30_chg_n15", 0.061))
 }
 NCR_CHARGE = ((NCR + "cell1_charge_c20", 3.064, 0.0),)
-"""Charges to full."""
+"""Charge from empty to full."""
 LG_CHARGES = (("lgm50/rate_0p1c_25c", 4.945, 1.0), ("lgm50/rate_1c_25c", 4.945, 1.0))
 """Captures of a discharge followed by a charge at C/3."""
 LG_DISCHARGES = (("lgm50/rate_0p5c_25c", 4.945, 1.0), ("lgm50/rate_1c_25c", 4.945, 1.0))
@@ -119,7 +125,7 @@ GROUPS = (
     Group("NCR, current +5 %", NCR_CELL, NCR_CHANGING, gain=1.05),
     *(Group(f"NCR, {1e3 * a:+.0f} mA", NCR_CELL, NCR_CHANGING, offset_a=a) for a in (-0.05, 0.05)),
     *(
-        Group(f"NCR, capacity {100 * q:+.0f} %", NCR_CELL, NCR_CHANGING, capacity=1 + q)
+        Group(f"NCR, capacity {100 * q:+.0f} %", NCR_CELL, NCR_CHANGING, capacity_ratio=1 + q)
         for q in (-0.05, 0.05, -0.2, 0.2)
     ),
     Group("Leaf (its own file)", LEAF, LEAF_CAPTURES),
@@ -162,46 +168,48 @@ def chosen(groups: Iterable[Group], parts: list[str]) -> list[Group]:
 
 
 def runs(group: Group, folder: Path) -> Iterator[tuple[CellModel, SampleBlock, Floats, float]]:
-    """Yield cell file, samples, true SOC and initial SOC of each capture and start."""
+    """Yield cell file, samples, true SOC and (wrong) initial SOC of each run: each capture with each of ``SOC_ERRORS``."""
     true_ah = group.recipe.capacity_ah
     cell = cell_file(group.recipe, folder)
-    if group.capacity != 1.0:
-        capacity = cell.cell.model_copy(update={"capacity_ah": group.capacity * true_ah})
-        cell = cell.model_copy(update={"cell": capacity})
+    if group.capacity_ratio != 1.0:
+        declared = cell.cell.model_copy(update={"capacity_ah": group.capacity_ratio * true_ah})
+        cell = cell.model_copy(update={"cell": declared})
     for name, capacity_ah, initial_soc in group.captures:
         samples, soc = load(name, capacity_ah, initial_soc)
         begin = first_sample(samples, group)
-        seen, truth = samples[begin:].copy(), soc[begin:]
-        seen["current_a"] = group.gain * seen["current_a"] + group.offset_a
-        for wrong in WRONG:
-            yield cell, seen, truth, float(np.clip(truth[0] + wrong, 0.0, 1.0))
+        measured, true_soc = samples[begin:].copy(), soc[begin:]
+        measured["current_a"] = group.gain * measured["current_a"] + group.offset_a
+        for soc_error in SOC_ERRORS:
+            yield cell, measured, true_soc, float(np.clip(true_soc[0] + soc_error, 0.0, 1.0))
 
 
 def first_sample(samples: SampleBlock, group: Group) -> int:
-    """Return the index of the first sample of the estimator."""
+    """Return the index of the sample at which the estimator starts, by ``cut`` and ``charging`` of the group."""
     discharged_ah = charge_ah(samples)
     lowest = int(np.argmax(discharged_ah)) if group.charging else 0
-    charge_from_lowest_ah = np.abs(discharged_ah[lowest:] - discharged_ah[lowest])
-    return lowest + int(np.argmax(charge_from_lowest_ah >= group.cut * charge_from_lowest_ah[-1]))
+    moved_ah = np.abs(discharged_ah[lowest:] - discharged_ah[lowest])
+    return lowest + int(np.argmax(moved_ah >= group.cut * moved_ah[-1]))
 
 
 @cache
 def cell_file(recipe: Recipe, folder: Path) -> CellModel:
-    """Return the cell file by `ocv` and `identify`. If `identify` fails, its error is printed and the file of `ocv` used."""
+    """Return the cell file by `ocv` and `identify`. If `identify` fails, print its error and return the file by `ocv`."""
     if recipe.generic:
         return load_cell(recipe.generic, recipe.capacity_ah)
     captures = *recipe.ocv, *recipe.identify
     stem = f"{captures[0].replace('/', '_')}_{len(captures)}_{captures[-1].replace('/', '_')}"
     ocv_file, identified_file = folder / f"{stem}_ocv.toml", folder / f"{stem}.toml"
-    capacity_option = () if recipe.measured else ("--capacity-ah", recipe.capacity_ah)
-    command("ocv", *map(path_of, recipe.ocv), *capacity_option, "--out", ocv_file)
+    capacity_option = () if recipe.measures_capacity else ("--capacity-ah", recipe.capacity_ah)
+    run_command("ocv", *map(path_of, recipe.ocv), *capacity_option, "--out", ocv_file)
     if not recipe.identify:
         return load_cell(ocv_file)
-    identify_error = command("identify", *map(path_of, recipe.identify), "--cell", ocv_file, "--out", identified_file)
+    identify_error = run_command(
+        "identify", *map(path_of, recipe.identify), "--cell", ocv_file, "--out", identified_file
+    )
     return load_cell(ocv_file if identify_error else identified_file)
 
 
-def command(*arguments: object) -> str:
+def run_command(*arguments: object) -> str:
     """Run the program; return its error text, empty if it succeeded."""
     process = subprocess.run([PROGRAM, *map(str, arguments)], capture_output=True, text=True, check=False)
     if process.returncode:
@@ -219,7 +227,7 @@ def load(name: str, capacity_ah: float, initial_soc: float) -> tuple[SampleBlock
     """Return samples without invalid voltages, and the true SOC at each."""
     rows = load_capture(path_of(name)).rows
     rows = rows[(rows["voltage_v"] > LOWEST_V) & (rows["voltage_v"] < HIGHEST_V)]
-    counter_file = DATA / f"{name}.soc.gz"
+    counter_file = DATA / f"{name}.soc.gz"  # true SOC by the charge counter of the tester
     if counter_file.exists():
         time_s, soc = np.genfromtxt(counter_file, delimiter=",", skip_header=1).T
         return rows, np.interp(rows["time_s"], time_s, soc)

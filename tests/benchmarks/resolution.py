@@ -1,7 +1,7 @@
 """Effect of sample rate, resolution and delay of a source on the SOC and its interval, on cells that differ from the model.
 
 Each row is a kind of source. A run is one simulated cell of ``tests.estimator.anywhere``, whose cell file has errors of the
-declared size. The load has levels of some seconds, or is that of a house. The estimator starts in mid-load with an SOC 0.2 too
+size that it declares. The load changes after some seconds, as in a drive, or is that of a house. The estimator starts in mid-load with an SOC 0.2 too
 low or 0.2 too high. Results are scored from 15 min on, above SOC 0.05:
 
 - RMSE: error of the SOC, of all runs and of the worst run [%]
@@ -31,9 +31,8 @@ from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.truth import simulate
 
 TRUTH_HZ = 10
-"""Number of true steps for each sample of slower sources."""
+"""Minimum rate of the simulation of the cell [Hz]."""
 SEEDS = range(1, 9)
-KELVIN_STEP = 1.0
 NOISE_V = 5e-4
 JITTER = 0.02
 """Jitter of the sample times [periods]."""
@@ -45,7 +44,9 @@ class Source:
 
     rate_hz: float = 1.0
     ampere_step: float = 0.01
+    """Resolution of the current [A]."""
     dead_band_a: float = 0.0
+    """Current below which the source reports 0 [A]."""
     delay_s: float = 0.0
     """Age of a sample's current minus that of its voltage [s]."""
     volt_step: float = 1e-3
@@ -55,6 +56,7 @@ class Source:
     house: bool = False
     """True: hours of small loads and a night of standby; False: a drive."""
     standby_a: float = 0.0
+    """Current that always flows in the house [A]."""
 
     @property
     def name(self) -> str:
@@ -70,12 +72,12 @@ class Source:
 
     @property
     def sampling(self) -> Sampling:
-        """Return the declared sampling."""
+        """Return the sampling that the settings declare for the source."""
         return Sampling(1.0 / self.rate_hz, self.ampere_step, self.dead_band_a)
 
 
 RATES_HZ = (100.0, 1.0, 0.1, 1.0 / 60.0)
-SOURCES = (
+SOURCES = (  # rate, resolution of the current, dead band
     *(Source(rate, step) for step in (0.01, 0.1) for rate in RATES_HZ),
     *(Source(rate, delay_s=delay_s) for delay_s in (1.0, -1.0) for rate in RATES_HZ),
     *(
@@ -118,7 +120,7 @@ def table_cells(results: list[Score]) -> Iterator[str]:
 
 
 def scores(source: Source, *, is_declared: bool = True, seeds: Iterable[int] = SEEDS) -> Iterator[Score]:
-    """Return the scores of each run of a kind of source."""
+    """Yield the score of each run of a kind of source."""
     for case in cases_of(source, seeds):
         samples, soc = sample_source(case, source)
         for soc_error in SOC_ERRORS:
@@ -136,7 +138,7 @@ def scores(source: Source, *, is_declared: bool = True, seeds: Iterable[int] = S
 
 
 def cases_of(source: Source, seeds: Iterable[int]) -> Iterator[Case]:
-    """Yield cells and loads, alternating between oxide and phosphate."""
+    """Yield a case (cell, cell file and load) for each seed, alternating between oxide and phosphate."""
     for seed in seeds:
         truth, file_c = (OXIDE, (25.0, 10.0, 0.0, -10.0)) if seed % 2 else (PHOSPHATE, (25.0, 5.0, -15.0))
         scaled = replace(truth, capacity_ah=source.capacity_ah, ohm=truth.ohm * truth.capacity_ah / source.capacity_ah)
@@ -146,20 +148,22 @@ def cases_of(source: Source, seeds: Iterable[int]) -> Iterator[Case]:
 
 def current_of(case: Case, source: Source, rate_hz: int) -> Floats:
     """Return the true current at ``rate_hz`` [A]; its levels change at arbitrary times."""
-    seconds = round(3600 * (case.unseen_h + case.hours))
+    seconds = round(3600 * (case.unseen_h + case.hours))  # the load before the estimator starts, and after it
     if not source.house:
         return np.repeat(load_a(case, seconds), rate_hz)
     rng, one_c = np.random.default_rng(case.seed), source.capacity_ah
+    # Appliances: levels of about 0.1 C and pauses, of four minutes on average. A night of standby follows after 5 h, and the
+    # last 3 h have a constant load.
     level_a = one_c * np.abs(rng.normal(0.08, 0.08, 400))
     level_a[rng.random(400) < 0.3] = 0.0
     level_a = np.repeat(level_a, rng.exponential(240.0, 400).astype(int) + 5)[:seconds]
-    level_a[5 * 3600 :] = 0.0  # the night
+    level_a[5 * 3600 :] = 0.0
     level_a[round(seconds - 3 * 3600) :] = 0.1 * one_c
     return np.repeat(level_a + source.standby_a, rate_hz)
 
 
 def sample_source(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
-    """Return the samples of the source, and the SOC at each."""
+    """Return the samples of the source until the cell is empty, and the true SOC at each."""
     rng = np.random.default_rng(1000 + case.seed)
     rate_hz = max(TRUTH_HZ, round(source.rate_hz))
     current_a = current_of(case, source, rate_hz)
@@ -177,15 +181,13 @@ def sample_source(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
         0,
         current_a.size - 1,
     )
-    empty = (soc[sample_indices] < 0.02) | (
-        voltage_v[sample_indices] < (2.5 if case.truth.ocv_v is OXIDE.ocv_v else 2.0)
-    )
+    cutoff_v = 2.5 if case.truth.ocv_v is OXIDE.ocv_v else 2.0
+    empty = (soc[sample_indices] < 0.02) | (voltage_v[sample_indices] < cutoff_v)  # the load would be disconnected
     sample_indices = sample_indices[: int(np.argmax(empty))] if empty.any() else sample_indices
     samples = np.zeros(sample_indices.size, dtype=SAMPLE)
     samples["time_s"] = sample_indices / rate_hz
-    reported_a = current_a[np.clip(sample_indices - delay_steps, 0, current_a.size - 1)] + rng.normal(
-        0.0, 2e-3 * source.capacity_ah / 3.0, sample_indices.size
-    )
+    noise_a = rng.normal(0.0, 2e-3 * source.capacity_ah / 3.0, sample_indices.size)  # 2 mA on a cell of 3 Ah
+    reported_a = current_a[np.clip(sample_indices - delay_steps, 0, current_a.size - 1)] + noise_a
     reported_a[np.abs(reported_a) < source.dead_band_a] = 0.0
     samples["current_a"] = np.round(reported_a / source.ampere_step) * source.ampere_step
     samples["voltage_v"] = (

@@ -10,12 +10,14 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Row:
-    """Row: quantity, target, measured value, and True if the target is met (None: no target)."""
+    """Row of the table."""
 
     what: str
+    """Measured quantity."""
     target: str
     measured: str
     met: bool | None
+    """True if the target is met; None: there is no target."""
 
 
 def show(rows: Iterable[Row], title: str = "bms_estimator benchmarks") -> bool:

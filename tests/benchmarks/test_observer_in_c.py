@@ -1,4 +1,4 @@
-"""Equal results of the observer in C and of the kernel."""
+"""The observer in C has the results of the kernel, so that the benchmark compares equal work."""
 
 import shutil
 import sys
@@ -22,11 +22,11 @@ from observer_in_c import ObserverInC
     [ObserverSettings(), ObserverSettings(dead_zone_v=0.0), ObserverSettings(law="scheme-3", nussbaum="k2-cos")],
     ids=["default", "no dead zone", "scheme 3"],
 )
-def test_the_observer_in_c_equals_the_kernel(settings, tmp_path):
+def test_the_observer_in_c_gives_the_results_of_the_kernel(settings, tmp_path):
     if shutil.which("cc") is None:
         pytest.skip("no C compiler (apt install gcc)")
     block = pulses(60_000)
-    block["voltage_v"][20_000:20_010] = np.nan
+    block["voltage_v"][20_000:20_010] = np.nan  # ten samples that both must drop
     estimator, c_estimator = (Estimator(load_cell(CELL), settings, identifier=None) for _ in range(2))
     expected = estimator.run(block)
     trace = np.zeros(block.size, dtype=TRACE)

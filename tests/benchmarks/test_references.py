@@ -1,4 +1,4 @@
-"""References of the comparison with other methods: resistances and time constants of a cell with known elements."""
+"""References of the comparison with other methods, computed for a simulated cell with known elements."""
 
 import numpy as np
 import pytest
@@ -7,11 +7,11 @@ from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE
 from tests.benchmarks.side_by_side.references import (
+    fit_two_exponentials,
     pulse_resistance,
     relaxations,
-    settled_after,
-    two_exponentials,
-    with_jump,
+    settling_time_s,
+    with_resistance_step,
 )
 from tests.benchmarks.side_by_side.trials import Block
 
@@ -20,9 +20,11 @@ R_S, R_TS, TAU_TS, R_TL, TAU_TL = 0.08, 0.02, 20.0, 0.03, 300.0
 
 
 def elements() -> Floats:
-    """Return a1..a21 of two RC pairs that do not depend on SOC."""
+    """Return the coefficients a1..a21 of the thesis for elements that do not depend on SOC."""
     a = np.zeros(22)
+    # offsets of the elements (2.5)-(2.9); their amplitudes remain 0
     a[[3, 6, 9, 12, 15]] = R_TS, R_TL, TAU_TS / R_TS, TAU_TL / R_TL, R_S
+    # coefficients of the OCV (2.10)
     a[[16, 17, 18, 19]] = 0.5, 20.0, 3.4, 0.7
     return a
 
@@ -39,14 +41,14 @@ def relaxation_test(rest_s: int = 900, resolution_v: float = 1e-3) -> Block:
     return Block(samples, soc)
 
 
-def test_rc_products_from_rests_within_five_percent():
+def test_rests_with_noise_give_both_rc_products_within_five_percent():
     result = relaxations(relaxation_test(), CAPACITY_AH)
     assert result.soc.size >= 15
     assert np.median(result.tau_ts_s) == pytest.approx(TAU_TS, rel=0.05)
     assert np.median(result.tau_tl_s) == pytest.approx(TAU_TL, rel=0.05)
 
 
-def test_rc_products_without_noise_within_one_percent():
+def test_rests_without_noise_give_both_rc_products_within_one_percent():
     result = relaxations(relaxation_test(resolution_v=1e-7), CAPACITY_AH)
     assert result.soc.size == 17
     assert result.tau_ts_s == pytest.approx(TAU_TS, rel=0.01)
@@ -56,17 +58,18 @@ def test_rc_products_without_noise_within_one_percent():
 def test_a_short_rest_or_a_single_exponential_gives_no_time_constants():
     assert relaxations(relaxation_test(rest_s=500), CAPACITY_AH).soc.size == 0
     time_s = np.arange(1.0, 900.0)
-    assert two_exponentials(time_s, 3.7 - 0.02 * np.exp(-time_s / 100.0)) is None
+    assert fit_two_exponentials(time_s, 3.7 - 0.02 * np.exp(-time_s / 100.0)) is None
 
 
-def test_series_resistance_from_pulses_within_two_percent():
+def test_pulses_give_the_series_resistance_within_two_percent():
     result = pulse_resistance(relaxation_test(), CAPACITY_AH)
     assert result.ohm.size >= 30
-    expected_ohm = R_S + R_TS * (1.0 - np.exp(-1.0 / TAU_TS)) + R_TL * (1.0 - np.exp(-1.0 / TAU_TL))  # at 1 Hz
+    # At 1 Hz a pulse also contains the first second of both RC pairs.
+    expected_ohm = R_S + R_TS * (1.0 - np.exp(-1.0 / TAU_TS)) + R_TL * (1.0 - np.exp(-1.0 / TAU_TL))
     assert np.median(result.ohm) == pytest.approx(expected_ohm, rel=0.02)
 
 
-def test_pulses_with_a_voltage_one_row_late():
+def test_pulses_give_the_series_resistance_although_the_voltage_is_logged_one_row_late():
     time_s, current_a = [], []
     for n in range(12):  # at 1 Hz in rests and 10 Hz in pulses, as an HPPC is logged
         rest_s, pulse_s = np.arange(0.0, 600.0), np.arange(600.0, 610.0, 0.1)
@@ -82,9 +85,9 @@ def test_pulses_with_a_voltage_one_row_late():
     assert result.ohm == pytest.approx(R_S, rel=0.02)
 
 
-def test_step_of_resistance_is_visible_in_later_pulses():
+def test_a_step_of_the_resistance_appears_in_later_pulses_only():
     block = relaxation_test()
-    with_step, jump_s = with_jump(block, 0.04)
+    with_step, jump_s = with_resistance_step(block, more_ohm=0.04)
     before, after = (pulse_resistance(b, CAPACITY_AH) for b in (block, with_step))
     after_step = before.time_s > jump_s + 6000.0  # all nine pulses of the median are after the step
     assert after_step.sum() >= 5
@@ -94,12 +97,12 @@ def test_step_of_resistance_is_visible_in_later_pulses():
     assert np.array_equal(after.ohm[before_step], before.ohm[before_step])
 
 
-def test_settling_time_ends_only_when_the_value_stays():
+def test_the_settling_time_ends_when_the_value_stays_within_ten_percent():
     time_s = np.arange(0.0, 4000.0, 10.0)
     ratio = np.where(time_s < 1000.0, 1.0, 1.0 - 0.5 * np.exp(-(time_s - 1000.0) / 200.0))
-    settled_s = settled_after(time_s, ratio, 1000.0)
+    settled_s = settling_time_s(time_s, ratio, 1000.0)
     assert settled_s == pytest.approx(200.0 * np.log(5.0), abs=10.0)
     ratio[250] = 2.0  # a deviation at 2500 s, long after the value has settled
-    assert settled_after(time_s, ratio, 1000.0) == settled_s
-    assert settled_after(time_s, np.where(time_s < 1000.0, 1.0, 0.5), 1000.0) == np.inf
-    assert settled_after(time_s, np.where(time_s < 1000.0, 2.0, 1.0), 1000.0) is None
+    assert settling_time_s(time_s, ratio, 1000.0) == settled_s
+    assert settling_time_s(time_s, np.where(time_s < 1000.0, 1.0, 0.5), 1000.0) == np.inf
+    assert settling_time_s(time_s, np.where(time_s < 1000.0, 2.0, 1.0), 1000.0) is None

@@ -1,27 +1,29 @@
-/* One sample's way through the adaptive observer, the yardstick for the kernel that does the same:
- * judge, Algorithm 1 with (3.12), (3.13), (3.18), (4.1), loss of lock, a row of trace.
- * Line by line bms_estimator/kernels/{estimate,observer,nussbaum,mittag_leffler,margins,cell,charge}.py;
- * records.h is made from their record types. */
+/* Step of the adaptive observer of the thesis in C, with which the speed of the numba kernel is compared. For one sample:
+ * checks of the input, Algorithm 1 of the thesis with equations (3.12), (3.13), (3.18) and (4.1), detection of a lost lock,
+ * and a row of the trace. It computes what bms_estimator/kernels/{step,start}.py, kernels/observer/ and
+ * kernels/cell_model/chen_mora.py do, with the same names. observer_in_c.py writes records.h from their record types. */
 
 #include <math.h>
 #include <stdint.h>
 
 #include "records.h"
 
-#define SMALLEST_LOOP 0.1
-#define GAP_RATIO 3.0
-#define UNMEASURED_S 60.0
-#define LONGEST_FLOW_S 3600.0
-#define SATURATED_BITS 3u
+#define SMALLEST_LOOP 0.1     /* lower limit of 1 + N R_s, by which the tracking error is divided */
+#define GAP_RATIO 3.0         /* a step longer than so many previous steps is a gap */
+#define UNMEASURED_S 60.0     /* beyond this interval the current between two samples counts as unknown [s] */
+#define LONGEST_FLOW_S 3600.0 /* maximum time over which charge is counted between two samples [s] */
+#define SATURATED_BITS 3u     /* status of a sample: voltage or current beyond the range of the converter */
 
 enum verdict { ACCEPTED, NOT_FINITE, OUT_OF_RANGE, REPEATED, SATURATED };
 enum nussbaum { MITTAG_LEFFLER, K2_COS, K_COS_SQRT, LN_COS_SQRT_LN };
 
+/* circuit element over SOC */
 static double element(double amplitude, double exponent, double offset, double soc) /* (2.5)-(2.9) */
 {
     return amplitude * exp(-exponent * soc) + offset;
 }
 
+/* OCV by cubic interpolation of a table with slopes, linear outside SOC 0..1 [V] */
 static double ocv(double soc, const settings_t *p)
 {
     const int last = OCV_POINTS - 1;
@@ -37,6 +39,7 @@ static double ocv(double soc, const settings_t *p)
     return v[i] + w * (v[i + 1] - v[i]) + bend * ((1.0 - t) * slope[i] - t * slope[i + 1]);
 }
 
+/* inverse of ocv: bisection over the table, then the Illinois method within an interval */
 static double soc_from_ocv(double voltage_v, const settings_t *p)
 {
     const int last = OCV_POINTS - 1;
@@ -73,6 +76,7 @@ static double soc_from_ocv(double voltage_v, const settings_t *p)
     return soc;
 }
 
+/* SOC below which a capacitance is not positive */
 static double delta(double exponent, double offset, double amplitude) /* (2.11), (2.12) */
 {
     return -log(offset / amplitude) / exponent;
@@ -84,6 +88,7 @@ static void update_margins(state_t *s)
     s->delta_2 = delta(s->a[11], s->a[12], s->a[10]);
 }
 
+/* Mittag-Leffler function of -r^alpha: a series for small r, otherwise a wave plus a tabulated decay */
 static double mittag_leffler(double r, const settings_t *p)
 {
     if (r <= SERIES_LIMIT) {
@@ -102,6 +107,7 @@ static double mittag_leffler(double r, const settings_t *p)
     return wave + v[i] + w * (v[i + 1] - v[i]) + bend * ((1.0 - t) * slope[i] - t * slope[i + 1]);
 }
 
+/* N(k), limited */
 static double nussbaum_gain(double k, const settings_t *p)
 {
     double gain, log_k;
@@ -122,12 +128,14 @@ static double nussbaum_gain(double k, const settings_t *p)
     return fmin(fmax(gain, -p->gain_limit), p->gain_limit);
 }
 
+/* integral of exp(rate t) over 0..dt_s */
 static double integral_of_exponential(double rate, double dt_s)
 {
     double x = rate * dt_s;
     return fabs(x) < 1e-8 ? dt_s * (1.0 + 0.5 * x) : expm1(x) / rate;
 }
 
+/* a1..a15 after dt_s under a constant square of the tracking error; s->decay and s->settle are cached for equal steps */
 static void adapt(state_t *s, const settings_t *p, double dt_s, double e_squared) /* (3.16)-(3.18) */
 {
     if (dt_s != s->decay_dt_s) {
@@ -141,6 +149,7 @@ static void adapt(state_t *s, const settings_t *p, double dt_s, double e_squared
         s->a[i] = s->target[i] + (s->a[i] - s->target[i]) * s->decay[i] + p->drive[i] * e_squared * s->settle[i];
 }
 
+/* exact step of both RC voltages under a constant gain; return the decay rate of the tracking error [1/s] */
 static double states_step(state_t *s, double gain, double drop_v, double tau_ts, double tau_tl, double dt_s)
 {
     double mean = -gain - 0.5 * (1.0 / tau_ts + 1.0 / tau_tl);
@@ -177,6 +186,7 @@ static void start(state_t *s, const settings_t *p, double time_s, double current
     update_margins(s);
 }
 
+/* restart after a loss of lock: initial gain and parameters, RC voltages that explain the measured voltage */
 static void recover(state_t *s, const settings_t *p, double voltage_v, double e_o)
 {
     s->k = p->k0;
@@ -210,6 +220,7 @@ static void watch_lock(state_t *s, const settings_t *p, double dt_s, double volt
     }
 }
 
+/* mean current between two samples; after a long interval only what both samples have in common */
 static double held_current(double dt_s, double before_a, double now_a)
 {
     if (dt_s <= UNMEASURED_S)
@@ -219,7 +230,7 @@ static double held_current(double dt_s, double before_a, double now_a)
     return now_a > 0.0 ? fmin(before_a, now_a) : fmax(before_a, now_a);
 }
 
-/* SOC down to which the elements are evaluated (E14) */
+/* SOC down to which the elements are evaluated (erratum 14) */
 static double lowest(const state_t *s, const settings_t *p)
 {
     return fmax(s->delta_1, s->delta_2) + p->margin_guard;
@@ -262,6 +273,7 @@ static void observer_step(state_t *s, const settings_t *p, double dt_s, double c
     watch_lock(s, p, dt_s, voltage_v, e_o);
 }
 
+/* checks of the input, in the order of the kernel */
 static enum verdict judge(state_t *s, const settings_t *p, const sample_t *x)
 {
     if (!(isfinite(x->time_s) && isfinite(x->current_a) && isfinite(x->voltage_v))) {
@@ -330,6 +342,7 @@ static void write_row(trace_t *row, const state_t *s, const settings_t *p, const
     row->r_s_std_ohm = row->r_ts_std_ohm = row->tau_ts_std_s = row->r_tl_std_ohm = row->tau_tl_std_s = NAN;
 }
 
+/* process n samples; return the number of rows written to the trace */
 int64_t run(state_t *state, const settings_t *settings, const sample_t *samples, trace_t *trace, int64_t n)
 {
     int64_t rows = 0;

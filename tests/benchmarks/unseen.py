@@ -1,4 +1,4 @@
-"""Benchmark of kills, restarts and gaps on real captures: RMSE [%] / inside 2 soc_std [%] / interval score [%].
+"""Benchmark of kills, restarts and gaps on real captures: RMSE of the SOC / fraction inside 2 soc_std / interval score [%].
 
 The estimator starts in mid-load with an SOC 0.2 too low and 0.2 too high. Results are scored from 15 min later on, above SOC
 0.05, as in `make anywhere`.
@@ -22,21 +22,21 @@ from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import GROUPS, chosen, runs
 from tests.estimator.anywhere.score import score
 
-NAMES = ("PF 25 C, US06", "PF 0 C", "NCR", "NCR, constant current", "LFP 25 C (its own file)")
+DEFAULT_GROUPS = ("PF 25 C, US06", "PF 0 C", "NCR", "NCR, constant current", "LFP 25 C (its own file)")
 SEED = 1
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Disturbance at intervals of ``every_s`` that are random within a third. Samples are missing for ``missing_s``.
-
-    With ``age_s`` it is a kill: the estimator resumes from a checkpoint that is up to ``age_s`` old.
-    """
+    """Repeated disturbance. Its interval and duration vary at random by up to a third."""
 
     name: str
     every_s: float
+    """Interval between two disturbances [s]."""
     missing_s: float
-    age_s: float | None = None
+    """Time without samples [s]."""
+    max_age_s: float | None = None
+    """Maximum age of the checkpoint from which the estimator resumes [s]; None: the estimator is not killed."""
 
 
 DISTURBANCES = (
@@ -51,26 +51,26 @@ DISTURBANCES = (
 
 def run_with_disturbance(estimator: Estimator, samples: SampleBlock, disturbance: Disturbance) -> NDArray[np.void]:
     """Return the trace of a disturbed run."""
-    random, time_s, traces, i = np.random.default_rng(SEED), samples["time_s"], [], 0
-    while i < samples.size:
-        end_s = time_s[i] + disturbance.every_s * random.uniform(0.67, 1.33)
+    random, time_s, traces, begin = np.random.default_rng(SEED), samples["time_s"], [], 0
+    while begin < samples.size:
+        end_s = time_s[begin] + disturbance.every_s * random.uniform(0.67, 1.33)
         missing_s, age_s = (
             disturbance.missing_s * random.uniform(0.67, 1.33),
-            (disturbance.age_s or 0.0) * random.uniform(),
+            (disturbance.max_age_s or 0.0) * random.uniform(),
         )
         checkpoint_index, end = np.searchsorted(time_s, [end_s - age_s, end_s])
-        traces.append(estimator.run(samples[i:checkpoint_index]).copy())
+        traces.append(estimator.run(samples[begin:checkpoint_index]).copy())
         checkpoint = estimator.record.copy()
         traces.append(estimator.run(samples[checkpoint_index:end]).copy())
-        if disturbance.age_s is not None and checkpoint["observer"]["started"][0]:
+        if disturbance.max_age_s is not None and checkpoint["observer"]["started"][0]:
             estimator.record[...] = checkpoint
             estimator.resume(age_s + missing_s)
-        i = int(np.searchsorted(time_s, end_s + missing_s))
+        begin = int(np.searchsorted(time_s, end_s + missing_s))
     return np.concatenate(traces)
 
 
-def row(runs_of_group: Iterable[tuple[CellModel, SampleBlock, Floats, float]], disturbance: Disturbance) -> str:
-    """Return the means over the runs of a group as text."""
+def table_cell(runs_of_group: Iterable[tuple[CellModel, SampleBlock, Floats, float]], disturbance: Disturbance) -> str:
+    """Return the text of a table cell: the means over the runs of a group."""
     scores = []
     for cell, samples, truth, initial_soc in runs_of_group:
         trace = run_with_disturbance(Estimator(cell, initial_soc=initial_soc), samples, disturbance)
@@ -82,15 +82,15 @@ def row(runs_of_group: Iterable[tuple[CellModel, SampleBlock, Floats, float]], d
 
 
 def main() -> None:
-    """Print the table of the groups whose name contains an argument, or of ``NAMES``."""
-    groups = [g for g in chosen(GROUPS, sys.argv[1:]) if sys.argv[1:] or g.name in NAMES]
+    """Print the table of the groups whose name contains an argument, or of ``DEFAULT_GROUPS``."""
+    groups = [g for g in chosen(GROUPS, sys.argv[1:]) if sys.argv[1:] or g.name in DEFAULT_GROUPS]
     table = Table(title="through kills, restarts and gaps: RMSE / inside / score in %")
     table.add_column("")
     for group in groups:
         table.add_column(group.name, justify="right")
     with tempfile.TemporaryDirectory() as folder:
         for disturbance in DISTURBANCES:
-            table.add_row(disturbance.name, *(row(runs(group, Path(folder)), disturbance) for group in groups))
+            table.add_row(disturbance.name, *(table_cell(runs(group, Path(folder)), disturbance) for group in groups))
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 

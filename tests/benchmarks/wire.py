@@ -1,4 +1,4 @@
-"""Fast encoder of a board's bytes for millions of samples."""
+"""Fast encoder of the frames of a board, for millions of samples."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,8 @@ from bms_estimator.protocols.firmware.framing import MESSAGE_SAMPLE, SAMPLE_BYTE
 from bms_estimator.protocols.firmware.messages import PROTOCOL_VERSION, Hello
 
 REFERENCE_V, FULL_SCALE, DIVIDER, VOLTS_PER_AMPERE, BANDGAP_V = 5.0, 1024, 5.0, 0.1, 1.1
+BANDGAP_READINGS = 256
+"""Number of bandgap readings whose sum the hello reports."""
 CONVERSIONS = 16
 """Number of conversion pairs in the window of a sample."""
 
@@ -32,8 +34,8 @@ def hello(rate_hz: int) -> bytes:
         current_uv_per_a=round(VOLTS_PER_AMPERE * 1e6),
         current_zero_ppm=500_000,
         bandgap_uv=round(BANDGAP_V * 1e6),
-        bandgap_sum=round(BANDGAP_V / REFERENCE_V * FULL_SCALE * 256),
-        bandgap_count=256,
+        bandgap_sum=round(BANDGAP_V / REFERENCE_V * FULL_SCALE * BANDGAP_READINGS),
+        bandgap_count=BANDGAP_READINGS,
         ntc_series_ohm=10_000,
         ntc_r25_ohm=10_000,
         ntc_beta_k=3950,
@@ -41,11 +43,11 @@ def hello(rate_hz: int) -> bytes:
 
 
 def sample_frames(block: SampleBlock, first: int = 0) -> NDArray[np.uint8]:
-    """Frames of samples.
+    """Return the frames of samples.
 
     Args:
         block: Shape (n,), dtype SAMPLE.
-        first: Sequence of the first.
+        first: Sequence number of the first sample.
 
     Returns:
         Shape (n, SAMPLE_FRAME_BYTES).
@@ -58,6 +60,7 @@ def sample_frames(block: SampleBlock, first: int = 0) -> NDArray[np.uint8]:
 
 @njit
 def _put(packet, offset, size, value):
+    """Write an unsigned integer, little-endian."""
     for i in range(size):
         packet[offset + i] = (value >> (8 * i)) & 0xFF
 
@@ -74,7 +77,7 @@ def _frames(board_us, voltage_sum, current_sum, first):
         _put(packet, 13, 3, current_sum[j])
         _put(packet, 16, 2, CONVERSIONS)
         _put(packet, SAMPLE_BYTES - 2, 2, crc16(packet, 0, SAMPLE_BYTES - 2))
-        code = 0  # COBS: each zero becomes the distance to the next
+        code = 0  # position of the last COBS code: each zero is replaced by the distance to the next zero
         for i in range(SAMPLE_BYTES):
             if packet[i] == 0:
                 frames[j, code] = i + 1 - code

@@ -1,8 +1,7 @@
-"""Broker of the demo: retained messages and last wills."""
+"""Broker of the demo: retained messages, last wills, its printed command and its shutdown."""
 
 import asyncio
 import contextlib
-import json
 import shutil
 import socket
 import sys
@@ -14,9 +13,10 @@ from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
 from tests.patience import LONG_S
 
-RETAINED = ["bms/p/availability", "bms/p/sensor/availability", "bms/p/info", "homeassistant/device/p/config"]
+RETAINED_TOPICS = ["bms/p/availability", "bms/p/sensor/availability", "bms/p/info", "homeassistant/device/p/config"]
+BMS_TOPICS = RETAINED_TOPICS[:3]
 
-# Program of a client with a last will that ends without a DISCONNECT when its input is closed
+# Program of a client with a last will. When its input is closed, it ends without a DISCONNECT.
 CRASHING_CLIENT = """
 import asyncio, os, sys, aiomqtt
 async def main():
@@ -37,36 +37,41 @@ def free_port() -> int:
 
 
 async def next_message(client: aiomqtt.Client) -> tuple[str, bytes, bool]:
+    """Wait for a message. Return topic, payload and retain flag."""
     async with asyncio.timeout(LONG_S):
         message = await anext(aiter(client.messages))
     return message.topic.value, message.payload, message.retain
 
 
 async def receive_retained(port: int, subscription: str) -> list[str]:
-    """Return the topics of the retained messages that a new client receives. The client's own message ends the list."""
+    """Return the topics of the retained messages that a new client receives.
+
+    After the subscription the client sends a message to itself. Retained messages come before it.
+    """
     topics = []
-    last = subscription.replace("#", "last").replace("+", "last")
+    own_topic = subscription.replace("#", "last").replace("+", "last")
     async with aiomqtt.Client("127.0.0.1", port) as client:
         await client.subscribe(subscription, qos=1)
-        await client.publish(last, json.dumps("x"), qos=1)
+        await client.publish(own_topic, b"end", qos=1)
         while True:
             topic, payload, retain = await next_message(client)
-            if not retain and payload == b'"x"':
+            if not retain and payload == b"end":
                 return sorted(topics)
             topics.append(topic)
 
 
 async def publish_all(client: aiomqtt.Client) -> None:
-    for topic in RETAINED:
+    """Publish a retained message on each topic of ``RETAINED_TOPICS``."""
+    for topic in RETAINED_TOPICS:
         await client.publish(topic, topic, qos=1, retain=True)
 
 
 @pytest.mark.parametrize(
     ("subscription", "expected"),
     [
-        ("bms/#", RETAINED[:3]),
-        ("homeassistant/#", RETAINED[3:]),
-        ("bms/+/availability", RETAINED[:1]),
+        ("bms/#", BMS_TOPICS),
+        ("homeassistant/#", ["homeassistant/device/p/config"]),
+        ("bms/+/availability", ["bms/p/availability"]),
         ("bms/p/info", ["bms/p/info"]),
         ("homeassistant/status", []),
     ],
@@ -79,7 +84,7 @@ async def test_subscriber_receives_each_matching_retained_message_once(free_port
         assert await receive_retained(free_port, subscription) == sorted(expected)
 
 
-async def test_an_empty_message_removes_a_retained_one(free_port):
+async def test_an_empty_retained_message_removes_the_retained_message_of_its_topic(free_port):
     async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as service:
         await publish_all(service)
         await service.publish("bms/p/info", b"", qos=1, retain=True)
@@ -112,24 +117,24 @@ async def test_will_of_a_client_that_disconnects_is_not_published(free_port):
             assert await next_message(late) == ("bms/p/availability", b"online", True)
 
 
-async def test_port_in_use_is_reported(free_port):
+async def test_a_port_in_use_is_an_error_but_without_a_given_port_a_free_one_is_used(free_port):
     async with DemoBroker(free_port):
         with pytest.raises(UserError, match=f"port {free_port}: taken"):
             DemoBroker(free_port)
         assert DemoBroker().port != free_port
 
 
-async def test_the_printed_command_shows_the_topics(free_port):
+async def test_the_printed_mosquitto_sub_command_shows_all_topics_of_the_packs(free_port):
     if shutil.which("mosquitto_sub") is None:
         pytest.skip("mosquitto_sub is not installed (apt install mosquitto-clients)")
     async with DemoBroker(free_port) as broker, aiomqtt.Client("127.0.0.1", free_port) as service:
         await publish_all(service)
-        process = await asyncio.create_subprocess_shell(
-            f"{broker.subscribe_command} -C 3", stdout=asyncio.subprocess.PIPE
-        )
+        command = f"{broker.subscribe_command} -C 3"  # -C: exit after three messages
+        process = await asyncio.create_subprocess_shell(command, stdout=asyncio.subprocess.PIPE)
         async with asyncio.timeout(LONG_S):
             shown, _ = await process.communicate()
-        assert sorted(shown.decode().split()[::2]) == sorted(RETAINED[:3])
+        words = shown.decode().split()  # topic and payload in turn
+        assert sorted(words[::2]) == sorted(BMS_TOPICS)
 
 
 async def test_messages_received_before_the_shutdown_are_delivered(free_port):

@@ -1,4 +1,4 @@
-"""True SOC that the demo shows: it belongs to the sample of the shown estimate."""
+"""The true SOC that the demo shows belongs to the same sample as the shown estimate."""
 
 import math
 
@@ -11,11 +11,13 @@ from bms_estimator.simulation.simulated_pack import SimulatedPack, constant
 
 LOAD_A, START_SOC, STEP_S = 0.275, 0.9, 0.02
 FALL_PER_S = 1.0 / 3600.0
-"""Decrease of the SOC by ``LOAD_A``, the 1C current [1/s]."""
+"""Decrease of the SOC under ``LOAD_A``, which is the 1C current [1/s]."""
+STEP_TOLERANCE = FALL_PER_S * STEP_S
+"""Change of the SOC in one step of the simulation."""
 
 
 def frame(at_s: float) -> bytes:
-    """Return a sample with this time stamp."""
+    """Return the frame of a sample whose board time is ``at_s``."""
     board_us = round(at_s * 1e6) % MODULUS
     return SampleMessage(
         sequence=0, board_us=board_us, voltage_sum=1, current_sum=1, count=1, aux_sum=0, aux_count=0, status=0
@@ -24,7 +26,7 @@ def frame(at_s: float) -> bytes:
 
 @pytest.fixture
 def truth() -> TrueSoc:
-    """Return the true SOC of a pack whose simulator is five minutes ahead of the received samples."""
+    """Return the recorder of the true SOC of a pack that is simulated for five minutes, before any frame is received."""
     truth = TrueSoc(SimulatedPack(load_cell("chen_mora"), constant(LOAD_A), soc=START_SOC))
     for step in range(1, round(300.0 / STEP_S)):
         truth(step * STEP_S)
@@ -38,18 +40,18 @@ def soc_at(at_s: float) -> float:
 def test_true_soc_is_that_of_the_last_complete_sample_although_the_simulation_is_ahead(truth: TrueSoc) -> None:
     assert truth.soc() == START_SOC
     truth.write(0.0, frame(10.0) + frame(60.0))
-    assert truth.soc() == pytest.approx(soc_at(60.0), abs=FALL_PER_S * STEP_S)
+    assert truth.soc() == pytest.approx(soc_at(60.0), abs=STEP_TOLERANCE)
     later = frame(90.0)
-    truth.write(0.0, later[:7])
-    assert truth.soc() == pytest.approx(soc_at(60.0), abs=FALL_PER_S * STEP_S)
+    truth.write(0.0, later[:7])  # an incomplete frame
+    assert truth.soc() == pytest.approx(soc_at(60.0), abs=STEP_TOLERANCE)
     truth.write(0.0, later[7:])
-    assert truth.soc() == pytest.approx(soc_at(90.0), abs=FALL_PER_S * STEP_S)
+    assert truth.soc() == pytest.approx(soc_at(90.0), abs=STEP_TOLERANCE)
 
 
-def test_noise_does_not_change_the_true_soc(truth: TrueSoc) -> None:
+def test_noise_on_the_line_does_not_change_the_true_soc(truth: TrueSoc) -> None:
     truth.write(0.0, frame(30.0))
     truth.write(0.0, b"\x05noise\0\0\xff" * 9)
-    assert truth.soc() == pytest.approx(soc_at(30.0), abs=FALL_PER_S * STEP_S)
+    assert truth.soc() == pytest.approx(soc_at(30.0), abs=STEP_TOLERANCE)
 
 
 def test_true_soc_continues_after_a_wrap_of_the_board_clock() -> None:

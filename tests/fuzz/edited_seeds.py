@@ -1,4 +1,4 @@
-"""Hypothesis strategies that edit seed inputs: splices of bytes and text, and replaced JSON values."""
+"""Hypothesis strategies that edit stored inputs (seeds): they splice bytes and text, and replace JSON values."""
 
 import copy
 import json
@@ -14,13 +14,41 @@ SEEDS = Path(__file__).parents[1] / "data" / "fuzz"
 MAX_EDITS = 4
 """Maximum number of edits of one input."""
 MAX_OFFSET = 1 << 17
-"""Maximum offset of an edit before the modulo by the input's length [bytes]; longer than every seed."""
+"""Maximum of a drawn offset, which is reduced modulo the length of the input; larger than every seed [bytes]."""
 MAX_REMOVED = 32
 """Maximum length of a removed piece [bytes]."""
 MAX_COPIED = 64
 """Maximum length of a piece copied from a seed [bytes]."""
-NUMBERS = (b"1e308", b"-1e308", b"1e999", b"nan", b"-inf", b"3_9", "٣".encode(), b"0x1F", b"-0", b"0", b"1" * 400)
-TOKENS = (*NUMBERS, b"true", b"\0", b"\xff", b"\n", b"\r\n", b",", b"=", b'"', b"[" * 40, b"{", b"}", b"_", b"#")
+UNUSUAL_NUMBERS = (
+    b"1e308",
+    b"-1e308",
+    b"1e999",
+    b"nan",
+    b"-inf",
+    b"3_9",
+    "٣".encode(),
+    b"0x1F",
+    b"-0",
+    b"0",
+    b"1" * 400,
+)
+TOKENS = (
+    *UNUSUAL_NUMBERS,
+    b"true",
+    b"\0",
+    b"\xff",
+    b"\n",
+    b"\r\n",
+    b",",
+    b"=",
+    b'"',
+    b"[" * 40,
+    b"{",
+    b"}",
+    b"_",
+    b"#",
+)
+"""Pieces to insert into an input of any format."""
 JSON_VALUES: SearchStrategy[Any] = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
     lambda children: st.lists(children, max_size=3) | st.dictionaries(st.text(max_size=5), children, max_size=3),
@@ -30,11 +58,11 @@ NO_INPUTS: SearchStrategy[bytes] = st.nothing()
 
 Test = Callable[..., None]
 Keys = tuple[Any, ...]
-"""Keys and indices from a JSON value to one inside it."""
+"""Keys and indices that lead from a JSON value to a value inside it."""
 
 
-def seeds(name: str) -> list[bytes]:
-    """Return the stored inputs of a reader. They include every input that has failed before."""
+def load_seeds(name: str) -> list[bytes]:
+    """Return the stored inputs in the folder ``name``. They include every input that has failed before."""
     return [path.read_bytes() for path in sorted((SEEDS / name).iterdir())]
 
 
@@ -49,12 +77,12 @@ def edited_seeds(
     Args:
         name: Folder of the seeds.
         tokens: Pieces of the reader's format to insert.
-        repair: Corrects checksums; half of the edited seeds are repaired.
-        others: Further inputs.
+        repair: Function that corrects checksums. About half of the inputs are repaired edited seeds.
+        others: Further inputs, if there is no ``repair``.
     """
-    stored = seeds(name)
-    edited_inputs = edited(stored, tokens)
-    inputs = edited_inputs | (edited_inputs.map(repair) if repair else others)
+    stored = load_seeds(name)
+    edited = edit(stored, tokens)
+    inputs = edited | (edited.map(repair) if repair else others)
 
     def decorate(test: Test) -> Test:
         for data in stored:
@@ -64,8 +92,8 @@ def edited_seeds(
     return decorate
 
 
-def edited(stored: Sequence[bytes], tokens: Sequence[bytes]) -> SearchStrategy[bytes]:
-    """Return a strategy of seeds with up to four splices; in seeds of JSON objects values are also replaced."""
+def edit(stored: Sequence[bytes], tokens: Sequence[bytes]) -> SearchStrategy[bytes]:
+    """Return a strategy of seeds with 1 to ``MAX_EDITS`` splices; JSON objects may instead have one value replaced."""
     seed = st.sampled_from(stored)
     copied = st.builds(
         lambda data, begin, length: data[begin % (len(data) + 1) :][:length],
@@ -74,20 +102,23 @@ def edited(stored: Sequence[bytes], tokens: Sequence[bytes]) -> SearchStrategy[b
     text = st.text(max_size=4).map(lambda characters: characters.encode("utf-8", "surrogatepass"))
     piece = st.sampled_from((*TOKENS, *tokens)) | st.binary(max_size=8) | text | copied
     splice = st.tuples(st.integers(0, MAX_OFFSET), st.none() | st.integers(0, MAX_REMOVED), piece)
-    inputs = st.builds(spliced, seed, st.lists(splice, min_size=1, max_size=MAX_EDITS))
-    objects = [value for data in stored if isinstance(value := parsed(data), dict)]
-    return inputs | json_edited(objects) if objects else inputs
+    inputs = st.builds(splice_all, seed, st.lists(splice, min_size=1, max_size=MAX_EDITS))
+    objects = [value for data in stored if isinstance(value := parse_json(data), dict)]
+    return inputs | replace_json_values(objects) if objects else inputs
 
 
-def spliced(data: bytes, splices: Sequence[tuple[int, int | None, bytes]]) -> bytes:
-    """Return ``data`` after splices of offset, removed bytes and inserted piece; None: overwrite."""
+def splice_all(data: bytes, splices: Sequence[tuple[int, int | None, bytes]]) -> bytes:
+    """Return ``data`` after splices of (offset, number of removed bytes, inserted piece).
+
+    None as number means that the piece overwrites as many bytes as it has.
+    """
     for offset, removed, piece in splices:
         begin = offset % (len(data) + 1)
         data = data[:begin] + piece + data[begin + (len(piece) if removed is None else removed) :]
     return data
 
 
-def parsed(data: bytes) -> Any:
+def parse_json(data: bytes) -> Any:
     """Return the JSON value of ``data``; None if it has none."""
     try:
         return json.loads(data)
@@ -95,16 +126,19 @@ def parsed(data: bytes) -> Any:
         return None
 
 
-def json_edited(objects: Sequence[Any]) -> SearchStrategy[bytes]:
-    """Return a strategy of JSON objects in which one value is replaced; a newline ends a line of a text protocol."""
+def replace_json_values(objects: Sequence[Any]) -> SearchStrategy[bytes]:
+    """Return a strategy of JSON objects in which one value, at any depth, is replaced."""
     places = [(value, keys) for value in objects for keys in inner_keys(value)]
-    return st.builds(
-        lambda place, new: json.dumps(replaced(*place, new)).encode() + b"\n", st.sampled_from(places), JSON_VALUES
-    )
+
+    def replace_at(place: tuple[Any, Keys], new: Any) -> bytes:
+        # The newline ends a line of a text protocol.
+        return json.dumps(replace(*place, new)).encode() + b"\n"
+
+    return st.builds(replace_at, st.sampled_from(places), JSON_VALUES)
 
 
 def inner_keys(value: Any) -> Iterator[Keys]:
-    """Yield the keys of a JSON value and of all values inside it."""
+    """Yield the ``Keys`` of all values inside a JSON value, and empty ones for the value itself."""
     yield ()
     children = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, child in children:
@@ -112,10 +146,10 @@ def inner_keys(value: Any) -> Iterator[Keys]:
             yield key, *keys
 
 
-def replaced(value: Any, keys: Keys, new: Any) -> Any:
+def replace(value: Any, keys: Keys, new: Any) -> Any:
     """Return a copy of a JSON value in which the value at ``keys`` is ``new``."""
     if not keys:
         return new
     changed = copy.copy(value)
-    changed[keys[0]] = replaced(value[keys[0]], keys[1:], new)
+    changed[keys[0]] = replace(value[keys[0]], keys[1:], new)
     return changed

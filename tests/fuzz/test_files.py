@@ -1,4 +1,4 @@
-"""Readers of files with edited content: they raise only user errors, which name the file."""
+"""Readers of files with edited content raise nothing but user errors, which name the file."""
 
 import binascii
 import gzip
@@ -21,16 +21,25 @@ from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.raw_capture import MAGIC
 from bms_estimator.sources.captures.replay import load_capture
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
-from tests.fuzz.edited_seeds import SEEDS, edited, edited_seeds
+from tests.fuzz.edited_seeds import SEEDS, edit, edited_seeds
 
-TOML = (b"[pack]\n", b"[sensor]\n", b"[cell]\n", b"[ocv]\n", b"capacity_ah = true\n", b"[[pack]]\n", b"= [", b'"""')
+TOML_TOKENS = (
+    b"[pack]\n",
+    b"[sensor]\n",
+    b"[cell]\n",
+    b"[ocv]\n",
+    b"capacity_ah = true\n",
+    b"[[pack]]\n",
+    b"= [",
+    b'"""',
+)
 CELL = load_cell("ncr18650")
 ARRAY_HEADER = (b"{'descr':", b"'|O'", b"'<f8'", b"(1,)")
 DOUBLES = st.floats() | st.sampled_from((0.0, -1.0, 1e308, 1e-308))
 
 
 def load_file(path: Path, load: Callable[[Path], object], data: bytes) -> None:
-    """Load a file with the content ``data``; an error names the file."""
+    """Load a file with the content ``data``. The only permitted exception is a user error that names the file."""
     path.write_bytes(data)
     try:
         load(path)
@@ -41,14 +50,14 @@ def load_file(path: Path, load: Callable[[Path], object], data: bytes) -> None:
 def with_capture_header(data: bytes) -> bytes:
     """Correct length and CRC of a capture's header."""
     _, brace, rest = data.partition(b"{")
-    header, end, reads = rest.partition(b"}")
+    header, end, crc_and_reads = rest.partition(b"}")
     text = brace + header + end
     crc = binascii.crc_hqx(text, 0xFFFF).to_bytes(2, "little")
-    return MAGIC + len(text).to_bytes(4, "little") + text + crc + reads[2:]
+    return MAGIC + len(text).to_bytes(4, "little") + text + crc + crc_and_reads[2:]
 
 
 def with_doubles(array: bytes, doubles: dict[int, float]) -> bytes:
-    """Overwrite aligned doubles of a stored array."""
+    """Overwrite doubles of a stored array, given by their index modulo the number of doubles."""
     changed = bytearray(array)
     for index, value in doubles.items():
         struct.pack_into("<d", changed, 8 * (index % (len(array) // 8)), value)
@@ -56,7 +65,7 @@ def with_doubles(array: bytes, doubles: dict[int, float]) -> bytes:
 
 
 def checkpoints() -> SearchStrategy[bytes]:
-    """Return checkpoints with one edited member and correct CRCs."""
+    """Return a strategy of checkpoints in which one file of the archive is edited and all CRCs are correct."""
     with zipfile.ZipFile(SEEDS / "checkpoint" / "seed.npz") as seed:
         members = {name: seed.read(name) for name in seed.namelist()}
     doubles = st.dictionaries(st.integers(0, 1 << 16), DOUBLES, min_size=1, max_size=8)
@@ -64,14 +73,15 @@ def checkpoints() -> SearchStrategy[bytes]:
     def archive(name: str, member: bytes) -> bytes:
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w") as file:
-            for each, unchanged in members.items():
-                file.writestr(each, member if each == name else unchanged)
+            for other_name, unchanged in members.items():
+                file.writestr(other_name, member if other_name == name else unchanged)
         return content.getvalue()
 
     def edited_member(name: str) -> SearchStrategy[bytes]:
-        arrays = edited([members[name]], ARRAY_HEADER) | st.builds(with_doubles, st.just(members[name]), doubles)
+        arrays = edit([members[name]], ARRAY_HEADER) | st.builds(with_doubles, st.just(members[name]), doubles)
         return st.builds(archive, st.just(name), arrays)
 
+    # Half of the checkpoints have an edited state, which contains most of the values.
     return st.sampled_from(list(members)).flatmap(edited_member) | edited_member("state.npy")
 
 
@@ -81,50 +91,50 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
-@edited_seeds("settings", *TOML)
-def test_settings_reader(folder: Path, data: bytes) -> None:
+@edited_seeds("settings", *TOML_TOKENS)
+def test_settings_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
     load_file(folder / "pack.toml", load_settings, data)
 
 
-@edited_seeds("cell", *TOML)
-def test_cell_reader(folder: Path, data: bytes) -> None:
+@edited_seeds("cell", *TOML_TOKENS)
+def test_cell_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
     load_file(folder / "cell.toml", load_any, data)
 
 
 @edited_seeds("csv", b"time_s", b"current_a", b"Voltage / V", b",,", b"\xef\xbb\xbf")
-def test_csv_reader(folder: Path, data: bytes) -> None:
+def test_csv_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
     load_file(folder / "table.csv", load_capture, data)
 
 
 @edited_seeds("csv.gz", repair=lambda data: gzip.compress(data, 1))
-def test_compressed_csv_reader(folder: Path, data: bytes) -> None:
+def test_compressed_csv_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
     load_file(folder / "table.csv.gz", load_capture, data)
 
 
 @edited_seeds("parquet", b"PAR1")
-def test_parquet_reader(folder: Path, data: bytes) -> None:
+def test_parquet_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
     load_file(folder / "table.parquet", load_capture, data)
 
 
 @edited_seeds("curve", b"soc", b"ocv_v", b"hysteresis_v", b",,")
-def test_curve_reader(folder: Path, data: bytes) -> None:
+def test_curve_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
     load_file(folder / "curve.csv", read_curve, data)
 
 
 @edited_seeds("capture", b"null", b'"version"', b": [", b"\\ud800", repair=with_capture_header)
-def test_capture_reader(folder: Path, data: bytes) -> None:
+def test_capture_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
     load_file(folder / "line.bms", load_capture, data)
 
 
 @edited_seeds("checkpoint", b"PK\x03\x04", *ARRAY_HEADER, others=checkpoints())
-def test_checkpoint_reader(folder: Path, data: bytes) -> None:
+def test_checkpoint_reader_raises_no_exception(folder: Path, data: bytes) -> None:
     file = CheckpointFile(folder, Settings(), CELL)
     file.path.write_bytes(data)
     file.load()
 
 
 @edited_seeds("known_board")
-def test_known_board_reader(folder: Path, data: bytes) -> None:
+def test_known_board_reader_raises_no_exception(folder: Path, data: bytes) -> None:
     file = KnownBoardFile(folder, "pack")
     file.path.write_bytes(data)
     file.load()

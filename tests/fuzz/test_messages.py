@@ -1,4 +1,4 @@
-"""Edited requests, published messages and USB descriptions: no exception, and only printable text."""
+"""Edited requests, published messages and USB descriptions cause no exception, and no unprintable text is shown."""
 
 import asyncio
 import contextlib
@@ -19,12 +19,12 @@ from bms_estimator.sinks.terminal.view_state import PackView, ViewState
 from bms_estimator.sources.serial.port_list import NoPortError, may_be_board, resolve_port
 from tests.fuzz.edited_seeds import edited_seeds
 
-JSON = (b"null", b'"version"', b": [", b'{"a":', b"\\ud800", b'"soc"', b'"transaction"')
+JSON_TOKENS = (b"null", b'"version"', b": [", b'{"a":', b"\\ud800", b'"soc"', b'"transaction"')
 TOPICS = ("state", "health", "info", "parameters", "availability", "alarm/soc_low")
 CONSOLE = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, color_system=None)
 
 
-@edited_seeds("requests", *JSON)
+@edited_seeds("requests", *JSON_TOKENS)
 def test_each_request_is_counted_and_answered_with_json(data: bytes) -> None:
     stats = DeliveryStats()
     requests = RequestDispatcher(stats, ("set_soc",))
@@ -38,8 +38,8 @@ def test_each_request_is_counted_and_answered_with_json(data: bytes) -> None:
     assert not stats.requests["failed"]
 
 
-@edited_seeds("published", *JSON, b"\\u001b[2J", b'"active":true', b'"text":"', b'"cells_v":[')
-def test_published_messages_show_only_printable_text(data: bytes) -> None:
+@edited_seeds("published", *JSON_TOKENS, b"\\u001b[2J", b'"active":true', b'"text":"', b'"cells_v":[')
+def test_published_messages_are_shown_as_printable_text_only(data: bytes) -> None:
     cache = TopicCache("bms")
     for topic in TOPICS:
         message = cache.take(f"bms/pack/{topic}", data, 0.0)

@@ -13,16 +13,21 @@ from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
 
-async def test_published_values_are_received_with_signs_and_cells(broker: Broker) -> None:
+async def test_the_mqtt_source_receives_current_with_its_sign_voltage_temperature_and_cells_of_the_node(
+    broker: Broker,
+) -> None:
     settings = Settings.model_validate(
         {"source": {"kind": "mqtt", "url": broker.url, "profile": "esphome-jk", "prefix": "bms7"}}
     )
     source = open_line_source(settings)
     assert source
-    pack = lambda time_s: Reading(12.5 if time_s > 0 else 0.0, 53.0, 21.5)  # noqa: E731 - a signal
+
+    def pack(time_s: float) -> Reading:
+        return Reading(current_a=12.5 if time_s > 0 else 0.0, voltage_v=53.0, temperature_c=21.5)
+
     node = SimulatedNode(pack, cells=16, mqtt=MqttSettings(url=broker.url), prefix="bms7", speed=20.0)
     async with asyncio.timeout(LONG_S), Listener(broker, "bms7/status") as listener, source:
-        node_task = asyncio.create_task(node.run(1e9))
+        node_task = asyncio.create_task(node.run(1e9))  # longer than the test
         received_samples = 0
         async for block, cells_v in source:
             assert (block["voltage_v"] == 53.0).all()
@@ -39,9 +44,12 @@ async def test_published_values_are_received_with_signs_and_cells(broker: Broker
 
 
 async def test_node_stops_after_its_duration_and_publishes_offline(broker: Broker) -> None:
-    node = SimulatedNode(lambda _: Reading(1.0, 3.3, 21.5), cells=1, mqtt=MqttSettings(url=broker.url), speed=1000.0)
+    pack = Reading(current_a=1.0, voltage_v=3.3, temperature_c=21.5)
+    node = SimulatedNode(lambda _: pack, cells=1, mqtt=MqttSettings(url=broker.url), speed=1000.0)
     async with asyncio.timeout(LONG_S), Listener(broker, "jk-bms/#") as listener:
         await node.run(10.0)
         await listener.wait("jk-bms/status", lambda payload: payload == b"offline")
-    assert node.samples == 5
-    assert listener.all("jk-bms/sensor/jk-bms_current/state") == 5 * [b"-1.00"]
+    assert node.samples == 5  # one each 2 s
+    assert listener.all("jk-bms/sensor/jk-bms_current/state") == 5 * [
+        b"-1.00"
+    ]  # a JK-BMS reports a discharge as negative

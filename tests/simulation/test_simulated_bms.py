@@ -36,12 +36,13 @@ SHORT_INTERVALS = {
 }
 """Intervals that are shortened to save test time."""
 AMPLITUDE_A = 40.0
+"""Amplitude of the current. The amplitude of the voltage is 1 V."""
 MEAN_V = 52.8
 TEMPERATURE_C = 21.0
 
 
 def alternating_load(time_s: float) -> Reading:
-    """Return a reading of a sinusoidal current. The voltage deviates from its mean in proportion to the current."""
+    """Return a reading with a sinusoidal current, and a voltage that falls in proportion to the current."""
     return Reading(AMPLITUDE_A * math.sin(time_s), MEAN_V - math.sin(time_s), TEMPERATURE_C)
 
 
@@ -56,18 +57,19 @@ class SampleRecord:
     def count(self) -> int:
         return sum(block.size for block in self.blocks)
 
-    async def read(self, source: SerialSource) -> None:
+    async def collect(self, source: SerialSource) -> None:
         async for block, cells_v in source:
             self.blocks.append(block.copy())
             self.cells += cells_v.tolist()
 
     async def wait_for_more(self, samples: int) -> None:
         """Wait until this number of further samples has arrived."""
-        final_count = self.count + samples
-        await until(lambda: self.count >= final_count)
+        awaited_count = self.count + samples
+        await until(lambda: self.count >= awaited_count)
 
 
 async def until(condition: Callable[[], object]) -> None:
+    """Wait until ``condition`` returns something true."""
     async with asyncio.timeout(LONG_S):
         while not condition():  # noqa: ASYNC110 - the condition is the test's
             await asyncio.sleep(0.01)
@@ -77,12 +79,12 @@ async def until(condition: Callable[[], object]) -> None:
 async def read_bms(
     bms: SimulatedBms, protocol: str, tap: CaptureRecorder
 ) -> AsyncIterator[tuple[SerialSource, SampleRecord]]:
-    """Run the BMS and a serial source that reads it. Yield the source and the record of its samples."""
+    """Run the BMS and a serial source that reads it and passes its bytes to ``tap``. Yield source and record."""
     with bms:
         sensor = SensorSettings.model_validate({"port": bms.path, "protocol": protocol})
         record = SampleRecord()
         async with SerialSource(sensor, tap=tap, first_retry_s=0.05, silent_s=0.5) as board:
-            tasks = [asyncio.create_task(bms.run()), asyncio.create_task(record.read(board))]
+            tasks = [asyncio.create_task(bms.run()), asyncio.create_task(record.collect(board))]
             try:
                 yield board, record
             finally:
@@ -97,7 +99,7 @@ async def test_replay_of_a_bms_with_faults_is_bit_identical_to_the_live_samples(
 ) -> None:
     for constant, value in SHORT_INTERVALS.items():
         monkeypatch.setattr(f"bms_estimator.{constant}", value)
-    protocol, path = name.removesuffix("-pb"), tmp_path / "line.bms"
+    protocol, path = name.removesuffix("-pb"), tmp_path / "line.bms"  # one protocol decodes both series of JK
     bms = SimulatedBms(name, alternating_load, cells=CELLS)
     header = make_header(SensorSettings.model_validate({"protocol": protocol}))
     with CaptureRecorder(path, header) as recording:
@@ -109,7 +111,7 @@ async def test_replay_of_a_bms_with_faults_is_bit_identical_to_the_live_samples(
                 bms.inject(fault)
                 await until(lambda: sum(board.counters[c] for c in names) > before)  # noqa: B023 - awaited here
                 await record.wait_for_more(1)
-            bms.inject(BmsFault.SILENCE, 1_000_000)
+            bms.inject(BmsFault.SILENCE, 1_000_000)  # until ``clear_faults``
             await until(lambda: board.silence_reason)
             assert "open, but silent" in (board.silence_reason or "")
             bms.clear_faults()
@@ -119,9 +121,11 @@ async def test_replay_of_a_bms_with_faults_is_bit_identical_to_the_live_samples(
     live = np.concatenate(record.blocks)
     step_v, step_a, step_k = RESOLUTIONS[name]
     assert np.abs(live["temperature_c"] - TEMPERATURE_C).max() <= step_k / 2 + 1e-9
-    voltage_drop_v = MEAN_V - live["voltage_v"]  # 1 V at the amplitude of the current
+    # Voltage drop and current, both relative to their amplitude, differ only by the rounding of both.
+    voltage_drop_v = MEAN_V - live["voltage_v"]
     max_error_v = (step_v + step_a / AMPLITUDE_A) / 2 + 1e-9
     assert np.abs(live["current_a"] / AMPLITUDE_A - voltage_drop_v).max() <= max_error_v
+    # A row has NaN for the cells of a response that did not come.
     complete_rows = [row for row in record.cells if not any(math.isnan(v) for v in row)]
     assert len(complete_rows) >= 3
     assert {len(row) for row in complete_rows} == {CELLS}

@@ -1,4 +1,4 @@
-"""Virtual board in Python: its frames contain the simulated readings, and its faults are counted by the decoder."""
+"""Virtual board in Python: its frames contain the simulated readings, and the decoder counts its faults."""
 
 import asyncio
 import contextlib
@@ -39,6 +39,8 @@ from tests.patience import LONG_S
 STEADY = Reading(current_a=2.5, voltage_v=22.2, temperature_c=25.0)
 DIVIDER = 6.1
 VOLTS_PER_AMPERE = 0.1
+PERIOD_S = compute_window(100)[1] * 1e-9
+"""Sample period of a board at 100 Hz, the default rate [s]."""
 END_MARK = b"and that is all"
 """Bytes that a board sends at the end of a test."""
 
@@ -51,17 +53,15 @@ async def receive(board: VirtualBoard, samples: int, events: dict[int, Event] | 
     Args:
         board: A board at 100 Hz.
         samples: Number of samples.
-        events: Events by the number of samples before them.
+        events: Actions on the board, by the number of samples before them.
     """
     data = bytearray()
-    period_s = compute_window(100)[1] * 1e-9
 
     async def run() -> None:
         try:
             for count in sorted({*(events or {}), samples}):
-                await board.run(
-                    (count - board.samples - 0.5) * period_s
-                )  # half a period early: no further sample begins
+                # The run ends half a period early, so that no further sample begins.
+                await board.run((count - board.samples - 0.5) * PERIOD_S)
                 if events and count in events:
                     events[count](board)
         finally:
@@ -88,32 +88,33 @@ def make_board(reading: Reading = STEADY, **options: Any) -> VirtualBoard:
 
 
 def decode(data: bytes) -> tuple[SampleBlock, FrameCounters]:
+    """Decode frames. Return their samples and the counters of the decoder."""
     decoder = FrameDecoder()
     return decoder.feed(0.0, data), decoder.counters
 
 
 async def test_frames_contain_the_readings_within_the_resolution_of_the_adc() -> None:
-    block, counters = decode(await receive(make_board(), 500))
+    block, counters = decode(await receive(make_board(), samples=500))
     assert block.size == 500
     assert np.allclose(np.diff(block["time_s"]), 0.01, rtol=0.0, atol=1e-9)
-    step_v = 5.0 / 1024
-    assert np.abs(block["voltage_v"] - 22.2).max() < DIVIDER * step_v
-    assert np.abs(block["current_a"] - 2.5).max() < step_v / VOLTS_PER_AMPERE
-    assert block["voltage_v"].mean() == pytest.approx(22.2, abs=0.2 * DIVIDER * step_v)
-    assert block["temperature_c"][-1] == pytest.approx(25.0, abs=0.3)
+    step_v = 5.0 / 1024  # 5 V on a 10-bit converter
+    assert np.abs(block["voltage_v"] - STEADY.voltage_v).max() < DIVIDER * step_v
+    assert np.abs(block["current_a"] - STEADY.current_a).max() < step_v / VOLTS_PER_AMPERE
+    assert block["voltage_v"].mean() == pytest.approx(STEADY.voltage_v, abs=0.2 * DIVIDER * step_v)
+    assert block["temperature_c"][-1] == pytest.approx(STEADY.temperature_c, abs=0.3)
     assert counters == FrameCounters(bytes_received=counters.bytes_received, frames_received=500)
 
 
-async def test_supply_other_than_5_v_does_not_change_the_values() -> None:
+async def test_a_supply_other_than_5_v_does_not_change_the_measured_values() -> None:
     block, _ = decode(await receive(make_board(parts=BoardParts(supply_v=4.75)), 300))
-    assert block["voltage_v"].mean() == pytest.approx(22.2, rel=1e-3)
-    assert block["current_a"].mean() == pytest.approx(2.5, rel=2e-3)
+    assert block["voltage_v"].mean() == pytest.approx(STEADY.voltage_v, rel=1e-3)
+    assert block["current_a"].mean() == pytest.approx(STEADY.current_a, rel=2e-3)
 
 
-async def test_supply_does_not_change_the_current_of_an_absolute_sensor() -> None:
+async def test_the_supply_does_not_change_the_current_of_a_sensor_that_is_not_ratiometric() -> None:
     parts = BoardParts(supply_v=4.75, volts_per_ampere=0.09, ratiometric=False)
     block, _ = decode(await receive(make_board(parts=parts), 300))
-    assert block["current_a"].mean() == pytest.approx(2.5, rel=2e-3)
+    assert block["current_a"].mean() == pytest.approx(STEADY.current_a, rel=2e-3)
 
 
 async def test_equal_seeds_give_equal_bytes() -> None:
@@ -124,12 +125,15 @@ async def test_equal_seeds_give_equal_bytes() -> None:
 @pytest.mark.parametrize(
     ("reading", "status"),
     [
-        (Reading(0.0, 30.6, 25.0), SampleStatus.VOLTAGE_SATURATED),
-        (Reading(26.0, 12.0, 25.0), SampleStatus.CURRENT_SATURATED),
-        (Reading(-26.0, 12.0, 25.0), SampleStatus.CURRENT_SATURATED),
+        # The ranges are 30.5 V (5 V times the divider) and 25 A (2.5 V on each side of the zero).
+        (Reading(current_a=0.0, voltage_v=30.6, temperature_c=25.0), SampleStatus.VOLTAGE_SATURATED),
+        (Reading(current_a=26.0, voltage_v=12.0, temperature_c=25.0), SampleStatus.CURRENT_SATURATED),
+        (Reading(current_a=-26.0, voltage_v=12.0, temperature_c=25.0), SampleStatus.CURRENT_SATURATED),
     ],
 )
-async def test_saturation_is_marked(reading: Reading, status: SampleStatus) -> None:
+async def test_samples_beyond_the_range_of_the_converter_are_marked_as_saturated(
+    reading: Reading, status: SampleStatus
+) -> None:
     block, _ = decode(await receive(make_board(reading), 10))
     assert (block["status"] == status).all()
 
@@ -145,28 +149,31 @@ async def test_saturation_is_marked(reading: Reading, status: SampleStatus) -> N
         (BoardFault.GARBAGE, {"frames_received": 60, "frames_lost": 0}),
     ],
 )
-async def test_each_fault_is_counted_by_its_kind(fault: BoardFault, expected: dict[str, int]) -> None:
-    data = await receive(make_board(), 60, {20: lambda b: b.inject(fault, 3)})
+async def test_the_decoder_counts_each_kind_of_fault_in_its_own_counters(
+    fault: BoardFault, expected: dict[str, int]
+) -> None:
+    data = await receive(make_board(), 60, {20: lambda board: board.inject(fault, frames=3)})
     _, counters = decode(data)
     assert {name: getattr(counters, name) for name in expected} == expected
     damaged = counters.crc_errors + counters.cobs_errors + counters.length_errors
     assert (damaged >= 3) == (fault in {BoardFault.CORRUPT, BoardFault.TRUNCATE, BoardFault.GARBAGE})
 
 
-async def test_swapped_samples_count_as_out_of_order() -> None:
-    _, counters = decode(await receive(make_board(), 60, {20: lambda b: b.inject(BoardFault.SWAP)}))
+async def test_a_sample_after_its_successor_counts_as_out_of_order_and_is_not_used() -> None:
+    _, counters = decode(await receive(make_board(), 60, {20: lambda board: board.inject(BoardFault.SWAP)}))
     assert (counters.out_of_order + counters.duplicates, counters.frames_lost) == (1, 1)
     assert counters.frames_received == 59
 
 
-async def test_sample_after_a_reset_is_marked_and_time_increases() -> None:
-    block, counters = decode(await receive(make_board(), 60, {30: lambda b: b.reset(ResetCause.EXTERNAL)}))
+async def test_the_first_sample_after_a_reset_is_marked_and_sample_times_keep_increasing() -> None:
+    block, counters = decode(await receive(make_board(), 60, {30: lambda board: board.reset(ResetCause.EXTERNAL)}))
     assert (counters.frames_received, counters.resets, counters.frames_lost) == (60, 1, 0)
     assert list(np.flatnonzero(block["status"] & SampleStatus.RESET)) == [30]
     assert (np.diff(block["time_s"]) > 0.0).all()
 
 
 async def test_wrap_of_the_board_clock_does_not_change_the_sample_times() -> None:
+    # The clock of 32 bits wraps after 0.1 s, which is after ten of the samples.
     block, counters = decode(await receive(make_board(clock_us=2**32 - 100_000), 50))
     assert np.allclose(np.diff(block["time_s"]), 0.01, rtol=0.0, atol=1e-9)
     assert counters.resets == 0
@@ -193,6 +200,7 @@ async def test_commands_are_executed_and_acknowledged() -> None:
         try:
             assert await ask(set_rate_command(250)) == (AckResult.OK, compute_window(250)[1])
             assert await ask(set_serial_command(77)) == (AckResult.OK, 77)
+            # A rejected command is answered with the value that remains, in the units of the line (1e-6).
             assert await ask(set_bandgap_command(1.3)) == (AckResult.BAD_VALUE, 1_100_000)
             assert await ask(set_divider_command(5.0)) == (AckResult.OK, 5_000_000)
             assert await ask(set_divider_command(0.5)) == (AckResult.BAD_VALUE, 5_000_000)
@@ -201,6 +209,7 @@ async def test_commands_are_executed_and_acknowledged() -> None:
             result, zero_ppm = await ask(zero_current_command())
             assert result == AckResult.OK
             assert abs(zero_ppm - 550_000) < 100  # 0.5 + 2.5 A x 0.1 V/A / 5 V
+            # The response to the second command also shows that the hello has arrived.
             os.write(host, b"\x05garbage\0")
             assert await ask(hello_command() + set_serial_command(78)) == (AckResult.OK, 78)
             assert decoder.hello is not None
@@ -216,7 +225,8 @@ async def test_commands_are_executed_and_acknowledged() -> None:
             os.close(host)
 
 
-async def test_samples_lost_by_a_host_that_does_not_read_are_marked_as_overrun() -> None:
+async def test_samples_lost_because_the_host_does_not_read_are_marked_as_overrun() -> None:
+    # 2,000 frames are more than the buffer of the pseudo-terminal holds.
     virtual = VirtualBoard(lambda _: STEADY, rate_hz=1000, speed=50.0)
     with virtual:
         host = os.open(virtual.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -248,19 +258,19 @@ async def test_text_mode_prints_lines_of_the_text_protocol() -> None:
     decoder = make_protocol(SensorSettings(port="x", protocol="text", baud=115_200))
     block = decoder.feed(0.0, data)
     assert block.size == 50
-    assert block["voltage_v"] == pytest.approx(22.2, abs=0.03)
-    assert block["current_a"] == pytest.approx(2.5, abs=0.06)
-    assert block["temperature_c"] == pytest.approx(25.0, abs=0.3)
+    assert block["voltage_v"] == pytest.approx(STEADY.voltage_v, abs=0.03)
+    assert block["current_a"] == pytest.approx(STEADY.current_a, abs=0.06)
+    assert block["temperature_c"] == pytest.approx(STEADY.temperature_c, abs=0.3)
 
 
 async def test_board_takes_no_sample_before_a_host_opens_the_line() -> None:
     sampled = asyncio.Event()
 
-    def signal(_: float) -> Reading:
+    def measure(_: float) -> Reading:
         sampled.set()
         return STEADY
 
-    with VirtualBoard(signal) as board:
+    with VirtualBoard(measure) as board:
         running = asyncio.create_task(board.run_for_host())
         await asyncio.sleep(0.05)
         assert not sampled.is_set()
@@ -272,10 +282,15 @@ async def test_board_takes_no_sample_before_a_host_opens_the_line() -> None:
 
 async def test_relay_changes_to_its_fallback_level_when_the_host_is_silent_and_to_low_at_a_reset() -> None:
     def set_relay(high: bool, high_when_silent: bool | None, silent_s: int = 0) -> Event:
-        return lambda b: b._handle_command(unseal(set_relay_command(Relay(high, high_when_silent, silent_s))))
+        return lambda board: board._handle_command(unseal(set_relay_command(Relay(high, high_when_silent, silent_s))))
 
     levels: dict[int, bool] = {}
-    read_level: Event = lambda b: levels.update({b.samples: b.relay_high})  # noqa: E731
+
+    def read_level(board: VirtualBoard) -> None:
+        levels[board.samples] = board.relay_high
+
+    # The keys are numbers of samples at 100 Hz. The commands at 30 and 250 end silences; their fallback levels apply after
+    # 2 s (sample 230) and 1 s (sample 350).
     events: dict[int, Event] = {
         10: set_relay(high=True, high_when_silent=None),
         20: read_level,
@@ -285,7 +300,7 @@ async def test_relay_changes_to_its_fallback_level_when_the_host_is_silent_and_t
         250: set_relay(high=False, high_when_silent=True, silent_s=1),
         300: read_level,
         360: read_level,
-        370: lambda b: b.reset(),
+        370: VirtualBoard.reset,
         380: read_level,
     }
     decoder = FrameDecoder()
@@ -294,11 +309,11 @@ async def test_relay_changes_to_its_fallback_level_when_the_host_is_silent_and_t
     assert [ack.result for ack in decoder.pop_acks()] == [AckResult.OK] * 3
 
 
-async def test_invalid_relay_command_changes_nothing() -> None:
-    """The command has a fallback level without the time after which it applies."""
+async def test_a_relay_command_with_a_fallback_but_no_time_is_rejected_and_changes_nothing() -> None:
+    # A fallback level (bit 8) without the time after which it applies (upper half).
     invalid = command(MessageType.COMMAND_SET_RELAY, (1 << 8).to_bytes(4, "little"))
     board = make_board()
     decoder = FrameDecoder()
-    decoder.feed(0.0, b"\0" + await receive(board, 20, {10: lambda b: b._handle_command(unseal(invalid))}))
+    decoder.feed(0.0, b"\0" + await receive(board, 20, {10: lambda board: board._handle_command(unseal(invalid))}))
     assert [(ack.result, ack.value) for ack in decoder.pop_acks()] == [(AckResult.BAD_VALUE, 0)]
     assert not board.relay_high

@@ -22,7 +22,7 @@ HOUR_S = 3600.0
 
 
 def run(seed: int, seconds: float) -> Result:
-    """Run one world."""
+    """Run one world, then free its objects."""
     result = World(seed, seconds).run()
     gc.collect()
     return result
@@ -38,7 +38,7 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=os.cpu_count(), help="number of worlds at the same time")
     options = parser.parse_args()
     load_kernels()
-    gc.disable()  # no collection during a world
+    gc.disable()  # ``run`` collects after each world, so that no collection slows a world down
     gc.freeze()  # shared objects are not scanned after each world
     if options.seed is not None:
         return _print_result(run(options.seed, options.hours * HOUR_S), log=True)
@@ -53,7 +53,7 @@ def _print_result(result: Result, *, log: bool = False) -> int:
     coverage_percent = 100.0 * errors.within_interval / max(errors.states, 1)
     figures = ", ".join(f"{name} {value:g}" for name, value in result.figures.items())
     _print_line(
-        f"seed {result.seed}: {result.violation or 'all holds'}; SOC off by {100.0 * errors.max_error:.1f} % and "
+        f"seed {result.seed}: {result.violation or 'all invariants hold'}; SOC off by {100.0 * errors.max_error:.1f} % and "
         f"{errors.max_stds:.1f} std at most, {coverage_percent:.0f} % within 2 std; {figures}; digest {result.digest}"
     )
     return int(bool(result.violation))
@@ -79,7 +79,7 @@ def _run_many(options: argparse.Namespace) -> int:
     coverage = sum(each.within_interval for each in errors) / max(states, 1)
     _print_line(
         f"{len(seeds)} worlds of {options.hours:g} h in {seconds:.0f} s, on {options.processes} processors, "
-        f"{(cpu.ru_utime + cpu.ru_stime) / len(seeds):.2f} s of processor each; SOC off by "
+        f"{(cpu.ru_utime + cpu.ru_stime) / len(seeds):.2f} s of CPU time each; SOC off by "
         f"{100.0 * max(each.max_error for each in errors):.1f} % and {max(each.max_stds for each in errors):.1f} std at "
         f"most, {100.0 * coverage:.1f} % of {states} states within 2 std; "
         f"{len(failed)} failed"

@@ -19,13 +19,13 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from tests.world.loop import KilledError, ProcessLoop, Timeline
 
-MAX_DELAY_S = 0.03
-"""Maximum delay of a packet [s]."""
+MIN_DELAY_S, MAX_DELAY_S = 0.0005, 0.03
+"""Range of the delay of a packet [s]."""
 CONNECT_TIMEOUT_S = 5.0
 """Timeout of paho for a host that does not respond [s]."""
 KEEPALIVE_CHECK_S = 2.0
 """Interval between two keepalive checks [s]."""
-UNSUPPORTED_VERSION = ReasonCode(PacketTypes.CONNACK, identifier=132)
+UNSUPPORTED_VERSION = ReasonCode(PacketTypes.CONNACK, identifier=0x84)
 CONNACK_OK = ReasonCode(PacketTypes.CONNACK, identifier=0)
 PUBACK_OK = ReasonCode(PacketTypes.PUBACK, identifier=0)
 CONNECTION_LOST = ReasonCode(PacketTypes.DISCONNECT, "Unspecified error")
@@ -33,7 +33,7 @@ KEEPALIVE_TIMEOUT = ReasonCode(PacketTypes.DISCONNECT, "Keep alive timeout")
 NORMAL_DISCONNECT = ReasonCode(PacketTypes.DISCONNECT, "Normal disconnection")
 NO_FLAGS = SimpleNamespace(is_disconnect_packet_from_server=False, session_present=False)
 MAX_IN_FLIGHT = 20
-"""Default of paho for QoS 1 messages without an acknowledgment."""
+"""Maximum number of QoS 1 messages without an acknowledgment; the default of paho."""
 KEEPALIVE_TOLERANCE = 1.5
 """Keepalive intervals without a packet after which a broker ends a connection (section 3.1.2.10 of MQTT 5)."""
 SUBACK_OK = ReasonCode(PacketTypes.SUBACK, identifier=0)
@@ -60,11 +60,15 @@ class Packet:
 
 @dataclass
 class Connection:
-    """TCP connection, possibly half open without either side noticing.
+    """TCP connection.
 
     Attributes:
-        arrival_at_broker_s: Arrival of the last packet to the broker; later packets arrive after it [s].
-        arrival_at_client_s: Arrival of the last packet to the client [s].
+        half_open: True if all packets are lost and neither end notices.
+        client_open: True if the connection is open at the client.
+        broker_open: True if the connection is open at the broker.
+        accepted: True if the broker has accepted the client.
+        arrival_at_broker_s: Arrival of the last packet that the client has sent; later packets arrive after it [s].
+        arrival_at_client_s: Arrival of the last packet that the broker has sent; later packets arrive after it [s].
         received_by_broker_s: Time of the last packet that the broker has received [s].
         received_by_client_s: Time of the last packet that the client has received [s].
         sent_by_client_s: Time of the last packet that the client has sent [s].
@@ -106,7 +110,7 @@ class Broker:
     Args:
         timeline: Timeline of the world.
         dice: Generator of the random delays.
-        received: Called with each received message and its connection; None: no connection, as of a will.
+        received: Called with each received message and its connection; None: a will, or a message of another client.
     """
 
     def __init__(
@@ -128,8 +132,8 @@ class Broker:
         """Stop the broker; all clients notice."""
         self.up = False
         for connection in list(self.connections):
-            self._end(connection, publishes_will=False)
-            self._hang_up(connection)
+            self._end_at_broker(connection, publishes_will=False)
+            self._end_at_client(connection)
         if loses_retained:
             self.retained.clear()
 
@@ -141,8 +145,8 @@ class Broker:
     def drop(self) -> None:
         """Cut all connections; both ends notice."""
         for connection in list(self.connections):
-            self._end(connection, publishes_will=True)
-            self._hang_up(connection)
+            self._end_at_broker(connection, publishes_will=True)
+            self._end_at_client(connection)
 
     def half_open(self) -> None:
         """Make all connections half open: packets are lost, and neither end notices."""
@@ -157,14 +161,14 @@ class Broker:
                 if silently:
                     connection.half_open = True
                 else:
-                    self._send_to_broker(connection, lambda c=connection: self._end(c, publishes_will=True))
+                    self._send_to_broker(connection, lambda c=connection: self._end_at_broker(c, publishes_will=True))
 
     def publish_as_other(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
         """Publish a message of another client."""
         if self.up:
             self._receive(Packet(topic, payload, 0, retain, 0), None)
 
-    # requests of clients
+    # packets from clients
 
     def connect(self, client: "VirtualPaho") -> Connection:
         """Open a connection of a client.
@@ -177,7 +181,7 @@ class Broker:
             raise LateError(CONNECT_TIMEOUT_S, TimeoutError("timed out"))
         if not self.up:
             raise ConnectionRefusedError(111, "Connection refused")
-        connection = Connection(client, self.loop, half_open=False)
+        connection = Connection(client, self.loop)
         connection.received_by_broker_s = connection.received_by_client_s = self._timeline.now_s
         self.connections.append(connection)
         self._send_to_broker(connection, lambda: self._accept(connection))
@@ -194,7 +198,7 @@ class Broker:
 
     def disconnect(self, connection: Connection) -> None:
         """Disconnect a client cleanly."""
-        self._send_to_broker(connection, lambda: self._end(connection, publishes_will=False))
+        self._send_to_broker(connection, lambda: self._end_at_broker(connection, publishes_will=False))
         connection.client_open = False
 
     # behavior
@@ -205,14 +209,15 @@ class Broker:
             self._send_to_client(
                 connection, lambda: client.on_connect(client, None, NO_FLAGS, UNSUPPORTED_VERSION, None)
             )
-            self._end(connection, publishes_will=False)
+            self._end_at_broker(connection, publishes_will=False)
             return
+        # A new connection with the same client identifier replaces the old one.
         for other in list(self.connections):
             if other is not connection and other.accepted and other.client.identifier == client.identifier:
-                self._end(other, publishes_will=True)
-                self._hang_up(other)
+                self._end_at_broker(other, publishes_will=True)
+                self._end_at_client(other)
         connection.accepted = True
-        self._send_to_client(connection, lambda: client.connected(CONNACK_OK))
+        self._send_to_client(connection, lambda: client.on_connack(CONNACK_OK))
 
     def _receive_from(self, connection: Connection, packet: Packet) -> None:
         self._receive(packet, connection)
@@ -233,8 +238,9 @@ class Broker:
         self._received(packet, source)
         for connection in self.connections:
             if any(matches(packet.topic, topic_filter) for topic_filter in connection.topic_filters):
-                as_published = packet.retain and "/request/" in packet.topic
-                self._forward(connection, packet.topic, packet.payload, retain=as_published)
+                # The service subscribes to requests with "retain as published", to other topics without.
+                retain = packet.retain and "/request/" in packet.topic
+                self._forward(connection, packet.topic, packet.payload, retain=retain)
 
     def _subscribe(self, connection: Connection, topics: list[str], mid: int) -> None:
         connection.topic_filters += topics
@@ -251,8 +257,7 @@ class Broker:
         client = connection.client
         self._send_to_client(connection, lambda: client.on_message(client, None, message))
 
-    def _end(self, connection: Connection, *, publishes_will: bool) -> None:
-        """End a connection at the broker."""
+    def _end_at_broker(self, connection: Connection, *, publishes_will: bool) -> None:
         if not connection.broker_open:
             return
         connection.broker_open = False
@@ -261,9 +266,8 @@ class Broker:
         if publishes_will and connection.accepted and will is not None and self.up:
             self._receive(will, None)
 
-    def _hang_up(self, connection: Connection) -> None:
-        """End a connection at the client."""
-        self._send_to_client(connection, lambda: connection.client.lost(CONNECTION_LOST))
+    def _end_at_client(self, connection: Connection) -> None:
+        self._send_to_client(connection, lambda: connection.client.on_loss(CONNECTION_LOST))
 
     def _check_keepalive(self, connection: Connection) -> None:
         """Check the keepalive of both sides."""
@@ -271,49 +275,50 @@ class Broker:
         if (
             connection.broker_open
             and connection.received_by_broker_s < now_s - KEEPALIVE_TOLERANCE * keepalive_s
-            and (now_s >= self.frozen_until_s)
+            and now_s >= self.frozen_until_s
         ):
-            self._end(connection, publishes_will=True)
-            self._hang_up(connection)
+            self._end_at_broker(connection, publishes_will=True)
+            self._end_at_client(connection)
         if connection.client_open and connection.loop.alive and now_s >= connection.loop.frozen_until_s:
             if connection.pinged_s is not None and now_s - connection.pinged_s >= keepalive_s:
-                connection.loop.call_soon(connection.client.lost, KEEPALIVE_TIMEOUT)
+                connection.loop.call_soon(connection.client.on_loss, KEEPALIVE_TIMEOUT)
             elif connection.pinged_s is None and (
                 min(connection.received_by_client_s, connection.sent_by_client_s) <= now_s - keepalive_s
             ):
+                # A ping and its response, which have no effect except on the times of the connection.
                 connection.pinged_s = now_s
                 self._send_to_broker(connection, lambda: self._send_to_client(connection, lambda: None))
         if connection.broker_open or (connection.client_open and connection.loop.alive):
             self._timeline.after(KEEPALIVE_CHECK_S, lambda: self._check_keepalive(connection))
 
-    def _send_to_broker(self, connection: Connection, packet: Callable[[], None]) -> None:
+    def _send_to_broker(self, connection: Connection, on_arrival: Callable[[], None]) -> None:
+        """Send a packet, whose effect at the broker is ``on_arrival``."""
         connection.sent_by_client_s = now_s = self._timeline.now_s
-        connection.arrival_at_broker_s = max(connection.arrival_at_broker_s, now_s) + self._dice.uniform(
-            0.0005, MAX_DELAY_S
-        )
-        self._timeline.at(connection.arrival_at_broker_s, lambda: self._arrive(connection, packet))
+        delay_s = self._dice.uniform(MIN_DELAY_S, MAX_DELAY_S)
+        connection.arrival_at_broker_s = max(connection.arrival_at_broker_s, now_s) + delay_s
+        self._timeline.at(connection.arrival_at_broker_s, lambda: self._arrive_at_broker(connection, on_arrival))
 
-    def _arrive(self, connection: Connection, packet: Callable[[], None]) -> None:
-        """Deliver a packet to the broker."""
+    def _arrive_at_broker(self, connection: Connection, on_arrival: Callable[[], None]) -> None:
         if connection.half_open or not connection.broker_open:
             return
         if self._timeline.now_s < self.frozen_until_s:
+            # Packets wait for the end of the freeze; a microsecond between them preserves their order.
             connection.arrival_at_broker_s = max(connection.arrival_at_broker_s, self.frozen_until_s) + 1e-6
-            self._timeline.at(connection.arrival_at_broker_s, lambda: self._arrive(connection, packet))
+            self._timeline.at(connection.arrival_at_broker_s, lambda: self._arrive_at_broker(connection, on_arrival))
             return
         connection.received_by_broker_s = self._timeline.now_s
-        packet()
+        on_arrival()
 
-    def _send_to_client(self, connection: Connection, packet: Callable[[], None]) -> None:
-        connection.arrival_at_client_s = max(connection.arrival_at_client_s, self._timeline.now_s) + self._dice.uniform(
-            0.0005, MAX_DELAY_S
-        )
+    def _send_to_client(self, connection: Connection, on_arrival: Callable[[], None]) -> None:
+        """Send a packet, whose effect at the client is ``on_arrival``."""
+        delay_s = self._dice.uniform(MIN_DELAY_S, MAX_DELAY_S)
+        connection.arrival_at_client_s = max(connection.arrival_at_client_s, self._timeline.now_s) + delay_s
 
         def arrive() -> None:
             if connection.half_open or not connection.client_open or not connection.loop.alive:
                 return
             connection.received_by_client_s, connection.pinged_s = self._timeline.now_s, None
-            connection.loop.call_soon(packet)
+            connection.loop.call_soon(on_arrival)
 
         self._timeline.at(connection.arrival_at_client_s, arrive)
 
@@ -334,7 +339,7 @@ class VirtualPaho:
     def __init__(self, broker: Broker, **arguments: Any) -> None:
         self._broker = broker
         self.identifier, self.protocol = arguments["client_id"], arguments["protocol"]
-        self._client_id = (self.identifier or "").encode()
+        self._client_id = (self.identifier or "").encode()  # read by aiomqtt
         self.keepalive_s = 60.0
         self.will: Packet | None = None
         self.max_inflight_messages = MAX_IN_FLIGHT
@@ -352,25 +357,29 @@ class VirtualPaho:
     def will_set(self, topic: str, payload: bytes, qos: int, retain: bool, *_: Any) -> None:
         self.will = Packet(topic, payload, qos, retain, 0)
 
-    def connect(self, *address: Any) -> None:
-        self.keepalive_s = address[2]
+    def connect(self, _host: str, _port: int, keepalive_s: float, *_: Any) -> None:
+        self.keepalive_s = keepalive_s
         self._connection = self._broker.connect(self)
 
-    def connected(self, code: ReasonCode) -> None:
+    def on_connack(self, code: ReasonCode) -> None:
+        """Tell aiomqtt that the broker has accepted the connection."""
         self.on_connect(self, None, NO_FLAGS, code, None)
 
-    def lost(self, code: ReasonCode) -> None:
+    def on_loss(self, code: ReasonCode) -> None:
+        """Close a lost connection, and tell aiomqtt."""
         if self._connection is not None and self._connection.client_open:
             self._connection.client_open = False
             connection = self._connection
-            self._broker._send_to_broker(connection, lambda: self._broker._end(connection, publishes_will=True))
+            self._broker._send_to_broker(
+                connection, lambda: self._broker._end_at_broker(connection, publishes_will=True)
+            )
             self.on_disconnect(self, None, NO_FLAGS, code, None)
 
     def loop_write(self) -> paho.MQTTErrorCode:
         return paho.MQTT_ERR_SUCCESS  # ``publish`` has sent the packet
 
     def socket(self) -> Any:
-        return SimpleNamespace(shutdown=lambda _: self.lost(CONNECTION_LOST))
+        return SimpleNamespace(shutdown=lambda _: self.on_loss(CONNECTION_LOST))
 
     def publish(self, topic: str, payload: bytes, qos: int, retain: bool, *_: Any) -> Any:
         self._mid += 1

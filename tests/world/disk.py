@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 MAX_SYNC_DELAY_S = 31.0
-"""Time after which a committed transaction is synced [s], by the next transaction of ``store.database`` or by the operating system."""
+"""Maximum time until a committed transaction is synced [s], by a later one of ``store.database`` or by the operating system."""
 
 
 class PowerCutError(BaseException):
@@ -28,7 +28,7 @@ class PowerCutError(BaseException):
 
 @dataclass
 class ArmedFault:
-    """Armed fault of the disk."""
+    """Fault that ends the process at one of its next operations on the disk."""
 
     operations_left: int
     """Number of operations until it occurs."""
@@ -62,14 +62,15 @@ class Disk:
         self._synced: dict[int, bytes] = {}
         """Synced bytes by inode."""
         self._names: dict[str, int] = {}
-        """Synced names."""
+        """Inode by name of file, at the last fsync of the folder."""
         self._pending: list[tuple[str, str, int]] = []
         """Name changes since the folder's last fsync: operation, name, inode."""
         self._folders: set[int] = set()
+        """Descriptors of the folder, which the service opens to sync its names."""
         self.connections: list[sqlite3.Connection] = []
         """Database connections of the present process."""
-        self._logs: dict[str, deque[tuple[float, int]]] = {}
-        """Times and sizes of each write-ahead log."""
+        self._log_sizes: dict[str, deque[tuple[float, int]]] = {}
+        """Time [s] and size [bytes] of each write-ahead log after each transaction, by name of file."""
 
     @property
     def is_faulty(self) -> bool:
@@ -78,7 +79,7 @@ class Disk:
 
     @contextmanager
     def installed(self) -> Iterator[None]:
-        """Replace the file functions of this process."""
+        """Replace the file functions of ``os`` in this process."""
         originals = {name: getattr(os, name) for name in ("open", "fsync", "replace", "rename", "unlink", "remove")}
         try:
             os.open, os.fsync = self._open(originals["open"]), self._fsync(originals["fsync"])
@@ -91,6 +92,8 @@ class Disk:
 
     def end_process(self) -> None:
         """Drop the database connections of an ended process without closing them."""
+        # Closing a connection moves the write-ahead log to the database, which a kill does not. Therefore the files are
+        # restored, except the index (-shm), which SQLite builds from the log.
         contents = {path: path.read_bytes() for path in self._databases()}
         for connection in self.connections:
             connection.close()
@@ -101,7 +104,7 @@ class Disk:
             if not path.name.endswith("-shm"):
                 path.write_bytes(content)
 
-    def transaction(self, call: Callable[[], Any], now_s: float) -> Any:
+    def run_transaction(self, call: Callable[[], Any], now_s: float) -> Any:
         """Run a call that uses a database.
 
         Raises:
@@ -110,17 +113,17 @@ class Disk:
         if self.full or self.broken:
             raise sqlite3.OperationalError("database or disk is full" if self.full else "disk I/O error")
         value = call()
-        self._note_databases(now_s)
+        self._record_log_sizes(now_s)
         return value
 
-    def _note_databases(self, now_s: float) -> None:
-        """Record the sizes of the databases' logs: parts older than ``MAX_SYNC_DELAY_S`` are synced."""
+    def _record_log_sizes(self, now_s: float) -> None:
+        """Record the sizes of the write-ahead logs, because a log is synced up to its size ``MAX_SYNC_DELAY_S`` ago."""
         for path in self._databases():
             if path.name.endswith("-wal"):
-                sizes = self._logs.setdefault(path.name, deque())
+                sizes = self._log_sizes.setdefault(path.name, deque())
                 size = path.stat().st_size
                 if sizes and sizes[-1][1] > size:
-                    sizes.clear()  # a new log
+                    sizes.clear()  # SQLite has begun a new log
                 sizes.append((now_s, size))
 
     def _databases(self) -> list[Path]:
@@ -130,30 +133,24 @@ class Disk:
         """Cut the power: synced data and a random part of the other data survive."""
         self.armed_fault = None  # no process runs that could reach it
         databases = {path: path.read_bytes() for path in self._databases()}
-        self._cut_files()
+        self._cut_files()  # deletes the databases, too
         for path, content in databases.items():
             if path.name.endswith("-wal"):
-                sizes = self._logs.get(path.name, deque())
+                sizes = self._log_sizes.get(path.name, deque())
                 synced = max((size for at_s, size in sizes if at_s < now_s - MAX_SYNC_DELAY_S), default=0)
                 surviving = self._dice.randint(min(synced, len(content)), len(content))
                 path.write_bytes(content[:surviving])
-                self._logs[path.name] = deque([(-math.inf, surviving)])  # all surviving bytes are synced
+                self._log_sizes[path.name] = deque([(-math.inf, surviving)])  # all surviving bytes are synced
             else:
                 path.write_bytes(content)
 
     def _cut_files(self) -> None:
+        """Replace the files by those that survive a power cut."""
         content = {path.name: path.read_bytes() for path in sorted(self.folder.iterdir()) if path.is_file()}
         inodes = {name: (self.folder / name).stat().st_ino for name in content}
         volatile = {inodes[name]: content[name] for name in content}
-        names = dict(self._names)
-        survivors = self._pending[: self._dice.randint(0, len(self._pending))]
-        for operation, name, inode in survivors:  # the journal replays changes in order
-            if operation == "unlink":
-                names.pop(name, None)
-            else:
-                if operation == "replace":
-                    names = {other: number for other, number in names.items() if number != inode}
-                names[name] = inode
+        surviving_changes = self._pending[: self._dice.randint(0, len(self._pending))]
+        names = _replay(surviving_changes, self._names)  # as the journal of the file system does
         for path in list(self.folder.iterdir()):
             path.unlink()
         surviving = {inode: self._surviving_bytes(inode, volatile.get(inode, b"")) for inode in names.values()}
@@ -170,7 +167,7 @@ class Disk:
         return self.connections[-1]
 
     def _surviving_bytes(self, inode: int, volatile: bytes) -> bytes:
-        """Return the bytes of a file that survive a power cut: all, none, the beginning, or zeros, if they are not synced."""
+        """Return the bytes of a file after a power cut. Unsynced files survive whole, empty, truncated or filled with zeros."""
         synced = self._synced.get(inode)
         if synced is not None and (not volatile or volatile == synced):
             return synced
@@ -185,7 +182,7 @@ class Disk:
                 return bytes(len(volatile))
 
     def _name_on_disk(self, path: Any) -> str | None:
-        """Return the name of a file on this disk; None for another file."""
+        """Return the name of a file on this disk; None for files elsewhere and for databases, which need other functions."""
         text = os.fspath(path) if not isinstance(path, int) else ""
         return (
             text.removeprefix(self._prefix)
@@ -193,8 +190,8 @@ class Disk:
             else None
         )
 
-    def _operation(self) -> None:
-        """Count an operation, and raise an armed fault."""
+    def _count_operation(self) -> None:
+        """Count an operation, and raise an armed fault that is due."""
         self.operations += 1
         if self.armed_fault is not None:
             self.armed_fault.operations_left -= 1
@@ -220,7 +217,7 @@ class Disk:
             writes = flags & (os.O_WRONLY | os.O_RDWR)
             is_new = writes and not os.path.lexists(path)
             if writes and not name.endswith(".lock"):
-                self._operation()
+                self._count_operation()
                 self._raise_if_faulty()
             descriptor = real(path, flags, mode)
             if is_new:
@@ -233,30 +230,20 @@ class Disk:
         def sync_file(descriptor: int) -> None:
             if descriptor in self._folders:
                 self._folders.discard(descriptor)
-                self._operation()
-                self._flush_names()
+                self._count_operation()
+                self._names, self._pending = _replay(self._pending, self._names), []
                 return
-            path = os.readlink(f"/proc/self/fd/{descriptor}")  # noqa: PTH115 - it is no file
+            path = os.readlink(f"/proc/self/fd/{descriptor}")  # noqa: PTH115 - no ordinary link
             if self._name_on_disk(path) is None:
                 real(descriptor)
                 return
-            self._operation()
-            if self.full or self.broken:  # the data written so far are torn
+            self._count_operation()
+            if self.full or self.broken:  # only a part of the written data has reached the disk
                 os.truncate(path, self._dice.randint(0, os.fstat(descriptor).st_size))
                 self._raise_if_faulty()
             self._synced[os.fstat(descriptor).st_ino] = Path(path).read_bytes()
 
         return sync_file
-
-    def _flush_names(self) -> None:
-        for operation, name, inode in self._pending:
-            if operation == "unlink":
-                self._names.pop(name, None)
-            else:
-                if operation == "replace":
-                    self._names = {other: n for other, n in self._names.items() if n != inode}
-                self._names[name] = inode
-        self._pending = []
 
     def _replace(self, real: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
         def replace_file(source: Any, target: Any, **_: Any) -> None:
@@ -264,7 +251,7 @@ class Disk:
             if name is None:
                 real(source, target)
                 return
-            self._operation()
+            self._count_operation()
             self._raise_if_faulty()
             inode = Path(source).stat().st_ino
             real(source, target)
@@ -279,8 +266,21 @@ class Disk:
                 real(path, dir_fd=dir_fd)
                 return
             if os.path.lexists(path):
-                self._operation()
+                self._count_operation()
                 self._pending.append(("unlink", name, 0))
             real(path)
 
         return unlink_file
+
+
+def _replay(changes: list[tuple[str, str, int]], names: dict[str, int]) -> dict[str, int]:
+    """Return the names of a folder, with their inodes, after changes in their order."""
+    names = dict(names)
+    for operation, name, inode in changes:
+        if operation == "unlink":
+            names.pop(name, None)
+            continue
+        if operation == "replace":  # the inode loses its former name
+            names = {other: number for other, number in names.items() if number != inode}
+        names[name] = inode
+    return names

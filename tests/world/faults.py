@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from tests.world.world import World
 
 MIN_PAUSE_S, MAX_PAUSE_S = 5.0, 300.0
-"""Range of the pause between the begins of two faults [s]."""
+"""Range of the time from the begin of a fault to that of the next [s]."""
 MEAN_PAUSE_S = 90.0
-"""Mean of the random part of the pause [s]."""
+"""Mean of the random part of that time; ``MIN_PAUSE_S`` is added [s]."""
 MIN_DURATION_S, MAX_DURATION_S = 0.1, 400.0
 """Range of the duration of a fault [s]."""
 MEAN_DURATION_S = 40.0
-"""Mean of the random part of the duration [s]."""
+"""Mean of the random part of the duration; ``MIN_DURATION_S`` is added [s]."""
 MAX_FIRST_S = 20.0
 """Maximum time before the first pause [s]."""
 MAX_FREEZE_S = 120.0
@@ -33,9 +33,13 @@ SYNC_CHANGE_S = 60.0
 STOP_S = 90.0
 """Stop timeout after which systemd kills the service [s]."""
 MIN_JUMP_S, MAX_JUMP_S = 3.0, 3600.0
-"""Range of steps of the board's clock [s]: the service accepts a sample that is less than 2 s early."""
+"""Range of the size of a step of the board's clock [s]. The service would accept a sample that is less than 2 s early."""
 MAX_RANDOM_S = 5.0
 """Maximum duration of random timestamps of the board [s]."""
+MAX_KILL_HANDLES = 200
+"""Maximum number of handles of the event loop that still run before a kill."""
+MAX_DISK_OPERATIONS = 8
+"""Maximum number of operations on the disk that still succeed before a kill or a power cut at a write."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +148,7 @@ def _step_board_clock(world: "World", fault: Fault) -> None:
     world.board.step_clock(_jump_s(fault))
 
 
-def _change_stamp(world: "World", fault: Fault) -> None:
+def _send_one_wrong_stamp(world: "World", fault: Fault) -> None:
     world.board.stamp_errors_us.append(round(_jump_s(fault) * 1e6))
 
 
@@ -156,9 +160,8 @@ def _randomize_stamps(world: "World", fault: Fault) -> None:
 
 def _stop_broker(world: "World", fault: Fault) -> None:
     if world.broker.up:
-        world.will_certain &= (
-            world.process is not None or not world.broker.connections
-        )  # the broker loses the will when it stops
+        # A broker that stops does not publish the will of a process that has ended.
+        world.will_certain &= world.process is not None or not world.broker.connections
         world.broker.stop(loses_retained=fault.severity < 0.3)
         world.timeline.after(fault.duration_s, world.broker.start)
 
@@ -182,9 +185,10 @@ def _freeze_broker(world: "World", fault: Fault) -> None:
 
 
 def _step_wall_clock(world: "World", fault: Fault) -> None:
+    # The factor is between 1 s and 1e6 s, so that steps of all sizes up to six days occur, ahead and back.
     world.clocks.wall_offset_s += (fault.severity - 0.5) * 10.0 ** (6.0 * world.dice["faults"].random())
     if fault.duration_s > SYNC_CHANGE_S:
-        world.clocks.synchronised = not world.clocks.synchronised
+        world.clocks.synchronized = not world.clocks.synchronized
 
 
 def _disk_fault(attribute: str) -> Callable[["World", Fault], None]:
@@ -196,11 +200,11 @@ def _disk_fault(attribute: str) -> Callable[["World", Fault], None]:
 
 
 def _kill_service(world: "World", fault: Fault) -> None:
-    world.kill_after = int(200 * fault.severity)
+    world.handles_until_kill = int(MAX_KILL_HANDLES * fault.severity)
 
 
 def _kill_service_at_write(world: "World", fault: Fault) -> None:
-    world.disk.armed_fault = ArmedFault(int(8 * fault.severity), KilledError)
+    world.disk.armed_fault = ArmedFault(int(MAX_DISK_OPERATIONS * fault.severity), KilledError)
 
 
 def _cut_power(world: "World", fault: Fault) -> None:
@@ -209,7 +213,7 @@ def _cut_power(world: "World", fault: Fault) -> None:
 
 
 def _cut_power_at_write(world: "World", fault: Fault) -> None:
-    world.disk.armed_fault = ArmedFault(int(8 * fault.severity), PowerCutError)
+    world.disk.armed_fault = ArmedFault(int(MAX_DISK_OPERATIONS * fault.severity), PowerCutError)
 
 
 def _stop_service(world: "World", fault: Fault) -> None:
@@ -252,11 +256,12 @@ def _send_hostile_requests(world: "World", fault: Fault) -> None:
 
 
 def _forge_availability(world: "World", fault: Fault) -> None:
+    # Different digits of the severity select topic and payload.
     topic = "availability" if fault.severity < 0.5 else "sensor/availability"
     world.broker.publish_as_other(
         f"bms/pack/{topic}", b"offline" if fault.severity % 0.2 < 0.1 else b"nonsense", retain=True
     )
-    world.will_certain &= world.process is not None
+    world.will_certain &= world.process is not None  # without a process, the forged message remains
 
 
 def _send_birth_message(world: "World", fault: Fault) -> None:
@@ -290,8 +295,11 @@ KINDS: dict[str, Callable[["World", Fault], None]] = {
     "availability forged": _forge_availability,
     "birth message": _send_birth_message,
     "board's clock stepped": _step_board_clock,
-    "one stamp wrong": _change_stamp,
+    "one stamp wrong": _send_one_wrong_stamp,
     "board's clock at random": _randomize_stamps,
 }
 CLOCK_FAULTS = ("board's clock stepped", "one stamp wrong", "board's clock at random")
-"""Faults of the board's clock, only with the binary protocol. They are drawn separately, so that older seeds keep their other faults."""
+"""Faults of the board's clock, which only the binary protocol transmits.
+
+They are drawn separately, so that a seed has the same other faults as before these faults existed.
+"""

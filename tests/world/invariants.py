@@ -14,7 +14,7 @@ from tests.world.broker import Connection, Packet
 MAX_STDS = 4.0
 """Maximum SOC error [standard deviations], in addition to ``SOC_TOLERANCE``."""
 SOC_TOLERANCE = 0.004
-"""Permitted SOC error in addition to ``MAX_STDS``: the published SOC may belong to the previous sample."""
+"""Permitted SOC error in addition to ``MAX_STDS``, because the published SOC may belong to the previous sample."""
 INTERVAL_STDS = 2.0
 """Half width of the interval whose coverage is reported [standard deviations]."""
 MAX_TASKS = 40
@@ -31,8 +31,8 @@ class InvariantError(Exception):
     """Violated invariant."""
 
 
-class Reference:
-    """Reference count of the valid samples delivered to a process, by a decoder of single messages."""
+class ReferenceDecoder:
+    """Independent decoder that counts the valid samples delivered to a process."""
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -51,22 +51,23 @@ class Reference:
         return self.samples > before
 
 
-class State(NamedTuple):
+class PublishedState(NamedTuple):
     """State that the service has published."""
 
     process: int
+    """Number of the process."""
     published_s: float
     disk_failed: bool
-    """True if the state may not be on disk, while older ones wait there."""
+    """True if this state may be missing on disk while older states wait there to be sent."""
 
 
-class End(NamedTuple):
+class ProcessEnd(NamedTuple):
     """End of a process."""
 
     at_s: float
-    """Time at which it last ran [s]: a frozen process saves nothing."""
+    """Time at which it last ran [s], which is before a freeze that had not ended."""
     survival_age_s: float
-    """Age beyond which its sent and received messages survive the end [s]."""
+    """Messages and acknowledgments older than this survive the end; infinite: all may be lost [s]."""
 
 
 IN_FLIGHT_S = 15.0
@@ -75,18 +76,18 @@ IN_FLIGHT_S = 15.0
 
 @dataclass
 class PublishedStates:
-    """Published states, and those that the broker has received."""
+    """States that the service has published, numbered from 0, and their deliveries to the broker."""
 
     payloads: dict[bytes, int] = field(default_factory=dict)
-    """Number of a state by payload."""
-    states: list[State] = field(default_factory=list)
-    last: int = -1
-    """Number of the newest state at the broker."""
+    """Number of each state by its payload."""
+    states: list[PublishedState] = field(default_factory=list)
+    newest: int = -1
+    """Largest number of a state that the broker has received; -1: none."""
     received: dict[int, list[tuple[Connection, int]]] = field(default_factory=dict)
     """Deliveries of each state: connection and packet identifier."""
-    ends: dict[int, End] = field(default_factory=dict)
-    """Ends of processes."""
-    doubled: int = 0
+    ends: dict[int, ProcessEnd] = field(default_factory=dict)
+    """Ends by number of process."""
+    repeated_deliveries: int = 0
     """Number of repeated deliveries after a reconnect."""
     lost_at_kill: int = 0
     """Number of states lost by a kill or a power cut."""
@@ -94,11 +95,11 @@ class PublishedStates:
     def record(self, payload: bytes, process: int, now_s: float, *, disk_failed: bool) -> None:
         """Record a published state."""
         self.payloads[payload] = len(self.states)
-        self.states.append(State(process, now_s, disk_failed))
+        self.states.append(PublishedState(process, now_s, disk_failed))
 
-    def end(self, process: int, now_s: float, survival_age_s: float) -> None:
+    def record_end(self, process: int, now_s: float, survival_age_s: float) -> None:
         """Record the end of a process."""
-        self.ends[process] = End(now_s, survival_age_s)
+        self.ends[process] = ProcessEnd(now_s, survival_age_s)
 
     def check_received(self, packet: Packet, connection: Connection | None, *, in_order: bool) -> str:
         """Check a state that the broker has received.
@@ -106,7 +107,7 @@ class PublishedStates:
         Args:
             packet: Message with the state.
             connection: Connection on which it arrived.
-            in_order: True if it must be newer than earlier ones also after a restart.
+            in_order: True if it must be newer than all states received before, also than those of earlier processes.
 
         Returns:
             Description of the violation; empty: none.
@@ -123,13 +124,13 @@ class PublishedStates:
             if self._acknowledgment_known(other, mid, connection, self.states[number].process):
                 return f"state {number} came again though its acknowledgement had come"
         if earlier:
-            self.doubled += 1
-        elif number < self.last:
-            last = self.states[self.last]
-            if self.states[number].process == last.process or (in_order and not last.disk_failed):
-                return f"state {number} came after state {self.last}"
+            self.repeated_deliveries += 1
+        elif number < self.newest:
+            newest = self.states[self.newest]
+            if self.states[number].process == newest.process or (in_order and not newest.disk_failed):
+                return f"state {number} came after state {self.newest}"
         earlier.append((connection, packet.mid))
-        self.last = max(self.last, number)
+        self.newest = max(self.newest, number)
         return ""
 
     def _acknowledgment_known(self, other: Connection, mid: int, connection: Connection, process: int) -> bool:
@@ -142,8 +143,8 @@ class PublishedStates:
         ends = [end for number, end in self.ends.items() if number >= process]
         return not any(acknowledged_s > end.at_s - end.survival_age_s for end in ends)
 
-    def lost(self, now_s: float) -> list[int]:
-        """Return the states that were lost without an explanation."""
+    def find_lost(self, now_s: float) -> list[int]:
+        """Return the numbers of states whose loss no end of a process explains; count the others in ``lost_at_kill``."""
         missing = [n for n in range(len(self.states)) if n not in self.received]
         ends = self.ends.items()
         lost = []
@@ -165,7 +166,7 @@ class SocErrors:
     states: int = 0
     """Number of published states with an SOC."""
     within_interval: int = 0
-    """Number of states whose SOC error is at most ``INTERVAL_STDS``."""
+    """Number of states whose SOC error is at most ``INTERVAL_STDS`` standard deviations."""
     max_stds: float = 0.0
     """Maximum SOC error beyond ``SOC_TOLERANCE`` [standard deviations]."""
     max_error: float = 0.0
@@ -180,9 +181,9 @@ class SocErrors:
         self.states += 1
         self.within_interval += error <= INTERVAL_STDS * e.soc_std
         self.max_error = max(self.max_error, error)
-        beyond = max(error - SOC_TOLERANCE, 0.0) / e.soc_std
-        self.max_stds = max(self.max_stds, beyond)
-        if beyond > MAX_STDS:
+        excess_stds = max(error - SOC_TOLERANCE, 0.0) / e.soc_std
+        self.max_stds = max(self.max_stds, excess_stds)
+        if excess_stds > MAX_STDS:
             return f"SOC {e.soc:.4f} +- {e.soc_std:.4f}, true {true_soc:.4f}"
         return ""
 
@@ -192,14 +193,15 @@ class ChargeTotals:
     """Published totals of charge and energy over all processes."""
 
     saved: ChargeEnergy = field(default_factory=ChargeEnergy)
-    """Last published totals that were on disk."""
+    """Last published totals that were on disk; later ones must not be smaller."""
 
     def check(self, estimate: Estimate, *, saved: bool) -> str:
         """Check the totals of a state; ``saved``: they are on disk. Return the violation, or an empty text."""
-        flow = ChargeEnergy(*(getattr(estimate, name) for name in ChargeEnergy._fields))
-        violation = f"{flow} after {self.saved}" if any(a < b for a, b in zip(flow, self.saved, strict=True)) else ""
+        totals = ChargeEnergy(*(getattr(estimate, name) for name in ChargeEnergy._fields))
+        decreased = any(total < saved_total for total, saved_total in zip(totals, self.saved, strict=True))
+        violation = f"{totals} after {self.saved}" if decreased else ""
         if saved:
-            self.saved = flow
+            self.saved = totals
         return violation
 
 
@@ -209,19 +211,23 @@ class AvailabilityCheck:
 
     limit_s: float
     """Maximum delay [s]."""
-    now: str | None = None
+    truth: str | None = None
+    """True value at the last check; None: the broker could not know it."""
     disagrees_since_s: float | None = None
     max_delay_s: float = 0.0
     """Largest delay so far [s]."""
 
     def check(self, truth: str | None, retained: str | None, now_s: float) -> str:
-        """Compare true and retained value; ``truth`` is None while the broker cannot know it. Return the violation, or an empty text."""
+        """Compare true and retained value. Return the violation, or an empty text.
+
+        ``truth`` is None while the broker cannot know it. No retained message is as good as "offline".
+        """
         agrees = truth is None or retained == truth or (truth == "offline" and retained is None)
-        if agrees or truth != self.now:
+        if agrees or truth != self.truth:
             self.disagrees_since_s = None if agrees else now_s
         elif self.disagrees_since_s is None:
             self.disagrees_since_s = now_s
-        self.now = truth
+        self.truth = truth
         delay_s = 0.0 if self.disagrees_since_s is None else now_s - self.disagrees_since_s
         self.max_delay_s = max(self.max_delay_s, delay_s)
         return f"{retained}, but {truth} for {delay_s:.0f} s" if delay_s > self.limit_s else ""

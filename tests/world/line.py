@@ -42,7 +42,7 @@ from tests.world.loop import Timeline
 BANDGAP_READINGS = 256
 """Number of bandgap readings whose sum the hello reports."""
 NOISE_STEPS = 0.5
-"""Noise of one conversion [steps]. A window has thousands, so that their mean is more accurate."""
+"""Noise of one conversion [steps]. A window has thousands of conversions, so that its mean has less noise."""
 MIN_DELAY_S = 0.001
 """Minimum delay of a write on USB [s]."""
 MAX_DELAY_S = 0.004
@@ -51,6 +51,8 @@ BOOTLOADER_S = 0.2
 """Time from a reset by opening the port to the board's first message [s]."""
 SPLIT_PROBABILITY = 0.2
 """Probability that bytes arrive in two reads."""
+DECLARED_DIVIDER = 1.0
+"""Ratio of the voltage divider that each board reports. The true ratio of the other pack's board differs from it."""
 ARDUINO_USB_ID = 0x2341, 0x0043
 """Vendor and product id of an Arduino Uno."""
 
@@ -80,7 +82,7 @@ class Board:
     def reset(self, cause: ResetCause = ResetCause.EXTERNAL) -> bytes:
         """Reset the board; return its hello."""
         self._boot_id = (self._boot_id + 1) % (1 << 16)
-        self._cause, self._sequence, self._ns, self._ntc_next, self._buffer = cause, 0, 0, False, b""
+        self._cause, self._sequence, self._board_ns, self._ntc_next, self._buffer = cause, 0, 0, False, b""
         self.stamp_errors_us.clear()
         self._window_ns = 0
         self._set_rate(self._first_rate_hz)
@@ -92,35 +94,37 @@ class Board:
         return self._period_ns * 1e-9
 
     def begin_window(self) -> None:
-        """Begin a window, at times that neither a reset nor a change of rate shifts."""
+        """Begin a window. The world calls this after each window, also if the board was reset meanwhile."""
         self._window_ns = self._period_ns
 
     @property
     def has_measured(self) -> bool:
-        """True if a window has ended, without a reset meanwhile."""
+        """True if the board was not reset since ``begin_window``, so that a sample is ready."""
         return self._window_ns > 0
 
     def step_clock(self, step_s: float) -> None:
         """Step the board's clock by ``step_s``, until the next reset."""
-        self._ns += round(step_s * 1e9)
+        self._board_ns += round(step_s * 1e9)
 
     def sample(self, reading: Reading) -> bytes:
         """Return the bytes of a sample with ``reading`` at the sensors."""
-        self._ns += self._window_ns
+        self._board_ns += self._window_ns
         parts, count = self._parts, self._count
-        voltage = self._sum(reading.voltage_v / parts.divider / parts.supply_v, count)
-        current = self._sum(parts.current_zero + reading.current_a * parts.fraction_per_ampere, count)
+        voltage_sum = self._sum_conversions(reading.voltage_v / parts.divider / parts.supply_v, count)
+        current_sum = self._sum_conversions(parts.current_zero + reading.current_a * parts.fraction_per_ampere, count)
         if self.text:
-            volts = voltage / count / FULL_SCALE * parts.supply_v * parts.divider
-            amperes = (current / count / FULL_SCALE - parts.current_zero) / parts.fraction_per_ampere
+            volts = voltage_sum / count / FULL_SCALE * parts.supply_v * parts.divider
+            amperes = (current_sum / count / FULL_SCALE - parts.current_zero) / parts.fraction_per_ampere
             return b"%.4f,%.4f,%.1f\r\n" % (volts, amperes, reading.temperature_c)
-        aux = self._ntc(reading.temperature_c) if self._ntc_next else self._bandgap()
-        status = BoardStatus.AUX_IS_NTC * self._ntc_next | (self._cause << 4)
+        aux_fraction = self._ntc_fraction(reading.temperature_c) if self._ntc_next else self._bandgap_fraction()
+        status = BoardStatus.AUX_IS_NTC * self._ntc_next | (self._cause << 4)  # the upper half holds the reset cause
         self._ntc_next = not self._ntc_next
         stamp_error_us = self.stamp_errors_us.popleft() if self.stamp_errors_us else 0
-        board_us = (self._ns // 1000 + stamp_error_us) % MODULUS
-        aux_sum, aux_count = self._sum(aux, self._aux_count), self._aux_count
-        message = SampleMessage(self._sequence, board_us, voltage, current, count, aux_sum, aux_count, int(status))
+        board_us = (self._board_ns // 1000 + stamp_error_us) % MODULUS
+        aux_sum, aux_count = self._sum_conversions(aux_fraction, self._aux_count), self._aux_count
+        message = SampleMessage(
+            self._sequence, board_us, voltage_sum, current_sum, count, aux_sum, aux_count, int(status)
+        )
         self._sequence = (self._sequence + 1) % MODULUS
         return message.encode()
 
@@ -135,35 +139,35 @@ class Board:
         return responses
 
     def _execute(self, packet: bytes) -> bytes:
-        kind, body = packet[1], packet[2:]
-        if packet[0] != PROTOCOL_VERSION:
-            return Ack(kind, AckResult.OTHER_VERSION, PROTOCOL_VERSION).encode()
-        if kind == MessageType.COMMAND_HELLO:
+        version, command, body = packet[0], packet[1], packet[2:]
+        if version != PROTOCOL_VERSION:
+            return Ack(command, AckResult.OTHER_VERSION, PROTOCOL_VERSION).encode()
+        if command == MessageType.COMMAND_HELLO:
             return self._hello().encode()
-        if kind == MessageType.COMMAND_RESTART:
-            return Ack(kind, AckResult.OK, 0).encode() + self.reset(ResetCause.WATCHDOG)
-        if kind == MessageType.COMMAND_SET_RATE and len(body) == 2:
+        if command == MessageType.COMMAND_RESTART:
+            return Ack(command, AckResult.OK, 0).encode() + self.reset(ResetCause.WATCHDOG)
+        if command == MessageType.COMMAND_SET_RATE and len(body) == 2:
             (rate_hz,) = struct.unpack("<H", body)
             if rate_hz not in RATE_HZ:
-                return Ack(kind, AckResult.BAD_VALUE, self._period_ns).encode()
+                return Ack(command, AckResult.BAD_VALUE, self._period_ns).encode()
             self._set_rate(rate_hz)
-            return Ack(kind, AckResult.OK, self._period_ns).encode()
-        return Ack(kind, AckResult.UNKNOWN_COMMAND, 0).encode()
+            return Ack(command, AckResult.OK, self._period_ns).encode()
+        return Ack(command, AckResult.UNKNOWN_COMMAND, 0).encode()
 
     def _set_rate(self, rate_hz: int) -> None:
         self._rate_hz = rate_hz
         self._count, self._period_ns = compute_window(rate_hz)
         self._aux_count = compute_aux_count(rate_hz)
 
-    def _sum(self, fraction: float, count: int) -> int:
-        """Return the sum of ``count`` conversions of a fraction of the reference."""
+    def _sum_conversions(self, fraction: float, count: int) -> int:
+        """Return the noisy sum of ``count`` conversions of an input at ``fraction`` of the reference voltage."""
         steps = fraction * FULL_SCALE * count + self._dice.gauss(0.0, NOISE_STEPS * math.sqrt(count))
         return min(max(round(steps), 0), (FULL_SCALE - 1) * count)
 
-    def _bandgap(self) -> float:
+    def _bandgap_fraction(self) -> float:
         return self._parts.bandgap_v / self._parts.supply_v
 
-    def _ntc(self, temperature_c: float) -> float:
+    def _ntc_fraction(self, temperature_c: float) -> float:
         parts = self._parts
         r_ohm = parts.ntc_r25_ohm * math.exp(parts.ntc_beta_k * (1.0 / (temperature_c + 273.15) - 1.0 / 298.15))
         return r_ohm / (r_ohm + parts.ntc_series_ohm)
@@ -176,7 +180,7 @@ class Board:
             boot_id=self._boot_id,
             serial=self.serial_number,
             sequence=self._sequence,
-            board_us=self._ns // 1000 % MODULUS,
+            board_us=self._board_ns // 1000 % MODULUS,
             rate_hz=self._rate_hz,
             period_ns=self._period_ns,
             adc_bits=10,
@@ -185,16 +189,12 @@ class Board:
             current_uv_per_a=round(parts.volts_per_ampere * 1e6),
             current_zero_ppm=round(parts.current_zero * 1e6),
             bandgap_uv=round(parts.bandgap_v * 1e6),
-            bandgap_sum=round(self._bandgap() * FULL_SCALE * BANDGAP_READINGS),
+            bandgap_sum=round(self._bandgap_fraction() * FULL_SCALE * BANDGAP_READINGS),
             bandgap_count=BANDGAP_READINGS,
             ntc_series_ohm=parts.ntc_series_ohm,
             ntc_r25_ohm=parts.ntc_r25_ohm,
             ntc_beta_k=parts.ntc_beta_k,
         )
-
-
-DECLARED_DIVIDER = 1.0
-"""Divider that each board reports; the other pack's board has a different one."""
 
 
 @dataclass
@@ -211,11 +211,12 @@ class Noise:
 
 @dataclass
 class OpenPort:
-    """Port opened by the service: two connected sockets, and the arrival of the last bytes sent to the service [s]."""
+    """Port opened by the service: a pair of connected sockets."""
 
     service_end: socket.socket
     board_end: socket.socket
     last_arrival_s: float = 0.0
+    """Arrival of the last bytes sent to the service [s]."""
 
 
 class Cable:
@@ -241,6 +242,7 @@ class Cable:
         self.opened_ports: list[OpenPort] = []
         """All ports that the running process has opened, including closed ones."""
         self.resets_when_opened = True
+        """True if opening the port resets the board, as an Arduino's DTR line does."""
         self.on_delivered: Callable[[bytes], None] = lambda _: None
         """Called with the bytes delivered to the service."""
 
@@ -266,7 +268,7 @@ class Cable:
             self._notify_reader(open_port.service_end)
 
     def close_all(self) -> None:
-        """Drop the port of an ended process."""
+        """Close all ports of an ended process."""
         for open_port in self.opened_ports:
             open_port.service_end.close()
             open_port.board_end.close()
@@ -278,15 +280,15 @@ class Cable:
         if open_port is None or not data or self.noise.mute:
             return
         data = self._with_noise(data)
-        parts = [data]
+        chunks = [data]
         if self._dice.random() < SPLIT_PROBABILITY:
             cut = self._dice.randint(0, len(data))
-            parts = [data[:cut], data[cut:]]
-        for part in parts:
+            chunks = [data[:cut], data[cut:]]
+        for chunk in chunks:
             open_port.last_arrival_s = max(open_port.last_arrival_s, self._timeline.now_s) + self._dice.uniform(
                 0.0, MAX_DELAY_S
             )
-            self._timeline.at(open_port.last_arrival_s, lambda part=part: self._deliver(open_port, part))
+            self._timeline.at(open_port.last_arrival_s, lambda chunk=chunk: self._deliver(open_port, chunk))
 
     def open(self, path: str, *_: Any, **__: Any) -> "VirtualPort":
         """Replacement of pyserial's ``Serial``.
@@ -350,7 +352,7 @@ class Cable:
     def _deliver(self, open_port: OpenPort, data: bytes) -> None:
         if self.open_port is not open_port or not data:
             return
-        with contextlib.suppress(BlockingIOError, OSError):  # the process does not read
+        with contextlib.suppress(BlockingIOError, OSError):  # bytes are lost if the process does not read
             sent = open_port.board_end.send(data)
             self.on_delivered(data[:sent])
             self._notify_reader(open_port.service_end)
@@ -363,20 +365,20 @@ class Cable:
         flip, lose = self.noise.flip, self.noise.lose
         if not flip and not lose:
             return data
-        random_ = self._dice.random
-        original = (byte ^ (1 << self._dice.randrange(8)) if random_() < flip else byte for byte in data)
-        return bytes(byte for byte in original if random_() >= lose)
+        draw = self._dice.random
+        flipped = (byte ^ (1 << self._dice.randrange(8)) if draw() < flip else byte for byte in data)
+        return bytes(byte for byte in flipped if draw() >= lose)
 
 
 class VirtualPort:
     """Open port as pyserial presents it to the service."""
 
     def __init__(self, cable: Cable, open_port: OpenPort) -> None:
-        self._cable, self._opening = cable, open_port
+        self._cable, self._open_port = cable, open_port
 
     def fileno(self) -> int:
-        self._cable.receive_soon(self._opening)  # called before each write
-        return self._opening.service_end.fileno()
+        self._cable.receive_soon(self._open_port)  # the service calls this before each write
+        return self._open_port.service_end.fileno()
 
     def close(self) -> None:
-        self._cable.close(self._opening)
+        self._cable.close(self._open_port)

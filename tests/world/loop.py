@@ -14,8 +14,8 @@ from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Executor
 from typing import Any
 
-MAX_CLOSINGS = 20
-"""Maximum number of awaits of a coroutine that is being closed."""
+MAX_CLOSE_ATTEMPTS = 20
+"""Maximum number of attempts to close a coroutine, each of which fails if the coroutine awaits."""
 CLEAN_UP_TASKS = 64
 """Number of new tasks after which finished ones are removed from the list of tasks."""
 
@@ -55,7 +55,7 @@ class Timeline:
 
 
 class Handle(asyncio.TimerHandle):
-    """Scheduled call. It replaces asyncio's own handle, which checks the debug mode three times and is slower.
+    """Scheduled call. asyncio's own handle is slower, because it checks the debug mode three times.
 
     Args:
         callback: Function to call.
@@ -91,8 +91,8 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         self.frozen_until_s = self._frozen_s = 0.0
         self.handles = 0
         """Number of handles that have run."""
-        self.faults: list[str] = []
-        """Uncaught exceptions."""
+        self.uncaught_exceptions: list[str] = []
+        """Descriptions of the exceptions that reached the loop."""
         self.threads: Executor = Executor()
         """Default executor."""
 
@@ -129,9 +129,8 @@ class ProcessLoop(asyncio.AbstractEventLoop):
             raise KilledError
         self._task_count += 1
         task = asyncio.Task(coro, loop=self, name=name or f"task {self._task_count}", context=context)
-        self._tasks = (
-            [task for task in self._tasks if not task.done()] if self._task_count % CLEAN_UP_TASKS == 0 else self._tasks
-        )
+        if self._task_count % CLEAN_UP_TASKS == 0:
+            self._tasks = [task for task in self._tasks if not task.done()]
         self._tasks.append(task)
         return task
 
@@ -166,7 +165,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
 
     def call_exception_handler(self, context: dict[str, Any]) -> None:
         if self.alive:
-            self.faults.append(f"{context.get('message')}: {context.get('exception')!r}")
+            self.uncaught_exceptions.append(f"{context.get('message')}: {context.get('exception')!r}")
 
     async def shutdown_asyncgens(self) -> None:
         pass
@@ -184,11 +183,11 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         return self._frozen_s if self._timeline.now_s < self.frozen_until_s else self._timeline.now_s
 
     @property
-    def waiting(self) -> int:
+    def ready_count(self) -> int:
         """Number of ready handles."""
         return len(self._ready)
 
-    def readable(self, fd: int) -> None:
+    def notify_reader(self, fd: int) -> None:
         """Schedule the reader of a descriptor."""
         reader = self._readers.get(fd)
         if reader is not None and self.alive:
@@ -213,7 +212,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
     def freeze(self, until_s: float) -> None:
         """Freeze the process until ``until_s``."""
         self._frozen_s, self.frozen_until_s = self.ran_until_s, until_s
-        self._timeline.at(until_s, lambda: None)
+        self._timeline.at(until_s, lambda: None)  # so that the time does not skip the end of the freeze
 
     def kill(self) -> None:
         """Kill the process: release its resources; none of its code has any further effect."""
@@ -222,6 +221,7 @@ class ProcessLoop(asyncio.AbstractEventLoop):
         self.alive = False
         self._ready.clear()
         self._readers.clear()
+        # Python would report coroutines that cannot be closed.
         original_hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
         try:
             with self._running():
@@ -253,8 +253,8 @@ class ProcessLoop(asyncio.AbstractEventLoop):
 
 
 def _close(coroutine: Any) -> None:
-    """Close a coroutine, even if it awaits while closing."""
-    for _ in range(MAX_CLOSINGS):
+    """Close a coroutine, even if it awaits in its own cleanup."""
+    for _ in range(MAX_CLOSE_ATTEMPTS):
         try:
             coroutine.close()
         except RuntimeError:  # the coroutine awaits while it is closed

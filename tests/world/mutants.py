@@ -42,7 +42,7 @@ def no_fsync() -> Iterator[None]:
 
 @contextlib.contextmanager
 def no_sensor_availability() -> Iterator[None]:
-    """Do not publish that the sensor is silent."""
+    """Publish a silent sensor as online."""
     original = MessageBuilder._sensor
 
     def sensor(self: MessageBuilder, health: Any) -> Any:
@@ -55,7 +55,7 @@ def no_sensor_availability() -> Iterator[None]:
 
 @contextlib.contextmanager
 def no_retry_after_disk_full() -> Iterator[None]:
-    """Do not retry saving the board after a disk error."""
+    """Do not retry to save the serial number of the board after a disk error."""
     original = BoardCheck._store_board
 
     def store_board(self: BoardCheck, now_s: float) -> None:
@@ -69,11 +69,12 @@ def no_retry_after_disk_full() -> Iterator[None]:
 
 @contextlib.contextmanager
 def no_check_of_board_clock() -> Iterator[None]:
-    """Accept a board's clock that runs ahead of the arrivals."""
+    """Accept samples whose board time is ahead of their arrival."""
     original = FrameDecoder._decode
 
     def decode(self: FrameDecoder, *arguments: Any) -> Any:
-        self._state["min_delay_s"], self._state["period_us"] = -math.inf, 1e12  # no sample counts as early
+        self._state["min_delay_s"] = -math.inf  # no sample counts as early
+        self._state["period_us"] = 1e12  # any step of the clock agrees with the sequence number
         return original(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:

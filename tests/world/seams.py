@@ -1,7 +1,7 @@
 """Replacement of the package's clocks and random numbers by those of the world.
 
-The package contains no code for this. All references of its modules to the standard library's clocks and random functions (module,
-function or default argument) are replaced while the world lasts.
+The package contains no code for this. While the world lasts, all references of its modules to the clocks and random functions of
+the standard library are replaced, also those in default arguments of functions.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ class Clocks:
 
     Attributes:
         wall_offset_s: Wall clock minus time of the world [s].
-        synchronised: True if the wall clock counts as synchronized.
+        synchronized: True if the wall clock counts as synchronized.
         boot: Boot id.
         boot_s: Time of the world at the last boot [s].
         suspended_s: Time since the boot that the monotonic clock does not count [s].
@@ -41,8 +41,8 @@ class Clocks:
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
-        self.wall_offset_s = 1.7e9
-        self.synchronised = True
+        self.wall_offset_s = 1.7e9  # the world begins in November 2023
+        self.synchronized = True
         self.boot = "first"
         self.boot_s = 0.0
         self.suspended_s = 0.0
@@ -57,7 +57,7 @@ class Clocks:
         return self.since_boot() - self.suspended_s
 
     def boot_timestamp(self) -> boot_clock.BootTimestamp:
-        return boot_clock.BootTimestamp(self.wall(), self.synchronised, self.since_boot(), self.boot)
+        return boot_clock.BootTimestamp(self.wall(), self.synchronized, self.since_boot(), self.boot)
 
 
 class _PatchedModule:
@@ -72,19 +72,23 @@ class _PatchedModule:
 
 
 LONGER_INTERVALS = (("service.live_loop", "LAG_STEP_S", 2.0), ("sources.serial.serial_source", "SEND_INTERVAL_S", 0.5))
-"""Poll intervals that are lengthened, because they would take most of the time of an idle hour: module, name, interval [s]."""
+"""Module, name and new value [s] of poll intervals. With the real ones, most of the simulation's time would be polling."""
 CACHED_FUNCTIONS = (("estimator.settings_records", "decay_table"),)
-"""Pure functions whose results are cached between starts."""
+"""Module and name of pure, slow functions. Their results are cached, because each start of the service calls them again."""
 
 
 @functools.cache
 def _cached(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a cached version of a function, which all worlds of this process share."""
     return functools.cache(function)
 
 
 @contextlib.contextmanager
-def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], disk: Disk) -> Iterator[None]:
+def replace_in_package(
+    clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], disk: Disk
+) -> Iterator[None]:
     """Replace clocks, random numbers, threads and disk of the package."""
+    # The keys are ids, because not every value of a module is hashable.
     replacements: dict[int, Any] = {
         id(time.time): clocks.wall,
         id(time.monotonic): clocks.monotonic,
@@ -133,17 +137,17 @@ def seams(clocks: Clocks, dice: random.Random, threads: Callable[[], Threads], d
 
 
 def _functions(value: Any, module: str) -> Iterator[FunctionType]:
-    """Yield a function, or the functions of a class, defined in ``module``."""
+    """Yield ``value`` if it is a function of ``module``, or its methods if it is a class of ``module``."""
     if isinstance(value, FunctionType) and value.__module__ == module:
         yield value
     elif isinstance(value, type) and value.__module__ == module:
-        for part in list(vars(value).values()):
-            if isinstance(part, FunctionType):
-                yield part
+        for member in list(vars(value).values()):
+            if isinstance(member, FunctionType):
+                yield member
 
 
 def _bind_defaults(function: FunctionType, replacements: dict[int, Any], undo: list[Callable[[], None]]) -> None:
-    """Replace default arguments of a function."""
+    """Replace default arguments of a function. Append to ``undo`` how to restore them."""
     defaults, named = function.__defaults__, function.__kwdefaults__
     if defaults and any(id(value) in replacements for value in defaults):
         undo.append(lambda: setattr(function, "__defaults__", defaults))

@@ -13,7 +13,7 @@ from tests.world.loop import KilledError, ProcessLoop, Timeline
 MIN_CALL_S, MAX_CALL_S = 0.0005, 0.05
 """Range of the duration of a call [s]."""
 POLL_S = 1.0
-"""Poll interval for a hung disk [s]."""
+"""Time after which a call is tried again if the disk hangs [s]."""
 
 
 class Threads:
@@ -24,7 +24,7 @@ class Threads:
         dice: Generator of the random delays of calls.
         loop: Loop of the process.
         disk: Disk that the process's own executors and threads use. They hang while the disk hangs.
-        on_end: Called with the exception class if a call has ended the process.
+        on_end: Called if a call ends the process, with ``KilledError`` or ``PowerCutError``.
     """
 
     def __init__(
@@ -39,11 +39,11 @@ class Threads:
         loop.threads = _Pool(self)
 
     def executor(self, *_: Any, thread_name_prefix: str = "", **__: Any) -> Executor:
-        """Replacement of ``ThreadPoolExecutor`` with one thread."""
+        """Stand in for ``ThreadPoolExecutor``: return an executor with one thread."""
         return _SingleThread(self, thread_name_prefix)
 
     def thread(self, *, target: Callable[..., Any], args: tuple[Any, ...] = (), **_: Any) -> Any:
-        """Replacement of ``Thread``."""
+        """Stand in for ``Thread``."""
         thread = _SingleThread(self, "")
         thread.start = lambda: thread.submit(target, *args)  # type: ignore[attr-defined]
         return thread
@@ -71,29 +71,29 @@ class Threads:
             self._timeline.after(POLL_S, lambda: self._run(call, future, on_done, uses_database))
             return
         try:
-            value = self._disk.transaction(call, self._timeline.now_s) if uses_database else call()
+            value = self._disk.run_transaction(call, self._timeline.now_s) if uses_database else call()
         except LateError as late:
             error = late.error
-            self._timeline.after(late.seconds, lambda: self.loop.alive and _end(future, None, error))
+            self._timeline.after(late.seconds, lambda: self.loop.alive and _complete(future, None, error))
         except (KilledError, PowerCutError) as end:
             self._on_end(type(end))
             return
         except Exception as error:  # noqa: BLE001 - passed to the caller
-            _end(future, None, error)
+            _complete(future, None, error)
         else:
-            _end(future, value, None)
+            _complete(future, value, None)
         on_done()
 
 
 class _Pool(Executor):
-    """Pool with a thread for each call."""
+    """Executor of ``asyncio.to_thread``, with a thread for each call."""
 
     def __init__(self, threads: Threads) -> None:
         self._threads = threads
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
         future: Future[Any] = Future()
-        self._threads.schedule(lambda: fn(*args, **named), future, lambda: None, None)
+        self._threads.schedule(lambda: fn(*args, **named), future, on_done=lambda: None, uses_database=None)
         return future
 
 
@@ -123,11 +123,11 @@ class _SingleThread(Executor):
             call, future = self._waiting.popleft()
             if future.set_running_or_notify_cancel():
                 self._is_busy = True
-                self._threads.schedule(call, future, self._start_next, self._is_database)
+                self._threads.schedule(call, future, on_done=self._start_next, uses_database=self._is_database)
                 return
 
 
-def _end(future: Future[Any], value: Any, error: BaseException | None) -> None:
+def _complete(future: Future[Any], value: Any, error: BaseException | None) -> None:
     if future.done():
         return
     if error is None:

@@ -1,7 +1,7 @@
-"""Methods side by side on real captures: each learns from one profile and is judged on others.
+"""Comparison of methods on real captures. Each method learns from one load profile and is evaluated on others.
 
-``make compare``, or some of the trials: ``make compare ARGS="NCR PF"``; with ``--json`` the figures one by one. What is
-measured and how is in docs/theory/comparison.md.
+``make compare`` runs all trials, ``make compare ARGS="NCR PF"`` those whose name contains a word, and ``--json`` prints each
+figure in place of tables. docs/theory/comparison.md tells what is measured and how.
 """
 
 import json
@@ -16,12 +16,12 @@ from pathlib import Path
 from rich.console import Console
 
 from tests.benchmarks.recipes import DATA, cell_file
-from tests.benchmarks.side_by_side.measure import Bench, Figure, Reference, of_trial, step_costs
+from tests.benchmarks.side_by_side.measure import Bench, Figure, Reference, measure_trial, step_costs
 from tests.benchmarks.side_by_side.tables import figure_tables, reference_table, seed_table
 from tests.benchmarks.side_by_side.trials import TRIALS, chosen
 
-TIMED = (TRIALS[0], TRIALS[2])
-"""At 1 and at 10 Hz."""
+TIMED_TRIALS = (TRIALS[0], TRIALS[2])
+"""Trials in which the time of a step is measured: one at 1 Hz, one at 10 Hz."""
 
 
 def main() -> None:
@@ -33,12 +33,13 @@ def main() -> None:
     references: list[Reference] = []
     with tempfile.TemporaryDirectory() as folder:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
+            # Compute all cell files, which ``cell_file`` then finds in the folder.
             list(pool.map(cell_file, {trial.recipe for trial in trials}, repeat(Path(folder))))
         with ProcessPoolExecutor() as pool:
-            for reference, found in pool.map(of_trial, trials, repeat(Path(folder))):
+            for reference, trial_figures in pool.map(measure_trial, trials, repeat(Path(folder))):
                 references.append(reference)
-                figures += found
-        for trial in TIMED:
+                figures += trial_figures
+        for trial in TIMED_TRIALS:
             bench = Bench(trial, Path(folder))
             figures += step_costs(bench.starts[0][1], bench.first.samples, trial.name)
     if "--json" in sys.argv:

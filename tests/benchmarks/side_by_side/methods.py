@@ -37,7 +37,7 @@ MAX_MV = 1e4
 MIN_COVERAGE = 0.9
 """Minimum fraction of a capture that a prediction must cover. A prediction ends where a learned capacitance becomes
 negative."""
-TRACED_S = 30.0
+R_S_INTERVAL_S = 30.0
 """Interval at which R_s is calculated from the observer's parameters [s]."""
 RLS_EVERY_S = 1.0
 """Sampling interval of recursive least squares [s]."""
@@ -99,13 +99,13 @@ class Elements:
         """Return the value as ``Learned`` does."""
         counted = soc_by_counting(samples, self.cell.cell.capacity_ah, initial_soc)
         below = np.flatnonzero(counted < LOWEST_SOC)
-        evaluated = below[0] if below.size else counted.size
+        evaluated_count = below[0] if below.size else counted.size
         try:
             error_v = predict(self.cell, samples, initial_soc, a=self.a, lowest_soc=LOWEST_SOC).error_v
         except UserError:
             return None
         rms_mv = 1e3 * _rms(error_v)
-        return rms_mv if error_v.size >= MIN_COVERAGE * evaluated and rms_mv < MAX_MV else None
+        return rms_mv if error_v.size >= MIN_COVERAGE * evaluated_count and rms_mv < MAX_MV else None
 
     def elements(self, soc: Floats) -> Floats:
         """Return the values as ``Learned`` does."""
@@ -190,7 +190,7 @@ class Observed(Elements):
             trace = estimator.run(samples)
             return trace["time_s"].copy(), trace["r_s_ohm"].copy()
         time_s = samples["time_s"]
-        cuts = np.searchsorted(time_s, np.arange(time_s[0], time_s[-1], TRACED_S)[1:])
+        cuts = np.searchsorted(time_s, np.arange(time_s[0], time_s[-1], R_S_INTERVAL_S)[1:])
         rows = []
         for piece in np.split(samples, np.unique(cuts)):
             estimator.run(piece)
@@ -233,8 +233,8 @@ class Arx:
         current_a, over_v, soc = overpotential(self.cell, samples, start_soc)
         open_v = open_circuit(self.cell, soc) - over_v + simulate_arx(self.coefficients, current_a)
         grid = ocv_grid(self.cell)
-        raw = np.array([chen_mora.soc_from_ocv(v, *grid) for v in open_v])
-        smooth = np.convolve(raw, np.ones(60) / 60.0, "same")
+        raw_soc = np.array([chen_mora.soc_from_ocv(v, *grid) for v in open_v])
+        smooth = np.convolve(raw_soc, np.ones(60) / 60.0, "same")
         return np.interp(samples["time_s"], evenly_spaced_times(samples), smooth)
 
     def series_resistance(self, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats] | None:
@@ -293,7 +293,7 @@ def run_ekf(cell: CellModel, samples: SampleBlock) -> Callable[[], object]:
 
 
 def learn_arx(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned:
-    """Run recursive least squares. All coefficients start at 0 for any cell file."""
+    """Run recursive least squares. Its coefficients start at 0, whatever the cell file."""
     current_a, over_v, _ = overpotential(cell, samples, initial_soc)
     return Arx(cell, rls_arx(current_a, over_v, RLS_FORGETTING))
 
@@ -329,8 +329,8 @@ def offline_fit(seed: int) -> Learn:
 
         _, r_s, r1, tau1, r2, tau2 = ekf_parameters(cell).tolist()
         start = {"R0 [Ohm]": r_s, "R1 [Ohm]": r1, "C1 [F]": tau1 / r1, "R2 [Ohm]": r2, "C2 [F]": tau2 / r2}
-        found = fit(cell, samples, initial_soc, start, seed)
-        return Elements(cell, constant_a(*found)) if found else None
+        fitted = fit(cell, samples, initial_soc, start, seed)
+        return Elements(cell, constant_a(*fitted)) if fitted else None
 
     return learn
 
@@ -388,8 +388,8 @@ def evenly_spaced_times(samples: SampleBlock) -> Floats:
 def overpotential(cell: CellModel, samples: SampleBlock, initial_soc: float) -> tuple[Floats, Floats, Floats]:
     """Return current [A], E_o minus terminal voltage [V] and counted SOC at intervals of ``RLS_EVERY_S``."""
     time_s = evenly_spaced_times(samples)
-    held = np.searchsorted(samples["time_s"], time_s, side="right") - 1
-    current_a = samples["current_a"][held].astype(np.float64)
+    last_rows = np.searchsorted(samples["time_s"], time_s, side="right") - 1
+    current_a = samples["current_a"][last_rows].astype(np.float64)
     charge_as = np.concatenate([[0.0], np.cumsum(current_a[:-1]) * RLS_EVERY_S])
     soc = initial_soc - charge_as / (3600.0 * cell.cell.capacity_ah)
     voltage_v = np.interp(time_s, samples["time_s"], samples["voltage_v"])

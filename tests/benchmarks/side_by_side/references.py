@@ -1,8 +1,9 @@
-"""References from the captures without a model: R_s in pulses, two time constants in rests.
+"""References from captures without a model: R_s from pulses, and two time constants from rests.
 
-A rest is judged where a load that moved enough charge ended and nothing flowed for ten minutes. Its first twenty minutes
-are fitted by v = v_inf - b_1 e^(-t/tau_1) - b_2 e^(-t/tau_2), each second weighing the same. A real cell relaxes with more
-than two time constants, and which two a fit finds depends on how long it looks: a reference to a factor, not to per cent.
+A rest is used if it lasts at least ten minutes and the load before it has moved enough charge. Its first twenty minutes are
+fitted by v = v_inf - b_1 e^(-t/tau_1) - b_2 e^(-t/tau_2), in which each second has the same weight. A real cell relaxes with
+more than two time constants, so that the result depends on the length of the window. Therefore this reference is valid to a
+factor, not to percent.
 """
 
 from dataclasses import dataclass
@@ -13,28 +14,30 @@ from scipy.optimize import least_squares
 
 from bms_estimator.calibration.cleaning.rests import resting_samples, true_runs
 from bms_estimator.model.arrays import Floats
-from tests.benchmarks.pulses import AROUND, pulses
+from tests.benchmarks.pulses import MEDIAN_PULSES, find_pulses
 from tests.benchmarks.side_by_side.trials import Block
 
 MIN_REST_S, WINDOW_S = 600.0, 1200.0
+"""Minimum duration of a rest, and duration of its part that is fitted [s]."""
 MIN_MOVED = 0.02
-"""Part of the capacity that the load before has moved: a pulse of seconds leaves the slow branch alone."""
+"""Minimum charge moved by the load before a rest, as a fraction of the capacity. A pulse does not excite the slow branch."""
 LOWEST_SOC = 0.1
-FIRST = (0.01, 0.3)
-"""Start of the fit: time constants in windows."""
-RANGE = (1.0, 3.0)
-"""Limits of the time constants, in seconds and in windows."""
-APART = 2.5
-"""Two time constants that are nearer are one."""
-MIN_SIZE = 3.0
-"""Minimum size of each exponential, in RMS of the residual."""
-MIN_RESOLUTION_V = 3e-4
-"""No fit leaves less [V]."""
+"""SOC below which neither rests nor pulses are used."""
+INITIAL_TAUS = (0.01, 0.3)
+"""Time constants at the start of the fit [windows]."""
+MIN_TAU_S, MAX_TAU_WINDOWS = 1.0, 3.0
+"""Limits of the time constants [s] and [windows]."""
+MIN_TAU_RATIO = 2.5
+"""Minimum ratio of the two time constants. Nearer ones cannot be distinguished from a single one."""
+MIN_AMPLITUDE = 3.0
+"""Minimum amplitude of each exponential, in multiples of the RMS residual."""
+MIN_RESIDUAL_V = 3e-4
+"""Lower limit of the RMS residual in this comparison [V]."""
 
 
 @dataclass(frozen=True)
 class Relaxations:
-    """Rests of a capture that show two time constants, shape (n,) each."""
+    """SOC and time constants of the rests that show two time constants, shape (n,) each."""
 
     soc: Floats
     tau_ts_s: Floats
@@ -43,7 +46,7 @@ class Relaxations:
 
 @dataclass(frozen=True)
 class Pulses:
-    """R_s that pulses show, the median of ``AROUND`` of them; shape (n,) each."""
+    """R_s from pulses, as running median over ``MEDIAN_PULSES`` pulses; shape (n,) each."""
 
     time_s: Floats
     soc: Floats
@@ -51,10 +54,10 @@ class Pulses:
 
 
 def relaxations(block: Block, capacity_ah: float) -> Relaxations:
-    """Fit every rest that is good for it."""
+    """Return the time constants of every rest that is long enough, follows enough load, and shows two of them."""
     samples = block.samples
-    rests = [(a, b) for a, b in true_runs(resting_samples(samples, capacity_ah)) if a > 0]
-    found, soc_before = [], float(block.soc[0])
+    rests = [(first, end) for first, end in true_runs(resting_samples(samples, capacity_ah)) if first > 0]
+    rows, soc_before = [], float(block.soc[0])
     for first, end in rests:
         time_s = samples["time_s"][first:end] - samples["time_s"][first - 1]
         moved = abs(soc_before - float(block.soc[first]))
@@ -62,55 +65,57 @@ def relaxations(block: Block, capacity_ah: float) -> Relaxations:
             continue
         soc_before = float(block.soc[end - 1])
         if moved > MIN_MOVED and soc_before > LOWEST_SOC:
-            taus = two_exponentials(time_s, samples["voltage_v"][first:end])
-            found += [(soc_before, *taus)] if taus else []
-    return Relaxations(*np.array(found).reshape(-1, 3).T)
+            taus_s = fit_two_exponentials(time_s, samples["voltage_v"][first:end])
+            rows += [(soc_before, *taus_s)] if taus_s else []
+    return Relaxations(*np.array(rows).reshape(-1, 3).T)
 
 
-def two_exponentials(time_s: Floats, voltage_v: Floats) -> tuple[float, float] | None:
-    """Time constants of a rest [s], the shorter first; None where it does not show two.
+def fit_two_exponentials(time_s: Floats, voltage_v: Floats) -> tuple[float, float] | None:
+    """Return both time constants of a rest [s], the shorter one first; None if the rest does not show two.
 
     Args:
-        time_s: Shape (n,), since the load ended [s].
+        time_s: Time since the end of the load, shape (n,) [s].
         voltage_v: Shape (n,) [V].
     """
-    early = time_s <= WINDOW_S
-    time_s, voltage_v = time_s[early].astype(np.float64), voltage_v[early].astype(np.float64)
+    in_window = time_s <= WINDOW_S
+    time_s, voltage_v = time_s[in_window].astype(np.float64), voltage_v[in_window].astype(np.float64)
     window_s = float(time_s[-1])
-    weight = np.sqrt(np.gradient(time_s))
+    weight = np.sqrt(np.gradient(time_s))  # each second has the same weight, whatever the sample rate
 
-    def solved(ln_taus: Floats) -> tuple[Floats, Floats]:
-        basis = np.column_stack([np.ones_like(time_s), *(-np.exp(-time_s / tau) for tau in np.exp(ln_taus))])
-        sizes = np.linalg.lstsq(basis * weight[:, None], voltage_v * weight, rcond=None)[0]
-        return sizes, (basis @ sizes - voltage_v) * weight
+    def fit_amplitudes(ln_taus: Floats) -> tuple[Floats, Floats]:
+        """Return v_inf, b_1 and b_2 [V] for these time constants, and the weighted residual."""
+        basis = np.column_stack([np.ones_like(time_s), *(-np.exp(-time_s / tau_s) for tau_s in np.exp(ln_taus))])
+        amplitudes_v = np.linalg.lstsq(basis * weight[:, None], voltage_v * weight, rcond=None)[0]
+        return amplitudes_v, (basis @ amplitudes_v - voltage_v) * weight
 
     fit = least_squares(
-        lambda ln_taus: solved(ln_taus)[1],
-        np.log(np.array(FIRST) * window_s),
-        bounds=(np.log(RANGE[0]), np.log(RANGE[1] * window_s)),
+        lambda ln_taus: fit_amplitudes(ln_taus)[1],
+        np.log(np.array(INITIAL_TAUS) * window_s),
+        bounds=(np.log(MIN_TAU_S), np.log(MAX_TAU_WINDOWS * window_s)),
         x_scale=1.0,
     )
-    sizes, left = solved(fit.x)
-    (short, short_v), (long, long_v) = sorted(zip(np.exp(fit.x), sizes[1:], strict=True))
-    rms_v = max(float(np.sqrt(left @ left / (weight @ weight))), MIN_RESOLUTION_V)
-    seen = min(short_v, long_v) * np.sign(short_v + long_v)
-    same_sign = short_v * long_v > 0.0
-    if not same_sign or abs(seen) < MIN_SIZE * rms_v or long < APART * short or long > 0.99 * RANGE[1] * window_s:
+    amplitudes_v, residual = fit_amplitudes(fit.x)
+    (short_s, short_v), (long_s, long_v) = sorted(zip(np.exp(fit.x), amplitudes_v[1:], strict=True))
+    rms_v = max(float(np.sqrt(residual @ residual / (weight @ weight))), MIN_RESIDUAL_V)
+    smaller_v = min(short_v, long_v) * np.sign(short_v + long_v)
+    same_sign = short_v * long_v > 0.0  # otherwise the two exponentials only shape each other
+    is_at_bound = long_s > 0.99 * MAX_TAU_WINDOWS * window_s
+    if not same_sign or abs(smaller_v) < MIN_AMPLITUDE * rms_v or long_s < MIN_TAU_RATIO * short_s or is_at_bound:
         return None
-    return float(short), float(long)
+    return float(short_s), float(long_s)
 
 
 def pulse_resistance(block: Block, capacity_ah: float) -> Pulses:
-    """R_s over time, above ``LOWEST_SOC``."""
-    rows, ohm = pulses(block.samples, capacity_ah)
+    """Return R_s from the pulses of a capture above ``LOWEST_SOC``."""
+    rows, ohm = find_pulses(block.samples, capacity_ah)
     above = block.soc[rows] > LOWEST_SOC
     rows, ohm = rows[above], ohm[above]
-    around = median_filter(ohm, AROUND, mode="nearest") if ohm.size else ohm
-    return Pulses(block.samples["time_s"][rows], block.soc[rows], around)
+    median_ohm = median_filter(ohm, MEDIAN_PULSES, mode="nearest") if ohm.size else ohm
+    return Pulses(block.samples["time_s"][rows], block.soc[rows], median_ohm)
 
 
-def with_jump(block: Block, more_ohm: float) -> tuple[Block, float]:
-    """The capture as if its cell's series resistance had grown by ``more_ohm`` half-way, and when that was [s]."""
+def with_resistance_step(block: Block, more_ohm: float) -> tuple[Block, float]:
+    """Return a capture as if the series resistance had grown by ``more_ohm`` at half time, and that time [s]."""
     time_s = block.samples["time_s"]
     jump_s = 0.5 * float(time_s[0] + time_s[-1])
     samples = block.samples.copy()
@@ -119,20 +124,20 @@ def with_jump(block: Block, more_ohm: float) -> tuple[Block, float]:
     return Block(samples, block.soc), jump_s
 
 
-def settled_after(
+def settling_time_s(
     time_s: Floats, ratio: Floats, jump_s: float, within: float = 0.1, hold_s: float = 600.0
 ) -> float | None:
     """Return the time after the step until ``ratio`` stays within ``within`` of 1 for ``hold_s`` [s].
 
     Args:
         time_s: Shape (n,) [s].
-        ratio: Shape (n,), of what is said to what is true.
-        jump_s: When it jumped [s].
-        within: How near.
-        hold_s: For how long [s].
+        ratio: Estimated divided by true value, shape (n,).
+        jump_s: Time of the step [s].
+        within: Permitted deviation of the ratio from 1.
+        hold_s: Time for which the ratio must stay there [s].
 
     Returns:
-        Infinite where it never does; None where it was no nearer before the jump: then it tells nothing.
+        Infinite if the ratio never stays there; None if it deviated more than half of the time before the step, too.
     """
     inside = np.abs(ratio - 1.0) < within
     before = (time_s < jump_s) & (time_s >= jump_s - hold_s)

@@ -1,4 +1,4 @@
-"""The tables, in Markdown."""
+"""Tables of the comparison, in Markdown."""
 
 from collections.abc import Iterable, Iterator
 
@@ -35,14 +35,16 @@ TABLES = {
     STEP: ("a step [ns]", 0),
     FIT: ("a fit, processor time [s]", 1),
 }
+"""Title and number of digits of each table."""
 PYBOP = "PyBOP"
-FACTORS = (R_S, TAU_TS, TAU_TL)
-NOTHING = -np.inf
-"""A method does not do that, or nothing shows it."""
+FACTOR_TABLES = (R_S, TAU_TS, TAU_TL)
+"""Tables whose values are factors, so that their mean is geometric."""
+NO_VALUE = -np.inf
+"""Mark of a method that does not offer the quantity, or of a capture that does not show it."""
 
 
 def reference_table(references: list[Reference]) -> Table:
-    """Return the references: median, and the interquartile range."""
+    """Return the table of the references: median and quartiles of each."""
     table = Table(title="references: median (quartiles)", box=box.MARKDOWN)
     for column in ("trial", "pulses", "R_s [mOhm]", "rests", "shorter RC product [s]", "longer [s]"):
         table.add_column(escape(column), justify="left" if column == "trial" else "right")
@@ -60,7 +62,7 @@ def reference_table(references: list[Reference]) -> Table:
 
 
 def quartiles(values: Floats, digits: int) -> str:
-    """Median and both quartiles, or a dash."""
+    """Return median and both quartiles as text; a dash without values."""
     if not values.size:
         return "-"
     low, middle, high = (f"{x:.{digits}f}" for x in np.percentile(values, (25, 50, 75)))
@@ -68,43 +70,45 @@ def quartiles(values: Floats, digits: int) -> str:
 
 
 def figure_tables(figures: Iterable[Figure]) -> Iterator[Table]:
-    """All of them that there are figures for."""
+    """Yield each table for which there are figures."""
     for name, (title, digits) in TABLES.items():
-        of_it = [f for f in figures if f.table == name]
-        if of_it:
-            yield figure_table(name, of_it, title, digits)
+        figures_of_table = [f for f in figures if f.table == name]
+        if figures_of_table:
+            yield figure_table(name, figures_of_table, title, digits)
 
 
 def figure_table(name: str, figures: list[Figure], title: str, digits: int) -> Table:
-    """Return the rows with a column for each method: the mean of both starts, of steps both; then the mean over
-    rows.
+    """Return a table with a column for each method.
 
-    That is geometric, of the rows with a number, how many in brackets where they are not all; and the mean rank.
+    A cell has the mean of both starts, or both values in the table of the step of R_s. The last rows have the geometric mean
+    over the rows with a number (the count of these rows is in brackets if it is not the count of all), and the mean rank.
     """
-    shown = [m.name for m in (*METHODS, FILE) if any(f.method == m.name for f in figures)]
-    table = Table("", *shown, title=escape(title), box=box.MARKDOWN)
+    methods = [m.name for m in (*METHODS, FILE) if any(f.method == m.name for f in figures)]
+    table = Table("", *methods, title=escape(title), box=box.MARKDOWN)
     rows = list(dict.fromkeys(f.row for f in figures))
-    values = np.full((len(rows), len(shown)), NOTHING)
+    values = np.full((len(rows), len(methods)), NO_VALUE)
     for i, row in enumerate(rows):
-        both = [[f.value for f in figures if (f.row, f.method) == (row, method)] for method in shown]
-        values[i] = [mean(np.array(x), name in FACTORS) for x in both]
-        each = both if name == JUMP else [[x] for x in values[i]]
-        table.add_row(row, *(" / ".join(text(x, digits, name) for x in some) or "-" for some in each))
+        by_start = [[f.value for f in figures if (f.row, f.method) == (row, method)] for method in methods]
+        values[i] = [mean(np.array(x), geometric=name in FACTOR_TABLES) for x in by_start]
+        cells = by_start if name == JUMP else [[x] for x in values[i]]
+        table.add_row(row, *(" / ".join(format_value(x, digits, name) for x in cell) or "-" for cell in cells))
     if name != JUMP:
-        table.add_row("geometric mean", *(over_rows(column, digits) for column in values.T))
-        common = np.isfinite(values[:, [j for j, method in enumerate(shown) if method == PYBOP]]).all(axis=1)
-        if PYBOP in shown and not common.all():
-            means = (over_rows(column, digits) for column in values[common].T)
-            table.add_row(f"geometric mean, the {common.sum()} rows of PyBOP", *means)
-    compete = [j for j, method in enumerate(shown) if method != FILE.name]
-    took_part = np.where(values == NOTHING, np.nan, np.nan_to_num(values, nan=np.inf, posinf=np.inf))[:, compete]
-    ranks = rankdata(took_part.round(digits), axis=1, nan_policy="omit")
+        table.add_row("geometric mean", *(mean_over_rows(column, digits) for column in values.T))
+        has_pybop = np.isfinite(values[:, [j for j, method in enumerate(methods) if method == PYBOP]]).all(axis=1)
+        if PYBOP in methods and not has_pybop.all():
+            means = (mean_over_rows(column, digits) for column in values[has_pybop].T)
+            table.add_row(f"geometric mean, the {has_pybop.sum()} rows of PyBOP", *means)
+    # The cell file itself has no rank. A failed method (NaN) ranks last; one without a value has no rank in this row.
+    ranked_methods = [j for j, method in enumerate(methods) if method != FILE.name]
+    finite_or_last = np.nan_to_num(values, nan=np.inf, posinf=np.inf)
+    ranked_values = np.where(values == NO_VALUE, np.nan, finite_or_last)[:, ranked_methods]
+    ranks = rankdata(ranked_values.round(digits), axis=1, nan_policy="omit")
     table.add_row("mean rank", *(f"{x:.1f}" for x in np.nanmean(ranks, axis=0)))
     return table
 
 
 def seed_table(figures: Iterable[Figure]) -> Table:
-    """Spread of PyBOP's voltage over its seeds: lowest, median and highest mean over both starts, for each row."""
+    """Return the spread of PyBOP's voltage error over its seeds: for each row, quantiles of the mean of both starts."""
     table = Table(
         "",
         "seeds",
@@ -114,33 +118,34 @@ def seed_table(figures: Iterable[Figure]) -> Table:
         title=escape("PyBOP: voltage RMS over its seeds [mV]"),
         box=box.MARKDOWN,
     )
-    of_it = [f for f in figures if (f.table, f.method) == (VOLTAGE, PYBOP)]
-    for row in dict.fromkeys(f.row for f in of_it):
-        seeds = sorted({f.seed for f in of_it if f.row == row})
-        means = [np.mean([f.value for f in of_it if (f.row, f.seed) == (row, seed)]) for seed in seeds]
+    of_pybop = [f for f in figures if (f.table, f.method) == (VOLTAGE, PYBOP)]
+    for row in dict.fromkeys(f.row for f in of_pybop):
+        seeds = sorted({f.seed for f in of_pybop if f.row == row})
+        means = [np.mean([f.value for f in of_pybop if (f.row, f.seed) == (row, seed)]) for seed in seeds]
         table.add_row(row, f"{len(seeds)}", *(f"{x:.1f}" for x in np.percentile(means, (0, 50, 100))))
     return table
 
 
-def mean(values: Floats, factor: bool) -> float:
-    """Return the mean of both starts; the geometric one for factors."""
+def mean(values: Floats, *, geometric: bool) -> float:
+    """Return the mean; ``NO_VALUE`` without values."""
     if not values.size:
-        return NOTHING
-    return float(np.exp(np.mean(np.log(values)))) if factor else float(values.mean())
+        return NO_VALUE
+    return float(np.exp(np.mean(np.log(values)))) if geometric else float(values.mean())
 
 
-def over_rows(column: Floats, digits: int) -> str:
-    """Geometric mean of what are numbers."""
+def mean_over_rows(column: Floats, digits: int) -> str:
+    """Return the geometric mean of the finite values of a column, with their count if some are missing."""
     numbers = column[np.isfinite(column)]
     if not numbers.size:
         return "-"
-    counted = "" if numbers.size == column.size else f" ({numbers.size})"
-    return f"{np.exp(np.mean(np.log(np.maximum(numbers, 10.0**-digits)))):.{digits}f}{counted}"
+    count = "" if numbers.size == column.size else f" ({numbers.size})"
+    at_least_last_digit = np.maximum(numbers, 10.0**-digits)  # a zero has no logarithm
+    return f"{np.exp(np.mean(np.log(at_least_last_digit))):.{digits}f}{count}"
 
 
-def text(value: float, digits: int, name: str) -> str:
-    """Format a number, or the reason why there is none."""
-    if value == NOTHING:
+def format_value(value: float, digits: int, name: str) -> str:
+    """Format a value, or the reason for a missing value."""
+    if value == NO_VALUE:
         return "-"
     if np.isinf(value) and name == JUMP:
         return "never"

@@ -1,7 +1,7 @@
-"""The trials: a cell, captures to learn from, and held-back captures.
+"""Trials of the comparison. Each has a cell, a capture to learn from, and held-back captures.
 
-Every method starts from the same cell: its file as it is at the temperature of the capture, with every resistance
-twice, or half, what the file says. The capacitances stay, so every time constant is as wrong.
+Every method starts from the same two cells: the cell file at the temperature of the capture, with every resistance doubled,
+and with every resistance halved. Capacitances are correct, so that time constants are wrong by the same factor.
 """
 
 from collections.abc import Iterator
@@ -18,61 +18,70 @@ from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import LEAF, LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_PULSES, Recipe, load
 
-WRONG_BY = (2.0, 0.5)
-"""Resistances of the start over those of the cell file."""
-LEFT_V = 0.02
-"""Assumed voltage error of the elements [V]."""
-KNOWN_K = 10.0
-"""Temperature range of the start, as of a file without a ladder."""
+START_FACTORS = (2.0, 0.5)
+"""Resistances of the two start cells, divided by those of the cell file."""
+ELEMENT_ERROR_V = 0.02
+"""Voltage error of the elements that the start cells declare [V]."""
+TEMPERATURE_RANGE_K = 10.0
+"""Distance of the temperature limits of a start cell from the temperature of its trial [K]."""
 
 
 @dataclass(frozen=True)
-class Part:
-    """A capture, or a part of it: SOC at the first sample of the capture, and from when until when [s of its clock]."""
+class CapturePart:
+    """Capture, or a part of it."""
 
     name: str
     initial_soc: float = 1.0
+    """SOC at the first sample of the whole capture."""
     begin_s: float = -np.inf
+    """Begin of the part, by the clock of the capture [s]."""
     end_s: float = np.inf
+    """End of the part, by the clock of the capture [s]."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Captures to learn from and held-back captures; all figures but the voltage use the first of these."""
+    """Capture to learn from, and held-back captures. All figures except the voltage use only the first held-back capture."""
 
     name: str
     recipe: Recipe
-    learn: Part
-    held_back: tuple[Part, ...]
+    learn: CapturePart
+    held_back: tuple[CapturePart, ...]
     temperature_c: float = REFERENCE_C
 
 
 @dataclass(frozen=True)
 class Block:
-    """Samples in the order of time, and the true SOC at each."""
+    """Samples in the order of time, and the true SOC at each sample."""
 
     samples: SampleBlock
     soc: Floats
 
 
-def _split(name: str, at_s: float) -> tuple[Part, tuple[Part, ...]]:
-    """A capture before and after the end of a rest."""
-    return Part(name, end_s=at_s), (Part(name, begin_s=at_s),)
+def _split(name: str, at_s: float) -> tuple[CapturePart, tuple[CapturePart, ...]]:
+    """Return a capture before ``at_s`` to learn from, and after it to evaluate on. A rest ends at ``at_s`` [s]."""
+    return CapturePart(name, end_s=at_s), (CapturePart(name, begin_s=at_s),)
 
 
 TRIALS = (
-    Trial("NCR 5", NCR_CELL, Part(NCR + "cell5_relaxation_c2"), (Part(NCR + "cell5_random_steps"),)),
+    Trial("NCR 5", NCR_CELL, CapturePart(NCR + "cell5_relaxation_c2"), (CapturePart(NCR + "cell5_random_steps"),)),
     Trial(
         "NCR 1",
         NCR_CELL,
-        Part(NCR + "cell1_hppc"),
+        CapturePart(NCR + "cell1_hppc"),
         (
-            Part(NCR + "cell1_random_steps", 0.98),
-            *(Part(NCR + f"cell1_{name}") for name in ("dst", "discharge_1c5", "discharge_c4")),
+            CapturePart(NCR + "cell1_random_steps", 0.98),
+            *(CapturePart(NCR + f"cell1_{name}") for name in ("dst", "discharge_1c5", "discharge_c4")),
         ),
     ),
     *(
-        Trial(f"PF {c:g}", PF_PULSES, Part(PF + f"{t}_hppc"), tuple(Part(PF + f"{t}_{name}") for name in names), c)
+        Trial(
+            f"PF {c:g}",
+            PF_PULSES,
+            CapturePart(PF + f"{t}_hppc"),
+            tuple(CapturePart(PF + f"{t}_{name}") for name in names),
+            c,
+        )
         for t, c, names in (
             ("25", 25.0, ("us06", "cycle1")),
             ("10", 10.0, ("us06",)),
@@ -84,12 +93,14 @@ TRIALS = (
         Trial(f"LFP {c:g}", LFP_CELL, *_split(LFP + f"dyn_{t}", at_s), c)
         for t, c, at_s in (("p25", 25.0, 18_745.0), ("p05", 5.0, 18_745.0), ("n15", -15.0, 25_070.0))
     ),
-    Trial("Leaf", LEAF, Part("leaf/hppc_25c_from_full"), (Part("leaf/cc_1c", 0.001, 10_080.0, 13_650.0),)),
+    Trial(
+        "Leaf", LEAF, CapturePart("leaf/hppc_25c_from_full"), (CapturePart("leaf/cc_1c", 0.001, 10_080.0, 13_650.0),)
+    ),
 )
 
 
-def block(part: Part, capacity_ah: float) -> Block:
-    """Read a part of a capture."""
+def read_block(part: CapturePart, capacity_ah: float) -> Block:
+    """Read a part of a capture, without glitches."""
     rows, soc = load(part.name, capacity_ah, part.initial_soc)
     samples = remove_glitches(rows, part.name)
     inside = (samples["time_s"] >= part.begin_s) & (samples["time_s"] < part.end_s)
@@ -97,19 +108,19 @@ def block(part: Part, capacity_ah: float) -> Block:
     return Block(samples, np.interp(samples["time_s"], rows["time_s"], soc))
 
 
-def chosen(parts: list[str]) -> list[Trial]:
-    """Return the trials whose name contains one of ``parts``; all without parts."""
-    return [trial for trial in TRIALS if not parts or any(part in trial.name for part in parts)]
+def chosen(words: list[str]) -> list[Trial]:
+    """Return the trials whose name contains one of ``words``, or all trials if there are no words."""
+    return [trial for trial in TRIALS if not words or any(word in trial.name for word in words)]
 
 
-def starts(right: CellModel, temperature_c: float) -> Iterator[tuple[float, CellModel]]:
-    """Return the factors on the resistances, and the resulting cells."""
-    for factor in WRONG_BY:
-        yield factor, wrong(right, factor, temperature_c)
+def start_cells(true_cell: CellModel, temperature_c: float) -> Iterator[tuple[float, CellModel]]:
+    """Yield the factor on the resistances and the resulting cell of each start."""
+    for factor in START_FACTORS:
+        yield factor, scale_resistances(true_cell, factor, temperature_c)
 
 
 def at_temperature(cell: CellModel, temperature_c: float) -> CellModel:
-    """The cell file as it would be if it had been made at ``temperature_c``: OCV and a1..a15."""
+    """Return the cell file with the OCV and a1..a15 (coefficients of the elements over SOC) of ``temperature_c``."""
     update: dict[str, object] = {}
     if isinstance(cell.ocv, TableOcv) and cell.ocv.per_kelvin_v is not None:
         shifted_v = np.array(cell.ocv.ocv_v) + np.array(cell.ocv.per_kelvin_v) * (temperature_c - REFERENCE_C)
@@ -126,22 +137,25 @@ def at_temperature(cell: CellModel, temperature_c: float) -> CellModel:
     return cell.model_copy(update=update)
 
 
-def wrong(cell: CellModel, factor: float, temperature_c: float) -> CellModel:
-    """The cell with resistances ``factor`` times as large, and a ladder of its two branches, right at ``temperature_c``."""
-    parts: dict[str, object] = {"adaptation": {}}
+def scale_resistances(cell: CellModel, factor: float, temperature_c: float) -> CellModel:
+    """Return a cell with ``factor`` times the resistances at ``temperature_c``, and an RC ladder of its two RC pairs.
+
+    It has no bounds of its own for the adaptation.
+    """
+    sections: dict[str, object] = {"adaptation": {}}
     for name in ("r_s", "r_ts", "r_tl"):
-        part = getattr(cell, name)
-        ohms = {key: factor * getattr(part, key) for key in ("amplitude_ohm", "offset_ohm")}
-        parts[name] = part.model_copy(update=ohms)
-    changed = cell.model_copy(update=parts)
+        element = getattr(cell, name)
+        ohms = {key: factor * getattr(element, key) for key in ("amplitude_ohm", "offset_ohm")}
+        sections[name] = element.model_copy(update=ohms)
+    changed = cell.model_copy(update=sections)
     ohm, weak = ladder_of_branches(changed).T, weak_share(SOC_GRID)
     ladder = Ladder(
         soc=tuple(SOC_GRID.tolist()),
         weak_ohm=_rows(weak * ohm / arrhenius(WEAK_J, temperature_c)),
         strong_ohm=_rows((1.0 - weak) * ohm / arrhenius(STRONG_J, temperature_c)),
         std=BRANCHES_STD,
-        error_v=LEFT_V,
-        temperature_c=(temperature_c - KNOWN_K, temperature_c + KNOWN_K),
+        error_v=ELEMENT_ERROR_V,
+        temperature_c=(temperature_c - TEMPERATURE_RANGE_K, temperature_c + TEMPERATURE_RANGE_K),
     )
     return changed.model_copy(update={"ladder": ladder})
 
