@@ -34,7 +34,7 @@ def report(tmp_path_factory) -> dict[str, str]:
 
 
 def test_documented_commands_install_the_service(report):
-    assert "/etc/bms-estimator/pack.toml: good: pack" in report["install"]
+    assert "/etc/bms-estimator/pack.toml: valid; pack" in report["install"]
     assert "+ journalctl -u bms-estimator -f" in report["install"]
 
 

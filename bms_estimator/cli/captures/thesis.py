@@ -57,7 +57,8 @@ def thesis(
 ) -> None:
     """Recompute the tables and figures of the thesis, and write a report that compares them with the printed ones.
 
-    The report is one HTML page. Chapters 2 to 4 of the thesis are simulated.
+    The thesis is "Adaptive Estimation of Li-ion Battery Model Parameters".
+    The report is one HTML page. Chapters 2 to 4 are simulated.
     Chapter 5 is computed from the captures, all of one type of cell.
     At least one capture must be a voltage relaxation test, and at least one a constant load or a load with steps.
     """

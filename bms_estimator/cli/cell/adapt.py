@@ -40,8 +40,9 @@ def adapt_command(
 ) -> None:
     """Estimate the parameters a1..a15 of the thesis's cell model by its adaptive observer, and write a cell file.
 
-    Algorithm 1 of the thesis runs over the capture with the smallest mean current.
-    a1..a12 are the averages of the parameters in this run, by its equation (3.19).
+    The thesis is "Adaptive Estimation of Li-ion Battery Model Parameters".
+    Its Algorithm 1 runs over the capture with the smallest mean current.
+    a1..a12 are the averages of the parameters in this run, by equation (3.19).
     a13..a15 describe R_s, which is computed by equation (4.2) over all captures.
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.

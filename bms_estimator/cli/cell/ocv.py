@@ -157,17 +157,21 @@ def ocv(
     form: Annotated[
         Form,
         typer.Option(
-            help="form of the OCV in the cell file: smooth table, or function (2.10) of the thesis, after Chen and Mora"
+            help="form of the OCV in the cell file: smooth table, or the function of Chen and Rincón-Mora's cell model"
         ),
     ] = Form.TABLE,
     soc: Annotated[
-        float, typer.Option(parser=decimal(0.0, 1.0), help="SOC at the first sample of the captures that start fullest")
+        float,
+        typer.Option(
+            parser=decimal(0.0, 1.0),
+            help="initial SOC of the captures that start at the highest voltage; that of other captures is read from the OCV curve",
+        ),
     ] = 1.0,
     series: Annotated[
         int | None,
         typer.Option(
             parser=whole(1),
-            help="number of cells in series; required for LFP packs; default: median voltage divided by 3.7 V",
+            help="number of cells in series; required for LFP packs; default: median voltage divided by 3.7 V, which is too high for LFP",
             show_default=False,
         ),
     ] = None,
@@ -177,8 +181,8 @@ def ocv(
 ) -> None:
     """Determine the open-circuit voltage (OCV) over SOC, and write a cell file.
 
-    The OCV is determined from files of three kinds, which are recognized:
-    captures with rests, such as HPPC or relaxation tests (5.2.1 of the thesis);
+    The OCV is determined from files of three kinds. The kind is detected from the content:
+    captures with rests, such as HPPC or relaxation tests;
     captures of slow discharges and charges;
     OCV curves in CSV files with the columns soc, ocv_v and, optionally, hysteresis_v.
     The files may have been recorded at different temperatures.

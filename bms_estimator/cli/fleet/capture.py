@@ -58,7 +58,7 @@ def capture(
 ) -> None:
     """Write a pack's stored samples to a file that `replay`, `identify`, `validate` and `capacity` can read.
 
-    The server stores samples for some days (setting `server.raw_days`). They are written in the order of sending.
+    The server stores samples for some days (setting `server.raw_days`). They are written in the order in which the edge sent them.
     With the settings that `fleet packs show PACK --out FOLDER` writes, `replay` gives the workers' estimates.
     """
     check_output_file(out, [], force=force)

@@ -40,7 +40,7 @@ def identify(
     from_file: Annotated[
         Path | None,
         typer.Option(
-            help="file with names of packs: one name a line, or a CSV file with the column pack", show_default=False
+            help="file with names of packs: one name a line, or a CSV file with a column `pack`", show_default=False
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="folder for the cell files and results.csv")] = Path("identified"),

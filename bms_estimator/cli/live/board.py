@@ -70,14 +70,14 @@ def board(
         int | None,
         typer.Option(
             parser=whole(1, 2**32 - 1),
-            help="set the serial number, given in decimal and shown in hexadecimal",
+            help="set the serial number; enter it in decimal; the output shows it in hexadecimal",
             show_default=False,
         ),
     ] = None,
     accept: Annotated[
         Path | None,
         typer.Option(
-            help="let the service of the pack with this settings file accept the next board that connects; no port is opened",
+            help="settings file of a pack, whose service is to accept the next board that connects, for example a replacement; opens no port",
             show_default=False,
         ),
     ] = None,

@@ -30,7 +30,9 @@ DEFAULT_LOAD_C = 3.0
 
 
 def simulate(
-    cell: Annotated[str, typer.Option(help=CELL_HELP)] = "chen_mora",
+    cell: Annotated[
+        str, typer.Option(help=f"{CELL_HELP}; chen_mora: 275 mAh Li-ion cell of Chen and Rincón-Mora")
+    ] = "chen_mora",
     capacity_ah: CapacityAh = None,
     series: Annotated[int, typer.Option(parser=whole(1), help="number of cells in series")] = 1,
     load: Annotated[LoadName, typer.Option(help="load profile")] = LoadName.RANDOM,
@@ -60,7 +62,7 @@ def simulate(
     mqtt: Annotated[
         str | None,
         typer.Option(
-            help="simulate an ESPHome node with a JK-BMS instead of a board, which publishes to this MQTT broker, mqtt://host:port",
+            help="instead of a board, simulate an ESPHome node with a JK-BMS that publishes to this MQTT broker, mqtt://host:port",
             show_default=False,
         ),
     ] = None,

@@ -125,7 +125,7 @@ def check(file: PackFile = Path("pack.toml")) -> None:
     make_line_producer(settings)  # raises an error if [source] is invalid or its optional package is missing
     for warning in warnings:
         typer.echo(f"warning: {file}: {warning}", err=True)
-    typer.echo(f"{file}: good: {_summary(settings, cell)}")
+    typer.echo(f"{file}: valid; {_summary(settings, cell)}")
 
 
 @app.command()

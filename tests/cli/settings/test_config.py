@@ -27,7 +27,7 @@ def test_init_writes_defaults_that_check_accepts(pack, capsys):
     assert f"{pack}: written" in out
     code, out, err = run(capsys, "config", "check", pack)
     assert (code, err) == (0, "")
-    assert out.startswith(f"{pack}: good: pack: ncr18650, 1 in series")
+    assert out.startswith(f"{pack}: valid; pack: ncr18650, 1 in series")
     assert load_settings(pack) == Settings()
 
 
@@ -234,7 +234,7 @@ def test_check_warns_about_implausible_settings(cell, settings, message, cell_fi
     pack.write_text(f'[pack]\ncell = "{cell_file(**cell)}"\n{settings}\n')
     code, out, err = run(capsys, "config", "check", pack)
     assert code == 0
-    assert f"{pack}: good: " in out
+    assert f"{pack}: valid; " in out
     assert f"warning: {pack}: {message}" in err
 
 
@@ -260,7 +260,7 @@ def test_check_warns_about_credentials_of_the_service(name, pack, capsys, monkey
     pack.write_text(f'[mqtt]\npassword_file = "{name}"\n')
     code, out, err = run(capsys, "config", "check", pack)
     assert code == 0
-    assert f"{pack}: good: " in out
+    assert f"{pack}: valid; " in out
     assert f"warning: {pack}: mqtt.password_file = {name}: not checked" in err
 
 
@@ -297,5 +297,5 @@ def test_check_fails_on_a_missing_token_file_and_warns_about_a_token_in_the_cred
     )
     pack.write_text('[influx]\nbucket = "bms"\ntoken_file = "influx-token"\n')
     code, out, err = run(capsys, "config", "check", pack)
-    assert (code, "good" in out) == (0, True)
+    assert (code, "valid" in out) == (0, True)
     assert "influx.token_file = influx-token: not checked" in err
