@@ -116,7 +116,7 @@ def slots(
             continue
         begin(sums, estimator.record[0])
         # ``add`` uses only store and samples of a block
-        block = Block(store=STORE_ID, number=1, oldest=1, arrival_s=0.0, samples=samples[first:end])
+        block = Block(store_created_ns=STORE_ID, number=1, oldest=1, arrival_s=0.0, samples=samples[first:end])
         add(sums, estimator.run(block.samples), block, estimator)
         hour = row(PackSettings(name=pack, cell=cell.cell.name[:30]), slot, sums, estimator)
         if hour.soc is not None and hour.soc_mean_std:

@@ -29,7 +29,7 @@ SAME_START_V = 0.02
 much."""
 GIVEN_V = 1e-3
 """Std of each point of a given curve, per cell [V]."""
-GIVEN_COMMON_V = 2e-3
+GIVEN_SYSTEMATIC_V = 2e-3
 """Std of the systematic error of a given curve, per cell [V]."""
 REST_SHARE = 0.7
 """Fraction of the half difference of low-rate curves that is hysteresis and remains in a rest after a discharge. The
@@ -224,7 +224,7 @@ def _slow_curve_source(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> 
 def _given_curve_source(curve: ExternalCurve, series_count: int) -> Source:
     """Return a given curve as a source."""
     everywhere = np.full(curve.soc.size, float(series_count))
-    points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, common_v=GIVEN_COMMON_V * everywhere)
+    points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, systematic_std_v=GIVEN_SYSTEMATIC_V * everywhere)
     hysteresis_v = None
     if curve.hysteresis_v is None:
         points = replace(points, direction=np.full(curve.soc.size, -1.0))
@@ -339,21 +339,21 @@ def _centered(points: Points, hysteresis_at_rest_v: Floats, relative_std: float)
         points,
         ocv_v=points.ocv_v - points.direction * hysteresis_v,
         std_v=np.hypot(points.std_v, np.where(points.direction == 0.0, hysteresis_v, 0.0)),
-        common_v=np.hypot(points.common_v, relative_std * hysteresis_v),
+        systematic_std_v=np.hypot(points.systematic_std_v, relative_std * hysteresis_v),
     )
 
 
-def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
+def subtract_rc_overpotential(found: OcvSources, ladder: Ladder) -> OcvSources:
     """Subtract the steady overpotential of the RC pairs from unpaired low-rate curves. In a pair it cancels.
 
     Args:
         found: Result of ``find_sources``.
         ladder: RC ladder with its relative standard deviation, if known.
     """
-    return replace(found, sources=tuple(_without_branches(source, ladder) for source in found.sources))
+    return replace(found, sources=tuple(_without_rc_overpotential(source, ladder) for source in found.sources))
 
 
-def _without_branches(source: Source, ladder: Ladder) -> Source:
+def _without_rc_overpotential(source: Source, ladder: Ladder) -> Source:
     """Return the source without the steady voltage drop of the RC pairs, if its curve is unpaired."""
     if source.unpaired is None:
         return source
@@ -364,7 +364,7 @@ def _without_branches(source: Source, ladder: Ladder) -> Source:
     points = replace(
         points,
         ocv_v=points.ocv_v - points.direction * drop_v,
-        common_v=np.hypot(points.common_v, ladder.std * drop_v),
+        systematic_std_v=np.hypot(points.systematic_std_v, ladder.std * drop_v),
     )
     removed = "the RC pairs" if first else "series resistance and RC pairs"
     note = f"{1e3 * drop_v.mean():.0f} mV subtracted for {removed}, as typical of such cells"

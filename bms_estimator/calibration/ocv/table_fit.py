@@ -162,7 +162,9 @@ def fit_table(points: Points) -> TableFit:
     for _ in range(ITERATIONS):
         bend_rows = _bend_rows(voltage_scale * BEND_V + (middle_slope_v + empty_slope_v) / BEND_SOC)
         model = _model(points, slope_v, systematic_factor, bend_rows, voltage_scale)
-        std_v = np.hypot(points.std_v, INDEPENDENT_ERROR_FRACTION * points.common_v) * scatter_factor[points.source]
+        std_v = (
+            np.hypot(points.std_v, INDEPENDENT_ERROR_FRACTION * points.systematic_std_v) * scatter_factor[points.source]
+        )
         coefficients = _solve(model, points, std_v, voltage_scale)
         slope_v = np.clip(_spline(points.soc, 1) @ coefficients[: model.splines], 0.0, MAX_SLOPE_V * voltage_scale)
         middle_slope_v = _spline(middles, 1) @ coefficients[: model.splines]
@@ -207,7 +209,9 @@ def _model(
     for source in range(int(points.source.max()) + 1):
         of_source = (points.source == source)[:, None]
         deviation_columns_v = (
-            systematic_factor * points.common_v[:, None] * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
+            systematic_factor
+            * points.systematic_std_v[:, None]
+            * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
         )
         columns += [of_source * deviation_columns_v, of_source * _shifts(points.soc, slope_v)]
         stds += [np.ones(DEVIATION_NODES.size), np.array([SOC_STD, CAPACITY_STD])]
@@ -254,7 +258,7 @@ def _error_factors(
     The first factor is that of each source's scatter, the second that of the systematic errors of all sources.
     """
     normalized = (points.ocv_v - model.points @ coefficients) / np.hypot(
-        points.std_v, INDEPENDENT_ERROR_FRACTION * points.common_v
+        points.std_v, INDEPENDENT_ERROR_FRACTION * points.systematic_std_v
     )
     sources = int(points.source.max()) + 1
     scatter = [

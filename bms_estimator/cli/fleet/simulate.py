@@ -68,7 +68,7 @@ def simulate(
 
     An edge sends a block again if a worker requests it.
     All edges share a few MQTT connections.
-    The packs consist of shipped cells, with different capacities and resistances.
+    The packs consist of cells that come with this program; their capacities and resistances vary.
     The samples of a block depend only on the seed, the pack and the number of the block.
     With --table and without --mqtt, only the table is written.
     """
@@ -86,7 +86,7 @@ def simulate(
 async def _run(
     fleet: SimulatedFleet, settings: MqttSettings, connections: int, speed: float, blocks: int | None
 ) -> Report:
-    start_s = time.time() - BLOCK_S / speed  # the first blocks are complete within the next minute
+    start_s = time.time() - BLOCK_S / speed  # a block earlier, so that the first blocks are sent within the next minute
     edges = SimulatedEdges(fleet, start_s=start_s, speed=speed, last=blocks)
     return await run_edges(fleet, edges, settings, connections=connections, stop=stop_on_signal(), report=typer.echo)
 

@@ -207,8 +207,8 @@ def open_capture(
 
     Args:
         path: The file.
-        sensor: Settings for decoding a raw capture, and the current sign of a table that defines none. None: the settings
-            in the header of a raw capture; discharge is positive in a table.
+        sensor: Settings that decode a raw capture. Their current sign also applies to a table without one. If None, a raw
+            capture is decoded with the settings in its header, and discharge is positive in a table.
         current_sign: Direction of positive current, which overrides ``sensor``, header and format.
 
     Raises:
