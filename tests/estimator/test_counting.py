@@ -15,7 +15,7 @@ from tests.estimator.anywhere.cases import Capture, Case, capture
 from tests.estimator.anywhere.use import DAY_S, cycles, days
 
 SEEDS = range(1, 9)
-OWN_CURVE = {"curve_error": 0.5, "unseen_h": 0.0}
+OWN_CURVE = {"file_ocv_error_ratio": 0.5, "load_before_h": 0.0}
 """Half of the typical OCV error, and no load before the estimator starts."""
 MAX_CAPACITY_ERROR = 0.025
 """Limit of the relative error of the capacity of each cell."""
@@ -60,7 +60,7 @@ def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(initial_
     errors, errors_over_std = [], []
     for seed in SEEDS:
         for capacity in (0.8, 1.2):
-            case = Case("cycles", capacity=capacity, seed=seed, **OWN_CURVE)
+            case = Case("cycles", file_capacity_ratio=capacity, seed=seed, **OWN_CURVE)
             # ``capacity`` is that of the cell file over the true one, so that 1 / capacity is to be learned.
             learned = relative_capacity(estimate_cycles(case, initial_soc_error).record[0])
             errors.append(capacity * learned.value - 1.0)
@@ -79,7 +79,9 @@ def test_a_gain_error_of_the_current_sensor_is_learned_as_a_capacity() -> None:
     """
     errors = []
     for seed in SEEDS:
-        estimator = estimate_cycles(Case("gain", gain=1.05, capacity=1.0, seed=seed, **OWN_CURVE), 0.0)
+        estimator = estimate_cycles(
+            Case("gain", current_gain=1.05, file_capacity_ratio=1.0, seed=seed, **OWN_CURVE), 0.0
+        )
         errors.append(relative_capacity(estimator.record[0]).value / 1.05 - 1.0)
     assert np.sqrt(np.mean(np.square(errors))) < MAX_RMS_CAPACITY_ERROR
 

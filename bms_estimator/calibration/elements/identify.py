@@ -501,7 +501,7 @@ def _worse_replays(outcome: Identification) -> str:
         if np.isfinite(c.score_after)
     ]
     return (
-        "nothing is written: replays cut in mid-load get worse, their interval score (smaller is better) goes from "
+        "nothing is written: replays that start in mid-load get worse, their interval score (smaller is better) goes from "
         f"{outcome.score_before:.2f} to {outcome.score_after:.2f} % of SOC; keep the cell file, or give captures with "
         f"more typical loads\n" + "\n".join(lines)
     )

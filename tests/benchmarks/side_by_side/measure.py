@@ -32,7 +32,7 @@ ENTRY_SOC_ERROR, LEARNING_SOC_ERROR = 0.2, 0.1
 R_S_STEP = 0.5
 """Relative size of the step of R_s."""
 MIN_PULSES = 9
-"""Minimum number of pulses of a reference, which is that of their running median."""
+"""Minimum number of pulses of a reference: the length of the running median over pulses."""
 ROUNDS = 9
 """Number of measurements of the time of a step."""
 TIMED_ROWS = 20_000
