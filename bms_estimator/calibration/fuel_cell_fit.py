@@ -177,7 +177,7 @@ def _correlation_length(error_v: Floats) -> float:
 def _errors(a: Floats, free: list[int], covariance: Floats) -> dict[Parameter, float]:
     """Return the relative standard deviations by key.
 
-    The standard deviation of the exchange current i_0 = e^(-a / A) follows from those of a and A.
+    The standard deviation of the exchange current i_0 = e^(-a / A) follows from the covariance of a and A.
     """
     std = {KEYS[j]: math.sqrt(covariance[k, k]) for k, j in enumerate(free)}
     slope, activation = NAMES.index("tafel_slope_v"), NAMES.index("activation_v")

@@ -44,13 +44,14 @@ PLATEAU_V = 0.15
 PLATEAU_SOC = 0.05
 """SOC interval over which the slope of a plateau is computed."""
 TYPICAL_HYSTERESIS_STD = 0.6
-"""Relative std of a hysteresis that is that of typical cells."""
+"""Relative std of a hysteresis that is taken from typical cells."""
 MIN_SHARE = 0.1
 """Lower limit of the remaining fraction that is measured by rests."""
 SHARE_POINTS = 6
 """Minimum number of rests that determine the remaining fraction."""
 SHARE_K = 10.0
-"""Maximum distance from 25 C of rests that determine the remaining fraction, beyond that of the low-rate curves [K]."""
+"""Maximum distance from 25 C of rests that determine the remaining fraction, in addition to the distance of the low-rate
+curves [K]."""
 SHARE_SOC = (0.1, 0.95)
 """SOC range of rests that determine the remaining fraction, and of a plateau."""
 MAX_CAPACITY_DIFFERENCE = 0.05
@@ -118,7 +119,7 @@ class OcvSources:
         hysteresis_v: Hysteresis of a rested cell at ``NODES`` and 25 C [V], from the source nearest to 25 C that shows
             hysteresis; None without such a source.
         hysteresis_std_v: Standard deviation of ``hysteresis_v`` [V].
-        usual_hysteresis: True if ``hysteresis_v`` is that of typical cells (``center_on_typical_hysteresis``).
+        usual_hysteresis: True if ``hysteresis_v`` comes from typical cells (``center_on_typical_hysteresis``).
     """
 
     capacity_ah: float

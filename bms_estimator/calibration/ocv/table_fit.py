@@ -36,7 +36,7 @@ NODES: Floats = np.unique(
 BEND_V = 2.0
 """Prior std of d2V/dSOC2 on flat parts of the curve, per ``CELL_V`` [V]."""
 BEND_SOC = 0.12
-"""SOC range over which the slope may change by its own size. The slope divided by this range adds to the prior std of
+"""SOC range over which the slope may change by 100 %. The slope divided by this range adds to the prior std of
 d2V/dSOC2, because steep parts bend more."""
 EMPTY_SLOPE_V = 60.0
 """Slope dV/dSOC that every curve may have at SOC 0, per ``CELL_V`` [V]."""
@@ -253,9 +253,10 @@ def _solve(model: _Model, points: Points, std_v: Floats, voltage_scale: float) -
 def _error_factors(
     points: Points, model: _Model, coefficients: Floats, systematic_factor: float
 ) -> tuple[Floats, float]:
-    """Return the factors by which the observed errors exceed the declared ones, at least 1.
+    """Return the factors by which the observed errors exceed the declared errors, at least 1.
 
-    The first factor is that of each source's scatter, the second that of the systematic errors of all sources.
+    The first value has a factor for the scatter of each source; the second is the factor for the systematic errors of all
+    sources.
     """
     normalized = (points.ocv_v - model.points @ coefficients) / np.hypot(
         points.std_v, INDEPENDENT_ERROR_FRACTION * points.systematic_std_v

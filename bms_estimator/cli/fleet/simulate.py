@@ -16,7 +16,7 @@ from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.broker_config import check
+from bms_estimator.mqtt.broker_config import check as check_broker_settings
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DeviceName
@@ -116,7 +116,7 @@ def _broker_settings(url: str, **options: str | Path | None) -> MqttSettings:
     """
     try:
         settings = MqttSettings.model_validate({"url": tuple(url.split(",")), **options})
-        check(settings)
+        check_broker_settings(settings)
     except ValidationError as error:
         raise UserError(f"--mqtt {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
     except UserError as error:

@@ -124,7 +124,7 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
 def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float, float, float]:
     """Return amplitude, exponent and offset of the element fitted last, within bounds.
 
-    If a bound limits one of them, the others are fitted again, because clipping each by itself would give a poor fit.
+    If a bound limits one of these values, the others are fitted again, because clipping each alone would give a poor fit.
 
     Args:
         fit: Record of ELEMENT_FIT after ``fit_element`` for this element.

@@ -68,8 +68,8 @@ class RawCapture:
         decoder_settings = sensor or recorded
         if decoder_settings.protocol != recorded.protocol:
             raise UserError(
-                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {decoder_settings.protocol!r}: "
-                "give settings with that protocol, or none"
+                f"{path}: recorded with protocol {recorded.protocol!r}, but sensor.protocol is {decoder_settings.protocol!r}: "
+                f"give settings with protocol {recorded.protocol!r}, or no settings"
             )
         self.decoder = make_protocol(
             decoder_settings.model_copy(update={"current_sign": current_sign or decoder_settings.current_sign})
