@@ -59,12 +59,12 @@ def simulate_use(case: Case, count: int) -> Capture:
 def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(initial_soc_error: float) -> None:
     errors, errors_over_std = [], []
     for seed in SEEDS:
-        for capacity in (0.8, 1.2):
-            case = Case("cycles", file_capacity_ratio=capacity, seed=seed, **OWN_CURVE)
-            # ``capacity`` is that of the cell file over the true one, so that 1 / capacity is to be learned.
+        for capacity_ratio in (0.8, 1.2):
+            case = Case("cycles", file_capacity_ratio=capacity_ratio, seed=seed, **OWN_CURVE)
+            # the true capacity divided by the capacity in the file is 1 / capacity_ratio
             learned = relative_capacity(estimate_cycles(case, initial_soc_error).record[0])
-            errors.append(capacity * learned.value - 1.0)
-            errors_over_std.append(error_over_std(learned, 1.0 / capacity))
+            errors.append(capacity_ratio * learned.value - 1.0)
+            errors_over_std.append(error_over_std(learned, 1.0 / capacity_ratio))
     assert np.abs(errors).max() < MAX_CAPACITY_ERROR
     assert np.sqrt(np.mean(np.square(errors))) < MAX_RMS_CAPACITY_ERROR
     # Both runs of a seed have the same error of the OCV, so that they are one degree of freedom.
@@ -91,7 +91,7 @@ def test_an_offset_of_20_ma_is_identified_within_a_day(temperature_c: float) -> 
     errors_over_std = []
     for seed in SEEDS:
         offset_a = 0.02 if seed % 2 else -0.02
-        parameters = {"capacity": 1.1, "offset_a": offset_a, "temperature_c": temperature_c}
+        parameters = {"file_capacity_ratio": 1.1, "offset_a": offset_a, "temperature_c": temperature_c}
         recording = simulate_use(Case("offset", soc=0.8, seed=seed, **parameters, **OWN_CURVE), count=1)
         estimator = Estimator(recording.cell, initial_soc=0.8)
         estimator.run(recording.samples)

@@ -28,7 +28,7 @@ def charge(one_c: float, rate_c: float, soc: float) -> Floats:
 
 
 def cycles(rng: np.random.Generator, one_c: float, count: int, by_soc: float, rest_s: int) -> Floats:
-    """Return currents of ``count`` drives, each of which lowers the SOC by ``by_soc``, and of charges at C/2, each followed by a rest [A]."""
+    """Return the current of ``count`` cycles of a drive that lowers the SOC by ``by_soc``, a rest, a charge at C/2 and a rest [A]."""
     parts = []
     for _ in range(count):
         down = drive(rng, one_c, 0.5, 20000)  # longer than needed
