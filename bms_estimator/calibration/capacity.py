@@ -160,7 +160,7 @@ def _check_range(anchors: Sequence[Anchor], p: np.void) -> None:
     """Check that most rests lie within the voltage range of the OCV curve.
 
     Raises:
-        UserError: Most rests lie outside. The curve is that of another cell.
+        UserError: Most rests lie outside the curve, which belongs to another cell.
     """
     low_v, high_v = float(p["ocv_v"][0]), float(p["ocv_v"][-1])
     beyond = [

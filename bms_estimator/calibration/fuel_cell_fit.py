@@ -77,7 +77,7 @@ class FuelCellFit:
     Attributes:
         model: The stack with its parameters, and their errors in ``std``.
         rms_v: Residual voltage by the name of each source, RMS [V].
-        undetermined: Reason why a parameter has the value of the file, by its key in ``[fuel_cell]``.
+        undetermined: Reason why a parameter keeps its initial value, by its key in ``[fuel_cell]``.
     """
 
     model: FuelCellModel
@@ -141,13 +141,14 @@ def _fit(sources: Sequence[Source], initial_parameters: Floats, free: list[int])
         solution = least_squares(residual, theta[free], jacobian, bounds=(-MAX_LN_CHANGE, MAX_LN_CHANGE), x_scale=0.1)
         theta = full_theta(solution.x)
         weights = np.array([_weight(source, initial_parameters, theta, len(free)) for source in sources])
-    information = jacobian(theta[free])
-    return theta, np.linalg.pinv(information.T @ information, hermitian=True) + _null_space_variance(information)
+    weighted_jacobian = jacobian(theta[free])
+    information = weighted_jacobian.T @ weighted_jacobian
+    return theta, np.linalg.pinv(information, hermitian=True) + _null_space_variance(information)
 
 
-def _null_space_variance(jacobian: Floats) -> Floats:
+def _null_space_variance(information: Floats) -> Floats:
     """Return a very large variance in directions that no datum determines, where a pseudoinverse gives zero."""
-    values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
+    values, vectors = np.linalg.eigh(information)
     null_space: Floats = vectors[:, values <= 1e-10 * values.max()]
     variance: Floats = 1e6 * null_space @ null_space.T
     return variance
@@ -176,14 +177,15 @@ def _correlation_length(error_v: Floats) -> float:
 def _errors(a: Floats, free: list[int], covariance: Floats) -> dict[Parameter, float]:
     """Return the relative standard deviations by key.
 
-    The standard deviation of the exchange current i_0 = e^(-a / A) follows from those of a and A.
+    The standard deviation of the exchange current i_0 = e^(-a / A) follows from the covariance of a and A.
     """
     std = {KEYS[j]: math.sqrt(covariance[k, k]) for k, j in enumerate(free)}
     slope, activation = NAMES.index("tafel_slope_v"), NAMES.index("activation_v")
-    ratio = a[1 + activation] / a[1 + slope]  # - ln i_0; d ln i_0 = ratio (d ln A - d ln a)
-    along = np.array([ratio if j == slope else -ratio if j == activation else 0.0 for j in free])
+    # ln i_0 = -ratio, therefore d ln i_0 = ratio (d ln A - d ln a)
+    ratio = a[1 + activation] / a[1 + slope]
+    gradient = np.array([ratio if j == slope else -ratio if j == activation else 0.0 for j in free])
     if "exchange_current_a" in std:
-        std["exchange_current_a"] = math.sqrt(along @ covariance @ along)
+        std["exchange_current_a"] = math.sqrt(gradient @ covariance @ gradient)
     return std
 
 

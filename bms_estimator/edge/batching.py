@@ -1,4 +1,4 @@
-"""Division of samples into blocks. Pure."""
+"""Division of samples into blocks. No I/O."""
 
 from typing import NamedTuple
 

@@ -49,14 +49,14 @@ class Block:
     """Block of samples, sent in one message.
 
     Attributes:
-        store: Creation time of the edge's store [ns since 1970].
+        store_created_ns: Creation time of the edge's store, from which timestamps count [ns since 1970].
         number: Number of this block in its store, from 1.
         oldest: Oldest number that the edge can still send; at most ``number``.
         arrival_s: Wall clock at the arrival of the last sample [s since 1970].
         samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MAX_SAMPLES`` of them.
     """
 
-    store: int
+    store_created_ns: int
     number: int
     oldest: int
     arrival_s: float
@@ -72,7 +72,7 @@ def encode(block: Block) -> bytes:
     if not 1 <= block.samples.size <= MAX_SAMPLES:
         raise ValueError(f"{block.samples.size} samples in a block: must be 1 to {MAX_SAMPLES}")
     header = _HEADER.pack(
-        _MAGIC, _VERSION, block.samples.size, block.store, block.number, block.oldest, block.arrival_s
+        _MAGIC, _VERSION, block.samples.size, block.store_created_ns, block.number, block.oldest, block.arrival_s
     )
     columns = [np.ascontiguousarray(block.samples[name], dtype=dtype) for name, dtype in _COLUMNS]
     columns[0] = _differences(columns[0].view("<u8"))

@@ -177,7 +177,7 @@ def _insert(connection: sqlite3.Connection, state: StoreState, ready: ReadyBlock
     # sample times never decrease within a store, even if the clock was set back before a restart
     samples["time_s"] = np.maximum(samples["time_s"] - state.created_s, state.last_s)
     block = Block(
-        store=state.created_s * NS,
+        store_created_ns=state.created_s * NS,
         number=state.next_number,
         oldest=state.next_number,  # replaced by the oldest number at the time of sending
         arrival_s=ready.arrival_s,
@@ -218,4 +218,4 @@ def _is_valid(created_s: int, number: int, data: Any) -> bool:
         block = decode(data)
     except BlockError:
         return False
-    return block.store == created_s * NS and block.number == number
+    return block.store_created_ns == created_s * NS and block.number == number

@@ -1,4 +1,4 @@
-"""Timestamps of samples for a fleet. A source's clock is mapped to a clock that never steps back. Pure."""
+"""Timestamps of samples for a fleet. A source's clock is mapped to a clock that never steps back. No I/O."""
 
 import math
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 SAMPLE = np.dtype(
     [
-        ("time_s", "f8"),  # time on the source's clock, not decreasing without faults
+        ("time_s", "f8"),  # time on the source's clock; it decreases only after a fault
         ("current_a", "f8"),  # positive on discharge
         ("voltage_v", "f8"),  # voltage at the pack's terminals
         ("temperature_c", "f8"),  # NaN without a sensor
@@ -32,7 +32,7 @@ CellBlock = NDArray[np.float64]
 """Shape (n, m): voltages of m cells for each of a block's n samples [V], NaN if not reported."""
 
 NO_CELLS: CellBlock = np.empty((0, 0))
-"""Cell voltages of a block of any length without cell voltages."""
+"""Empty ``CellBlock``, used for blocks of any length without cell voltages."""
 
 MIN_C = -60.0
 """Lowest plausible temperature of a pack or stack [C]."""

@@ -135,7 +135,7 @@ def _load_client_certificate(context: ssl.SSLContext, settings: BrokerSettings, 
                 f"{section}.key_file = {key_file}: is not the key of {section}.cert_file = {cert_file}"
             ) from None
         raise UserError(
-            f"{section}.cert_file = {cert_file}, {section}.key_file = {key_file}: no certificate in PEM with its key: {error}"
+            f"{section}.cert_file = {cert_file}, {section}.key_file = {key_file}: must be a PEM certificate and its key: {error}"
         ) from None
 
 

@@ -1,6 +1,6 @@
 """Errata E1 to E36 of the thesis, numbered as in docs/theory/thesis.md.
 
-Corrected numbers are computed. Printed numbers are those of ``printed_values``.
+Corrected numbers are computed. Printed numbers come from ``printed_values``.
 """
 
 from dataclasses import dataclass

@@ -32,7 +32,7 @@ def deltas() -> tuple[float, float]:
 
 
 def product_errors() -> tuple[float, float]:
-    """Return the mean errors of R_ts C_ts and R_tl C_tl against those of Chen and Mora, as in Fig. 29 [%]."""
+    """Return the mean errors of R_ts C_ts and R_tl C_tl relative to the cell of Chen and Mora, as in Fig. 29 [%]."""
     true = load_cell("chen_mora").a
     return mean_error_percent(PRODUCTS[0], A, true), mean_error_percent(PRODUCTS[1], A, true)
 

@@ -8,7 +8,7 @@ not depend on captures. Step 3 computes R_s by (4.2) and fits its coefficients a
 to 0.6C and the loads of the relaxation tests. No parameter is estimated from the capture that validates it: for the
 validation of a constant load, step 3 omits that load.
 
-The captures are real ones, or those of the simulated pack. Each result is computed on first use.
+The captures come from a real cell or from the simulated pack. Each result is computed on first use.
 """
 
 from collections.abc import Sequence
@@ -102,7 +102,7 @@ class Procedure:
     """Procedure of chapter 5 on one pack.
 
     Args:
-        cell: Capacity, limits, and bounds of a1..a12. Without bounds those of Table 10 are used. Elements and OCV of
+        cell: Capacity, limits, and bounds of a1..a12. Without bounds, the bounds of Table 10 are used. Elements and OCV of
             the cell are not used.
         captures: Discharging captures: at least one relaxation test, and one constant load or steps.
         voltage_step_v: Resolution of the voltage [V].

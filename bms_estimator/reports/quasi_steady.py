@@ -1,6 +1,7 @@
 """Response of the thesis's observer, (3.1)-(3.3), to a constant current with true parameters, for errata 15, 16 and 27.
 
-x2 and x3 are the voltages of the RC pairs, x2^ and x3^ those of the observer, e its error and N its gain. Both RC pairs
+x2 and x3 are the voltages of the RC pairs of the cell, x2^ and x3^ the voltages of the RC pairs of the observer. e is the
+error of the observer, N its gain. Both RC pairs
 of the observer are driven by one input u, but the RC pairs of the cell by i/C_ts and i/C_tl. If x2^ and x3^ change
 slowly, u = x2^/tau_ts = x3^/tau_tl. Therefore x2^ : x3^ is tau_ts : tau_tl in the observer, but x2 : x3 is R_ts : R_tl
 in the cell. Since u = -N e is not zero, e is not zero either.

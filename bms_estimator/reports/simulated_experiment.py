@@ -1,11 +1,11 @@
 """Simulated 6S 22.2 V 6.6 Ah pack with the loads of chapter 5 of the thesis, measured by a simulated sensor chain.
 
-Tables, figures, sections and errata are those of the thesis. The pack has the open-circuit voltage of Table 8 and the
-R_s of Table 9. Its R_ts, R_tl, C_ts and C_tl are those of Chen and Mora's cell, because Fig. 29 compares the pack with
+Numbers of tables, figures, sections and errata refer to the thesis. The pack has the open-circuit voltage of Table 8 and the
+R_s of Table 9. Its R_ts, R_tl, C_ts and C_tl come from Chen and Mora's cell, because Fig. 29 compares the pack with
 that cell. These elements lie within the bounds of Table 10, but differ from the values to which the adaptation
 converges (Lemma 4.1.3).
 
-The loads are the resistors of section 5.1. Their currents differ from the printed ones (erratum 21). The bulb is a
+The loads are the resistors of section 5.1. Their currents differ from the printed currents (erratum 21). The bulb is a
 resistor with the bulb's printed current. The voltage is measured by a divider, the current by a +-10 A sensor. The
 noise is uniform within half a step and is added before rounding.
 """

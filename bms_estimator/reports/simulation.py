@@ -121,7 +121,7 @@ def discharge(cell: CellModel, current_a: float, step_s: float, first_s: Floats 
 
 
 def observer_settings(law: str, lambda_: float = 1.0, alpha: float = ALPHA) -> ObserverSettings:
-    """Return the settings of the thesis: no dead zone and no reset of k. The sign of N is that of erratum 1."""
+    """Return the settings of the thesis: no dead zone and no reset of k. The sign of N follows erratum 1."""
     printed_law = {"law": law, "dead_zone_v": 0.0, "rearm_gain": None, "epsilon_v": EPSILON_V}
     return ObserverSettings.model_validate(printed_law | {"lambda": lambda_, "alpha": alpha})
 

@@ -95,7 +95,7 @@ def measure() -> tuple[RunResult, ...]:
 
 
 def _measure(cell: CellModel, name: str, c_rate: float, limits: Floats) -> RunResult:
-    """Run the observer from full to empty at ``c_rate``; ``limits`` are those of a1..a12 at index 1..12."""
+    """Run the observer from full to empty at ``c_rate``; ``limits`` has the limits of a1..a12 at index 1..12."""
     current_a = c_rate * cell.cell.capacity_ah
     samples = discharge(cell, current_a, 3600.0 / c_rate / SAMPLES)
     estimator = Estimator(

@@ -18,10 +18,11 @@ from bms_estimator.reports.report_items import Reproduction
 from bms_estimator.reports.simulation import element
 
 PRODUCTS_PERCENT = 20.0
-"""Maximum error of the RC products [%]: ten times the 1.9 % of Table 7. Theorem 4.1.2 claims that they are exact."""
+"""Maximum error of the products R_ts C_ts and R_tl C_tl [%], about ten times the 1.9 % of Table 7. Theorem 4.1.2 claims that
+the products are exact."""
 SOC_PERCENT = 5.0
-"""Maximum error of the interpolated SOC [%]. An initial error of this size persists in coulomb counting. Section 7.1 of
-the thesis claims that interpolation is more accurate."""
+"""Maximum error of the interpolated SOC [%]. Coulomb counting would keep an initial error of this size. Section 7.1 of
+the thesis claims that interpolation in the OCV curve is more accurate."""
 MIDDLE_SOC = 0.5
 """SOC at which the RC products are compared."""
 
@@ -53,7 +54,7 @@ class Claim:
     Attributes:
         key: Name of the claim in the tables, such as "constant loads, mean".
         location: Table or figure of the thesis.
-        criterion: Condition for more than half of the captures.
+        criterion: Condition that more than half of the captures must meet.
         results: Results of each capture that the claim can be tested on.
     """
 
@@ -92,19 +93,23 @@ class Claim:
         return f"{criterion}: met on {self.captures_met} of {len(self.results)} captures (values {self.span}); required: more than half."
 
 
-def _constant(measure: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
+def _constant_load_test(
+    measure: Callable[[Procedure, str], float], limit: float
+) -> Callable[[Procedure], list[Result]]:
+    """Return a test that compares the measure with the limit on each capture of a constant load."""
     return lambda p: [Result(c.name, measure(p, c.name), limit) for c in p.validating if c.kind is Kind.CONSTANT]
 
 
-def _steps(measure: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
+def _step_load_test(measure: Callable[[Procedure, str], float], limit: float) -> Callable[[Procedure], list[Result]]:
+    """Return a test that compares the measure with the limit on each capture of a load in steps."""
     return lambda p: [Result(c.name, measure(p, c.name), limit) for c in p.validating if c.kind is Kind.STEPS]
 
 
-def _mean(p: Procedure, name: str) -> float:
+def _mean_percent(p: Procedure, name: str) -> float:
     return p.dynamic[name].mean_percent
 
 
-def _max(p: Procedure, name: str) -> float:
+def _max_percent(p: Procedure, name: str) -> float:
     return p.dynamic[name].max_percent
 
 
@@ -124,7 +129,7 @@ def _soc_difference(p: Procedure) -> list[Result]:
 
 
 def products(p: Procedure) -> Iterator[tuple[str, float, float]]:
-    """Yield names of relaxation test and RC product, and the product as estimated and as measured in the rests [s]."""
+    """Yield a label, the estimated value and the value measured in the rests [s] for each relaxation test and RC product."""
     for test, capture in zip(p.tests, p.captures_of(Kind.RELAXATION), strict=True):
         try:
             measured = initial_elements(capture.samples, test, p.cell.cell.capacity_ah)
@@ -153,22 +158,22 @@ CLAIMS: dict[str, tuple[str, str, Callable[[Procedure], list[Result]]]] = {
     "constant loads, mean": (
         "Table 11",
         f"mean error at most {LARGEST_CONSTANT:g} %, the largest printed for a constant load",
-        _constant(_mean, LARGEST_CONSTANT),
+        _constant_load_test(_mean_percent, LARGEST_CONSTANT),
     ),
     "constant loads, largest": (
         "Figure 33",
         f"largest error at most {printed_values.MAX_CONSTANT:g} %",
-        _constant(_max, printed_values.MAX_CONSTANT),
+        _constant_load_test(_max_percent, printed_values.MAX_CONSTANT),
     ),
     "steps, mean": (
         "Table 11",
         f"mean error at most {LARGEST_STEPS:g} %, the larger of the two printed for steps",
-        _steps(_mean, LARGEST_STEPS),
+        _step_load_test(_mean_percent, LARGEST_STEPS),
     ),
     "steps, largest": (
         "Figure 38",
         f"largest error at most {printed_values.MAX_STEPS:g} %",
-        _steps(_max, printed_values.MAX_STEPS),
+        _step_load_test(_max_percent, printed_values.MAX_STEPS),
     ),
     "dynamic against static, ratio": (
         "Table 13",

@@ -53,15 +53,16 @@ _VOLTAGE_LIMITS = (
     (3.45, VoltageLimits(3.65, 3.40, 2.70, 3.10)),  # LFP: factory settings of the Seplos BMS 3.0
     (math.inf, VoltageLimits(4.25, 4.15, 2.70, 3.00)),  # all chemistries that are charged to 4.2 V
 )
-"""Voltage limits by chemistry, each after the upper limit of the nominal voltage of its cells [V]."""
+"""Pairs of a maximum nominal voltage of a cell [V] and the limits of cells up to this nominal voltage. The first pair that
+matches applies."""
 
 MIN_CHARGE_C = 0.02
 """Minimum charge current as a C-rate [1/h]. A smaller current may be the sensor's offset."""
 CLEAR_DECIMALS = 9
 """Number of decimals to which clear levels are rounded, so that 0.1 - 0.08 gives 0.02."""
 MAX_DISCHARGE_C = 5.0
-"""Default limit of the discharge current as a C-rate [1/h]. ``current_max_a`` of a generic cell's file is no default,
-because this limit of valid samples lies far above the continuous limit of most such cells."""
+"""Default limit of the discharge current as a C-rate [1/h]. ``current_max_a`` of a generic cell file would be too high a
+default: it only rejects invalid samples, and lies far above the continuous current of most cells."""
 CURRENT_CLEAR_FRACTION = 0.95
 """Default clear level of a current as a fraction of its limit."""
 

@@ -65,7 +65,9 @@ class CellSignals(Signal):
     count: Annotated[int, Field(ge=1, le=MAX_CELLS)] = Field(
         default=1, description="number of cells; {} in signal stands for the cell number"
     )
-    first: Annotated[int, Field(ge=0)] = Field(default=1, description="cell number of the first cell in signal")
+    first: Annotated[int, Field(ge=0)] = Field(
+        default=1, description="number that replaces {} in signal for the first cell"
+    )
 
     @model_validator(mode="after")
     def _check_cell_placeholder(self) -> Self:
@@ -142,7 +144,7 @@ class CanSource(BaseSource):
 
     @property
     def sensor_defaults(self) -> Mapping[str, object]:
-        """Return the ``[sensor]`` defaults: sign of a profile, and resolutions unless another DBC file replaces its own."""
+        """Return the ``[sensor]`` defaults of a profile: its current sign, and its resolutions unless ``dbc`` replaces its DBC file."""
         if self.profile is None:
             return {}
         resolutions = RESOLUTIONS[self.profile] if self.dbc is None else {}

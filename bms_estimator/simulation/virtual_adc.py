@@ -118,7 +118,10 @@ class VirtualConverter:
 
 
 def compute_window(rate_hz: int) -> tuple[int, int]:
-    """Return the number of conversion pairs in a window, and its length [ns] by the clock division of the firmware."""
+    """Return the number of conversion pairs in a window, and the length of the window [ns].
+
+    The firmware divides its clock, so that a conversion takes a whole number of clock cycles.
+    """
     conversions = CONVERSIONS_PER_S // rate_hz // 2 * 2  # an even number, because they come in pairs
     cycles = round(CLOCK_HZ / (rate_hz * conversions))
     return conversions // 2, conversions * cycles * 1_000_000_000 // CLOCK_HZ

@@ -1,4 +1,4 @@
-"""One-minute row of a pack: means, extremes and sums of its publications. Pure."""
+"""One-minute row of a pack: means, extremes and sums of its publications. No I/O."""
 
 import math
 from dataclasses import dataclass, field

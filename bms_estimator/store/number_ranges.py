@@ -1,4 +1,4 @@
-"""Ascending numbers, stored as contiguous ranges. The messages of a day usually form one range. Pure."""
+"""Ascending numbers, stored as contiguous ranges. The messages of a day usually form one range. No I/O."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator

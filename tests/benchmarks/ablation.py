@@ -1,7 +1,7 @@
 """Ablation study of the filter: scores of ``make anywhere`` without one part of the filter, by kinds of groups.
 
-One part at a time is disabled in the settings of the filter, in its first state or in its samples. The cell files are not
-changed. A cell of the table has RMSE of the SOC, fraction of time inside two std, and interval score, all in %.
+One part at a time is disabled: by the settings of the filter, by its first state, or by its samples. The cell files are not
+changed. Each entry of the table has RMSE of the SOC, fraction of time inside two std, and interval score, all in %.
 """
 
 import sys
@@ -25,6 +25,7 @@ from tests.benchmarks.recipes import GROUPS, Group, chosen, runs
 from tests.estimator.anywhere.score import Score, score
 
 Change = Callable[[np.void], None]
+"""Function that changes the settings of the filter."""
 
 KINDS = {
     "NMC/NCA, 25, 10 C": ("PF 25 C, US06", "PF 25 C, mixed", "PF 10 C", "NCR", "Leaf"),
@@ -86,7 +87,7 @@ PARTS: dict[str, Change] = {
 }
 """Part of the filter, and the change of the settings that disables it."""
 ONE_FILTER, NO_TEMPERATURE = "filter bank (one hypothesis)", "temperature"
-"""Parts that are disabled in the first state, and in the samples."""
+"""Two parts that no setting disables: the first is disabled in the first state, the second in the samples."""
 
 
 def main() -> None:
@@ -131,7 +132,7 @@ def score_without(part: str, cell: CellModel, samples: SampleBlock, truth: Float
 
 
 def merge_all_hypotheses(state: np.void, settings: np.void) -> None:
-    """Replace all hypotheses by the middle one, with the SOC's standard deviation of all."""
+    """Replace all hypotheses by the middle one, with the standard deviation that the SOC has over all hypotheses."""
     if state["count"] == HYPOTHESES:
         copy_hypothesis(state, HYPOTHESES // 2, 0)
         state["count"], state["best"] = 1, 0

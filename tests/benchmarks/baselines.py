@@ -11,7 +11,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 EKF_VOLTAGE_SIGMA_V = 0.005
-"""Standard deviation of the measurement noise of the textbook filter, and minimum of the joint filter's [V]."""
+"""Standard deviation of the measurement noise of the textbook filter, and minimum in the joint filter [V]."""
 ELEMENT_STD = 0.7
 """Joint filter: initial standard deviation of ln of each element; 0.7 is a factor of two."""
 ELEMENT_WALK = 1e-6
@@ -23,24 +23,25 @@ NOISE_WINDOW_S = 60.0
 """Joint filter: time constant of the adaptation of the measurement noise to the innovations [s]."""
 LN_SPAN = math.log(4.0)
 """Joint filter: bound of the change of ln of each element. Elements stay between a quarter and four times their start, as
-those of the observer."""
+in the observer."""
 FIVE_SIGMA_V = 0.1
 """Filter with five time constants: measurement noise of the voltage averaged over a second [V].
 
 Of 5, 20, 50, 100 and 200 mV this value has the best result.
 """
 FIVE_TAU_S = np.array([2.0, 15.0, 80.0, 400.0, 2000.0])
-"""Time constants of this filter [s]."""
+"""Time constants of the filter with five time constants [s]."""
 INITIAL_VARIANCE = np.array([0.2**2, 0.01**2, 0.01**2])
-"""Initial variance of the SOC, and of both RC voltages [V^2], of each filter."""
+"""Initial variances in every filter: of the SOC, and of two RC voltages [V^2]."""
 WALK = np.array([1e-10, 1e-9, 1e-9])
-"""Variance per second that is added to the SOC, and to both RC voltages [V^2], of each filter."""
+"""Process noise of every filter: variance per second of the SOC, and of two RC voltages [V^2/s]."""
 SOC_STEP = 1e-4
 """Half of the SOC interval over which the slope of the OCV is computed."""
 MAX_RLS_TRACE = 1e6
 """Recursive least squares: maximum trace of the covariance."""
 COLD_C = 0.0
-"""Temperature at which one activation energy per resistance has the same effect as the two of the cell file [C]."""
+"""Temperature at which a resistance with one activation energy equals the sum of the weakly and the strongly temperature
+dependent resistance of the cell file [C]."""
 
 
 @njit
@@ -135,7 +136,7 @@ def joint_ekf(
         innovation = voltage_v[k] - (ocv(x[0], grid[0], grid[1]) - x[1] - x[2] - ohmic_v)
         ph = p @ h
         model_v2 = h @ ph
-        # The expected square of the innovation is the model's variance plus that of the noise.
+        # The expected square of the innovation is the variance of the model plus the variance of the noise.
         noise_v2 += min(dt / NOISE_WINDOW_S, 1.0) * (innovation**2 - model_v2 - noise_v2)
         noise_v2 = max(noise_v2, EKF_VOLTAGE_SIGMA_V**2)
         s = model_v2 + noise_v2
@@ -176,9 +177,9 @@ def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]
 
     weak, strong = share_between_nearest(weak_ohm), share_between_nearest(strong_ohm)
     middle = len(weak) // 2
-    factor = weak[middle] * arrhenius(WEAK_J, COLD_C) + strong[middle] * arrhenius(STRONG_J, COLD_C)
-    ratio = np.log(np.maximum(factor / np.maximum(weak[middle] + strong[middle], 1e-9), 1.0))
-    return weak + strong, ratio / math.log(arrhenius(1.0, COLD_C))
+    cold_ohm = weak[middle] * arrhenius(WEAK_J, COLD_C) + strong[middle] * arrhenius(STRONG_J, COLD_C)
+    ln_ratio = np.log(np.maximum(cold_ohm / np.maximum(weak[middle] + strong[middle], 1e-9), 1.0))
+    return weak + strong, ln_ratio / math.log(arrhenius(1.0, COLD_C))
 
 
 @njit
@@ -235,7 +236,7 @@ def ladder_ekf(
         h[0] = _ocv_slope(x[0], grid)
         innovation = voltage_v[k] - (ocv(x[0], grid[0], grid[1]) - x[1:].sum() - current_a[k] * r[0])
         ph = p @ h
-        # Several samples within a second together have the weight of one.
+        # All samples of a second together have the weight of one sample.
         s = h @ ph + FIVE_SIGMA_V**2 / min(max(dt, 0.01), 1.0)
         x = x + ph / s * innovation
         p = p - np.outer(ph, ph) / s

@@ -22,10 +22,11 @@ from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWri
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 HOURS = (4, 16)
-"""Durations of a short and a long capture [h]. The replay of the long one must not take more memory."""
+"""Durations of a short and a long capture [h]. The replay of the long capture must not take more memory."""
 GROWTH_MIB = 16.0
 """Permitted difference of memory, which the allocator may retain [MiB]."""
 RECORDS_PER_WRITE = 1_000_000
+"""Number of records that are written at a time, to limit the memory."""
 RECORD = np.dtype([("arrival_s", "<f8"), ("length", "<u4"), ("data", "u1", SAMPLE_FRAME_BYTES), ("crc", "<u2")])
 """Record of a raw capture that contains one frame, as a recording at 100 Hz does."""
 
@@ -42,7 +43,7 @@ class Replay:
 
 
 def rows() -> Iterator[Row]:
-    """Measure the replay of the long capture, and how much more memory it takes than that of the short one."""
+    """Measure the replay of the long capture, and how much more memory it takes than the replay of the short capture."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pack.raw"
         sample_counts = [hours * 3600 * RATE_HZ for hours in HOURS]

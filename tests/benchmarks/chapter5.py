@@ -26,6 +26,7 @@ from tests.benchmarks.recipes import DATA, LFP, NCR, PF, charge_ah, path_of
 WIDTH = 150
 """Width of the printed tables [characters]."""
 RELAXATION, CONSTANT, STEPS = Kind
+"""Kinds of captures: relaxation test, constant load, load in steps."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Experiment:
         cell: Cell file, of which only the limits are used.
         capacity_ah: Capacity by the captures, counted from full [Ah].
         captures: Name and kind of each capture.
-        room: True for room temperature, as in the experiments of the thesis.
+        room: True if measured at room temperature, as in the experiments of the thesis.
     """
 
     name: str
@@ -113,7 +114,7 @@ MIDDLE_SOC = 0.5
 
 
 def make_procedure(experiment: Experiment) -> Procedure:
-    """Return the procedure of the thesis on one cell. Of a capture of a constant load only the discharge is used."""
+    """Return the procedure of the thesis on one cell. Captures of a constant load are limited to the discharge."""
     cell = load_cell(experiment.cell, experiment.capacity_ah)
     captures = [
         Capture(name.split("/")[1], kind, _samples(name, kind, experiment)) for name, kind in experiment.captures
@@ -132,7 +133,7 @@ def discharge(rows: SampleBlock, min_a: float) -> SampleBlock:
 
     A current below ``min_a`` is neither charge nor discharge [A].
     """
-    # The rows are split at the begin and at the end of each charge.
+    # The rows are split at the beginning and the end of each charge.
     edges = np.r_[0, np.flatnonzero(np.diff((rows["current_a"] < -min_a).astype(np.int8))) + 1, rows.size]
     parts_between_charges = [rows[first:end] for first, end in itertools.pairwise(edges)]
     largest_discharge = max(parts_between_charges, key=lambda part: charge_ah(part)[-1])
@@ -253,7 +254,7 @@ class FastInStep3(Procedure):
         return self.captures_of(Kind.CONSTANT, Kind.RELAXATION)
 
 
-class OwnInStep3(FastInStep3):
+class ValidatedLoadInStep3(FastInStep3):
     """Procedure in which a load also contributes to the R_s with which it is validated."""
 
     def r_s_without(self, name: str) -> SeriesResistanceFit:  # noqa: ARG002 - none is left out
@@ -282,19 +283,22 @@ class PrintedSign(Unweighted):
         return {name: replace(curve, r_s_ohm=-curve.r_s_ohm) for name, curve in super().r_s_curves.items()}
 
 
+# names of the variants; "as it is" is the procedure without changes
 AS_IT_IS, UNWEIGHTED, FAST = "as it is", "(4.2) not weighted by the current", "1.5C in step 3 of the other loads"
-VARIANTS = {UNWEIGHTED: Unweighted, FAST: FastInStep3, "each load in its own step 3 as well": OwnInStep3}
+VARIANTS = {UNWEIGHTED: Unweighted, FAST: FastInStep3, "each load in its own step 3 as well": ValidatedLoadInStep3}
 
 
 def variants(experiment: Experiment, default_procedure: Procedure) -> dict[str, Procedure]:
     """Return variants of a procedure, with other versions of step 3 or other bounds."""
     model = load_cell(experiment.cell, experiment.capacity_ah)
     bounds = {f"a{i}": model.bounds(i) for i in range(1, 13)}
-    own_bounds = model.model_copy(update={"adaptation": bounds})
+    model_with_bounds = model.model_copy(update={"adaptation": bounds})
     return {
         AS_IT_IS: default_procedure,
         **{name: variant(model, default_procedure.captures, VOLTAGE_STEP_V) for name, variant in VARIANTS.items()},
-        "bounds around the cell file's elements": Procedure(own_bounds, default_procedure.captures, VOLTAGE_STEP_V),
+        "bounds around the cell file's elements": Procedure(
+            model_with_bounds, default_procedure.captures, VOLTAGE_STEP_V
+        ),
     }
 
 

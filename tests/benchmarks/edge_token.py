@@ -39,7 +39,7 @@ PARTITIONS = 4
 BLOCK_PERIOD_S = 0.5
 """Interval between two blocks of an honest pack [s]."""
 MAX_RATIO = 15.0
-"""Maximum of the longest latency in an attack divided by the longest latency without an attack."""
+"""Maximum permitted ratio of the longest latency in an attack to the longest latency without an attack."""
 IN_FLIGHT = 64
 """Maximum number of the attacker's unacknowledged messages."""
 ATTACKS = {

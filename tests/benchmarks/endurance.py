@@ -106,14 +106,14 @@ def chunks(rate_hz: int, seconds: float, chunk_s: float) -> Iterator[bytes]:
 
 
 def send(master: int, rate_hz: int, seconds: float, results: "mp.Queue[tuple[int, int, int]]") -> None:
-    """Send frames at ``rate_hz``, as a board does. This function runs in a process of its own.
+    """Send frames at ``rate_hz``, as a board does. This function runs in another process.
 
     Frames for which the line has no space are lost. At the end the numbers of all frames, of lost frames and of written bytes
     are put into ``results``. After a delay of the process, pending frames are sent in small bursts.
     """
     os.set_blocking(master, False)
     frame_bytes = len(next(chunks(rate_hz, 1.0 / rate_hz, 1.0)))
-    begin_s, frames, lost, written = time.monotonic(), 0, 0, 0
+    begin_s, frames, lost, written = time.monotonic(), 0, 0, 0  # numbers of frames, lost frames and written bytes
     for chunk in chunks(rate_hz, seconds, CHUNK_S):
         position = 0
         while position < len(chunk):
@@ -137,7 +137,7 @@ class Run:
 
     sent: int
     """Number of frames of the board."""
-    no_room: int
+    no_space: int
     """Number of frames for which the line had no space, because the service did not read."""
     line: dict[str, int]
     """Counters of the line, by the health message of the service."""
@@ -182,7 +182,7 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
                     continue
                 rss_mib.append(process.memory_info().rss / 2**20)
             cpu = (sum(process.cpu_times()[:2]) - before_s) / (time.monotonic() - begin_s)
-            frames, no_room, written = results.get(timeout=LONG_S)
+            frames, no_space, written = results.get(timeout=LONG_S)
             health = await live.wait_json("bms/load/health", lambda h: h["line"]["bytes_received"] >= written)
             service.send_signal(signal.SIGINT)
             await service.wait()
@@ -194,7 +194,7 @@ async def serve(rate_hz: int, seconds: float, folder: Path, broker: Broker) -> R
             os.close(master)
     half = len(rss_mib) // 2
     means = float(np.mean(rss_mib[:half])), float(np.mean(rss_mib[half:]))
-    return Run(frames, no_room, health["line"], health["samples"], cpu, means)
+    return Run(frames, no_space, health["line"], health["samples"], cpu, means)
 
 
 def _send_over(master: "mp.reduction.DupFd", *arguments: object) -> None:
@@ -240,8 +240,8 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         }
         received = run.line["frames_received"]
         quantity = f"{options.rate:,} frames/s for {options.minutes:g} min over a PTY"
-        is_met = received == run.sent == run.samples["samples"] and not any(faults.values()) and not run.no_room
-        fault_counts = ", ".join(f"{n} {name}" for name, n in (faults | {"without room": run.no_room}).items() if n)
+        is_met = received == run.sent == run.samples["samples"] and not any(faults.values()) and not run.no_space
+        fault_counts = ", ".join(f"{n} {name}" for name, n in (faults | {"without space": run.no_space}).items() if n)
         yield Row(quantity, "none lost", f"{received:,} of {run.sent:,} received {fault_counts}", is_met)
         yield Row("  service's processor time", f"below {MAX_CPU:.0%} of a core", f"{run.cpu:.1%}", run.cpu < MAX_CPU)
         first, second = run.rss_mib

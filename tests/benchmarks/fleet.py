@@ -1,7 +1,7 @@
 """Benchmark of a fleet of processes: server, workers and simulated edge devices. ``make fleet ARGS="--packs 10000"``.
 
 The lag is the time from the arrival of a block's last sample at the edge to the arrival of ``bms.<pack>.state`` at a listener.
-Quantiles are those of ``OBSERVED_PACKS`` packs. The maximum over all packs comes from the heartbeats of the workers. The first
+Quantiles are computed over ``OBSERVED_PACKS`` packs. The maximum over all packs comes from the heartbeats of the workers. The first
 minutes, in which every pack starts, are not measured.
 """
 
@@ -32,6 +32,7 @@ from tests.benchmarks.fleet_rig import Rig, cpu_s, create_streams, rig, rss_mib
 from tests.patience import LONG_S
 
 SEED, DAY_S, PARTITIONS = 1, 86_400.0, 64
+"""Seed of the simulated packs, seconds of a day, and number of partitions of the stream."""
 OBSERVED_PACKS = 256
 """Number of packs whose estimates are received; they are evenly spread over the fleet."""
 
@@ -43,7 +44,7 @@ class ReceivedMessages:
     Attributes:
         lags_s: Lags of the estimates of the observed packs [s].
         worst_s: Maximum lag of all blocks, by the heartbeats [s].
-        within: Numbers of estimates with the true SOC inside (True) and outside (False) two standard deviations.
+        within: Number of estimates, by whether the true SOC is within two standard deviations.
         workers: Last heartbeat by name of the worker.
     """
 
@@ -127,7 +128,7 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     await asyncio.to_thread(fleet_rig.stop_workers)
     stop_time_s = time.monotonic() - stop_begin_s
     raw_bytes, raw_messages, states_bytes = await _stream_sizes(fleet_rig)
-    pack_days = max(1, processed_blocks) * BLOCK_S / DAY_S  # of the processed blocks, even if some are missing
+    pack_days = max(1, processed_blocks) * BLOCK_S / DAY_S  # days of samples in the processed blocks
     workers_cpu_s = sum(cpu_time_s[name] for name in names)
     blocks_per_day = DAY_S / BLOCK_S
     sys.stderr.write((fleet_rig.folder / "edges.log").read_text().splitlines()[-1] + "\n")

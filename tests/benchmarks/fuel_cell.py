@@ -19,6 +19,7 @@ from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, f
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.fuel_cell_settings import MEMORY_S
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop
+from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sources.captures.curves import read_polarisation
@@ -31,14 +32,16 @@ DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
 MIN_A = 0.1
 """Minimum current of the measured points that are used; the measured cells have 1 cm2 [A]."""
 WRONG_FACTORS = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])
-"""Initial values of the kernel constants in the fit, divided by those of ``pem_30w``."""
+"""Initial values of the fit divided by the values of ``pem_30w``, by index of the kernel constant. Index 0 is unused."""
 LEARNING_HZ = 100
 """Sample rate at which parameters are learned in operation [Hz]."""
 LAST_SAMPLES = 30 * LEARNING_HZ
-"""Number of samples at the end of a part over which values are averaged: those of 30 s."""
+"""Number of samples of 30 s, over which values are averaged at the end of each part of a run."""
 R, LOSSES = 1, slice(5, 8)
-"""Indices of the kernel constants r, and B, i_L and i_n."""
+"""Index of the kernel constant r, and indices of B, i_L and i_n."""
 PRINTED_PARAMETERS = "r_ohm", "tafel_slope_v", "exchange_current_a", "c_dl_farad"
+STEP_OHM = 0.06
+"""Increase of the resistance during a run [ohm]."""
 
 
 def print_line(text: str) -> None:
@@ -62,7 +65,7 @@ def rms_mv(error_v: np.ndarray) -> float:
 
 
 def prediction_rms_mv(model: FuelCellModel, held_back: Source) -> float:
-    return rms_mv(held_back.voltage_v - held_back.predict(model.a, np.zeros(8))[0])
+    return rms_mv(held_back.voltage_v - held_back.predict(model.a, np.zeros(LEARNABLE))[0])
 
 
 def format_parameters(fit: FuelCellFit) -> str:
@@ -80,8 +83,9 @@ def print_identification() -> None:
     )
     start = PEM.identified(PEM.a * WRONG_FACTORS, {})
     measured_curve = mann_stack.curve(CURVE_A)
+    # seeds 1 and 5: different loads and noise
     learned, evaluated = (mann_stack.measured(*mann_stack.random_steps(60.0, 1000.0, seed=s), seed=s) for s in (1, 5))
-    for rate_hz, every in ((500, 2), (100, 10)):
+    for rate_hz, every in ((500, 2), (100, 10)):  # every nth sample of 1000 Hz
         held_back = make_source("held back", evaluated.every(every))
         for name, sources in (
             (
@@ -139,7 +143,7 @@ def print_real_curves() -> None:
 def print_learning() -> None:
     print_line("## Learned in operation at 100 Hz; the contacts grow by 60 mohm at 300 s")
     time_s, current_a = mann_stack.random_steps(1200.0, 500.0, seed=4)
-    record = mann_stack.measured(time_s, current_a, seed=4, more_ohm=np.where(time_s < 300.0, 0.0, 0.06)).every(5)
+    record = mann_stack.measured(time_s, current_a, seed=4, more_ohm=np.where(time_s < 300.0, 0.0, STEP_OHM)).every(5)
     estimator, block = Estimator(PEM), make_samples(record)
     estimator.run(block[:1])
     edges = [1, *(LEARNING_HZ * s for s in (60, 150, 300, 310, 360, 450, 600, 900, 1200))]
@@ -171,10 +175,12 @@ def print_ablation() -> None:
         "## Number of learned parameters, and memory: r increases by 60 mohm at 300 s; learned over true values at 450, 600, 900 s"
     )
     time_s, current_a = mann_stack.random_steps(900.0, 500.0, seed=4)
-    more_ohm = np.where(time_s < 300.0, 0.0, 0.06)
+    more_ohm = np.where(time_s < 300.0, 0.0, STEP_OHM)
     no_temperature, grown_a = np.full(time_s.size, np.nan), PEM.a.copy()
-    grown_a[R] += 0.06
-    before_v, after_v = (open_loop(a, np.zeros(8), time_s, current_a, no_temperature)[0] for a in (PEM.a, grown_a))
+    grown_a[R] += STEP_OHM
+    before_v, after_v = (
+        open_loop(a, np.zeros(LEARNABLE), time_s, current_a, no_temperature)[0] for a in (PEM.a, grown_a)
+    )
     own_v = np.where(time_s < 300.0, before_v, after_v) + np.random.default_rng(0).normal(0.0, 0.003, time_s.size)
     records = {
         "Mann's stack": mann_stack.measured(time_s, current_a, seed=4, more_ohm=more_ohm).every(5),

@@ -6,9 +6,9 @@ reference is a later estimate with a smaller std.
 The captures last only a few hours. Therefore a slot of six minutes replaces an hour of the fleet. The estimator starts at
 the points of a capture at which `make anywhere` starts. Each run counts as a pack. Columns of the table:
 
-- judged: number of comparisons of an estimate with a later one
-- hindsight: fraction of these in which the later estimate is covered
-- truth, there: fraction of the estimates with a more certain later one that cover the true SOC
+- judged: number of comparisons of an estimate with a later estimate
+- hindsight: fraction of these comparisons in which the estimate covers the later estimate
+- truth, there: fraction of the estimates which cover the true SOC, among the estimates with a more certain later estimate
 - truth, all: fraction of all estimates that cover the true SOC
 - offset: mean of error over std of the estimates of "truth, there". Later estimates share this error and cannot show it
 """
@@ -77,7 +77,7 @@ def _outcome(group: Group, folder: Path) -> list[str]:
     records = run_query(hours, "honest", limits=limits()).records
     if not records:
         return ["0"]
-    errors_there = np.array([x for pack in packs for x in judged(pack)])
+    errors_there = np.array([x for pack in packs for x in normalized_errors(pack)])
     all_errors = np.array(
         [estimate.error / (estimate.hour.soc_mean_std or np.nan) for pack in packs for estimate in pack]
     )
@@ -94,8 +94,8 @@ def _outcome(group: Group, folder: Path) -> list[str]:
     return [str(judgements), f"{100 * within:.0f}", columns_there[0], f"{100 * inside_all:.0f}", columns_there[1]]
 
 
-def judged(pack: list[SlotEstimate]) -> list[float]:
-    """Return error over standard deviation of the estimates that have a more certain later one."""
+def normalized_errors(pack: list[SlotEstimate]) -> list[float]:
+    """Return error over standard deviation of the estimates that have a more certain later estimate."""
     std = np.array([estimate.hour.soc_mean_std or np.nan for estimate in pack])
     return [
         estimate.error / std[n]
@@ -116,7 +116,7 @@ def slots(
             continue
         begin(sums, estimator.record[0])
         # ``add`` uses only store and samples of a block
-        block = Block(store=STORE_ID, number=1, oldest=1, arrival_s=0.0, samples=samples[first:end])
+        block = Block(store_created_ns=STORE_ID, number=1, oldest=1, arrival_s=0.0, samples=samples[first:end])
         add(sums, estimator.run(block.samples), block, estimator)
         hour = row(PackSettings(name=pack, cell=cell.cell.name[:30]), slot, sums, estimator)
         if hour.soc is not None and hour.soc_mean_std:

@@ -2,10 +2,12 @@
 
 The cell of the thesis has a load of steps of random height and length, sampled each second. In the cell file R_s, R_ts,
 tau_ts, R_tl and tau_tl are wrong by a factor of 2 up or down. Sixteen of the 32 combinations are used, in which every pair of
-parameters has each of its four combinations equally often. Bounds are a quarter and four times the values of the file. The
-tables contain the median over the files of the largest error of R_s and both RC products, and of all five parameters.
+parameters has each of its four combinations equally often. The law bounds each parameter to a quarter and to four times its
+value in the file. The tables contain two medians over the files: of the largest error among R_s and both RC products, and of
+the largest error among all five parameters.
 
-The printed law is Algorithm 1 of the thesis, with the Nussbaum gain N(k). The effect of N on it is measured on the real captures of ``../shared/data``, if they exist.
+The printed law is Algorithm 1 of the thesis, with the Nussbaum gain N(k). The effect of N
+on this law is measured on the real captures of ``../shared/data``, if they exist.
 """
 
 import itertools
@@ -59,18 +61,19 @@ INFINITE_DEAD_ZONE_V = 9.0
 K_BOUND = learning_law.MAX_RATE_HZ / RATE_HZ
 """Upper bound of k in the learning law."""
 OBSERVER_SETTINGS = ("dead_zone_v", "k0")
-"""Settings of a part that belong to the observer; the others belong to the learning law."""
+"""Changed settings that belong to the observer; all others belong to the learning law."""
 LEAK = 1e-4
-"""Gain of the leakage in the law without a memory. That law diverges at ten times this value."""
+"""Gain of the leakage in the law without a memory. This law diverges at ten times this gain."""
 HIGH_OHM_FACTOR = 10.0
 """Factor of the resistances of a cell on which k has a visible effect."""
 SOC_ERROR = 0.05
-"""Difference by which the counted SOC is too low."""
+"""Error of the initial SOC, by which the counted SOC is too low."""
 NO_N: dict[str, Any] = {"nussbaum": "k2-cos", "k0": 0.0, "dead_zone_v": INFINITE_DEAD_ZONE_V}
 """Settings of N(k) = k^2 cos k with constant k = 0."""
 NO_LOCK_DETECTION = {"lock_error_v": 100.0}
 """Settings with which no error counts as a loss of lock."""
 CAPTURES = ("cell5_relaxation_c2", "cell1_random_steps", "cell1_dst")
+"""Captures of the NCR18650 with which the gains N(k) and N = 0 are compared."""
 Run = Callable[[Any, Any, Any, Any], int]
 """Type of ``kernels.step.run``."""
 
@@ -109,7 +112,7 @@ def learning_errors(
 def percent(errors_by_file: np.ndarray) -> list[str]:
     """Return for each hour, as text, two medians over the files [%].
 
-    They are those of the largest error of R_s and both RC products, and of the largest error of all five parameters.
+    The first is the largest error among R_s and both RC products, the second the largest error among all five parameters.
     """
     converging = 100.0 * np.median(errors_by_file[:, :, CONVERGING].max(axis=2), axis=0)
     all_five = 100.0 * np.median(errors_by_file.max(axis=2), axis=0)
@@ -281,7 +284,7 @@ def errors_by_element(block: SampleBlock) -> Iterator[tuple[str, ...]]:
 
 
 def compare_with_zero_gain() -> Iterator[tuple[str, ...]]:
-    """Yield for each real capture, with the identifier, the difference of a1..a15 with N = 0 from those with N(k)."""
+    """Yield the difference between a1..a15 with N = 0 and a1..a15 with N(k) for each real capture. The identifier is on."""
     for name in CAPTURES:
         path = SHARED_DATA / "ncr18650" / f"{name}.csv.gz"
         if not path.is_file():

@@ -27,18 +27,19 @@ from tests.mosquitto import MOSQUITTO, Broker
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 PUBLISH_RATE_HZ = 10
-"""Highest permitted publish rate [Hz]. Each message has the newest sample of its window."""
+"""Publish rate of the service, the highest that its settings permit [Hz]. Each message has the newest sample of its window."""
 SETTLE_S = 2.0
 """Time from the first estimate to the measurement [s]."""
 MEASURE_S = 20.0
+"""Duration of the measurement [s]."""
 PATIENCE_S = 30.0
 """Timeout of the first estimate, and of the end of the service [s]."""
 BARE_MESSAGES = 100
 """Number of messages that are published without the service, for comparison."""
 BARE_BYTES = 945
-"""Size of these messages, which equals that of a state message [bytes]."""
+"""Size of these messages, which is the size of a state message [bytes]."""
 MAX_S = 120
-"""Duration of the readings that are prepared for a board [s]."""
+"""Duration of the readings that are prepared for a board, longer than any run [s]."""
 
 PACK_TOML = """
 [pack]

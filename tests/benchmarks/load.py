@@ -8,6 +8,7 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 CELL = "thunder_power_6s"
 RATE_HZ = 100
+"""Default sample rate [Hz]."""
 VOLTAGE_STEP_V = 25.0 / 1024 / 16
 """Resolution of the mean of sixteen conversions of a 10-bit ADC of 5 V behind a 5:1 divider [V]."""
 CURRENT_STEP_A = 5.0 / 1024 / 0.1 / 16

@@ -22,12 +22,13 @@ from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
 CHARGE_A = -30.0
+"""Current of the pack, a charge [A]."""
 PERIOD_S = 0.1
 """Interval of the publisher [s]."""
 LATE_S = 3.0
-"""Maximum time from the end of the delay to the hook's program [s]."""
+"""Maximum time from the end of the alarm's delay to the start of the hook's program [s]."""
 ALARM_OF_QUANTITY = {"t": "over_temperature", "cells": "cell_over_voltage"}
-"""Quantities that become null, by their names in the publisher's messages, and the alarm that needs each."""
+"""Alarm that needs each quantity that becomes null, by the name of the quantity in the published messages."""
 PACK_TOML = """
 [pack]
 name = "attack"

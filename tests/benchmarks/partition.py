@@ -61,7 +61,7 @@ def _block(samples: SampleBlock, minute: int) -> bytes:
     """Return the encoded block of one minute."""
     part = samples[minute * SAMPLES : (minute + 1) * SAMPLES]
     arrival_s = STORE_ID / 1e9 + float(part["time_s"][-1])
-    return encode(Block(store=STORE_ID, number=minute + 1, oldest=1, arrival_s=arrival_s, samples=part))
+    return encode(Block(store_created_ns=STORE_ID, number=minute + 1, oldest=1, arrival_s=arrival_s, samples=part))
 
 
 def _block_us(partition: Partition, blocks: list[bytes]) -> float:

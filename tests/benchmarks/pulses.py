@@ -1,7 +1,7 @@
 """Comparison of the estimated R_s with the resistance of current steps in the captures.
 
 A pulse is a step of the current by more than C/5 between two constant currents. Its resistance is the change of the voltage
-divided by that of the current. With more than two rows a second the change is over two rows, because logged current and
+divided by the change of the current. With more than two rows a second the change is over two rows, because logged current and
 voltage may be one row apart. A running median over nine pulses is used, because a single pulse has errors of up to 16 %.
 Results are compared from 15 min after the start on.
 """

@@ -16,7 +16,7 @@ MAX_INITIAL_SOC = 1.0 - 1e-3
 BOUND_FACTOR = 4.0
 """Ratio of upper bound to initial value, and of initial value to lower bound, as for the observer's parameters."""
 UNREACHED_V = 1e3
-"""Voltage limit that no simulation reaches, not even with the extreme values that the optimizer tries [V]."""
+"""Cut-off voltage that no simulation reaches, even with the extreme values that the optimizer tries [V]."""
 CHANGE_C = 0.02
 """Minimum change of the current before and after which the rows are always used [C-rate]."""
 EVERY_S = 10.0
@@ -28,7 +28,7 @@ MAX_ROWS = 7_000
 def thin_out(samples: SampleBlock, change_a: float) -> SampleBlock:
     """Return about a tenth of the rows of a test at 1 Hz, with all steps of the current by more than ``change_a``.
 
-    A fit to them takes one minute instead of five.
+    A fit to these rows takes one minute instead of five.
     """
     changed = np.abs(np.diff(samples["current_a"])) > change_a
     is_used = np.concatenate([[True], changed]) | np.concatenate([changed, [True]])

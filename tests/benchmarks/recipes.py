@@ -19,7 +19,7 @@ PROGRAM = Path(sys.executable).with_name("bms-estimator")
 SOC_ERRORS = (-0.2, 0.2)
 """Errors of the initial SOC; each run is done with both."""
 IN_MID_LOAD, FROM_START = 0.35, 0.0
-"""Fraction of the charge of a capture that has flowed before the first used sample."""
+"""Fractions of the charge of a capture that have flowed when the estimator starts."""
 LOWEST_V, HIGHEST_V = 1.5, 4.5
 """Range of valid cell voltages [V]."""
 PF, NCR, LFP = "panasonic18650pf/", "ncr18650/", "a123/"
@@ -28,7 +28,7 @@ PF, NCR, LFP = "panasonic18650pf/", "ncr18650/", "a123/"
 
 @dataclass(frozen=True)
 class Recipe:
-    """Captures from which the commands `ocv` and `identify` compute a cell file, or a generic cell in its place."""
+    """Captures from which the commands `ocv` and `identify` compute a cell file, or the name of a generic cell file."""
 
     capacity_ah: float
     ocv: tuple[str, ...] = ()
@@ -38,6 +38,7 @@ class Recipe:
     """True if `ocv` measures the capacity, so that it is not declared."""
 
 
+# cell files of the Panasonic cell, by the captures for `identify`
 PF_HPPC = tuple(PF + f"{t}_hppc" for t in ("25", "10", "0", "n10"))
 PF_PULSES = Recipe(2.9, PF_HPPC[:1], PF_HPPC)
 PF_US06 = Recipe(2.9, PF_HPPC[:1], (*PF_HPPC, PF + "25_us06"))
@@ -74,7 +75,7 @@ class Group:
     offset_a: float = 0.0
     """Offset of the current sensor [A]."""
     capacity_ratio: float = 1.0
-    """Declared divided by true capacity."""
+    """Capacity in the cell file divided by the true capacity."""
     charging: bool = False
     """True: the estimator starts in the charge after the lowest SOC, and ``cut`` is a fraction of that charge."""
 
@@ -101,7 +102,8 @@ LFP_FILES = (
     ("5", "", LFP_WITHOUT_5),
     ("-15", " (its own file)", LFP_CELL),
 )
-"""Temperature [C], note and recipe of each group. The file for the capture at 5 C does not use this capture."""
+"""Temperature [C], note in the name, and recipe of each LFP group. The cell file for the capture at 5 C is computed without
+this capture."""
 LFP_CHARGES = {
     t: ((LFP + name, 2.05, soc),)
     for t, name, soc in (("25", "c30_chg_p25", -0.006), ("5", "c30_chg_p05", 0.011), ("-15", "c30_chg_n15", 0.061))

@@ -1,8 +1,8 @@
 """Effect of sample rate, resolution and delay of a source on the SOC and its interval, on cells that differ from the model.
 
-Each row is a kind of source. A run is one simulated cell of ``tests.estimator.anywhere``, whose cell file has errors of the
-size that it declares. The load changes after some seconds, as in a drive, or is that of a house. The estimator starts in mid-load with an SOC 0.2 too
-low or 0.2 too high. Results are scored from 15 min on, above SOC 0.05:
+Each row is a kind of source. A run is one simulated cell of ``tests.estimator.anywhere``. The errors of its cell file are as
+large as the cell file declares. The load changes every few seconds, as in a drive, or is the load of a house. The estimator
+starts in mid-load with an SOC 0.2 too low or 0.2 too high. Results are scored from 15 min on, above SOC 0.05:
 
 - RMSE: error of the SOC, of all runs and of the worst run [%]
 - inside: fraction of time with the true SOC inside soc +- 2 soc_std, of all runs and of the worst run [%]
@@ -11,7 +11,7 @@ low or 0.2 too high. Results are scored from 15 min on, above SOC 0.05:
 
     make resolution ARGS="--undeclared"
 
-With ``--undeclared`` the estimator has the default sampling settings instead of those of the source.
+With ``--undeclared`` the estimator has the default sampling settings instead of the settings for the source.
 """
 
 import sys
@@ -33,9 +33,11 @@ from tests.estimator.anywhere.truth import simulate
 TRUTH_HZ = 10
 """Minimum rate of the simulation of the cell [Hz]."""
 SEEDS = range(1, 9)
+"""Seeds of the runs of a source: odd for oxide, even for phosphate cells."""
 NOISE_V = 5e-4
+"""Std of the noise of the voltage [V]."""
 JITTER = 0.02
-"""Jitter of the sample times [periods]."""
+"""Maximum jitter of the sample times, as a fraction of the sample period."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Source:
     dead_band_a: float = 0.0
     """Current below which the source reports 0 [A]."""
     delay_s: float = 0.0
-    """Age of a sample's current minus that of its voltage [s]."""
+    """Delay of a sample's current relative to its voltage [s]; negative: the voltage is delayed."""
     volt_step: float = 1e-3
     """Resolution of the voltage [V]."""
     capacity_ah: float = 3.0
@@ -143,12 +145,12 @@ def cases_of(source: Source, seeds: Iterable[int]) -> Iterator[Case]:
         truth, file_c = (OXIDE, (25.0, 10.0, 0.0, -10.0)) if seed % 2 else (PHOSPHATE, (25.0, 5.0, -15.0))
         scaled = replace(truth, capacity_ah=source.capacity_ah, ohm=truth.ohm * truth.capacity_ah / source.capacity_ah)
         hours = 13.0 if source.house else 1.3
-        yield Case(f"{source.name} {seed}", truth=scaled, file_c=file_c, hours=hours, seed=seed)
+        yield Case(f"{source.name} {seed}", truth=scaled, file_temperatures_c=file_c, hours=hours, seed=seed)
 
 
 def current_of(case: Case, source: Source, rate_hz: int) -> Floats:
     """Return the true current at ``rate_hz`` [A]; its levels change at arbitrary times."""
-    seconds = round(3600 * (case.unseen_h + case.hours))  # the load before the estimator starts, and after it
+    seconds = round(3600 * (case.load_before_h + case.hours))  # the load before the estimator starts, and after it
     if not source.house:
         return np.repeat(load_a(case, seconds), rate_hz)
     rng, one_c = np.random.default_rng(case.seed), source.capacity_ah
@@ -167,14 +169,14 @@ def sample_source(case: Case, source: Source) -> tuple[SampleBlock, Floats]:
     rng = np.random.default_rng(1000 + case.seed)
     rate_hz = max(TRUTH_HZ, round(source.rate_hz))
     current_a = current_of(case, source, rate_hz)
-    shift = rng.integers(rate_hz)
+    shift = rng.integers(rate_hz)  # less than a second
     current_a = np.concatenate([np.full(shift, current_a[0]), current_a])  # no sample falls on a change of level
     truth = case.truth
     curves = truth.ocv_v, truth.per_kelvin_v, truth.hysteresis_v, truth.ohm
     temperature_c = np.full(current_a.size, case.temperature_c)
     voltage_v, soc = simulate(1.0 / rate_hz, current_a, temperature_c, case.soc, -1.0, truth.capacity_ah, *curves)
     step, delay_steps = round(rate_hz / source.rate_hz), round(source.delay_s * rate_hz)
-    sample_indices = np.arange(round(3600 * case.unseen_h * rate_hz), current_a.size, step)
+    sample_indices = np.arange(round(3600 * case.load_before_h * rate_hz), current_a.size, step)
     max_jitter_steps = round(JITTER * step)
     sample_indices = np.clip(
         sample_indices + rng.integers(-max_jitter_steps, max_jitter_steps + 1, sample_indices.size),

@@ -28,7 +28,7 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Repeated disturbance. Its interval and duration vary at random by up to a third."""
+    """Disturbance that recurs. Its interval and its duration vary at random by up to a third."""
 
     name: str
     every_s: float

@@ -46,7 +46,7 @@ def load_and_rests_a(soc_span: float, rests: int = 6, rest_s: float = 2400.0) ->
 
 def wrong_cell(seed: int = 1) -> CellModel:
     """Return a cell file with a random error of the OCV and ``WRONG_CAPACITY``."""
-    return cell_file(Case("", seed=seed, capacity=WRONG_CAPACITY))
+    return cell_file(Case("", seed=seed, file_capacity_ratio=WRONG_CAPACITY))
 
 
 def capacity_from(rows: SampleBlock, model: CellModel, offset_std_a: float | None = None) -> Capacity:

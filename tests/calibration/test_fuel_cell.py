@@ -7,6 +7,7 @@ import pytest
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS, Source, fit_fuel_cell
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, polarisation
+from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
 from bms_estimator.sources.captures.curves import read_polarisation
@@ -23,7 +24,7 @@ IMPEDANCE_OHM = 0.061
 
 def simulate_sources(truth: FuelCellModel, *, seed: int, highest_a: float = 8.0) -> list[Source]:
     """Return a polarisation curve and a record of current steps (10 s at 500 Hz) of the model with 3 mV of noise."""
-    rng, theta = np.random.default_rng(seed), np.zeros(8)
+    rng, theta = np.random.default_rng(seed), np.zeros(LEARNABLE)
     time_s, current_a = mann_stack.random_steps(10.0, 500.0, seed=seed, highest_a=highest_a)
     no_curve_c, no_record_c = np.full(CURVE_A.size, np.nan), np.full(time_s.size, np.nan)  # no temperature
     curve_v, _ = polarisation(truth.a, theta, CURVE_A, no_curve_c)
@@ -93,7 +94,7 @@ def test_a_stack_with_unmodelled_effects_is_predicted_to_some_millivolts() -> No
     *fitted_sources, other_source = sources
     fit = fit_fuel_cell(fitted_sources, PEM)
     before_v, after_v = (
-        np.sqrt(np.mean((other_source.voltage_v - other_source.predict(m.a, np.zeros(8))[0]) ** 2))
+        np.sqrt(np.mean((other_source.voltage_v - other_source.predict(m.a, np.zeros(LEARNABLE))[0]) ** 2))
         for m in (PEM, fit.model)
     )
     assert after_v < 0.016
@@ -120,6 +121,7 @@ def test_a_real_polarisation_curve_gives_the_resistance_measured_by_impedance() 
     assert fit.model.fuel_cell.r_ohm == pytest.approx(
         IMPEDANCE_OHM, abs=3.0 * fit.model.std["r_ohm"] * fit.model.fuel_cell.r_ohm
     )
+    # found by this fit; the cell file has 5 A
     assert fit.model.fuel_cell.limiting_current_a == pytest.approx(4.39, rel=0.05)
 
 

@@ -205,10 +205,11 @@ def test_known_fields_of_a_checkpoint_of_another_version_are_restored() -> None:
 def test_filter_states_of_a_version_without_ocv_states_are_restored() -> None:
     """The OCV states start with their prior. All other states have the restored mean and covariance."""
     learned = learned_estimator()
-    # Number of last axes whose size is the number of states.
+    # Field, and the number of its trailing axes that run over the states of the filter.
     truncated_axes = {"filter.mean": 1, "filter.covariance": 2, "checks.good_mean": 1, "checks.good_covariance": 2}
     saved = dict(fields(learned.record.copy()))
     for name, axes in truncated_axes.items():
+        # [..., :NODE] or [..., :NODE, :NODE]: without the OCV states, which begin at index NODE
         saved[name] = saved[name][(..., *axes * (slice(NODE),))]
     estimator = new_estimator(SETTINGS, CELL)
     assert restore_state(estimator, saved, 1.0) == ""
@@ -456,6 +457,7 @@ async def test_a_save_on_a_full_disk_is_not_retried_at_each_change_of_the_soc(
 
 
 async def test_an_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # health is published often enough to show each save
     monkeypatch.setattr("bms_estimator.service.publisher.SLOW_S", 0.05)
     saved_samples = []
 

@@ -22,7 +22,7 @@ def samples(count: int = 60) -> SampleBlock:
     return rows
 
 
-BLOCK = Block(store=1_700_000_000 * 10**9, number=7, oldest=3, arrival_s=1.7e9, samples=samples())
+BLOCK = Block(store_created_ns=1_700_000_000 * 10**9, number=7, oldest=3, arrival_s=1.7e9, samples=samples())
 HEADER_BYTES = 40
 """Length of the header of an encoded block [bytes]."""
 
@@ -35,14 +35,19 @@ HEADER_BYTES = 40
     )
 )
 def test_decoded_samples_equal_the_encoded_ones_bit_for_bit(rows: SampleBlock) -> None:
-    decoded = decode(encode(Block(store=1, number=1, oldest=1, arrival_s=0.0, samples=rows))).samples
+    decoded = decode(encode(Block(store_created_ns=1, number=1, oldest=1, arrival_s=0.0, samples=rows))).samples
     for name in SAMPLE.names or ():
         assert decoded[name].tobytes() == rows[name].tobytes()
 
 
 def test_header_is_decoded_as_it_was_encoded() -> None:
     decoded = decode(encode(BLOCK))
-    assert (decoded.store, decoded.number, decoded.oldest, decoded.arrival_s) == (BLOCK.store, 7, 3, 1.7e9)
+    assert (decoded.store_created_ns, decoded.number, decoded.oldest, decoded.arrival_s) == (
+        BLOCK.store_created_ns,
+        7,
+        3,
+        1.7e9,
+    )
 
 
 def test_sixty_samples_at_a_constant_period_take_less_than_200_bytes() -> None:
@@ -52,7 +57,7 @@ def test_sixty_samples_at_a_constant_period_take_less_than_200_bytes() -> None:
 @pytest.mark.parametrize("count", [0, MAX_SAMPLES + 1])
 def test_block_without_samples_or_with_too_many_is_not_encoded(count: int) -> None:
     with pytest.raises(ValueError, match=f"{count} samples in a block"):
-        encode(Block(store=1, number=1, oldest=1, arrival_s=0.0, samples=samples(count)))
+        encode(Block(store_created_ns=1, number=1, oldest=1, arrival_s=0.0, samples=samples(count)))
 
 
 @given(st.binary(max_size=200))

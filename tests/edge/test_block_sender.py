@@ -143,7 +143,7 @@ async def test_samples_keep_their_period_if_a_new_store_begins_later_than_the_wa
         simulated.add(4)
         async with asyncio.timeout(LONG_S):
             first, second, third = [decode((await simulated.edge.store.take(1))[0].message.payload) for _ in range(3)]
-    assert (first.number, first.store > later.store) == (1, True)
+    assert (first.number, first.store_created_ns > later.store) == (1, True)
     assert (first.samples["time_s"] == 0.0).all()  # they were timestamped before the request
     assert second.samples["time_s"].tolist() == [*np.arange(60.0)]
     assert third.samples["time_s"].tolist() == [*np.arange(60.0, 120.0)]
@@ -219,7 +219,7 @@ async def test_invalid_block_requests_are_counted_and_ignored(
     async with simulated.edge:
         simulated.add(3)
         await simulated.assert_all_received()
-        store = receiver.blocks[0].store
+        store = receiver.blocks[0].store_created_ns
         garbage = [b"", b"\xff\x00", b"{}", b'{"store": -1, "number": 1, "resend": false}', b"9" * 10_000, b"[" * 9_000]
         garbage += [f'{{"store": {n}, "number": {n}, "resend": true}}'.encode() for n in (10**30, 10**400)]
         for payload in garbage:
@@ -239,7 +239,7 @@ async def test_blocks_are_sent_to_any_mqtt_broker(broker: Broker, tmp_path: Path
         samples["time_s"] = np.arange(600.0)
         edge.take(samples)
         await listener.wait("raw/pack", lambda data: decode(data).number == 9)
-        store = decode(listener.all("raw/pack")[0]).store
+        store = decode(listener.all("raw/pack")[0]).store_created_ns
         message_count = len(listener.messages)
         await listener.publish(
             "edge/pack/awaits", BlockRequest(store=store, number=7, resend=True).model_dump_json(), qos=1

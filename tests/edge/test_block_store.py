@@ -85,10 +85,10 @@ async def test_blocks_are_taken_in_order_with_times_relative_to_the_store(tmp_pa
         await write_blocks(store, *ready)
         blocks = await take(store, 4)
         assert numbers(blocks) == [1, 2, 3, 4]
-        assert {block.store for block in blocks} == {int(WALL_S) * NS}
+        assert {block.store_created_ns for block in blocks} == {int(WALL_S) * NS}
         for block, original in zip(blocks, ready, strict=True):
             assert block.arrival_s == original.arrival_s
-            assert (block.store / NS + block.samples["time_s"] == original.samples["time_s"]).all()
+            assert (block.store_created_ns / NS + block.samples["time_s"] == original.samples["time_s"]).all()
             assert (block.samples["voltage_v"] == original.samples["voltage_v"]).all()
 
 
@@ -106,7 +106,7 @@ async def test_restarted_edge_continues_numbers_and_time_of_the_store_and_sends_
         await write_blocks(store, block_at(WALL_S))  # a clock set back does not set back the time of the store
         blocks = await take(store, 4)
     assert numbers(blocks) == [4, 5, 6, 7]
-    assert {block.store for block in blocks} == {int(WALL_S) * NS}
+    assert {block.store_created_ns for block in blocks} == {int(WALL_S) * NS}
     assert {block.oldest for block in blocks} == {4}
     assert blocks[-1].samples["time_s"].tolist() == [304.0] * 5
 
@@ -181,8 +181,8 @@ async def test_request_for_blocks_later_than_those_on_disk_begins_a_new_store(
         await write_blocks(store, block_at(WALL_S + 1000.0))
         (block,) = await take(store, 1)
         assert (block.number, block.oldest) == (1, 1)
-        assert block.store > block_request.store
-        assert block.store / NS + block.samples["time_s"][0] == WALL_S + 1000.0
+        assert block.store_created_ns > block_request.store
+        assert block.store_created_ns / NS + block.samples["time_s"][0] == WALL_S + 1000.0
         assert store.dropped == 3
 
 
@@ -213,7 +213,7 @@ async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: 
         async with open_store(path, wall_s=WALL_S + 500.0) as store:
             await write_blocks(store, block_at(WALL_S + 500.0))
             (block,) = await take(store, 1)
-    assert block.store > created_s * NS
+    assert block.store_created_ns > created_s * NS
     assert block.number == 1
     quarantined = [line for line in lines if line["event"] == "database set aside, a new one is begun"]
     assert bool(quarantined) == (damage in ("no database", "other tables"))
@@ -227,7 +227,7 @@ async def test_file_deleted_while_in_use_loses_only_the_blocks_written_before(tm
         await write_blocks(store, *minute_blocks(2, first=3))
         blocks = await take(store, 2)
         assert numbers(blocks) == [1, 2]
-        assert blocks[0].store == (int(WALL_S) + 180) * NS  # created at the first block after the deletion
+        assert blocks[0].store_created_ns == (int(WALL_S) + 180) * NS  # created at the first block after the deletion
         assert blocks[0].samples["time_s"][0] == 0.0
 
 
@@ -243,9 +243,9 @@ async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
         blocks = await take(store, 3)
         assert numbers(blocks) == [2, 3, 6]
         assert {block.oldest for block in blocks} == {2}  # block 2 is not yet confirmed and can be sent again
-        store.on_request(BlockRequest(store=blocks[0].store, number=2, resend=True))
+        store.on_request(BlockRequest(store=blocks[0].store_created_ns, number=2, resend=True))
         assert numbers(await take(store, 3)) == [2, 3, 6]
-        store.on_request(BlockRequest(store=blocks[0].store, number=4, resend=True))
+        store.on_request(BlockRequest(store=blocks[0].store_created_ns, number=4, resend=True))
         (block,) = await take(store, 1)
         assert (block.number, block.oldest, store.dropped) == (6, 6, 3)  # 1, 4 and 5 are lost
 

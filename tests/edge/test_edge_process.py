@@ -106,7 +106,7 @@ async def test_edge_sends_no_block_twice_after_a_kill_and_ends_cleanly_on_sigter
     assert voltages == sorted(set(voltages))
     assert (receiver.samples["time_s"][1:] >= receiver.samples["time_s"][:-1]).all()
     assert [block.number for block in receiver.blocks] == list(range(1, len(receiver.blocks) + 1))
-    assert {block.store for block in receiver.blocks} == {store["made_s"] * 10**9}
+    assert {block.store_created_ns for block in receiver.blocks} == {store["made_s"] * 10**9}
     imported = {each.rpartition("|")[2].strip() for each in lines if each.startswith("import time:")}
     assert "bms_estimator.edge.block_sender" in imported
     assert not [name for name in imported if name.split(".")[0] in ("numba", "scipy") or ".kernels" in name]

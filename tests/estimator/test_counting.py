@@ -15,7 +15,7 @@ from tests.estimator.anywhere.cases import Capture, Case, capture
 from tests.estimator.anywhere.use import DAY_S, cycles, days
 
 SEEDS = range(1, 9)
-OWN_CURVE = {"curve_error": 0.5, "unseen_h": 0.0}
+OWN_CURVE = {"file_ocv_error_ratio": 0.5, "load_before_h": 0.0}
 """Half of the typical OCV error, and no load before the estimator starts."""
 MAX_CAPACITY_ERROR = 0.025
 """Limit of the relative error of the capacity of each cell."""
@@ -59,12 +59,12 @@ def simulate_use(case: Case, count: int) -> Capture:
 def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(initial_soc_error: float) -> None:
     errors, errors_over_std = [], []
     for seed in SEEDS:
-        for capacity in (0.8, 1.2):
-            case = Case("cycles", capacity=capacity, seed=seed, **OWN_CURVE)
-            # ``capacity`` is that of the cell file over the true one, so that 1 / capacity is to be learned.
+        for capacity_ratio in (0.8, 1.2):
+            case = Case("cycles", file_capacity_ratio=capacity_ratio, seed=seed, **OWN_CURVE)
+            # the true capacity divided by the capacity in the file is 1 / capacity_ratio
             learned = relative_capacity(estimate_cycles(case, initial_soc_error).record[0])
-            errors.append(capacity * learned.value - 1.0)
-            errors_over_std.append(error_over_std(learned, 1.0 / capacity))
+            errors.append(capacity_ratio * learned.value - 1.0)
+            errors_over_std.append(error_over_std(learned, 1.0 / capacity_ratio))
     assert np.abs(errors).max() < MAX_CAPACITY_ERROR
     assert np.sqrt(np.mean(np.square(errors))) < MAX_RMS_CAPACITY_ERROR
     # Both runs of a seed have the same error of the OCV, so that they are one degree of freedom.
@@ -79,7 +79,9 @@ def test_a_gain_error_of_the_current_sensor_is_learned_as_a_capacity() -> None:
     """
     errors = []
     for seed in SEEDS:
-        estimator = estimate_cycles(Case("gain", gain=1.05, capacity=1.0, seed=seed, **OWN_CURVE), 0.0)
+        estimator = estimate_cycles(
+            Case("gain", current_gain=1.05, file_capacity_ratio=1.0, seed=seed, **OWN_CURVE), 0.0
+        )
         errors.append(relative_capacity(estimator.record[0]).value / 1.05 - 1.0)
     assert np.sqrt(np.mean(np.square(errors))) < MAX_RMS_CAPACITY_ERROR
 
@@ -89,7 +91,7 @@ def test_an_offset_of_20_ma_is_identified_within_a_day(temperature_c: float) -> 
     errors_over_std = []
     for seed in SEEDS:
         offset_a = 0.02 if seed % 2 else -0.02
-        parameters = {"capacity": 1.1, "offset_a": offset_a, "temperature_c": temperature_c}
+        parameters = {"file_capacity_ratio": 1.1, "offset_a": offset_a, "temperature_c": temperature_c}
         recording = simulate_use(Case("offset", soc=0.8, seed=seed, **parameters, **OWN_CURVE), count=1)
         estimator = Estimator(recording.cell, initial_soc=0.8)
         estimator.run(recording.samples)

@@ -15,7 +15,7 @@ FULL_HZ, HOURS = 100, 0.4
 """Rate and duration of the simulation, which slower sensors sample."""
 MIN_STEP_A = 0.5 * OXIDE.capacity_ah
 """Smallest current step whose resistance is compared [A]."""
-FILES = {"of another such cell": Case("R_s"), "generic": Case("R_s", file_c="generic")}
+FILES = {"of another such cell": Case("R_s"), "generic": Case("R_s", file_temperatures_c="generic")}
 
 
 @pytest.fixture(scope="module")

@@ -164,7 +164,9 @@ def test_rests_without_current_limit_the_error_of_the_soc_on_a_plateau() -> None
 
     Without rests, the offset would cause an error of up to 9 %.
     """
-    case = Case("LFP, rests", **LFP, load_c=0.1, hours=9.0, soc=1.0, unseen_h=0.0, capacity=1.0, seed=32)
+    case = Case(
+        "LFP, rests", **LFP, load_c=0.1, hours=9.0, soc=1.0, load_before_h=0.0, file_capacity_ratio=1.0, seed=32
+    )
     seconds = round(3600.0 * case.hours)
     current_a = load_a(case, seconds)
     current_a[np.arange(seconds) % 1800 < 300] = 0.0

@@ -25,7 +25,7 @@ def one_block(samples: SampleBlock, number: int, store: int = STORE_ID_NS, oldes
     """Return the samples as one encoded block, which arrives at the time of its last sample."""
     # some tests send samples without a finite time
     arrival_s = store / 1e9 + float(np.nan_to_num(samples["time_s"][-1]))
-    return encode(Block(store=store, number=number, oldest=oldest, arrival_s=arrival_s, samples=samples))
+    return encode(Block(store_created_ns=store, number=number, oldest=oldest, arrival_s=arrival_s, samples=samples))
 
 
 def blocks_of(samples: SampleBlock, store: int = STORE_ID_NS, oldest: int = 1, size: int = SAMPLES) -> list[bytes]:

@@ -63,7 +63,7 @@ class Receiver:
         blocks = []
         for block in self.blocks:
             samples = block.samples.copy()
-            samples["time_s"] += block.store / 1e9  # the store's creation time [ns since 1970]
+            samples["time_s"] += block.store_created_ns / 1e9  # the store's creation time [ns since 1970]
             blocks.append(samples)
         return np.concatenate(blocks)
 
@@ -95,11 +95,11 @@ class Receiver:
             await asyncio.sleep(POLL_S)
 
     async def _process(self, block: Block) -> None:
-        if block.store < self._store or block.number in self.dropped_once:
+        if block.store_created_ns < self._store or block.number in self.dropped_once:
             self.dropped_once.discard(block.number)
             return
-        if block.store > self._store:
-            self._store, self._next = block.store, block.oldest
+        if block.store_created_ns > self._store:
+            self._store, self._next = block.store_created_ns, block.oldest
         if block.oldest > self._next:  # the edge has dropped blocks
             self.lost += block.oldest - self._next
             self._next = block.oldest

@@ -78,7 +78,7 @@ def heavy_block(samples: int, period_s: float, store: int = 1) -> bytes:
     rows = np.zeros(samples, SAMPLE)
     rows["time_s"] = period_s * np.arange(samples)
     rows["voltage_v"], rows["temperature_c"] = 3.7, 25.0
-    return encode(Block(store=store, number=1, oldest=1, arrival_s=1.79e9, samples=rows))
+    return encode(Block(store_created_ns=store, number=1, oldest=1, arrival_s=1.79e9, samples=rows))
 
 
 def numbered(data: bytes, number: int) -> bytes:

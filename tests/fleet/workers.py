@@ -50,7 +50,9 @@ def samples(pack: str, number: int) -> np.ndarray:
 
 def block(pack: str, number: int, arrival_s: float = 1.79e9) -> bytes:
     """Return block ``number`` of a pack, encoded."""
-    return encode(Block(store=STORE_ID_NS, number=number, oldest=1, arrival_s=arrival_s, samples=samples(pack, number)))
+    return encode(
+        Block(store_created_ns=STORE_ID_NS, number=number, oldest=1, arrival_s=arrival_s, samples=samples(pack, number))
+    )
 
 
 async def load_packs(nc: Client, packs: list[str]) -> PackRegistry:

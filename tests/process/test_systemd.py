@@ -29,7 +29,7 @@ def receive_states(systemd: socket.socket) -> list[str]:
             return states
 
 
-def test_process_is_ready_once_all_packs_are_and_alive_when_all_packs_have_reported_since(
+def test_process_is_ready_with_its_last_pack_and_alive_after_a_report_of_each_pack(
     tmp_path: Path, systemd: socket.socket
 ) -> None:
     notifier = SystemdNotifier(["a", "b"], {"NOTIFY_SOCKET": str(tmp_path / "notify")})

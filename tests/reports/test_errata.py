@@ -17,8 +17,8 @@ from bms_estimator.kernels.cell_model.chen_mora import (
     c_tl,
     c_ts,
     cell_step,
-    crossing,
     emf,
+    min_stable_exponent,
     r_s,
     r_tl,
     r_ts,
@@ -79,7 +79,7 @@ def test_the_condition_on_a8_holds_exactly_if_c_ts_is_positive():
         a = np.zeros(16)
         a[7:10] = a7, a8, a9
         is_positive = c_ts(soc, a) > 0.0
-        assert (a8 > crossing(soc, a9, a7)) == is_positive
+        assert (a8 > min_stable_exponent(soc, a9, a7)) == is_positive
         signs.add(is_positive)
     assert signs == {True, False}
 

@@ -73,6 +73,7 @@ CAPTURES: dict[str, tuple[list[Line], dict[str, Any], list[tuple[float, bool]]]]
         WITHOUT_IDENTIFIER,
         [(90.0, True), (0.0, False)],
     ),
+    # raised after 30 s instead of the delay, because a replay sees the silence only at the next sample
     "link_lost": ([Line(30), Line(30, silent=True), Line(30)], {}, [(60.0, True), (66.0, False)]),
 }
 """For each alarm: parts of a capture, sections of the settings, and expected transitions.
@@ -273,8 +274,9 @@ async def test_a_saturated_current_exceeds_any_limit() -> None:
     assert change.alarm.since == iso_utc(WALL_S)
 
 
-def test_a_second_silence_renews_the_cause_of_a_latched_link_lost() -> None:
+def test_a_latched_link_lost_is_active_again_during_a_second_silence() -> None:
     alarms = make_evaluator({"link_lost": {"latch": True}})
+    # gone: the cause of the alarm has ended
     saved = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False}
     alarms.restore(json.dumps({"link_lost": saved}))
     alarms.on_silence(1.0, WALL_S, "")
@@ -373,6 +375,7 @@ async def test_a_rarely_measured_quantity_is_watched_again_after_a_loss(tmp_path
     rare = [CHARGING._replace(seconds=1), CHARGING._replace(seconds=4, temperature_c=None)]
     lines = [*rare * 6, CHARGING._replace(temperature_c=None), *rare * 8]
     result = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    # last value at 26 s, then lost after 10 s; next value at 60 s, then measured after 10 s
     assert result.watched("over_temperature") == [(36.0, False), (70.0, True)]
 
 
@@ -447,9 +450,11 @@ def test_the_time_between_bursts_of_samples_counts_toward_a_delay(spacing_s: flo
     assert transitions == [150.0], "the first burst after which it has been over the limit for 10 s"
 
 
-def test_a_single_gap_does_not_count_toward_a_delay() -> None:
+def test_isolated_gaps_do_not_count_toward_a_delay() -> None:
     alarms = make_evaluator({"pack_over_voltage": {"delay_s": 25.0}})
-    times_s = [*range(5), *range(25, 200), *range(220, 300)]  # two gaps of about 20 s
+    # gaps from 4 to 25 s, before which the voltage is above the limit and after which below, and from 199 to 220 s within
+    # the time above the limit
+    times_s = [*range(5), *range(25, 200), *range(220, 300)]
     block = np.zeros(len(times_s), dtype=SAMPLE)
     block["time_s"] = times_s
     block["voltage_v"] = np.where((block["time_s"] < 180.0) & (block["time_s"] > 10.0), 7.4, 8.6)

@@ -16,7 +16,7 @@ from bms_estimator.store.outbox_queue import OutboxQueue
 
 
 @contextlib.contextmanager
-def no_rewind() -> Iterator[None]:
+def no_resend_after_reconnect() -> Iterator[None]:
     """Do not resend messages that were in flight when a connection broke."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OutboxQueue, "rewind", lambda _: None)

@@ -9,8 +9,8 @@ from tests.world.faults import Fault
 from tests.world.mutants import (
     no_check_of_board_clock,
     no_fsync,
+    no_resend_after_reconnect,
     no_retry_after_disk_full,
-    no_rewind,
     no_sensor_availability,
 )
 from tests.world.world import World
@@ -41,7 +41,7 @@ def test_a_seed_always_gives_the_same_world() -> None:
 @pytest.mark.parametrize(
     ("mutant", "faults", "violation"),
     [
-        (no_rewind, [make_fault("connections half open")], "the broker never got"),
+        (no_resend_after_reconnect, [make_fault("connections half open")], "the broker never got"),
         (
             no_fsync,
             # A cut damages an unsynced checkpoint only by chance, so there are 39 cuts.

@@ -8,13 +8,13 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 GLITCH_FRACTION = 0.5
-"""Maximum deviation of a voltage from the median, as a fraction of the median. A larger one is a fault of the
+"""Maximum deviation of a voltage from the median, as a fraction of the median. A larger deviation is a fault of the
 instrument, because no Li-ion cell has such a range."""
 MAX_BACKWARD_FRACTION = 0.1
-"""Maximum fraction of samples with a time before that of an earlier sample. A small correction of a clock causes few of
-them."""
+"""Maximum fraction of samples whose timestamp is lower than an earlier timestamp. A small correction of a clock causes few
+such samples."""
 MIN_GOOD_FRACTION = 0.5
-"""Minimum fraction of good voltages. With fewer, the median is not that of good voltages, so that glitches are not
+"""Minimum fraction of good voltages. With fewer, the median may be a glitch, so that glitches are not
 recognized."""
 REST_C_RATE = 0.01
 """Maximum C-rate of a rest [1/h]. A hundredth of 1 C changes SOC by 0.25 % in a quarter of an hour."""
@@ -31,7 +31,7 @@ SOC_SLACK = 0.03
 def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
     """Return the samples that are finite, later than all samples before, and within 50 % of the median voltage.
 
-    The median is that of the voltages above 0 V.
+    The median is taken over the voltages above 0 V.
 
     Raises:
         UserError: Nothing is left, most voltages are glitches, or the time goes back.

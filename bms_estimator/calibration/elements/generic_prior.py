@@ -47,8 +47,8 @@ def scaled_generic_ladder(
 ) -> Ladder:
     """Return the generic resistances over SOC, scaled to the resistances from rests.
 
-    Rests do not show the growth of resistances in the cold and near empty. Therefore the growth remains that of the
-    generic cell.
+    Rests do not show the growth of resistances in the cold and near empty. Therefore the growth of the
+    generic cell is kept.
 
     Args:
         generic: Result of ``nearest_generic_cell``.

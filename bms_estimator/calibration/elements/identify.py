@@ -63,8 +63,9 @@ MIN_SLOPE_V = 1e-3
 MIN_SPAN_K = 10.0
 """Minimum temperature difference that gives activation energies and dE/dT [K]."""
 FULL_TOLERANCE_V = 0.03
-"""Maximum distance of a first rest's voltage from that of a full cell at which the capture counts as starting full, per
-cell [V]. It applies only away from 25 C, because cold rests are not relaxed and their voltage gives a wrong SOC."""
+"""Maximum distance of the voltage of a first rest from the voltage of a full cell at which the capture counts as starting
+full, per cell [V]. This rule applies only away from 25 C, because cold rests are not relaxed and their voltage gives a
+wrong SOC."""
 COLD_K = 5.0
 """Minimum deviation from 25 C at which ``FULL_TOLERANCE_V`` applies [K]."""
 MIN_CELL_C = -45.0
@@ -77,7 +78,7 @@ LADDER_STD = 0.1
 """Relative std of resistances between cells of one make: two NCR18650 differ by 5 to 8 %, and cells age."""
 GENERIC_STD = 0.3
 """Minimum relative std of a generic ladder. A ladder with a smaller std was identified, so that its temperature range
-is that of captures."""
+comes from captures."""
 SHAPE_MIN_SOC = 0.4
 """SOC above which a resistance is averaged to normalize its shape."""
 SHAPE_LIMITS = (0.2, 20.0)
@@ -501,7 +502,7 @@ def _worse_replays(outcome: Identification) -> str:
         if np.isfinite(c.score_after)
     ]
     return (
-        "nothing is written: replays cut in mid-load get worse, their interval score (smaller is better) goes from "
+        "nothing is written: replays that start in mid-load get worse, their interval score (smaller is better) goes from "
         f"{outcome.score_before:.2f} to {outcome.score_after:.2f} % of SOC; keep the cell file, or give captures with "
         f"more typical loads\n" + "\n".join(lines)
     )

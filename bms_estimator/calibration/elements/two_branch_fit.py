@@ -14,7 +14,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Capacitance, Ladder, Resistance
 
 SOC = np.linspace(0.02, 1.0, 50)
-"""SOC grid on which the curves are fitted to those of the ladder."""
+"""SOC grid on which the curves are fitted to the resistances of the ladder."""
 EXPONENTS = np.geomspace(1.0, 60.0, 60)
 """Candidate exponents b of A e^(-b SOC) + c."""
 NEGLIGIBLE = 1e-4

@@ -39,7 +39,7 @@ class Points:
         soc: Shape (n,), increasing, 0..1.
         ocv_v: Shape (n,) [V].
         std_v: Shape (n,), standard deviation of ``ocv_v``, independent between points [V].
-        common_v: Shape (n,), standard deviation of the systematic error of the point's source [V].
+        systematic_std_v: Shape (n,), standard deviation of the systematic error of the point's source [V].
         cold_v: Shape (n,), standard deviation of the error of incomplete relaxation in the cold, which is common to all
             sources [V].
         temperature_c: Shape (n,), temperature [C]; NaN if unknown.
@@ -52,7 +52,7 @@ class Points:
     soc: Floats
     ocv_v: Floats
     std_v: Floats
-    common_v: Floats = field(default_factory=lambda: np.zeros(0))
+    systematic_std_v: Floats = field(default_factory=lambda: np.zeros(0))
     cold_v: Floats = field(default_factory=lambda: np.zeros(0))
     temperature_c: Floats = field(default_factory=lambda: np.zeros(0))
     direction: Floats = field(default_factory=lambda: np.zeros(0))
@@ -62,8 +62,8 @@ class Points:
 
     def __post_init__(self) -> None:
         """Fill in the defaults: no systematic error, unknown temperature, no hysteresis, one source."""
-        if self.common_v.size == 0:
-            object.__setattr__(self, "common_v", np.zeros(self.soc.size))
+        if self.systematic_std_v.size == 0:
+            object.__setattr__(self, "systematic_std_v", np.zeros(self.soc.size))
         if self.cold_v.size == 0:
             object.__setattr__(self, "cold_v", np.zeros(self.soc.size))
         if self.temperature_c.size == 0:
@@ -91,7 +91,7 @@ def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
         soc=test.soc[order],
         ocv_v=test.ocv_v[order],
         std_v=np.hypot(test.std_v, AFTER_CHARGE_V * series_count * after_charge)[order],
-        common_v=(series_count * (RELAXED_V + COLD_SOURCE_FRACTION * cold_v))[order],
+        systematic_std_v=(series_count * (RELAXED_V + COLD_SOURCE_FRACTION * cold_v))[order],
         cold_v=(series_count * cold_v)[order],
         temperature_c=temperature_c[order],
         direction=-1.0 * ~after_charge[order],  # a charge between two discharges is too short to reverse the hysteresis
@@ -118,7 +118,7 @@ def joined(sources: Sequence[Points]) -> Points:
         soc=soc[order],
         ocv_v=column("ocv_v"),
         std_v=column("std_v"),
-        common_v=column("common_v"),
+        systematic_std_v=column("systematic_std_v"),
         cold_v=column("cold_v"),
         temperature_c=column("temperature_c"),
         direction=column("direction"),
@@ -145,7 +145,7 @@ def with_ends(points: Points, empty_std_v: float, full_std_v: float) -> Points:
             soc=np.insert(points.soc, index, soc),
             ocv_v=np.insert(points.ocv_v, index, ocv_v),
             std_v=np.insert(points.std_v, index, std_v),
-            common_v=np.insert(points.common_v, index, points.common_v[nearest]),
+            systematic_std_v=np.insert(points.systematic_std_v, index, points.systematic_std_v[nearest]),
             cold_v=np.insert(points.cold_v, index, points.cold_v[nearest]),
             temperature_c=np.insert(points.temperature_c, index, points.temperature_c[nearest]),
             direction=np.insert(points.direction, index, points.direction[nearest]),

@@ -19,8 +19,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 MIN_DURATION_S = 7.0 * 3600.0
-"""Minimum duration of a low-rate curve, that of a full curve at C/7 [s]. At C/10 half of the difference between
-discharge and charge is some 20 mV."""
+"""Minimum duration of a low-rate curve [s]. A full curve at C/7 takes this long. Faster curves deviate too much from the OCV:
+half of the difference between discharge and charge is already some 20 mV at C/10."""
 MAX_CURRENT_DEVIATION = 0.05
 """Maximum relative deviation of a constant current from its median, in addition to a standard deviation of its
 noise."""
@@ -52,23 +52,27 @@ HYSTERESIS_SOC = (0.03, 0.98)
 """SOC range of the measured hysteresis. Outside, the value at the end of the range is used, because the curves have
 end-point transients there."""
 POINT_V = 1e-3
-"""Std of the voltage of a point of a low-rate curve, per cell in series [V]."""
+"""Assumed std of the voltage of a point of a low-rate curve, per cell in series [V]."""
 POINT_SOC = 0.002
-"""Std of the SOC of a point of a low-rate curve."""
+"""Assumed std of the SOC of a point of a low-rate curve."""
 PAIR_V = 1.5e-3
-"""Constant part of the systematic error of the mean of a pair, per cell in series [V]."""
+"""Assumed constant part of the systematic error of the mean of a pair, per cell in series [V]."""
 PAIR_FRACTION = 0.1
-"""Variable part of the systematic error of the mean of a pair, as a fraction of the half difference."""
+"""Assumed variable part of the systematic error of the mean of a pair, as a fraction of the half difference between charge
+and discharge."""
 UNPAIRED_FRACTION = 0.5
-"""Systematic error as a fraction of the half difference, at SOCs where only one curve of a pair has data."""
+"""Assumed systematic error as a fraction of the half difference, at SOCs where only one curve of a pair has data."""
 END_TRANSIENT_SOC = 0.03
 """SOC range before the end of a charge that stops early. The voltage rises there before the end, so that the range is
 not averaged with the discharge."""
 UNPAIRED_V = 0.01
-"""Systematic error of an unpaired curve without its ohmic part, per cell in series [V]."""
+"""Assumed systematic error of an unpaired curve without its ohmic part, per cell in series [V]."""
+UNPAIRED_OHMIC_FRACTION = 0.5
+"""Ohmic part of the systematic error of an unpaired curve, as a fraction of the ohmic drop, which is measured only at the full
+end and subtracted at every SOC."""
 PAIR_COLD_FRACTION = 0.25
-"""Fraction of the cold-relaxation error that remains after averaging charge and discharge. An unpaired curve has all of
-it."""
+"""Fraction of the error ``COLD_V``, by which a cold cell relaxes too slowly, that remains in the mean of charge and discharge.
+An unpaired curve has all of this error."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,8 @@ class SlowBranch:
         temperature_c: Mean temperature [C]; NaN without a sensor.
         before_ah: Net charge drawn between the start of the capture and the start of the curve [Ah].
         start_v: Voltage of the rest before the curve [V]; NaN without a rest.
-        step_v: Voltage jump between rest and current at the full end of the curve [V]; NaN without a rest there.
+        step_v: Jump of the voltage when the current starts or stops at the end of the curve at which the cell is full [V]; NaN
+            without a rest there.
         to_empty: True for a discharge down to empty.
     """
 
@@ -180,7 +185,7 @@ def _branch(
         temperature_c=mean_temperature_c(part),
         before_ah=float(moved_ah[first]),
         start_v=float(good["voltage_v"][first - 1]) if first > 0 and resting[first - 1] else float("nan"),
-        step_v=max(jump_v, 0.0),
+        step_v=float(np.maximum(jump_v, 0.0)),  # NaN stays NaN
         to_empty=not charge and last_fall_v > EMPTY_FALL * float(np.median(voltage_v)),
     )
 
@@ -258,12 +263,12 @@ def _pair(
     if high <= HYSTERESIS_SOC[1]:  # the voltage of a charge that stops early rises before its end
         high -= END_TRANSIENT_SOC
     grid_of_both = GRID[(low <= GRID) & (high >= GRID)]
-    half_of_both_v = 0.5 * (
+    half_difference_v = 0.5 * (
         _voltage_at(grid_of_both, charge_soc, charge.voltage_v)
         - _voltage_at(grid_of_both, discharge_soc, discharge.voltage_v)
     )
-    median_half_v = float(np.median(half_of_both_v))
-    half_v = np.where((low <= GRID) & (high >= GRID), np.interp(GRID, grid_of_both, half_of_both_v), median_half_v)
+    median_half_v = float(np.median(half_difference_v))
+    half_v = np.where((low <= GRID) & (high >= GRID), np.interp(GRID, grid_of_both, half_difference_v), median_half_v)
     grid = GRID[(min(discharge_soc[-1], charge_soc[0]) <= GRID) & (max(discharge_soc[0], charge_soc[-1]) >= GRID)]
     half_on_grid_v = np.interp(grid, GRID, half_v)
     has_discharge = (grid >= discharge_soc[-1]) & (grid <= discharge_soc[0])
@@ -280,7 +285,8 @@ def _pair(
         branches=(discharge, charge),
         points=replace(
             points,
-            common_v=points.common_v + np.where(unpaired, UNPAIRED_FRACTION, PAIR_FRACTION) * np.abs(half_on_grid_v),
+            systematic_std_v=points.systematic_std_v
+            + np.where(unpaired, UNPAIRED_FRACTION, PAIR_FRACTION) * np.abs(half_on_grid_v),
         ),
         hysteresis_v=_smooth(half_v - ohmic_v),
         notes=() if steps else ("hysteresis includes the ohmic drop",),
@@ -293,9 +299,10 @@ def _unpaired(branch: SlowBranch, soc: Floats, series_count: int, notes: tuple[s
     sign = -1.0 if branch.charge else 1.0
     ohmic_v = float(np.nan_to_num(branch.step_v))
     ocv_v = _voltage_at(grid, soc, branch.voltage_v) + sign * ohmic_v
-    common_v = UNPAIRED_V * series_count + 0.5 * ohmic_v
+    systematic_std_v = UNPAIRED_V * series_count + UNPAIRED_OHMIC_FRACTION * ohmic_v
     points = replace(
-        _points(grid, ocv_v, common_v, 1.0, branch.temperature_c, series_count), direction=-sign * np.ones(grid.size)
+        _points(grid, ocv_v, systematic_std_v, 1.0, branch.temperature_c, series_count),
+        direction=np.full(grid.size, 1.0 if branch.charge else -1.0),
     )
     return SlowCurve((branch,), points, None, notes)
 
@@ -307,15 +314,15 @@ def _voltage_at(grid: Floats, soc: Floats, voltage_v: Floats) -> Floats:
 
 
 def _points(
-    grid: Floats, ocv_v: Floats, common_v: float, cold_fraction: float, temperature_c: float, series_count: int
+    grid: Floats, ocv_v: Floats, systematic_std_v: float, cold_fraction: float, temperature_c: float, series_count: int
 ) -> Points:
     """Return the points of a low-rate curve at the SOCs ``grid``.
 
     Args:
         grid: SOC of the points.
         ocv_v: Open-circuit voltage [V].
-        common_v: Std of the systematic error [V].
-        cold_fraction: Fraction of the cold-relaxation error that remains.
+        systematic_std_v: Std of the systematic error [V].
+        cold_fraction: Fraction of the error ``COLD_V`` of relaxation in the cold that remains.
         temperature_c: Temperature [C]; NaN if unknown.
         series_count: Cells in series.
     """
@@ -326,7 +333,7 @@ def _points(
         soc=grid,
         ocv_v=ocv_v,
         std_v=std_v,
-        common_v=common_v * everywhere,
+        systematic_std_v=systematic_std_v * everywhere,
         cold_v=cold_v,
         temperature_c=temperature_c * everywhere,
     )

@@ -29,7 +29,7 @@ SAME_START_V = 0.02
 much."""
 GIVEN_V = 1e-3
 """Std of each point of a given curve, per cell [V]."""
-GIVEN_COMMON_V = 2e-3
+GIVEN_SYSTEMATIC_V = 2e-3
 """Std of the systematic error of a given curve, per cell [V]."""
 REST_SHARE = 0.7
 """Fraction of the half difference of low-rate curves that is hysteresis and remains in a rest after a discharge. The
@@ -44,13 +44,14 @@ PLATEAU_V = 0.15
 PLATEAU_SOC = 0.05
 """SOC interval over which the slope of a plateau is computed."""
 TYPICAL_HYSTERESIS_STD = 0.6
-"""Relative std of a hysteresis that is that of typical cells."""
+"""Relative std of a hysteresis that is taken from typical cells."""
 MIN_SHARE = 0.1
 """Lower limit of the remaining fraction that is measured by rests."""
 SHARE_POINTS = 6
 """Minimum number of rests that determine the remaining fraction."""
 SHARE_K = 10.0
-"""Maximum distance from 25 C of rests that determine the remaining fraction, beyond that of the low-rate curves [K]."""
+"""Maximum distance from 25 C of rests that determine the remaining fraction, in addition to the distance of the low-rate
+curves [K]."""
 SHARE_SOC = (0.1, 0.95)
 """SOC range of rests that determine the remaining fraction, and of a plateau."""
 MAX_CAPACITY_DIFFERENCE = 0.05
@@ -118,7 +119,7 @@ class OcvSources:
         hysteresis_v: Hysteresis of a rested cell at ``NODES`` and 25 C [V], from the source nearest to 25 C that shows
             hysteresis; None without such a source.
         hysteresis_std_v: Standard deviation of ``hysteresis_v`` [V].
-        usual_hysteresis: True if ``hysteresis_v`` is that of typical cells (``center_on_typical_hysteresis``).
+        usual_hysteresis: True if ``hysteresis_v`` comes from typical cells (``center_on_typical_hysteresis``).
     """
 
     capacity_ah: float
@@ -224,7 +225,7 @@ def _slow_curve_source(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> 
 def _given_curve_source(curve: ExternalCurve, series_count: int) -> Source:
     """Return a given curve as a source."""
     everywhere = np.full(curve.soc.size, float(series_count))
-    points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, common_v=GIVEN_COMMON_V * everywhere)
+    points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, systematic_std_v=GIVEN_SYSTEMATIC_V * everywhere)
     hysteresis_v = None
     if curve.hysteresis_v is None:
         points = replace(points, direction=np.full(curve.soc.size, -1.0))
@@ -339,21 +340,21 @@ def _centered(points: Points, hysteresis_at_rest_v: Floats, relative_std: float)
         points,
         ocv_v=points.ocv_v - points.direction * hysteresis_v,
         std_v=np.hypot(points.std_v, np.where(points.direction == 0.0, hysteresis_v, 0.0)),
-        common_v=np.hypot(points.common_v, relative_std * hysteresis_v),
+        systematic_std_v=np.hypot(points.systematic_std_v, relative_std * hysteresis_v),
     )
 
 
-def without_branches(found: OcvSources, ladder: Ladder) -> OcvSources:
+def subtract_rc_overpotential(found: OcvSources, ladder: Ladder) -> OcvSources:
     """Subtract the steady overpotential of the RC pairs from unpaired low-rate curves. In a pair it cancels.
 
     Args:
         found: Result of ``find_sources``.
         ladder: RC ladder with its relative standard deviation, if known.
     """
-    return replace(found, sources=tuple(_without_branches(source, ladder) for source in found.sources))
+    return replace(found, sources=tuple(_without_rc_overpotential(source, ladder) for source in found.sources))
 
 
-def _without_branches(source: Source, ladder: Ladder) -> Source:
+def _without_rc_overpotential(source: Source, ladder: Ladder) -> Source:
     """Return the source without the steady voltage drop of the RC pairs, if its curve is unpaired."""
     if source.unpaired is None:
         return source
@@ -364,7 +365,7 @@ def _without_branches(source: Source, ladder: Ladder) -> Source:
     points = replace(
         points,
         ocv_v=points.ocv_v - points.direction * drop_v,
-        common_v=np.hypot(points.common_v, ladder.std * drop_v),
+        systematic_std_v=np.hypot(points.systematic_std_v, ladder.std * drop_v),
     )
     removed = "the RC pairs" if first else "series resistance and RC pairs"
     note = f"{1e3 * drop_v.mean():.0f} mV subtracted for {removed}, as typical of such cells"

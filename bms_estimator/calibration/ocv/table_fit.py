@@ -36,7 +36,7 @@ NODES: Floats = np.unique(
 BEND_V = 2.0
 """Prior std of d2V/dSOC2 on flat parts of the curve, per ``CELL_V`` [V]."""
 BEND_SOC = 0.12
-"""SOC range over which the slope may change by its own size. The slope divided by this range adds to the prior std of
+"""SOC range over which the slope may change by 100 %. The slope divided by this range adds to the prior std of
 d2V/dSOC2, because steep parts bend more."""
 EMPTY_SLOPE_V = 60.0
 """Slope dV/dSOC that every curve may have at SOC 0, per ``CELL_V`` [V]."""
@@ -162,7 +162,9 @@ def fit_table(points: Points) -> TableFit:
     for _ in range(ITERATIONS):
         bend_rows = _bend_rows(voltage_scale * BEND_V + (middle_slope_v + empty_slope_v) / BEND_SOC)
         model = _model(points, slope_v, systematic_factor, bend_rows, voltage_scale)
-        std_v = np.hypot(points.std_v, INDEPENDENT_ERROR_FRACTION * points.common_v) * scatter_factor[points.source]
+        std_v = (
+            np.hypot(points.std_v, INDEPENDENT_ERROR_FRACTION * points.systematic_std_v) * scatter_factor[points.source]
+        )
         coefficients = _solve(model, points, std_v, voltage_scale)
         slope_v = np.clip(_spline(points.soc, 1) @ coefficients[: model.splines], 0.0, MAX_SLOPE_V * voltage_scale)
         middle_slope_v = _spline(middles, 1) @ coefficients[: model.splines]
@@ -207,7 +209,9 @@ def _model(
     for source in range(int(points.source.max()) + 1):
         of_source = (points.source == source)[:, None]
         deviation_columns_v = (
-            systematic_factor * points.common_v[:, None] * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
+            systematic_factor
+            * points.systematic_std_v[:, None]
+            * linear_interpolation_matrix(points.soc, DEVIATION_NODES)
         )
         columns += [of_source * deviation_columns_v, of_source * _shifts(points.soc, slope_v)]
         stds += [np.ones(DEVIATION_NODES.size), np.array([SOC_STD, CAPACITY_STD])]
@@ -249,12 +253,13 @@ def _solve(model: _Model, points: Points, std_v: Floats, voltage_scale: float) -
 def _error_factors(
     points: Points, model: _Model, coefficients: Floats, systematic_factor: float
 ) -> tuple[Floats, float]:
-    """Return the factors by which the observed errors exceed the declared ones, at least 1.
+    """Return the factors by which the observed errors exceed the declared errors, at least 1.
 
-    The first factor is that of each source's scatter, the second that of the systematic errors of all sources.
+    The first value has a factor for the scatter of each source; the second is the factor for the systematic errors of all
+    sources.
     """
     normalized = (points.ocv_v - model.points @ coefficients) / np.hypot(
-        points.std_v, INDEPENDENT_ERROR_FRACTION * points.common_v
+        points.std_v, INDEPENDENT_ERROR_FRACTION * points.systematic_std_v
     )
     sources = int(points.source.max()) + 1
     scatter = [

@@ -37,7 +37,7 @@ class AdaptedCapture:
         voltage_rms_v: RMS error of the voltage, open loop, above SOC 0.1 [V].
         score_before: Interval score of replays with the given cell [%]; NaN for a capture that is too short.
         score_after: Interval score with the adapted cell [%].
-        held_back: True if ``score_after`` is that of a cell adapted to the other captures only.
+        held_back: True if ``score_after`` is the score with a cell adapted to the other captures only.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Adaptation:
 def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = None) -> Adaptation:
     """Estimate a1..a15 by the thesis's procedure.
 
-    If the cell file has no bounds for the adaptive law (3.18), those printed in Table 10 of the thesis are used, scaled
+    If the cell file has no bounds for the adaptive law (3.18), the bounds of Table 10 of the thesis are used, scaled
     to the cell's capacity.
 
     Args:

@@ -14,7 +14,7 @@ import numpy as np
 
 from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, averaged, averaging_window
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, crossing, delta
+from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, delta, min_stable_exponent
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
@@ -71,7 +71,7 @@ class AdaptiveRun:
         a: Shape (n, 16), a1..a15 at index 1..15.
         window: Interval t_int to t_unst over which (3.19) averages.
         average: Shape (16,), averages (3.19) of a1..a15 at index 1..15.
-        crossings: Crossings of a8 and a11.
+        crossings: Points of the run at which a8 and a11 meet their stability conditions.
         epsilon_v: eps2 of Algorithm 1, the maximum error of a converged observer [V].
         lock_losses: Number of times that the observer lost the lock.
         outcome: "converged", or the reason for a failure.
@@ -98,7 +98,7 @@ class AdaptiveRun:
         amplitude, offset = {"a8": (7, 9), "a11": (10, 12)}[parameter]  # indices in ``a``
         # the lower limit of SOC avoids a division by zero
         rows = zip(np.maximum(self.soc, 1e-6), self.a[:, offset], self.a[:, amplitude], strict=True)
-        return np.array([crossing(soc, a_offset, a_amplitude) for soc, a_offset, a_amplitude in rows])
+        return np.array([min_stable_exponent(soc, a_offset, a_amplitude) for soc, a_offset, a_amplitude in rows])
 
 
 def adaptive_run(

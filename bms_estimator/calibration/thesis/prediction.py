@@ -1,8 +1,8 @@
 """Terminal voltage of Chen and Mora's model with constant parameters a1..a15 under a measured current.
 
 Section 5.3 and chapter 6 of the thesis validate the parameters in this way. Numbers in parentheses are equations of the
-thesis. The dynamic model has elements that depend on SOC. The static model has constant elements, those at one SOC. In
-both, E_o depends on SOC.
+thesis. The dynamic model has elements that depend on SOC. The static model has constant elements, which are the values
+at one SOC. In both, E_o depends on SOC.
 """
 
 from dataclasses import dataclass, fields
@@ -23,7 +23,7 @@ GRID = np.linspace(0.0, 1.0, 4001)
 EMPTY_SOC = 0.0
 """SOC at which a prediction ends. The curves of the model are undefined below."""
 DELTA_FACTOR = 1.05
-"""SOC at which a prediction ends, relative to delta1 and delta2, the SOCs at which a capacitance is zero."""
+"""Ratio of the SOC at which a prediction ends to delta1 or delta2, the SOCs at which a capacitance is zero."""
 DELTA_MARGIN = 1e-4
 """Additional SOC above delta1 and delta2 at which a prediction ends."""
 JUMP_FRACTION = 0.1
@@ -91,7 +91,7 @@ def predict(
         cell: Capacity, OCV and elements. ``a``, if given, replaces the elements.
         samples: Raw samples, dtype ``SAMPLE``.
         initial_soc: SOC 0..1 at the first sample.
-        a: a1..a15 at index 1..15; None: those of ``cell``.
+        a: a1..a15 at index 1..15; None: the values of ``cell``.
         lowest_soc: SOC below which the prediction ends. It also ends just above delta1 and delta2, the SOCs below which
             a capacitance of the model is negative.
 
@@ -133,7 +133,7 @@ def open_circuit(cell: CellModel, soc: Floats) -> Floats:
 
 
 def static_elements(a: Floats, soc: float) -> Floats:
-    """Return a1..a15 of the static model of chapter 6, whose elements are those at ``soc``."""
+    """Return a1..a15 of the static model of chapter 6, whose elements have the values at ``soc`` for every SOC."""
     frozen = np.array(a)
     # index of each element's offset; its amplitude is two before
     for offset, element in ((3, r_ts), (6, r_tl), (9, c_ts), (12, c_tl), (15, r_s)):
@@ -151,11 +151,11 @@ def _unstable_below(a: Floats) -> float:
 def soc_by_interpolation(cell: CellModel, run: Prediction) -> tuple[Floats, Floats]:
     """Return SOC by the measured voltage and the model's overpotentials.
 
-    E_o = y + x2 + x3 + i R_s (2.4) is inverted to SOC. R_s and the overpotentials are those at the counted SOC, because
+    E_o = y + x2 + x3 + i R_s (2.4) is inverted to SOC. R_s and the overpotentials are taken at the counted SOC, because
     they depend on SOC only weakly.
 
     Returns:
-        SOC (0..1) and E_o [V], each of the run's shape. Outside the curve, SOC is that of the nearest end.
+        SOC (0..1) and E_o [V], each of the run's shape. Outside the curve, the nearest end gives the SOC.
     """
     a = cell.a
     ohmic_v = run.current_a * np.array([r_s(x, a) for x in run.soc])

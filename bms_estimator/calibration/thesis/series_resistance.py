@@ -139,7 +139,7 @@ def fit_series_resistance(curve: SeriesResistance, lowest_soc: float = 0.0) -> S
 
     Args:
         curve: R_s over SOC.
-        lowest_soc: SOC below which bins are omitted; 0 if the curve has no such bins.
+        lowest_soc: SOC below which bins are omitted; 0 uses all bins.
 
     Raises:
         UserError: Too few SOC bins with data.

@@ -12,7 +12,7 @@ import typer
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_output_file, name_of
-from bms_estimator.cli.options.pack_options import load_pack, unpacked_cell
+from bms_estimator.cli.options.pack_options import load_pack, single_cell_of
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import identified_cell, ocv_correction_with_std, relative_capacity
 from bms_estimator.model.cell_file import write_cell
@@ -68,9 +68,9 @@ def export(
     A service whose settings name this cell file starts with the learned values.
     """
     settings, model = load_pack(pack)
-    cell, series = unpacked_cell(pack, settings), settings.pack.series
+    cell, series = single_cell_of(pack, settings), settings.pack.series
     file = CheckpointFile(checkpoint.parent if checkpoint else state_folder(settings), settings, model)
-    if checkpoint:
+    if checkpoint:  # its name may differ from the name that a service gives
         file.path = checkpoint
     check_output_file(out, [pack, file.path], force=force)
     if checkpoint and not checkpoint.exists():

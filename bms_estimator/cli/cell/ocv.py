@@ -29,7 +29,7 @@ from bms_estimator.calibration.ocv.sources import (
     center_on_typical_hysteresis,
     find_sources,
     has_plateau,
-    without_branches,
+    subtract_rc_overpotential,
 )
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.cli.options.capture_options import (
@@ -60,18 +60,18 @@ MAX_CELL_V = 4.5
 MAX_CELLS = 300
 """Maximum plausible number of cells in series."""
 MIN_VOLTAGE_RATIO = 0.55
-"""Minimum voltage of a valid sample as a fraction of the OCV at SOC 0.5."""
+"""Minimum voltage of a valid sample as a fraction of the OCV at SOC 0.5: 2.0 V for a cell of 3.7 V, below usual cut-offs."""
 MAX_VOLTAGE_RATIO = 1.06
-"""Maximum voltage of a valid sample as a fraction of the OCV at SOC 1."""
+"""Maximum voltage of a valid sample as a fraction of the OCV at SOC 1: 4.45 V for a cell of 4.2 V, above usual overcharge."""
 MIN_EMPTY_RATIO = 0.25
 """Minimum plausible ratio of the OCV at SOC 0 to that at SOC 0.5."""
 MEASURED_CAPACITY_STD = 0.03
 """Relative standard deviation of a capacity measured by a slow discharge. It covers the gain of the current sensor,
 differences between cells of the type, and ageing over some years."""
 MIN_CURRENT_LIMIT_C = 5.0
-"""Minimum of the current limit of a valid sample, as a multiple of the capacity [1/h]."""
+"""Minimum C-rate of ``current_max_a`` in the written cell file, the limit above which a sample is not valid [1/h]."""
 PEAK_CURRENT_MARGIN = 1.5
-"""Minimum ratio of the current limit of a valid sample to the largest current in the captures."""
+"""Minimum ratio of ``current_max_a`` in the written cell file to the largest current in the captures."""
 STEEP_SOC = 0.05
 """Width of the ranges at both ends of the SOC in which OCV curves are steep."""
 TABULATED_SOC = np.linspace(0.0, 1.0, 11)
@@ -207,7 +207,7 @@ def ocv(
     preliminary_v = fit_curve(ocv_sources.points)(NODES)
     generic = nearest_generic_cell(NODES, preliminary_v, ocv_sources.capacity_ah, series_count)
     ladder, elements = _elements(generic, ocv_sources, recordings)
-    ocv_sources = without_branches(ocv_sources, ladder)
+    ocv_sources = subtract_rc_overpotential(ocv_sources, ladder)
     # the two phases of a plateau cause hysteresis, which the form chen-mora does not have
     if form is Form.TABLE and ocv_sources.hysteresis_v is None and has_plateau(NODES, preliminary_v, series_count):
         ocv_sources = center_on_typical_hysteresis(
@@ -332,9 +332,9 @@ def _elements(
     if test is None:
         return scaled_generic_ladder(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
     samples = next(recording.samples for recording in recordings if recording.name == test.name)
-    rests = initial_elements(samples, test, ocv_sources.capacity_ah)
+    rest_elements = initial_elements(samples, test, ocv_sources.capacity_ah)
     temperature_c = float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C))
-    return scaled_generic_ladder(generic, rests, temperature_c), dict(rests.sections)
+    return scaled_generic_ladder(generic, rest_elements, temperature_c), dict(rest_elements.sections)
 
 
 def _cell_and_ocv_sections(

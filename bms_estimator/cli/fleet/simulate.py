@@ -16,7 +16,7 @@ from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.broker_config import check
+from bms_estimator.mqtt.broker_config import check as check_broker_settings
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DeviceName
@@ -68,7 +68,7 @@ def simulate(
 
     An edge sends a block again if a worker requests it.
     All edges share a few MQTT connections.
-    The packs consist of shipped cells, with different capacities and resistances.
+    The packs consist of cells that come with this program; their capacities and resistances vary.
     The samples of a block depend only on the seed, the pack and the number of the block.
     With --table and without --mqtt, only the table is written.
     """
@@ -86,7 +86,7 @@ def simulate(
 async def _run(
     fleet: SimulatedFleet, settings: MqttSettings, connections: int, speed: float, blocks: int | None
 ) -> Report:
-    start_s = time.time() - BLOCK_S / speed  # the first blocks are complete within the next minute
+    start_s = time.time() - BLOCK_S / speed  # a block earlier, so that the first blocks are sent within the next minute
     edges = SimulatedEdges(fleet, start_s=start_s, speed=speed, last=blocks)
     return await run_edges(fleet, edges, settings, connections=connections, stop=stop_on_signal(), report=typer.echo)
 
@@ -116,7 +116,7 @@ def _broker_settings(url: str, **options: str | Path | None) -> MqttSettings:
     """
     try:
         settings = MqttSettings.model_validate({"url": tuple(url.split(",")), **options})
-        check(settings)
+        check_broker_settings(settings)
     except ValidationError as error:
         raise UserError(f"--mqtt {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
     except UserError as error:

@@ -28,7 +28,7 @@ def load_pack(path: Path) -> tuple[Settings, PackModel]:
     return settings, _model(settings, _locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
-def unpacked_cell(path: Path, settings: Settings) -> CellModel:
+def single_cell_of(path: Path, settings: Settings) -> CellModel:
     """Return the model of one cell of a pack, before it is scaled to the cells in series and parallel.
 
     The cell file is searched as in ``load_pack``.

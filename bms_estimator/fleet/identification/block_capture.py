@@ -50,11 +50,11 @@ class BlockCapture:
         except BlockError:
             self.damaged += 1
             return
-        key = (block.store, block.number)
-        if block.store < self._store or key in self._blocks:
+        key = (block.store_created_ns, block.number)
+        if block.store_created_ns < self._store or key in self._blocks:
             self.repeated += 1
             return
-        self._store = block.store
+        self._store = block.store_created_ns
         if _wall_s(block, -1) >= self.since_s and _wall_s(block, 0) < self.until_s:
             self._blocks[key] = data
 
@@ -105,16 +105,16 @@ class BlockCapture:
             samples = block.samples[self._in_span(block)]
             if not samples.size:
                 continue
-            first_store = first_store or block.store
-            if store not in (0, block.store):
-                offset_s = max((block.store - first_store) * 1e-9, last_s - float(samples["time_s"][0]))
-            store = block.store
+            first_store = first_store or block.store_created_ns
+            if store not in (0, block.store_created_ns):
+                offset_s = max((block.store_created_ns - first_store) * 1e-9, last_s - float(samples["time_s"][0]))
+            store = block.store_created_ns
             samples["time_s"] += offset_s
             last_s = float(samples["time_s"][-1])
             yield samples
 
     def _in_span(self, block: Block) -> np.ndarray:
-        wall_s = block.store * 1e-9 + block.samples["time_s"]
+        wall_s = block.store_created_ns * 1e-9 + block.samples["time_s"]
         return (wall_s >= self.since_s) & (wall_s < self.until_s)
 
     def _block(self, key: tuple[int, int]) -> Block:
@@ -122,7 +122,7 @@ class BlockCapture:
 
 
 def _wall_s(block: Block, sample: int) -> float:
-    return block.store * 1e-9 + float(block.samples["time_s"][sample])
+    return block.store_created_ns * 1e-9 + float(block.samples["time_s"][sample])
 
 
 async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: float = math.inf) -> BlockCapture:

@@ -85,9 +85,9 @@ class Collector:
 
     async def _subscribe(self) -> JetStreamContext.PullSubscription:
         js = self._nc.jetstream()
-        wait_s = (
-            2.0 * self._period_s + 60.0
-        )  # longer than a row waits in this process; otherwise the server would redeliver the row
+        # longer than a row waits in this process; otherwise the server would redeliver the row
+        wait_s = 2.0 * self._period_s + 60.0
+        # 3 * MAX_ROWS: rows that wait here, and rows of an ended process that are not yet redelivered
         config = ConsumerConfig(
             durable_name=DURABLE, ack_policy=AckPolicy.EXPLICIT, ack_wait=wait_s, max_ack_pending=3 * MAX_ROWS
         )

@@ -198,7 +198,11 @@ class SimulatedFleet:
         samples = self.samples(packs, numbers)
         for i, (pack, number) in enumerate(zip(packs.tolist(), numbers.tolist(), strict=True)):
             block = Block(
-                store=int(self.store[pack]), number=number, oldest=1, arrival_s=float(arrival_s[i]), samples=samples[i]
+                store_created_ns=int(self.store[pack]),
+                number=number,
+                oldest=1,
+                arrival_s=float(arrival_s[i]),
+                samples=samples[i],
             )
             yield encode(block)
 

@@ -44,10 +44,10 @@ def classify_block(d: np.void, block: Block) -> BlockOrder:
         block: The received block.
     """
     store, number = int(d["store"]), int(d["awaited"])
-    if block.store < store:
+    if block.store_created_ns < store:
         return BlockOrder.FORMER_STORE
-    if block.store > store:
-        d["store"], number = block.store, _await_block(d, 1)
+    if block.store_created_ns > store:
+        d["store"], number = block.store_created_ns, _await_block(d, 1)
     if block.oldest > number:
         number = _skip_lost_blocks(d, block.oldest)
     if block.number < number:

@@ -15,7 +15,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.fleet.packs.pack_type import Digest, PackType
 from bms_estimator.fleet.worker import hour_summary
 from bms_estimator.fleet.worker.density import MAX_TIMESTAMP_S
-from bms_estimator.fleet.worker.pack_state import PACK_STATE, Fields
+from bms_estimator.fleet.worker.pack_state import CONFIG_DIGEST, LAST_STORE_NS, PACK_STATE, STATE_DIGEST, Fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads import Payload
 from bms_estimator.model.sample import SampleBlock
@@ -36,17 +36,18 @@ Publications = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
 
 
 class BlockProcessor:
-    """Processor of the pack whose state is in the unpacked record.
+    """Processor of blocks, which all packs of a partition share.
 
     Args:
-        record: Unpacked record, shape (1,), dtype ``PACK_STATE``.
+        record: Record of shape (1,) and dtype ``PACK_STATE``. The caller loads the state of a pack into it before each
+            ``step``.
         counters: Counters of the partition; updated.
         wall: Wall clock for publish times [s since 1970].
     """
 
     def __init__(self, record: NDArray[np.void], counters: Counter[str], wall: Callable[[], float]) -> None:
         self._record, self._counters, self._wall = record, counters, wall
-        self._delivery, self._flow, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
+        self._delivery, self._charge_energy, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
         self._observer = record[0]["estimator"]["observer"]
         self._window = Window()
 
@@ -56,8 +57,8 @@ class BlockProcessor:
         Args:
             pack: Name of the pack.
             block: The block; its implausible timestamps are set to NaN.
-            pack_type: Type of the pack; its estimator is bound to the unpacked record.
-            unmigrated_fields: Estimator fields in the layout of another version; None if the unpacked record has them.
+            pack_type: Type of the pack; its estimator is bound to the record.
+            unmigrated_fields: Estimator fields that another version saved; None if they are already in the record.
         """
         self._check_times(block.samples)
         self._restore_or_reset(pack_type, unmigrated_fields, block)
@@ -81,36 +82,39 @@ class BlockProcessor:
     def _restore_or_reset(self, pack_type: PackType, unmigrated_fields: Fields | None, block: Block) -> None:
         """Adapt the pack's state to its present settings and this version. Reset an incompatible state."""
         d, record = self._delivery, self._record[0]
-        is_same_config = _digest(d["made_of"]) == pack_type.config_digest
+        is_same_config = _digest(d[CONFIG_DIGEST]) == pack_type.config_digest
         if is_same_config and unmigrated_fields is None:
             return
         has_state = bool(self._hour["store"])  # 0 before the first block
-        if _digest(d["meaning"]) == pack_type.state_digest and has_state:
+        if _digest(d[STATE_DIGEST]) == pack_type.state_digest and has_state:
             saved = unmigrated_fields
             if saved is None:
                 saved = {name: v.copy() for name, v in fields(self._record["estimator"])}
             record["estimator"] = np.zeros((), PACK_STATE["estimator"])
+            # the observer's state also depends on settings outside ``STATE_DIGEST``; other states do not
             valid = saved if is_same_config else without_observer(saved)
             error = restore_state(pack_type.estimator, valid, self._gap_s(block))
             # the restored estimator has no last sample, and its counters begin at 0
-            self._flow["sums"]["counted"] = self._hour["outliers_before"] = self._hour["searches_before"] = 0
+            self._charge_energy["sums"]["counted"] = 0
+            self._hour["outliers_before"] = self._hour["searches_before"] = 0
             self._counters["not_taken_over" if error else "taken_over"] += 1
         else:
             for name in ("flow", "hour", "estimator"):
                 record[name] = np.zeros((), PACK_STATE[name])
-            d["clock"] = d["hour"] = 0
+            d[LAST_STORE_NS] = d["hour"] = 0
             self._counters["begun_anew"] += has_state
-        d["made_of"], d["meaning"] = pack_type.config_digest, pack_type.state_digest
+        d[CONFIG_DIGEST], d[STATE_DIGEST] = pack_type.config_digest, pack_type.state_digest
 
     def _resume_after_store_change(self, estimator: Estimator, block: Block) -> None:
-        """Resume the estimator after a gap if the block is of another store.
+        """Resume the estimator after a gap if the edge's store is another one than for the last sample.
 
-        Timestamps count from the creation of the store, so that the estimator cannot compute the gap.
+        Timestamps count from the creation of the store, and therefore the estimator cannot compute the gap.
         """
-        if int(self._delivery["clock"]) == block.store:
+        if int(self._delivery[LAST_STORE_NS]) == block.store_created_ns:
             return
-        self._flow["sums"]["counted"] = 0  # no charge is counted over the gap
-        has_time_base = math.isfinite(self._observer["time_s"])  # otherwise the estimator has already been resumed
+        self._charge_energy["sums"]["counted"] = 0  # no charge is counted over the gap
+        # infinite if ``_restore_or_reset`` has already resumed the estimator
+        has_time_base = math.isfinite(self._observer["time_s"])
         if self._observer["started"] and has_time_base:
             estimator.resume(self._gap_s(block))
 
@@ -118,7 +122,9 @@ class BlockProcessor:
         """Estimate the samples; add the estimates to the hour, the charge and energy meter and the publish window."""
         observer, counters = self._observer, self._counters
         accepted_before, steps_back_before = int(observer["samples"]), int(observer["time_steps_back"])
-        pack_type.meter.continue_from(ChargeEnergy(*(float(self._flow[name]) for name in ChargeEnergy._fields)))
+        pack_type.meter.continue_from(
+            ChargeEnergy(*(float(self._charge_energy[name]) for name in ChargeEnergy._fields))
+        )
         for part in _parts(block):
             trace = pack_type.estimator.run(part.samples)
             hour_summary.add(self._record["hour"], trace, part, pack_type.estimator)
@@ -131,15 +137,15 @@ class BlockProcessor:
 
     def _state_payload(self, pack_type: PackType, now_s: float) -> bytes | None:
         """Return the payload of topic ``state`` from the publish window; None if no sample was accepted."""
-        flow, window, d = pack_type.meter.update_totals(), self._window.take(), self._delivery
-        for name, value in zip(ChargeEnergy._fields, flow, strict=True):
-            self._flow[name] = value
+        totals, window, d = pack_type.meter.update_totals(), self._window.take(), self._delivery
+        for name, value in zip(ChargeEnergy._fields, totals, strict=True):
+            self._charge_energy[name] = value
         if window is None:
             return None
         # ``blocks`` does not count the present block yet
         counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
         remaining = remaining_charge(pack_type.estimator, window.current_a)
-        return _json(make_state_payload(window, remaining, counters, now_s, flow, pack_type.capacity_ah))
+        return _json(make_state_payload(window, remaining, counters, now_s, totals, pack_type.capacity_ah))
 
     def _parameters_payload(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
         """Return the payload of topic ``parameters``. Its ages refer to the arrival time of the samples."""
@@ -156,15 +162,15 @@ class BlockProcessor:
     def _gap_s(self, block: Block) -> float:
         """Return the length of the gap before a block [s]; infinite if unknown."""
         d, times_s = self._delivery, _finite_times_s(block.samples)
-        if not d["clock"] or not times_s.size:
+        if not d[LAST_STORE_NS] or not times_s.size:
             return math.inf
-        gap_s = (block.store - int(d["clock"])) / 1e9 + (float(times_s[0]) - float(d["last_s"]))
+        gap_s = (block.store_created_ns - int(d[LAST_STORE_NS])) / 1e9 + (float(times_s[0]) - float(d["last_s"]))
         return gap_s if gap_s >= 0.0 else math.inf
 
     def _roll_over_hour(
         self, pack: str, block: Block, pack_type: PackType
     ) -> tuple[tuple[tuple[str, bytes], ...], bool]:
-        """Finish the current hour if the block is of a later one, and begin the new hour.
+        """If the block is of a later hour, finish the current hour and begin the new one.
 
         Returns:
             Message id and row of the finished hour, empty for the first hour of a pack; and True if a new hour has begun.
@@ -185,7 +191,7 @@ class BlockProcessor:
         """Record store and timestamp of the last valid sample."""
         times_s = _finite_times_s(block.samples)
         if times_s.size:
-            self._delivery["clock"], self._delivery["last_s"] = block.store, times_s[-1]
+            self._delivery[LAST_STORE_NS], self._delivery["last_s"] = block.store_created_ns, times_s[-1]
 
     def _arrival_s(self, block: Block) -> float:
         """Return the arrival time of the last sample at the edge [s since 1970].
@@ -195,7 +201,7 @@ class BlockProcessor:
         if 0.0 <= block.arrival_s <= MAX_WALL_S:
             return block.arrival_s
         self._counters["no_arrival"] += 1
-        return block.store / 1e9 + float(self._delivery["last_s"])
+        return block.store_created_ns / 1e9 + float(self._delivery["last_s"])
 
 
 def _parts(block: Block) -> Iterator[Block]:

@@ -100,7 +100,7 @@ class CheckpointStore:
         self._nc, self._js, self._worker = nc, nc.jetstream(), worker
         self._checkpoints, self._states = checkpoints, states
         self._object_names = NUID()
-        self._last_sent: dict[int, Pointer] = {}  # last pointer sent by partition, possibly without a response
+        self._last_sent: dict[int, Pointer] = {}  # by partition; its response may have been lost
 
     async def claim(self, partition: int) -> Claim:
         """Take over a partition from its present owner, if any.

@@ -35,7 +35,7 @@ def hour_of(block: Block) -> int:
     A block whose last timestamp is not finite belongs to the hour in which its store was created.
     """
     last_s = float(block.samples["time_s"][-1])
-    return int((block.store / 1e9 + (last_s if math.isfinite(last_s) else 0.0)) // HOUR_S)
+    return int((block.store_created_ns / 1e9 + (last_s if math.isfinite(last_s) else 0.0)) // HOUR_S)
 
 
 def begin(sums: Sums, record: np.void) -> None:
@@ -61,8 +61,8 @@ def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> No
     """
     settings = estimator.settings[0]
     rest_a = REST_C * float(settings["capacity_as"]) / HOUR_S
-    accumulate_hour(sums, trace, int(sums["store"][0]) != block.store, float(settings["gap_s"]), rest_a)
-    sums["store"] = block.store
+    accumulate_hour(sums, trace, int(sums["store"][0]) != block.store_created_ns, float(settings["gap_s"]), rest_a)
+    sums["store"] = block.store_created_ns
     sums["dropped"] += block.samples.size - trace.size
 
 

@@ -26,6 +26,6 @@ def load_fleet_kernels() -> None:
     partition = Partition(0, lambda _: (settings, cell))
     # the second block finishes an hour, and is of another store
     for sequence, store in enumerate((HOUR_NS, 3 * HOUR_NS), 1):
-        block = Block(store=store, number=1, oldest=1, arrival_s=store / 1e9, samples=samples)
+        block = Block(store_created_ns=store, number=1, oldest=1, arrival_s=store / 1e9, samples=samples)
         partition.take(PACK, encode(block), sequence)
     load_kernels()

@@ -22,6 +22,9 @@ Fields = Mapping[str, NDArray[Any]]
 MAX_LOST_BLOCKS = 2**62
 """Limit of the count of lost blocks, so that it cannot overflow."""
 
+# names of fields of ``DELIVERY``; checkpoints contain these names, so that they cannot be changed
+LAST_STORE_NS, CONFIG_DIGEST, STATE_DIGEST = "clock", "made_of", "meaning"
+
 DELIVERY = np.dtype(
     [
         # creation time of the store with the awaited block [ns since 1970]; 0: no block yet
@@ -40,15 +43,15 @@ DELIVERY = np.dtype(
         # number of blocks that were never received
         ("lost_blocks", "i8"),
         # creation time of the store that contains the last valid sample [ns since 1970]; 0: no sample yet
-        ("clock", "u8"),
-        # timestamp of the last valid sample [s since ``clock``]
+        (LAST_STORE_NS, "u8"),
+        # timestamp of the last valid sample [s since ``LAST_STORE_NS``]
         ("last_s", "f8"),
         # current hour [hours since 1970]; 0: no block yet
         ("hour", "i8"),
         # ``PackType.config_digest`` of the settings with which the state was computed
-        ("made_of", "u8", 2),
-        # ``PackType.state_digest`` of the settings on which the meaning of the state depends
-        ("meaning", "u8", 2),
+        (CONFIG_DIGEST, "u8", 2),
+        # ``PackType.state_digest`` of the settings that the state depends on
+        (STATE_DIGEST, "u8", 2),
     ],
     align=True,
 )

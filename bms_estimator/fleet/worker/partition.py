@@ -168,7 +168,7 @@ class Partition:
         return BlockResult(pack)
 
     def take_deferred(self, pack: str, data: bytes, sequence: int) -> BlockResult:
-        """Process the next deferred message of a known pack. The arguments are those of ``take``."""
+        """Process the next deferred message of a known pack. ``take`` describes the arguments."""
         pack_type = self._look_up(pack)
         if pack_type is None or pack not in self.deferred:
             return BlockResult(pack)

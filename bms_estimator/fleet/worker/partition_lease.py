@@ -163,7 +163,7 @@ class PartitionLease:
                 return
             snapshot, partition.deferred.is_saved = partition.snapshot(), True
             try:
-                # The summaries are sent first, because the next owner does not compute those of saved samples again.
+                # The summaries are sent first, because the next owner does not compute the summaries of saved samples again.
                 await self.send_summaries()
                 self.claim = await self._checkpoints.write(claim, snapshot.sequence, snapshot.chunks())
             except FencedError as error:

@@ -41,13 +41,13 @@ def r_tl(soc: float, a: Floats) -> float:
 
 @njit(cache=True)
 def c_ts(soc: float, a: Floats) -> float:
-    """Return the short-term capacitance C_ts(SOC) [F], (2.7); negative below delta1 (``delta``)."""
+    """Return the short-term capacitance C_ts(SOC) [F], (2.7); negative at SOCs below delta1, see ``delta``."""
     return -a[7] * math.exp(-a[8] * soc) + a[9]  # (2.7)
 
 
 @njit(cache=True)
 def c_tl(soc: float, a: Floats) -> float:
-    """Return the long-term capacitance C_tl(SOC) [F], (2.8); negative below delta2 (``delta``)."""
+    """Return the long-term capacitance C_tl(SOC) [F], (2.8); negative at SOCs below delta2, see ``delta``."""
     return -a[10] * math.exp(-a[11] * soc) + a[12]  # (2.8)
 
 
@@ -201,8 +201,8 @@ def delta(exponent: float, offset: float, amplitude: float) -> float:
 
 
 @njit(cache=True)
-def crossing(soc: float, offset: float, amplitude: float) -> float:
-    """Return the exponent a8 (or a11) above which C_ts (or C_tl) is positive at ``soc``: Lemma 4.1.1 and Fig. 19 of the thesis.
+def min_stable_exponent(soc: float, offset: float, amplitude: float) -> float:
+    """Return the exponent a8 (a11) above which C_ts (C_tl) is positive at ``soc``: Lemma 4.1.1 and Fig. 19 of the thesis.
 
     ``offset`` and ``amplitude`` are those of ``delta``.
     """

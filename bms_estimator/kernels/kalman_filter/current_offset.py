@@ -19,8 +19,8 @@ REST_S = 60.0
 ZERO_C = 0.002
 """Maximum mean current of a rest at which the current counts as zero, as a C-rate."""
 MIN_VARIANCE_RATIO = 4.0
-"""Minimum ratio of the offset's variance to that of a rest's information for an update. Successive rests have a common
-error, so that a rest does not update the offset again before its variance has grown."""
+"""Minimum ratio of the variance of the offset to the variance of the offset measured in a rest, for an update.
+Successive rests have a common error, so that a rest does not update the offset again before its variance has grown."""
 
 
 @njit(cache=True)

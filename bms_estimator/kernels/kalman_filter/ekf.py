@@ -98,7 +98,7 @@ def transition_diagonal(s: Record, p: Record) -> None:
 def hysteresis_charge(s: Record, p: Record) -> float:
     """Return the charge that moves the hysteresis in the window [A s].
 
-    The charge is that of the trend of the current, because short regeneration does not reverse the hysteresis.
+    It is computed with the trend of the current, because short regeneration does not reverse the hysteresis.
     """
     w = s.window
     return w.charge_as if w.gap and w.time_s > p.unmeasured_s else s.x_a[TREND] * w.time_s

@@ -24,13 +24,14 @@ CAPACITANCES = (2, 3)
 MAX_LN_VARIANCE = 0.5**2
 """Maximum variance of the logarithm of an estimate that is added to the map: a relative std of 50 %."""
 MODEL_ERROR = 0.02
-"""Relative error with which (2.5)-(2.9) describe a real element."""
+"""Assumed relative error with which (2.5)-(2.9) describe a real element."""
 PRIOR_ERROR = 0.7
-"""Relative error of the configured function in SOC bins that were not visited, after scaling to the visited ones."""
+"""Relative error of the prior in SOC bins without data. The prior is the configured function, scaled to fit the bins with
+data."""
 EXPONENT_MIN = 0.5
-"""Lower limit of the exponents."""
+"""Lower limit of the exponents. A function with a smaller exponent is nearly a straight line over SOC 0..1."""
 EXPONENT_MAX = 300.0
-"""Upper limit of the exponents."""
+"""Upper limit of the exponents. A function with a larger exponent decays within a small part of the first bin."""
 SEARCH_POINTS = 24
 """Number of exponents in the logarithmic search."""
 REFINEMENTS = 12
@@ -123,7 +124,7 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
 def fit_within(fit: Record, e: int, lower: Floats, upper: Floats) -> tuple[float, float, float]:
     """Return amplitude, exponent and offset of the element fitted last, within bounds.
 
-    If a bound limits one of them, the others are fitted again, because clipping each by itself would give a poor fit.
+    If a bound limits one of these values, the others are fitted again, because clipping each alone would give a poor fit.
 
     Args:
         fit: Record of ELEMENT_FIT after ``fit_element`` for this element.
@@ -157,7 +158,7 @@ def _sign(e: int) -> float:
 def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: Floats, y: Floats, w: Floats) -> int:
     """Write SOC, value and weight of the element in each bin to ``x``, ``y`` and ``w``; return the number of visited bins."""
     visited = 0
-    ratios = weights = 0.0
+    ln_ratios = weights = 0.0
     for b in range(BINS):
         x[b] = (b + 0.5) / BINS
         if m.weight[e, b] > 0.0:
@@ -169,9 +170,10 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
             visited += 1
             # samples of one pass are not independent: the weight uses the mean variance, not the variance of the mean
             w[b] = 1.0 / (m.dwell_s[e, b] / m.weight[e, b] + MODEL_ERROR**2)
-            ratios += w[b] * (m.moment[e, b] / m.weight[e, b] - math.log(y[b]))
+            ln_ratios += w[b] * (m.moment[e, b] / m.weight[e, b] - math.log(y[b]))
             weights += w[b]
-    scale = math.exp(ratios / weights) if visited > 0 else 1.0  # of the visited bins over the configured function
+    # geometric mean of the measured value over the configured function in the visited bins
+    scale = math.exp(ln_ratios / weights) if visited > 0 else 1.0
     for b in range(BINS):
         if m.weight[e, b] > 0.0:
             y[b] = math.exp(m.moment[e, b] / m.weight[e, b])
@@ -186,18 +188,19 @@ def _observations(m: Record, e: int, prior: Floats, base: int, sign: float, x: F
 def _best_exponent(start: float, sign: float, x: Floats, y: Floats, w: Floats) -> float:
     """Return the exponent with the least cost, by a logarithmic search and a golden section around its best point.
 
-    ``start`` is a first candidate.
+    The search also tries the exponent ``start``.
     """
-    ratio = math.log(EXPONENT_MAX / EXPONENT_MIN) / (SEARCH_POINTS - 1)
+    ln_step = math.log(EXPONENT_MAX / EXPONENT_MIN) / (SEARCH_POINTS - 1)
     lowest, highest = math.log(EXPONENT_MIN), math.log(EXPONENT_MAX)
+    # all of these are logarithms of exponents
     best = min(max(math.log(start), lowest), highest)
     least = _linear_part(math.exp(best), sign, x, y, w)[2]
     for j in range(SEARCH_POINTS):
-        candidate = lowest + ratio * j
+        candidate = lowest + ln_step * j
         cost = _linear_part(math.exp(candidate), sign, x, y, w)[2]
         if cost < least:
             best, least = candidate, cost
-    low, high = max(best - ratio, lowest), min(best + ratio, highest)
+    low, high = max(best - ln_step, lowest), min(best + ln_step, highest)
     golden = 0.5 * (math.sqrt(5.0) - 1.0)
     left, right = high - golden * (high - low), low + golden * (high - low)
     cost_left = _linear_part(math.exp(left), sign, x, y, w)[2]
@@ -242,8 +245,9 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
         unconstrained = (sw * sgy - sg * sy) / det
         amplitude = max(amplitude, unconstrained)
     offset = max((sy - sg * amplitude) / sw, MIN_RATIO * offset)
-    cross = offset * sw * offset + amplitude * (2.0 * offset * sg + amplitude * sgg)
-    cost = syy + cross - 2.0 * (offset * sy + amplitude * sgy)
+    # weighted sum of (y - model)^2 with the model offset + amplitude g
+    model_square = offset * sw * offset + amplitude * (2.0 * offset * sg + amplitude * sgg)
+    cost = syy + model_square - 2.0 * (offset * sy + amplitude * sgy)
     return amplitude, offset, cost
 
 
@@ -251,7 +255,7 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
 def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats) -> None:
     """Write the standard errors, roots of the diagonal of (J' W J)^-1, by elimination; NaN if the matrix is singular."""
     amplitude, exponent, offset = fit.a[base], fit.a[base + 1], fit.a[base + 2]
-    # prior: each parameter has a std of 3 times its value
+    # a weak prior keeps the matrix regular: each parameter has a std of 3 times its value
     h00, h11, h22 = (3.0 * amplitude) ** -2, (3.0 * exponent) ** -2, (3.0 * offset) ** -2
     h01 = h02 = h12 = 0.0
     for b in range(BINS):

@@ -72,9 +72,9 @@ def write_equivalent_circuit(f: Record, p: Record, e: Record) -> None:
 
 @njit(cache=True)
 def ln_r_s_ratio(f: Record, p: Record) -> tuple[float, float]:
-    """Return ln of R_s over the file's R_0 at equal SOC and temperature, and its variance.
+    """Return ln of the ratio of R_s to R_0 in the file at equal SOC and temperature, and its variance.
 
-    The ratio is that of current steps if these have determined it, otherwise that of the filter.
+    The ratio comes from current steps if they have determined it, otherwise from the filter.
     """
     if r_s_identified_by_steps(f, p):
         return f.step.ln_ratio, f.step.variance + SHAPE_STD**2

@@ -14,8 +14,8 @@ LOAD_S = 600.0
 USUAL_S = 6.0 * 3600.0
 """Averaging time of the long-term mean load, which is expected after the present one in a long gap [s]."""
 INTERPOLATION_VARIANCE = 0.2
-"""Variance of the error of linear interpolation. The error is that of the mean current between two samples, and the
-variance is divided by the squared change of the current between them. It is 1/12 for loads that last much longer than a
+"""Variance of the mean current between two samples by linear interpolation, divided by the squared change of the current
+between the samples. It is 1/12 for loads that last much longer than a
 sample period, 0.10 and 0.18 for loads of 20 s sampled every 10 s and every 60 s, and 1/4 for independent samples."""
 MAX_EQUAL_STEPS = 1.5
 """Maximum difference between two reported currents that count as equal, in steps of the resolution."""
@@ -63,8 +63,8 @@ def expected_excess_charge(s: Record, held_a: float, dt_s: float) -> float:
 def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
     """Return the std of the charge in ``dt_s`` about ``held_a`` x ``dt_s`` [A s].
 
-    The unknown current is assumed constant over the gap. It is drawn from the distribution of the present load or, the
-    longer the gap, from that of the long-term load.
+    The unknown current is assumed constant over the gap. Its distribution changes from the present load in a short gap to
+    the long-term load in a long gap.
     """
     present_share = math.exp(-dt_s / LOAD_S)
     present_a2 = s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a

@@ -227,8 +227,8 @@ def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: floa
 def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
     """Average fast voltage change times fast current change, and the squared fast current change.
 
-    The ratio of both averages is -R_s if the sign is right. A ramp does not count as a change, because the voltage has
-    ramps of its own at the ends of the OCV curve.
+    The ratio of both averages is -R_s if the sign is right. A ramp does not count as a change, because at the ends of the OCV
+    curve the voltage changes slowly even under constant current.
     """
     if dt_s > FAST_S or c.slow_v == 0.0:  # the step is too long for a fast change, or this is the first sample
         c.slow_v = c.slower_v = voltage_v

@@ -10,9 +10,9 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 MIN_LN_WEIGHT = -9.0
-"""ln of the weight, relative to that of the likeliest hypothesis, below which a hypothesis is removed."""
+"""ln of the ratio to the weight of the likeliest hypothesis, below which a hypothesis is removed."""
 MERGE_STDS = 0.7
-"""Distance below which two neighbouring hypotheses are merged, in std of the more certain one's SOC."""
+"""SOC distance below which two neighbouring hypotheses are merged, in multiples of the smaller SOC std of the two."""
 
 
 @njit(cache=True)

@@ -121,7 +121,7 @@ EKF_SETTINGS = np.dtype(
         ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
         ("current_step_a", "f8"),  # resolution of the reported current [A]; 0: not rounded
         ("dead_band_a", "f8"),  # current below which the sensor reports 0 [A]
-        *[(field.name, "f8") for field in fields(Noise)],  # volts are those of the pack
+        *[(field.name, "f8") for field in fields(Noise)],  # voltages are of the whole pack
     ],
     align=True,
 )
@@ -163,7 +163,7 @@ EKF_STATE = np.dtype(
     [
         ("mean", "f8", (HYPOTHESES, STATES)),
         ("covariance", "f8", (HYPOTHESES, STATES, STATES)),
-        ("ln_weight", "f8", HYPOTHESES),  # log-weights; that of the best is 0 after merging
+        ("ln_weight", "f8", HYPOTHESES),  # log-weights; the best hypothesis has 0 after merging
         ("minute_u", "f8", HYPOTHESES),  # running mean of the normalized innovation over a minute
         ("ten_minutes_u", "f8", HYPOTHESES),  # running mean of the normalized innovation over ten minutes
         ("fast_inflation", "f8", HYPOTHESES),  # factor on the variance of B_FAST

@@ -1,8 +1,8 @@
 """Battery monitors of Victron Energy, BMV and SmartShunt: the text half of the VE.Direct protocol.
 
 The device sends a block each second. Each line is CR LF, label, tab and value. The value of the last line, ``Checksum``,
-is one byte that makes the sum of all bytes of the block 0 modulo 256 (Victron's VE.Direct protocol and its FAQ). V in mV, I in mA and positive on charge, T in
-degrees Celsius where there is a sensor. A second block contains history. HEX messages, from ``:`` to the end of the
+is one byte that makes the sum of all bytes of the block 0 modulo 256 (Victron's VE.Direct protocol and its FAQ). The labels
+are V [mV], I [mA, positive on charge] and T [degrees Celsius, only with a sensor]. A second block contains history. HEX messages, from ``:`` to the end of the
 line, may appear in between and are not part of the checksum.
 """
 
@@ -46,7 +46,7 @@ class VeDirectProtocol(ReadingProtocol):
             return None
         return f"VE.Direct battery monitor {self._product}, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
-    def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - the block carries no time
+    def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - the base class adds the time
         self._unparsed += data
         while (at := self._unparsed.find(END)) >= 0 and len(self._unparsed) > at + len(END):
             end = at + len(END) + 1

@@ -1,4 +1,4 @@
-"""Conversion of snapshots to InfluxDB's line protocol, with the names that Telegraf gives MQTT payloads. Pure."""
+"""Conversion of snapshots to InfluxDB's line protocol, with the names that Telegraf gives MQTT payloads. No I/O."""
 
 from collections.abc import Iterator, Mapping
 from datetime import datetime

@@ -1,4 +1,4 @@
-"""AsyncAPI 3 document of all topics, generated from the payload models. Pure."""
+"""AsyncAPI 3 document of all topics, generated from the payload models. No I/O."""
 
 from typing import Any
 

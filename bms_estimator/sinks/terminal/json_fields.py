@@ -1,4 +1,4 @@
-"""Fields of a payload with the requested types, because other versions or publishers may send any value. Pure."""
+"""Fields of a payload with the requested types, because other versions or publishers may send any value. No I/O."""
 
 MAX_ABS_NUMBER = 1e12
 """Maximum absolute value of an accepted number. No quantity of a battery exceeds it, and longer text would fill a screen."""

@@ -1,4 +1,4 @@
-"""Screen of the terminal view: a table of packs, alarms and faults, the last log lines and a hint. Pure."""
+"""Screen of the terminal view: a table of packs, alarms and faults, the last log lines and a hint. No I/O."""
 
 from collections.abc import Sequence
 

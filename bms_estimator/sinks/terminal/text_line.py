@@ -1,4 +1,4 @@
-"""One line of text for each message of a pack, for a file or a pipe. Pure."""
+"""One line of text for each message of a pack, for a file or a pipe. No I/O."""
 
 from bms_estimator.mqtt.topic_cache import DeviceMessage
 from bms_estimator.sinks.terminal.json_fields import JsonFields

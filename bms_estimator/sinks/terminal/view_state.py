@@ -1,4 +1,4 @@
-"""State of the terminal view: last publications of all packs, the broker's outage, and the log. Pure."""
+"""State of the terminal view: last publications of all packs, the broker's outage, and the log. No I/O."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

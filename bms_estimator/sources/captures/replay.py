@@ -68,8 +68,8 @@ class RawCapture:
         decoder_settings = sensor or recorded
         if decoder_settings.protocol != recorded.protocol:
             raise UserError(
-                f"{path}: recorded from protocol {recorded.protocol!r}, and sensor.protocol is {decoder_settings.protocol!r}: "
-                "give settings with that protocol, or none"
+                f"{path}: recorded with protocol {recorded.protocol!r}, but sensor.protocol is {decoder_settings.protocol!r}: "
+                f"give settings with protocol {recorded.protocol!r}, or no settings"
             )
         self.decoder = make_protocol(
             decoder_settings.model_copy(update={"current_sign": current_sign or decoder_settings.current_sign})
@@ -207,8 +207,8 @@ def open_capture(
 
     Args:
         path: The file.
-        sensor: Settings for decoding a raw capture, and the current sign of a table that defines none. None: the settings
-            in the header of a raw capture; discharge is positive in a table.
+        sensor: Settings that decode a raw capture. Their current sign also applies to a table without one. If None, a raw
+            capture is decoded with the settings in its header, and discharge is positive in a table.
         current_sign: Direction of positive current, which overrides ``sensor``, header and format.
 
     Raises:

@@ -20,8 +20,8 @@ Words = Mapping[tuple[Table, int], int]
 _FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
 
 
-class Value(NamedTuple):
-    """A register value and its quantity."""
+class RegisterQuantity(NamedTuple):
+    """Quantity of the battery, and the register that holds it."""
 
     quantity: str
     """Key within ``[source]``: ``voltage``, ``current``, ``temperature``, ``cells``."""
@@ -39,7 +39,7 @@ class Request(NamedTuple):
     table: Table
     address: int
     words: int
-    values: tuple[Value, ...]
+    values: tuple[RegisterQuantity, ...]
     """Values in the request, by address."""
 
     @property
@@ -50,16 +50,18 @@ class Request(NamedTuple):
         return f"{quantities} ({self.table} register{'s' if last else ''} {self.address}{last})"
 
 
-def list_values(settings: ModbusSource) -> tuple[Value, ...]:
+def list_values(settings: ModbusSource) -> tuple[RegisterQuantity, ...]:
     """Return the values to read from the device."""
     single_registers = {"voltage": settings.voltage, "current": settings.current, "temperature": settings.temperature}
-    values = [Value(quantity, register) for quantity, register in single_registers.items() if register is not None]
+    values = [
+        RegisterQuantity(quantity, register) for quantity, register in single_registers.items() if register is not None
+    ]
     if settings.cells is not None:
-        values += [Value("cells", settings.cells.cell(number)) for number in range(settings.cells.count)]
+        values += [RegisterQuantity("cells", settings.cells.cell(number)) for number in range(settings.cells.count)]
     return tuple(values)
 
 
-def plan_requests(values: Sequence[Value], *, gap: int = GAP_WORDS) -> tuple[Request, ...]:
+def plan_requests(values: Sequence[RegisterQuantity], *, gap: int = GAP_WORDS) -> tuple[Request, ...]:
     """Return the requests that read ``values``, as few as possible.
 
     A request reads one table, at most ``MAX_WORDS`` registers, and at most ``gap`` unused registers between two values.
@@ -105,7 +107,7 @@ def decode(register: Register, words: Words) -> float:
     return math.nan if raw == register.absent or not math.isfinite(value) else round(value, DECIMALS)
 
 
-def decode_reading(values: Sequence[Value], words: Words) -> Reading | None:
+def decode_reading(values: Sequence[RegisterQuantity], words: Words) -> Reading | None:
     """Return the reading with the device's sign of current; None without voltage or current."""
     decoded: dict[str, list[float]] = {}
     for quantity, register in values:

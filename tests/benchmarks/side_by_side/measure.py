@@ -28,15 +28,15 @@ Starts = Iterable[tuple[float, CellModel]]
 """Initial cell models, each with the factor by which its resistances are wrong."""
 
 ENTRY_SOC_ERROR, LEARNING_SOC_ERROR = 0.2, 0.1
-"""The SOC that a method is given is too low by these: in mid-load of a capture, and at the start of learning."""
+"""Errors by which the initial SOC is too low: for the SOC estimate from mid-load, and for learning with a wrong SOC."""
 R_S_STEP = 0.5
 """Relative size of the step of R_s."""
 MIN_PULSES = 9
-"""Minimum number of pulses of a reference, which is that of their running median."""
+"""Minimum number of pulses of a reference: the length of the running median over pulses."""
 ROUNDS = 9
 """Number of measurements of the time of a step."""
 TIMED_ROWS = 20_000
-"""Number of samples of such a measurement."""
+"""Number of samples for the measurement of the time of a step."""
 
 VOLTAGE, VOLTAGE_WRONG, SOC = "voltage", "voltage, learned at SOC -0.1", "SOC"
 R_S, TAU_TS, TAU_TL = "R_s", "RC short", "RC long"

@@ -123,7 +123,7 @@ class Elements:
 
 
 class FixedEkf(Elements):
-    """Result with constant a1..a15 whose SOC is that of an EKF with the cell's elements at SOC 0.5."""
+    """Result with constant a1..a15 and the SOC of an EKF with the cell's elements at SOC 0.5."""
 
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
         """Return the SOC as ``Learned`` does."""
@@ -131,7 +131,7 @@ class FixedEkf(Elements):
 
 
 class Counted(Elements):
-    """Result with constant a1..a15 whose SOC is counted."""
+    """Result with constant a1..a15 and the SOC by coulomb counting."""
 
     def soc(self, samples: SampleBlock, start_soc: float) -> Floats | None:
         """Return the SOC as ``Learned`` does."""

@@ -2,8 +2,8 @@
 
 A rest is used if it lasts at least ten minutes and the load before it has moved enough charge. Its first twenty minutes are
 fitted by v = v_inf - b_1 e^(-t/tau_1) - b_2 e^(-t/tau_2), in which each second has the same weight. A real cell relaxes with
-more than two time constants, so that the result depends on the length of the window. Therefore this reference is valid to a
-factor, not to percent.
+more than two time constants, so that the result depends on the length of the window. Therefore this reference can show that a method is
+wrong by a factor, but not by some percent.
 """
 
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from tests.benchmarks.side_by_side.trials import Block
 MIN_REST_S, WINDOW_S = 600.0, 1200.0
 """Minimum duration of a rest, and duration of its part that is fitted [s]."""
 MIN_MOVED = 0.02
-"""Minimum charge moved by the load before a rest, as a fraction of the capacity. A pulse does not excite the slow branch."""
+"""Minimum charge moved by the load before a rest, as a fraction of the capacity. A pulse does not excite the slow RC pair."""
 LOWEST_SOC = 0.1
 """SOC below which neither rests nor pulses are used."""
 INITIAL_TAUS = (0.01, 0.3)
 """Time constants at the start of the fit [windows]."""
 MIN_TAU_S, MAX_TAU_WINDOWS = 1.0, 3.0
-"""Limits of the time constants [s] and [windows]."""
+"""Lower limit [s] and upper limit [windows] of the time constants."""
 MIN_TAU_RATIO = 2.5
-"""Minimum ratio of the two time constants. Nearer ones cannot be distinguished from a single one."""
+"""Minimum ratio of the two time constants. Time constants that are nearer cannot be distinguished from a single one."""
 MIN_AMPLITUDE = 3.0
 """Minimum amplitude of each exponential, in multiples of the RMS residual."""
 MIN_RESIDUAL_V = 3e-4
@@ -137,7 +137,7 @@ def settling_time_s(
         hold_s: Time for which the ratio must stay there [s].
 
     Returns:
-        Infinite if the ratio never stays there; None if it deviated more than half of the time before the step, too.
+        Infinite if the ratio never stays there; None if it also deviated for more than half of ``hold_s`` before the step.
     """
     inside = np.abs(ratio - 1.0) < within
     before = (time_s < jump_s) & (time_s >= jump_s - hold_s)

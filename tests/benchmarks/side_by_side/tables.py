@@ -98,7 +98,7 @@ def figure_table(name: str, figures: list[Figure], title: str, digits: int) -> T
         if PYBOP in methods and not has_pybop.all():
             means = (mean_over_rows(column, digits) for column in values[has_pybop].T)
             table.add_row(f"geometric mean, the {has_pybop.sum()} rows of PyBOP", *means)
-    # The cell file itself has no rank. A failed method (NaN) ranks last; one without a value has no rank in this row.
+    # The cell file has no rank. A failed method (NaN) ranks last. A method without a value has no rank in this row.
     ranked_methods = [j for j, method in enumerate(methods) if method != FILE.name]
     finite_or_last = np.nan_to_num(values, nan=np.inf, posinf=np.inf)
     ranked_values = np.where(values == NO_VALUE, np.nan, finite_or_last)[:, ranked_methods]

@@ -19,7 +19,7 @@ from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import LEAF, LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_PULSES, Recipe, load
 
 START_FACTORS = (2.0, 0.5)
-"""Resistances of the two start cells, divided by those of the cell file."""
+"""Factors by which the resistances of the two start cells differ from the cell file."""
 ELEMENT_ERROR_V = 0.02
 """Voltage error of the elements that the start cells declare [V]."""
 TEMPERATURE_RANGE_K = 10.0
@@ -140,7 +140,7 @@ def at_temperature(cell: CellModel, temperature_c: float) -> CellModel:
 def scale_resistances(cell: CellModel, factor: float, temperature_c: float) -> CellModel:
     """Return a cell with ``factor`` times the resistances at ``temperature_c``, and an RC ladder of its two RC pairs.
 
-    It has no bounds of its own for the adaptation.
+    The cell has no bounds for the adaptation.
     """
     sections: dict[str, object] = {"adaptation": {}}
     for name in ("r_s", "r_ts", "r_tl"):

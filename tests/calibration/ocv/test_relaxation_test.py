@@ -83,7 +83,8 @@ def test_without_noise_a_long_rest_is_extrapolated_to_a_fifth_of_a_millivolt():
 def test_rests_of_any_length_are_within_their_std(rest_s):
     result = relaxation_test(relaxation(rest_s=rest_s, rounds=ROUNDS), CAPACITY_AH, name="mine")
     assert len(result.rests) + len(result.rejected) == 1 + ROUNDS
-    assert len(result.rejected) <= (rest_s < 400)  # the last rest, at a low SOC at which the time constants are long
+    # only the last of the rests of 240 s may be rejected, because near empty the time constants are long
+    assert len(result.rejected) <= (1 if rest_s == 240 else 0)
     error_v = np.abs(result.ocv_v - true_ocv_v(result.soc))
     max_error_v = {240: 0.016, 400: 8e-3, 3600: 1e-3}[rest_s]
     assert error_v.max() < max_error_v

@@ -12,7 +12,7 @@ from bms_estimator.calibration.ocv.sources import (
     Recording,
     center_on_typical_hysteresis,
     find_sources,
-    without_branches,
+    subtract_rc_overpotential,
 )
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
@@ -75,7 +75,7 @@ def test_an_unpaired_curve_is_moved_by_half_of_a_typical_hysteresis(direction):
     centered = center_on_typical_hysteresis(result, typical_v)
     uncorrected, points = result.points, centered.points
     assert points.ocv_v - uncorrected.ocv_v == pytest.approx(direction * hysteresis_v(uncorrected.soc), abs=1e-4)
-    assert (points.common_v > uncorrected.common_v).all()
+    assert (points.systematic_std_v > uncorrected.systematic_std_v).all()
     assert centered.hysteresis_v == pytest.approx(typical_v)
     assert centered.hysteresis_std_v == pytest.approx(TYPICAL_HYSTERESIS_STD * typical_v)
 
@@ -86,12 +86,14 @@ def test_the_overpotential_of_an_unpaired_curve_is_subtracted(direction, rested)
     """The ohmic drop is also subtracted if no step from or to a rest determines it."""
     samples, ladder = slow((direction,)), load_cell("nca", CAPACITY_AH).ladder
     result = sources_of(samples if rested else samples[samples["current_a"] != 0.0], capacity_ah=CAPACITY_AH)
-    uncorrected, (source,) = result.points, without_branches(result, ladder).sources
+    uncorrected, (source,) = result.points, subtract_rc_overpotential(result, ladder).sources
     # With a rest, the step of the current has already shown the series resistance, the first row.
     rows = [row for part in (ladder.weak_ohm, ladder.strong_ohm) for row in part[int(rested) :]]
     drop_v = CURRENT_A * sum(np.interp(uncorrected.soc, ladder.soc, row) for row in rows)
     assert source.points.ocv_v - uncorrected.ocv_v == pytest.approx(direction * drop_v, rel=1e-3)
-    assert source.points.common_v == pytest.approx(np.hypot(uncorrected.common_v, ladder.std * drop_v), rel=1e-3)
+    assert source.points.systematic_std_v == pytest.approx(
+        np.hypot(uncorrected.systematic_std_v, ladder.std * drop_v), rel=1e-3
+    )
     assert source.notes[-1].startswith(f"{1e3 * drop_v.mean():.0f} mV")
 
 
@@ -101,14 +103,14 @@ def test_a_cold_unpaired_curve_has_a_larger_overpotential():
     for temperature_c in (25.0, 0.0):
         samples["temperature_c"] = temperature_c
         result = sources_of(samples)
-        overpotential_v.append((without_branches(result, ladder).points.ocv_v - result.points.ocv_v).mean())
+        overpotential_v.append((subtract_rc_overpotential(result, ladder).points.ocv_v - result.points.ocv_v).mean())
     assert 1.5 < overpotential_v[1] / overpotential_v[0] < 5.0
 
 
 def test_no_overpotential_is_subtracted_from_pairs_rests_and_given_curves():
     soc, ladder = np.linspace(0.0, 1.0, 101), load_cell("nca", CAPACITY_AH).ladder
     result = sources_of(slow((1.0, -1.0)), relaxation(), curves=[ExternalCurve("book", soc, true_v(soc), None)])
-    assert without_branches(result, ladder) == result
+    assert subtract_rc_overpotential(result, ladder) == result
 
 
 def test_rests_and_given_curves_without_hysteresis_are_moved_by_half_of_a_typical_hysteresis():

@@ -19,11 +19,13 @@ def true_v(soc):
     return chen_mora(np.array(TABLE_1), soc)
 
 
-def make_points(soc, *, noise_v=0.0, offset_v=0.0, std_v=1e-3, common_v=2e-3, temperature_c=np.nan, seed=0):
-    """Return points of one capture; ``common_v`` is the std of an error that all points share [V]."""
+def make_points(soc, *, noise_v=0.0, offset_v=0.0, std_v=1e-3, systematic_std_v=2e-3, temperature_c=np.nan, seed=0):
+    """Return points of one capture; ``systematic_std_v`` is the std of an error that all points share [V]."""
     ocv_v = true_v(soc) + offset_v + noise_v * np.random.default_rng(seed).standard_normal(soc.size)
     ones = np.ones(soc.size)
-    return Points(soc, ocv_v, std_v * ones, common_v=common_v * ones, temperature_c=temperature_c * ones)
+    return Points(
+        soc, ocv_v, std_v * ones, systematic_std_v=systematic_std_v * ones, temperature_c=temperature_c * ones
+    )
 
 
 def slope_v(fit, soc):
@@ -33,7 +35,9 @@ def slope_v(fit, soc):
 
 @pytest.mark.parametrize(("noise_v", "max_error_v"), [(0.0, 1.5e-3), (3e-3, 4e-3)])
 def test_table_is_increasing_and_near_the_true_curve(noise_v, max_error_v):
-    fit = fit_table(make_points(np.linspace(0.02, 0.99, 40), noise_v=noise_v, std_v=noise_v + 5e-4, common_v=5e-4))
+    fit = fit_table(
+        make_points(np.linspace(0.02, 0.99, 40), noise_v=noise_v, std_v=noise_v + 5e-4, systematic_std_v=5e-4)
+    )
     assert (fit.soc[0], fit.soc[-1]) == (0.0, 1.0)
     assert (np.diff(fit.ocv_v) > 0.0).all()
     assert (np.diff(fit(GRID)) > 0.0).all()
@@ -45,7 +49,7 @@ def test_table_is_increasing_and_near_the_true_curve(noise_v, max_error_v):
 def test_slopes_between_clustered_noisy_points_are_those_of_the_curve():
     """The points are 0.004 apart with errors of 3 mV, so that lines through them have slopes of several volts."""
     soc = np.concatenate([z + np.array([0.0, 0.004, 0.008, 0.02]) for z in np.arange(0.05, 0.95, 0.05)])
-    points = make_points(soc, noise_v=3e-3, std_v=5e-4, common_v=2e-3)
+    points = make_points(soc, noise_v=3e-3, std_v=5e-4, systematic_std_v=2e-3)
     assert np.abs(np.diff(points.ocv_v) / np.diff(soc)).max() > 1.5
     inside = GRID[(GRID > 0.15) & (GRID < 0.9)]
     true_slope_v = (true_v(inside + 1e-4) - true_v(inside - 1e-4)) / 2e-4
@@ -62,7 +66,9 @@ def test_points_that_fall_give_an_increasing_table():
 
 def test_the_error_of_the_curve_equals_the_scatter_of_the_fits():
     soc = np.linspace(0.05, 0.98, 30)
-    fits = [fit_table(make_points(soc, noise_v=2e-3, std_v=2e-3, common_v=1e-4, seed=seed)) for seed in range(40)]
+    fits = [
+        fit_table(make_points(soc, noise_v=2e-3, std_v=2e-3, systematic_std_v=1e-4, seed=seed)) for seed in range(40)
+    ]
     inside = (NODES > 0.15) & (NODES < 0.95)
     error_over_std = np.array([(fit.ocv_v - true_v(NODES)) / fit.error_v for fit in fits])[:, inside]
     assert 0.3 < np.sqrt(np.mean(error_over_std**2)) < 1.1
@@ -83,7 +89,9 @@ def test_the_error_is_larger_in_a_gap_beyond_the_points_and_if_captures_disagree
 
 def test_the_more_certain_source_determines_the_curve():
     soc = np.linspace(0.05, 0.98, 45)
-    fit = fit_table(joined([make_points(soc, common_v=1e-3), make_points(soc, offset_v=0.02, common_v=0.02)]))
+    fit = fit_table(
+        joined([make_points(soc, systematic_std_v=1e-3), make_points(soc, offset_v=0.02, systematic_std_v=0.02)])
+    )
     inside = (NODES > 0.15) & (NODES < 0.95)
     assert max_v((fit.ocv_v - true_v(NODES))[inside]) < 2e-3
 
@@ -102,12 +110,13 @@ def test_known_end_voltages_are_reached_and_unknown_ones_are_extrapolated():
 def test_the_temperature_coefficient_is_between_its_true_value_and_0(per_kelvin_v):
     soc = np.linspace(0.05, 0.98, 45)
     at_temperatures = [
-        make_points(soc, offset_v=per_kelvin_v * (t - 25.0), temperature_c=t, common_v=5e-4) for t in (15.0, 25.0, 45.0)
+        make_points(soc, offset_v=per_kelvin_v * (t - 25.0), temperature_c=t, systematic_std_v=5e-4)
+        for t in (15.0, 25.0, 45.0)
     ]
     fitted_per_kelvin_v = fit_table(joined(at_temperatures)).per_kelvin_v
     assert fitted_per_kelvin_v is not None
     assert fitted_per_kelvin_v[10:-10] == pytest.approx(np.full(NODES.size - 20, per_kelvin_v), rel=0.25)
-    cold = make_points(soc, offset_v=-30.0 * per_kelvin_v, temperature_c=-5.0, common_v=4e-3)
+    cold = make_points(soc, offset_v=-30.0 * per_kelvin_v, temperature_c=-5.0, systematic_std_v=4e-3)
     cold = replace(cold, cold_v=np.full(soc.size, 0.016))
     with_cold_rests = fit_table(joined([at_temperatures[1], cold])).per_kelvin_v
     assert with_cold_rests is not None
@@ -127,6 +136,9 @@ def test_points_of_cells_in_series_give_the_table_times_their_number():
     soc = np.linspace(0.05, 0.98, 45)
     cell_points = make_points(soc, noise_v=1e-3)
     pack_points = replace(
-        cell_points, ocv_v=6.0 * cell_points.ocv_v, std_v=6.0 * cell_points.std_v, common_v=6.0 * cell_points.common_v
+        cell_points,
+        ocv_v=6.0 * cell_points.ocv_v,
+        std_v=6.0 * cell_points.std_v,
+        systematic_std_v=6.0 * cell_points.systematic_std_v,
     )
     assert fit_table(pack_points).ocv_v == pytest.approx(6.0 * fit_table(cell_points).ocv_v, rel=2e-3)

@@ -379,4 +379,4 @@ def test_recording_of_another_protocol_is_rejected(tmp_path, capsys):
     pack.write_text("")
     code, _, err = run(capsys, "replay", capture, "--pack", pack)
     assert code == 2
-    assert "recorded from protocol 'junctek', and sensor.protocol is 'binary'" in err
+    assert "recorded with protocol 'junctek', but sensor.protocol is 'binary'" in err

@@ -24,7 +24,7 @@ DECLARED_AH = 1.1 * OXIDE.capacity_ah
 
 def simulate_discharge(seed: int, **changes: object):
     """Simulate a discharge of six equal cells from full, at 1 Hz. Return its samples and true SOC."""
-    case = Case("", seed=seed, soc=1.0, unseen_h=0.0, hours=1.6, **changes)
+    case = Case("", seed=seed, soc=1.0, load_before_h=0.0, hours=1.6, **changes)
     simulated = capture(case)
     simulated.samples["voltage_v"] *= SERIES
     return simulated

@@ -110,11 +110,12 @@ def test_sign_of_the_current_is_an_option(tables, tmp_path, capsys):
 
 
 def test_cell_file_with_worse_replays_is_not_written(tables, tmp_path, capsys, monkeypatch):
+    # before the fit, after a fit with the given OCV, and after a fit with a corrected OCV
     scores = iter([1.0, 9.0, 9.0])
     monkeypatch.setattr(identify, "interval_score", lambda *_: next(scores))
     out = tmp_path / "worse.toml"
     code, text, err = run(capsys, "identify", tables / "steps0.csv", "--cell", "ncr18650", "--out", out)
     assert (code, text) == (2, "")
-    assert "nothing is written: replays cut in mid-load get worse" in err
+    assert "nothing is written: replays that start in mid-load get worse" in err
     assert "from 1.00 to 9.00 % of SOC" in err
     assert not out.exists()

@@ -76,7 +76,7 @@ def test_several_captures_are_fitted_jointly(captures, tmp_path, capsys):
     cell = load_cell(out)
     assert cell.cell.series_count == 1
     assert "OCV: 20 rests of run0.csv, 20 rests of run1.csv" in out.read_text()
-    # circuit elements are estimated roughly from the rests; at SOC 0.5 the true cell has 0.0861 ohm and about 20 mohm
+    # circuit elements are estimated roughly from the rests; at SOC 0.5 the true R_s is 86.1 mohm and the true R_tl about 20 mohm
     assert cell.r_s.offset_ohm == pytest.approx(0.0861, rel=0.15)
     assert 0.01 < cell.r_tl.offset_ohm < 0.05
 
@@ -227,7 +227,8 @@ def test_kinds_of_captures_are_recognized_and_combined_to_one_curve(tmp_path, ca
 
 @pytest.mark.parametrize("direction", ["dis", "chg"])
 def test_unpaired_slow_curve_of_lfp_is_centered_on_the_hysteresis(tmp_path, capsys, shared_data, direction):
-    """On a plateau, a tenth of the charge or more lies within the hysteresis. That of the generic cell is used."""
+    """On a plateau, the hysteresis corresponds to 0.1 of SOC or more, so the curve is shifted by the hysteresis of the generic
+    cell."""
     folder, out, pair = shared_data / "a123", tmp_path / "lone.toml", tmp_path / "pair.toml"
     files = {name: folder / f"c30_{name}_p25.csv.gz" for name in ("dis", "chg")}
     for captures, cell_file in (([files[direction]], out), (list(files.values()), pair)):
@@ -255,6 +256,7 @@ def test_unpaired_slow_curve_of_a_layered_oxide_is_corrected(tmp_path, capsys, d
     deviation_v = np.interp(soc, ocv.soc, ocv.ocv_v) - np.interp(soc, published["soc"], published["ocv_v"])
     assert abs(deviation_v.mean()) < 5e-3
     assert np.sqrt(np.mean(deviation_v**2)) < 10e-3
+    # resistances with weak temperature dependence
     ladder, generic = load_cell(out).ladder, load_cell("nca", 4.945).ladder
     assert np.array(ladder.weak_ohm) == pytest.approx(np.array(generic.weak_ohm), rel=1e-3)
 

@@ -46,7 +46,7 @@ def test_first_start_reports_the_compilation_and_can_be_interrupted(command: str
 
 def test_line_is_printed_once_and_only_if_a_kernel_is_compiled() -> None:
     lines: list[str] = []
-    kernel = njit(chen_mora.crossing.py_func)  # not in the cache
+    kernel = njit(chen_mora.min_stable_exponent.py_func)  # not in the cache
     with show_compile_progress(lines.append):
         kernel(0.5, 1.0, 2.0)
         njit(chen_mora.delta.py_func)(0.5, 1.0, 2.0)

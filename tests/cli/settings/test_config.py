@@ -45,6 +45,7 @@ def test_file_of_init_contains_all_settings_and_is_valid_with_all_of_them_uncomm
     lines = pack.read_text().splitlines()
     for name, field in Settings.model_fields.items():
         assert f"[{name}]" in lines or f"#[{name}]" in lines, field
+    # a required setting has no default: its line ends in "= " and is not valid TOML
     uncommented = [line.removeprefix("#") for line in lines if not line.startswith("# ") and not line.endswith("= ")]
     sections = re.split(r"^(?=\[)", "\n".join(uncommented), flags=re.MULTILINE)
     sources = [section for section in sections if section.startswith("[source]")]
@@ -59,14 +60,14 @@ def test_file_of_init_contains_all_settings_and_is_valid_with_all_of_them_uncomm
         loaded = load_settings(pack)
         assert loaded.source
         assert loaded.source.kind in KINDS
-        assert loaded.sensor.protocol == "text"
+        assert loaded.sensor.protocol == "text"  # the decoder of all sources except the serial line
         checked_fields = set(written["sensor"]) - {"protocol"}
         assert loaded.sensor.model_dump(include=checked_fields) == Settings().sensor.model_dump(include=checked_fields)
 
 
 @pytest.fixture
 def long_probe(monkeypatch):
-    """Let a probe decide soon that the device is no board, and then wait for the answers of other protocols."""
+    """Shorten the wait for a board, and lengthen the wait for answers in other protocols."""
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.1)
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
 
@@ -196,7 +197,7 @@ def test_file_of_init_contains_units_and_limits_of_settings(pack, capsys):
 
 
 def default_settings(capsys):
-    """Return the output of ``show`` without a file, which has the defaults."""
+    """Return the default settings, as ``show`` prints them without a file."""
     code, out, _ = run(capsys, "config", "show")
     assert code == 0
     return out

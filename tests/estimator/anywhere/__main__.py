@@ -3,8 +3,8 @@
 import sys
 
 from tests.estimator.anywhere import cycles
-from tests.estimator.anywhere.summary import PATH, rows, write
+from tests.estimator.anywhere.summary import SUMMARY_PATH, rows, write
 
 write(rows())
 cycles.write(row for chemistry in cycles.CHEMISTRIES for row in cycles.rows(chemistry))
-sys.stdout.write(f"{PATH}\n{cycles.PATH}\n")
+sys.stdout.write(f"{SUMMARY_PATH}\n{cycles.SUMMARY_PATH}\n")

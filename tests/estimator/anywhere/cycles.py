@@ -1,8 +1,8 @@
 """Full cycles and charges from empty on the first day of a cell of which only chemistry and capacity are known.
 
 The estimator has the generic cell file and no initial SOC. The true cell has the OCV of a measured cell (LG M50, NCR18650,
-Leaf, the LFP test cell) or a random OCV with errors up to 1.5 std (LCO, LTO). Its resistances are 0.7 to 3 times those of
-the generic cell.
+Leaf, the LFP test cell) or a random OCV with errors up to 1.5 std (LCO, LTO). Its resistances are 0.7 to 3 times as large as
+in the generic cell.
 """
 
 import csv
@@ -25,9 +25,11 @@ from tests.estimator.anywhere.truth import GRID, curve_of, measured_curve, simul
 from tests.estimator.anywhere.use import drive
 
 CAPACITY_AH = 3.0
+"""Capacity of all cells [Ah]."""
 AFTER_S = 300.0
 """Time after switch-on that is not scored [s]."""
 EMPTY_SOC = 0.02
+"""SOC at which a capture ends after the charge."""
 REST_S = 900
 """Rest between two phases [s]."""
 TAIL_S = 4 * 3600
@@ -44,7 +46,7 @@ class Cycle:
     begin: Literal["discharge", "charge"]
     """First phase: a discharge at 1 C to empty, or the charge of an empty cell."""
     resistance: float
-    """Resistance of the true cell over that of the generic cell."""
+    """Resistance of the true cell divided by the resistance of the generic cell."""
     soc: float
     """SOC at the first sample, from rest."""
     charge_c: float = 1.0
@@ -59,19 +61,20 @@ class Cycle:
 
 def cycles(chemistry: str) -> tuple[Cycle, ...]:
     """Return the cycles of one generic cell."""
+    # different seeds for all cycles
     from_discharge = [Cycle(chemistry, "discharge", r, soc, seed=n) for n, (r, soc) in enumerate(DISCHARGES)]
     from_charge = [Cycle(chemistry, "charge", r, soc, c, seed=20 + n) for n, (r, soc, c) in enumerate(CHARGES)]
     return (*from_discharge, *from_charge)
 
 
 DISCHARGES = ((0.7, 0.41), (1.0, 0.7), (1.5, 0.41), (2.0, 0.55), (3.0, 0.41), (3.0, 0.8))
-"""Relative resistance and initial SOC of the full cycles."""
+"""Full cycles: ratio of the resistance to the generic cell's, and initial SOC."""
 CHARGES = ((0.7, 0.03, 1.0), (1.0, 0.05, 0.3), (2.0, 0.02, 0.5), (3.0, 0.05, 1.0))
-"""Relative resistance, initial SOC and current [C] of the charges from empty."""
-THREE_TIMES_PHOSPHATE = Cycle("lfp", "discharge", resistance=1.815, soc=0.41)
-"""Cycle of a cell with three times the resistances of ``PHOSPHATE``, in proportion to its capacity."""
+"""Charges from empty: ratio of the resistance to the generic cell's, initial SOC, and current [C]."""
+LFP_CYCLE_WITH_TRIPLED_RESISTANCE = Cycle("lfp", "discharge", resistance=1.815, soc=0.41)
+"""Cycle of a cell whose resistances, multiplied by the capacity, are three times as large as in ``PHOSPHATE``."""
 MAX_CURVE_STDS = 1.5
-"""Maximum error of a random true curve, in std of the generic one."""
+"""Maximum error of a random true curve, in std of the generic curve."""
 CHEMISTRIES = ("nmc", "nca", "lfp", "lmo", "lco", "lto")
 
 
@@ -116,10 +119,10 @@ def capture(cycle: Cycle) -> tuple[SampleBlock, Floats]:
         """Return the current that flowed, the voltage and the SOC."""
         current_a = load(cycle, np.random.default_rng(3000 + cycle.seed), charge_s)
         room_c = np.full(current_a.size, 25.0)
-        branch = -1.0  # the cell was discharged
-        return current_a, *simulate(1.0, current_a, room_c, cycle.soc, branch, CAPACITY_AH, *curves, **limits)
+        hysteresis = -1.0  # the cell was discharged
+        return current_a, *simulate(1.0, current_a, room_c, cycle.soc, hysteresis, CAPACITY_AH, *curves, **limits)
 
-    # The first run shows when the charger ends the charge. The second run has no rest beyond ``REST_S`` after it.
+    # The first run shows when the charger ends the charge. In the second run, the rest after the charge begins then.
     current_a, _, _ = run(MAX_CHARGE_S)
     charge_s = int(np.count_nonzero(current_a[: -REST_S - TAIL_S] < 0.0))
     current_a, voltage_v, soc = run(charge_s)
@@ -147,20 +150,20 @@ class CycleRow:
 
     cycle: Cycle
     score: Score
-    capacity: float
+    capacity_error_percent: float
     """Relative error of the learned capacity [%]."""
-    initializations: int
+    reinitializations: int
     """Number of re-initializations of the filter."""
 
     @property
     def line(self) -> list[str]:
-        """Return the columns ``HEAD`` of the checked-in summary."""
-        values = (self.score.rmse, self.score.cover, self.score.std, self.score.score, self.capacity)
+        """Return the columns ``SUMMARY_COLUMNS`` of the checked-in summary."""
+        values = (self.score.rmse, self.score.cover, self.score.std, self.score.score, self.capacity_error_percent)
         return [self.cycle.name, *(f"{value:.1f}" for value in values)]
 
 
-HEAD = ["cycle", "rmse", "cover", "std", "score", "capacity"]
-PATH = Path(__file__).with_name("cycles.csv")
+SUMMARY_COLUMNS = ["cycle", "rmse", "cover", "std", "score", "capacity"]
+SUMMARY_PATH = Path(__file__).with_name("cycles.csv")
 
 
 def row(cycle: Cycle) -> CycleRow:
@@ -181,5 +184,5 @@ def rows(chemistry: str) -> list[CycleRow]:
 
 def write(table: Iterable[CycleRow]) -> None:
     """Write the checked-in summary."""
-    with PATH.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([HEAD, *(r.line for r in table)])
+    with SUMMARY_PATH.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([SUMMARY_COLUMNS, *(r.line for r in table)])

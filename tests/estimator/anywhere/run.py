@@ -12,7 +12,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 
 BLOCK_S = 600.0
-"""Duration over which innovations are summed [s]. Model errors that last so long disturb the SOC."""
+"""Duration over which innovations are summed [s]. Errors of the model that last for minutes disturb the SOC."""
 MIN_UPDATES_OF_BLOCK = 0.5
 """Minimum number of updates of a block, as a fraction of the fullest block."""
 
@@ -21,7 +21,7 @@ MIN_UPDATES_OF_BLOCK = 0.5
 class Run:
     """Results at each sample, arrays of shape (n,).
 
-    ``innovation_v`` and its variance S in ``variance_v2`` are those of the last update of the filter. ``updated`` is
+    ``innovation_v`` and its variance S in ``variance_v2`` come from the last update of the filter. ``updated`` is
     True at the samples that complete an update.
     """
 

@@ -7,10 +7,11 @@ import numpy as np
 from bms_estimator.model.arrays import Floats
 
 MAX_WEIGHT_S = 60.0
-"""Maximum weight of the time between two samples [s]."""
+"""Maximum weight of a sample, so that a long gap does not dominate the score [s]."""
 LOWEST_SOC = 0.05
 """True SOC below which samples are not scored."""
 MIN_SAMPLES = 10
+"""Minimum number of scored samples."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ def score(time_s: Floats, soc: Floats, soc_std: Floats, truth: Floats, after_s: 
         return None
     weight /= weight.sum()
     error, std = (soc - truth)[judged], soc_std[judged]
+    # distance of the true SOC from the interval
     beyond = np.clip(np.abs(error) - 2.0 * std, 0.0, None)
     means = np.array([error**2, error, beyond == 0.0, std, 4.0 * std + 40.0 * beyond, (error / std) ** 2]) @ weight
     return Score(100.0 * np.sqrt(means[0]), *(100.0 * means[1:5]), means[5])

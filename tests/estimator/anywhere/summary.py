@@ -13,7 +13,7 @@ from tests.estimator.anywhere.cases import CASES, SOC_ERRORS, Capture, Case, cap
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import Score, score
 
-PATH = Path(__file__).with_name("summary.csv")
+SUMMARY_PATH = Path(__file__).with_name("summary.csv")
 DIGITS = 2
 """Decimal digits of the table."""
 
@@ -28,9 +28,9 @@ class Row:
     score: Score
     nis: float
     """Normalized innovation squared, see ``Run.nis``."""
-    capacity: float
+    capacity_error_percent: float
     """Relative error of the learned capacity [%]."""
-    reopened: int
+    reinitializations: int
     """Number of re-initializations of the SOC."""
 
 
@@ -50,31 +50,31 @@ def row(case: Case, recording: Capture, soc_error: float) -> Row:
     result = score(recording.samples["time_s"], run.soc, run.soc_std, recording.soc, case.after_s)
     assert result is not None
     f = estimator.record[0]["filter"]
-    # LN_Q is ln of the learned over the file's capacity, and ``case.capacity`` is the file's over the true one.
-    learned_over_true = case.capacity * np.exp(f["mean"][f["best"], LN_Q])
+    # LN_Q is the ln of (learned capacity / capacity in the file); ``file_capacity_ratio`` is (capacity in the file / true capacity)
+    learned_over_true = case.file_capacity_ratio * np.exp(f["mean"][f["best"], LN_Q])
     capacity_error = 100.0 * (learned_over_true - 1.0)
     return Row(case.name, soc_error, result, run.nis(case.after_s), capacity_error, int(f["reopened"]))
 
 
-HEAD = ("case", "soc_error", *(f.name for f in fields(Score)), "nis", "capacity", "reopened")
+SUMMARY_COLUMNS = ("case", "soc_error", *(f.name for f in fields(Score)), "nis", "capacity", "reopened")
 
 
 def numbers(r: Row) -> tuple[float, ...]:
-    """Return the values of the columns of ``HEAD`` after case and error."""
-    return (*astuple(r.score), r.nis, r.capacity, float(r.reopened))
+    """Return the values of the summary columns that follow the name of the case and the SOC error."""
+    return (*astuple(r.score), r.nis, r.capacity_error_percent, float(r.reinitializations))
 
 
 def write(table: list[Row]) -> None:
     """Write the checked-in table."""
-    with PATH.open("w", newline="") as file:
+    with SUMMARY_PATH.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(HEAD)
+        writer.writerow(SUMMARY_COLUMNS)
         for r in table:
             writer.writerow([r.case, f"{r.soc_error:+.1f}", *(f"{v:.{DIGITS}f}" for v in numbers(r))])
 
 
 def read() -> dict[tuple[str, float], tuple[float, ...]]:
     """Return the checked-in ``numbers`` by name of the case and error of the initial SOC."""
-    with PATH.open() as file:
+    with SUMMARY_PATH.open() as file:
         lines = list(csv.reader(file))[1:]
     return {(line[0], float(line[1])): tuple(map(float, line[2:])) for line in lines}

@@ -1,6 +1,6 @@
 """Simulation of cells that differ from the estimator's model.
 
-A cell has eight processes with time constants between those of the ladder, each with its own activation energy. One process
+A cell has eight processes, each with another time constant and activation energy than the RC pairs of the estimator. One process
 has Butler-Volmer kinetics, so that its resistance falls with the current. The OCV has a fast and a slow hysteresis and an
 entropy term. Resistances rise towards empty and full.
 """
@@ -19,13 +19,13 @@ from bms_estimator.numba_cache import njit
 GRID = np.linspace(0.0, 1.0, 401)
 """SOC grid of the true cells."""
 TAU_S = np.array([0.0, 0.4, 3.0, 17.0, 70.0, 300.0, 1200.0, 4000.0])
-"""Time constants at 25 C [s]; the first is that of the series resistance."""
+"""Time constants of the processes at 25 C [s]; 0 for the series resistance."""
 ENERGY_J = np.array([10e3, 42e3, 48e3, 38e3, 30e3, 28e3, 26e3, 24e3])
-"""Activation energies of the resistances [J/mol]; those of the time constants are half as large."""
+"""Activation energies of the resistances of the processes [J/mol]. A time constant has half of this activation energy."""
 KINETIC = 2
-"""Index of the process with kinetics: charge transfer, 3 s."""
+"""Index of the process with Butler-Volmer kinetics: charge transfer, 3 s."""
 KINETIC_V = 0.051
-"""Overpotential 2 R T / F above which the kinetic resistance falls [V]."""
+"""Overpotential 2 R T / F above which the resistance of charge transfer falls [V]."""
 COOLING_S = 900.0
 """Thermal time constant of a cell [s]."""
 GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
@@ -33,9 +33,10 @@ GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 TAPER_C = 0.05
 """Current at which a charger ends its charge [C]."""
 LOOPS_SOC, FAST_FRACTION = (0.015, 0.15), 0.6
-"""Charge constants of the fast and the slow hysteresis [SOC], and fraction of the hysteresis that is fast.
+"""SOC changes over which the fast and the slow hysteresis go from their middle to their limit, and fraction of the hysteresis
+that is fast.
 
-Both are stop operators (Prandtl), so that regeneration moves the hysteresis only by its own charge.
+Both are stop operators (Prandtl), so that regeneration moves the hysteresis only in proportion to the regenerated charge.
 """
 
 
@@ -54,8 +55,8 @@ class Truth:
 
 
 @njit
-def along(soc, values):
-    """Interpolate linearly between the points of ``GRID``."""
+def interpolate(soc, values):
+    """Interpolate values at ``GRID`` linearly."""
     position = min(max(soc, 0.0), 1.0) * (len(values) - 1)
     i = min(int(position), len(values) - 2)
     return values[i] + (position - i) * (values[i + 1] - values[i])
@@ -67,26 +68,27 @@ def simulate(
     current_a,
     room_c,
     soc,
-    branch,
+    hysteresis,
     capacity_ah,
     ocv_v,
     per_kelvin_v,
     hysteresis_v,
     ohm,
-    warms_k=0.0,
+    self_heating_k_per_w=0.0,
     low_v=-math.inf,
     high_v=math.inf,
 ):
-    """Return terminal voltage [V] and SOC at each sample, from rest at ``soc``. A current is constant until the next
+    """Return terminal voltage [V] and SOC at each sample, from rest at ``soc``. The current is constant until the next
     sample.
 
-    ``branch`` is the initial hysteresis: -1 after a discharge, 1 after a charge. A constant loss of 1 W finally warms
-    the cell by ``warms_k`` above ``room_c``. A charger limits the voltage to ``high_v`` [V] and stops at C/20. A
-    protection ends the discharge below ``low_v`` [V]. The function writes the current that flowed to ``current_a`` [A].
+    ``hysteresis`` is the initial state: -1 after a discharge, 1 after a charge. The temperature of
+    the cell finally exceeds the room temperature ``room_c`` by ``self_heating_k_per_w`` times the loss. A charger limits
+    the voltage to ``high_v`` [V] and stops at C/20. A protection ends the discharge below ``low_v`` [V]. The function writes the current that flowed to ``current_a`` [A].
     """
     voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
-    # x are the filtered currents of the processes [A], fast and slow the two parts of the hysteresis, -1..1.
-    x, fast, slow, rise_k = np.zeros(len(TAU_S)), branch, branch, 0.0
+    # x: low-pass filtered currents of the processes [A]; fast, slow: states of the two parts of the hysteresis, -1..1;
+    # rise_k: cell temperature minus room temperature [K]
+    x, fast, slow, rise_k = np.zeros(len(TAU_S)), hysteresis, hysteresis, 0.0
     stopped = 0.0  # sign of the current that a limit has stopped
     for n in range(len(current_a)):
         i, celsius = current_a[n], room_c[n] + rise_k
@@ -94,15 +96,15 @@ def simulate(
             i = 0.0
         elif i != 0.0:
             stopped = 0.0
-        cold = (1.0 / (celsius + KELVIN) - 1.0 / REFERENCE_K) / GAS_J
+        inverse_temperature = (1.0 / (celsius + KELVIN) - 1.0 / REFERENCE_K) / GAS_J
         x[0] = i
-        open_v = along(soc, ocv_v) + (celsius - 25.0) * along(soc, per_kelvin_v)
-        v = open_v + along(soc, hysteresis_v) * (FAST_FRACTION * fast + (1.0 - FAST_FRACTION) * slow)
+        open_v = interpolate(soc, ocv_v) + (celsius - 25.0) * interpolate(soc, per_kelvin_v)
+        v = open_v + interpolate(soc, hysteresis_v) * (FAST_FRACTION * fast + (1.0 - FAST_FRACTION) * slow)
         for k in range(len(TAU_S)):
-            drop_v = x[k] * along(soc, ohm[:, k]) * math.exp(ENERGY_J[k] * cold)
+            drop_v = x[k] * interpolate(soc, ohm[:, k]) * math.exp(ENERGY_J[k] * inverse_temperature)
             v -= KINETIC_V * math.asinh(drop_v / KINETIC_V) if k == KINETIC else drop_v
         if i < 0.0 and v > high_v:
-            series_ohm = along(soc, ohm[:, 0]) * math.exp(ENERGY_J[0] * cold)
+            series_ohm = interpolate(soc, ohm[:, 0]) * math.exp(ENERGY_J[0] * inverse_temperature)
             held_a = min(i + (v - high_v) / series_ohm, 0.0)
             v -= series_ohm * (held_a - i)
             i = held_a
@@ -112,11 +114,11 @@ def simulate(
             stopped = 1.0
         current_a[n] = i
         voltage_v[n], true_soc[n] = v, soc
-        rise_k += (warms_k * i * (open_v - v) - rise_k) * dt_s / COOLING_S
+        rise_k += (self_heating_k_per_w * i * (open_v - v) - rise_k) * dt_s / COOLING_S
         drawn_soc = i * dt_s / 3600.0 / capacity_ah
         soc -= drawn_soc
         for k in range(1, len(TAU_S)):
-            x[k] = i + (x[k] - i) * math.exp(-dt_s / (TAU_S[k] * math.exp(0.5 * ENERGY_J[k] * cold)))
+            x[k] = i + (x[k] - i) * math.exp(-dt_s / (TAU_S[k] * math.exp(0.5 * ENERGY_J[k] * inverse_temperature)))
         fast = min(max(fast - drawn_soc / LOOPS_SOC[0], -1.0), 1.0)
         slow = min(max(slow - drawn_soc / LOOPS_SOC[1], -1.0), 1.0)
     return voltage_v, true_soc
@@ -125,23 +127,23 @@ def simulate(
 def impedance(truth: Truth, node: int, temperature_c: float, rad_s: Floats, current_a: float) -> Floats:
     """Return the complex impedance at ``GRID[node]`` and angular frequencies ``rad_s`` [ohm].
 
-    The kinetic resistance is that at ``current_a``.
+    The resistance of charge transfer depends on the current and is taken at ``current_a``.
     """
-    cold = np.exp(ENERGY_J / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K))
-    ohm = truth.ohm[node] * cold
+    arrhenius_factor = np.exp(ENERGY_J / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K))
+    ohm = truth.ohm[node] * arrhenius_factor
     drop = ohm[KINETIC] * current_a / KINETIC_V
     ohm[KINETIC] *= math.asinh(drop) / drop
-    return (ohm / (1.0 + 1j * rad_s[:, None] * TAU_S * np.sqrt(cold))).sum(axis=1)
+    return (ohm / (1.0 + 1j * rad_s[:, None] * TAU_S * np.sqrt(arrhenius_factor))).sum(axis=1)
 
 
-def rising(low: float, high: float) -> Floats:
-    """Return a factor over ``GRID`` that rises by ``low`` towards empty and by ``high`` towards full."""
+def u_shape(low: float, high: float) -> Floats:
+    """Return a factor over ``GRID`` that rises from about 1 by ``low`` towards empty and by ``high`` towards full."""
     return 1.0 + low * np.exp(-GRID / 0.07) + high * np.exp((GRID - 1.0) / 0.05) + 0.15 * np.cos(5.0 * GRID)
 
 
 def resistances(milliohm: tuple[float, ...]) -> Floats:
     """Return the resistances of the eight processes over SOC, shape (401, 8) [ohm], from those at mid SOC [mohm]."""
-    shapes = [rising(0.4, 0.0), rising(1.0, 0.3), rising(2.5, 0.8), rising(2.0, 0.5), *4 * [rising(3.0, 0.2)]]
+    shapes = [u_shape(0.4, 0.0), u_shape(1.0, 0.3), u_shape(2.5, 0.8), u_shape(2.0, 0.5), *4 * [u_shape(3.0, 0.2)]]
     return 1e-3 * np.array(milliohm) * np.column_stack(shapes)
 
 

@@ -7,6 +7,7 @@ from bms_estimator.model.arrays import Floats
 LEVEL_S = 20.0
 """Mean duration of a level of the current [s]."""
 DAY_S = 86400
+"""Seconds of a day."""
 EMPTY_SOC = 0.12
 """SOC at which the user ends a drive."""
 
@@ -27,7 +28,7 @@ def charge(one_c: float, rate_c: float, soc: float) -> Floats:
 
 
 def cycles(rng: np.random.Generator, one_c: float, count: int, by_soc: float, rest_s: int) -> Floats:
-    """Return currents of drives over ``by_soc`` and charges at C/2, each followed by a rest [A]."""
+    """Return the current of ``count`` cycles of a drive that lowers the SOC by ``by_soc``, a rest, a charge at C/2 and a rest [A]."""
     parts = []
     for _ in range(count):
         down = drive(rng, one_c, 0.5, 20000)  # longer than needed

@@ -25,7 +25,7 @@ def encoded_block(number, store=STORE_ID_NS):
     """Return a block of 60 samples, which begins ``number`` minutes after the creation of the store."""
     rows = samples(60.0 * number)
     arrival_s = store * 1e-9 + rows["time_s"][-1]
-    return encode(Block(store=store, number=number, oldest=1, arrival_s=arrival_s, samples=rows))
+    return encode(Block(store_created_ns=store, number=number, oldest=1, arrival_s=arrival_s, samples=rows))
 
 
 def make_capture(*blocks, **span):

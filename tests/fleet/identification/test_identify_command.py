@@ -31,7 +31,9 @@ async def upload(url):
         await put(nc, subjects.PACKS_BUCKET, pack_rows | {"wrong": b"{"})
         for number, part in enumerate(np.array_split(samples, 100), 1):
             arrival_s = STORE_ID_NS * 1e-9 + part["time_s"][-1]
-            data = encode(Block(store=STORE_ID_NS, number=number, oldest=1, arrival_s=arrival_s, samples=part))
+            data = encode(
+                Block(store_created_ns=STORE_ID_NS, number=number, oldest=1, arrival_s=arrival_s, samples=part)
+            )
             await nc.publish(subjects.raw("house"), data)
             if number < 10:
                 await nc.publish(subjects.raw("young"), data)

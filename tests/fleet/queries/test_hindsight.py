@@ -6,7 +6,7 @@ import pytest
 from bms_estimator import load_capture, load_cell
 from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.fleet.queries.parquet_files import write
-from tests.benchmarks.hindsight import judged, limits, slots
+from tests.benchmarks.hindsight import limits, normalized_errors, slots
 
 SLOT_S = 60.0
 """Duration of a slot of a capture, which stands for an hour of a fleet [s]."""
@@ -33,7 +33,7 @@ def packs(data):
 def test_coverage_estimated_in_hindsight_agrees_with_the_true_coverage(packs, tmp_path):
     write(tmp_path, [slot.hour for pack in packs for slot in pack])
     (overall, *_) = run_query(tmp_path, "honest", limits=limits(SLOT_S)).records
-    errors_in_stds = [error for pack in packs for error in judged(pack)]
+    errors_in_stds = [error for pack in packs for error in normalized_errors(pack)]
     is_inside = np.abs(errors_in_stds) <= 2.0
     assert overall["packs"] == len(packs)
     assert overall["within_2_std"] == pytest.approx(is_inside.mean(), abs=0.1)

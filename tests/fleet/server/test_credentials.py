@@ -268,7 +268,7 @@ async def _run_worker(fleet: Fleet) -> None:
     """Run a worker that processes a block, publishes a state and a reply, and writes a checkpoint."""
     samples = np.zeros(60, dtype=SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(60), 3.9, 25.0
-    block = encode(Block(store=1, number=1, oldest=1, arrival_s=60.0, samples=samples))
+    block = encode(Block(store_created_ns=1, number=1, oldest=1, arrival_s=60.0, samples=samples))
     stop = asyncio.Event()
     file = credentials.credentials_file(fleet.keys, "acme", Role.WORKER)
     working = asyncio.create_task(work(Options(fleet.cluster.url, "one", file), stop))

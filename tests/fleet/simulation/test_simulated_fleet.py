@@ -26,7 +26,12 @@ def test_block_depends_only_on_seed_pack_and_number() -> None:
     alone = next(fleet(1000).blocks(pack_6, np.array([900]), arrival_s[:1]))
     assert with_others[2] == alone
     block = decode(alone)
-    assert (block.number, block.oldest, block.samples.size, block.store) == (900, 1, BLOCK_S, fleet(8).store[6])
+    assert (block.number, block.oldest, block.samples.size, block.store_created_ns) == (
+        900,
+        1,
+        BLOCK_S,
+        fleet(8).store[6],
+    )
     assert next(fleet(8, seed=2).blocks(pack_6, np.array([900]), arrival_s[:1])) != alone
 
 

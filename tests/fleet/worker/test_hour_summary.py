@@ -24,7 +24,7 @@ PACK = PackSettings(name="p1", cell="ncr18650", series=1, parallel=2)
 def block(samples, number=1, store=STORE_ID_NS):
     """Return a block that arrives at the time of its last sample."""
     last_s = float(samples["time_s"][-1])
-    return Block(store=store, number=number, oldest=1, arrival_s=store / 1e9 + last_s, samples=samples)
+    return Block(store_created_ns=store, number=number, oldest=1, arrival_s=store / 1e9 + last_s, samples=samples)
 
 
 def add_blocks(sums, estimator, samples, store=STORE_ID_NS):
@@ -152,4 +152,6 @@ def test_block_with_an_infinite_last_time_belongs_to_the_hour_of_its_store():
     samples = np.zeros(60, SAMPLE)
     samples["time_s"] = 3600.0 + np.arange(60)
     samples["time_s"][-1] = math.inf
-    assert hour_of(Block(store=STORE_ID_NS, number=1, oldest=1, arrival_s=0.0, samples=samples)) == STORE_HOUR
+    assert (
+        hour_of(Block(store_created_ns=STORE_ID_NS, number=1, oldest=1, arrival_s=0.0, samples=samples)) == STORE_HOUR
+    )

@@ -506,7 +506,8 @@ class TestInvalidBlocks:
         self, stream, samples, arrival_s: float
     ) -> None:
         result = stream.send(
-            "a", encode(Block(store=STORE_ID_NS, number=1, oldest=1, arrival_s=arrival_s, samples=samples[:20]))
+            "a",
+            encode(Block(store_created_ns=STORE_ID_NS, number=1, oldest=1, arrival_s=arrival_s, samples=samples[:20])),
         )
         assert Estimate.model_validate_json(result.state).time == "2024-10-04T00:00:19.000Z"
         assert stream.partition.counters["no_arrival"] == 1
@@ -531,7 +532,9 @@ class TestInvalidBlocks:
         rows = pulses(hours=0.02)[0][:3]
         for store, number, oldest, arrival_s, time_s, voltage_v in sent:
             rows["time_s"][1], rows["voltage_v"][2] = time_s, voltage_v
-            block = Block(store=store, number=number, oldest=min(oldest, number), arrival_s=arrival_s, samples=rows)
+            block = Block(
+                store_created_ns=store, number=number, oldest=min(oldest, number), arrival_s=arrival_s, samples=rows
+            )
             for pack in ("a", "unknown"):
                 stream.send(pack, encode(replace(block, samples=rows)))
             stream.take_over()

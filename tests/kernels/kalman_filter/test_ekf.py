@@ -408,7 +408,7 @@ def test_a_hypothesis_with_a_large_bias_loses_weight(right: int) -> None:
 
 
 DRIVE_CASE = next(case for case in CASES if case.name == "oxide 25C")
-FAST_CASE = Case("100 Hz", rate_hz=100.0, hours=0.25, unseen_h=0.3, seed=5)
+FAST_CASE = Case("100 Hz", rate_hz=100.0, hours=0.25, load_before_h=0.3, seed=5)
 
 
 def make_estimator(drive, soc_error=0.2):

@@ -88,7 +88,7 @@ def test_repeated_cycles_do_not_make_the_soc_overconfident() -> None:
     """The cell file has its declared error. The interval contains the true SOC over six cycles."""
     nees = []
     for seed in (51, 54, 57):
-        error, std, _ = simulate_partial_cycles(cell_file(Case("", seed=seed, capacity=1.03)), cycles=6)
+        error, std, _ = simulate_partial_cycles(cell_file(Case("", seed=seed, file_capacity_ratio=1.03)), cycles=6)
         second_half = slice(error.size // 2, None)
         nees.append(np.mean((error[second_half] / std[second_half]) ** 2))
         assert np.mean(np.abs(error[second_half]) < 2.0 * std[second_half]) > 0.95

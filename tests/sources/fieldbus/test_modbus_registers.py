@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from bms_estimator.settings.modbus_source import MAX_WORDS, PROFILES, CellRegisters, ModbusSource, Register
 from bms_estimator.sources.fieldbus.modbus_registers import (
     GAP_WORDS,
-    Value,
+    RegisterQuantity,
     decode,
     decode_reading,
     list_values,
@@ -57,7 +57,9 @@ def test_value_of_each_type_and_word_order_is_decoded(
 @given(st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(STRUCT_FORMATS)), st.booleans()), max_size=60))
 def test_requests_cover_every_register_once_within_the_maximum_length(registers: list[tuple[int, str, bool]]) -> None:
     values = [
-        Value("cells", Register(address=address, type=register_type, table="input" if is_input else "holding"))
+        RegisterQuantity(
+            "cells", Register(address=address, type=register_type, table="input" if is_input else "holding")
+        )
         for address, register_type, is_input in registers
     ]
     requests = plan_requests(values)
