@@ -42,14 +42,12 @@ def adapt_command(
 
     The thesis is "Adaptive Estimation of Li-ion Battery Model Parameters".
     Its adaptive observer (Algorithm 1) runs over the capture with the smallest mean current.
-    a1..a12, the coefficients of both RC pairs over SOC, are the averages of their estimates in this run, by equation (3.19).
-    a13..a15 are the coefficients of the series resistance R_s over SOC, which equation (4.2) computes from all captures.
+    The averages of this run, by equation (3.19), are a1..a12: coefficients of both RC pairs as functions of SOC.
+    Equation (4.2) computes the series resistance R_s from all captures; a13..a15 are its coefficients.
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
-    The captures are replayed with the cell file of --cell and with the new cell file, and each file gets a score:
-    the width of the interval SOC ± 2 std plus a penalty if the true SOC is outside, so that smaller is better.
-    The new file is written only if its score is at most 5 % above that of --cell, because a smaller difference is not
-    significant (docs/cell/adapt.md).
+    Replays of the captures give both cell files a score for SOC error and width of the SOC interval (docs/cell/identify.md).
+    The new file is written only if its score is at most 5 % above that of --cell; smaller differences are not significant.
     """
     check_output_file(out, captures, force=force)
     reject_duplicates(captures)

@@ -61,10 +61,8 @@ def identify_command(
     Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole SOC range are best.
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
-    The captures are replayed with the cell file of --cell and with the new cell file, and each file gets a score:
-    the width of the interval SOC ± 2 std plus a penalty if the true SOC is outside, so that smaller is better.
-    The new file is written only if its score is at most 5 % above that of --cell, because a smaller difference is not
-    significant (docs/cell/identify.md).
+    Replays of the captures give both cell files a score for SOC error and width of the SOC interval (docs/cell/identify.md).
+    The new file is written only if its score is at most 5 % above that of --cell; smaller differences are not significant.
 
     For a fuel cell, give polarization curves (columns current_a, voltage_v) and captures under load
     (docs/theory/fuel-cell.md).
