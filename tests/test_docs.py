@@ -62,11 +62,22 @@ def test_the_code_of_an_equation_exists(path: str, name: str) -> None:
     assert name in defined_names(ROOT / path)
 
 
+def equations_of(cell: str) -> list[tuple[str, int]]:
+    """Return chapter and number of each equation of a cell like ``(2.1)`` or ``(2.5)-(2.9)``."""
+    match = re.fullmatch(r"\((\d)\.(\d+)\)(?:-\(\1\.(\d+)\))?", cell)
+    if match is None:
+        return []
+    chapter, first, last = match.groups()
+    return [(chapter, number) for number in range(int(first), int(last or first) + 1)]
+
+
 def test_every_equation_has_a_row_with_its_code() -> None:
-    code_of_equation = {cells[0]: cells[-1] for cells in table_rows(EQUATIONS)}
+    code_of_equation = {
+        (chapter, number): cells[-1] for cells in table_rows(EQUATIONS) for chapter, number in equations_of(cells[0])
+    }
     for chapter, last in LAST_EQUATION.items():
         for number in range(1, last + 1):
-            assert re.search(r"`[\w/]+\.py`: `\w+`", code_of_equation[f"({chapter}.{number})"])
+            assert re.search(r"`[\w/]+\.py`: `\w+`", code_of_equation[chapter, number])
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -20,9 +20,7 @@ COMMANDS = {
     "top": LazyCommand(
         "bms_estimator.cli.live.top:top", "Show all packs that publish to an MQTT broker, as a table in the terminal."
     ),
-    "edge": LazyCommand(
-        "bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet server, whose workers estimate."
-    ),
+    "edge": LazyCommand("bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet server."),
     "replay": LazyCommand(
         "bms_estimator.cli.captures.replay:replay",
         "Run the estimator over a capture: recorded raw bytes, CSV or Parquet.",

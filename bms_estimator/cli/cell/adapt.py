@@ -38,16 +38,16 @@ def adapt_command(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate the parameters a1..a15 of the thesis's cell model by its adaptive observer, and write a cell file.
+    """Estimate a cell's RC pairs and series resistance by the thesis's adaptive observer, and write a cell file.
 
     The thesis is "Adaptive Estimation of Li-ion Battery Model Parameters".
-    Its Algorithm 1 runs over the capture with the smallest mean current.
-    a1..a12 are the averages of the parameters in this run, by equation (3.19).
-    a13..a15 describe R_s, which is computed by equation (4.2) over all captures.
+    Its adaptive observer (Algorithm 1) runs over the capture with the smallest mean current.
+    The averages of this run, by equation (3.19), are a1..a12: coefficients of both RC pairs as functions of SOC.
+    Equation (4.2) computes the series resistance R_s from all captures; a13..a15 are its coefficients.
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
-    The captures are replayed with the cell file of --cell and with the new cell file.
-    The new file is written only if the error score of its replays is at most 5 % higher (docs/cell/adapt.md).
+    Replays of the captures give both cell files a score for SOC error and width of the SOC interval (docs/cell/identify.md).
+    The new file is written only if its score is at most 5 % above that of --cell; smaller differences are not significant.
     """
     check_output_file(out, captures, force=force)
     reject_duplicates(captures)

@@ -101,7 +101,7 @@ def export(
         ocv_error_mv=(1e3 * std_v / series).tolist(),
     )
     write_cell(out, renamed, _remarks(result, settings.pack.cell))
-    typer.echo(json.dumps(asdict(result)) if as_json else _text(result))
+    typer.echo(json.dumps(asdict(result)) if as_json else _text(result, settings.pack.cell))
 
 
 def _remarks(result: ExportResult, cell: str) -> list[str]:
@@ -111,13 +111,14 @@ def _remarks(result: ExportResult, cell: str) -> list[str]:
     ]
 
 
-def _text(result: ExportResult) -> str:
+def _text(result: ExportResult, cell: str) -> str:
     correction, error = (
         " ".join(f"{mv:.0f}" for mv in column) for column in (result.ocv_correction_mv, result.ocv_error_mv)
     )
     return (
         f"{result.out}: written from {result.checkpoint}\n"
-        f"capacity {result.capacity_ah:.4g} ± {result.capacity_std_ah:.2g} Ah; series resistance x {result.r_s_factor:.3f}\n"
+        f"capacity {result.capacity_ah:.4g} ± {result.capacity_std_ah:.2g} Ah; "
+        f"series resistance {result.r_s_factor:.3f} times that of {Path(cell).name}\n"
         f"OCV at SOC 0, 0.1 ... 1 corrected by {correction} mV, std {error} mV"
     )
 

@@ -35,7 +35,9 @@ from bms_estimator.sources.captures.replay import load_capture
 
 def identify_command(
     captures: CapturesFromRest,
-    cell: Annotated[str, typer.Option(help=f"{CELL_OR_FUEL_CELL_HELP}; supplies capacity and OCV", show_default=False)],
+    cell: Annotated[
+        str, typer.Option(help=f"cell that supplies capacity and OCV: {CELL_OR_FUEL_CELL_HELP}", show_default=False)
+    ],
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
     soc: InitialSoc = None,
@@ -59,8 +61,8 @@ def identify_command(
     Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole SOC range are best.
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
-    The captures are replayed with the cell file of --cell and with the new cell file.
-    The new file is written only if the error score of its replays is at most 5 % higher (docs/cell/identify.md).
+    Replays of the captures give both cell files a score for SOC error and width of the SOC interval (docs/cell/identify.md).
+    The new file is written only if its score is at most 5 % above that of --cell; smaller differences are not significant.
 
     For a fuel cell, give polarization curves (columns current_a, voltage_v) and captures under load
     (docs/theory/fuel-cell.md).

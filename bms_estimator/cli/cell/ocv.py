@@ -389,13 +389,15 @@ def _table(out: Path, result: OcvResult, ocv_sources: OcvSources) -> Table:
         "capacity": f"{result.capacity_ah:.4g} Ah"
         + ("" if measured is None else f", a slow discharge {measured:.4g} Ah"),
         "cells in series": f"{result.series_count}",
-        "std of a point": f"{np.median(std_mv):.2f} mV, at most {std_mv.max():.2f} mV",
+        "std of a point": f"{np.median(std_mv):.2f} mV median, at most {std_mv.max():.2f} mV",
         "points minus curve": f"{result.rms_mv:.2f} mV RMS, at most {result.max_mv:.2f} mV",
         f"points minus curve, SOC {STEEP_SOC:g} to {1.0 - STEEP_SOC:g}": f"{result.rms_inside_mv:.2f} mV RMS",
     }
     if result.captures:
         remaining_mv = 1e3 * np.abs(result.remaining_v)
-        rows["relaxation after a rest"] = f"{np.median(remaining_mv):.2f} mV, at most {remaining_mv.max():.2f} mV"
+        rows["relaxation after a rest"] = (
+            f"{np.median(remaining_mv):.2f} mV median, at most {remaining_mv.max():.2f} mV"
+        )
         rows["rejected rests"] = f"{len(result.rejected)}"
         rows["skipped glitches"] = f"{sum(test.glitches for test in ocv_sources.tests)}"
     if result.error_mv:

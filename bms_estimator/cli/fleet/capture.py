@@ -59,7 +59,7 @@ def capture(
     """Write a pack's stored samples to a file that `replay`, `identify`, `validate` and `capacity` can read.
 
     The server stores samples for some days (setting `server.raw_days`). They are written in the order in which the edge sent them.
-    With the settings that `fleet packs show PACK --out FOLDER` writes, `replay` gives the workers' estimates.
+    To reproduce the workers' estimates, run `replay` with the settings that `fleet packs show PACK --out FOLDER` writes.
     """
     check_output_file(out, [], force=force)
     sink = table_sink(out)

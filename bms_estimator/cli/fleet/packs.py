@@ -86,7 +86,7 @@ def show(
         typer.Option(help="write pack.toml and the cell file to this folder instead of printing", show_default=False),
     ] = None,
 ) -> None:
-    """Print a pack's settings as a pack file; `replay --pack` with this file gives the workers' estimates."""
+    """Print a pack's settings as a pack file; `replay --pack` with this file reproduces the workers' estimates."""
     registry = asyncio.run(fetch_registry((server, creds, ca)))
     reject_unknown([pack], registry)
     files = pack_files(pack, registry)

@@ -41,8 +41,8 @@ def serve(
         str | None, typer.Option(help="host:port for workers; default: server.listen of the settings")
     ] = None,
     mqtt: Annotated[str | None, typer.Option(help="host:port for edges; default: server.mqtt of the settings")] = None,
-    node: Annotated[int, typer.Option(min=1, max=5, help="position of this node in the list --of")] = 1,
-    of: Annotated[
+    node: Annotated[int, typer.Option(min=1, max=5, help="position of this node in the list of --cluster, from 1")] = 1,
+    cluster: Annotated[
         str | None,
         typer.Option(
             help="addresses under which the 3 or 5 nodes of a cluster connect to each other: host,host:port,...; "
@@ -52,10 +52,11 @@ def serve(
 ) -> None:
     """Run a node of the fleet server, which stores samples and results in streams, until SIGINT or SIGTERM.
 
-    The first start creates keys for each tenant in the folder. In a cluster, copy keys/claims.json to the other nodes.
+    The first start writes the keys of each tenant to --folder.
+    In a cluster, copy keys/claims.json from the folder of node 1 to the folder of each other node.
     """
     settings = _settings(settings_file, listen=listen, mqtt=mqtt)
-    location = NodeLocation(_folder(settings, folder), node, _nodes(settings, node, of))
+    location = NodeLocation(_folder(settings, folder), node, _nodes(settings, node, cluster))
 
     def read_spec() -> ServerSpec:
         settings = _settings(settings_file, listen=listen, mqtt=mqtt)
@@ -121,31 +122,33 @@ def _folder(settings: FleetSettings, option: Path | None) -> Path:
     return (option or settings.server.folder or Path(systemd_folder or user_folder)).expanduser().absolute()
 
 
-def _nodes(settings: FleetSettings, number: int, of: str | None) -> tuple[str, ...]:
+def _nodes(settings: FleetSettings, number: int, cluster: str | None) -> tuple[str, ...]:
     """Return the addresses under which the nodes of a cluster connect to each other; empty for a single node.
 
     Args:
         settings: Settings of the fleet.
         number: Position of this node in the list, from 1.
-        of: List of host or host:port, separated by commas; None: a single node.
+        cluster: List of host or host:port, separated by commas; None: a single node.
 
     Raises:
-        UserError: --of is invalid, or keys and certificates are missing.
+        UserError: --cluster is invalid, or keys and certificates are missing.
     """
-    if of is None:
+    if cluster is None:
         if number != 1:
-            raise UserError(f"--node {number}: requires --of host,host,host, which names all nodes")
+            raise UserError(f"--node {number}: requires --cluster host,host,host, which names all nodes")
         return ()
-    nodes = tuple(host if _has_port(host) else f"{host}:{CLUSTER_PORT}" for host in of.split(","))
+    nodes = tuple(host if _has_port(host) else f"{host}:{CLUSTER_PORT}" for host in cluster.split(","))
     if len(set(nodes)) != len(nodes) or len(nodes) not in (3, 5):
-        raise UserError(f"--of {of}: must name 3 or 5 distinct nodes, so that a majority remains if one fails")
+        raise UserError(
+            f"--cluster {cluster}: must name 3 or 5 distinct nodes, so that a majority remains if one fails"
+        )
     if number > len(nodes):
-        raise UserError(f"--node {number}: --of names only {len(nodes)} nodes")
+        raise UserError(f"--node {number}: --cluster names only {len(nodes)} nodes")
     try:
         if not all(parse_listen(node).loopback for node in nodes):
-            settings.reject_unprotected(f"--of {of}")
+            settings.reject_unprotected(f"--cluster {cluster}")
     except ValueError as error:
-        raise UserError(f"--of {of}: {error}") from None
+        raise UserError(f"--cluster {cluster}: {error}") from None
     return nodes
 
 

@@ -23,8 +23,9 @@ def edge(
     ),
     port: Annotated[str | None, typer.Option(help="serial port that replaces sensor.port of the settings")] = None,
 ) -> None:
-    """Send a pack's raw samples to a fleet server, whose workers estimate, until SIGINT or SIGTERM.
+    """Send a pack's raw samples to a fleet server until SIGINT or SIGTERM.
 
+    The fleet's workers estimate SOC and parameters from the samples.
     Samples are stored on disk until the server confirms them (docs/fleet/edge.md).
     """
     settings = with_sensor(load_settings(pack), port=port)

@@ -31,7 +31,7 @@ def history(
     since: Annotated[
         datetime | None,
         typer.Option(
-            formats=TIME_FORMATS, metavar="TIME", help=f"first time in UTC: {TIME_EXAMPLE}; default: the oldest row"
+            formats=TIME_FORMATS, metavar="TIME", help=f"start time in UTC: {TIME_EXAMPLE}; default: the oldest row"
         ),
     ] = None,
     until: Annotated[

@@ -16,7 +16,7 @@ from bms_estimator.model.sample import CurrentSign
 AsJson = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
 """Option that prints the result as JSON."""
 CELL_HELP = "generic cell (lfp, nmc, nca, lco, lmo, lto), name of a shipped cell, or path of a cell file"
-CELL_OR_FUEL_CELL_HELP = f"{CELL_HELP}; of a fuel cell: pem_30w, or path of its cell file"
+CELL_OR_FUEL_CELL_HELP = f"{CELL_HELP}; for a fuel cell: pem_30w or path of a fuel-cell file"
 CAPTURE_FORMATS = "file of `record` or `run --record`, CSV (.csv, .csv.gz) or Parquet"
 """Formats of a capture in help texts."""
 CAPTURE_HELP = f"capture to read: {CAPTURE_FORMATS}; -: read standard input"
