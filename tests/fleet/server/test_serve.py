@@ -282,6 +282,7 @@ async def test_three_nodes_form_a_cluster_whose_streams_have_three_replicas(
             "is open to other machines: add [tls] and [tenants.NAME], or listen on 127.0.0.1",
         ),
         (["--mqtt", "here"], "--mqtt here: must be host:port"),
+        (["--of", "a,b,c"], "--of: renamed; write --cluster a,b,c"),
         (["--node", "2"], "--node 2: requires --cluster"),
         (["--cluster", "a,b"], "must name 3 or 5 distinct nodes"),
         (["--cluster", "a,b,c"], "--cluster a,b,c is open to other machines"),
