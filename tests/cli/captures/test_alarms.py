@@ -70,7 +70,7 @@ def test_check_reports_wrong_and_implausible_limits_and_hooks(
     exit_code, out, err = run(capsys, "config", "check", pack)
     assert exit_code == code
     assert message in err
-    assert ("good" in out) == (code == 0)
+    assert ("valid; pack" in out) == (code == 0)
 
 
 def test_show_prints_the_limits_in_effect(pack: Path, capsys: pytest.CaptureFixture[str]) -> None:
