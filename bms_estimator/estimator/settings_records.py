@@ -17,7 +17,7 @@ from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
-from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import SCHEME_2_EPSILON, SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
 from bms_estimator.settings.sampling import BOARD, Sampling
 
 DEAD_ZONE_STEPS = 2.0
@@ -169,8 +169,6 @@ def _adaptation(p: np.void, cell: CellModel, observer: ObserverSettings) -> None
             bounds = cell.bounds(i)
             target[i], rate[i] = bounds.limit, bounds.rate
             initial[i] = bounds.limit if bounds.initial is None else bounds.initial
-        elif (
-            observer.law == "scheme-2" and a[i] <= observer.scheme_2_epsilon
-        ):  # (3.17) for i in the set q of the thesis
-            rate[i] = observer.scheme_2_lambda
+        elif observer.law == "scheme-2" and a[i] <= SCHEME_2_EPSILON:  # (3.17) for i in the set q of the thesis
+            rate[i] = SCHEME_2_LAMBDA
     p["a_initial"], p["target"], p["rate"], p["drive"] = initial, target, rate, drive

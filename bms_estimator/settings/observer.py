@@ -1,10 +1,18 @@
 """``[observer]`` and ``[identifier]``: adaptive observer and joint Kalman filter."""
 
-from typing import Annotated, Literal
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import NotNegative, Positive, Strict
+
+SCHEME_2_LAMBDA = 100.0
+"""Rate lambda_i in (3.17), as in the simulations of the thesis [1/s]."""
+SCHEME_2_EPSILON = 0.35
+"""Largest parameter that (3.17) returns to its initial value."""
+FORMER_SETTINGS = {"scheme_2_lambda", "scheme_2_epsilon"}
+"""Settings of former versions."""
 
 
 class ObserverSettings(Strict):
@@ -48,10 +56,29 @@ class ObserverSettings(Strict):
         default=0.005,
         description="adaptation stops if the SOC is less than this above max(delta1, delta2), at which a capacitance of the model is 0",
     )
-    scheme_2_lambda: Positive = Field(default=100.0, description="scheme-2: rate lambda_i in (3.17)")
-    scheme_2_epsilon: Positive = Field(
-        default=0.35, description="scheme-2: parameters up to this value are penalized by (3.17)"
-    )
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """Return names and values for ``repr``, whose hash marks stored states.
+
+        Constants that were settings before are included, so that the hashes of stored states stay valid.
+        """
+        yield from super().__repr_args__()
+        yield "scheme_2_lambda", SCHEME_2_LAMBDA
+        yield "scheme_2_epsilon", SCHEME_2_EPSILON
+
+    @model_validator(mode="before")
+    @classmethod
+    def _reject_former_settings(cls, table: object) -> object:
+        """Reject settings of (3.17) that are constants now.
+
+        Raises:
+            ValueError: A former setting is present.
+        """
+        if isinstance(table, dict) and (former := sorted(FORMER_SETTINGS & table.keys())):
+            raise ValueError(
+                f"{', '.join(former)}: not a setting; (3.17) uses {SCHEME_2_LAMBDA:g} and {SCHEME_2_EPSILON:g}"
+            )
+        return table
 
     @model_validator(mode="before")
     @classmethod

@@ -6,6 +6,7 @@ is the adaptive gain, and e is the error of the voltage that drives both.
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
 from bms_estimator.estimator import Estimator
@@ -14,11 +15,11 @@ from bms_estimator.kernels.cell_model.chen_mora import delta, ocv, r_s
 from bms_estimator.model.cell import Bounds, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.simulation import discharge, with_bounds
-from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
 
 CELL = load_cell("chen_mora")
 SMALL = [1, 3, 6, 13, 15]
-"""Indices of the parameters below the default epsilon of scheme 2, which returns them to their initial values."""
+"""Indices of the parameters up to the epsilon of scheme 2, which returns them to their initial values."""
 LARGE = [i for i in range(1, 16) if i not in SMALL]
 DISTURBANCE_V = 0.3
 """Error of the measured voltage, so that e, which drives (3.16), is far from zero [V]."""
@@ -66,13 +67,16 @@ def test_scheme_2_returns_small_parameters_to_their_initial_values(disturbed_sam
     assert while_disturbed[1] == pytest.approx(while_disturbed[3], rel=1e-9)
 
 
-def test_scheme_2_returns_the_parameters_below_its_epsilon():
+def test_scheme_2_returns_the_parameters_up_to_its_epsilon():
     """``rate`` is the rate at which a parameter returns to its initial value."""
-    estimator = Estimator(
-        CELL, make_settings("scheme-2", scheme_2_epsilon=7.0, scheme_2_lambda=50.0), initial_soc=1.0, identifier=None
-    )
-    assert estimator.settings["rate"][0, [1, 3, 4, 6, 13, 15]].tolist() == [50.0] * 6
-    assert estimator.settings["rate"][0, [2, 5, 7, 14]].tolist() == [0.0] * 4
+    estimator = Estimator(CELL, make_settings("scheme-2"), initial_soc=1.0, identifier=None)
+    assert (estimator.settings["rate"][0, SMALL] == SCHEME_2_LAMBDA).all()
+    assert (estimator.settings["rate"][0, LARGE] == 0.0).all()
+
+
+def test_former_settings_of_scheme_2_are_rejected_with_the_constants():
+    with pytest.raises(ValidationError, match=r"scheme_2_epsilon: not a setting; \(3\.17\) uses 100 and 0\.35"):
+        make_settings("scheme-2", scheme_2_epsilon=7.0)
 
 
 @pytest.mark.parametrize(("law", "last"), [("scheme-3", 15), ("improved", 12)])
