@@ -29,7 +29,7 @@ TAU_TS, TAU_TL = NAMES.index("tau_ts"), NAMES.index("tau_tl")
 """Indices of the time constants in theta."""
 SCALED_INDICES = {"r_s": (13, 15), "r_ts": (1, 3), "tau_ts": (7, 9), "r_tl": (4, 6), "tau_tl": (10, 12)}
 """Indices of amplitude and offset, the a_i that scale with each element of theta. A time constant has the bounds of its
-capacitance, because its resistance is that of the file."""
+capacitance, because its resistance has the value of the cell file."""
 
 
 def learning_settings(cell: CellModel, observer: ObserverSettings, observer_record: np.void) -> NDArray[np.void]:

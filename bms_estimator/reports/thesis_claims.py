@@ -148,7 +148,7 @@ def _products(p: Procedure) -> list[Result]:
 
 
 PRINTED_RATIO = printed_values.TABLE_13["dynamic"] / printed_values.TABLE_13["static"]
-"""Printed mean error of the dynamic model divided by that of the static model."""
+"""Printed ratio of the mean errors of the dynamic and the static model."""
 LARGEST_CONSTANT = max(printed_values.TABLE_11[load] for load in printed_values.CURRENTS_A)
 """Largest printed mean error under a constant load [%]."""
 LARGEST_STEPS = max(printed_values.TABLE_11[load] for load in ("constant steps", "variable steps"))

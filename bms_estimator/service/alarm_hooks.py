@@ -28,8 +28,8 @@ RELAY_RETRY_S = 0.5
 CLOSE_S = 2.0
 """Timeout of running hooks at shutdown [s]."""
 FIRST_RETRY_S = 0.5
-"""First delay before the retry of a program that could not be started [s]. Each retry doubles the delay, up to 30 s. Delay
-after an internal error of a hook [s]."""
+"""First delay before the retry of a program that could not be started [s]. Each retry doubles the delay, up to 30 s. After
+an internal error, a hook also waits for this time."""
 
 PublishRaw = Callable[[str, bytes], None]
 """Publishes a payload on a topic."""

@@ -52,3 +52,19 @@ def test_a_raised_alarm_is_published_before_the_next_snapshot_is_due() -> None:
     assert raised_alarms == [[], ["pack_over_voltage"]]
     # the second snapshot has no estimate, because the publish window has not ended
     assert [each.estimate is None for each in sink.snapshots] == [False, True]
+
+
+def test_an_estimate_that_is_due_is_published_before_the_alarm_of_the_same_sample() -> None:
+    now_s, cell, sink = 0.0, load_cell("chen_mora"), Collector()
+    limits = {"pack_over_voltage": {"limit_v": 4.0, "clear_v": 3.9, "delay_s": 0.0}}
+    settings = Settings.model_validate({"publish": {"rate_hz": 1.0}, "alarms": limits})
+    estimator = Estimator(cell, initial_soc=0.5)
+    clock = Clock(monotonic=lambda: now_s)
+    publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock)
+    for now_s, voltage_v in ((0.0, 3.8), (1.0, 4.05)):
+        block = np.array([(now_s, 0.0, voltage_v, 25.0, 0)], dtype=SAMPLE)
+        publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
+    assert [
+        (each.estimate and each.estimate.voltage_v, any(alarm.active for alarm in each.alarms))
+        for each in sink.snapshots
+    ] == [(3.8, False), (4.05, False), (None, True)]

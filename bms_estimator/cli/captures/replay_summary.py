@@ -57,7 +57,7 @@ class ReplayResult:
     """Number of implausible temperatures."""
     gaps: int
     time_steps_back: int
-    """Number of samples whose time is before that of the previous sample."""
+    """Number of samples with a timestamp before the previous sample's."""
     parameters: dict[str, LearnedParameter]
     """Parameters of a fuel cell by the keys of its file; empty for a battery, whose parameters depend on SOC."""
     samples_per_s: float | None

@@ -111,7 +111,7 @@ class OcvResult:
     capacity_measured_ah: float | None
     """Capacity by a slow discharge from full to empty; None without such a discharge."""
     generic: str
-    """Most similar generic cell, whose resistances are scaled to those of the captures."""
+    """Most similar generic cell. Its resistances are scaled to the resistances of the captures."""
     usual_hysteresis: bool
     """True if the hysteresis is that of the generic cell, because no source determines it."""
     series_count: int

@@ -87,5 +87,5 @@ def name_of(path: Path) -> str:
 
 
 def write_cell_named_as_file(out: Path, cell: CellModel, remarks: list[str]) -> None:
-    """Write a cell file. The name of its cell becomes that of the file, and ``remarks`` become comments at its beginning."""
+    """Write a cell file. Its cell is named after the file, and ``remarks`` become comments at its beginning."""
     write_cell(out, cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name_of(out)})}), remarks)

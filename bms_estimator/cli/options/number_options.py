@@ -1,4 +1,4 @@
-"""Parsers of numeric options, as strict as those of the settings. Python itself would parse ``3_9`` as 39."""
+"""Parsers of numeric options, as strict as the parsers of settings. Python itself would parse ``3_9`` as 39."""
 
 import math
 import re

@@ -61,7 +61,7 @@ class Limits:
     capacity_limit: float = 0.8
     """Query failing: lower limit of the capacity as a fraction of the rated capacity."""
     r_s_limit: float = 2.0
-    """Query failing: upper limit of R_s as a multiple of that of the cell file."""
+    """Query failing: upper limit of the ratio of R_s to the cell file's R_s."""
     r_s_fresh_s: float = 86_400.0
     """Maximum time since R_s was last identified [s]; older values are not used."""
     min_days: int = 7

@@ -38,7 +38,7 @@ SLOW_FRACTION = 0.75
 FAST_FRACTION = 0.25
 """Amplitude of the fast oscillation of SOC as a fraction of ``SOC_AMPLITUDE``."""
 FREQUENCY_RATIO = 3.3
-"""Frequency of the fast oscillation divided by that of the slow oscillation."""
+"""Ratio of the frequencies of the fast and the slow oscillation."""
 MIN_PERIOD_S = 8 * 3600.0
 """Minimum period of the slow oscillation [s], at which the current reaches 0.43 C."""
 MAX_PERIOD_S = 24 * 3600.0

@@ -4,7 +4,7 @@ One decoder serves the live line and the replay. Its state holds everything betw
 depend on how the bytes were divided into calls, except for the arrival time of the byte that ends a frame.
 
 ``d`` is the state of the decoder (a record of ``DECODER``), and ``s`` the scaling of the board (a record of ``SCALING``).
-Offsets in a packet are those of the tables in firmware/PROTOCOL.md.
+The tables in firmware/PROTOCOL.md give the offsets in a packet.
 """
 
 import math
