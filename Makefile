@@ -20,7 +20,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere resolution unseen nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month observability resolution unseen nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -88,6 +88,12 @@ compare: ## comparison of methods, including PyBOP, on all real captures, e.g. m
 
 anywhere: venv ## SOC error from any starting point of real captures, e.g. make anywhere ARGS=PF: minutes
 	@$(BIN)/python -m tests.benchmarks.anywhere $(ARGS)
+
+month: venv ## SOC error over simulated weeks of use, day by day, e.g. make month ARGS="A123 --days 30 --seeds 1 2": minutes
+	@$(BIN)/python -m tests.estimator.month $(ARGS)
+
+observability: venv ## the smallest honest std of the SOC by cell and SOC window, e.g. make observability ARGS="lfp --window 0.5 0.95"
+	@$(BIN)/python -m tests.benchmarks.observability $(ARGS)
 
 chapter5: venv ## the experiments of the thesis's chapter 5 on real captures, beside Tables 11 and 13
 	@$(BIN)/python -m tests.benchmarks.chapter5

@@ -11,7 +11,7 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
+from bms_estimator.checkpoint.history_file import SUFFIX
 from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity, without_observer
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import Totals
@@ -45,6 +46,8 @@ MAX_LATER_FILES = 4
 """Maximum number of quarantined files of later formats, which serve a return to the later version."""
 _COUNTER_FIELDS = "restarts", "total", "clean", "alarms"
 """Field names of the run counters in the file."""
+_CURVES = "fit."
+"""Prefix of the names of the fit's arrays in the file."""
 MAX_COUNT = 1e15
 """Maximum plausible value of a counter: the number of samples of 30,000 years at 1,000 a second."""
 
@@ -80,6 +83,9 @@ class CheckpointContent:
     """Counters including this start; zero if the file belongs to another pack or cannot be read."""
     reason: str
     """Reason for the rejection; empty if the file is valid."""
+    curves: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Arrays of the fit to whose curves the state is relative (``pack_model.saved.curve_arrays``); empty: the curves are
+    those of the cell file."""
 
 
 class CheckpointFile:
@@ -108,7 +114,9 @@ class CheckpointFile:
         self.saved: tuple[int, float] | None = None
         """Number of samples and SOC of the last saved state; None before the first save of this run."""
 
-    def save(self, state: NDArray[np.void], counters: RunCounters) -> None:
+    def save(
+        self, state: NDArray[np.void], counters: RunCounters, curves: Mapping[str, NDArray[Any]] | None = None
+    ) -> None:
         """Write the file atomically: after a power cut either the old or the new file exists.
 
         A missing folder is created.
@@ -116,11 +124,13 @@ class CheckpointFile:
         Args:
             state: Shape (1,), dtype ESTIMATOR_STATE.
             counters: Counters of this and earlier runs.
+            curves: Arrays of the fit to whose curves the state is relative; None or empty: those of the cell file.
 
         Raises:
             OSError: The file cannot be written.
         """
         content = {"identity": self._identity, "observer": self._observer, "state": state, **asdict(self._now())}
+        content |= {f"{_CURVES}{name}": array for name, array in (curves or {}).items()}
         self._write(content, counters)
 
     def update_counters(self, counters: RunCounters) -> None:
@@ -216,7 +226,8 @@ class CheckpointFile:
         self._content = {name: v for name, v in file.items() if name not in ("format", *_COUNTER_FIELDS)}
         if str(file["observer"]) != self._observer:
             state = without_observer(state)
-        return CheckpointContent(state, unseen_s, counters, "")
+        curves = {name.removeprefix(_CURVES): v for name, v in file.items() if name.startswith(_CURVES)}
+        return CheckpointContent(state, unseen_s, counters, "", curves)
 
     def _remove_oldest(self) -> None:
         """Remove the pack's oldest files beyond ``MAX_FILES``, because each configured cell leaves a file."""
@@ -225,6 +236,7 @@ class CheckpointFile:
         others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
         for path in others[MAX_FILES - 1 :]:
             path.unlink(missing_ok=True)
+            path.with_suffix(SUFFIX).unlink(missing_ok=True)
 
 
 class _RejectedError(Exception):

@@ -9,18 +9,17 @@ from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import OBSERVER_COUNTERS
 from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS, store_last_good_state
 from bms_estimator.kernels.kalman_filter.mixture import decorrelate_state
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
 from bms_estimator.kernels.kalman_filter.ocv_correction import reset_ocv_correction
 from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET, STATES
-from bms_estimator.kernels.observer.records import OBSERVER_STATE
 
-_DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
-OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
-"""Fields of the observer's state that count since start."""
 _PARTS_WITHOUT_FILTER = ("observer.", "learning.", "series_resistance.")
 """Prefixes of the fields that are also estimated while the filter is off."""
+_MAY_BE_INFINITE = ("filter.learned_soc",)
+"""Fields that are infinite after a fit of the pack's model was adopted."""
 EXTENDABLE_FIELDS = {"filter.mean": 1, "filter.covariance": 2}
 """Number of trailing axes along the filter's states, by field. Later versions append states at the end of these axes."""
 MAX_SOC_DIFFERENCE = 0.03
@@ -67,6 +66,8 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
         estimator.state[name] = 0
     estimator.record["counters"] = np.zeros(1, COUNTERS)
     estimator.record["filter"]["reopened"] = estimator.record["checks"]["seen_reopened"] = 0
+    estimator.record["history"]["enabled"] = 0  # the slow fit, which takes the rows, enables them again
+    estimator.record["anchors"]["full_anchors"] = estimator.record["anchors"]["empty_anchors"] = 0
     return ""
 
 
@@ -116,8 +117,8 @@ def _invalid_state_reason(estimator: Estimator, after_first_sample: NDArray[np.v
         part, _, quantity = name.partition(".")
         checked = np.isfinite(first_field)
         if (
-            part in ("observer", "learning", "series_resistance", "filter", "checks", "map")
-            and not np.isfinite(field[checked]).all()
+            part in ("observer", "learning", "series_resistance", "filter", "checks", "anchors", "map")
+            and not (np.isfinite(field[checked]) | (name in _MAY_BE_INFINITE and ~np.isnan(field[checked]))).all()
         ):
             return f"{quantity} of the {part} is not finite"
     s, first = record[0]["observer"], after_first_sample[0]["observer"]

@@ -9,23 +9,30 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels import step as kernel
-from bms_estimator.kernels.kalman_filter.hypotheses import set_soc
+from bms_estimator.kernels.accumulators.history import add_reference
+from bms_estimator.kernels.kalman_filter.anchors import NO_ANCHOR
+from bms_estimator.kernels.kalman_filter.hypotheses import USER_SOC_STD, set_soc
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
+from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sampling import BOARD, Sampling
+from bms_estimator.settings.sampling import BOARD, EXACT, Sampling
 
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
 SAMPLE_OUTCOMES = tuple(SampleOutcome)
 """Outcomes by their integer values. Indexing a tuple is faster than ``SampleOutcome(value)``, which takes nearly as long as
 the kernel."""
+_DROPPED = tuple(name for name in OBSERVER_STATE.names or () if name.startswith("dropped_"))
+OBSERVER_COUNTERS = ("samples", "gaps", "time_steps_back", "lock_losses", "gain_rearms", *_DROPPED)
+"""Fields of the observer's state that count since start."""
 DEFAULT_IDENTIFIER = IdentifierSettings()
 """Default settings of the identifier."""
 
@@ -43,11 +50,14 @@ class Estimator:
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
         initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
-        sampling: Resolution and period of the source; default: those of the board.
+        sampling: Resolution, period and gain errors of the source; default: those of a board, with exact gains.
+        limits: Limits of charger and protection; default: those of the cell file.
 
     Attributes:
         record: Shape (1,), dtype ``ESTIMATOR_STATE``: the complete state, which can be copied, saved and restored.
         settings_record: Shape (1,), dtype ``ESTIMATOR_SETTINGS``.
+        cell_file_settings: The filter's part of ``settings_record`` by the cell file, record of dtype ``EKF_SETTINGS``. The
+            slow fit (``bms_estimator.pack_model``) changes the curves in ``settings_record``.
         state: The observer's part of ``record``, shape (1,), dtype ``OBSERVER_STATE``.
         settings: The observer's part of ``settings_record``, shape (1,), dtype ``OBSERVER_SETTINGS``.
     """
@@ -61,7 +71,8 @@ class Estimator:
         voltage_resolution_v: float = 1e-3,
         voltage_noise_v: float | None = None,
         initial_soc: float | None = None,
-        sampling: Sampling = BOARD,
+        sampling: Sampling = EXACT,
+        limits: ChargeLimits = NO_LIMITS,
     ) -> None:
         self.cell = cell
         self.settings_record = estimator_settings(
@@ -72,8 +83,10 @@ class Estimator:
             voltage_noise_v=voltage_noise_v,
             initial_soc=initial_soc,
             sampling=sampling,
+            limits=limits,
         )
         self.settings: NDArray[np.void] = self.settings_record["observer"]
+        self.cell_file_settings: np.void = self.settings_record[0]["filter"].copy()
         self.record: NDArray[np.void] = np.zeros(1, dtype=ESTIMATOR_STATE)
         self.state: NDArray[np.void] = self.record["observer"]
         self._trace: TraceBlock = np.zeros(0, dtype=TRACE)
@@ -112,8 +125,19 @@ class Estimator:
         """
         if self._trace.size < block.size:
             self._trace = np.zeros(block.size, dtype=TRACE)
-        rows = kernel.run(self.record, self.settings_record, block, self._trace)
-        return self._trace[:rows]
+        return self._trace[: self.run_part(block, self._trace)[1]]
+
+    def run_part(self, block: SampleBlock, trace: TraceBlock) -> tuple[int, int]:
+        """Process samples until the recording of the history needs its caller, or to the end of the block.
+
+        Args:
+            block: Samples.
+            trace: At least as long as ``block``; a row is written for each accepted sample.
+
+        Returns:
+            Number of samples processed, and number of rows written.
+        """
+        return kernel.run(self.record, self.settings_record, block, trace)
 
     @property
     def identifying(self) -> bool:
@@ -134,11 +158,19 @@ class Estimator:
         if self.identifying:
             f, c = self.record[0]["filter"], self.record[0]["checks"]
             set_soc(f, self.settings_record[0]["filter"], soc)
+            add_reference(self.record[0]["history"], NO_ANCHOR, soc, USER_SOC_STD)
             c["outliers"] = 0.0  # a wrong SOC may have caused them
             if not c["suspects"] & UNUSABLE:
                 # no previous sample: if the sensor freezes now, the SOC before this call must not be restored
                 c["last_v"] = 0.0
             store_last_good_state(c, f)
+
+    def restart(self) -> None:
+        """Return to the state before the first sample, for another pack. The counters of the samples stay."""
+        counters = {name: self.state[name].copy() for name in OBSERVER_COUNTERS}
+        self.record[...] = np.zeros(1, ESTIMATOR_STATE)
+        for name, count in counters.items():
+            self.state[name] = count
 
     def resume(self, unseen_s: float) -> None:
         """Prepare for samples with another time base, after a gap without measurements.
@@ -169,6 +201,7 @@ def make_estimator(settings: Settings, cell: PackModel) -> Estimator:
         voltage_noise_v=settings.sensor.voltage_noise_v,
         initial_soc=settings.pack.initial_soc,
         sampling=settings.sampling,
+        limits=settings.charge_limits,
     )
 
 
@@ -195,5 +228,5 @@ def estimate(
         The columns of dtype ``TRACE``, one row for each accepted sample: ``soc`` with ``soc_std``, the circuit elements
         with their standard deviations, and the observer's values. Unknown values are NaN.
     """
-    estimator = Estimator(cell, initial_soc=initial_soc, voltage_resolution_v=voltage_resolution_v)
+    estimator = Estimator(cell, initial_soc=initial_soc, voltage_resolution_v=voltage_resolution_v, sampling=BOARD)
     return Columns(estimator.run(capture.rows), capture.name)

@@ -14,7 +14,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, RESISTANC
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, Noise
 from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.settings.observer import IdentifierSettings
-from bms_estimator.settings.sampling import BOARD, Sampling
+from bms_estimator.settings.sampling import EXACT, Sampling
 
 CURVE_ERROR_V = 0.004
 """Default std of the OCV per cell, for a cell file without an error column [V]."""
@@ -46,6 +46,11 @@ MIN_BIAS_OF_R_STD = 0.15
 resistances are uncertain, too."""
 ROOM_C = 15.0, 35.0
 """Lower and upper end of the temperature range of resistances without a declared range, as in a room [C]."""
+MIN_SOC_STD = 0.005
+"""Minimum std of the published SOC, because full and empty of a cell are not defined better."""
+MIN_SOC_STD_OF_R_STD = 0.03
+"""Minimum std of the published SOC, as a fraction of the std of ln R. A cell that was not measured is full at another point of
+the curve."""
 MIN_RESISTANCE = 1e-4
 """Minimum of each resistance, as a fraction of the sum at SOC 0.5. Equivalent time constants are weighted by resistance
 and need weights above 0."""
@@ -62,7 +67,7 @@ def filter_settings(
     identifier: IdentifierSettings,
     voltage_resolution_v: float,
     voltage_noise_v: float | None,
-    sampling: Sampling = BOARD,
+    sampling: Sampling = EXACT,
 ) -> NDArray[np.void]:
     """Return the filter's settings record.
 
@@ -72,7 +77,7 @@ def filter_settings(
         identifier: Section ``[identifier]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
-        sampling: Resolution and period of the source.
+        sampling: Resolution, period and gain errors of the source.
 
     Returns:
         Shape (1,), dtype ``EKF_SETTINGS``.
@@ -82,10 +87,12 @@ def filter_settings(
     p["capacity_as"], p["series"] = 3600.0 * cell.cell.capacity_ah, series
     p["ocv_v"], p["ocv_slope_v"] = ocv_and_slope_v
     _open_circuit(p, cell, identifier.hysteresis_v)
+    _add_voltage_gain_error(p, sampling.voltage_gain_std)
     weak_ohm, strong_ohm, r_std, (p["low_c"], p["high_c"]) = _ladder_resistances(cell)
     mid_soc = GRID // 2
     p["middle_ohm"] = weak_ohm[mid_soc].sum() + strong_ohm[mid_soc].sum()
     p["weak_ohm"], p["strong_ohm"] = np.maximum(weak_ohm, MIN_RESISTANCE * p["middle_ohm"]), strong_ohm
+    r_std = float(np.hypot(r_std, sampling.current_gain_std))
     noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
     p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0  # noise and rounding
     p["unmeasured_s"] = unmeasured_s(sampling)
@@ -97,6 +104,9 @@ def filter_settings(
     for name, configured in (("capacity_std", capacity_std), ("soc_std", identifier.soc_std)):
         if configured is not None:
             noise = replace(noise, **{name: configured})
+    # a current sensor with a wrong gain counts the charge of a cell with another capacity
+    noise = replace(noise, capacity_std=float(np.hypot(noise.capacity_std, sampling.current_gain_std)))
+    p["min_soc_std"] = max(MIN_SOC_STD, MIN_SOC_STD_OF_R_STD * noise.r_std)
     noise = replace(noise, bias_relative=max(noise.bias_relative, MIN_BIAS_OF_R_STD * r_std))
     for field in fields(noise):
         p[field.name] = getattr(noise, field.name)
@@ -137,6 +147,19 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
         p["hysteresis_v"] = 0.5 * hysteresis_v * series
         if not is_mean_curve:  # a curve without hysteresis was measured after discharge
             p["ocv_v"] += 0.5 * hysteresis_v * series
+
+
+def _add_voltage_gain_error(p: np.void, gain_std: float) -> None:
+    """Add the error of the voltage sensor's gain to the error of the OCV in ``p``, a record of dtype EKF_SETTINGS.
+
+    Both errors are constant and have equal effects. The gain's error of the overpotential is negligible.
+
+    Args:
+        p: Record that contains E_o and its error; written.
+        gain_std: Relative std of the gain.
+    """
+    ocv_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_v"].size), p["ocv_v"])
+    p["curve_error_v"] = np.hypot(p["curve_error_v"], gain_std * ocv_v)
 
 
 def _ladder_resistances(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import Estimator
+from bms_estimator.estimator.filter_settings import SOC_GRID
 from bms_estimator.kernels.cell_model.chen_mora import emf
 from bms_estimator.kernels.cell_model.rc_ladder import on_grid
 from bms_estimator.kernels.identifier import MIN_BINS
@@ -84,18 +85,44 @@ def relative_capacity(record: np.void) -> IdentifiedValue:
     return IdentifiedValue(math.exp(ln_q), math.exp(ln_q) * std, 0.0)
 
 
-def relative_series_resistance(record: np.void, settings: np.void) -> IdentifiedValue:
+def relative_series_resistance(record: np.void, settings: np.void, cell_file: np.void | None = None) -> IdentifiedValue:
     """Return the ratio of R_s to that of the cell file at equal SOC and temperature.
 
     Args:
         record: Record of dtype ESTIMATOR_STATE, after a sample, with the identifier enabled.
         settings: Record of dtype ESTIMATOR_SETTINGS.
+        cell_file: ``Estimator.cell_file_settings``; None: ``settings`` has the curves of the cell file.
     """
-    ln_ratio, variance = ln_r_s_ratio(record["filter"], settings["filter"])
+    f, p = record["filter"], settings["filter"]
+    ln_ratio, variance = ln_r_s_ratio(f, p)
     value = math.exp(ln_ratio)
+    if cell_file is not None:
+        value *= _series_ohm(f, p) / _series_ohm(f, cell_file)
     return IdentifiedValue(
         value, value * math.sqrt(variance), float(record["unlearned_s"][ELEMENT_NAMES.index("r_s_ohm")])
     )
+
+
+def _series_ohm(f: np.void, p: np.void) -> float:
+    """Return R_0 of the curves in ``p`` at the present SOC and temperature [ohm]."""
+    soc = float(f["soc"])
+    weak_ohm, strong_ohm = (on_grid(soc, np.ascontiguousarray(p[name][:, 0])) for name in ("weak_ohm", "strong_ohm"))
+    return float(f["weak"] * weak_ohm + f["strong"] * strong_ohm)
+
+
+def fitted_ocv_correction(estimator: Estimator, soc: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the correction of the cell file's OCV by the slow fit [V]. The filter's correction is relative to the sum."""
+    p, cell_file = estimator.settings_record[0]["filter"], estimator.cell_file_settings
+    difference_v: NDArray[np.float64] = p["ocv_v"] - cell_file["ocv_v"]
+    return np.asarray(np.interp(soc, np.linspace(0.0, 1.0, difference_v.size), difference_v))
+
+
+def fitted_resistance_factors(estimator: Estimator, soc: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the slow fit's factors on the resistances R_0..R_6 of the cell file, shape (n, RESISTANCES)."""
+    p, cell_file = estimator.settings_record[0]["filter"], estimator.cell_file_settings
+    fitted_ohm, file_ohm = (record["weak_ohm"] + record["strong_ohm"] for record in (p, cell_file))
+    factors = np.divide(fitted_ohm, file_ohm, out=np.ones_like(file_ohm), where=file_ohm > 0.0)
+    return np.column_stack([np.interp(soc, SOC_GRID, column) for column in factors.T])
 
 
 def current_offset(record: np.void) -> IdentifiedValue:
@@ -165,7 +192,8 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
     record, settings = estimator.record[0], estimator.settings_record[0]
     capacity = relative_capacity(record)
     (ln_r0, r0_std), (ln_r, r_std) = _state_and_std(record, LN_R0), _state_and_std(record, LN_R)
-    r0_factor, pair_factor = math.exp(ln_r0), math.exp(ln_r)
+    middle = fitted_resistance_factors(estimator, np.array([0.5]))[0]
+    r0_factor, pair_factor = math.exp(ln_r0) * middle[0], math.exp(ln_r) * float(np.median(middle[1:]))
     values = cell.model_dump()
     values["cell"]["capacity_ah"] *= capacity.value
     values["cell"]["capacity_std"] = min(capacity.relative_std, MAX_CAPACITY_STD)
@@ -174,21 +202,30 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
     for name in ("c_ts", "c_tl"):  # the time constants do not change
         values[name] |= {key: values[name][key] / pair_factor for key in ("amplitude_farad", "offset_farad")}
     if cell.ladder is not None:
-        factors = [r0_factor, *(len(cell.ladder.weak_ohm) - 1) * [pair_factor]]
+        scales = np.exp(np.array([ln_r0, *(len(cell.ladder.weak_ohm) - 1) * [ln_r]]))
+        factors = scales[:, None] * fitted_resistance_factors(estimator, np.array(cell.ladder.soc)).T
         for name in ("weak_ohm", "strong_ohm"):
-            rows = zip(factors, values["ladder"][name], strict=True)
-            values["ladder"][name] = [[factor * r for r in row] for factor, row in rows]
+            values["ladder"][name] = (factors * np.array(values["ladder"][name])).tolist()
         values["ladder"]["std"] = max(r0_std, r_std)
     if settings["filter"]["learned"] > 0.0:
-        values["ocv"] = _corrected_ocv(record, settings, cell, series)
+        values["ocv"] = _corrected_ocv(estimator, cell, series)
     return CellModel.model_validate(values)
 
 
-def _corrected_ocv(record: np.void, settings: np.void, cell: CellModel, series: int) -> dict[str, Any]:
+def _corrected_ocv(estimator: Estimator, cell: CellModel, series: int) -> dict[str, Any]:
     """Return the corrected OCV of a cell as a table, with the other columns of the given table."""
     table = cell.ocv.model_dump() if isinstance(cell.ocv, TableOcv) else {"form": "table", "soc": EVEN_SOC}
     soc = np.array(table["soc"])
-    correction_v, std_v = ocv_correction_with_std(record, settings, soc)
+    correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], soc)
+    correction_v = correction_v + fitted_ocv_correction(estimator, soc)
     ocv_v = np.array(table["ocv_v"]) if "ocv_v" in table else np.array([emf(x, cell.a) for x in soc])
     rising_v = np.maximum.accumulate(ocv_v + correction_v / series) + MIN_RISE_V * np.arange(soc.size)
+    if table.get("hysteresis_v"):
+        fitted_v, file_v = (
+            estimator.settings_record[0]["filter"]["hysteresis_v"],
+            estimator.cell_file_settings["hysteresis_v"],
+        )
+        if file_v.any():
+            factor = float(fitted_v.sum() / file_v.sum())
+            table = table | {"hysteresis_v": [factor * v for v in table["hysteresis_v"]]}
     return table | {"ocv_v": rising_v.tolist(), "error_v": (std_v / series).tolist()}

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from bms_estimator.estimator.anchor_settings import MAX_EMPTY_SOC, MIN_FULL_SOC, soc_at_cutoff, soc_at_full
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
@@ -33,7 +34,14 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
     if isinstance(cell, FuelCellModel):
         lines = [_voltage_out_of_range(settings, _no_load_v(cell), "at no load"), *_ignored(settings, cell)]
     else:
-        checks = _too_large_capacity, _series_counted_twice, _implausible_cell_voltage, _missing_parallel
+        checks = (
+            _too_large_capacity,
+            _series_counted_twice,
+            _implausible_cell_voltage,
+            _missing_parallel,
+            _full_voltage_off_curve,
+            _cutoff_voltage_off_curve,
+        )
         full_v = float(ocv_grid(cell)[0][-1])
         lines = [*(check(settings, cell) for check in checks), _voltage_out_of_range(settings, full_v, "when full")]
     return [line for line in lines if line]
@@ -87,6 +95,29 @@ def _missing_parallel(settings: Settings, cell: CellModel) -> str | None:
     if settings.pack.parallel > 1 or c.capacity_ah > SMALL_CELL_AH or c.series_count <= MAX_SINGLE_ROW:
         return None
     return f"{c.series_count} in series of {c.capacity_ah:g} Ah: a single row of small cells; is pack.parallel right?"
+
+
+def _full_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None:
+    ocv_v, limits = ocv_grid(cell)[0], settings.charge_limits
+    soc = soc_at_full(ocv_v, limits)
+    if soc >= MIN_FULL_SOC:
+        return None
+    return (
+        f"pack.full_voltage_v = {limits.full_voltage_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there and SOC 1 at "
+        f"{ocv_v[-1]:.2f} V, so that the end of a charge does not correct the SOC; is it the voltage of the whole pack? If the "
+        "charger ends there, make a cell file from charges to this voltage (bms-estimator ocv)"
+    )
+
+
+def _cutoff_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None:
+    ocv_v, limits = ocv_grid(cell)[0], settings.charge_limits
+    soc = soc_at_cutoff(ocv_v, limits)
+    if soc <= MAX_EMPTY_SOC:
+        return None
+    return (
+        f"pack.cutoff_voltage_v = {limits.cutoff_voltage_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there and SOC 0 "
+        f"at {ocv_v[0]:.2f} V, so that the end of a discharge does not correct the SOC; is it the voltage of the whole pack?"
+    )
 
 
 def _voltage_out_of_range(settings: Settings, highest_v: float, when: str) -> str | None:

@@ -6,6 +6,7 @@ Numbers in parentheses are equations of the thesis.
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.estimator.anchor_settings import anchor_settings
 from bms_estimator.estimator.filter_settings import filter_settings, unmeasured_s
 from bms_estimator.estimator.fuel_cell_settings import fuel_cell_settings
 from bms_estimator.estimator.learning_settings import learning_settings
@@ -17,8 +18,9 @@ from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.observer import SCHEME_2_EPSILON, SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
-from bms_estimator.settings.sampling import BOARD, Sampling
+from bms_estimator.settings.sampling import EXACT, Sampling
 
 DEAD_ZONE_STEPS = 2.0
 """Default dead zone in steps of the voltage converter: half a step of rounding, half a step of noise, and a safety factor
@@ -56,7 +58,8 @@ def estimator_settings(
     voltage_resolution_v: float,
     voltage_noise_v: float | None,
     initial_soc: float | None,
-    sampling: Sampling = BOARD,
+    sampling: Sampling = EXACT,
+    limits: ChargeLimits = NO_LIMITS,
 ) -> NDArray[np.void]:
     """Return the settings record of the whole estimator.
 
@@ -67,7 +70,8 @@ def estimator_settings(
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
         initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
-        sampling: Resolution and period of the source.
+        sampling: Resolution, period and gain errors of the source.
+        limits: Limits of charger and protection.
 
     Returns:
         Shape (1,), dtype ``ESTIMATOR_SETTINGS``.
@@ -91,6 +95,7 @@ def estimator_settings(
     for i in range(1, PARAMETERS):
         p["lower"][i], p["upper"][i] = cell.bounds(i).lower, cell.bounds(i).upper
     grid = p["observer"]["ocv_v"], p["observer"]["ocv_slope_v"]
+    p["anchors"] = anchor_settings(cell, grid[0], limits, voltage_resolution_v)[0]
     p["filter"] = filter_settings(cell, grid, identifier, voltage_resolution_v, voltage_noise_v, sampling)[0]
     return record
 
@@ -148,7 +153,7 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
     p["voltage_min_v"] = cell.voltage_min_v
     p["voltage_max_v"] = cell.voltage_max_v
     p["current_max_a"] = cell.current_max_a
-    _period_limits(p, BOARD)
+    _period_limits(p, EXACT)
 
 
 def _period_limits(p: np.void, sampling: Sampling) -> None:

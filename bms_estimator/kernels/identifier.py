@@ -7,8 +7,9 @@ The adaptive law is (3.18) of the thesis. Errata are listed in docs/theory/thesi
 
 import math
 
+from bms_estimator.kernels.accumulators.history import add_reference, add_window, begin_segment
 from bms_estimator.kernels.cell_model.chen_mora import delta
-from bms_estimator.kernels.kalman_filter.ekf import predict
+from bms_estimator.kernels.kalman_filter.anchors import EMPTY, FULL, NO_ANCHOR, apply_anchor, detect_anchor
 from bms_estimator.kernels.kalman_filter.element_map import (
     CAPACITANCES,
     ELEMENTS,
@@ -28,18 +29,19 @@ from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     write_equivalent_circuit,
 )
 from bms_estimator.kernels.kalman_filter.frozen_sensor import detect_frozen_input
-from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD, update_hypotheses
+from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD, update_hypotheses, weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.input_checks import (
     UNUSABLE,
     coast_without_voltage,
     passes_innovation_gate,
     restore_if_not_finite,
+    store_last_good_state,
     track_current_sign,
     update_input_faults,
 )
 from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD, detect_current_step
-from bms_estimator.kernels.kalman_filter.window import WINDOW_S, add_to_window, integrate_current, prepare_transition
+from bms_estimator.kernels.kalman_filter.window import WINDOW_S, add_to_window, integrate_current
 from bms_estimator.kernels.start import restart_filter
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
@@ -48,6 +50,8 @@ FIT_EVERY_S = 120.0
 """Interval at which the next of the five elements is fitted, in sample time [s]."""
 MIN_BINS = 3
 """Minimum number of SOC bins for a fit of an element's three parameters."""
+LONG_GAP = 2
+"""Value of ``window.gap`` after a gap in which the pack may have been charged or exchanged."""
 MIN_EXCITATION_C = 0.05
 """Minimum load that excites the resistances, as a C-rate, RMS over 10 min."""
 
@@ -64,10 +68,10 @@ def identifier_step(
         dt_s: Time since the previous sample [s].
         gap: True if samples are missing since the previous sample.
         current_a: Current, positive on discharge [A].
-        voltage_v: Terminal voltage [V].
+        voltage_v: Terminal voltage [V]; NaN if it was not measured at this sample.
         temperature_c: Temperature of the cell [C]; NaN without a sensor.
     """
-    f, c = s.filter, s.checks
+    f, c, measured = s.filter, s.checks, math.isfinite(voltage_v)
     change_a = current_a - f.current_a
     if gap and f.window.samples > 0:
         update_from_window(s, p)  # measurements before the gap give no information on the charge in it
@@ -75,20 +79,19 @@ def identifier_step(
     if dt_s > p.filter.unmeasured_s:
         s.unlearned_s[:] += dt_s
     unknown_soc = f.window.unknown_as / p.filter.capacity_as
-    if gap and unknown_soc > MAX_SINGLE_STD and not c.suspects & UNUSABLE:  # one hypothesis does not suffice
-        prepare_transition(f, p.filter)
-        predict(f, p.filter, f.best)
-        restart_filter(s, p, math.hypot(f.soc_std, unknown_soc), current_a, voltage_v)
+    if gap and dt_s >= p.filter.unmeasured_s:
+        f.window.gap = LONG_GAP
+    may_hide_charge = f.window.gap == LONG_GAP or (f.window.gap and unknown_soc > MAX_SINGLE_STD)
+    # after a gap that ended without a voltage, the first voltage selects
+    if measured and may_hide_charge and not c.suspects & UNUSABLE:
+        restart_filter(s, p, f.window.time_s, current_a, voltage_v)
         s.fit_age_s += dt_s
         return
-    voltage_usable = detect_frozen_input(c, f, p.filter, dt_s, current_a, voltage_v)
-    track_current_sign(c, p.filter, dt_s, current_a, voltage_v)
+    accepted = measured and accept_voltage(s, p, current_a, voltage_v, change_a)
     if c.suspects & UNUSABLE:
-        coast_without_voltage(c, f, p.filter, dt_s, current_a)
-    elif voltage_usable and passes_innovation_gate(
-        c, s.counters, f, p.filter, s.elements, dt_s, change_a, current_a, voltage_v
-    ):
-        detect_current_step(f, p.filter, dt_s, change_a, voltage_v)
+        coast(s, p, dt_s, current_a)
+    elif accepted:
+        detect_current_step(f, p.filter, s.observer.voltage_age_s, change_a, voltage_v)
         add_to_window(f, current_a, voltage_v)
     else:
         f.step.phase = UNHELD
@@ -101,17 +104,66 @@ def identifier_step(
 
 
 @njit(cache=True)
+def coast(s: Record, p: Record, dt_s: float, current_a: float) -> None:
+    """Process a sample without its voltage. For the history, the time of the fault is a gap."""
+    f, c = s.filter, s.checks
+    fault_s, charge_as, soc_std = f.window.time_s, f.window.charge_as, f.soc_std
+    coast_without_voltage(c, f, p.filter, dt_s, current_a)
+    if not c.suspects & UNUSABLE:
+        begin_segment(s.history, fault_s, charge_as, soc_std * p.filter.capacity_as)
+
+
+@njit(cache=True)
+def accept_voltage(s: Record, p: Record, current_a: float, voltage_v: float, change_a: float) -> bool:
+    """Run the input checks with a measured voltage; return True if the filter may use the voltage.
+
+    The checks compare successive measured voltages. They run during a fault, too, because they detect its end.
+    """
+    c, f, dt_s = s.checks, s.filter, s.observer.voltage_age_s
+    usable = detect_frozen_input(c, f, p.filter, dt_s, current_a, voltage_v)
+    track_current_sign(c, p.filter, dt_s, current_a, voltage_v)
+    if c.suspects & UNUSABLE or not usable:
+        return False
+    return passes_innovation_gate(c, s.counters, f, p.filter, s.elements, dt_s, change_a, current_a, voltage_v)
+
+
+@njit(cache=True)
 def update_from_window(s: Record, p: Record) -> None:
     """Update the filter, the input checks, the elements and the map with the samples of the window."""
     f, c = s.filter, s.checks
     dt_s = f.window.time_s
     c.mean_a = f.window.sum_a / f.window.samples
+    add_window(s.history, f, p.filter)
+    voltage_v = f.window.sum_v / f.window.samples
     update_hypotheses(f, p.filter)
+    correct_at_anchor(s, p, dt_s, voltage_v)
     restore_if_not_finite(c, s.counters, f, p.filter, dt_s)
     update_input_faults(c, f, p.filter, dt_s)
     write_equivalent_circuit(f, p.filter, s.elements)
     if dt_s <= p.filter.unmeasured_s:
         add_elements_to_map(s, p, dt_s)
+
+
+@njit(cache=True)
+def correct_at_anchor(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
+    """Correct the SOC if the window of ``dt_s`` with mean voltage ``voltage_v`` [V] completes a charge or discharge."""
+    f, c, a = s.filter, s.checks, s.anchors
+    kind = detect_anchor(a, p.anchors, f, p.filter, dt_s, c.mean_a, voltage_v)
+    if kind == NO_ANCHOR:
+        return
+    if kind == FULL:
+        add_reference(s.history, kind, 1.0, a.full_std)
+    else:
+        add_reference(s.history, kind, 0.0, a.empty_std)
+    a.last, a.soc_before, a.soc_std_before = kind, f.soc, weakest_cell_soc_std(f, p.filter)
+    if kind == FULL and p.anchors.corrects_full:
+        apply_anchor(f, p.filter, 1.0, a.full_std)
+    elif kind == EMPTY and p.anchors.corrects_empty:
+        apply_anchor(f, p.filter, 0.0, a.empty_std)
+    a.soc_after = f.soc
+    if not c.suspects & UNUSABLE:
+        c.last_v = 0.0  # no previous sample: if the sensor freezes now, the SOC before the anchor must not be restored
+    store_last_good_state(c, f)
 
 
 @njit(cache=True)

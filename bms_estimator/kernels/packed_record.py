@@ -60,13 +60,14 @@ def _fields(dtype: np.dtype[Any], offset: int) -> Iterator[tuple[int, tuple[int,
     ``offset`` is the position of this record in the outermost one [bytes].
 
     Raises:
-        ValueError: A field does not consist of whole words, or is an array of records.
+        ValueError: A field does not consist of whole words.
     """
     for name in dtype.names or ():
         field, offset_in_record = dtype.fields[name][:2]  # type: ignore[index]
         field_offset = offset + offset_in_record
-        if field.names:
-            yield from _fields(field, field_offset)
+        if field.base.names:
+            for k in range(math.prod(field.shape)):
+                yield from _fields(field.base, field_offset + k * field.base.itemsize)
         elif field.base.str[1:] not in _WORD_TYPES or field_offset % WORD_BYTES:
             raise ValueError(f"{name}: {field} at {field_offset} does not consist of whole words")
         else:

@@ -5,7 +5,9 @@
 
 import numpy as np
 
+from bms_estimator.kernels.accumulators.history import HISTORY
 from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS
+from bms_estimator.kernels.kalman_filter.anchors import ANCHOR_SETTINGS, ANCHORS
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import EQUIVALENT
 from bms_estimator.kernels.kalman_filter.input_checks import CHECKS, COUNTERS
@@ -19,6 +21,7 @@ ESTIMATOR_SETTINGS = np.dtype(
         ("observer", OBSERVER_SETTINGS),
         ("learning", LEARNING_SETTINGS),
         ("filter", EKF_SETTINGS),
+        ("anchors", ANCHOR_SETTINGS),
         ("identify", "i8"),  # 1: the filter runs; 0: SOC by coulomb counting, parameters as configured
         ("series_resistance", "i8"),  # 1: R_s by (4.2), step 3 of the thesis
         ("hand_over", "i8"),  # 1: identified parameters become the limits of the adaptive law (3.18)
@@ -39,8 +42,10 @@ ESTIMATOR_STATE = np.dtype(
         ("elements", EQUIVALENT),  # circuit equivalent to the filter's ladder at the present SOC and temperature
         ("checks", CHECKS),
         ("counters", COUNTERS),
+        ("anchors", ANCHORS),
         ("map", ELEMENT_MAP),
         ("fit", ELEMENT_FIT),
+        ("history", HISTORY),
         ("fit_age_s", "f8"),  # time since the last fit of an element [s]
         ("next_element", "i8"),  # index of the element to be fitted next
         ("unseen_s", "f8"),  # gap before the first sample with a new time base [s]; infinite if unknown

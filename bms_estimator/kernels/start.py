@@ -5,15 +5,28 @@
 
 import math
 
+from bms_estimator.kernels.accumulators.history import begin_segment
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.kernels.kalman_filter.anchors import interrupt_anchors
+from bms_estimator.kernels.kalman_filter.ekf import predict
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     write_equivalent_circuit,
 )
-from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, spawn_hypotheses, update_hypotheses
+from bms_estimator.kernels.kalman_filter.gap_charge import is_resting
+from bms_estimator.kernels.kalman_filter.hypotheses import (
+    begin_gap,
+    forget_state_of_charge,
+    initialize_filter,
+    set_initial_soc,
+    spawn_after_gap,
+    spawn_hypotheses,
+    update_hypotheses,
+)
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
+from bms_estimator.kernels.kalman_filter.mixture import copy_hypothesis, limit_soc_std, merge_all
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
 from bms_estimator.kernels.kalman_filter.temperature import is_temperature, update_arrhenius_factors
-from bms_estimator.kernels.kalman_filter.window import add_to_window, reset_window
+from bms_estimator.kernels.kalman_filter.window import add_to_window, prepare_transition, reset_window
 from bms_estimator.kernels.observer.learning_law import initialize_learning, initialize_states_at_rest
 from bms_estimator.kernels.observer.series_resistance import (
     initialize_series_resistance,
@@ -34,18 +47,52 @@ def start_filter(s: Record, p: Record, current_a: float, voltage_v: float, tempe
 
 
 @njit(cache=True)
-def restart_filter(s: Record, p: Record, soc_std: float, current_a: float, voltage_v: float) -> None:
-    """Re-initialize the filter after an unmeasured gap with an unknown load, at its present SOC with ``soc_std``."""
+def restart_filter(s: Record, p: Record, gap_s: float, current_a: float, voltage_v: float) -> None:
+    """Re-initialize the SOC after a gap of ``gap_s`` [s]; infinite if unknown. The window contains a gap of known duration."""
     f = s.filter
+    begin_segment(s.history, gap_s, f.window.charge_as, f.window.unknown_as)
     f.current_a, f.step.phase = current_a, UNHELD
     update_arrhenius_factors(f)
-    spawn_hypotheses(f, p.filter, f.soc, min(soc_std, MAX_SOC_STD_AFTER_GAP))
+    if gap_s < p.filter.unmeasured_s:  # too short for a charge or an exchange of the pack
+        soc_std = math.hypot(f.soc_std, f.window.unknown_as / p.filter.capacity_as)
+        prepare_transition(f, p.filter)
+        predict(f, p.filter, f.best)
+        spawn_hypotheses(f, p.filter, f.soc, min(soc_std, MAX_SOC_STD_AFTER_GAP))
+    else:
+        merge_all(f)
+        begin_gap(f, gap_s)
+        rested = gap_s < math.inf and is_resting(f, p.filter)
+        propagate_over_gap(f, p.filter, gap_s, rested)
+        spawn_after_gap(f, p.filter, gap_s, rested)
     reset_window(f)
+    interrupt_anchors(s.anchors)
     s.checks.slow_v = 0.0  # no slow means yet
     s.checks.gated_in_row, s.checks.gated_s = 0, 0.0
     if not s.checks.suspects & UNUSABLE:
         s.checks.last_v = 0.0  # no previous sample
         first_update(s, p, current_a, voltage_v)
+
+
+@njit(cache=True)
+def propagate_over_gap(f: Record, p: Record, gap_s: float, rested: bool) -> None:
+    """Propagate hypothesis 0 over a gap with the usual load and, if ``rested``, hypothesis 1 without a load.
+
+    After a gap of unknown duration, SOC and polarization are unknown. ``f`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
+    """
+    if gap_s == math.inf:
+        f.x_a[:] = 0.0
+        forget_state_of_charge(f, p, 0)
+        set_initial_soc(f, p, 0, f.soc, MAX_SOC_STD_AFTER_GAP)
+        return
+    if rested:
+        copy_hypothesis(f, 0, 1)
+    prepare_transition(f, p)
+    predict(f, p, 0)
+    limit_soc_std(f, 0, MAX_SOC_STD_AFTER_GAP)
+    if rested:
+        w = f.window
+        w.charge_as = w.throughput_as = w.unknown_as = 0.0
+        predict(f, p, 1)
 
 
 @njit(cache=True)
@@ -88,6 +135,6 @@ def restart_after_unknown_gap(s: Record, p: Record, current_a: float, voltage_v:
             s.filter.temperature_c, s.filter.sensed = temperature_c, 1
         elif not s.filter.sensed:
             s.filter.temperature_c = REFERENCE_C
-        restart_filter(s, p, MAX_SOC_STD_AFTER_GAP, current_a, voltage_v)
+        restart_filter(s, p, math.inf, current_a, voltage_v)
     if p.learning.enabled:
         initialize_states_at_rest(s, p, voltage_v)

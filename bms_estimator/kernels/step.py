@@ -6,6 +6,7 @@
 import math
 from enum import IntEnum
 
+from bms_estimator.kernels.accumulators.history import needs_caller
 from bms_estimator.kernels.cell_model.chen_mora import soc_from_ocv
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.kernels.identifier import identifier_step
@@ -41,6 +42,7 @@ _OUT_OF_RANGE = int(SampleOutcome.OUT_OF_RANGE)
 _REPEATED = int(SampleOutcome.REPEATED)
 _SATURATED = int(SampleOutcome.SATURATED)
 _SATURATED_BITS = int(SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED)
+_VOLTAGE_HELD = int(SampleStatus.VOLTAGE_HELD)
 
 
 @njit(cache=True)
@@ -75,6 +77,10 @@ def step(
     temperature_c: float,
 ) -> int:
     """Process one sample.
+
+    A held voltage is not a measurement, so that only the current and the temperature of its sample are used. The first
+    sample initializes the estimator with its voltage in any case. The observer of the thesis has the voltage as its only
+    input, which it holds between measurements.
 
     Args:
         state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
@@ -116,16 +122,20 @@ def step(
     gap = new_clock or is_gap(s, p, dt_s)
     previous_a, previous_soc = s.current_a, s.soc
     count_charge(s, p, dt_s, current_a)
+    measured_v = math.nan if status & _VOLTAGE_HELD else voltage_v
+    s.voltage_age_s += dt_s
     if settings[0].identify:
-        identifier_step(state[0], settings[0], dt_s, gap, current_a, voltage_v, temperature_c)
+        identifier_step(state[0], settings[0], dt_s, gap, current_a, measured_v, temperature_c)
     else:
         s.soc = s.soc_coulomb
     if settings[0].learning.enabled:
-        learning_step(state[0], settings[0], dt_s, previous_a, voltage_v)
+        learning_step(state[0], settings[0], dt_s, previous_a, measured_v)
     else:
         observer_step(s, p, dt_s, voltage_v)
     if settings[0].series_resistance:
-        series_resistance_step(state[0], settings[0], dt_s, previous_a, previous_soc, voltage_v)
+        series_resistance_step(state[0], settings[0], dt_s, previous_a, previous_soc, measured_v)
+    if math.isfinite(measured_v):
+        s.voltage_age_s = 0.0
     return outcome
 
 
@@ -143,8 +153,10 @@ def is_gap(s: Record, p: Record, dt_s: float) -> bool:
 
 
 @njit(cache=True)
-def run(state: Records, settings: Records, samples: Records, trace: Records) -> int:
+def run(state: Records, settings: Records, samples: Records, trace: Records) -> tuple[int, int]:
     """Process a block of samples and write a row of ``trace`` for each accepted sample.
+
+    The run ends early if the history's rows must be taken or its event is due (``history.needs_caller``).
 
     Args:
         state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
@@ -153,7 +165,7 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
         trace: Shape (m,) with m >= n, dtype TRACE; written from its start.
 
     Returns:
-        Number of rows written to ``trace``.
+        Number of samples processed, and number of rows written to ``trace``.
     """
     rows = 0
     for j in range(samples.shape[0]):
@@ -162,7 +174,9 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
             write_observer_trace(trace[rows], state[0].observer, settings[0], x)
             write_filter_trace(trace[rows], state[0], settings[0])
             rows += 1
-    return rows
+            if needs_caller(state[0].history):
+                return j + 1, rows
+    return samples.shape[0], rows
 
 
 @njit(cache=True)
@@ -195,7 +209,8 @@ def write_filter_trace(row: Record, s: Record, p: Record) -> None:
 
     Without the filter, ``innovation_v`` is the observer's output error e, ``r_s_ohm`` is R_s by (4.2) if enabled, and the
     other columns are NaN. ``soc_ocv`` is then NaN, because the observer's v_ts and v_tl absorb any error of the SOC, so that
-    the inverted OCV (7.1) would return the observer's own SOC.
+    the inverted OCV (7.1) would return the observer's own SOC. It is also NaN with a held voltage, which does not belong to
+    the present current.
     """
     if not p.identify:
         row.innovation_v = s.observer.innovation_v
@@ -206,8 +221,10 @@ def write_filter_trace(row: Record, s: Record, p: Record) -> None:
         return
     f, e = s.filter, s.elements
     row.innovation_v = f.innovation_v
-    e_o = open_circuit(f, p.filter, e, row.current_a, row.voltage_v)
-    row.soc_ocv = soc_from_ocv(e_o, p.filter.ocv_v, p.filter.ocv_slope_v)
+    row.soc_ocv = math.nan
+    if s.observer.voltage_age_s == 0.0:
+        e_o = open_circuit(f, p.filter, e, row.current_a, row.voltage_v)
+        row.soc_ocv = soc_from_ocv(e_o, p.filter.ocv_v, p.filter.ocv_slope_v)
     row.soc_std = weakest_cell_soc_std(f, p.filter)
     row.r_s_ohm, row.r_s_std_ohm = value_and_std(e, R_S)
     row.r_ts_ohm, row.r_ts_std_ohm = value_and_std(e, R_TS)

@@ -1,12 +1,12 @@
 """Events of a pack for the topic ``event``, from the differences between successive snapshots."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
 
 from pydantic import Field
 
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads import Health, Payload, Snapshot
+from bms_estimator.model.payloads import AnchorReport, FitReport, Health, Payload, Snapshot
 
 MIN_UNSEEN_S = 1.0
 """Minimum duration of a gap that causes an event [s]. Shorter gaps only count in ``health``."""
@@ -20,6 +20,10 @@ EventName = Literal[
     "sensor_online",
     "suspicion",
     "suspicion_cleared",
+    "full",
+    "empty",
+    "soc_reinitialized",
+    "pack_fitted",
     "checkpoint_fails",
     "checkpoint_saved",
     "alarm_raised",
@@ -35,11 +39,19 @@ class Event(Payload):
     time: str = Field(description="time of detection, ISO 8601, UTC")
     name: EventName = Field(description="kind of event")
     text: str = Field(description="description: reason and remedy")
+    anchor: AnchorReport | None = Field(
+        default=None, description="SOC before and after the correction; null unless the name is full or empty"
+    )
+    fit: FitReport | None = Field(
+        default=None, description="SOC and capacity before and after a fit; null unless the name is pack_fitted"
+    )
 
 
 class _EventText(NamedTuple):
     name: EventName
     text: str
+    anchor: AnchorReport | None = None
+    fit: FitReport | None = None
 
 
 def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
@@ -63,12 +75,12 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
         gaps = _gap_event(health.total.unseen_s - previous.total.unseen_s)
         texts = [*gaps, *_sensor_events(previous, health), *_input_fault_events(previous.suspects, health.suspects)]
         texts += _checkpoint_events(previous.checkpoint, health)
-    health_events = [Event(time=health.publish_time, name=name, text=text) for name, text in texts]
+        texts += _soc_events(previous.identifier, health)
+        texts += _fit_events(previous, health)
+    health_events = [Event(time=health.publish_time, **text._asdict()) for text in texts]
     # alarms are evaluated for each snapshot, but several snapshots may share one ``health``
     alarm_time = snapshot.estimate.publish_time if snapshot.estimate else health.publish_time
-    return health_events + [
-        Event(time=alarm_time, name=name, text=text) for name, text in _alarm_events(before, snapshot)
-    ]
+    return health_events + [Event(time=alarm_time, **text._asdict()) for text in _alarm_events(before, snapshot)]
 
 
 def _alarm_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
@@ -125,6 +137,50 @@ def _input_fault_events(previous: list[str], present: list[str]) -> Iterator[_Ev
 def _fault_text(sentence: str) -> str:
     """Return the constant part of an input fault's text."""
     return next((fault.text for fault in InputFault if sentence.endswith(fault.text)), sentence)
+
+
+def _soc_events(previous: Mapping[str, int], health: Health) -> Iterator[_EventText]:
+    """Yield the reasons of jumps of the SOC. ``previous`` are the earlier counters ``health.identifier``."""
+
+    def has_increased(name: str) -> bool:
+        return health.identifier.get(name, 0) > previous.get(name, 0)
+
+    anchor = health.anchor
+    if anchor is not None and (has_increased("full_anchors") or has_increased("empty_anchors")):
+        yield _EventText(anchor.kind, _anchor_text(anchor), anchor)
+    if has_increased("searched"):
+        yield _EventText(
+            "soc_reinitialized",
+            "the voltage contradicted the SOC for minutes; the SOC is estimated again with a std of 20 %",
+        )
+    if has_increased("reset"):
+        yield _EventText("soc_reinitialized", "a value of the filter was not finite; its last good state was restored")
+
+
+def _fit_events(previous: Health, health: Health) -> Iterator[_EventText]:
+    """Yield a fit of the pack's model that changed SOC or capacity."""
+    before, model = previous.pack_model, health.pack_model
+    if model is None or model.change is None or (before is not None and before.changes >= model.changes):
+        return
+    change = model.change
+    text = (
+        f"the fit to the pack's history changed the SOC from {100.0 * change.soc_before:.1f} to "
+        f"{100.0 * change.soc_after:.1f} % and the capacity from {change.capacity_before_ah:.4g} to "
+        f"{change.capacity_after_ah:.4g} Ah"
+    )
+    yield _EventText("pack_fitted", text, fit=change)
+
+
+def _anchor_text(anchor: AnchorReport) -> str:
+    """Return the cause of an anchor, and what it changed."""
+    if anchor.kind == "full":
+        cause = "the charger ended at the full voltage"
+    else:
+        cause = "the discharge ended at the cut-off voltage"
+    before = f"SOC {100.0 * anchor.soc_before:.1f} % (std {100.0 * anchor.soc_std_before:.1f} %)"
+    if anchor.soc_after == anchor.soc_before:
+        return f"{cause}: {before}, unchanged"
+    return f"{cause}: {before} corrected to {100.0 * anchor.soc_after:.1f} %"
 
 
 def _checkpoint_events(previous: str, health: Health) -> Iterator[_EventText]:

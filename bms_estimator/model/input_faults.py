@@ -14,6 +14,7 @@ class InputFault(IntFlag):
     TEMPERATURE = 32
     VOLTAGE = 64
     CURRENT = 128
+    PACK = 256
 
     @property
     def text(self) -> str:
@@ -38,4 +39,6 @@ _TEXTS = {
     "and that the source does not repeat an old value",
     InputFault.CURRENT: "the current stays the same to the last digit though the voltage changes: check the current sensor, "
     "and that all loads flow through it",
+    InputFault.PACK: "the SOC before and after a gap differs by more than a charge in the gap explains: check whether the pack "
+    "was exchanged, because capacity and resistances were learned from the pack before; the request forget_pack discards them",
 }

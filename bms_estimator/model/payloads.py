@@ -100,7 +100,7 @@ class Estimate(Payload):
         description="state of charge by coulomb counting alone, 0..1"
     )
     soc_ocv: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
-        description="state of charge by the inverted OCV (7.1), 0..1"
+        description="state of charge by the inverted OCV (7.1), 0..1; null if the last sample had no new voltage"
     )
     remaining_capacity_ah: Annotated[
         float | None, Quantity(Entity("Remaining capacity", "Ah", 2, 0.02, is_primary=True), packs="batteries")
@@ -270,6 +270,49 @@ class Totals(Payload):
     energy_in_kwh: float = Field(default=0.0, description="energy charged at the terminals [kWh]")
 
 
+class AnchorReport(Payload):
+    """The last end of a charge or discharge that defines SOC 1 or 0."""
+
+    kind: Literal["full", "empty"] = Field(
+        description="full: the charger ended at the full voltage; empty: the protection ended at the cut-off voltage"
+    )
+    soc_before: float = Field(description="SOC before the correction, 0..1")
+    soc_std_before: float = Field(description="standard deviation of soc_before")
+    soc_after: float = Field(
+        description="SOC after the correction, 0..1; equal to soc_before if the OCV curve contradicts the configured voltage"
+    )
+
+
+class FitReport(Payload):
+    """Change of the estimates by a fit of the pack's model."""
+
+    soc_before: float = Field(description="SOC before the fit was adopted, 0..1")
+    soc_after: float = Field(description="SOC after the fit was adopted, 0..1")
+    capacity_before_ah: float = Field(description="capacity before the fit was adopted [Ah]")
+    capacity_after_ah: float = Field(description="capacity after the fit was adopted [Ah]")
+
+
+class PackModelHealth(Payload):
+    """Fit of the pack's model to its history; counters since start."""
+
+    fits: int = Field(description="adopted fits")
+    late: int = Field(description="fits that were not done when due and were adopted at a later sample")
+    failed: int = Field(description="fits that ended with an error, which the log describes")
+    changes: int = Field(
+        description="fits that changed the SOC, or the capacity relative to the rated one, by more than 0.01"
+    )
+    rows: int = Field(description="rows of the history")
+    segments: int = Field(description="uninterrupted measurements in the history")
+    history_days: float = Field(
+        description="time from the first to the last row, without gaps of unknown duration [days]"
+    )
+    capacity_ah: float | None = Field(description="learned capacity of the pack [Ah]; null before the first sample")
+    capacity_std_ah: float | None = Field(description="standard deviation of capacity_ah [Ah]")
+    last_fit: str | None = Field(description="time at which the last fit ended, ISO 8601, UTC; null: none since start")
+    last_fit_s: float | None = Field(description="duration of the last fit [s]")
+    change: FitReport | None = Field(description="the last of the changes; null: none since start")
+
+
 class Health(Payload):
     """Topic ``health``, retained: state of the service and the source."""
 
@@ -292,6 +335,9 @@ class Health(Payload):
     samples: dict[str, int] = Field(description="accepted and dropped samples by kind, since start")
     identifier: dict[str, int] = Field(description="samples skipped by the identifier, and its resets, since start")
     suspects: list[str] = Field(description="input diagnostics with remedies; empty: none")
+    anchor: AnchorReport | None = Field(
+        default=None, description="the last end of a charge or discharge; null: none since the first start"
+    )
     lock_losses: Annotated[int, Quantity(prometheus="counter")] = Field(
         description="number of lock losses of the observer"
     )
@@ -321,6 +367,9 @@ class Health(Payload):
     recording: RecordingHealth | None = Field(description="recording of raw bytes; null: none")
     edge: EdgeHealth | None = Field(default=None, description="blocks for a fleet's server; null: none are sent")
     hooks: HookHealth | None = Field(default=None, description="alarm hooks; null: none")
+    pack_model: PackModelHealth | None = Field(
+        default=None, description="fit of the pack's model; null: none, as for a fuel cell"
+    )
     unseen_s: float | None = Field(
         description="length of the last gap in the samples or before the start [s]; "
         "null: no gap since the start, or unknown"

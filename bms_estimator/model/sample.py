@@ -52,6 +52,8 @@ class SampleStatus(IntFlag):
     OVERRUN = 4
     RESET = 8
     GAP = 16
+    VOLTAGE_HELD = 32
+    """The voltage is not a new measurement but that of an earlier sample. Current and temperature are new."""
 
 
 def remove_implausible(values: NDArray[np.float64], low: float, high: float) -> int:

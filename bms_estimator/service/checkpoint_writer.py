@@ -3,12 +3,16 @@
 import asyncio
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import structlog
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.estimator import Estimator
+from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.telemetry.alarms import AlarmEvaluator
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
@@ -36,6 +40,8 @@ class CheckpointWriter:
         totals: Totals over restarts.
         restarts: Number of starts that found a checkpoint.
         interval_s: Maximum interval between two saves [s].
+        pack_model: Slow fit, whose history is saved when its ``revision`` changes; None: no history.
+        history: File of the history; None: no history.
     """
 
     def __init__(
@@ -47,12 +53,17 @@ class CheckpointWriter:
         *,
         restarts: int,
         interval_s: float,
+        pack_model: SlowFit | None = None,
+        history: HistoryFile | None = None,
     ) -> None:
         self._interval_s = interval_s
+        self._pack_model, self._history = pack_model, history
+        self._saved_revision = pack_model.revision if pack_model else 0
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
         self._totals, self._restarts = totals, restarts
         self._saved_alarms = self._alarms.saved_state
         publisher.saved_flow = totals.flow
+        self._saved_fit = pack_model.fit if pack_model else None  # fit of the saved state
         self._saved_progress: tuple[int, float] | None = None
         """Samples and SOC (``_progress``) of the last saved state; None: this run has not saved a state."""
 
@@ -66,7 +77,8 @@ class CheckpointWriter:
         while True:
             await asyncio.sleep(min(CHECK_S, self._interval_s))
             if loop.time() >= tried_s + self._interval_s or (self._needs_save and not failed):
-                failed = not await self._save()
+                history_saved = await self._save_history()
+                failed = not (await self._save() and history_saved)
                 tried_s = loop.time()
 
     async def save_final(self, *, clean: bool) -> None:
@@ -78,6 +90,7 @@ class CheckpointWriter:
         try:
             async with asyncio.timeout(FINAL_SAVE_S):
                 await self._save(clean=clean)
+                await self._save_history(is_last=True)
         except TimeoutError:
             log.warning("the disk hangs: the last checkpoint is not written", file=str(self._checkpoint.path))
 
@@ -89,6 +102,8 @@ class CheckpointWriter:
     def _needs_save(self) -> bool:
         """True if the state has changed enough to be saved before the interval ends."""
         if self._saved_progress is None or self._saved_alarms != self._alarms.saved_state:
+            return True
+        if self._pack_model and self._pack_model.revision != self._saved_revision:
             return True
         return bool(abs(self._estimator.state["soc"][0] - self._saved_progress[1]) >= SOC_CHANGE)
 
@@ -104,17 +119,40 @@ class CheckpointWriter:
         An unchanged state is not saved again: a new save time would hide the gap since the last sample.
         """
         progress, counters = self._progress, self._counters(clean=clean)
-        if not progress[0] or progress == self._saved_progress:
+        if not progress[0] or (progress == self._saved_progress and not self._curves_changed):
             if clean or self._saved_alarms != counters.alarms:
                 return await self._write_with_counters(counters, lambda: self._checkpoint.update_counters(counters))
             return True
-        state = self._estimator.record.copy()
-        if not await self._write_with_counters(counters, lambda: self._checkpoint.save(state, counters)):
+        state, fit = self._estimator.record.copy(), self._pack_model.fit if self._pack_model else None
+        curves = curve_arrays(fit)
+        if not await self._write_with_counters(counters, lambda: self._checkpoint.save(state, counters, curves)):
             self._publisher.saved_flow = None  # the unsaved totals are published
             return False
-        self._publisher.checkpoint, self._saved_progress = "saved", progress
+        self._publisher.checkpoint, self._saved_progress, self._saved_fit = "saved", progress, fit
         self._publisher.saved_flow = ChargeEnergy.from_totals(counters.total)
         return True
+
+    async def _save_history(self, *, is_last: bool = False) -> bool:
+        """Save the history if its revision has changed, or at the end. Return False if it cannot be written."""
+        model, file = self._pack_model, self._history
+        if model is None:
+            return True
+        if is_last:
+            model.take_rows()
+        revision = model.revision
+        if file is None or (revision == self._saved_revision and not (is_last and model.unsaved_rows)):
+            self._saved_revision = revision
+            return True
+        arrays = history_arrays(model.history, model.saved_fit)
+        if await self._write(lambda: file.save(arrays), file.path):
+            self._saved_revision = revision
+            return True
+        return False
+
+    @property
+    def _curves_changed(self) -> bool:
+        """True if the state is relative to other curves than the saved one."""
+        return self._pack_model is not None and self._pack_model.fit is not self._saved_fit
 
     def _counters(self, *, clean: bool) -> RunCounters:
         return RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state)
@@ -126,9 +164,9 @@ class CheckpointWriter:
             self._saved_alarms = counters.alarms
         return written
 
-    async def _write(self, write: Callable[[], None]) -> bool:
-        """Call ``write`` in the disk's thread. Return False if it fails."""
-        file = str(self._checkpoint.path)
+    async def _write(self, write: Callable[[], None], path: Path | None = None) -> bool:
+        """Call ``write``, which writes ``path`` or the checkpoint, in the disk's thread. Return False if it fails."""
+        file = str(path or self._checkpoint.path)
         future = asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, write)
         try:
             # asyncio.wait_for of Python 3.11 may swallow a cancellation

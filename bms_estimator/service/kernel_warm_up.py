@@ -7,6 +7,9 @@ import numpy as np
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.pack_model.curve_change import return_to_cell_file
+from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.saved import neutral_fit
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
@@ -31,6 +34,8 @@ def load_kernels() -> None:
     estimator.set_soc(0.5)
     estimator.resume(0.0)
     make_parameters_payload(estimator, 0.0)
+    SlowFit(estimator).adopt(neutral_fit())
+    return_to_cell_file(estimator)
     remaining_charge(estimator, 0.0)
     gc.collect()
     gc.freeze()  # a full garbage collection over numba's objects would stop the loop for 100 ms each time

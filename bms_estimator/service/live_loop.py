@@ -4,11 +4,12 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Awaitable, Callable, Sequence
+from concurrent.futures import Executor
 
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile, RunCounters
-from bms_estimator.checkpoint.restore import restore_state
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
@@ -16,18 +17,22 @@ from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import CheckpointWriter
+from bms_estimator.service.fit_thread import FitThread, new_slow_fit
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.request_handlers import RequestHandlers
+from bms_estimator.service.restored_pack import restore_pack
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import Source, SourceHealth
-from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
+from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
+from bms_estimator.telemetry.pack_model import pack_model_health
 
 LAG_STEP_S = 0.1
 """Interval at which the loop's lag is measured [s]. Any longer blocking of the loop is noticed."""
@@ -54,6 +59,8 @@ async def run_estimation_loop(
     recording: Callable[[], RecordingHealth | None] = lambda: None,
     hooks: AlarmHooks | None = None,
     edge: BlockSender | None = None,
+    history: HistoryFile | None = None,
+    fit_executor: Executor | None = None,
 ) -> Estimator:
     """Estimate until the source ends or ``stop`` is set.
 
@@ -73,6 +80,8 @@ async def run_estimation_loop(
         recording: Returns the state of a recording; None without a recording.
         hooks: Alarm hooks; opened and closed here.
         edge: Sender that also receives all samples. Its owner opens and closes it. None: no sender.
+        history: File of the history and the last fit; None: they are not saved.
+        fit_executor: Runs the fits of the pack's model; None: a thread of their own.
 
     Returns:
         The estimator after the last sample.
@@ -81,7 +90,9 @@ async def run_estimation_loop(
     hooks = hooks or AlarmHooks((), name, None, None)
     notifier = notifier or SystemdNotifier([name])
     estimator = new_estimator(settings, cell)
-    counters, outcome = _restore(estimator, checkpoint, clock)
+    fit_thread = FitThread(clock, fit_executor)
+    pack_model = new_slow_fit(settings, estimator, submit=fit_thread.submit, on_failure=fit_thread.log_failure)
+    counters, outcome = restore_pack(estimator, pack_model, checkpoint, history, clock)
     restored_s = since_boot()
     totals = LifetimeTotals(estimator, counters.total)
     publisher = Publisher(
@@ -99,15 +110,25 @@ async def run_estimation_loop(
         recording=recording,
         edge=edge.health if edge else lambda: None,
         hooks=lambda: hooks.health,
+        pack_model=lambda: pack_model_health(pack_model, fit_thread.times) if pack_model else None,
         on_alarm=hooks.on_alarm_change,
     )
     _restore_alarms(publisher, counters.alarms)
     hooks.restore_active(publisher.alarm_monitor.report)
     if requests is not None:
-        RequestHandlers(estimator, publisher, current_zero).register(requests)
+        RequestHandlers(estimator, publisher, current_zero, pack_model).register(requests)
     interval_s = settings.state.checkpoint_s
     writer = (
-        CheckpointWriter(checkpoint, estimator, publisher, totals, restarts=counters.restarts, interval_s=interval_s)
+        CheckpointWriter(
+            checkpoint,
+            estimator,
+            publisher,
+            totals,
+            restarts=counters.restarts,
+            interval_s=interval_s,
+            pack_model=pack_model,
+            history=history,
+        )
         if checkpoint
         else None
     )
@@ -118,7 +139,7 @@ async def run_estimation_loop(
         await stack.enter_async_context(hooks)
         notifier.ready(name)
         tasks = [
-            _estimate(source, estimator, totals, publisher, edge, restored_s),
+            _estimate(source, estimator, pack_model or estimator, totals, publisher, edge, restored_s),
             _keep_alive(publisher, notifier, name, clock),
             _measure_lag(publisher),
         ]
@@ -141,6 +162,7 @@ async def run_estimation_loop(
 async def _estimate(
     source: Source,
     estimator: Estimator,
+    runner: Estimator | SlowFit,
     totals: LifetimeTotals,
     publisher: Publisher,
     edge: BlockSender | None,
@@ -151,6 +173,7 @@ async def _estimate(
     Args:
         source: Supplies the blocks.
         estimator: Estimator.
+        runner: The estimator, or the slow fit that runs it.
         totals: Totals over restarts.
         publisher: Publisher.
         edge: Sender that receives all samples; None: no sender.
@@ -163,7 +186,7 @@ async def _estimate(
             estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s
         if edge:
             edge.take(received.samples)
-        trace = estimator.run(received.samples)
+        trace = runner.run(received.samples)
         totals.add(trace)
         publisher.add(received, trace)
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
@@ -195,30 +218,9 @@ async def _measure_lag(publisher: Publisher) -> None:
         publisher.add_lag(loop.time() - due_s)
 
 
-def _restore(estimator: Estimator, checkpoint: CheckpointFile | None, clock: Clock) -> tuple[RunCounters, str]:
-    """Restore a valid checkpoint. Return the counters of earlier runs, and the outcome as text."""
-    if checkpoint is None:
-        return RunCounters(0, new_totals(clock.wall())), "off"
-    content = checkpoint.load()
-    outcome = content.reason
-    if not outcome:
-        error = restore_state(estimator, content.state, content.unseen_s)
-        outcome = f"{REJECTED}{error}" if error else f"restored{_soc_text(estimator)}"
-    if refused := outcome.startswith(REJECTED):
-        outcome = f"{outcome}; {checkpoint.quarantine()}"
-    write_log = log.warning if refused else log.info
-    write_log("checkpoint", file=str(checkpoint.path), outcome=outcome)
-    return content.counters, outcome
-
-
 def _restore_alarms(publisher: Publisher, saved: str) -> None:
     """Restore the alarms of an earlier run; damaged ones are logged and dropped."""
     try:
         publisher.alarm_monitor.restore(saved)
     except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
         log.warning("the alarms of the checkpoint are damaged and were not restored", reason=str(error))
-
-
-def _soc_text(estimator: Estimator) -> str:
-    soc = float(estimator.state["soc"][0])
-    return "" if math.isnan(soc) else f": SOC {soc:.4f}"

@@ -9,6 +9,7 @@ from pathlib import Path
 import structlog
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_plausibility import implausible_settings
@@ -102,6 +103,7 @@ async def run_pack_service(
         history = database.path if database and settings.store.history_days else None
         all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
+    pack_history = HistoryFile(folder, settings, cell) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
             stack.enter_context(instance_lock(folder, settings.pack.name))
@@ -125,6 +127,7 @@ async def run_pack_service(
             recording=partial(recording_health, tap),
             hooks=hooks,
             edge=edge,
+            history=pack_history,
         )
 
 

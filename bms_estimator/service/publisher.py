@@ -18,6 +18,7 @@ from bms_estimator.model.payloads import (
     HookHealth,
     Info,
     LoopHealth,
+    PackModelHealth,
     RecordingHealth,
     Snapshot,
 )
@@ -63,6 +64,7 @@ class Publisher:
         recording: Returns the state of a recording; None where nothing is recorded.
         edge: Returns the state of the fleet edge; None without one.
         hooks: Returns successes and failures of alarm hooks; None without hooks.
+        pack_model: Returns the state of the slow fit; None without one.
         on_alarm: Called with each alarm that is raised or cleared.
 
     Attributes:
@@ -92,6 +94,7 @@ class Publisher:
         recording: Callable[[], RecordingHealth | None] = lambda: None,
         edge: Callable[[], EdgeHealth | None] = lambda: None,
         hooks: Callable[[], HookHealth | None] = lambda: None,
+        pack_model: Callable[[], PackModelHealth | None] = lambda: None,
         on_alarm: Callable[[Change], object] = lambda _: None,
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
@@ -101,7 +104,7 @@ class Publisher:
         self._rest = RestDetector(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
         self._source_health, self._recording, self._edge, self._latency = source_health, recording, edge, Latency()
-        self._hooks = hooks
+        self._hooks, self._pack_model = hooks, pack_model
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
         self.saved_flow: ChargeEnergy | None = None
@@ -257,6 +260,7 @@ class Publisher:
             recording=self._recording(),
             edge=self._edge(),
             hooks=self._hooks(),
+            pack_model=self._pack_model(),
         )
 
     def _log_input_faults(self, health: Health) -> None:

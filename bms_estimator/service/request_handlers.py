@@ -8,6 +8,7 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.errors import UserError
+from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
@@ -22,16 +23,22 @@ class RequestHandlers:
         estimator: Estimator of the pack.
         publisher: Publisher of the pack.
         zero_board: Makes the board store the present current as zero; None: the source has no such command.
+        pack_model: Slow fit of the pack's model; None: none.
     """
 
     def __init__(
-        self, estimator: Estimator, publisher: Publisher, zero_board: Callable[[], Awaitable[None]] | None
+        self,
+        estimator: Estimator,
+        publisher: Publisher,
+        zero_board: Callable[[], Awaitable[None]] | None,
+        pack_model: SlowFit | None = None,
     ) -> None:
         self._estimator, self._publisher, self._zero_board = estimator, publisher, zero_board
+        self._pack_model = pack_model
 
     def register(self, requests: RequestDispatcher) -> None:
         """Register all handlers."""
-        for handler in (self.set_soc, self.current_zero, self.publish_rate, self.acknowledge_alarm):
+        for handler in (self.set_soc, self.current_zero, self.publish_rate, self.acknowledge_alarm, self.forget_pack):
             requests.register(handler.__name__, handler)
 
     async def set_soc(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -90,3 +97,18 @@ class RequestHandlers:
         acknowledged = self._publisher.alarm_monitor.acknowledge(name)
         log.info("alarms acknowledged on request", alarms=acknowledged)
         return {"acknowledged": acknowledged}
+
+    async def forget_pack(self, _: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Discard everything learned from the pack, because it was exchanged for a new one.
+
+        Raises:
+            UserError: The service fits no model of the pack, or no sample has been taken yet.
+        """
+        if self._pack_model is None:
+            raise UserError("nothing is learned from this pack: identifier.pack_model or identifier.enabled is false")
+        if not self._estimator.state["started"][0]:
+            raise UserError("no sample has been taken yet")
+        rows = int(self._pack_model.history.rows.size)
+        self._pack_model.forget()
+        log.info("history and model of the pack discarded on request", rows=rows)
+        return {"rows": rows}

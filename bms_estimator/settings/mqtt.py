@@ -6,7 +6,7 @@ from pydantic import Field
 
 from bms_estimator.settings.broker import BrokerSettings
 
-Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate"]
+Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate", "forget_pack"]
 """Name of a request that changes the estimator or the service."""
 
 

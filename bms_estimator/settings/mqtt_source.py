@@ -106,7 +106,7 @@ class MqttSource(BaseSource):
     )
     settle_s: Annotated[float, Field(ge=0, le=60)] = Field(
         default=0.5,
-        description="time for which a new voltage waits for a new current, or a new current for a new voltage; then the last value of the missing one is used",
+        description="time for which a new current waits for a new voltage; then the last voltage is used, and the estimator only counts the current. A new voltage waits for a new current at least as long, up to interval_s",
     )
     max_age_s: Positive = Field(default=30.0, description="maximum age of a voltage or current in a sample")
     slow_max_age_s: Positive = Field(

@@ -96,6 +96,11 @@ class IdentifierSettings(Strict):
         default=True,
         description="false: the SOC is counted from the current, and the observer's law estimates the parameters",
     )
+    pack_model: bool = Field(
+        default=True,
+        repr=False,  # not part of the digest of a fleet's settings, because a fleet's worker does not fit
+        description="a fit to the pack's history of weeks, each hour, gives its own OCV curve, capacity and resistances; false: these are the cell file's with the corrections that the filter learns",
+    )
     map_memory_h: Annotated[float, Field(ge=1)] = Field(
         default=336.0, description="time constant with which old values of learned parameters lose weight"
     )

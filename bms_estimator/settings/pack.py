@@ -1,7 +1,7 @@
 """Settings of one pack, from ``pack.toml``. The name of a setting with a unit ends in the unit."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
@@ -9,6 +9,7 @@ from bms_estimator.model.config_file import Fraction, Positive, Strict, read_tom
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.settings.can_source import CanSource
+from bms_estimator.settings.charge_limits import ChargeLimits
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings, PrometheusSettings
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
@@ -57,6 +58,25 @@ class PackSettings(Strict):
     initial_soc: Fraction | None = Field(
         default=None, description="initial SOC; default: from the measured voltage, by the OCV curve"
     )
+    full_voltage_v: Positive | None = Field(
+        default=None,
+        description="voltage at the terminals of the pack at which the charger ends a charge, which defines SOC 1; default: OCV of the cell file at SOC 1",
+    )
+    tail_current_a: Positive | None = Field(
+        default=None,
+        description="current at full_voltage_v at which the charger ends a charge; default: C/20, and up to C/8 where the charge ends",
+    )
+    cutoff_voltage_v: Positive | None = Field(
+        default=None,
+        description="voltage at the terminals of the pack at which the protection ends a discharge, which defines SOC 0; default: OCV of the cell file at SOC 0",
+    )
+
+    @model_validator(mode="after")
+    def _full_above_cutoff(self) -> Self:
+        full_v, cutoff_v = self.full_voltage_v, self.cutoff_voltage_v
+        if full_v is not None and cutoff_v is not None and full_v <= cutoff_v:
+            raise ValueError(f"full_voltage_v = {full_v:g}: must be above cutoff_voltage_v = {cutoff_v:g}")
+        return self
 
 
 class PublishSettings(Strict):
@@ -169,6 +189,12 @@ class Settings(Strict):
         }
 
     @property
+    def charge_limits(self) -> ChargeLimits:
+        """Limits of charger and protection."""
+        pack = self.pack
+        return ChargeLimits(pack.full_voltage_v, pack.tail_current_a, pack.cutoff_voltage_v)
+
+    @property
     def sampling(self) -> Sampling:
         """Sampling of the source."""
         sensor = self.sensor
@@ -176,6 +202,8 @@ class Settings(Strict):
             period_s=sensor.sample_period_s,
             current_resolution_a=sensor.current_resolution_a or 0.0,
             current_dead_band_a=sensor.current_dead_band_a or 0.0,
+            voltage_gain_std=sensor.voltage_gain_std,
+            current_gain_std=sensor.current_gain_std,
         )
 
 

@@ -1,11 +1,14 @@
-"""Sampling of a source: period, current resolution and dead band."""
+"""Sampling of a source: period, resolution, dead band and gain errors."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Period and current resolution of a source; the defaults are those of a board of the firmware."""
+    """Period, current resolution and gain errors of a source.
+
+    The defaults are the period of a board of the firmware, and an exact sensor.
+    """
 
     period_s: float = 0.01
     """Time between two samples [s]."""
@@ -13,7 +16,15 @@ class Sampling:
     """Resolution of the current [A]; 0: negligible."""
     current_dead_band_a: float = 0.0
     """Magnitude below which the device reports a current of 0 [A]."""
+    voltage_gain_std: float = 0.0
+    """Relative std of the voltage sensor's gain."""
+    current_gain_std: float = 0.0
+    """Relative std of the current sensor's gain."""
 
 
-BOARD = Sampling()
-"""Sampling of a board of the firmware."""
+BOARD_GAIN_STD = 0.001
+"""Relative std of the gains of a calibrated board, and of laboratory instruments at the worst."""
+EXACT = Sampling()
+"""Sampling with the period of a board and exact gains."""
+BOARD = Sampling(voltage_gain_std=BOARD_GAIN_STD, current_gain_std=BOARD_GAIN_STD)
+"""Sampling of a calibrated board of the firmware."""

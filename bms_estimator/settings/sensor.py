@@ -7,14 +7,20 @@ from pydantic import Field, ModelWrapValidatorHandler, model_validator
 from bms_estimator.model.config_file import NotNegative, Positive, Strict
 from bms_estimator.model.one_of import OneOf
 from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS
+from bms_estimator.settings.sampling import BOARD_GAIN_STD
 
 ALLOWED_WITH_SOURCE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
 """Values that settings of a serial device may have if there is a ``[source]``, by setting. The first value is the
 default, so that a file that contains all defaults is valid. The protocol text is allowed, because a ``[source]`` sets it."""
 
 
-def _with_device_resolution(sensor: dict[str, object]) -> dict[str, object]:
-    """Return the table ``[sensor]`` with the resolution of the device, unless configured."""
+MAX_GAIN_STD = 0.2
+"""Maximum relative std of a gain. A sensor with a larger error must be calibrated."""
+GainStd = Annotated[float, Field(ge=0.0, le=MAX_GAIN_STD)]
+
+
+def _with_device_defaults(sensor: dict[str, object]) -> dict[str, object]:
+    """Return the table ``[sensor]`` with the resolution and the gain errors of the device, unless configured."""
     protocol = sensor.get("protocol")
     if not isinstance(protocol, str) or protocol not in DEVICES:
         return sensor
@@ -67,6 +73,14 @@ class SensorSettings(Strict):
         default=None,
         description="the device reports currents below this magnitude as 0; default: that of the device, otherwise 0",
     )
+    voltage_gain_std: GainStd = Field(
+        default=BOARD_GAIN_STD,
+        description="relative standard deviation of the voltage's gain, 0.01 for a voltage that may be 1 % wrong; default: that of the device, 0.005 except for a board, which is calibrated",
+    )
+    current_gain_std: GainStd = Field(
+        default=BOARD_GAIN_STD,
+        description="relative standard deviation of the current's gain; default: that of the device, 0.005 except for a board, which is calibrated",
+    )
     period_s: Positive | None = Field(
         default=None, description="sample period of a device that sends at a fixed rate; default: that of the device"
     )
@@ -77,7 +91,7 @@ class SensorSettings(Strict):
         """Add the device's defaults without marking them as set, so that ``exclude_unset`` leaves them out."""
         if not isinstance(table, dict):
             return validate(table)
-        settings = validate(_with_device_resolution(table))
+        settings = validate(_with_device_defaults(table))
         settings.model_fields_set.intersection_update(table)
         return settings
 

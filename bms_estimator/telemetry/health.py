@@ -7,11 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
+from bms_estimator.kernels.kalman_filter.anchors import FULL, NO_ANCHOR
 from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads import EdgeHealth, Health, HookHealth, LoopHealth, RecordingHealth, Totals
+from bms_estimator.model.payloads import (
+    AnchorReport,
+    EdgeHealth,
+    Health,
+    HookHealth,
+    LoopHealth,
+    PackModelHealth,
+    RecordingHealth,
+    Totals,
+)
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 
@@ -50,7 +60,21 @@ def identifier_counters(record: np.void) -> dict[str, int]:
     ``searched`` is the number of re-initializations of the SOC.
     """
     counts = zip(COUNTERS.names or (), record["counters"].item(), strict=True)
-    return dict(counts) | {"searched": int(record["filter"]["reopened"])}
+    anchors = {name: int(record["anchors"][name]) for name in ("full_anchors", "empty_anchors")}
+    return dict(counts) | {"searched": int(record["filter"]["reopened"])} | anchors
+
+
+def last_anchor(record: np.void) -> AnchorReport | None:
+    """Return the last end of a charge or discharge, from a record of ESTIMATOR_STATE; None without one."""
+    a = record["anchors"]
+    if a["last"] == NO_ANCHOR:
+        return None
+    return AnchorReport(
+        kind="full" if a["last"] == FULL else "empty",
+        soc_before=float(a["soc_before"]),
+        soc_std_before=float(a["soc_std_before"]),
+        soc_after=float(a["soc_after"]),
+    )
 
 
 def suspicions(record: np.void, settings: np.void) -> list[str]:
@@ -89,6 +113,7 @@ def make_health_payload(
     recording: RecordingHealth | None,
     edge: EdgeHealth | None = None,
     hooks: HookHealth | None = None,
+    pack_model: PackModelHealth | None = None,
 ) -> Health:
     """Return the payload of topic ``health``.
 
@@ -110,6 +135,7 @@ def make_health_payload(
         recording: State of the recording; None: nothing is recorded.
         edge: State of the fleet edge; None without one.
         hooks: Successes and failures of alarm hooks; None without hooks.
+        pack_model: State of the slow fit; None without one.
     """
     state = record["observer"]
     return Health(
@@ -126,6 +152,7 @@ def make_health_payload(
         samples=sample_counters(state),
         identifier=identifier_counters(record),
         suspects=suspicions(record, settings),
+        anchor=last_anchor(record),
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),
         publish_drops=delivery.drops,
@@ -141,6 +168,7 @@ def make_health_payload(
         recording=recording,
         edge=edge,
         hooks=hooks,
+        pack_model=pack_model,
         unseen_s=unseen_s,
         total=total,
     )

@@ -122,17 +122,17 @@ def _cell_file_parameters(cell: CellModel, a: np.ndarray) -> dict[str, Parameter
 
 
 def _ocv(estimator: Estimator) -> OcvCurve:
-    """Return the filter's OCV with its std: the OCV of the cell file plus the learned correction."""
+    """Return the filter's OCV with its std: the OCV of cell file or slow fit plus the filter's correction."""
     record, settings = estimator.record[0], estimator.settings_record[0]
     p = settings["filter"]
     correction_v, std_v = ocv_correction_with_std(record, settings, OCV_SOC)
-    file_v = _cell_file_ocv(p["ocv_v"].tobytes(), p["ocv_slope_v"].tobytes())
-    return OcvCurve(soc=OCV_SOC.tolist(), ocv_v=(file_v + correction_v).tolist(), std_v=std_v.tolist())
+    curve_v = _filter_ocv(p["ocv_v"].tobytes(), p["ocv_slope_v"].tobytes())
+    return OcvCurve(soc=OCV_SOC.tolist(), ocv_v=(curve_v + correction_v).tolist(), std_v=std_v.tolist())
 
 
 @lru_cache(maxsize=64)
-def _cell_file_ocv(ocv_v: bytes, ocv_slope_v: bytes) -> NDArray[np.float64]:
-    """Return the OCV of the cell file at ``OCV_SOC`` [V], from the tables of the filter."""
+def _filter_ocv(ocv_v: bytes, ocv_slope_v: bytes) -> NDArray[np.float64]:
+    """Return the OCV at ``OCV_SOC`` [V] from the tables of the filter."""
     curve, slope = np.frombuffer(bytearray(ocv_v)), np.frombuffer(bytearray(ocv_slope_v))
     return np.array([chen_mora.ocv(soc, curve, slope) for soc in OCV_SOC])
 
@@ -157,7 +157,7 @@ def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
 def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]:
     """Return capacity and R_s relative to the cell file, and the offset of the current sensor."""
     record, settings = estimator.record[0], estimator.settings_record[0]
-    ratio, p = relative_series_resistance(record, settings), settings["filter"]
+    ratio, p = relative_series_resistance(record, settings, estimator.cell_file_settings), settings["filter"]
     capacity, offset_a = relative_capacity(record), current_offset(record)
     first_std_a = float(p["offset_c"] * p["capacity_as"]) / 3600.0
     return {

@@ -21,6 +21,7 @@ from bms_estimator.checkpoint.identity import fields, pack_identity
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.kernels.kalman_filter.records import NODE, OFFSET
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.payloads import Health
@@ -202,6 +203,22 @@ def test_known_fields_of_a_checkpoint_of_another_version_are_restored() -> None:
     assert estimator.record["filter"]["ohm"].shape == fresh.record["filter"]["ohm"].shape
 
 
+def test_a_checkpoint_without_anchors_is_restored_and_one_with_anchors_keeps_the_last_anchor() -> None:
+    """A restart counts anchors from zero, and trickle charging after it causes no second anchor."""
+    saved = learned_estimator()
+    a = saved.record[0]["anchors"]
+    a["last"], a["full_anchors"], a["full_wait_soc"], a["soc_before"] = FULL, 3, 0.02, 0.9
+    by_name = dict(fields(saved.record))
+    without_anchors = {name: v for name, v in by_name.items() if not name.startswith("anchors.")}
+    for state, expected in ((without_anchors, (0, 0, 0.0, 0.0)), (by_name, (FULL, 0, 0.02, 0.9))):
+        estimator = new_estimator(SETTINGS, CELL)
+        assert restore_state(estimator, state, 1.0) == ""
+        assert estimator.state["soc"][0] == saved.state["soc"][0]
+        restored = estimator.record[0]["anchors"]
+        names = "last", "full_anchors", "full_wait_soc", "soc_before"
+        assert tuple(restored[name] for name in names) == expected
+
+
 def test_filter_states_of_a_version_without_ocv_states_are_restored() -> None:
     """The OCV states start with their prior. All other states have the restored mean and covariance."""
     learned = learned_estimator()
@@ -351,11 +368,11 @@ async def test_the_final_save_waits_for_a_running_save(tmp_path: Path) -> None:
     saving, began, release, saved_samples = threading.Lock(), threading.Event(), threading.Event(), []
 
     class SlowDisk(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters) -> None:
+        def save(self, state: Any, counters: RunCounters, curves: Any = None) -> None:
             assert saving.acquire(blocking=False), "two saves at once"
             began.set()
             assert release.wait(LONG_S)
-            super().save(state, counters)
+            super().save(state, counters, curves)
             saved_samples.append(int(state["observer"]["samples"][0]))
             saving.release()
 
@@ -385,8 +402,8 @@ async def test_changes_of_the_soc_are_saved_before_a_long_checkpoint_interval_ha
     loop = asyncio.get_running_loop()
 
     class ReportingFile(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters) -> None:
-            super().save(state, counters)
+        def save(self, state: Any, counters: RunCounters, curves: Any = None) -> None:
+            super().save(state, counters, curves)
             loop.call_soon_threadsafe(saved.put_nowait, float(state["observer"]["soc"][0]))
 
     class ReportingWriter(checkpoint_writer.CheckpointWriter):
@@ -436,7 +453,7 @@ async def test_a_save_on_a_full_disk_is_not_retried_at_each_change_of_the_soc(
     attempts = []
 
     class FullDiskFile(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters) -> None:
+        def save(self, state: Any, counters: RunCounters, *_: Any) -> None:
             attempts.append((state, counters))
             raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -462,8 +479,8 @@ async def test_an_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch
     saved_samples = []
 
     class CountingFile(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters) -> None:
-            super().save(state, counters)
+        def save(self, state: Any, counters: RunCounters, curves: Any = None) -> None:
+            super().save(state, counters, curves)
             saved_samples.append(state["observer"]["samples"][0])
 
     async with run_with_frequent_saves(CountingFile(tmp_path, SETTINGS, CELL)) as (source, sink, _):

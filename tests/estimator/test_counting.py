@@ -17,9 +17,9 @@ from tests.estimator.anywhere.use import DAY_S, cycles, days
 SEEDS = range(1, 9)
 OWN_CURVE = {"file_ocv_error_ratio": 0.5, "load_before_h": 0.0}
 """Half of the typical OCV error, and no load before the estimator starts."""
-MAX_CAPACITY_ERROR = 0.025
-"""Limit of the relative error of the capacity of each cell."""
-MAX_RMS_CAPACITY_ERROR = 0.015
+MAX_CAPACITY_ERROR = 0.04
+"""Limit of the relative error of the capacity of each cell, which the filter learns in its first cycle only."""
+MAX_RMS_CAPACITY_ERROR = 0.018
 """Limit of the RMS of the relative error of the capacity over all cells."""
 MAX_OFFSET_ERROR_A = 0.003
 """Limit of the error of an offset after a day, in cells of 3 Ah [A]."""

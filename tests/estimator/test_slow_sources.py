@@ -1,5 +1,7 @@
 """Sources with little information: one sample each minute, a coarse current, a dead band, and a delayed current."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from bms_estimator.kernels.kalman_filter.gap_charge import rounding_charge_varia
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.sampling import BOARD, Sampling
 from tests.benchmarks.resolution import Source, scores
 from tests.estimator.simulated_cell import TRUTH, pulses
 
@@ -88,15 +90,16 @@ def test_the_rounding_error_of_a_constant_reported_current_is_constant(
     assert rounding_charge_variance(f, p, 1.0, current_a + 1.0) == pytest.approx(ROUNDING_STD_A**2)
 
 
-def test_an_estimator_without_sampling_assumes_the_resolution_of_the_board() -> None:
+def test_an_estimator_without_sampling_assumes_the_resolution_of_the_board_and_exact_gains() -> None:
     block, _ = pulses(hours=0.5)
-    configured, by_default = Estimator(TRUTH, sampling=Settings().sampling), Estimator(TRUTH)
+    without_gains = replace(Settings().sampling, voltage_gain_std=0.0, current_gain_std=0.0)
+    configured, by_default = Estimator(TRUTH, sampling=without_gains), Estimator(TRUTH)
     assert configured.run(block).tobytes() == by_default.run(block).tobytes()
 
 
 def test_the_resolution_of_a_source_is_that_of_its_protocol_unless_configured() -> None:
     without_dead_band = Settings.model_validate({"sensor": {"protocol": "pylontech", "current_dead_band_a": 0.0}})
-    assert without_dead_band.sampling == Sampling(2.0, 0.01, 0.0)
-    assert Settings().sampling == Sampling(period_s=0.01)
+    assert without_dead_band.sampling == Sampling(2.0, 0.01, 0.0, 0.005, 0.005)
+    assert Settings().sampling == BOARD
     minute = Settings.model_validate({"sensor": {"protocol": "text", "period_s": 60}})
     assert minute.sampling.period_s == minute.sensor.sample_period_s == 60.0

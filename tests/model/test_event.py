@@ -5,7 +5,7 @@ from typing import Any
 
 from bms_estimator.model.events import events
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads import AnchorReport, Snapshot
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 AT_41_C = f"no data at 41 C, the cell file knows 25 C: {InputFault.TEMPERATURE.text}"
@@ -85,3 +85,36 @@ def test_a_gap_before_the_start_causes_one_event():
 def test_equal_snapshots_cause_no_events():
     assert events(CELL_SNAPSHOT, CELL_SNAPSHOT) == []
     assert events(CELL_SNAPSHOT, with_health()) == []
+
+
+def with_counters(anchor: AnchorReport | None = None, **counters: int) -> Snapshot:
+    """Return a snapshot with an anchor and counters of the identifier."""
+    return with_health(anchor=anchor, identifier=CELL_SNAPSHOT.health.identifier | counters)
+
+
+def test_an_anchor_causes_an_event_with_the_soc_before_and_after_it():
+    full = AnchorReport(kind="full", soc_before=0.932, soc_std_before=0.021, soc_after=0.991)
+    empty = AnchorReport(kind="empty", soc_before=0.0, soc_std_before=0.02, soc_after=0.0)
+    states = [
+        with_counters(full, full_anchors=1),
+        with_counters(full, full_anchors=2),
+        with_counters(full, full_anchors=2),
+        with_counters(empty, full_anchors=2, empty_anchors=1),
+    ]
+    events_of_changes = [events(*pair) for pair in itertools.pairwise(states)]
+    assert [[(event.name, event.text, event.anchor) for event in changes] for changes in events_of_changes] == [
+        [("full", "the charger ended at the full voltage: SOC 93.2 % (std 2.1 %) corrected to 99.1 %", full)],
+        [],
+        [("empty", "the discharge ended at the cut-off voltage: SOC 0.0 % (std 2.0 %), unchanged", empty)],
+    ]
+    assert "full" not in event_names(None, states[0]), "the anchor of an earlier run causes no event"
+
+
+def test_a_reinitialized_soc_causes_an_event_with_the_reason():
+    [event] = events(with_counters(searched=1), with_counters(searched=2))
+    assert (event.name, event.text.split(";")[0]) == (
+        "soc_reinitialized",
+        "the voltage contradicted the SOC for minutes",
+    )
+    [event] = events(with_counters(reset=0), with_counters(reset=1))
+    assert (event.name, event.text.split(";")[0]) == ("soc_reinitialized", "a value of the filter was not finite")

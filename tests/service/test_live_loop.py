@@ -21,6 +21,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Estimate
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.live_loop import LAG_STEP_S, run_estimation_loop
 from bms_estimator.settings.observer import IdentifierSettings
@@ -104,6 +105,7 @@ async def test_state_after_blocks_equals_that_after_single_steps() -> None:
             run.source.give(*rows[i : i + 7])
         live = await run.end()
     single_steps = new_estimator(SETTINGS, CELL)
+    SlowFit(single_steps)  # switches the history on
     for row in rows:
         single_steps.step(*row)
     assert live.record.tobytes() == single_steps.record.tobytes()

@@ -95,7 +95,7 @@ def test_an_ocv_table_must_increase_from_empty_to_full(tmp_path: Path, table: st
         ("[mqtt]\nurl = 'http://x'", r"mqtt\.url = 'http://x'.*mqtts://host:port"),
         (
             "[mqtt]\ncommands = ['reboot']",
-            r"mqtt\.commands\.0 = 'reboot'.*'set_soc', 'current_zero', 'acknowledge_alarm' or 'publish_rate'",
+            r"mqtt\.commands\.0 = 'reboot'.*'set_soc', 'current_zero', 'acknowledge_alarm', 'publish_rate' or 'forget_pack'",
         ),
         ("[sensor]\ncurrent_step_a = 0.05", r"sensor\.current_step_a.*: unknown key"),
         ("[sensor]\nsample_rate_hz = 5000", r"sensor\.sample_rate_hz = 5000: .*1000"),

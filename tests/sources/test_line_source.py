@@ -136,5 +136,6 @@ def test_source_sets_defaults_of_the_sensor_which_settings_override():
     assert (settings.sensor.protocol, settings.sensor.voltage_resolution_v) == ("text", 5e-3)
     sensor = SensorSettings(voltage_resolution_v=0.1, current_sign="charge_positive")
     settings = Settings.model_validate({"source": {"kind": "linux"}, "sensor": sensor})
-    assert settings.sensor == sensor.model_copy(update={"protocol": "text", "period_s": 1.0})
+    gain_std = {"voltage_gain_std": 0.005, "current_gain_std": 0.005}
+    assert settings.sensor == sensor.model_copy(update={"protocol": "text", "period_s": 1.0} | gain_std)
     assert settings.sensor.sample_period_s == 1.0

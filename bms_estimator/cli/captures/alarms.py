@@ -31,6 +31,7 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.service.alarm_monitor import AlarmMonitor
+from bms_estimator.service.fit_thread import new_slow_fit
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, open_capture
 from bms_estimator.sources.captures.stdin import standard_input
@@ -126,9 +127,10 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
     monitor = AlarmMonitor(settings, model, estimator, source, clock, changes.append)
+    runner = new_slow_fit(settings, estimator) or estimator
     async for received in source:
         now_s = max(now_s, float(received.samples["time_s"][-1]))
-        monitor.add(received, estimator.run(received.samples), now_s)
+        monitor.add(received, runner.run(received.samples), now_s)
     monitor.evaluate(now_s)
     raised_alarms = _pair_changes(changes)
     latched = {alarm.name for alarm in monitor.report if alarm.latched}

@@ -35,6 +35,8 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.service.fit_thread import new_slow_fit
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
@@ -44,6 +46,7 @@ from bms_estimator.sources.captures.replay import RawCapture, Replay, open_captu
 from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
+from bms_estimator.telemetry.pack_model import FitTimes, pack_model_health
 
 RARE_FAULT_FRACTION = 0.01
 """Maximum fraction of samples with a fault for which no likely cause is reported."""
@@ -69,6 +72,12 @@ def replay(
     force: Force = False,
     current_sign: SignOfCurrent = None,
     as_json: AsJson = False,
+    no_pack_model: Annotated[
+        bool,
+        typer.Option(
+            "--no-pack-model", help="do not fit the pack's own curve, capacity and resistances to its history"
+        ),
+    ] = False,
     mqtt: Annotated[
         str | None, typer.Option(help="also publish the estimates to this MQTT broker, mqtt://host:port")
     ] = None,
@@ -94,7 +103,8 @@ def replay(
         with show_compile_progress():
             source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
         replay_source = Replay(source, speed=speed)
-        result = asyncio.run(_replay(settings, model, replay_source, table_sink(out) if out else None))
+        table = table_sink(out) if out else None
+        result = asyncio.run(_replay(settings, model, replay_source, table, fit_pack=not no_pack_model))
         if isinstance(source, RawCapture):
             for warning in _unread_warnings(source, result.duration_s or 0.0):
                 typer.echo(f"warning: {capture}: {warning}", err=True)
@@ -114,17 +124,26 @@ def _unread_warnings(source: RawCapture, duration_s: float) -> Iterator[str]:
         yield f"the last {source.unread_bytes:,} bytes are no complete record: the file is truncated, or the length in a record is damaged"
 
 
-async def _replay(settings: Settings, model: PackModel, source: Replay, table: TableSink | None) -> ReplayResult:
+async def _replay(
+    settings: Settings, model: PackModel, source: Replay, table: TableSink | None, *, fit_pack: bool
+) -> ReplayResult:
     """Run the estimator over a source, and pass the estimates to table, summary and broker."""
     with show_compile_progress():
         estimator, summary = new_estimator(settings, model), Summary()
+    errors: dict[str, str] = {}  # the last text of each kind
+    pack_model = None
+    if fit_pack:
+        pack_model = new_slow_fit(
+            settings, estimator, on_failure=lambda error: errors.update({type(error).__name__: str(error)})
+        )
+    runner = pack_model or estimator
     async with AsyncExitStack() as stack:
-        publisher = await _open_publisher(stack, settings, model, estimator, source)
+        publisher = await _open_publisher(stack, settings, model, estimator, pack_model, source)
         stack.enter_context(table or nullcontext())
         update_progress = stack.enter_context(_progress(source))
         started_s, impossible = time.perf_counter(), None
         async for received in source:
-            trace = estimator.run(received.samples)
+            trace = runner.run(received.samples)
             summary.add(trace)
             if trace.size < received.samples.size:  # samples were dropped
                 impossible = out_of_range_reason(received.samples, estimator.settings[0]) or impossible
@@ -137,12 +156,19 @@ async def _replay(settings: Settings, model: PackModel, source: Replay, table: T
         wall_s = time.perf_counter() - started_s
         if publisher:
             publisher.publish_last()
-    result = summary.result(estimator, source.samples, wall_s)
+    for kind, text in errors.items():
+        typer.echo(f"warning: a fit of the pack's model failed: {kind}: {text}", err=True)
+    result = summary.result(estimator, pack_model, source.samples, wall_s)
     return replace(result, impossible=impossible, temperatures_dropped=source.counters.get("implausible", 0))
 
 
 async def _open_publisher(
-    stack: AsyncExitStack, settings: Settings, model: PackModel, estimator: Estimator, source: Replay
+    stack: AsyncExitStack,
+    settings: Settings,
+    model: PackModel,
+    estimator: Estimator,
+    pack_model: SlowFit | None,
+    source: Replay,
 ) -> Publisher | None:
     """Return the publisher; None without a broker."""
     if settings.mqtt is None:
@@ -154,7 +180,16 @@ async def _open_publisher(
         settings.mqtt, settings.pack.name, RequestDispatcher(delivery), delivery, outbox, home_assistant=home
     )
     sinks = [await stack.enter_async_context(mqtt)]
-    return Publisher(settings, model, estimator, source=source, sinks=sinks, clock=Clock(), delivery=delivery)
+    return Publisher(
+        settings,
+        model,
+        estimator,
+        source=source,
+        sinks=sinks,
+        clock=Clock(),
+        delivery=delivery,
+        pack_model=lambda: pack_model_health(pack_model, FitTimes(None, None)) if pack_model else None,
+    )
 
 
 @contextmanager
@@ -201,8 +236,16 @@ def _soc_rows(result: ReplayResult) -> dict[str, str]:
     return {
         "SOC": f"{_number_text(result.soc_initial, '.2%')} to {_number_text(result.soc_final, '.2%')}",
         "SOC, std at the end": _number_text(result.soc_std_final, ".2%"),
+        **({} if result.capacity_ah is None else {"capacity": _capacity_text(result)}),
         **_temperature_row(result),
     }
+
+
+def _capacity_text(result: ReplayResult) -> str:
+    """Return the learned capacity with its std and the number of fits that determined it."""
+    text = f"{_number_text(result.capacity_ah, '.4g')} ± {_number_text(result.capacity_std_ah, '.2g')} Ah"
+    failed = f", {result.failed_fits:,} failed" if result.failed_fits else ""
+    return f"{text}, {result.fits:,} fits{failed}" if result.fits or failed else text
 
 
 def _temperature_row(result: ReplayResult) -> dict[str, str]:

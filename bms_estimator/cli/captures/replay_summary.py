@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.state import finite
@@ -60,6 +62,14 @@ class ReplayResult:
     """Number of samples with a timestamp before the previous sample's."""
     parameters: dict[str, LearnedParameter]
     """Parameters of a fuel cell by the keys of its file; empty for a battery, whose parameters depend on SOC."""
+    capacity_ah: float | None
+    """Learned capacity at the end [Ah]; None without the identifier."""
+    capacity_std_ah: float | None
+    """Standard deviation of the learned capacity [Ah]."""
+    fits: int
+    """Number of adopted fits of the pack's model."""
+    failed_fits: int
+    """Number of fits that ended with an error."""
     samples_per_s: float | None
     """Number of processed samples per second, including dropped samples."""
     wall_s: float
@@ -94,17 +104,23 @@ class Summary:
         self._error_sum += float(error_v @ error_v)
         self._soc_difference_sum += float(soc_difference @ soc_difference)
 
-    def result(self, estimator: Estimator, sample_count: int, wall_s: float) -> ReplayResult:
+    def result(
+        self, estimator: Estimator, pack_model: SlowFit | None, sample_count: int, wall_s: float
+    ) -> ReplayResult:
         """Return the result of the replay, without ``impossible`` and ``temperatures_dropped``, which the caller sets.
 
         Args:
             estimator: Estimator after the last sample.
+            pack_model: Slow fit of the estimator; None without one.
             sample_count: Number of samples in the capture, including dropped samples.
             wall_s: Duration of the replay [s].
         """
         record, settings = estimator.record[0], estimator.settings_record[0]
         observer = record["observer"]
         counters = sample_counters(observer)
+        identified = estimator.identifying and bool(observer["started"])
+        declared_ah = float(estimator.settings["capacity_as"][0]) / 3600.0
+        capacity = relative_capacity(record) if identified else None
         return ReplayResult(
             samples=self._row_count,
             duration_s=self._duration_s if self._row_count else None,
@@ -128,6 +144,10 @@ class Summary:
             gaps=counters["gaps"],
             time_steps_back=counters["time_steps_back"],
             parameters=_learned_parameters(estimator),
+            capacity_ah=capacity.value * declared_ah if capacity else None,
+            capacity_std_ah=capacity.std * declared_ah if capacity else None,
+            fits=pack_model.fits if pack_model else 0,
+            failed_fits=pack_model.failed if pack_model else 0,
             samples_per_s=sample_count / wall_s if wall_s > 0.0 else None,
             wall_s=wall_s,
         )

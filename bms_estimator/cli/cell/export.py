@@ -14,9 +14,16 @@ from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_output_file, name_of
 from bms_estimator.cli.options.pack_options import load_pack, single_cell_of
 from bms_estimator.estimator.estimator import new_estimator
-from bms_estimator.estimator.identified_parameters import identified_cell, ocv_correction_with_std, relative_capacity
+from bms_estimator.estimator.identified_parameters import (
+    fitted_ocv_correction,
+    identified_cell,
+    ocv_correction_with_std,
+    relative_capacity,
+)
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.pack_model.handover import adopt_curves
+from bms_estimator.pack_model.saved import fit_of_curves
 from bms_estimator.process.state_folder import state_folder
 
 app = typer.Typer(
@@ -82,6 +89,12 @@ def export(
             f"{settings.state.checkpoint_s:g} s (give another file with --checkpoint)"
         )
     estimator = new_estimator(settings, model)
+    try:
+        fit = fit_of_curves(content.curves)
+    except ValueError as error:
+        raise UserError(f"{file.path}: nothing to export: {error}") from error
+    if fit:
+        adopt_curves(estimator.settings_record[0]["filter"], estimator.cell_file_settings, fit)
     reason = restore_state(estimator, content.state, unseen_s=0.0)
     if reason or not estimator.record[0]["filter"]["started"]:
         raise UserError(
@@ -90,6 +103,7 @@ def export(
     learned = identified_cell(estimator, cell, series)
     renamed = learned.model_copy(update={"cell": learned.cell.model_copy(update={"name": name_of(out)})})
     correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], TABULATED_SOC)
+    correction_v += fitted_ocv_correction(estimator, TABULATED_SOC)
     capacity, cell_ah = relative_capacity(estimator.record[0]), cell.cell.capacity_ah
     result = ExportResult(
         out=str(out),

@@ -154,6 +154,7 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         voltage_noise_v=settings.sensor.voltage_noise_v,
         initial_soc=settings.pack.initial_soc,
         sampling=settings.sampling,
+        limits=settings.charge_limits,
     )
     observer = records[0]["observer"]
     values = {

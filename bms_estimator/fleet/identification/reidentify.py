@@ -27,7 +27,6 @@ from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.sampling import Sampling
 
 TRAINING_FRACTION = 2.0 / 3.0
 """Fraction of the time used for training; the rest is the holdout."""
@@ -235,8 +234,10 @@ class _Pack:
             voltage_resolution_v=sensor.voltage_resolution_v / series,
             voltage_noise_v=None if sensor.voltage_noise_v is None else sensor.voltage_noise_v / series,
             initial_soc=settings.pack.initial_soc,
-            sampling=Sampling(
-                sampling.period_s, sampling.current_resolution_a / parallel, sampling.current_dead_band_a / parallel
+            sampling=replace(
+                sampling,
+                current_resolution_a=sampling.current_resolution_a / parallel,
+                current_dead_band_a=sampling.current_dead_band_a / parallel,
             ),
         )
 

@@ -22,7 +22,7 @@ from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
 from bms_estimator.model.one_of import OneOf
 from bms_estimator.protocols.registry import DEVICES
 from bms_estimator.settings.pack import DeviceName, PackSettings, Settings
-from bms_estimator.settings.sensor import SensorSettings
+from bms_estimator.settings.sensor import GainStd, SensorSettings
 
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
 """Pattern of a cell's name. It may be longer than a pack's name, because ``fleet identify`` names cell files after
@@ -56,6 +56,12 @@ class PackSpec(Strict):
     current_resolution_a: NotNegative | None = Field(default=None, description="resolution of the current")
     current_dead_band_a: NotNegative | None = Field(
         default=None, description="limit below which the device reports a current of 0"
+    )
+    voltage_gain_std: GainStd | None = Field(
+        default=None, description="relative standard deviation of the voltage's gain; default: that of the protocol"
+    )
+    current_gain_std: GainStd | None = Field(
+        default=None, description="relative standard deviation of the current's gain; default: that of the protocol"
     )
     period_s: Positive | None = Field(default=None, description="interval between two samples; default: 1 s")
 

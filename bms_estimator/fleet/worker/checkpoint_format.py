@@ -77,7 +77,7 @@ def dtype_of(layout: str) -> np.dtype[Any]:
 
 def _layout_fields(dtype: np.dtype[Any]) -> list[Any]:
     return [
-        [name, _layout_fields(part) if part.names else part.base.str, list(part.shape)]
+        [name, _layout_fields(part.base) if part.base.names else part.base.str, list(part.shape)]
         for name, (part, *_) in (dtype.fields or {}).items()
     ]
 

@@ -57,9 +57,15 @@ MIN_LN_Q = math.log(0.5)
 MAX_LN_Q = math.log(1.3)
 """Upper limit of ln of the learned over the declared capacity. New cells exceed their declared capacity only
 slightly."""
-HOLD_NOTHING, HOLD_CAPACITY, HOLD_CELL, HOLD_CELL_AND_CURVE = range(4)
-"""Sets of states that an update does not change. ``HOLD_NOTHING`` is empty, and ``HOLD_CAPACITY`` contains LN_Q.
-``HOLD_CELL`` contains LN_Q, OFFSET and the OCV nodes. ``HOLD_CELL_AND_CURVE`` also contains CURVE."""
+HOLD_CAPACITY, HOLD_NODES, HOLD_OFFSET, HOLD_CURVE = 1, 2, 4, 8
+"""Bits of a set of states that an update does not change: LN_Q, the OCV nodes, OFFSET, and CURVE."""
+HOLD_CELL = HOLD_CAPACITY | HOLD_NODES
+"""States of the cell that do not change within hours."""
+LEARNING_SOC = 1.0
+"""Charge throughput after switch-on in which the filter learns LN_Q and the OCV nodes [SOC]: one pass of the curve. Then it holds
+them: their errors still count in the std of the SOC, but voltages do not change them. A filter that linearizes each pass about
+another estimate takes the same errors of the curve for new information, and its std decreases while its error remains. A first
+gap ends the learning, too."""
 INDEPENDENT_R_STD = 0.5
 """Maximum std of the independent parts of LN_R0 and LN_R. The rest of a larger std is common to both, because it is due to
 the unknown size of the cell. Only cell files of cells that were not measured have a larger std."""
@@ -259,12 +265,12 @@ def update_state_directly(s: Record, q: int, j: int, value: float, variance: flo
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     for k in range(STATES):
         ph[k] = cov[j, k]
-    apply_correction(x, cov, ph, value - x[j], cov[j, j] + variance, HOLD_NOTHING)
+    apply_correction(x, cov, ph, value - x[j], cov[j, j] + variance, cell_to_hold(s))
 
 
 @njit(cache=True)
 def states_to_hold(s: Record, p: Record, q: int) -> int:
-    """Return the set of states that a voltage must not change, ``HOLD_NOTHING`` to ``HOLD_CELL_AND_CURVE``.
+    """Return the set of states that a voltage must not change.
 
     An SOC outside 0..1 is limited, so that a voltage error there gives no information on sensor, capacity and curve. If
     resistances are uncertain, resistance and capacity have equal effects on the voltage under a large constant current
@@ -272,22 +278,32 @@ def states_to_hold(s: Record, p: Record, q: int) -> int:
     """
     soc, one_c = s.mean[q, SOC], p.capacity_as / 3600.0
     if not 0.0 <= soc <= 1.0:
-        return HOLD_CELL_AND_CURVE if s.x_a[CHARGE] < -CHARGE_C * one_c else HOLD_CELL
+        is_charge = s.x_a[CHARGE] < -CHARGE_C * one_c
+        return HOLD_CELL | HOLD_OFFSET | (HOLD_CURVE if is_charge else 0)
     if p.r_std <= INDEPENDENT_R_STD:
-        return HOLD_NOTHING
+        return cell_to_hold(s)
     small_a = NEARLY_FULL_C * one_c if soc > NEARLY_FULL_SOC else LEARNING_C * one_c
     varying = s.x_a[TREND] > 0.0 and s.rms_a2 - s.mean_a * s.mean_a > (VARYING_C * one_c) ** 2
-    return HOLD_NOTHING if abs(s.x_a[TREND]) < small_a or varying else HOLD_CAPACITY
+    capacity_is_visible = abs(s.x_a[TREND]) < small_a or varying
+    return cell_to_hold(s) | (0 if capacity_is_visible else HOLD_CAPACITY)
+
+
+@njit(cache=True)
+def cell_to_hold(s: Record) -> int:
+    """Return the set of the cell's states if the filter has learned them, and the empty set before."""
+    return HOLD_CELL if s.learned_soc >= LEARNING_SOC else 0
 
 
 @njit(cache=True)
 def is_held(j: int, hold: int) -> bool:
     """Return True if state ``j`` is in the set ``hold``, so that its mean and variance do not change."""
     if j == LN_Q:
-        return hold >= HOLD_CAPACITY
+        return hold & HOLD_CAPACITY != 0
+    if j == OFFSET:
+        return hold & HOLD_OFFSET != 0
     if j == CURVE:
-        return hold >= HOLD_CELL_AND_CURVE
-    return (j == OFFSET or j >= NODE) and hold >= HOLD_CELL
+        return hold & HOLD_CURVE != 0
+    return j >= NODE and hold & HOLD_NODES != 0
 
 
 @njit(cache=True)

@@ -75,6 +75,12 @@ def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
 
 
 @njit(cache=True)
+def is_resting(s: Record, p: Record) -> bool:
+    """Return True if the mean current over 10 min is that of an idle pack."""
+    return abs(s.mean_a) < IDLE_C * p.capacity_as / 3600.0
+
+
+@njit(cache=True)
 def interpolation_charge_variance(change_a: float, dt_s: float) -> float:
     """Return the variance of the charge in ``dt_s`` about the straight line between two samples [A^2 s^2].
 

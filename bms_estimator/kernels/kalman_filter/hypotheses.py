@@ -10,6 +10,8 @@ The output is the mean and standard deviation of the mixture.
 
 import math
 
+import numpy as np
+
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
     REFERENCE_C,
@@ -18,6 +20,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
 from bms_estimator.kernels.kalman_filter.current_offset import update_offset_at_rest
 from bms_estimator.kernels.kalman_filter.ekf import (
     INDEPENDENT_R_STD,
+    LEARNING_SOC,
     MAX_SOC,
     MIN_SOC,
     adapt_bias_inflation,
@@ -25,6 +28,7 @@ from bms_estimator.kernels.kalman_filter.ekf import (
     update,
 )
 from bms_estimator.kernels.kalman_filter.gap_charge import (
+    USUAL_S,
     initialize_load_statistics,
     update_load_statistics,
 )
@@ -74,11 +78,6 @@ OVERLAP = 0.62
 """Std of a hypothesis, as a fraction of the distance between neighbours."""
 BEYOND_STD = 0.03
 """Std in SOC of the prior weight of a hypothesis beyond ``MIN_SOC`` or ``MAX_SOC``, whose SOC is limited."""
-MIN_STD = 0.005
-"""Minimum std of the published SOC, because full and empty of a cell are not defined better."""
-MIN_STD_OF_R_STD = 0.03
-"""Minimum std of the published SOC, as a fraction of the std of ln R. A cell that was not measured is full at another point of
-the curve."""
 HYST_STD = 0.7
 """Initial std of the hysteresis state h."""
 HISTORY_S = 1800.0
@@ -90,6 +89,12 @@ INCONSISTENT_STDS = 2.0
 that its innovations alone are small."""
 REINITIALIZED_STD = 0.2
 """Std of the SOC after a re-initialization, equal to the default at switch-on."""
+MIN_PROBABILITY = 1e-12
+"""Minimum prior probability of a hypothesis, so that its logarithm is finite."""
+EXCHANGE_STDS = 3.0
+"""Minimum error of the SOC after a gap that shows an exchange of the pack, in standard deviations."""
+MAX_EVENT_C = 2.0
+"""Maximum mean current of a charge or a discharge in a gap, as a C-rate. A larger change of the SOC is an exchange."""
 USER_SOC_STD = 0.03
 """Std of a correct SOC set by the user."""
 WRONG_USER_SOC_STD = 0.12
@@ -115,6 +120,8 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
     cov[:, :] = 0.0
     cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
     cov[LN_R0, LN_R] = cov[LN_R, LN_R0] = max(resistance_std(s, p) ** 2 - INDEPENDENT_R_STD**2, 0.0)
+    s.learned_soc = s.gap_s = 0.0
+    s.exchanged = 0
     s.step.phase, s.step.ln_ratio, s.step.variance = UNHELD, 0.0, resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = offset_variance(p)
     cov[LN_Q, LN_Q] = p.capacity_std**2
@@ -129,35 +136,132 @@ def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
 
     SOC, polarization, hysteresis and errors of the model are unknown.
     """
-    mean, covariance = s.mean[s.best], s.covariance[s.best]
-    for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
-        decorrelate_state(mean, covariance, j)
-    for k in range(BRANCHES):
-        decorrelate_state(mean, covariance, X + k)
-    s.x_a[:] = 0.0
-    initial_branch_currents(p, s.current_a, mean, covariance)
-    covariance[HYST, HYST], covariance[CURVE, CURVE] = HYST_STD**2, 1.0
-    s.count = HYPOTHESES if soc_std > MAX_SINGLE_STD else 1
-    spacing = 2.0 * SPREAD_STDS * soc_std / (HYPOTHESES - 1)
     if s.best != 0:
         copy_hypothesis(s, s.best, 0)
+    forget_state_of_charge(s, p, 0)
+    s.x_a[:] = 0.0
+    s.count = HYPOTHESES if soc_std > MAX_SINGLE_STD else 1
+    spacing = 2.0 * SPREAD_STDS * soc_std / (HYPOTHESES - 1)
     for q in range(s.count - 1, -1, -1):
         if q > 0:
             copy_hypothesis(s, 0, q)
         distance = (q - (s.count - 1) // 2) * spacing
         std = OVERLAP * spacing if s.count > 1 else soc_std
-        s.mean[q, SOC] = min(max(soc + distance, MIN_SOC), MAX_SOC)
-        s.covariance[q, SOC, SOC] = std * std
+        set_initial_soc(s, p, q, min(max(soc + distance, MIN_SOC), MAX_SOC), std)
         s.ln_weight[q] = -0.5 * (distance / soc_std) ** 2 - 0.5 * ((soc + distance - s.mean[q, SOC]) / BEYOND_STD) ** 2
-        half_v2 = 0.5 * bias_variance(s, p, q)
-        s.covariance[q, B_SLOW, B_SLOW] = s.covariance[q, B_FAST, B_FAST] = half_v2
-        s.minute_u[q] = s.ten_minutes_u[q] = 0.0
-        s.fast_inflation[q] = s.slow_inflation[q] = 1.0
     for q in range(s.count, HYPOTHESES):
         clear_hypothesis(s, q)
     s.best = (s.count - 1) // 2
+    begin_search(s)
+
+
+@njit(cache=True)
+def forget_state_of_charge(s: Record, p: Record, q: int) -> None:
+    """Set all states of hypothesis ``q`` except those of sensor and cell to their prior, with an SOC of 0 without variance.
+
+    The RC pairs have the prior of an unknown load up to the present current, including the current in ``s.x_a``.
+    """
+    mean, covariance = s.mean[q], s.covariance[q]
+    for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
+        decorrelate_state(mean, covariance, j)
+    for k in range(BRANCHES):
+        decorrelate_state(mean, covariance, X + k)
+    initial_branch_currents(p, s.current_a, mean, covariance)
+    covariance[HYST, HYST], covariance[CURVE, CURVE] = HYST_STD**2, 1.0
+    s.minute_u[q] = s.ten_minutes_u[q] = 0.0
+    s.fast_inflation[q] = s.slow_inflation[q] = 1.0
+
+
+@njit(cache=True)
+def set_initial_soc(s: Record, p: Record, q: int, soc: float, std: float) -> None:
+    """Set mean and std of a hypothesis's SOC, and the variance of its biases at that SOC."""
+    s.mean[q, SOC] = soc
+    s.covariance[q, SOC, SOC] = std * std
+    half_v2 = 0.5 * bias_variance(s, p, q)
+    s.covariance[q, B_SLOW, B_SLOW] = s.covariance[q, B_FAST, B_FAST] = half_v2
+
+
+@njit(cache=True)
+def begin_search(s: Record) -> None:
+    """Begin the time in which the hypotheses are unreliable, and compute the moments of the mixture."""
     s.seeded_s = s.rest_s = s.rest_as = 0.0
     mixture_moments(s)
+
+
+@njit(cache=True)
+def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
+    """Initialize hypotheses after a gap: usual use in the gap, or any SOC.
+
+    In the gap the pack may have been charged, discharged or exchanged, with a prior probability that grows with ``gap_s``
+    [s]. Hypotheses with the same estimates of sensor and cell therefore cover SOC 0 to 1 evenly. One hypothesis remains
+    beside them: the usual load if one filter suffices for its std, or else a rest that continued. If the voltage cannot
+    distinguish them, the remaining one stays likely. The weights of the others represent the rest of the usual load.
+
+    Args:
+        s: Record of EKF_STATE; hypothesis 0 was propagated with the usual load, and hypothesis 1 with a rest if ``rested``.
+        p: Record of EKF_SETTINGS.
+        gap_s: Duration of the gap [s].
+        rested: True if the pack rested before the gap.
+    """
+    soc, std = s.mean[0, SOC], math.sqrt(s.covariance[0, SOC, SOC])
+    event = p.event_probability * (1.0 - math.exp(-gap_s / p.event_s))
+    kept, kept_probability = -1, 0.0
+    if std <= MAX_SINGLE_STD:
+        kept, kept_probability = 0, 1.0 - event
+    elif rested:
+        kept, kept_probability = 1, (1.0 - event) * math.exp(-gap_s / USUAL_S)
+    even = HYPOTHESES if kept < 0 else HYPOTHESES - 1
+    spacing = 1.0 / (even - 1)
+    row = HYPOTHESES  # row of the remaining hypothesis; rows are in the order of SOC
+    if kept >= 0:
+        row = min(max(math.ceil(s.mean[kept, SOC] / spacing), 0), even)
+        if row != kept:
+            copy_hypothesis(s, kept, row)
+        for k in range(BRANCHES):
+            s.mean[row, X + k] += s.x_a[k]
+    first = 1 if row == 0 else 0
+    if row != HYPOTHESES:
+        copy_hypothesis(s, row, first)
+    forget_state_of_charge(s, p, first)
+    s.x_a[:] = 0.0
+    for n in range(even - 1, -1, -1):
+        q = n if n < row else n + 1
+        if q != first:
+            copy_hypothesis(s, first, q)
+        set_initial_soc(s, p, q, n * spacing, OVERLAP * spacing)
+        weight = event / even + (1.0 - event - kept_probability) * spacing * normal_density(n * spacing, soc, std)
+        s.ln_weight[q] = math.log(max(weight, MIN_PROBABILITY))
+    if kept >= 0:
+        s.ln_weight[row] = math.log(max(kept_probability, MIN_PROBABILITY))
+    s.count, s.best = HYPOTHESES, np.argmax(s.ln_weight)
+    begin_search(s)
+
+
+@njit(cache=True)
+def normal_density(x: float, mean: float, std: float) -> float:
+    """Return the density of a normal distribution."""
+    return math.exp(-0.5 * ((x - mean) / std) ** 2) / (std * math.sqrt(2.0 * math.pi))
+
+
+@njit(cache=True)
+def end_learning(s: Record) -> None:
+    """Hold LN_Q from now on, and set the OCV nodes to their prior.
+
+    The nodes learned in one pass have common errors with the SOC of that pass.
+    """
+    s.learned_soc = LEARNING_SOC
+    for q in range(s.count):
+        reset_ocv_correction(s.mean[q], s.covariance[q])
+
+
+@njit(cache=True)
+def begin_gap(s: Record, gap_s: float) -> None:
+    """Store the SOC before a gap of ``gap_s`` [s], or no gap if its duration is infinite, and end the learning."""
+    s.gap_s = gap_s if gap_s < math.inf else 0.0
+    s.soc_before, s.std_before = s.mean[0, SOC], math.sqrt(s.covariance[0, SOC, SOC])
+    s.exchanged = 0
+    if s.learned_soc < LEARNING_SOC:
+        end_learning(s)
 
 
 @njit(cache=True)
@@ -166,6 +270,7 @@ def set_soc(s: Record, p: Record, soc: float) -> None:
     spawn_hypotheses(s, p, soc, WRONG_USER_SOC_STD)
     s.covariance[s.best, SOC, SOC] = USER_SOC_STD**2
     s.ln_weight[s.best] += LN_ODDS_CORRECT
+    s.gap_s, s.exchanged = 0.0, 0
     mixture_moments(s)
 
 
@@ -180,6 +285,11 @@ def update_hypotheses(s: Record, p: Record) -> None:
         prepare_transition(s, p)
     update_arrhenius_factors(s)
     s.seeded_s += dt_s
+    if s.learned_soc < LEARNING_SOC:
+        s.learned_soc += w.throughput_as / p.capacity_as
+        if s.learned_soc >= LEARNING_SOC:
+            end_learning(s)
+    s.soc_before -= w.charge_as / p.capacity_as
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
     scale, best = innovation_scale(s, p), 0
     for q in range(s.count):
@@ -207,6 +317,7 @@ def update_hypotheses(s: Record, p: Record) -> None:
     prune_and_merge(s)
     mixture_moments(s)
     reinitialize_if_biased(s, p)
+    detect_exchange(s)
     reset_window(s)
 
 
@@ -229,9 +340,16 @@ def innovation_scale(s: Record, p: Record) -> float:
 def reinitialize_if_biased(s: Record, p: Record) -> None:
     """Re-initialize the SOC if the bias of a single remaining hypothesis is larger than plausible model errors."""
     if s.count == 1 and normalized_bias_squared(s, p, 0) > REINITIALIZE_STDS**2:
-        reset_ocv_correction(s.mean[0], s.covariance[0])
         spawn_hypotheses(s, p, s.mean[0, SOC], REINITIALIZED_STD)
         s.reopened += 1
+
+
+@njit(cache=True)
+def detect_exchange(s: Record) -> None:
+    """Detect that the pack was exchanged in the last gap, because no possible current in the gap explains the SOC after it."""
+    error = EXCHANGE_STDS * math.hypot(s.soc_std, s.std_before)
+    if s.gap_s > 0.0 and abs(s.soc - s.soc_before) > error + MAX_EVENT_C * s.gap_s / 3600.0:
+        s.exchanged = 1
 
 
 @njit(cache=True)
@@ -250,4 +368,4 @@ def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
 def weakest_cell_soc_std(s: Record, p: Record) -> float:
     """Return the std of the SOC of the weakest cell in series, whose deviation from the mean cannot be observed."""
     spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
-    return math.hypot(max(s.soc_std, MIN_STD, MIN_STD_OF_R_STD * p.r_std), spread)
+    return math.hypot(max(s.soc_std, p.min_soc_std), spread)

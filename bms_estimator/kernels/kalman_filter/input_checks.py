@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.kernels.kalman_filter.ekf import LEARNING_SOC
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS
 from bms_estimator.kernels.kalman_filter.frozen_sensor import (
     FAST_S,
@@ -72,7 +73,9 @@ MAX_REINITIALIZATIONS = 4.0
 TEMPERATURE_MARGIN_K = 5.0
 """Distance from the temperature range of the cell file for the fault TEMPERATURE [K]."""
 
-SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT = (int(bit) for bit in InputFault)
+SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT, PACK = (
+    int(bit) for bit in InputFault
+)
 UNUSABLE = SIGN_OF_CURRENT | VOLTAGE | CURRENT
 """Faults during which the voltage is not used."""
 
@@ -270,7 +273,8 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     """Process a sample without its voltage, during a fault of ``UNUSABLE``.
 
     A wrong sign of the current causes an SOC error of twice the charge, always in one direction. A frozen current may be
-    any typical load. Estimates learned with a wrong sign are useless, so that the filter is re-initialized afterwards.
+    any typical load. Afterwards the SOC is re-initialized. Estimates of the cell learned with a wrong sign are useless, so that
+    they are initialized, too, unless the filter already holds them.
     """
     counted_soc = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
     error_soc = UNOBSERVED_CHARGE_ERROR * counted_soc
@@ -285,12 +289,12 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     if bits:
         c.suspects = bits
         return
+    soc_std = max(f.soc_std, RESTORED_STD)
     if c.suspects & SIGN_OF_CURRENT:
         soc_std = max(f.soc_std, p.soc_std)
-        initialize_filter(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
-        spawn_hypotheses(f, p, f.soc, soc_std)
-    else:
-        spawn_hypotheses(f, p, f.soc, max(f.soc_std, RESTORED_STD))
+        if f.learned_soc < LEARNING_SOC:
+            initialize_filter(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
+    spawn_hypotheses(f, p, f.soc, soc_std)
     reset_window(f)
     c.suspects = 0
 
@@ -323,6 +327,8 @@ def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
     outside_k = max(p.low_c - f.temperature_c, f.temperature_c - p.high_c)
     if f.sensed and outside_k > TEMPERATURE_MARGIN_K * (CLEAR_FRACTION if before & TEMPERATURE else 1.0):
         bits |= TEMPERATURE
+    if f.exchanged:
+        bits |= PACK
     c.suspects = bits
 
 

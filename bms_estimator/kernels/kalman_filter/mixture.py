@@ -81,6 +81,24 @@ def merge_pair(s: Record, a: int, b: int) -> None:
 
 
 @njit(cache=True)
+def merge_all(s: Record) -> None:
+    """Replace all hypotheses by the normal distribution with their mean and covariance."""
+    for _ in range(s.count - 1):
+        merge_pair(s, 0, 1)
+        remove_hypothesis(s, 1)
+
+
+@njit(cache=True)
+def limit_soc_std(s: Record, q: int, max_std: float) -> None:
+    """Limit the std of the SOC of hypothesis ``q``. Its correlations with the other states remain."""
+    covariance = s.covariance[q]
+    if covariance[SOC, SOC] > max_std * max_std:
+        scale = max_std / math.sqrt(covariance[SOC, SOC])
+        covariance[SOC, :] *= scale
+        covariance[:, SOC] *= scale
+
+
+@njit(cache=True)
 def remove_hypothesis(s: Record, q: int) -> None:
     """Remove row ``q`` and move the later rows up."""
     for j in range(q, s.count - 1):

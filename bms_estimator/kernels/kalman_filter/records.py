@@ -89,6 +89,11 @@ class Noise:
     """P(0): std of the part of the unknown load that is constant for hours, as a C-rate."""
     load_s: float = 20.0
     """P(0): correlation time of the varying part of the unknown load [s]."""
+    event_probability: float = 0.5
+    """P(0): probability that a long gap hides a charge, a discharge or an exchange of the pack, so that any SOC is possible.
+    Nothing is known about it, so that the odds are even."""
+    event_s: float = 3600.0
+    """P(0): time constant with which this probability grows with the duration of the gap [s], of the order of a charge."""
     half_likelihood_exponent: float = 0.17
     """Half of the likelihood's exponent in the weights of hypotheses. It is below 0.5, because successive errors are not
     independent."""
@@ -117,6 +122,7 @@ EKF_SETTINGS = np.dtype(
         ("middle_ohm", "f8"),  # sum of all resistances at SOC 0.5 and 25 C [ohm]
         ("low_c", "f8"),  # temperature range of the resistances, lower end [C]
         ("high_c", "f8"),  # temperature range of the resistances, upper end [C]
+        ("min_soc_std", "f8"),  # minimum std of the published SOC
         ("sensor_v2", "f8"),  # variance of one voltage sample: noise and rounding [V^2]
         ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
         ("current_step_a", "f8"),  # resolution of the reported current [A]; 0: not rounded
@@ -136,7 +142,7 @@ WINDOW = np.dtype(
         ("unknown_as", "f8"),  # std of the charge in unmeasured gaps [A s]
         ("between_as2", "f8"),  # variance of the charge between samples far apart [A^2 s^2]
         ("rounded_as2", "f8"),  # variance of the charge by rounding of the current [A^2 s^2]
-        ("gap", "i8"),  # 1: samples are missing
+        ("gap", "i8"),  # 1: samples are missing; 2: the gap may hide a charge or an exchange of the pack
         ("sum_v", "f8"),
         ("sum_a", "f8"),
         ("sum_as", "f8"),  # sum over the samples of the charge up to each sample
@@ -173,6 +179,11 @@ EKF_STATE = np.dtype(
         ("started", "i8"),  # 1: initialized
         ("seeded_s", "f8"),  # time since the hypotheses were initialized [s]
         ("reopened", "i8"),  # number of re-initializations of the SOC because of an implausible bias
+        ("learned_soc", "f8"),  # charge throughput with LN_Q and OCV nodes learned, up to ``ekf.LEARNING_SOC`` [SOC]
+        ("gap_s", "f8"),  # duration of the last gap that may hide a charge [s]; 0: none
+        ("soc_before", "f8"),  # SOC before this gap, less the charge counted since it
+        ("std_before", "f8"),  # std of the SOC before this gap
+        ("exchanged", "i8"),  # 1: no charge or discharge in this gap explains the SOC after it
         ("window", WINDOW),
         ("current_a", "f8"),  # current of the last sample [A]
         ("same_s", "f8"),  # time for which the reported current has been constant within its resolution [s]

@@ -74,18 +74,29 @@ def learning_step(s: Record, p: Record, dt_s: float, previous_a: float, voltage_
         p: Record of ESTIMATOR_SETTINGS.
         dt_s: Time since the previous sample [s].
         previous_a: Current at the previous sample [A].
-        voltage_v: Measured voltage [V].
+        voltage_v: Measured voltage [V]; NaN if it was not measured at this sample.
     """
     m, q, o = s.learning, p.learning, s.observer
     load_constants(q.model, m.given, p, o.soc, m.temperature_c)
     unmeasured_s = p.observer.unmeasured_s
     mean_a = interpolated_current(dt_s, previous_a, o.current_a, unmeasured_s)
     advance(q.model, m.x, m.dx, m.theta, m.given, mean_a, dt_s)
+    m.settle_s = max(m.settle_s - dt_s, 0.0) if dt_s <= unmeasured_s else q.settle_s
+    if math.isfinite(voltage_v):
+        learn_from_voltage(s, p, o.voltage_age_s, voltage_v)
+    else:
+        estimate_v = output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) + m.offset_v
+        write_observer_state(s, p, estimate_v)
+
+
+@njit(cache=True)
+def learn_from_voltage(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
+    """Correct the output and learn from a measured voltage [V], ``dt_s`` after the previous measured voltage."""
+    m, q, o = s.learning, p.learning, s.observer
     e = voltage_v - output(q.model, m.x, m.dx, m.theta, m.given, o.current_a, m.psi) - m.offset_v
     o.innovation_v = e
     inject_output_error(m, q, dt_s, e)
     o.adapting = 0 if o.soc <= q.soc_floor else 1  # a fuel cell has no SOC and always adapts
-    m.settle_s = max(m.settle_s - dt_s, 0.0) if dt_s <= unmeasured_s else q.settle_s
     if o.adapting and m.settle_s == 0.0:
         accumulate_information(m, q, dt_s, e)
         m.waited_s += dt_s

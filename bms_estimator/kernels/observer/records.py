@@ -52,6 +52,7 @@ OBSERVER_STATE = np.dtype(
         ("time_s", "f8"),  # time stamp of the last accepted sample [s]
         ("current_a", "f8"),  # current of the last accepted sample [A]
         ("step_s", "f8"),  # time between the last two accepted samples [s]
+        ("voltage_age_s", "f8"),  # age of the last measured voltage at the last accepted sample [s]
         ("soc", "f8"),  # x1, 0..1: by the identifier, or by coulomb counting
         ("soc_coulomb", "f8"),  # by coulomb counting alone (3.1), 0..1
         ("v_ts", "f8"),  # x2 [V]

@@ -67,7 +67,7 @@ def series_resistance_step(
         dt_s: Time since the previous sample [s].
         previous_a: Current at the previous sample, constant until this sample [A].
         previous_soc: SOC at the previous sample.
-        voltage_v: Measured voltage [V].
+        voltage_v: Measured voltage [V]; NaN if it was not measured at this sample.
     """
     r, o = s.series_resistance, s.observer
     mid_soc = max(0.5 * (previous_soc + o.soc), stability_floor(o, p.observer))
@@ -75,7 +75,7 @@ def series_resistance_step(
     r.v_ts = rc_step(r.v_ts, previous_a, ohm_ts, ohm_ts * c_ts(mid_soc, o.a), dt_s)  # (2.2)
     r.v_tl = rc_step(r.v_tl, previous_a, ohm_tl, ohm_tl * c_tl(mid_soc, o.a), dt_s)  # (2.3)
     r.settle_s = max(r.settle_s - dt_s, 0.0) if dt_s <= p.observer.unmeasured_s else p.learning.settle_s
-    if r.settle_s > 0.0 or not o.adapting or not current_suffices(o.current_a, p):
+    if r.settle_s > 0.0 or not o.adapting or math.isnan(voltage_v) or not current_suffices(o.current_a, p):
         return
     b = bin_of(o.soc)
     if r.samples[b] >= MAX_SAMPLES:

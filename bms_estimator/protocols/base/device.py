@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 
+BMS_GAIN_STD = 0.005
+"""Relative std of the gains of a BMS. Vendors state 0.5 % for the pack voltage, and seldom a smaller error."""
+
 
 @dataclass(frozen=True)
 class SensorDefaults:
@@ -23,6 +26,10 @@ class SensorDefaults:
     """Smallest step of the current [A]."""
     current_dead_band_a: float | None = None
     """Current below which the device reports 0 [A]."""
+    voltage_gain_std: float = BMS_GAIN_STD
+    """Relative std of the voltage sensor's gain."""
+    current_gain_std: float = BMS_GAIN_STD
+    """Relative std of the current sensor's gain."""
 
 
 @dataclass(frozen=True)

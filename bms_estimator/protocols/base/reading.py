@@ -23,14 +23,19 @@ class Reading(NamedTuple):
     cells_v: tuple[float, ...] = ()
     time_s: float = nan
     """Timestamp by the device's clock, with any origin [s]; NaN: not reported."""
+    voltage_held: bool = False
+    """True if the voltage is that of an earlier reading, and only the other values are new."""
 
 
+VOLTAGE_HELD = "voltage_held"
+"""Name of the mark of a held voltage in a line."""
 _VOLT: Mapping[str, float] = {"": 1.0, "v": 1.0, "volt": 1.0, "volts": 1.0, "mv": 1e-3}
 _UNITS: Mapping[str, Mapping[str, float]] = {
     "voltage_v": _VOLT,
     "current_a": {"": 1.0, "a": 1.0, "amp": 1.0, "amps": 1.0, "ma": 1e-3},
     "temperature_c": {"": 1.0, "c": 1.0, "degc": 1.0},
     "time_s": {"s": 1.0},
+    VOLTAGE_HELD: {"": 1.0},  # 1: held, 0: measured
     "cells_v": _VOLT,
 }
 _NAMES = {
@@ -38,6 +43,7 @@ _NAMES = {
     "current_a": ("I", "i", "A", "amp", "amps", "current", "ibat", "ibatt"),
     "temperature_c": ("T", "temp", "temperature"),  # t may be the time
     "time_s": ("time",),  # only with its unit, because boards print times in any unit
+    VOLTAGE_HELD: (VOLTAGE_HELD,),
     "cells_v": ("cells", "cell_voltages"),
 }
 _QUANTITIES = {
@@ -62,8 +68,8 @@ def read_line(line: bytes) -> Reading | None:
 
     Examples: ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
     ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
-    ``time_s`` is the board's timestamp. A cell that is ``null`` was not measured. Unknown names are skipped. A repeated
-    name or an unknown unit makes the line invalid.
+    ``time_s`` is the board's timestamp. ``voltage_held=1`` marks the voltage of an earlier line. A cell that is ``null``
+    was not measured. Unknown names are skipped. A repeated name or an unknown unit makes the line invalid.
     """
     if b";" in line and b"." not in line:
         line = line.replace(b",", b".")
@@ -92,7 +98,7 @@ def _pair_values(text: str) -> Iterable[_NamedValues]:
 def _json_values(line: bytes) -> Iterable[_NamedValues]:
     for name, value in json.loads(line.decode(), parse_float=number, parse_constant=number).items():
         values = [nan if v is None else v for v in value] if isinstance(value, list) else [value]
-        if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+        if name == VOLTAGE_HELD or all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
             yield name, [float(v) for v in values], ""
 
 
@@ -114,9 +120,10 @@ def _to_reading(named_values: Iterable[_NamedValues]) -> Reading | None:
     if "voltage_v" not in values_si or "current_a" not in values_si:
         return None
     (voltage_v,), (current_a,), (temperature_c,), (time_s,) = (
-        values_si.get(field, [nan]) for field in _UNITS if field != "cells_v"
+        values_si.get(field, [nan]) for field in ("voltage_v", "current_a", "temperature_c", "time_s")
     )
-    return Reading(voltage_v, current_a, temperature_c, tuple(values_si.get("cells_v", ())), time_s)
+    cells_v, (held,) = tuple(values_si.get("cells_v", ())), values_si.get(VOLTAGE_HELD, [0.0])
+    return Reading(voltage_v, current_a, temperature_c, cells_v, time_s, voltage_held=held > 0.0)
 
 
 def sample_json_line(
@@ -126,6 +133,7 @@ def sample_json_line(
     temperature_c: float | None = None,
     cells_v: Sequence[float | None] = (),
     time_s: float | None = None,
+    voltage_held: bool = False,
 ) -> bytes:
     """Return the JSON line of one sample.
 
@@ -135,6 +143,7 @@ def sample_json_line(
         temperature_c: None or NaN: not measured [degC].
         cells_v: Cell voltages, from the first on; None or NaN: not measured [V].
         time_s: Timestamp by the device's clock, with any origin [s]; None: not reported.
+        voltage_held: True if the voltage is that of an earlier sample.
 
     Raises:
         ValueError: Voltage or current is not finite.
@@ -146,6 +155,8 @@ def sample_json_line(
         line["temperature_c"] = round(temperature_c, 3)
     if time_s is not None and math.isfinite(time_s):
         line["time_s"] = round(time_s, 6)
+    if voltage_held:
+        line[VOLTAGE_HELD] = 1
     if cells_v:
         line["cells_v"] = [None if v is None or not math.isfinite(v) else round(v, 4) for v in cells_v]
     return json.dumps(line, separators=(",", ":")).encode() + b"\n"

@@ -14,6 +14,7 @@ from bms_estimator.model.sample import (
     SAMPLE,
     CurrentSign,
     SampleBlock,
+    SampleStatus,
     remove_implausible,
 )
 from bms_estimator.protocols.base.device import Device, SensorDefaults
@@ -103,7 +104,7 @@ class TextProtocol(DeviceProtocol):
             block["current_a"] = [self._sign * reading.current_a for reading in readings]
             block["temperature_c"] = [reading.temperature_c for reading in readings]
             self._implausible += remove_implausible(block["temperature_c"], MIN_C, MAX_C)
-            block["status"] = 0
+            block["status"] = [SampleStatus.VOLTAGE_HELD if reading.voltage_held else 0 for reading in readings]
             block["time_s"] = self._times(arrival_s, readings)
         return block
 

@@ -216,6 +216,13 @@ def _acknowledge(root: str) -> dict[str, Any]:
     return _button("Acknowledge alarms", f"{root}/request/acknowledge_alarm") | availability
 
 
+def _forget_pack(root: str) -> dict[str, Any]:
+    """Return the button that discards what was learned from the pack. It is disabled, because a press cannot be undone."""
+    availability = {"availability": [{"topic": f"{root}/availability"}]}
+    hidden = {"entity_category": "config", "enabled_by_default": False}
+    return _button("Forget pack", f"{root}/request/forget_pack") | availability | hidden
+
+
 def _button(name: str, topic: str) -> dict[str, Any]:
     return {"platform": "button", "name": name, "command_topic": topic, "payload_press": "{}"}
 
@@ -243,4 +250,5 @@ _COMMANDS = {
     "current_zero": _current_zero,
     "acknowledge_alarm": _acknowledge,
     "publish_rate": _publish_rate,
+    "forget_pack": _forget_pack,
 }

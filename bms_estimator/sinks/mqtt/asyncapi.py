@@ -30,6 +30,7 @@ ARGUMENTS: dict[str, Document] = {
     "current_zero": {},
     "acknowledge_alarm": {"name": {"type": ["string", "null"], "description": "name of an alarm; default: all"}},
     "publish_rate": {"rate_hz": {"type": "number", "minimum": MIN_RATE_HZ, "maximum": MAX_RATE_HZ}},
+    "forget_pack": {},
 }
 """JSON schemas of the fields of each command."""
 OPTIONAL = ("name",)

@@ -76,7 +76,7 @@ class _Columns(NamedTuple):
     """Columns of a sample in a table."""
 
     indices: tuple[int, ...]
-    """Column indices of time, current, voltage, and temperature if there is one."""
+    """Column indices of time, current, voltage, and of temperature and status if there are such columns."""
     names: tuple[str, ...]
     discharge_sign: float
 
@@ -287,6 +287,9 @@ def _find_columns(path: Path | str, header: Sequence[str], sign: Sign) -> _Colum
             f"needed: {_header_text(NAMINGS[0])}, or {_header_text(NAMINGS[1])} (Battery Data Format)"
         )
     names = tuple(name for name in (*naming.required, naming.temperature_c) if name in header)
+    # ``fleet capture`` writes exactly the columns of a sample; the status of another table has another meaning
+    if set(header) == set(SAMPLE.names or ()):
+        names += ("status",)
     return _Columns(tuple(header.index(name) for name in names), names, sign.factor(naming))
 
 
@@ -303,4 +306,6 @@ def _make_block(
     block["current_a"] = columns.discharge_sign * values[1]
     block["voltage_v"] = values[2]
     block["temperature_c"] = values[3] if len(values) > 3 else np.nan
+    if len(values) > 4:
+        block["status"] = np.nan_to_num(values[4]).clip(min=0.0)
     return block, remove_implausible(block["temperature_c"], MIN_C, MAX_C)

@@ -45,8 +45,9 @@ class _TimestampedValue(NamedTuple):
 class SampleAssembler:
     """Assembler of lines, one for each sample, from MQTT messages.
 
-    A sample is complete when voltage and current have arrived. If only one of them arrives within ``settle_s``, the
-    last value of the other is used up to ``max_age_s``, because some publishers send only changes.
+    A sample is complete when voltage and current have arrived. If only one of them arrives in time (``_pairing_s``), the
+    last value of the other is used up to ``max_age_s``, because some publishers send only changes. The line marks a voltage
+    that an earlier sample has used, because the estimator must not use a voltage twice.
     Retained messages are rejected, because their age is unknown.
     """
 
@@ -114,11 +115,9 @@ class SampleAssembler:
 
     def wait_s(self, now_s: float) -> float | None:
         """Return the time until a sample is complete without a further message [s]; None if a message is needed."""
-        return (
-            max(min(self._unused_arrival_s.values()) + self._settings.settle_s - now_s, 0.0)
-            if self._unused_arrival_s
-            else None
-        )
+        if not self._unused_arrival_s:
+            return None
+        return max(min(self._unused_arrival_s.values()) + self._pairing_s() - now_s, 0.0)
 
     def add_message(self, topic: str, payload: bytes, now_s: float, *, retained: bool) -> None:
         """Store the values of a message.
@@ -157,6 +156,7 @@ class SampleAssembler:
             len(self._unused_arrival_s) < len(REQUIRED_QUANTITIES) and (self.wait_s(now_s) or 0.0) > 0.0
         ):
             return b""
+        voltage_held = "voltage" not in self._unused_arrival_s
         self._unused_arrival_s.clear()
         voltage_v, current_a = (self._value(name, now_s, self._settings.max_age_s) for name in REQUIRED_QUANTITIES)
         if voltage_v is None or current_a is None:
@@ -168,7 +168,19 @@ class SampleAssembler:
             temperature_c=self._value("temperature", now_s, self._settings.slow_max_age_s),
             cells_v=self._cells_v(now_s),
             time_s=self._value("time", now_s, self._settings.settle_s),  # an older time belongs to an earlier sample
+            voltage_held=voltage_held,
         )
+
+    def _pairing_s(self) -> float:
+        """Return the time for which a new voltage or current waits for the other [s].
+
+        A voltage is used with the current that is nearest in time, so that it waits for the next current as long as the
+        last one was old. The wait is limited to the expected sample period.
+        """
+        current, arrival_s = self._values.get("current"), self._unused_arrival_s.get("voltage")
+        if current is None or arrival_s is None:
+            return self._settings.settle_s
+        return max(self._settings.settle_s, min(arrival_s - current.arrival_s, self._settings.interval_s))
 
     def _store_value(self, binding: _TopicBinding, payload: bytes, cell: int | None, now_s: float) -> None:
         """Store the values of a payload.

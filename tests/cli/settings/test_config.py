@@ -229,6 +229,12 @@ def cell_file(tmp_path):
             "series = 7\nparallel = 4",
             "sensor.voltage_resolution_v = 0.02441: the board's range ends at 25.0 V, but this pack has 29.1",
         ),
+        ({}, "series = 2\nfull_voltage_v = 8.1", "pack.full_voltage_v = 8.1: the OCV of"),
+        (
+            {},
+            "series = 2\ncutoff_voltage_v = 6.8",
+            "pack.cutoff_voltage_v = 6.8: the OCV of",
+        ),
     ],
 )
 def test_check_warns_about_implausible_settings(cell, settings, message, cell_file, pack, capsys):
@@ -247,6 +253,7 @@ def test_check_warns_about_implausible_settings(cell, settings, message, cell_fi
         'cell = "ncr18650"\nseries = 14\nparallel = 4\n[sensor]\nprotocol = "text"',
         'cell = "leaf"\nseries = 4\nparallel = 2',
         'cell = "lfp"\ncapacity_ah = 100\nseries = 4',
+        'cell = "lfp"\ncapacity_ah = 100\nseries = 4\nfull_voltage_v = 13.8\ntail_current_a = 4\ncutoff_voltage_v = 11.2',
     ],
 )
 def test_check_accepts_plausible_packs(settings, pack, capsys):

@@ -239,11 +239,32 @@ def cell_file(case: Case) -> CellModel:
     if case.file_temperatures_c == "generic":
         return generic
     rng = np.random.default_rng(2000 + case.seed)
-    slope_v = np.gradient(case.truth.ocv_v, GRID)
-    std_v, std_soc_v = case.file_ocv_error_ratio * OCV_STD_V[kind], case.file_ocv_error_ratio * OCV_STD_SOC * slope_v
+    return own_file(case.truth, generic, OCV_STD_V[kind], case.file_temperatures_c, rng, case.file_ocv_error_ratio)
+
+
+def own_file(
+    truth: Truth,
+    generic: CellModel,
+    ocv_std_v: float,
+    temperatures_c: tuple[float, ...],
+    rng: np.random.Generator,
+    ocv_error_ratio: float = 1.0,
+) -> CellModel:
+    """Return a cell file of another cell of the same type, with the capacity of ``generic``.
+
+    Args:
+        truth: True cell.
+        generic: Generic cell file of its chemistry.
+        ocv_std_v: Std of the voltage error of the OCV [V].
+        temperatures_c: Temperatures at which the resistances were measured [C].
+        rng: Generator of the errors.
+        ocv_error_ratio: Error of the OCV divided by a typical error.
+    """
+    slope_v = np.gradient(truth.ocv_v, GRID)
+    std_v, std_soc_v = ocv_error_ratio * ocv_std_v, ocv_error_ratio * OCV_STD_SOC * slope_v
     ocv_error_v = std_v * smooth(rng, OCV_LENGTH_SOC) + std_soc_v * smooth(rng, OCV_LENGTH_SOC)
-    file_ocv_v = rising((case.truth.ocv_v + ocv_error_v)[OCV_NODES])
-    hysteresis_v = case.truth.hysteresis_v[GRID.size // 2]  # constant over SOC; this error is within ``error_v``
+    file_ocv_v = rising((truth.ocv_v + ocv_error_v)[OCV_NODES])
+    hysteresis_v = truth.hysteresis_v[GRID.size // 2]  # constant over SOC; this error is within ``error_v``
     table = {
         "soc": GRID[OCV_NODES],
         "ocv_v": file_ocv_v + 1e-6 * np.arange(OCV_NODES.size),
@@ -251,7 +272,7 @@ def cell_file(case: Case) -> CellModel:
         "hysteresis_v": np.full(OCV_NODES.size, hysteresis_v),
     }
     ocv = TableOcv(form="table", **{name: tuple(column) for name, column in table.items()})
-    return generic.model_copy(update={"ocv": ocv, "ladder": ladder(case.truth, case.file_temperatures_c, rng)})
+    return generic.model_copy(update={"ocv": ocv, "ladder": ladder(truth, temperatures_c, rng)})
 
 
 def rising(curve_v: Floats) -> Floats:

@@ -32,6 +32,8 @@ GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 """Gas constant [J/mol/K], 0 C and 25 C [K]."""
 TAPER_C = 0.05
 """Current at which a charger ends its charge [C]."""
+STATE_X = 5
+"""Index of the first filtered current in the state of a simulation."""
 LOOPS_SOC, FAST_FRACTION = (0.015, 0.15), 0.6
 """SOC changes over which the fast and the slow hysteresis go from their middle to their limit, and fraction of the hysteresis
 that is fast.
@@ -78,18 +80,54 @@ def simulate(
     low_v=-math.inf,
     high_v=math.inf,
 ):
-    """Return terminal voltage [V] and SOC at each sample, from rest at ``soc``. The current is constant until the next
+    """Return terminal voltage [V] and SOC at each sample, from rest at ``soc``. See ``simulate_from``.
+
+    ``hysteresis`` is the initial state: -1 after a discharge, 1 after a charge.
+    """
+    state = rest_state(soc, hysteresis)
+    curves = ocv_v, per_kelvin_v, hysteresis_v, ohm
+    return simulate_from(state, dt_s, current_a, room_c, capacity_ah, *curves, self_heating_k_per_w, low_v, high_v)
+
+
+@njit
+def rest_state(soc, hysteresis):
+    """Return the state of a cell at rest, for ``simulate_from``.
+
+    Its elements are SOC, the two states of the hysteresis (fast, slow; -1..1), the cell temperature minus the room
+    temperature [K], the sign of the current that a limit has stopped, and the low-pass filtered currents of the
+    processes [A].
+    """
+    state = np.zeros(STATE_X + len(TAU_S))
+    state[:STATE_X] = soc, hysteresis, hysteresis, 0.0, 0.0
+    return state
+
+
+@njit
+def simulate_from(
+    state,
+    dt_s,
+    current_a,
+    room_c,
+    capacity_ah,
+    ocv_v,
+    per_kelvin_v,
+    hysteresis_v,
+    ohm,
+    self_heating_k_per_w,
+    low_v,
+    high_v,
+):
+    """Return terminal voltage [V] and SOC at each sample, from ``state`` on. The current is constant until the next
     sample.
 
-    ``hysteresis`` is the initial state: -1 after a discharge, 1 after a charge. The temperature of
-    the cell finally exceeds the room temperature ``room_c`` by ``self_heating_k_per_w`` times the loss. A charger limits
-    the voltage to ``high_v`` [V] and stops at C/20. A protection ends the discharge below ``low_v`` [V]. The function writes the current that flowed to ``current_a`` [A].
+    The temperature of the cell finally exceeds the room temperature ``room_c`` by ``self_heating_k_per_w`` times the
+    loss. A charger limits the voltage to ``high_v`` [V] and stops at C/20. A protection ends the discharge below
+    ``low_v`` [V]. The function writes the current that flowed to ``current_a`` [A], and the state after the last sample
+    to ``state``.
     """
     voltage_v, true_soc = np.empty(len(current_a)), np.empty(len(current_a))
-    # x: low-pass filtered currents of the processes [A]; fast, slow: states of the two parts of the hysteresis, -1..1;
-    # rise_k: cell temperature minus room temperature [K]
-    x, fast, slow, rise_k = np.zeros(len(TAU_S)), hysteresis, hysteresis, 0.0
-    stopped = 0.0  # sign of the current that a limit has stopped
+    soc, fast, slow, rise_k, stopped = state[0], state[1], state[2], state[3], state[4]
+    x = state[STATE_X:]
     for n in range(len(current_a)):
         i, celsius = current_a[n], room_c[n] + rise_k
         if i * stopped > 0.0:
@@ -121,6 +159,7 @@ def simulate(
             x[k] = i + (x[k] - i) * math.exp(-dt_s / (TAU_S[k] * math.exp(0.5 * ENERGY_J[k] * inverse_temperature)))
         fast = min(max(fast - drawn_soc / LOOPS_SOC[0], -1.0), 1.0)
         slow = min(max(slow - drawn_soc / LOOPS_SOC[1], -1.0), 1.0)
+    state[0], state[1], state[2], state[3], state[4] = soc, fast, slow, rise_k, stopped
     return voltage_v, true_soc
 
 

@@ -1,6 +1,9 @@
 """Correction of the cell file's OCV by states of the filter, one for each node of the SOC."""
 
+import math
+
 import numpy as np
+import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import ocv_correction_with_std
@@ -58,10 +61,12 @@ def test_an_ocv_with_a_plateau_is_not_learned() -> None:
     assert np.allclose(std_v, estimator.settings_record[0]["filter"]["curve_error_v"])
 
 
-def simulate_partial_cycles(cell: CellModel, cycles: int) -> tuple[np.ndarray, np.ndarray, Estimator]:
+def simulate_partial_cycles(
+    cell: CellModel, cycles: int, passes: float = math.inf
+) -> tuple[np.ndarray, np.ndarray, Estimator]:
     """Run an estimator whose initial SOC is 0.1 too high; return the error of the SOC, its std, and the estimator.
 
-    Each cycle is a drive from SOC 0.85 to about 0.35, a rest, a charge and a rest.
+    The run ends after a charge throughput of ``passes`` times the capacity. Each cycle is a drive from SOC 0.85 to about 0.35, a rest, a charge and a rest.
     """
     pieces, soc, charge_c, rest_s = [], 0.85, 0.35, 2400
     for n in range(cycles):
@@ -80,7 +85,9 @@ def simulate_partial_cycles(cell: CellModel, cycles: int) -> tuple[np.ndarray, n
         1.0, current_a, samples["temperature_c"], soc, branch, OXIDE.capacity_ah, *curves
     )
     estimator = Estimator(cell, initial_soc=soc + 0.1)
-    trace = estimator.run(samples)
+    throughput = np.cumsum(np.abs(current_a)) / 3600.0 / OXIDE.capacity_ah
+    trace = estimator.run(samples[throughput < passes])
+    true_soc = true_soc[: trace.size]
     return trace["soc"] - true_soc, trace["soc_std"].copy(), estimator
 
 
@@ -95,16 +102,19 @@ def test_repeated_cycles_do_not_make_the_soc_overconfident() -> None:
     assert np.mean(nees) < 1.5
 
 
-def test_the_ocv_of_a_generic_cell_is_learned_as_far_as_the_soc_is_known() -> None:
+def test_the_ocv_of_a_generic_cell_is_learned_in_the_first_pass_only() -> None:
     """The cycles between SOC 0.35 and 0.85 reach no steep part of the OCV that would determine the SOC. Therefore
-    neither SOC nor OCV becomes certain.
+    neither SOC nor OCV becomes certain. After the first pass the OCV is that of the cell file again, with its error.
     """
-    error, std, estimator = simulate_partial_cycles(GENERIC, cycles=6)
-    assert (np.abs(error[900:]) < 2.0 * std[900:]).mean() > 0.95
     soc = np.linspace(0.4, 0.8, 9)
+    error, std, estimator = simulate_partial_cycles(GENERIC, cycles=1, passes=0.5)
     correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], soc)
     p = estimator.settings_record[0]["filter"]
     curve_error_v = np.interp(soc, np.linspace(0.0, 1.0, 401), OXIDE.ocv_v - p["ocv_v"])
     assert (np.abs(curve_error_v - correction_v) < 2.0 * std_v).all()
-    assert (std_v < 0.8 * np.interp(soc, CURVE_GRID, p["curve_error_v"])).all()
-    assert np.std(curve_error_v - correction_v) < 0.5 * np.std(curve_error_v)
+    assert (std_v < 0.9 * np.interp(soc, CURVE_GRID, p["curve_error_v"])).all()
+    error, std, estimator = simulate_partial_cycles(GENERIC, cycles=6)
+    assert (np.abs(error[900:]) < 2.0 * std[900:]).mean() > 0.95
+    correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], soc)
+    assert (correction_v == 0.0).all()
+    assert std_v == pytest.approx(np.interp(soc, CURVE_GRID, p["curve_error_v"]), rel=1e-6)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.protocols.base.reading import Reading, read_line
+from bms_estimator.protocols.base.reading import Reading, read_line, sample_json_line
 
 
 @pytest.mark.parametrize(
@@ -43,6 +43,25 @@ def test_voltage_and_current_are_read_from_common_formats(line: bytes) -> None:
 )
 def test_temperature_is_read_from_common_formats(line: bytes) -> None:
     assert read_line(line) == Reading(voltage_v=6.6, current_a=-2.0, temperature_c=25.5)
+
+
+@pytest.mark.parametrize(
+    ("line", "held"),
+    [
+        (b'{"voltage_v": 6.6, "current_a": 2, "voltage_held": 1}', True),
+        (b'{"voltage_v": 6.6, "current_a": 2, "voltage_held": true}', True),
+        (b'{"voltage_v": 6.6, "current_a": 2, "voltage_held": false}', False),
+        (b"V=6.6 I=2 voltage_held=1", True),
+        (b"V=6.6 I=2 voltage_held=0", False),
+        (b"V=6.6 I=2", False),
+        (sample_json_line(6.6, 2.0, voltage_held=True), True),
+        (sample_json_line(6.6, 2.0), False),
+    ],
+)
+def test_a_line_marks_a_held_voltage(line: bytes, held: bool) -> None:
+    reading = read_line(line)
+    assert reading is not None
+    assert (reading.voltage_v, reading.current_a, reading.voltage_held) == (6.6, 2.0, held)
 
 
 @pytest.mark.parametrize(

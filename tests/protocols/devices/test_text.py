@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bms_estimator.model.sample import NO_CELLS, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, SampleBlock, SampleStatus
 from bms_estimator.protocols.devices.text import MAX_LINE_BYTES, TextProtocol
 
 lines = (
@@ -96,3 +96,8 @@ def test_reads_decoded_as_a_batch_give_the_same_samples_as_one_by_one() -> None:
     batch_block = batch_decoder.feed_reads(np.arange(3.0), ends, data)
     np.testing.assert_array_equal(batch_block, np.concatenate(blocks))
     np.testing.assert_equal(batch_decoder.cells, [[np.nan, np.nan], [3.31, 3.29], [np.nan, np.nan]])
+
+
+def test_the_mark_of_a_held_voltage_is_a_status_bit() -> None:
+    _, block, _ = decode(b'\nV=3.3 I=1\n{"voltage": 3.3, "current": 2, "voltage_held": true}\n3.4,2.0\n', [])
+    assert block["status"].tolist() == [0, SampleStatus.VOLTAGE_HELD, 0]

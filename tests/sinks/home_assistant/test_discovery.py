@@ -269,7 +269,7 @@ def test_allowed_commands_have_controls() -> None:
     [without_commands] = discoveries(CELL_SNAPSHOT)
     assert {c["platform"] for c in components_of(without_commands).values()} == {"sensor"}
     [with_commands] = discoveries(
-        CELL_SNAPSHOT, commands=("set_soc", "current_zero", "acknowledge_alarm", "publish_rate")
+        CELL_SNAPSHOT, commands=("set_soc", "current_zero", "acknowledge_alarm", "publish_rate", "forget_pack")
     )
     platforms = {key: c["platform"] for key, c in with_commands["components"].items() if "command_topic" in c}
     assert platforms == {
@@ -277,6 +277,7 @@ def test_allowed_commands_have_controls() -> None:
         "current_zero": "button",
         "acknowledge_alarm": "button",
         "publish_rate": "number",
+        "forget_pack": "button",
     }
 
 
@@ -291,6 +292,7 @@ def test_entities_of_an_earlier_configuration_are_removed() -> None:
         "current_zero": "button",
         "acknowledge_alarm": "button",
         "publish_rate": "number",
+        "forget_pack": "button",
     }
 
 

@@ -104,6 +104,7 @@ def test_registers_of_devices_with_a_profile_are_decoded() -> None:
         -2.5,
         (),
         pytest.approx(math.nan, nan_ok=True),
+        False,
     )
     seplos = source(profile="seplos-v3")
     words_read = {0x1000: 5320, 0x1001: 0xFF38, 0x1009: 2961} | {0x1100 + i: 3325 + i for i in range(16)}

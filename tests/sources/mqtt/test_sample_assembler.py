@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bms_estimator.model.sample import SampleStatus
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings
@@ -232,13 +233,41 @@ def test_value_of_a_silent_topic_is_used_up_to_the_maximum_age() -> None:
     assembler.add_message("i", b"2", 20.0, retained=False)
     assert assembler.line(20.4) == b""
     assert assembler.wait_s(20.4) == pytest.approx(0.1)
-    assert json.loads(assembler.line(20.5)) == {"voltage_v": 51.0, "current_a": 2.0}
+    assert json.loads(assembler.line(20.5)) == {"voltage_v": 51.0, "current_a": 2.0, "voltage_held": 1}
     assert assembler.wait_s(20.5) is None
     assert feed(assembler, [("i", "3")], 40.0) == []
     assert assembler.counters["stale"] == 2
     assert assembler.fault == "voltage: no message on v for 30 s"
-    assert feed(assembler, [("v", "50")], 41.0) == [{"voltage_v": 50.0, "current_a": 3.0}]
+    assert feed(assembler, [("v", "50")], 40.4) == [{"voltage_v": 50.0, "current_a": 3.0}]
     assert assembler.fault is None
+
+
+def test_a_voltage_is_used_once_and_the_samples_of_later_currents_mark_it() -> None:
+    assembler, decoder = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"})), TextProtocol()
+    messages = [(n, "i", b"1") for n in range(20)] + [(0.2, "v", b"52"), (9.9, "v", b"51"), (14.5, "v", b"50")]
+    samples = []
+    for time_s, topic, payload in sorted(messages):
+        assembler.add_message(topic, payload, time_s, retained=False)
+        for now_s in (time_s, time_s + 0.45, time_s + 0.55):
+            block = decoder.feed(now_s, assembler.line(now_s))
+            samples += [(voltage_v, int(status)) for _, _, voltage_v, _, status in block.tolist()]
+    measured = [voltage_v for voltage_v, status in samples if not status & SampleStatus.VOLTAGE_HELD]
+    assert measured == [52.0, 51.0, 50.0]
+    assert len(samples) >= 20
+
+
+def test_a_voltage_waits_for_the_current_that_is_nearest_in_time() -> None:
+    assembler = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, interval_s=10.0))
+    assert feed(assembler, [("i", "1"), ("v", "52")]) == [{"voltage_v": 52.0, "current_a": 1.0}]
+    assembler.add_message("v", b"51", 9.0, retained=False)  # 9 s after the last current
+    assert assembler.line(9.9) == b""
+    assembler.add_message("i", b"5", 10.0, retained=False)
+    assert json.loads(assembler.line(10.0)) == {"voltage_v": 51.0, "current_a": 5.0}
+    assembler.add_message("v", b"50", 12.0, retained=False)  # the last current is 2 s old
+    assert assembler.wait_s(12.0) == 2.0
+    assert json.loads(assembler.line(14.0)) == {"voltage_v": 50.0, "current_a": 5.0}
+    assembler.add_message("v", b"50", 36.0, retained=False)
+    assert assembler.wait_s(36.0) == 10.0  # not longer than the expected sample period
 
 
 def test_temperature_is_used_for_five_minutes() -> None:

@@ -1,0 +1,77 @@
+"""Settings record of the anchors from cell file and settings."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.kalman_filter.anchors import ANCHOR_SETTINGS
+from bms_estimator.model.cell import CellModel
+from bms_estimator.settings.charge_limits import ChargeLimits
+
+VOLTAGE_ERROR = 0.005
+"""Relative error of the voltage of charger and source. A BMS seldom measures the voltage of a pack more accurately."""
+NEARLY_FULL_SOC = 0.995
+"""SOC whose OCV is high enough for the default full voltage. It differs from ``VOLTAGE_ERROR`` where the curve is steep:
+chargers of LFP cells end between 3.5 and 3.65 V, within 0.4 % of SOC."""
+TAIL_C = 0.05
+"""Default tail current, as a C-rate. At C/20 the overpotential is some 10 mV, which is 1 % of SOC in oxide cells."""
+MAX_END_C = 0.125
+"""Maximum current at which a charge may end with the default tail current, as a C-rate. Chargers end at C/50 to C/10."""
+MAX_END_RATIO = 1.5
+"""Maximum current at which a charge may end, in multiples of a configured tail current."""
+TRICKLE_C = 0.01
+"""Minimum charge current, as a C-rate. It exceeds the std of a current sensor's offset (``Noise.offset_c``), and an LG M50
+charges another 0.8 % between C/50 and C/100."""
+CUTOFF_MARGIN = 0.02
+"""Relative margin of the cut-off voltage. Near empty the voltage falls by some 50 mV between two samples of a slow source,
+which is less than 0.2 % of SOC."""
+MIN_FULL_SOC = 0.98
+"""Minimum SOC of the OCV curve at the full voltage for a correction of the filter: 2 std of the anchor below 1."""
+MAX_EMPTY_SOC = 0.05
+"""Maximum SOC of the OCV curve at the cut-off voltage for a correction of the filter: 1.5 std of the anchor at 25 C."""
+
+
+def anchor_settings(
+    cell: CellModel, ocv_v: NDArray[np.float64], limits: ChargeLimits, voltage_resolution_v: float
+) -> NDArray[np.void]:
+    """Return the settings record of the anchors.
+
+    Args:
+        cell: The pack as one two-terminal object.
+        ocv_v: Open-circuit voltage from ``settings_records.ocv_grid`` [V].
+        limits: Limits of charger and protection.
+        voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
+
+    Returns:
+        Shape (1,), dtype ``ANCHOR_SETTINGS``.
+    """
+    record = np.zeros(1, dtype=ANCHOR_SETTINGS)
+    p, one_c = record[0], cell.cell.capacity_ah
+    full_v, min_v = limits.full_voltage_v, np.inf
+    if full_v is None:
+        full_v, min_v = ocv_v[-1], np.interp(NEARLY_FULL_SOC, _soc_grid(ocv_v), ocv_v)
+    p["full_v"] = min((1.0 - VOLTAGE_ERROR) * full_v, min_v) - voltage_resolution_v
+    p["corrects_full"] = soc_at_full(ocv_v, limits) >= MIN_FULL_SOC
+    if limits.tail_current_a is None:
+        p["tail_a"], p["small_a"] = TAIL_C * one_c, MAX_END_C * one_c
+    else:
+        p["tail_a"], p["small_a"] = limits.tail_current_a, MAX_END_RATIO * limits.tail_current_a
+    p["trickle_a"] = min(TRICKLE_C * one_c, 0.5 * p["tail_a"])
+    cutoff_v = ocv_v[0] if limits.cutoff_voltage_v is None else limits.cutoff_voltage_v
+    p["cutoff_v"] = (1.0 + CUTOFF_MARGIN) * cutoff_v + voltage_resolution_v
+    p["corrects_empty"] = soc_at_cutoff(ocv_v, limits) <= MAX_EMPTY_SOC
+    return record
+
+
+def soc_at_full(ocv_v: NDArray[np.float64], limits: ChargeLimits) -> float:
+    """Return the SOC of the OCV curve at the full voltage."""
+    return 1.0 if limits.full_voltage_v is None else float(np.interp(limits.full_voltage_v, ocv_v, _soc_grid(ocv_v)))
+
+
+def soc_at_cutoff(ocv_v: NDArray[np.float64], limits: ChargeLimits) -> float:
+    """Return the SOC of the OCV curve at the cut-off voltage."""
+    cutoff_v = limits.cutoff_voltage_v
+    return 0.0 if cutoff_v is None else float(np.interp(cutoff_v, ocv_v, _soc_grid(ocv_v)))
+
+
+def _soc_grid(ocv_v: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.linspace(0.0, 1.0, ocv_v.size)

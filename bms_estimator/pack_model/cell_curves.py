@@ -1,0 +1,114 @@
+"""Curves of one cell as functions of SOC and temperature, from the filter's settings record."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    GAS_J,
+    GRID,
+    REFERENCE_C,
+    RESISTANCES,
+)
+from bms_estimator.model.arrays import Floats
+
+SOC_GRID = np.linspace(0.0, 1.0, GRID)
+"""SOC grid of resistances, hysteresis and OCV error. Shape (GRID,)."""
+MIN_END_SLOPE_V, MAX_END_SLOPE_V = 1.0, 8.0
+"""Limits of the slope with which the OCV is extrapolated beyond SOC 0 and 1 [V]."""
+ZERO_C_K = 273.15
+"""Temperature 0 C in kelvin."""
+SLOPE_REACH = 0.01
+"""Half width of the secant that gives the slope of the OCV [SOC]."""
+
+
+DIRECTION_OF_ERROR, DIRECTION_STD_V = 0.5, (2e-3, 6e-3)
+"""Std of the OCV's error by direction as a fraction of the OCV's std, and its limits [V]. Simulated weeks of measured cells
+have 2 to 3 mV, generic cells up to 6 mV."""
+DROP_OF_R_STD, DROP_STD = 0.25, (0.04, 0.08)
+"""Relative std of the overpotential at one SOC as a fraction of the std of ln R, and its limits."""
+
+
+class CellCurves:
+    """OCV, resistances, hysteresis and prior errors of one cell.
+
+    Args:
+        settings: Record of dtype EKF_SETTINGS of the pack.
+    """
+
+    def __init__(self, settings: np.void) -> None:
+        series = float(settings["series"])
+        self.series = series
+        self.capacity_as = float(settings["capacity_as"])
+        self.one_c_a = self.capacity_as / 3600.0
+        self._soc = np.linspace(0.0, 1.0, settings["ocv_v"].size)
+        self._ocv_v = settings["ocv_v"] / series
+        slope_v = settings["ocv_slope_v"] / series
+        self._low_slope_v, self._high_slope_v = np.clip(slope_v[[1, -2]], MIN_END_SLOPE_V, MAX_END_SLOPE_V)
+        self.error_v = settings["curve_error_v"] / series
+        self.hysteresis_v = settings["hysteresis_v"] / series
+        self.per_kelvin_v = settings["per_kelvin_v"] / series
+        self._parts_ohm = np.hstack([settings["weak_ohm"], settings["strong_ohm"]]) / series
+        self.r_std, self.capacity_std = float(settings["r_std"]), float(settings["capacity_std"])
+        self.direction_std_v = float(np.clip(DIRECTION_OF_ERROR * np.median(self.error_v), *DIRECTION_STD_V))
+        """Std of the OCV's error that differs between charge, rest and discharge [V]."""
+        self.drop_std = float(np.clip(DROP_OF_R_STD * self.r_std, *DROP_STD))
+        """Relative std of the overpotential at one SOC, which differs between charge and discharge."""
+        self.offset_std_a = float(settings["offset_c"]) * self.one_c_a
+
+    def ocv(self, soc: Floats) -> Floats:
+        """Return the OCV at 25 C [V], with linear extrapolation beyond SOC 0 and 1."""
+        inside = np.interp(np.clip(soc, 0.0, 1.0), self._soc, self._ocv_v)
+        below, above = np.minimum(soc, 0.0), np.maximum(soc - 1.0, 0.0)
+        return np.asarray(inside + self._low_slope_v * below + self._high_slope_v * above)
+
+    def slope(self, soc: Floats, reach: float = SLOPE_REACH) -> Floats:
+        """Return the slope of the OCV as a secant over ``soc`` +- ``reach`` [V per unit SOC]."""
+        return np.asarray((self.ocv(soc + reach) - self.ocv(soc - reach)) / (2.0 * reach))
+
+    def resistances(self, soc: Floats, weak: Floats, strong: Floats) -> Floats:
+        """Return the resistances at each SOC, shape (n, RESISTANCES) [ohm].
+
+        Args:
+            soc: SOCs.
+            weak: Factor by temperature on the weakly temperature-dependent part; see ``arrhenius``.
+            strong: Factor by temperature on the strongly temperature-dependent part.
+        """
+        position = NodePosition.of(soc, GRID)
+        i, (low, high) = position.below, position.weights
+        parts_ohm = low[:, None] * self._parts_ohm[i] + high[:, None] * self._parts_ohm[i + 1]
+        return np.asarray(weak[:, None] * parts_ohm[:, :RESISTANCES] + strong[:, None] * parts_ohm[:, RESISTANCES:])
+
+
+def arrhenius(energy_j: float, temperature_c: Floats) -> Floats:
+    """Return the factor on a resistance with an activation energy [J/mol]; 1 at 25 C."""
+    inverse_k = 1.0 / (temperature_c + ZERO_C_K) - 1.0 / (REFERENCE_C + ZERO_C_K)
+    return np.asarray(np.exp(energy_j / GAS_J * inverse_k))
+
+
+@dataclass(frozen=True)
+class NodePosition:
+    """Position of SOCs between evenly spaced nodes of a piecewise linear function over SOC 0..1."""
+
+    below: NDArray[np.intp]
+    """Index of the node below each SOC."""
+    fraction: Floats
+    """Distance from that node, as a fraction of the distance to the next."""
+
+    @classmethod
+    def of(cls, soc: Floats, nodes: int) -> "NodePosition":
+        """Return the position of each SOC; those beyond 0..1 have that of the nearest end."""
+        position = np.clip(soc, 0.0, 1.0) * (nodes - 1)
+        below = np.minimum(position.astype(np.intp), nodes - 2)
+        return cls(below, position - below)
+
+    @property
+    def weights(self) -> tuple[Floats, Floats]:
+        """Derivatives of the function by its values at the nodes below and above."""
+        return 1.0 - self.fraction, self.fraction
+
+    def interpolate(self, values: Floats, offset: NDArray[np.intp] | int = 0) -> Floats:
+        """Return the function with the given values at its nodes, of which the first is at index ``offset``."""
+        at, (low, high) = self.below + offset, self.weights
+        return np.asarray(low * values[at] + high * values[at + 1])

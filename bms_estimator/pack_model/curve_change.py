@@ -1,0 +1,62 @@
+"""Change of the curves to which the filter's state is relative: R_s and resistances keep their values in ohm."""
+
+import math
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES, resistances
+from bms_estimator.kernels.kalman_filter.input_checks import store_last_good_state
+from bms_estimator.kernels.kalman_filter.ocv_correction import reset_ocv_correction
+from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0
+from bms_estimator.model.arrays import Floats
+
+
+def present_ohm(settings: np.void, f: np.void) -> Floats:
+    """Return the resistances of the curves at the present SOC and temperature, shape (RESISTANCES,) [ohm].
+
+    Args:
+        settings: Record of dtype EKF_SETTINGS.
+        f: Record of dtype EKF_STATE, after a sample.
+    """
+    ohm = np.zeros(RESISTANCES)
+    resistances(
+        float(f["soc"]), settings["weak_ohm"], settings["strong_ohm"], float(f["weak"]), float(f["strong"]), ohm
+    )
+    return ohm
+
+
+def keep_series_resistance(f: np.void, before: Floats, after: Floats) -> None:
+    """Keep R_s as learned from current steps, which is stored relative to R_0 of the curves.
+
+    Args:
+        f: Record of dtype EKF_STATE.
+        before: Resistances of the curves before the change (``present_ohm``).
+        after: Resistances of the curves after the change.
+    """
+    f["step"]["ln_ratio"] += math.log(before[0] / after[0])
+
+
+def return_to_cell_file(estimator: Estimator) -> None:
+    """Replace the curves of a fit by those of the cell file.
+
+    SOC, capacity and the resistances at the present SOC stay. The correction of the OCV starts from its prior.
+    """
+    f, settings = estimator.record[0]["filter"], estimator.settings_record["filter"]
+    if not f["started"]:
+        settings[0] = estimator.cell_file_settings
+        return
+    before = present_ohm(settings[0], f)
+    settings[0] = estimator.cell_file_settings
+    after = present_ohm(settings[0], f)
+    keep_series_resistance(f, before, after)
+    variance = float(settings[0]["r_std"]) ** 2
+    count = int(f["count"])
+    for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):
+        mean[LN_R0] += math.log(before[0] / after[0])
+        mean[LN_R] += math.log(before[1:].sum() / after[1:].sum())
+        for j in (LN_R0, LN_R):
+            covariance[j, :] = covariance[:, j] = 0.0
+            covariance[j, j] = variance
+        reset_ocv_correction(mean, covariance)
+    store_last_good_state(estimator.record[0]["checks"], f)

@@ -1,0 +1,175 @@
+"""Residuals of the slow fit, their cost, and the normal equations of a Gauss-Newton step.
+
+The cost is twice the negative log of the posterior density, up to a constant. It is the sum of squared residuals in
+standard deviations, of which those of the voltages are limited by Huber's function.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from bms_estimator.kernels.kalman_filter.anchors import EMPTY, FULL
+from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.intervals import Intervals, Links
+from bms_estimator.pack_model.prediction import Prediction, Reference, VoltageModel
+from bms_estimator.pack_model.prior import FULL_REPEAT_STD, Prior
+from bms_estimator.pack_model.unknowns import Unknowns
+
+HUBER = 3.0
+"""Residual beyond which the cost of a voltage grows linearly, in std."""
+BEYOND_SOC, BEYOND_STD = 0.03, 0.01
+"""Tolerated SOC beyond 0..1, and std of the cost of a larger excess."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Residuals of one kind, with the non-zero derivatives of their predictions."""
+
+    error: Floats
+    """Measured minus predicted value in std, shape (n,)."""
+    columns: NDArray[np.intp]
+    """Indices of the unknowns, shape (n, k)."""
+    values: Floats
+    """Derivatives of the prediction by these unknowns, in std, shape (n, k)."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of a history at ``x``, in std."""
+
+    x: Floats
+    """Unknowns."""
+    cost: float
+    """Cost of all residuals and of the prior."""
+    prediction: Prediction
+    """Predicted voltages."""
+    voltage: Floats
+    """Residual of each row's voltage."""
+    links: Block
+    """Residuals of the SOC at the start of each linked interval."""
+    reference: Floats
+    """Residual of each known SOC."""
+    beyond: Floats
+    """Excess of each row's SOC beyond its tolerated range."""
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Normal equations A x = b of a Gauss-Newton step x."""
+
+    a: Floats
+    b: Floats
+
+
+class Equations:
+    """Equations of one history.
+
+    Args:
+        cell: Curves of the cell file.
+        rows: Shape (n,), dtype HISTORY_ROW, in order of time, at least one row.
+        reference: Estimate at which the std of each row is computed.
+    """
+
+    def __init__(self, cell: CellCurves, rows: NDArray[np.void], reference: Reference) -> None:
+        self.rows = rows
+        self.intervals = Intervals(cell, rows)
+        self.links = Links.of(cell, self.intervals)
+        self.u = Unknowns.of(self.intervals.count, self.intervals.segments)
+        self.prior = Prior(cell, self.intervals, self.u)
+        self.model = VoltageModel(cell, self.intervals, self.u, reference)
+        self.voltage_v = rows["voltage_v"] / cell.series
+        self.weight = (rows["duration_s"] > 0.0) / np.sqrt(self.model.variance_v2)
+        """Inverse of the std of each row's voltage [1/V]; 0 for rows without a voltage."""
+        self.known = np.flatnonzero(np.isfinite(rows["reference_soc"]))
+        self.known_soc: Floats = rows["reference_soc"][self.known]
+        kind = rows["reference_kind"][self.known]
+        self.is_full = kind == FULL
+        std = np.where(self.is_full, FULL_REPEAT_STD, rows["reference_std"][self.known])
+        # all ends of discharge together count as one, because their error recurs
+        self.known_std = std * np.where(kind == EMPTY, math.sqrt(max(int((kind == EMPTY).sum()), 1)), 1.0)
+
+    def residuals(self, x: Floats) -> Residuals:
+        """Return residuals and cost at ``x``."""
+        p = self.model.predict(x)
+        voltage = self.weight * (self.voltage_v - p.voltage_v)
+        reference = (self.known_soc - p.soc[self.known] - self.is_full * x[self.u.full]) / self.known_std
+        beyond = (np.minimum(p.soc + BEYOND_SOC, 0.0) + np.maximum(p.soc - 1.0 - BEYOND_SOC, 0.0)) / BEYOND_STD
+        link_cost, links = self._link(x)
+        deviation = x - self.prior.mean
+        cost = huber_cost(voltage) + deviation @ self.prior.precision @ deviation
+        cost += link_cost + reference @ reference + beyond @ beyond
+        return Residuals(x, float(cost), p, voltage, links, reference, beyond)
+
+    def normal_equations(self, r: Residuals, *, smooth: bool = False) -> NormalEquations:
+        """Return the normal equations at the unknowns of ``r``.
+
+        Args:
+            r: Residuals.
+            smooth: True: derivatives by the SOC use the slope of the cell file's OCV; see ``VoltageModel.derivatives``.
+        """
+        precision = self.prior.precision
+        a, b = precision.copy(), -precision @ (r.x - self.prior.mean)
+        for block in (self._voltage_block(r, smooth=smooth), r.links, *self._soc_blocks(r)):
+            if block.error.size:
+                jacobian = matrix(block.columns, block.values, self.u.size)
+                a += (jacobian.T @ jacobian).toarray()
+                b += jacobian.T @ block.error
+        return NormalEquations(a, b)
+
+    def _voltage_block(self, r: Residuals, *, smooth: bool) -> Block:
+        columns, values = self.model.derivatives(r.x, r.prediction, smooth=smooth)
+        limit = huber_weight(r.voltage)
+        return Block(limit * r.voltage, columns, (limit * self.weight)[:, None] * values)
+
+    def _soc_blocks(self, r: Residuals) -> tuple[Block, Block]:
+        """Return the blocks of known SOCs and of SOCs beyond their tolerated range."""
+        columns, values = self.model.soc_derivatives(r.x)
+        known, out = self.known, np.flatnonzero(r.beyond)
+        known_columns = np.column_stack([columns[known], np.full(known.size, self.u.full.start)])
+        known_values = np.column_stack([values[known], self.is_full]) / self.known_std[:, None]
+        return (
+            Block(r.reference, known_columns, known_values),
+            Block(-r.beyond[out], columns[out], values[out] / BEYOND_STD),
+        )
+
+    def _link(self, x: Floats) -> tuple[float, Block]:
+        """Return cost and residuals of the SOC at the start of an interval, counted from the start of the one before.
+
+        A gap may hide a charge, so that any SOC is possible with the probability of such an event. The error is then
+        weighted by the probability that there was none.
+        """
+        u, links = self.u, self.links
+        later, k = links.interval, links.interval - 1
+        inverse_q = np.exp(-x[u.ln_q][k])
+        drawn = (links.drawn_soc - x[u.offset][k] * links.hours) * inverse_q
+        error = -(x[u.soc][later] - x[u.soc][k] + drawn) / links.std
+        event = links.event_probability
+        usual = (1.0 - event) * np.exp(-0.5 * error**2) / links.std / math.sqrt(2.0 * math.pi)
+        is_gap = event > 0.0
+        total = np.where(is_gap, usual + event, 1.0)
+        cost = np.where(is_gap, -2.0 * np.log(total), error**2).sum()
+        weight = np.where(is_gap, np.sqrt(usual / total), 1.0)
+        columns = np.column_stack([u.soc.start + later, u.soc.start + k, u.ln_q.start + k, u.offset.start + k])
+        values = np.column_stack([np.ones(k.size), -np.ones(k.size), -drawn, -links.hours * inverse_q])
+        return float(cost), Block(weight * error, columns, (weight / links.std)[:, None] * values)
+
+
+def matrix(columns: NDArray[np.intp], values: Floats, size: int) -> sparse.csr_matrix:
+    """Return the matrix with the given columns and values in each row, shape (n, size)."""
+    n, k = columns.shape
+    return sparse.csr_matrix((values.ravel(), (np.repeat(np.arange(n), k), columns.ravel())), shape=(n, size))
+
+
+def huber_cost(residual: Floats) -> float:
+    """Return the sum of squares, of which those of large residuals grow linearly."""
+    size = np.abs(residual)
+    return float(np.where(size > HUBER, 2.0 * HUBER * size - HUBER**2, residual**2).sum())
+
+
+def huber_weight(residual: Floats) -> Floats:
+    """Return the factor on a residual and its derivatives whose square has the gradient of Huber's cost."""
+    return np.sqrt(HUBER / np.maximum(np.abs(residual), HUBER))

@@ -1,0 +1,228 @@
+"""Fit of the pack's model to its history, from several starts, as a mixture of local minima."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW
+from bms_estimator.kernels.kalman_filter.records import NODES
+from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition
+from bms_estimator.pack_model.equations import Equations
+from bms_estimator.pack_model.prediction import Reference
+from bms_estimator.pack_model.solve import Minimum, minimize
+from bms_estimator.pack_model.unknowns import CURVE_NODES, SCALES, SHAPE_NODES
+
+STARTS = ((0.0, 0.0), (0.08, 0.0), (-0.08, 0.0), (0.16, 0.0), (-0.16, 0.0), (0.0, 0.08), (0.0, -0.08))
+"""Starts of the minimization: shift of all SOCs, and ln of the true over the declared capacity."""
+LIKELIHOOD_EXPONENT = 0.2
+"""Exponent of the likelihood in the weights of minima. It is below 1, because errors of successive rows are not independent."""
+SAME_COST, SAME_SOC = 0.3, 0.01
+"""Differences of cost and SOC below which two minima count as one."""
+MIN_SOC_STD = 0.005
+"""Minimum std of the SOC, because full and empty of a cell are not defined better."""
+NODE_SOC = np.linspace(0.0, 1.0, NODES)
+"""SOCs of the filter's OCV nodes."""
+SOC, LN_Q, OFFSET, LN_R, CURVE = 0, 1, 2, slice(3, 6), slice(6, 6 + NODES)
+"""Positions in the vector of results."""
+
+
+@dataclass(frozen=True)
+class PackFit:
+    """Result of a fit: the present state of the pack, and its curves. Voltages and resistances are of one cell."""
+
+    elapsed_s: float
+    """Time of the history's last row [s]."""
+    segment: float
+    """Segment of the last row."""
+    charge_as: float
+    """Charge of the last row [A s]."""
+    mean: Floats
+    """SOC at the last row, ln of the true over the declared capacity, current offset as a C-rate, three scales of the
+    resistances as ln, and the OCV's correction at ``NODES`` SOCs [V]."""
+    covariance: Floats
+    """Covariance of ``mean``."""
+    curve_v: Floats
+    """Correction of the OCV at ``GRID`` SOCs [V]."""
+    ln_r: Floats
+    """ln of the factor on the series resistance, fast and slow RC pairs at ``GRID`` SOCs, shape (GRID, 3)."""
+    hysteresis: float
+    """Factor on the cell file's hysteresis."""
+    row_elapsed_s: Floats
+    """Time of each row [s]."""
+    row_soc: Floats
+    """SOC of each row."""
+    cost: float
+    """Cost of the best minimum."""
+    curves: tuple[Floats, ...]
+    """OCV error and error by direction of each minimum, the best first, as starts of the next fit."""
+
+
+FINITE_FIELDS = tuple(
+    name for name in HISTORY_ROW.names or () if name not in {"gap_s", "reference_soc", "reference_std"}
+)
+"""Fields of a row that must be finite. A gap may be infinite, and a row without a known SOC has a NaN."""
+
+
+class FitError(ValueError):
+    """A history that gives no finite fit, for example because a row is not finite."""
+
+
+def fit(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None = None) -> PackFit:
+    """Fit the pack's model.
+
+    Args:
+        cell: Curves of the cell file.
+        rows: Shape (n,), dtype HISTORY_ROW, in order of time.
+        previous: Previous fit, near which one start lies.
+
+    Raises:
+        FitError: ``rows`` is empty, or the fit is not finite.
+    """
+    _require_finite(rows)
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite is refused below
+            if previous is None:
+                previous = _fit(cell, rows, Reference(rows["soc"], np.zeros(SCALES)), None)
+            result = _fit(cell, rows, reference_of(previous, rows), previous)
+    except np.linalg.LinAlgError as error:
+        raise FitError(f"the equations of {rows.size} history rows have no solution: {error}") from error
+    if not (np.isfinite(result.mean).all() and np.isfinite(result.covariance).all()):
+        raise FitError(f"the fit of {rows.size} history rows is not finite")
+    return result
+
+
+def _require_finite(rows: NDArray[np.void]) -> None:
+    """Raise a FitError if there are no rows, or if a row is not finite."""
+    if rows.size == 0:
+        raise FitError("the history has no rows: record some before the first fit")
+    for name in FINITE_FIELDS:
+        finite = np.isfinite(rows[name].reshape(rows.size, -1)).all(axis=1)
+        if not finite.all():
+            raise FitError(f"history row {np.argmin(finite)} of {rows.size}: {name} is not finite: remove the row")
+
+
+def reference_of(previous: PackFit, rows: NDArray[np.void]) -> Reference:
+    """Return SOC and resistances of the previous fit. Later rows have the SOC of the filter, which continued from it."""
+    is_fitted = rows["elapsed_s"] <= previous.elapsed_s
+    soc = np.where(is_fitted, np.interp(rows["elapsed_s"], previous.row_elapsed_s, previous.row_soc), rows["soc"])
+    return Reference(soc, previous.mean[LN_R])
+
+
+def _fit(cell: CellCurves, rows: NDArray[np.void], reference: Reference, previous: PackFit | None) -> PackFit:
+    equations = Equations(cell, rows, reference)
+    minima: list[Minimum] = []
+    for start in starts(equations, previous):
+        minimum = minimize(equations, start)
+        if not any(_is_same(equations, minimum, other) for other in minima):
+            minima.append(minimum)
+    return mixture(equations, minima)
+
+
+def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
+    """Return the starts of the minimization: those near the previous fit, then the filter's SOC with ``STARTS``."""
+    results = [] if previous is None else [continued(equations, previous, curves) for curves in previous.curves[1::-1]]
+    for shift, ln_q in STARTS:
+        x = equations.prior.mean.copy()
+        x[equations.u.soc] = filter_soc(equations, ln_q) + shift
+        x[equations.u.ln_q] = ln_q
+        results.append(x)
+    return results
+
+
+def filter_soc(equations: Equations, ln_q: float) -> Floats:
+    """Return the SOC at the start of each interval, counted back from the filter's SOC at the interval's end."""
+    intervals = equations.intervals
+    drawn_soc = intervals.drawn_soc[intervals.ends] * math.exp(-ln_q)
+    return np.asarray(equations.rows["soc"][intervals.ends] + drawn_soc)
+
+
+def continued(equations: Equations, previous: PackFit, curves: Floats) -> Floats:
+    """Return a start near the previous fit.
+
+    Args:
+        equations: Equations of the present history.
+        previous: Previous fit.
+        curves: OCV error and error by direction of one of its minima.
+    """
+    u = equations.u
+    x = equations.prior.mean.copy()
+    x[u.curve.start :] = curves
+    x[u.ln_q], x[u.offset] = previous.mean[LN_Q], previous.mean[OFFSET]
+    x[u.ln_r] = previous.mean[LN_R]
+    x[u.soc] = continued_soc(equations, previous)
+    return x
+
+
+def continued_soc(equations: Equations, previous: PackFit) -> Floats:
+    """Return the SOC at the start of each interval.
+
+    It is that of the previous fit, up to its last row. Later it is counted on from the interval before, or is that of the
+    filter after a gap.
+    """
+    intervals, links, ln_q = equations.intervals, equations.links, previous.mean[LN_Q]
+    start_s = equations.rows["elapsed_s"][intervals.starts]
+    soc: Floats = np.interp(start_s, previous.row_elapsed_s, previous.row_soc)
+    after_gap = filter_soc(equations, ln_q)
+    drawn_soc = dict(zip(links.interval.tolist(), links.drawn_soc * math.exp(-ln_q), strict=True))
+    for k in np.flatnonzero(start_s > previous.elapsed_s).tolist():
+        soc[k] = after_gap[k] if intervals.is_new_segment[k] else soc[k - 1] - drawn_soc[k]
+    return soc
+
+
+def _is_same(equations: Equations, a: Minimum, b: Minimum) -> bool:
+    difference = np.abs(a.x[equations.u.soc] - b.x[equations.u.soc]).max()
+    return abs(a.cost - b.cost) < SAME_COST and bool(difference < SAME_SOC)
+
+
+def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
+    """Return mean and covariance of the mixture of minima, weighted by their cost.
+
+    The weights contain no determinants of covariances: these would favour a larger capacity.
+    """
+    minima = sorted(minima, key=lambda minimum: minimum.cost)
+    weights = np.exp(-0.5 * LIKELIHOOD_EXPONENT * (np.array([m.cost for m in minima]) - minima[0].cost))
+    weights /= weights.sum()
+    matrix = [_results(equations, m) for m in minima]
+    means = np.array([mean for mean, _ in matrix])
+    mean = weights @ means
+    covariance: Floats = sum(
+        w * (cov + np.outer(part - mean, part - mean)) for w, part, (_, cov) in zip(weights, means, matrix, strict=True)
+    )
+    u, rows = equations.u, equations.rows
+    last = rows[-1]
+    x = weights @ np.array([m.x for m in minima])
+    shape = NodePosition.of(SOC_GRID, SHAPE_NODES).interpolate(x[u.shape])
+    return PackFit(
+        elapsed_s=float(last["elapsed_s"]),
+        segment=float(last["segment"]),
+        charge_as=float(last["charge_as"]),
+        mean=mean,
+        covariance=0.5 * (covariance + covariance.T),  # symmetric to the last bit
+        curve_v=NodePosition.of(SOC_GRID, CURVE_NODES).interpolate(x[u.curve]),
+        ln_r=shape[:, None] + x[u.ln_r],
+        hysteresis=float(max(x[u.hysteresis].sum(), 0.0)),
+        row_elapsed_s=rows["elapsed_s"].copy(),
+        row_soc=weights @ np.array([equations.model.soc(m.x) for m in minima]),
+        cost=minima[0].cost,
+        curves=tuple(m.x[u.curve.start :] for m in minima),
+    )
+
+
+def _results(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:
+    """Return mean and covariance of the results of one minimum."""
+    u, x, model = equations.u, minimum.x, equations.model
+    select = np.zeros((CURVE.stop, u.size))
+    columns, values = model.soc_derivatives(x)
+    select[SOC, columns[-1]] = values[-1]
+    select[LN_Q, u.ln_q.stop - 1] = 1.0
+    select[OFFSET, u.offset.stop - 1] = 1.0
+    select[LN_R, u.ln_r] = np.eye(SCALES)
+    position, nodes = NodePosition.of(NODE_SOC, CURVE_NODES), np.arange(CURVE.start, CURVE.stop)
+    for at, weight in zip((position.below, position.below + 1), position.weights, strict=True):
+        select[nodes, u.curve.start + at] = weight
+    mean = select @ x
+    mean[SOC] = model.soc(x)[-1]
+    return mean, select @ minimum.covariance @ select.T

@@ -1,0 +1,116 @@
+"""Intervals of the history: each has its own SOC at its start, offset and capacity, and lies within one segment."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.cell_curves import CellCurves
+
+INTERVAL_S = 86400.0
+"""Maximum duration of an interval [s]."""
+COUNTED_STD = 0.015
+"""Std of the charge counted in an interval, as a fraction of the capacity, at which the interval ends. A sensor with a dead
+band reports no current at night, so that a day's count may be wrong by several percent."""
+HOUR_S = 3600.0
+"""Length of an hour [s]."""
+CHARGE_ERROR = 0.002
+"""Std of the SOC after a throughput of 1, due to the nonlinearity of the current sensor."""
+DAY_SOC = 0.002
+"""Std of the SOC counted over a day in addition to that by its throughput."""
+EVENT_PROBABILITY, EVENT_S = 0.5, 3600.0
+"""Probability that a long gap hides a charge or an exchange of the pack, and time constant with which it grows [s]."""
+
+
+class Intervals:
+    """Division of a history into intervals.
+
+    Args:
+        cell: Curves of the cell file.
+        rows: Shape (n,), dtype HISTORY_ROW, in order of time.
+
+    Attributes:
+        starts, ends: First and last row of each interval.
+        of_row: Interval of each row.
+        is_new_segment: Whether a segment begins with the interval.
+        segment: Segment of each row, counted from 0.
+        drawn_soc: Charge drawn since the interval's first row, as a fraction of the declared capacity, for each row.
+        hours: Time since the interval's first row [h], for each row.
+    """
+
+    def __init__(self, cell: CellCurves, rows: NDArray[np.void]) -> None:
+        self.rows = rows
+        self.starts, self.of_row = split(rows, (COUNTED_STD * cell.capacity_as) ** 2)
+        self.ends = np.r_[self.starts[1:], rows.size] - 1
+        start = rows[self.starts]
+        self.is_new_segment = np.r_[True, start["segment"][1:] != start["segment"][:-1]]
+        self.segment = (np.cumsum(self.is_new_segment) - 1)[self.of_row]
+        self.drawn_soc: Floats = (rows["charge_as"] - start["charge_as"][self.of_row]) / cell.capacity_as
+        self.hours: Floats = (rows["elapsed_s"] - start["elapsed_s"][self.of_row]) / HOUR_S
+
+    @property
+    def count(self) -> int:
+        """Number of intervals."""
+        return int(self.starts.size)
+
+    @property
+    def segments(self) -> int:
+        """Number of segments."""
+        return int(self.is_new_segment.sum())
+
+
+def split(rows: NDArray[np.void], max_variance_as2: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first row of each interval, and the interval of each row."""
+    segment, elapsed_s = rows["segment"].tolist(), rows["elapsed_s"].tolist()
+    variance_as2 = rows["charge_variance_as2"].tolist()
+    starts, of_row = [0], np.zeros(rows.size, np.intp)
+    for j in range(1, rows.size):
+        first = starts[-1]
+        is_long = elapsed_s[j] - elapsed_s[first] > INTERVAL_S
+        if segment[j] != segment[j - 1] or is_long or variance_as2[j] - variance_as2[first] > max_variance_as2:
+            starts.append(j)
+        of_row[j] = len(starts) - 1
+    return np.array(starts, np.intp), of_row
+
+
+@dataclass(frozen=True)
+class Links:
+    """Charge from the start of one interval to the start of the next, for pairs without a gap of unknown duration."""
+
+    interval: NDArray[np.intp]
+    """Later interval of each pair."""
+    drawn_soc: Floats
+    """Charge between the two starts, as a fraction of the declared capacity."""
+    hours: Floats
+    """Time between the two starts during which the sensor's offset was counted [h]."""
+    std: Floats
+    """Std of the SOC at the later start, counted from the earlier one."""
+    event_probability: Floats
+    """Probability that a gap between the two hides a charge; 0 without a gap."""
+
+    @classmethod
+    def of(cls, cell: CellCurves, intervals: Intervals) -> "Links":
+        """Return the links of a history."""
+        rows, starts, is_new = intervals.rows, intervals.starts, intervals.is_new_segment
+        k = np.flatnonzero(np.isfinite(rows["gap_s"][starts]) | ~is_new)
+        k = k[k > 0]
+        is_gap, before, after = is_new[k], rows[starts[k] - 1], rows[starts[k]]
+
+        def counted(name: str, since: Floats) -> Floats:
+            """Return the increase of a counter, which restarts with each segment."""
+            return np.asarray(after[name] - np.where(is_gap, 0.0, since))
+
+        first = rows[starts[k - 1]]
+        counted_as = counted("charge_as", before["charge_as"])
+        throughput_soc = counted("throughput_soc", first["throughput_soc"])
+        variance_as2 = np.maximum(counted("charge_variance_as2", first["charge_variance_as2"]), 0.0)
+        between_s = np.where(is_gap, 0.0, after["elapsed_s"] - before["elapsed_s"])
+        days = np.maximum(after["elapsed_s"] - first["elapsed_s"], HOUR_S) / INTERVAL_S
+        return cls(
+            interval=k,
+            drawn_soc=intervals.drawn_soc[starts[k] - 1] + counted_as / cell.capacity_as,
+            hours=intervals.hours[starts[k] - 1] + between_s / HOUR_S,
+            std=np.sqrt(CHARGE_ERROR**2 * throughput_soc + DAY_SOC**2 * days + variance_as2 / cell.capacity_as**2),
+            event_probability=np.where(is_gap, EVENT_PROBABILITY * -np.expm1(-after["gap_s"] / EVENT_S), 0.0),
+        )

@@ -1,0 +1,243 @@
+"""Estimator with a slow fit: records the history, fits the pack's model at intervals, and hands it to the filter."""
+
+import math
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.identified_parameters import relative_capacity
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW
+from bms_estimator.kernels.kalman_filter.input_checks import store_last_good_state
+from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.curve_change import keep_series_resistance, present_ohm, return_to_cell_file
+from bms_estimator.pack_model.fit import PackFit, fit
+from bms_estimator.pack_model.handover import adopt_curves, adopt_state
+from bms_estimator.pack_model.history import History
+from bms_estimator.pack_model.resume import resume_history
+
+FIT_INTERVAL_S = 3600.0
+"""Interval between two fits, on the clock of the samples [s]."""
+ADOPT_DELAY_S = 120.0
+"""Time from the start of a fit to the adoption of its result, on the clock of the samples [s]. The service fits in
+another thread meanwhile; a replay, which waits for the fit, adopts it at the same sample."""
+MIN_ROWS = 8
+"""Minimum number of new rows for a fit."""
+MIN_THROUGHPUT_SOC = 1.0
+"""Minimum throughput of the history before the first fit is adopted [SOC]. Before, the filter's own estimate is as good."""
+MIN_CHANGE = 0.01
+"""Minimum change of the SOC, or of the capacity relative to the cell file's, that is reported as an event."""
+
+Submit = Callable[[Callable[[], PackFit]], "Future[PackFit]"]
+"""Function that runs a fit and returns its future."""
+
+
+@dataclass(frozen=True)
+class FitChange:
+    """Change of the estimates by the adoption of a fit. Capacities are relative to that of the cell file."""
+
+    soc_before: float
+    soc_after: float
+    capacity_before: float
+    capacity_after: float
+
+
+def run_now(call: Callable[[], PackFit]) -> "Future[PackFit]":
+    """Run a fit at once, and return its completed future."""
+    future: Future[PackFit] = Future()
+    try:
+        future.set_result(call())
+    except Exception as error:  # noqa: BLE001 - it is counted and reported when the fit is due
+        future.set_exception(error)
+    return future
+
+
+class SlowFit:
+    """Estimator whose cell model is fitted to the pack's history.
+
+    To continue from earlier runs, call ``load``, restore the estimator's state, and call ``resume``, before the first
+    sample.
+
+    Args:
+        estimator: Estimator of a battery with the identifier enabled; its history is switched on.
+        submit: Runs a fit, for example in another thread, and returns its future.
+        interval_s: Interval between two fits, on the clock of the samples [s].
+        on_failure: Called with the exception of a failed fit. The previous fit stays.
+
+    Attributes:
+        history: Rows of this and earlier runs.
+        saved_fit: The last fit of the history, adopted or not; None: none.
+        fit: The adopted fit, to whose curves the filter's state is relative; None: the curves are the cell file's.
+        fits: Number of adopted fits.
+        late: Number of fits that were not done when due, so that they were adopted at a later sample.
+        failed: Number of fits that raised an exception.
+        changes: Number of fits that changed the SOC or the capacity by more than ``MIN_CHANGE``.
+        last_change: The last of these changes; None: none yet.
+        unsaved_rows: Number of rows since the last increase of ``revision``.
+        revision: Number that increases when history and fit should be saved.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        *,
+        submit: Submit = run_now,
+        interval_s: float = FIT_INTERVAL_S,
+        on_failure: Callable[[BaseException], None] = lambda _: None,
+    ) -> None:
+        self.estimator, self.history = estimator, History()
+        self.cell = CellCurves(estimator.cell_file_settings)
+        self.fit: PackFit | None = None
+        self.fits = self.late = self.failed = self.changes = self.revision = self.unsaved_rows = 0
+        self.last_change: FitChange | None = None
+        self._submit, self._interval_s, self._on_failure = submit, interval_s, on_failure
+        self._pending: Future[PackFit] | None = None
+        self._is_late = False
+        self._new_rows = 0  # number of rows since the last fit
+        self.saved_fit: PackFit | None = None
+        h = self._h
+        h["enabled"], h["event_s"] = 1, interval_s
+
+    def run(self, block: SampleBlock) -> NDArray[np.void]:
+        """Process a block of samples. Return one row of dtype TRACE for each accepted sample."""
+        trace, rows, start = np.zeros(block.size, TRACE), 0, 0
+        while start < block.size:
+            used, written = self.estimator.run_part(block[start:], trace[rows:])
+            start, rows = start + used, rows + written
+            self.take_rows()
+            if self._h["elapsed_s"] >= self._h["event_s"]:
+                self._handle_event()
+        return trace[:rows]
+
+    def load(self, history: History, fit: PackFit | None, state_fit: PackFit | None) -> None:
+        """Take over history and fit of earlier runs, and adopt the curves.
+
+        Args:
+            history: Rows of earlier runs.
+            fit: Last fit of the history; None: none.
+            state_fit: Fit to whose curves the state that will be restored is relative; None: the cell file's curves, or
+                there is no such state.
+        """
+        self.history, self.saved_fit = history, fit
+        self._adopt_curves(state_fit)
+
+    def resume(self, gap_s: float, *, restored: bool) -> None:
+        """Continue the history in a new segment, after the estimator's state was restored or found unusable.
+
+        Args:
+            gap_s: Time since the state was saved [s]; infinite if unknown.
+            restored: True if the state was restored. Otherwise the last fit supplies the curves.
+        """
+        h, saved = self._h, self.saved_fit
+        if not restored and saved is not None:
+            self._adopt_curves(saved)
+        resume_history(
+            h, self.estimator.record[0]["filter"], self.history, gap_s, self.cell.capacity_as, restored=restored
+        )
+        fitted_s = -math.inf if saved is None else saved.elapsed_s
+        self._new_rows = int((self.history.rows["elapsed_s"] > fitted_s).sum())
+        next_s = float(h["event_s"]) if restored else math.inf
+        h["enabled"], h["event_s"] = 1, min(max(next_s, h["elapsed_s"]), h["elapsed_s"] + self._interval_s)
+        is_adopted = restored and self.fit is not None and saved is not None and self.fit.elapsed_s >= saved.elapsed_s
+        if saved is not None and not is_adopted:  # its capacity and offset are adopted like those of a new fit
+            self._pending = run_now(lambda: saved)
+            h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
+
+    def forget(self) -> None:
+        """Discard history and fit, and restart the estimator with the curves of the cell file, as for a new pack."""
+        self._pending, self.fit, self.saved_fit, self.last_change = None, None, None, None
+        self.history, self._is_late, self._new_rows, self.unsaved_rows = History(), False, 0, 0
+        return_to_cell_file(self.estimator)
+        self.estimator.restart()
+        self._h["enabled"], self._h["event_s"] = 1, self._interval_s
+        self.revision += 1
+
+    def adopt(self, fitted: PackFit) -> None:
+        """Hand a fit to the filter: its curves become the settings, its results the state."""
+        estimator, record = self.estimator, self.estimator.record[0]
+        before = float(estimator.state["soc"][0]), relative_capacity(record).value
+        self._adopt_curves(fitted)
+        adopt_state(estimator, fitted)
+        store_last_good_state(record["checks"], record["filter"])
+        self.fits += 1
+        self.saved_fit = fitted
+        after = float(estimator.state["soc"][0]), relative_capacity(record).value
+        if max(abs(after[0] - before[0]), abs(after[1] - before[1])) > MIN_CHANGE:
+            self.changes += 1
+            self.last_change = FitChange(before[0], after[0], before[1], after[1])
+
+    def take_rows(self) -> None:
+        """Append the completed rows of the estimator's state to the history."""
+        h = self._h
+        if count := int(h["count"]):
+            self.history.append(h["rows"][:count].copy(), self.cell.capacity_as)
+            self._new_rows += count
+            self.unsaved_rows += count
+            h["count"] = 0
+            h["rows"] = np.zeros(1, HISTORY_ROW)  # so that the state does not depend on the division into blocks
+
+    @property
+    def _h(self) -> np.void:
+        record: np.void = self.estimator.record[0]["history"]
+        return record
+
+    def _handle_event(self) -> None:
+        h = self._h
+        if self._pending is None:
+            self._begin_fit()
+        elif self._pending.done():
+            self._end_fit(self._pending)
+            self._pending, self._is_late = None, False
+            h["event_s"] += self._interval_s - ADOPT_DELAY_S
+        elif not self._is_late:  # ``event_s`` has passed, so that the next sample asks again
+            self.late += 1
+            self._is_late = True
+
+    def _begin_fit(self) -> None:
+        """Begin a fit if there is enough new data, and set the time of the next event."""
+        h = self._h
+        if self._new_rows >= MIN_ROWS and self._throughput() >= MIN_THROUGHPUT_SOC:
+            self._new_rows = 0
+            rows, previous = self.history.rows, self.saved_fit
+            self._pending = self._submit(lambda: fit(self.cell, rows, previous))
+            h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
+            return
+        h["event_s"] = h["elapsed_s"] + self._interval_s
+        if self.unsaved_rows:
+            self.unsaved_rows = 0
+            self.revision += 1
+
+    def _end_fit(self, done: "Future[PackFit]") -> None:
+        """Adopt the result of a completed fit, or report its failure."""
+        error = done.exception()
+        if error is not None:
+            self.failed += 1
+            self._on_failure(error)
+        else:
+            self.adopt(done.result())
+        self.unsaved_rows = 0
+        self.revision += 1
+
+    def _throughput(self) -> float:
+        """Return the throughput of the history [SOC]; infinite with a known SOC or a second segment."""
+        rows = self.history.rows
+        if np.isfinite(rows["reference_soc"]).any() or rows["segment"][0] != rows["segment"][-1]:
+            return math.inf
+        return float(rows["throughput_soc"][-1])
+
+    def _adopt_curves(self, fitted: PackFit | None) -> None:
+        """Write the curves of a fit, or of the cell file, to the filter's settings."""
+        self.fit, settings = fitted, self.estimator.settings_record["filter"]
+        f = self.estimator.record[0]["filter"]
+        before = present_ohm(settings[0], f)
+        if fitted is None:
+            settings[0] = self.estimator.cell_file_settings
+        else:
+            adopt_curves(settings[0], self.estimator.cell_file_settings, fitted)
+        if f["started"]:
+            keep_series_resistance(f, before, present_ohm(settings[0], f))

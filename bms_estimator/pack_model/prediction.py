@@ -1,0 +1,238 @@
+"""Predicted voltage of each history row, with its variance and its derivatives by the unknowns x.
+
+    v = E(z, T) + c(z) + M (m_1 h_1 + m_2 h_2) - sum of scaled resistances times currents + error by direction
+    z = z_interval - (charge - offset t) / (Q e^q)
+
+All voltages are of one cell. What recurs at each pass of an SOC in one direction is one unknown (error by direction), so
+that passing an SOC often does not determine the curve better than to the size of that error.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.accumulators.history import HYSTERESIS_SOC, ROW_SOC
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, TAUS, WEAK_J
+from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition, arrhenius
+from bms_estimator.pack_model.intervals import Intervals
+from bms_estimator.pack_model.prior import variance_between_nodes
+from bms_estimator.pack_model.unknowns import (
+    CURVE_NODES,
+    DIRECTION_NODES,
+    RESISTANCE_GROUPS,
+    SCALES,
+    SHAPE_NODES,
+    Unknowns,
+)
+
+PASS_DROP = 0.75
+"""Std of the overpotential that differs from pass to pass, as a fraction of the std that recurs."""
+COUNT_SOC, KNEE_SOC, KNEE_WIDTH_SOC = 0.004, 0.015, 0.12
+"""Std of a row's SOC by counting, additional std of the place of the knee near empty, and width of the knee [SOC]."""
+EMPTY_RELATIVE, EMPTY_WIDTH_SOC = 0.4, 0.04
+"""Relative error of the overpotential at empty, and SOC within which it decays."""
+START_LOAD_C = 0.6
+"""Std of the load before the RC pairs were reset, as a C-rate."""
+GROUP_STARTS = [RESISTANCE_GROUPS.index(group) for group in range(SCALES)]
+"""First resistance of each group."""
+
+Derivatives = tuple[NDArray[np.intp], Floats]
+"""Non-zero derivatives of n values by the unknowns: indices of the unknowns and derivatives, both of shape (n, k)."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted voltages of n rows, and the terms they consist of."""
+
+    voltage_v: Floats
+    """Predicted voltage [V]."""
+    soc: Floats
+    """SOC z."""
+    ohm: Floats
+    """Resistances of the cell file at z and T, shape (n, RESISTANCES) [ohm]."""
+    scale: Floats
+    """Factor on the resistances of each group, shape (n, SCALES)."""
+    drops_v: Floats
+    """Voltage drop over the resistances of each group, positive on discharge, shape (n, SCALES) [V]."""
+    drop_v: Floats
+    """Overpotential: sum of ``drops_v`` [V]."""
+    hysteresis_v: Floats
+    """M: half of the difference of the OCV after charge and after discharge [V]."""
+    h: Floats
+    """Fast and slow part of the hysteresis, -1..1, shape (n, 2)."""
+    shape_at: NodePosition
+    """Position of z on the nodes of the resistances' error."""
+    curve_at: NodePosition
+    """Position of z on the nodes of the OCV's error."""
+    direction_at: NodePosition
+    """Position of z on the nodes of the error by direction."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Estimate of SOC and resistances at which the std of each row is computed.
+
+    A std that depended on the unknowns would draw the fit to SOCs and resistances with a large std.
+    """
+
+    soc: Floats
+    """SOC of each row."""
+    ln_r: Floats
+    """ln of the true over the file's resistances of each group, shape (SCALES,)."""
+
+
+class VoltageModel:
+    """Model of the voltages of one history. Attributes do not depend on the unknowns.
+
+    Args:
+        cell: Curves of the cell file.
+        intervals: Intervals of the history.
+        u: Positions of the unknowns.
+        reference: Estimate at which the std of each row is computed.
+    """
+
+    def __init__(self, cell: CellCurves, intervals: Intervals, u: Unknowns, reference: Reference) -> None:
+        self.cell, self.u, self.intervals = cell, u, intervals
+        rows = intervals.rows
+        temperature_c: Floats = rows["temperature_c"]
+        self.warm_k: Floats = temperature_c - REFERENCE_C
+        self.weak, self.strong = arrhenius(WEAK_J, temperature_c), arrhenius(STRONG_J, temperature_c)
+        self.hysteresis_factor = arrhenius(HYSTERESIS_J, temperature_c)
+        self.current_a = np.column_stack([rows["current_a"], rows["x_a"]])
+        self.counted_h: Floats = rows["hysteresis"]
+        # the hysteresis at the start of the segment decays with the throughput
+        self.start_h_decay = np.exp(-rows["throughput_soc"][:, None] / np.array(HYSTERESIS_SOC))
+        self.start_h_at = u.start_hysteresis.start + 2 * intervals.segment
+        # the unknown load before the reset of the RC pairs decays with their time constants
+        self.start_load_a = START_LOAD_C * cell.one_c_a * np.exp(-rows["settled_s"][:, None] / TAUS)
+        direction = (rows["direction"] + 1.0).astype(np.intp)
+        self.direction_start = u.direction.start + direction * DIRECTION_NODES
+        z = np.clip(reference.soc, 0.0, 1.0)
+        ohm = cell.resistances(z, self.weak, self.strong)
+        drop_v = by_group(ohm * self.current_a) @ np.exp(reference.ln_r)
+        self.direction_v = np.sqrt(
+            cell.direction_std_v**2 + (cell.drop_std * drop_v) ** 2 + variance_between_nodes(cell, z)
+        )
+        """Std of the error by direction [V]."""
+        self.variance_v2 = self._variance(z, drop_v, ohm)
+        """Variance of each row's voltage about its prediction [V^2]."""
+
+    def _variance(self, z: Floats, drop_v: Floats, ohm: Floats) -> Floats:
+        """Return the variance of each row's voltage about its prediction [V^2]."""
+        near_empty, at_empty = np.exp(-((z / KNEE_WIDTH_SOC) ** 2)), np.exp(-((z / EMPTY_WIDTH_SOC) ** 2))
+        cell = self.cell
+        by_pass_v2 = (
+            cell.direction_std_v**2
+            + (PASS_DROP * cell.drop_std * drop_v) ** 2
+            + (EMPTY_RELATIVE * at_empty * drop_v) ** 2
+        )
+        by_soc_v2 = (cell.slope(z) * (COUNT_SOC + KNEE_SOC * near_empty)) ** 2
+        by_start_v2 = ((self.start_load_a * ohm[:, 1:]) ** 2).sum(axis=1)
+        return np.asarray(by_pass_v2 + by_soc_v2 + by_start_v2)
+
+    def soc(self, x: Floats) -> Floats:
+        """Return the SOC of each row."""
+        u, k = self.u, self.intervals.of_row
+        return np.asarray(x[u.soc][k] - self._drawn_soc(x) * np.exp(-x[u.ln_q][k]))
+
+    def soc_derivatives(self, x: Floats) -> Derivatives:
+        """Return the derivatives of the SOC of each row by SOC, offset and ln of the capacity of its interval."""
+        u, k = self.u, self.intervals.of_row
+        inverse_q = np.exp(-x[u.ln_q][k])
+        at = np.column_stack([u.soc.start + k, u.offset.start + k, u.ln_q.start + k])
+        return at, np.column_stack([np.ones(k.size), self.intervals.hours * inverse_q, self._drawn_soc(x) * inverse_q])
+
+    def _drawn_soc(self, x: Floats) -> Floats:
+        """Return the true charge since the interval's start, as a fraction of the declared capacity."""
+        offset: Floats = x[self.u.offset][self.intervals.of_row]
+        return self.intervals.drawn_soc - offset * self.intervals.hours
+
+    def predict(self, x: Floats) -> Prediction:
+        """Return the predicted voltages."""
+        return self._predict_at(x, self.soc(x))
+
+    def _predict_at(self, x: Floats, z: Floats) -> Prediction:
+        """Return the voltages that ``x`` predicts if the rows' SOCs are ``z``."""
+        u, cell = self.u, self.cell
+        shape_at, curve_at = NodePosition.of(z, SHAPE_NODES), NodePosition.of(z, CURVE_NODES)
+        direction_at = NodePosition.of(z, DIRECTION_NODES)
+        ohm = cell.resistances(z, self.weak, self.strong)
+        ln_shape = shape_at.interpolate(x[u.shape]) + x[u.arrhenius] * self.warm_k
+        scale = np.exp(x[u.ln_r] + ln_shape[:, None])
+        true_a = self.current_a - (x[u.offset][self.intervals.of_row] * cell.one_c_a)[:, None]
+        drops_v = scale * by_group(ohm * true_a)
+        drop_v = drops_v.sum(axis=1)
+        hysteresis_v = self.hysteresis_factor * np.interp(z, SOC_GRID, cell.hysteresis_v)
+        h = self.counted_h + self.start_h_decay * np.column_stack([x[self.start_h_at], x[self.start_h_at + 1]])
+        ocv_v = cell.ocv(z) + curve_at.interpolate(x[u.curve])
+        ocv_v += self.warm_k * (x[u.entropy] + np.interp(z, SOC_GRID, cell.per_kelvin_v))
+        by_direction_v = self.direction_v * direction_at.interpolate(x, self.direction_start)
+        return Prediction(
+            voltage_v=ocv_v - drop_v + hysteresis_v * (h @ x[u.hysteresis]) + by_direction_v,
+            soc=z,
+            ohm=ohm,
+            scale=scale,
+            drops_v=drops_v,
+            drop_v=drop_v,
+            hysteresis_v=hysteresis_v,
+            h=h,
+            shape_at=shape_at,
+            curve_at=curve_at,
+            direction_at=direction_at,
+        )
+
+    def derivatives(self, x: Floats, p: Prediction, *, smooth: bool) -> Derivatives:
+        """Return the derivatives of the predicted voltages.
+
+        Args:
+            x: Unknowns.
+            p: Prediction at ``x``.
+            smooth: True: the derivative by SOC is the slope of the cell file's OCV. The slope of the fitted correction is
+                rough and would pass for information on the SOC.
+        """
+        u, n, m = self.u, p.soc.size, x[self.u.hysteresis]
+        soc_columns, by_soc = self._derivatives_by_soc(x, p, smooth=smooth)
+        shape_low, shape_high = p.shape_at.weights
+        curve_low, curve_high = p.curve_at.weights
+        direction_low, direction_high = p.direction_at.weights
+        by_start_h = p.hysteresis_v[:, None] * m * self.start_h_decay
+        direction_at = self.direction_start + p.direction_at.below
+        terms = [
+            *zip(soc_columns.T, by_soc.T, strict=True),
+            *((np.full(n, u.ln_r.start + j), -p.drops_v[:, j]) for j in range(SCALES)),
+            (u.shape.start + p.shape_at.below, -shape_low * p.drop_v),
+            (u.shape.start + p.shape_at.below + 1, -shape_high * p.drop_v),
+            *((np.full(n, u.hysteresis.start + j), p.hysteresis_v * p.h[:, j]) for j in range(2)),
+            *((self.start_h_at + j, by_start_h[:, j]) for j in range(2)),
+            (np.full(n, u.entropy.start), self.warm_k),
+            (np.full(n, u.arrhenius.start), -self.warm_k * p.drop_v),
+            (u.curve.start + p.curve_at.below, curve_low),
+            (u.curve.start + p.curve_at.below + 1, curve_high),
+            (direction_at, self.direction_v * direction_low),
+            (direction_at + 1, self.direction_v * direction_high),
+        ]
+        columns, values = zip(*terms, strict=True)
+        return np.column_stack(columns), np.column_stack(values)
+
+    def _derivatives_by_soc(self, x: Floats, p: Prediction, *, smooth: bool) -> Derivatives:
+        """Return the derivatives by SOC, offset and capacity of the interval."""
+        slope_v = self.cell.slope(p.soc) if smooth else self._slope_v(x, p.soc)
+        columns, by_soc = self.soc_derivatives(x)
+        by_soc *= slope_v[:, None]
+        by_soc[:, 1] += (p.scale * by_group(p.ohm)).sum(axis=1) * self.cell.one_c_a
+        return columns, by_soc
+
+    def _slope_v(self, x: Floats, z: Floats) -> Floats:
+        """Return the slope of the predicted voltages over SOC [V per unit SOC], as a secant over the SOC range of a row.
+
+        The fitted curves are piecewise linear, so that their slope at a point does not hold for a step to the next node.
+        """
+        above_v, below_v = (self._predict_at(x, z + reach).voltage_v for reach in (ROW_SOC / 2.0, -ROW_SOC / 2.0))
+        return (above_v - below_v) / ROW_SOC
+
+
+def by_group(values: Floats) -> Floats:
+    """Return the sum over the resistances of each group, shape (n, SCALES)."""
+    return np.asarray(np.add.reduceat(values, GROUP_STARTS, axis=1))

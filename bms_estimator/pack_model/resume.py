@@ -1,0 +1,78 @@
+"""Continuation of a history after a restart of the service.
+
+A checkpoint is saved each minute, the history each hour. Therefore the checkpoint's record of the history may be newer
+than the saved rows, or, after a crash between both writes, older.
+"""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW, complete_row
+from bms_estimator.pack_model.history import History
+
+
+def resume_history(
+    h: np.void, f: np.void, history: History, gap_s: float, capacity_as: float, *, restored: bool
+) -> None:
+    """Append what the checkpoint knows beyond the saved rows, and begin a segment with an unused number.
+
+    Args:
+        h: Record of dtype HISTORY: restored from a checkpoint, or new.
+        f: Record of dtype EKF_STATE, restored or new.
+        history: Saved rows.
+        gap_s: Time since the checkpoint was saved [s]; infinite if unknown.
+        capacity_as: Declared capacity [A s].
+        restored: True if ``h`` and ``f`` are restored.
+    """
+    if not restored and not history.rows.size:
+        return  # the first start
+    is_linked = restored and _append_saved(h, f, history, capacity_as)
+    rows = history.rows
+    if rows.size:
+        h["elapsed_s"] = max(h["elapsed_s"], rows["elapsed_s"][-1])
+        h["segment"] = max(h["segment"], rows["segment"][-1])
+    h["segment"] += 1
+    h["gap_s"] = gap_s if is_linked else math.inf
+    h["count"] = h["direction"] = 0
+    h["charge_as"] = h["charge_variance_as2"] = h["throughput_soc"] = h["direction_s"] = h["row_as"] = 0.0
+    h["hysteresis"] = 0.0
+
+
+def _append_saved(h: np.void, f: np.void, history: History, capacity_as: float) -> bool:
+    """Append the rows of the checkpoint that are not saved, and a row with its count of the charge.
+
+    Return True if the charge is counted without interruption to the checkpoint.
+    """
+    complete_row(h)
+    rows = h["rows"][: int(h["count"])].copy()
+    if history.rows.size:
+        last = history.rows[-1]
+        if last["segment"] > h["segment"]:
+            return False
+        rows = rows[rows["elapsed_s"] > last["elapsed_s"]]
+        # rows may be lost between the last saved one and those of a later segment, so that the charge is unknown
+        rows["gap_s"][(rows["segment"] > last["segment"]) & (rows["segment"] == rows["segment"][:1])] = math.inf
+        history.append(rows, capacity_as)
+    else:
+        history.append(rows, capacity_as)
+        if not rows.size:
+            return False
+    history.append(_count_row(h, f, history.rows[-1]), capacity_as)
+    return True
+
+
+def _count_row(h: np.void, f: np.void, last: np.void) -> np.ndarray:
+    """Return a row without a voltage, with the charge up to the checkpoint.
+
+    The next segment is linked to it. ``last`` is the last saved row.
+    """
+    row = np.zeros(1, HISTORY_ROW)
+    row["elapsed_s"] = max(h["elapsed_s"], last["elapsed_s"])
+    row["segment"] = h["segment"]
+    row["gap_s"] = last["gap_s"] if last["segment"] == h["segment"] else math.inf
+    for name in ("charge_as", "charge_variance_as2", "throughput_soc", "hysteresis"):
+        row[name] = h[name]
+    row["temperature_c"], row["soc"] = f["temperature_c"], f["soc"]
+    row["reference_soc"] = row["reference_std"] = math.nan
+    return row

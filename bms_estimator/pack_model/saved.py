@@ -1,0 +1,98 @@
+"""Conversion of history and fit to arrays that can be saved, and back."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW
+from bms_estimator.kernels.kalman_filter.records import NODES
+from bms_estimator.pack_model.cell_curves import SOC_GRID
+from bms_estimator.pack_model.fit import PackFit
+from bms_estimator.pack_model.history import MAX_ROWS, History
+
+SAVED_MINIMA = 2
+"""Number of a fit's minima that are saved; the next fit starts from no more."""
+_RESULTS = 6 + NODES
+_SHAPES = {
+    "elapsed_s": (),
+    "segment": (),
+    "charge_as": (),
+    "mean": (_RESULTS,),
+    "covariance": (_RESULTS, _RESULTS),
+    "curve_v": (SOC_GRID.size,),
+    "ln_r": (SOC_GRID.size, 3),
+    "hysteresis": (),
+    "cost": (),
+}
+"""Fields of a fit on which the curves and the handed-over state depend, with their shapes."""
+_HISTORY_FIELDS = "row_elapsed_s", "row_soc", "curves"
+"""Fields of a fit from which the next fit starts."""
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def curve_arrays(fit: PackFit | None) -> dict[str, NDArray[Any]]:
+    """Return the curves and results of a fit by name; empty without one."""
+    return {} if fit is None else {name: np.array(getattr(fit, name)) for name in _SHAPES}
+
+
+def fit_of_curves(arrays: Arrays) -> PackFit | None:
+    """Return the fit of ``curve_arrays``, without the fields from which the next fit starts.
+
+    Raises:
+        ValueError: A field is missing, has another shape or is not finite.
+    """
+    if not arrays:
+        return None
+    values: dict[str, Any] = {}
+    for name, shape in _SHAPES.items():
+        value = arrays.get(name)
+        if value is None or value.shape != shape or not np.isfinite(value).all():
+            raise ValueError(f"{name} of the fit is missing or damaged")
+        values[name] = value if shape else float(value)
+    none = np.zeros(0)
+    return PackFit(**values, row_elapsed_s=none, row_soc=none, curves=())
+
+
+def neutral_fit() -> PackFit:
+    """Return a fit that confirms the cell file."""
+    values: dict[str, Any] = {name: np.zeros(shape) if shape else 0.0 for name, shape in _SHAPES.items()}
+    values |= {"covariance": np.eye(_RESULTS), "hysteresis": 1.0}
+    none = np.zeros(0)
+    return PackFit(**values, row_elapsed_s=none, row_soc=none, curves=())
+
+
+def history_arrays(history: History, fit: PackFit | None) -> dict[str, NDArray[Any]]:
+    """Return history and fit as arrays by name."""
+    arrays = {"rows": history.rows, **curve_arrays(fit)}
+    if fit is not None:
+        arrays |= {"row_elapsed_s": fit.row_elapsed_s, "row_soc": fit.row_soc}
+        arrays["curves"] = np.array(fit.curves[:SAVED_MINIMA]).reshape(min(len(fit.curves), SAVED_MINIMA), -1)
+    return arrays
+
+
+def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
+    """Return history and fit of ``history_arrays``.
+
+    Raises:
+        ValueError: A field is missing, has another layout or is not finite.
+    """
+    rows = arrays.get("rows")
+    if rows is None or rows.dtype != HISTORY_ROW or rows.ndim != 1 or rows.size > MAX_ROWS:
+        raise ValueError("its rows have another layout")
+    if not all(
+        np.isfinite(rows[name]).all() for name in ("elapsed_s", "duration_s", "segment", "voltage_v", "charge_as")
+    ):
+        raise ValueError("a row is not finite")
+    if (np.diff(rows["segment"]) < 0.0).any():
+        raise ValueError("its rows are not in the order of time")
+    fit = fit_of_curves({name: value for name, value in arrays.items() if name in _SHAPES})
+    if fit is None:
+        return History(rows), None
+    elapsed_s, soc, starts = (arrays.get(name, np.zeros(0)) for name in _HISTORY_FIELDS)
+    if elapsed_s.shape != soc.shape or elapsed_s.ndim != 1 or not np.isfinite(starts).all():
+        raise ValueError("the starts of the next fit are damaged")
+    return History(rows), replace(fit, row_elapsed_s=elapsed_s, row_soc=soc, curves=tuple(starts))

@@ -1,0 +1,94 @@
+"""Restore of a pack at the start: state from the checkpoint, history and fit from the history file."""
+
+import math
+
+import structlog
+
+from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointContent, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.history_file import HistoryFile, RejectedHistoryError
+from bms_estimator.checkpoint.restore import restore_state
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.clock import Clock
+from bms_estimator.pack_model.curve_change import return_to_cell_file
+from bms_estimator.pack_model.fit import PackFit
+from bms_estimator.pack_model.handover import adopt_curves
+from bms_estimator.pack_model.history import History
+from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.saved import fit_of_curves, history_of
+from bms_estimator.telemetry.lifetime_totals import new_totals
+
+log = structlog.get_logger(__name__)
+
+
+def restore_pack(
+    estimator: Estimator,
+    pack_model: SlowFit | None,
+    checkpoint: CheckpointFile | None,
+    history: HistoryFile | None,
+    clock: Clock,
+) -> tuple[RunCounters, str]:
+    """Restore a valid checkpoint and a valid history; rejected files are quarantined.
+
+    Args:
+        estimator: New estimator.
+        pack_model: New slow fit of the estimator; None: the estimator runs without one.
+        checkpoint: File of the state; None: the state is not saved.
+        history: File of the history; None: the history is not saved.
+        clock: The clocks.
+
+    Returns:
+        Counters of earlier runs, and the outcome of the checkpoint as text.
+    """
+    if checkpoint is None:
+        return RunCounters(0, new_totals(clock.wall())), "off"
+    content = checkpoint.load()
+    state_fit = _fit_of_state(content)
+    if pack_model:
+        rows, fit = _load_history(history)
+        pack_model.load(rows, fit, state_fit)
+    elif state_fit:
+        adopt_curves(estimator.settings_record[0]["filter"], estimator.cell_file_settings, state_fit)
+    outcome = content.reason
+    if not outcome:
+        error = restore_state(estimator, content.state, content.unseen_s)
+        outcome = f"{REJECTED}{error}" if error else f"restored{_soc_text(estimator)}"
+    restored = outcome.startswith("restored")
+    if content.curves and (pack_model is None or state_fit is None):
+        return_to_cell_file(estimator)
+    if pack_model:
+        pack_model.resume(content.unseen_s if restored else math.inf, restored=restored)
+    if refused := outcome.startswith(REJECTED):
+        outcome = f"{outcome}; {checkpoint.quarantine()}"
+    write_log = log.warning if refused else log.info
+    write_log("checkpoint", file=str(checkpoint.path), outcome=outcome)
+    return content.counters, outcome
+
+
+def _fit_of_state(content: CheckpointContent) -> PackFit | None:
+    """Return the fit to whose curves the state is relative; None without a usable fit."""
+    try:
+        return fit_of_curves(content.curves)
+    except ValueError as error:
+        log.warning("the state is restored with the curves of the cell file", reason=str(error))
+        return None
+
+
+def _load_history(file: HistoryFile | None) -> tuple[History, PackFit | None]:
+    """Return the saved history and its last fit. A rejected file is quarantined."""
+    if file is None:
+        return History(), None
+    try:
+        arrays = file.load()
+        if arrays is None:
+            return History(), None
+        history, fit = history_of(arrays)
+    except (RejectedHistoryError, ValueError) as error:
+        log.warning("history", file=str(file.path), outcome=f"{REJECTED}{error}; {file.quarantine()}")
+        return History(), None
+    log.info("history", file=str(file.path), outcome=f"restored: {history.rows.size} rows")
+    return history, fit
+
+
+def _soc_text(estimator: Estimator) -> str:
+    soc = float(estimator.state["soc"][0])
+    return "" if math.isnan(soc) else f": SOC {soc:.4f}"

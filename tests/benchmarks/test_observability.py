@@ -1,0 +1,126 @@
+"""The smallest honest std of the SOC: its documented table, its limits, and a simulation."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.cell import load_cell
+from bms_estimator.pack_model.prior import DIRECTION_CORRELATION_SOC, curve_covariance
+from bms_estimator.pack_model.unknowns import DIRECTIONS
+from tests.benchmarks.observability import (
+    CELLS,
+    LOWEST_SOCS,
+    NOT_FULL_SOC,
+    RATED_AH,
+    Observability,
+    Window,
+    bound,
+    curves,
+    std_row,
+)
+
+PAGE = Path(__file__).parents[2] / "docs" / "theory" / "observability.md"
+TOLERANCE = 0.11
+"""Tolerance of a documented std, which is rounded to 0.1 [%]."""
+SMOOTH_SOC = 0.03
+"""Std of the Gaussian kernel that smooths the simulated curves. Curves of real cells have no steps [SOC]."""
+
+
+def documented() -> dict[tuple[str, str, str], list[str]]:
+    """Return the rows of the documented table by cell, window and full."""
+    lines = [
+        line.strip("| ").split(" | ")
+        for line in PAGE.read_text(encoding="utf-8").splitlines()
+        if line.startswith("| `")
+    ]
+    return {(row[0].strip("`"), row[1], row[2]): row[3:] for row in lines if row[2] in ("yes", "no")}
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_the_documented_table_has_the_computed_values(name: str) -> None:
+    rows, cell = documented(), curves(load_cell(name, RATED_AH))
+    for low in LOWEST_SOCS:
+        for full in (False, True):
+            window, full_seen, *values = std_row(Observability(cell, Window(low, full=full)))[:-1]
+            expected = rows[name, window, full_seen]
+            assert [v == "-" for v in values] == [v == "-" for v in expected]
+            numbers = [(float(v), float(e)) for v, e in zip(values, expected, strict=True) if v != "-"]
+            assert all(abs(value - number) < TOLERANCE for value, number in numbers)
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_a_full_charge_lowers_the_std_and_a_narrow_window_raises_it(name: str) -> None:
+    cell, at = curves(load_cell(name, RATED_AH)), np.array([0.65])
+    stds = [Observability(cell, Window(low)).std(at)[0] for low in LOWEST_SOCS]
+    assert stds == sorted(stds)
+    assert stds[0] < stds[-1]
+    for low in LOWEST_SOCS:
+        assert bound(cell, (low, 1.0), full=True) < 0.9 * bound(cell, (low, NOT_FULL_SOC), full=False)
+
+
+def test_an_unseen_charge_raises_the_std_and_a_measured_capacity_lowers_it() -> None:
+    cell = curves(load_cell("lfp", RATED_AH))
+    usual, unseen, measured = (
+        Observability(cell, window).mean_std
+        for window in (Window(0.12), Window(0.12, charge_seen=False), Window(0.12, capacity_std=0.01))
+    )
+    assert measured < 0.9 * usual < 0.9 * unseen
+
+
+def test_the_voltages_cannot_separate_soc_and_capacity_from_the_curve() -> None:
+    """The change of the curve is the slope times the change of the SOC, so that the voltages stay the same."""
+    cell, window = curves(load_cell("nca", RATED_AH)), Window(0.12)
+    result = Observability(cell, window)
+    assert (result.spectrum[0] < 1e-6).sum() == 2
+    ends_soc = window.soc[[0, window.soc.size // 2, -1]]
+    for change in result.uncertain_directions():
+        soc = change.soc + change.ln_q * (ends_soc - result.middle)
+        assert change.curve_v == pytest.approx(-cell.slope(ends_soc) * soc, abs=6e-3)
+
+
+@pytest.mark.parametrize(("name", "tolerance"), [("ncr18650", 0.1), ("nmc", 0.2)])
+def test_the_error_in_a_simulation_agrees_with_the_std(name: str, tolerance: float) -> None:
+    window = Window(0.30)
+    rms_std = np.sqrt(np.mean(Observability(curves(load_cell(name, RATED_AH)), window).std(window.soc) ** 2))
+    errors = errors_of_draws(name, window, 200)
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(rms_std, rel=tolerance)
+    assert np.mean(np.abs(errors) < 2.0 * rms_std) > 0.9
+
+
+def errors_of_draws(name: str, window: Window, draws: int) -> Floats:
+    """Return the error of the SOC at each SOC of the window, shape (draws, n).
+
+    The voltages are those of a random curve. The least-squares estimate starts at the true SOC and is linearized again at
+    each iteration. The hysteresis is known.
+    """
+    rng, cell, soc = np.random.default_rng(1), curves(load_cell(name, RATED_AH)), window.soc
+    grid = np.linspace(0.0, 1.0, 101)
+    root = np.linalg.cholesky(curve_covariance(cell, grid) + 1e-10 * np.eye(grid.size))
+    kernel = np.exp(-0.5 * ((grid[:, None] - grid) / SMOOTH_SOC) ** 2)
+    smooth = kernel @ root
+    smooth *= (np.linalg.norm(root, axis=1) / np.linalg.norm(smooth, axis=1))[:, None]
+    by_direction = (
+        np.exp(-np.abs(soc[:, None] - soc) / DIRECTION_CORRELATION_SOC) * cell.direction_std_v**2 / DIRECTIONS
+    )
+    precision = np.linalg.inv(curve_covariance(cell, soc) + by_direction)
+    from_middle = soc - 0.5 * (soc[0] + soc[-1])
+    results = []
+    for _ in range(draws):
+        curve_v = np.interp(soc, grid, smooth @ rng.standard_normal(grid.size))
+        noise_v = np.linalg.cholesky(by_direction) @ rng.standard_normal(soc.size)
+        declared = cell.capacity_std * rng.standard_normal()
+        shift, stretch = 0.0, declared
+        for _ in range(30):
+            at = soc + shift + stretch * from_middle
+            jacobian = cell.slope(at)[:, None] * np.column_stack([np.ones(soc.size), from_middle])
+            gain = jacobian.T @ precision
+            normal = gain @ jacobian
+            normal[1, 1] += cell.capacity_std**-2
+            right = gain @ (cell.ocv(soc) + curve_v + noise_v - cell.ocv(at))
+            right[1] += (declared - stretch) / cell.capacity_std**2
+            step = np.linalg.solve(normal, right)
+            shift, stretch = shift + step[0], stretch + step[1]
+        results.append(shift + stretch * from_middle)
+    return np.array(results)

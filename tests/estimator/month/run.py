@@ -1,0 +1,83 @@
+"""Run of the estimator over a simulated month, judged day by day."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.identified_parameters import relative_capacity
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.learning import SlowFit
+from tests.benchmarks.observability import bound, curves
+from tests.estimator.anywhere.score import Score, score
+from tests.estimator.anywhere.use import DAY_S
+from tests.estimator.month.cases import Case
+
+AFTER_S = 900.0
+"""Time after switch-on that is not scored [s]."""
+FULL_SOC = 0.99
+"""SOC at which a charge counts as full."""
+UNSEEN_CHARGES = ("bicycle",)
+"""Uses whose charges are not seen, so that regeneration above ``FULL_SOC`` is the end of no charge."""
+BLOCK = 100_000
+"""Samples between two copies of the trace, whose rows take 200 bytes."""
+
+
+@dataclass(frozen=True)
+class Day:
+    """Result of one day."""
+
+    number: int
+    """1 for the first day."""
+    score: Score | None
+    """None if too few samples can be scored."""
+    capacity_ratio: float
+    """Learned capacity at the end of the day divided by the true one."""
+    capacity_std: float
+    """Std of the learned capacity divided by the true capacity."""
+    bound: float
+    """Smallest honest std of the SOC after infinite time in the window of SOCs that was passed until the end of the day."""
+
+
+def run(case: Case, data: Path) -> list[Day]:
+    """Return the results of each day on which the electronics were on."""
+    recording = case.draw(data)
+    samples, truth = recording.samples, recording.truth
+    estimator = Estimator(recording.cell, voltage_resolution_v=case.source.volt_step, sampling=case.source.sampling)
+    runner = SlowFit(estimator, interval_s=DAY_S)
+    results: list[Day] = []
+    cell = curves(recording.cell)
+    for number in range(case.days):
+        begin, end = np.searchsorted(samples["time_s"], (number * DAY_S, (number + 1) * DAY_S))
+        if begin == end:
+            continue
+        time_s, soc, soc_std = run_blocks(runner, samples[begin:end])
+        true_soc = truth["soc"][np.searchsorted(samples["time_s"], time_s)]
+        result = score(time_s, soc, soc_std, true_soc, 0.0 if results else AFTER_S)
+        learned = relative_capacity(estimator.record[0])
+        to_true = recording.declared_ah / truth["capacity_ah"][end - 1]
+        results.append(
+            Day(number + 1, result, learned.value * to_true, learned.std * to_true, bound_of(case, cell, truth[:end]))
+        )
+    return results
+
+
+def bound_of(case: Case, cell: CellCurves, truth: np.ndarray) -> float:
+    """Return the smallest honest std of the SOC in the window of a history, with a full charge if one was seen."""
+    soc = truth["soc"]
+    is_full = (soc > FULL_SOC) & (truth["current_a"] < 0.0)
+    full = case.use not in UNSEEN_CHARGES and bool(is_full.any())
+    return bound(cell, (float(soc.min()), float(soc.max())), full=full)
+
+
+def run_blocks(estimator: SlowFit, samples: SampleBlock) -> tuple[Floats, Floats, Floats]:
+    """Run the estimator over samples, and return time, SOC and std of the SOC at each accepted sample."""
+    parts = []
+    for begin in range(0, samples.size, BLOCK):
+        trace = estimator.run(samples[begin : begin + BLOCK])
+        parts.append([trace[name].copy() for name in ("time_s", "soc", "soc_std")])
+    time_s, soc, soc_std = np.concatenate(parts, axis=1)
+    return time_s, soc, soc_std

@@ -1,0 +1,89 @@
+"""Sources: the samples that reach the estimator, made from the true values."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
+from bms_estimator.settings.sampling import Sampling
+
+
+@dataclass(frozen=True)
+class Source:
+    """Errors and resolution of a source."""
+
+    name: str
+    step_s: float = 1.0
+    volt_step: float = 1e-3
+    volt_noise_std: float = 1e-3
+    ampere_step: float = 0.0
+    """Resolution of the current [A]; 0: exact."""
+    dead_band_a: float = 0.0
+    """Magnitude below which the source reports a current of 0 [A]."""
+    offset_a: float = 0.0
+    """Magnitude of the offset of the current; its sign is random [A]."""
+    voltage_gain: float = 1.0
+    """Measured voltage divided by the true voltage."""
+    current_gain: float = 1.0
+    """Measured current divided by the true current."""
+    voltage_gain_std: float = 0.001
+    """Std of the voltage's gain that the owner configures; default: that of a calibrated board."""
+    current_gain_std: float = 0.001
+    """Std of the current's gain that the owner configures."""
+    voltage_period_s: float = 0.0
+    """Time between two voltages that come on a topic of their own [s]; 0: a voltage in each sample."""
+
+    fast_day: int = 0
+    """Number of the day on which a board delivers 100 samples a second; 0: none."""
+
+    @property
+    def sampling(self) -> Sampling:
+        """Sampling that the owner configures."""
+        return Sampling(self.step_s, self.ampere_step, self.dead_band_a, self.voltage_gain_std, self.current_gain_std)
+
+
+BOARD = Source("board")
+"""Board of the firmware, of which one sample a second is used."""
+FAST_BOARD = Source("board, 100 Hz on day 2", fast_day=2)
+"""Board of the firmware. A month at 100 Hz would take too long, therefore only one day is at this rate."""
+BMS_GAINS = {"voltage_gain_std": 0.005, "current_gain_std": 0.005}
+"""Default of the service for a BMS."""
+BMS = Source("bms", volt_step=0.01, volt_noise_std=0.0, ampere_step=0.1, **BMS_GAINS)
+"""BMS with coarse steps, of one cell."""
+SPLIT = Source("split", voltage_period_s=10.0, **BMS_GAINS)
+"""Voltage and current on separate topics."""
+SOLAR = Source("solar", step_s=10.0, ampere_step=0.01, dead_band_a=0.1, offset_a=0.03, **BMS_GAINS)
+"""Charge controller of a solar system, for some tens of ampere-hours. Steps of 10 mV of 16 cells in series are below 1 mV
+of one cell."""
+
+
+def measure(source: Source, history: np.ndarray, rng: np.random.Generator) -> SampleBlock:
+    """Return the samples of the seen part of a history, dtype ``SAMPLE``."""
+    samples = np.zeros(history.size, dtype=SAMPLE)
+    samples["time_s"], samples["temperature_c"] = history["time_s"], history["temperature_c"]
+    current_a = source.current_gain * history["current_a"] + source.offset_a * rng.choice((-1.0, 1.0))
+    current_a[np.abs(current_a) < source.dead_band_a] = 0.0
+    samples["current_a"] = rounded(current_a, source.ampere_step)
+    noise_v = source.volt_noise_std * rng.standard_normal(history.size)
+    samples["voltage_v"] = rounded(source.voltage_gain * history["voltage_v"] + noise_v, source.volt_step)
+    if source.voltage_period_s:
+        samples = pair_with_last_voltage(samples, round(source.voltage_period_s / source.step_s))
+    seen: SampleBlock = samples[history["is_seen"]]
+    return seen
+
+
+def rounded(values: Floats, step: float) -> Floats:
+    """Return the values in whole steps; a step of 0 changes nothing."""
+    return np.round(values / step) * step if step else values
+
+
+def pair_with_last_voltage(samples: SampleBlock, period: int) -> SampleBlock:
+    """Return the samples with the last voltage received, of which one in ``period`` samples arrives.
+
+    A source that receives voltage and current on separate topics marks the other voltages as held.
+    """
+    last = np.arange(samples.size) // period * period
+    samples["voltage_v"] = samples["voltage_v"][last]
+    samples["status"][last != np.arange(samples.size)] = SampleStatus.VOLTAGE_HELD
+    return samples

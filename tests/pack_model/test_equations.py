@@ -1,0 +1,117 @@
+"""Derivatives of the predicted voltages, and the minimization of the cost."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.kernels.accumulators.history import ROW_SOC
+from bms_estimator.pack_model.equations import BEYOND_SOC, Equations
+from bms_estimator.pack_model.solve import minimize
+from tests.pack_model.histories import (
+    Truth,
+    cell_curves,
+    equations_of,
+    measured_rows,
+    random_unknowns,
+    reference_row,
+    unknowns_of,
+    with_voltages,
+)
+
+LINEAR = ("hysteresis", "start_hysteresis", "entropy", "curve", "direction")
+"""Kinds of unknowns in which the voltage is linear."""
+EXPONENTIAL = ("ln_r", "shape", "arrhenius")
+"""Kinds of unknowns that scale the resistances."""
+
+
+@pytest.fixture(scope="module")
+def equations() -> Equations:
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell), Truth())
+    return equations_of(cell, np.concatenate([rows, reference_row(rows, 0.85, 0.01)]))
+
+
+def analytical(equations: Equations, x: np.ndarray) -> np.ndarray:
+    """Return the derivatives of all voltages by all unknowns, shape (n, unknowns)."""
+    model = equations.model
+    columns, values = model.derivatives(x, model.predict(x), smooth=False)
+    jacobian = np.zeros((columns.shape[0], equations.u.size))
+    np.add.at(jacobian, (np.arange(columns.shape[0])[:, None], columns), values)
+    return jacobian
+
+
+def numerical(equations: Equations, x: np.ndarray, j: int, step: float) -> np.ndarray:
+    """Return the central difference of all voltages by unknown ``j``."""
+    e = np.zeros(x.size)
+    e[j] = step
+    predict = equations.model.predict
+    return (predict(x + e).voltage_v - predict(x - e).voltage_v) / (2.0 * step)
+
+
+@pytest.mark.parametrize(
+    ("kind", "step"), [*((kind, 1e-3) for kind in LINEAR), *((kind, 1e-5) for kind in EXPONENTIAL)]
+)
+def test_derivatives_by_unknowns_that_do_not_move_the_soc(equations: Equations, kind: str, step: float) -> None:
+    x = random_unknowns(equations)
+    jacobian, part = analytical(equations, x), getattr(equations.u, kind)
+    for j in range(part.start, part.stop):
+        np.testing.assert_allclose(jacobian[:, j], numerical(equations, x, j, step), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("shift", [-0.25, 0.0, 0.15])
+def test_derivative_by_soc_is_the_secant_over_the_soc_range_of_a_row(equations: Equations, shift: float) -> None:
+    """The shifts move rows beyond SOC 0 and 1, where the fitted curves are constant."""
+    x = random_unknowns(equations)
+    x[equations.u.soc] += shift
+    jacobian, u = analytical(equations, x), equations.u
+    for j in range(u.soc.start, u.soc.stop):
+        np.testing.assert_allclose(jacobian[:, j], numerical(equations, x, j, ROW_SOC / 2), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["offset", "ln_q"])
+def test_derivatives_by_offset_and_capacity(equations: Equations, kind: str) -> None:
+    """They contain the secant over SOC, so that single rows deviate from the derivative at a point."""
+    x = random_unknowns(equations)
+    x[equations.u.curve] = x[equations.u.direction] = 0.0
+    jacobian, part = analytical(equations, x), getattr(equations.u, kind)
+    for j in range(part.start, part.stop):
+        by_difference = numerical(equations, x, j, 1e-4)
+        assert np.linalg.norm(jacobian[:, j] - by_difference) < 0.05 * np.linalg.norm(by_difference)
+
+
+def test_gradient_of_the_cost(equations: Equations) -> None:
+    """b is half of the negative gradient, with rows beyond the tolerated SOC, outliers and a known SOC."""
+    x = random_unknowns(equations)
+    x[equations.u.soc] += 0.15
+    r = equations.residuals(x)
+    assert np.any(r.beyond > 0.0)
+    assert np.any(np.abs(r.voltage) > 3.0)
+    b = equations.normal_equations(r).b
+    u = equations.u
+    for kind in ("ln_r", "hysteresis", "full", "curve", "direction", "start_hysteresis"):
+        part = getattr(u, kind)
+        for j in range(part.start, part.stop):
+            e = np.zeros(x.size)
+            e[j] = 1e-6
+            gradient = (equations.residuals(x + e).cost - equations.residuals(x - e).cost) / 2e-6
+            assert -2.0 * b[j] == pytest.approx(gradient, rel=1e-3, abs=1e-3 * np.abs(b[part]).max() + 1e-3)
+
+
+def test_cost_of_a_soc_beyond_its_range_decreases_along_the_step(equations: Equations) -> None:
+    x = unknowns_of(equations, Truth(soc=1.0 + BEYOND_SOC + 0.07))
+    r = equations.residuals(x)
+    normal = equations.normal_equations(r)
+    step = np.linalg.solve(normal.a, normal.b)
+    assert equations.residuals(x + 0.1 * step).cost < r.cost
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.08, -0.08, 0.15])
+def test_minimum_is_below_its_start_and_its_neighbors(equations: Equations, shift: float) -> None:
+    start = unknowns_of(equations, Truth(ln_r=(0.3, 0.3, 0.3)))
+    start[equations.u.soc] += shift
+    minimum = minimize(equations, start)
+    assert minimum.cost < equations.residuals(start).cost
+    for values, vectors in [np.linalg.eigh(minimum.covariance)]:
+        for variance, vector in zip(values[-20:], vectors.T[-20:], strict=True):
+            for sign in (-1.0, 1.0):
+                neighbor = minimum.x + sign * np.sqrt(variance) * vector
+                assert equations.residuals(neighbor).cost > minimum.cost

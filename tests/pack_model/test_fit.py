@@ -1,0 +1,196 @@
+"""Fits of histories with known true values, and of odd histories."""
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.fit import LN_Q, LN_R, OFFSET, SOC, FitError, PackFit, fit
+from tests.pack_model.histories import Truth, cell_curves, measured_rows, reference_row, with_voltages
+
+CHARGED_SOC = 0.5
+"""Charge that a gap hides."""
+
+
+def std_of(fitted: PackFit) -> np.ndarray:
+    return np.sqrt(np.diag(fitted.covariance))
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        Truth(soc=0.9),
+        Truth(soc=0.86, ln_q=-0.06, offset_c=0.0008, ln_r=(0.4, 0.3, 0.25)),
+        Truth(soc=0.97, ln_q=0.05, offset_c=-0.0005, ln_r=(-0.3, -0.3, -0.2)),
+    ],
+)
+def test_rows_without_noise_are_fitted_back(truth: Truth) -> None:
+    """The filter's SOC, from which the fit starts, is 6 % too high. Two known SOCs make the capacity observable."""
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell, days=5), truth, filter_error=0.06)
+    lowest = int(np.argmin(rows["soc"]))
+    parts = [rows[: lowest + 1], rows[lowest + 1 :]]
+    known = [reference_row(part, end_soc(cell, part, truth), 0.005) for part in parts]
+    fitted = fit(cell, np.concatenate([parts[0], known[0], parts[1], known[1]]))
+    std = std_of(fitted)
+    assert abs(fitted.mean[SOC] - known[1]["reference_soc"][0]) < 0.003
+    assert abs(fitted.mean[LN_Q] - truth.ln_q) < 0.01
+    assert std[LN_Q] < 0.5 * cell.capacity_std
+    assert abs(fitted.mean[OFFSET] - truth.offset_c) < 0.5 * std[OFFSET]
+    np.testing.assert_allclose(fitted.mean[LN_R], truth.ln_r, atol=0.08)
+
+
+def end_soc(cell: CellCurves, rows: np.ndarray, truth: Truth) -> float:
+    """Return the true SOC at the end of the last row."""
+    last = rows[-1]
+    drawn_soc = (last["current_a"] / cell.one_c_a - truth.offset_c) * last["duration_s"] / 7200.0
+    return float(last["soc"] - 0.06 - drawn_soc * np.exp(-truth.ln_q))
+
+
+def test_known_soc_pulls_the_soc() -> None:
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell, days=1), Truth())
+    free = fit(cell, rows)
+    wanted = rows["soc"][-1] + 0.04
+    known = fit(cell, np.concatenate([rows, reference_row(rows, wanted, 0.005)]))
+    assert abs(known.mean[SOC] - wanted) < 0.5 * abs(free.mean[SOC] - wanted)
+    assert std_of(known)[SOC] < std_of(free)[SOC]
+
+
+def with_hidden_charge(charged_soc: float) -> np.ndarray:
+    """Return two segments of a cell with a gap of two hours between them, in which it was charged."""
+    cell = cell_curves()
+    first = with_voltages(cell, measured_rows(cell, days=1), Truth())
+    first = first[: np.argmin(first["soc"]) + 1]
+    start_soc = first["soc"][-1] + charged_soc
+    second = measured_rows(cell, days=2, segment=1, gap_s=7200.0)
+    second["elapsed_s"] += first["elapsed_s"][-1] + first["duration_s"][-1] + 7200.0
+    return np.concatenate([first, with_voltages(cell, second, Truth(soc=start_soc))])
+
+
+def test_charge_hidden_by_a_gap_does_not_move_the_capacity() -> None:
+    rows = with_hidden_charge(CHARGED_SOC)
+    fitted = fit(cell_curves(), rows)
+    assert abs(fitted.mean[LN_Q]) < 0.03
+    assert np.abs(fitted.row_soc - rows["soc"]).max() < 0.03
+
+
+def test_fits_are_bit_identical() -> None:
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell), Truth(ln_q=0.04, ln_r=(0.2, 0.2, 0.2)), 0.03)
+    first = fit(cell, rows[:60])
+    one, two = (fit(cell, rows.copy(), first) for _ in range(2))
+    assert one.mean.tobytes() == two.mean.tobytes()
+    assert one.covariance.tobytes() == two.covariance.tobytes()
+    assert one.curve_v.tobytes() == two.curve_v.tobytes()
+
+
+def test_next_fit_starts_at_the_previous_one() -> None:
+    """From its own result a fit of the same rows finds no minimum that is worse."""
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell), Truth(soc=0.88, ln_q=-0.05), 0.1)
+    first = fit(cell, rows)
+    second = fit(cell, rows, first)
+    assert second.cost <= first.cost + 0.3
+    assert abs(second.mean[SOC] - first.mean[SOC]) < std_of(first)[SOC]
+
+
+def all_rest(rows: np.ndarray) -> np.ndarray:
+    rows = rows.copy()
+    rows["direction"] = 0.0
+    for name in ("current_a", "x_a", "charge_as", "throughput_soc", "hysteresis"):
+        rows[name] = 0.0
+    return rows
+
+
+def a_week_of_zeros(rows: np.ndarray) -> np.ndarray:
+    rows = all_rest(rows)
+    rows["elapsed_s"] *= 7.0 * 86400.0 / rows["elapsed_s"][-1]
+    return rows
+
+
+def without_voltages(rows: np.ndarray) -> np.ndarray:
+    rows = rows.copy()
+    rows["duration_s"], rows["reference_soc"], rows["reference_std"] = 0.0, 1.0, 0.01
+    return rows
+
+
+def single_rows(rows: np.ndarray) -> np.ndarray:
+    rows = rows[:12].copy()
+    rows["segment"] = np.arange(rows.size)
+    rows["gap_s"] = np.where(np.arange(rows.size) % 2, 3600.0, np.inf)
+    rows["charge_as"] = rows["throughput_soc"] = 0.0
+    return rows
+
+
+ODD = {
+    "one row": lambda rows: rows[:1],
+    "two rows": lambda rows: rows[:2],
+    "no voltages": without_voltages,
+    "all rest": all_rest,
+    "a week without current": a_week_of_zeros,
+    "segments of one row": single_rows,
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize("chemistry", ["nmc", "lfp"])
+def test_odd_history_gives_a_finite_fit(name: str, chemistry: str) -> None:
+    cell = cell_curves(chemistry)
+    rows = ODD[name](with_voltages(cell, measured_rows(cell, days=1), Truth()))
+    first = fit(cell, rows)
+    for fitted in (first, fit(cell, rows, first)):
+        assert np.isfinite(fitted.mean).all()
+        assert np.all(std_of(fitted) > 0.0)
+        assert np.isfinite(fitted.curve_v).all()
+
+
+@settings(max_examples=8, phases=[Phase.explicit, Phase.generate])
+@given(
+    seed=st.integers(0, 1000),
+    count=st.integers(1, 25),
+    temperature_c=st.floats(-40.0, 80.0),
+    error_v=st.floats(-2.0, 2.0),
+    charge_scale=st.floats(-20.0, 20.0),
+    filter_soc=st.floats(0.0, 1.0),
+    capacity_std=st.sampled_from([0.0, 0.05, 0.5]),
+    offset_std_a=st.sampled_from([0.0, 0.01, 1.0]),
+    gap_s=st.sampled_from([0.0, 60.0, 1e6, np.inf]),
+)
+def test_any_finite_history_gives_a_finite_fit(
+    seed: int,
+    count: int,
+    temperature_c: float,
+    error_v: float,
+    charge_scale: float,
+    filter_soc: float,
+    capacity_std: float,
+    offset_std_a: float,
+    gap_s: float,
+) -> None:
+    """Rows in random order of charge, with wrong voltages and extreme temperatures."""
+    cell, rng = cell_curves(), np.random.default_rng(seed)
+    cell.capacity_std, cell.offset_std_a = capacity_std, offset_std_a
+    rows = with_voltages(cell_curves(), measured_rows(cell, days=1), Truth())
+    rows = rows[np.sort(rng.choice(rows.size, count, replace=False))]
+    rows["temperature_c"], rows["soc"], rows["gap_s"] = temperature_c, filter_soc, gap_s
+    rows["voltage_v"] += error_v * rng.normal(size=count)
+    rows["charge_as"] *= charge_scale
+    rows["segment"] = np.cumsum(rng.random(count) < 0.2)
+    fitted = fit(cell, rows)
+    assert np.isfinite(fitted.mean).all()
+    assert np.isfinite(fitted.covariance).all()
+    assert np.all(np.linalg.eigvalsh(fitted.covariance) > -1e-9)
+
+
+def test_no_rows_and_rows_that_are_not_finite_are_refused() -> None:
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell, days=1), Truth())
+    with pytest.raises(FitError, match="no rows"):
+        fit(cell, rows[:0])
+    for name in ("voltage_v", "temperature_c", "charge_as", "current_a"):
+        bad = rows.copy()
+        bad[name][5] = np.nan
+        with pytest.raises(FitError, match=f"row 5 of {rows.size}: {name}"):
+            fit(cell, bad)
