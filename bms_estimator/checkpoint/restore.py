@@ -18,8 +18,6 @@ from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET
 
 _PARTS_WITHOUT_FILTER = ("observer.", "learning.", "series_resistance.")
 """Prefixes of the fields that are also estimated while the filter is off."""
-_MAY_BE_INFINITE = ("filter.learned_soc",)
-"""Fields that are infinite after a fit of the pack's model was adopted."""
 EXTENDABLE_FIELDS = {"filter.mean": 1, "filter.covariance": 2}
 """Number of trailing axes along the filter's states, by field. Later versions append states at the end of these axes."""
 MAX_SOC_DIFFERENCE = 0.03
@@ -118,7 +116,7 @@ def _invalid_state_reason(estimator: Estimator, after_first_sample: NDArray[np.v
         checked = np.isfinite(first_field)
         if (
             part in ("observer", "learning", "series_resistance", "filter", "checks", "anchors", "map")
-            and not (np.isfinite(field[checked]) | (name in _MAY_BE_INFINITE and ~np.isnan(field[checked]))).all()
+            and not np.isfinite(field[checked]).all()
         ):
             return f"{quantity} of the {part} is not finite"
     s, first = record[0]["observer"], after_first_sample[0]["observer"]

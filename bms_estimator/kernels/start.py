@@ -60,7 +60,7 @@ def restart_filter(s: Record, p: Record, gap_s: float, current_a: float, voltage
         spawn_hypotheses(f, p.filter, f.soc, min(soc_std, MAX_SOC_STD_AFTER_GAP))
     else:
         merge_all(f)
-        begin_gap(f, gap_s)
+        begin_gap(f, p.filter, gap_s)
         rested = gap_s < math.inf and is_resting(f, p.filter)
         propagate_over_gap(f, p.filter, gap_s, rested)
         spawn_after_gap(f, p.filter, gap_s, rested)

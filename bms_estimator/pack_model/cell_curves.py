@@ -55,6 +55,9 @@ class CellCurves:
         """Std of the OCV's error that differs between charge, rest and discharge [V]."""
         self.drop_std = float(np.clip(DROP_OF_R_STD * self.r_std, *DROP_STD))
         """Relative std of the overpotential at one SOC, which differs between charge and discharge."""
+        self.charge_error, self.aged_soc = float(settings["charge_error"]), float(settings["aged_soc"])
+        self.event_probability, self.event_s = float(settings["event_probability"]), float(settings["event_s"])
+        self.offset_s = float(settings["offset_s"])
         self.offset_std_a = float(settings["offset_c"]) * self.one_c_a
 
     def ocv(self, soc: Floats) -> Floats:

@@ -21,8 +21,6 @@ LIKELIHOOD_EXPONENT = 0.2
 """Exponent of the likelihood in the weights of minima. It is below 1, because errors of successive rows are not independent."""
 SAME_COST, SAME_SOC = 0.3, 0.01
 """Differences of cost and SOC below which two minima count as one."""
-MIN_SOC_STD = 0.005
-"""Minimum std of the SOC, because full and empty of a cell are not defined better."""
 NODE_SOC = np.linspace(0.0, 1.0, NODES)
 """SOCs of the filter's OCV nodes."""
 SOC, LN_Q, OFFSET, LN_R, CURVE = 0, 1, 2, slice(3, 6), slice(6, 6 + NODES)

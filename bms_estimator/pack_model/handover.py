@@ -76,7 +76,7 @@ def adopt_state(estimator: Estimator, fit: PackFit) -> None:
     """
     f, h = estimator.record[0]["filter"], estimator.record[0]["history"]
     p = estimator.settings_record[0]["filter"]
-    f["learned_soc"] = np.inf
+    f["learned_soc"] = p["learning_soc"]  # the filter holds capacity and curve from now on
     if h["segment"] != fit.segment:
         for q in range(int(f["count"])):
             _adopt_parameters(f["mean"][q], f["covariance"][q], fit, p, FIRST_PARAMETER)

@@ -15,12 +15,8 @@ COUNTED_STD = 0.015
 band reports no current at night, so that a day's count may be wrong by several percent."""
 HOUR_S = 3600.0
 """Length of an hour [s]."""
-CHARGE_ERROR = 0.002
-"""Std of the SOC after a throughput of 1, due to the nonlinearity of the current sensor."""
 DAY_SOC = 0.002
 """Std of the SOC counted over a day in addition to that by its throughput."""
-EVENT_PROBABILITY, EVENT_S = 0.5, 3600.0
-"""Probability that a long gap hides a charge or an exchange of the pack, and time constant with which it grows [s]."""
 
 
 class Intervals:
@@ -111,6 +107,6 @@ class Links:
             interval=k,
             drawn_soc=intervals.drawn_soc[starts[k] - 1] + counted_as / cell.capacity_as,
             hours=intervals.hours[starts[k] - 1] + between_s / HOUR_S,
-            std=np.sqrt(CHARGE_ERROR**2 * throughput_soc + DAY_SOC**2 * days + variance_as2 / cell.capacity_as**2),
-            event_probability=np.where(is_gap, EVENT_PROBABILITY * -np.expm1(-after["gap_s"] / EVENT_S), 0.0),
+            std=np.sqrt(cell.charge_error**2 * throughput_soc + DAY_SOC**2 * days + variance_as2 / cell.capacity_as**2),
+            event_probability=np.where(is_gap, cell.event_probability * -np.expm1(-after["gap_s"] / cell.event_s), 0.0),
         )

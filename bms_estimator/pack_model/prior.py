@@ -6,6 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.kalman_filter.anchors import FULL
+from bms_estimator.kernels.kalman_filter.ekf import INDEPENDENT_R_STD
+from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
+from bms_estimator.kernels.kalman_filter.ocv_correction import CORRELATION_SOC
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.intervals import Intervals
@@ -18,8 +21,6 @@ from bms_estimator.pack_model.unknowns import (
     Unknowns,
 )
 
-CURVE_CORRELATION_SOC = 0.6
-"""Correlation length of the OCV's error [SOC]. Cells of one chemistry differ in the used range of the electrodes."""
 SLIP_SOC = 0.02
 """Std of the place of a feature of the OCV along SOC."""
 SLIP_CORRELATION_SOC = 0.3
@@ -34,14 +35,10 @@ DIRECTION_CORRELATION_SOC = 0.1
 """Correlation length of the error by direction [SOC]."""
 SHAPE_STD, SHAPE_CORRELATION_SOC = 0.15, 0.4
 """Relative std of the resistances over SOC, and its correlation length."""
-INDEPENDENT_R_STD = 0.5
-"""Maximum std of the independent parts of the scales of the resistances. The rest of a larger std is common to all."""
 RC_CORRELATION = 0.7
 """Prior correlation of the scales of the fast and slow RC pairs."""
 HYSTERESIS_MEAN, HYSTERESIS_STD = 0.5, 0.5
 """Prior of the fraction of the cell file's hysteresis in each of its two parts."""
-START_HYSTERESIS_STD = 0.7
-"""Std of the hysteresis at the start of a segment, where -1 and 1 are its limits."""
 ENTROPY_STD_V = 1.5e-4
 """Std of the temperature coefficient of the OCV [V/K]."""
 ARRHENIUS_STD = 0.004
@@ -50,10 +47,6 @@ MIN_FULL_STD = 0.006
 """Minimum std of the SOC at which this pack's charger ends, common to all charges."""
 FULL_REPEAT_STD = 0.01
 """Std of the SOC of one end of charge about the mean of this pack's charges."""
-OFFSET_DAYS = 10.0
-"""Time constant of the drift of the current sensor's offset [days]."""
-AGED_SOC = 1000.0
-"""Charge throughput over which aging changes the capacity by its initial std [SOC]."""
 CALENDAR_STD = 0.05
 """Std of the change of the capacity in a year without use."""
 MIN_CAPACITY_STD, MIN_AGING_STD = 1e-4, 1e-4
@@ -100,7 +93,7 @@ class Prior:
         diagonal = self.precision.ravel()[:: u.size + 1]
         for part, std in (
             (u.hysteresis, HYSTERESIS_STD),
-            (u.start_hysteresis, START_HYSTERESIS_STD),
+            (u.start_hysteresis, HYST_STD),
             (u.entropy, ENTROPY_STD_V),
             (u.arrhenius, ARRHENIUS_STD),
         ):
@@ -126,7 +119,7 @@ class Prior:
         std = max(cell.offset_std_a / cell.one_c_a, MIN_OFFSET_STD_C)
         self._add_square([u.offset.start], [1.0], std)
         for k, days in enumerate(days_between(intervals), start=1):
-            keep = math.exp(-max(days, MIN_DAYS) / OFFSET_DAYS)
+            keep = math.exp(-max(days, MIN_DAYS) * DAY_S / cell.offset_s)
             self._add_square([u.offset.start + k, u.offset.start + k - 1], [1.0, -keep], std * math.sqrt(1.0 - keep**2))
 
     def _add_capacity(self, cell: CellCurves, intervals: Intervals, u: Unknowns) -> None:
@@ -135,7 +128,7 @@ class Prior:
         self._add_square([u.ln_q.start], [1.0], max(cell.capacity_std, MIN_CAPACITY_STD))
         used_soc = rows["throughput_soc"][intervals.ends] - rows["throughput_soc"][starts]
         for k, days in enumerate(days_between(intervals), start=1):
-            by_use = 2.0 * cell.capacity_std**2 * max(float(used_soc[k - 1]), 0.0) / AGED_SOC
+            by_use = 2.0 * cell.capacity_std**2 * max(float(used_soc[k - 1]), 0.0) / cell.aged_soc
             variance = by_use + CALENDAR_STD**2 * days / YEAR_DAYS + MIN_AGING_STD**2
             self._add_square([u.ln_q.start + k, u.ln_q.start + k - 1], [1.0, -1.0], math.sqrt(variance))
 
@@ -178,13 +171,13 @@ def curve_covariance(cell: CellCurves, soc: Floats) -> Floats:
     level_v = np.sqrt(error_v**2 - slip_v**2)
     distance = np.abs(soc[:, None] - soc)
     slip_v2 = np.outer(slip_v, slip_v) * np.exp(-distance / SLIP_CORRELATION_SOC)
-    level_v2 = np.outer(level_v, level_v) * np.exp(-distance / CURVE_CORRELATION_SOC)
+    level_v2 = np.outer(level_v, level_v) * np.exp(-distance / CORRELATION_SOC)
     return np.asarray(slip_v2 + level_v2)
 
 
 def variance_between_nodes(cell: CellCurves, soc: Floats) -> Floats:
     """Return the mean variance of the OCV's error about its interpolation between two nodes [V^2]."""
-    correlation = math.exp(-1.0 / (CURVE_NODES - 1) / CURVE_CORRELATION_SOC)
+    correlation = math.exp(-1.0 / (CURVE_NODES - 1) / CORRELATION_SOC)
     return np.asarray(np.interp(soc, SOC_GRID, cell.error_v) ** 2 * (1.0 - correlation) / 3.0)
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.kalman_filter.ekf import LEARNING_SOC
 from bms_estimator.kernels.kalman_filter.hypotheses import spawn_hypotheses
-from bms_estimator.kernels.kalman_filter.records import LN_Q, NODE
+from bms_estimator.kernels.kalman_filter.records import LN_Q, NODE, Noise
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
@@ -94,7 +93,7 @@ def test_capacity_and_ocv_are_learned_in_the_first_pass_of_the_curve_and_then_he
     estimator.run(block[:7000])
     assert not np.array_equal(cell_estimates(estimator)[0], initial_mean)
     estimator.run(block[7000:8640])
-    assert estimator.record[0]["filter"]["learned_soc"] == LEARNING_SOC
+    assert estimator.record[0]["filter"]["learned_soc"] == Noise().learning_soc
     mean, variance = cell_estimates(estimator)
     estimator.run(block[8640:])
     held_mean, held_variance = cell_estimates(estimator)
@@ -134,7 +133,7 @@ def test_a_reinitialization_of_the_soc_does_not_change_estimates_of_the_cell() -
     estimator = Estimator(use.cell, initial_soc=0.8)
     estimator.run(use.samples[:600])
     f, p = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
-    f["learned_soc"] = LEARNING_SOC
+    f["learned_soc"] = Noise().learning_soc
     spawn_hypotheses(f, p, float(use.soc[600]) - 0.4, 0.01)
     mean, _ = cell_estimates(estimator)
     estimator.run(use.samples[600:3000])

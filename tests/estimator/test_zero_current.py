@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter import ekf
-from bms_estimator.kernels.kalman_filter.records import EKF_STATE, OFFSET, SOC, STATES
+from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE, OFFSET, SOC, STATES
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings
@@ -146,13 +146,14 @@ def test_a_constant_small_load_stays_in_the_interval() -> None:
 
 def test_a_direct_update_of_a_state_equals_the_kalman_update() -> None:
     rng = np.random.default_rng(3)
-    s = np.zeros(1, EKF_STATE)[0]
+    s, p = np.zeros(1, EKF_STATE)[0], np.zeros(1, EKF_SETTINGS)[0]
+    p["learning_soc"] = 1.0
     root = rng.standard_normal((STATES, STATES))
     before, mean = root @ root.T, rng.standard_normal(STATES)
     mean[SOC] = 0.5
     s["covariance"][0], s["mean"][0] = before, mean
     innovation, variance = 0.01, 0.3
-    ekf.update_state_directly(s, 0, OFFSET, mean[OFFSET] + innovation, variance)
+    ekf.update_state_directly(s, p, 0, OFFSET, mean[OFFSET] + innovation, variance)
     gain = before[OFFSET] / (before[OFFSET, OFFSET] + variance)
     assert s["mean"][0] == pytest.approx(mean + innovation * gain)
     assert s["covariance"][0] == pytest.approx(before - np.outer(gain, before[OFFSET]))

@@ -227,7 +227,7 @@ class _Pack:
         settings = settings_of(self._spec)
         sensor, sampling = settings.sensor, settings.sampling
         series, parallel = self._spec.series, self._spec.parallel
-        return Estimator(
+        estimator = Estimator(
             cell,
             settings.observer,
             identifier=settings.identifier,
@@ -240,6 +240,9 @@ class _Pack:
                 current_dead_band_a=sampling.current_dead_band_a / parallel,
             ),
         )
+        # the samples are one recording of hours, all of which the filter may learn from
+        estimator.settings_record["filter"]["learning_soc"] = math.inf
+        return estimator
 
     def _cell_file(self, cell: CellModel, method: str, before_v: float, after_v: float) -> str:
         name = cell_name(self._outcome.pack)

@@ -57,4 +57,4 @@ def update_offset_at_rest(s: Record, p: Record) -> None:
     for q in range(s.count):
         offset_a2 = s.covariance[q, OFFSET, OFFSET]
         if offset_a2 > MIN_VARIANCE_RATIO * information_a2:
-            update_state_directly(s, q, OFFSET, half_a, offset_a2 * information_a2 / (offset_a2 - information_a2))
+            update_state_directly(s, p, q, OFFSET, half_a, offset_a2 * information_a2 / (offset_a2 - information_a2))

@@ -61,11 +61,6 @@ HOLD_CAPACITY, HOLD_NODES, HOLD_OFFSET, HOLD_CURVE = 1, 2, 4, 8
 """Bits of a set of states that an update does not change: LN_Q, the OCV nodes, OFFSET, and CURVE."""
 HOLD_CELL = HOLD_CAPACITY | HOLD_NODES
 """States of the cell that do not change within hours."""
-LEARNING_SOC = 1.0
-"""Charge throughput after switch-on in which the filter learns LN_Q and the OCV nodes [SOC]: one pass of the curve. Then it holds
-them: their errors still count in the std of the SOC, but voltages do not change them. A filter that linearizes each pass about
-another estimate takes the same errors of the curve for new information, and its std decreases while its error remains. A first
-gap ends the learning, too."""
 INDEPENDENT_R_STD = 0.5
 """Maximum std of the independent parts of LN_R0 and LN_R. The rest of a larger std is common to both, because it is due to
 the unknown size of the cell. Only cell files of cells that were not measured have a larger std."""
@@ -260,12 +255,12 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
 
 
 @njit(cache=True)
-def update_state_directly(s: Record, q: int, j: int, value: float, variance: float) -> None:
+def update_state_directly(s: Record, p: Record, q: int, j: int, value: float, variance: float) -> None:
     """Update hypothesis ``q`` by a direct measurement of state ``j``."""
     x, cov, ph = s.mean[q], s.covariance[q], s.ph
     for k in range(STATES):
         ph[k] = cov[j, k]
-    apply_correction(x, cov, ph, value - x[j], cov[j, j] + variance, cell_to_hold(s))
+    apply_correction(x, cov, ph, value - x[j], cov[j, j] + variance, cell_to_hold(s, p))
 
 
 @njit(cache=True)
@@ -281,17 +276,17 @@ def states_to_hold(s: Record, p: Record, q: int) -> int:
         is_charge = s.x_a[CHARGE] < -CHARGE_C * one_c
         return HOLD_CELL | HOLD_OFFSET | (HOLD_CURVE if is_charge else 0)
     if p.r_std <= INDEPENDENT_R_STD:
-        return cell_to_hold(s)
+        return cell_to_hold(s, p)
     small_a = NEARLY_FULL_C * one_c if soc > NEARLY_FULL_SOC else LEARNING_C * one_c
     varying = s.x_a[TREND] > 0.0 and s.rms_a2 - s.mean_a * s.mean_a > (VARYING_C * one_c) ** 2
     capacity_is_visible = abs(s.x_a[TREND]) < small_a or varying
-    return cell_to_hold(s) | (0 if capacity_is_visible else HOLD_CAPACITY)
+    return cell_to_hold(s, p) | (0 if capacity_is_visible else HOLD_CAPACITY)
 
 
 @njit(cache=True)
-def cell_to_hold(s: Record) -> int:
+def cell_to_hold(s: Record, p: Record) -> int:
     """Return the set of the cell's states if the filter has learned them, and the empty set before."""
-    return HOLD_CELL if s.learned_soc >= LEARNING_SOC else 0
+    return HOLD_CELL if s.learned_soc >= p.learning_soc else 0
 
 
 @njit(cache=True)

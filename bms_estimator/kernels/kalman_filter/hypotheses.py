@@ -20,7 +20,6 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
 from bms_estimator.kernels.kalman_filter.current_offset import update_offset_at_rest
 from bms_estimator.kernels.kalman_filter.ekf import (
     INDEPENDENT_R_STD,
-    LEARNING_SOC,
     MAX_SOC,
     MIN_SOC,
     adapt_bias_inflation,
@@ -244,24 +243,24 @@ def normal_density(x: float, mean: float, std: float) -> float:
 
 
 @njit(cache=True)
-def end_learning(s: Record) -> None:
+def end_learning(s: Record, p: Record) -> None:
     """Hold LN_Q from now on, and set the OCV nodes to their prior.
 
     The nodes learned in one pass have common errors with the SOC of that pass.
     """
-    s.learned_soc = LEARNING_SOC
+    s.learned_soc = p.learning_soc
     for q in range(s.count):
         reset_ocv_correction(s.mean[q], s.covariance[q])
 
 
 @njit(cache=True)
-def begin_gap(s: Record, gap_s: float) -> None:
+def begin_gap(s: Record, p: Record, gap_s: float) -> None:
     """Store the SOC before a gap of ``gap_s`` [s], or no gap if its duration is infinite, and end the learning."""
     s.gap_s = gap_s if gap_s < math.inf else 0.0
     s.soc_before, s.std_before = s.mean[0, SOC], math.sqrt(s.covariance[0, SOC, SOC])
     s.exchanged = 0
-    if s.learned_soc < LEARNING_SOC:
-        end_learning(s)
+    if s.learned_soc < p.learning_soc < math.inf:
+        end_learning(s, p)
 
 
 @njit(cache=True)
@@ -285,10 +284,10 @@ def update_hypotheses(s: Record, p: Record) -> None:
         prepare_transition(s, p)
     update_arrhenius_factors(s)
     s.seeded_s += dt_s
-    if s.learned_soc < LEARNING_SOC:
+    if s.learned_soc < p.learning_soc:
         s.learned_soc += w.throughput_as / p.capacity_as
-        if s.learned_soc >= LEARNING_SOC:
-            end_learning(s)
+        if s.learned_soc >= p.learning_soc:
+            end_learning(s, p)
     s.soc_before -= w.charge_as / p.capacity_as
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
     scale, best = innovation_scale(s, p), 0

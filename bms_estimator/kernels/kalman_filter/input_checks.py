@@ -8,7 +8,6 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
-from bms_estimator.kernels.kalman_filter.ekf import LEARNING_SOC
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS
 from bms_estimator.kernels.kalman_filter.frozen_sensor import (
     FAST_S,
@@ -292,7 +291,7 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     soc_std = max(f.soc_std, RESTORED_STD)
     if c.suspects & SIGN_OF_CURRENT:
         soc_std = max(f.soc_std, p.soc_std)
-        if f.learned_soc < LEARNING_SOC:
+        if f.learned_soc < p.learning_soc:
             initialize_filter(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
     spawn_hypotheses(f, p, f.soc, soc_std)
     reset_window(f)

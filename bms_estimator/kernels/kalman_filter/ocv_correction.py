@@ -9,7 +9,7 @@ A voltage depends on SOC and curve together, so that its information on the curv
 The joint covariance contains this limit, so that no rule has to select voltages for learning (as in simultaneous
 localization and mapping: Smith, Self and Cheeseman 1990).
 
-The nodes are learned in the first pass of the curve (``ekf.LEARNING_SOC``). Afterwards they are considered states with their
+The nodes are learned in the first pass of the curve (``Noise.learning_soc``). Afterwards they are considered states with their
 prior: their gain is 0 (Schmidt-Kalman filter).
 
 ``x`` is a mean of EKF_STATE, ``p`` a record of EKF_SETTINGS.

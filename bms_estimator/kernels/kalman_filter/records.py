@@ -89,6 +89,11 @@ class Noise:
     """P(0): std of the part of the unknown load that is constant for hours, as a C-rate."""
     load_s: float = 20.0
     """P(0): correlation time of the varying part of the unknown load [s]."""
+    learning_soc: float = 1.0
+    """Charge throughput after switch-on in which the filter learns LN_Q and the OCV nodes [SOC]: one pass of the curve. Then it
+    holds them: their errors still count in the std of the SOC, but voltages do not change them. A filter that linearizes each
+    pass about another estimate takes the same errors of the curve for new information, and its std decreases while its error
+    remains. A first gap ends the learning, too, unless the throughput is infinite."""
     event_probability: float = 0.5
     """P(0): probability that a long gap hides a charge, a discharge or an exchange of the pack, so that any SOC is possible.
     Nothing is known about it, so that the odds are even."""
@@ -179,7 +184,7 @@ EKF_STATE = np.dtype(
         ("started", "i8"),  # 1: initialized
         ("seeded_s", "f8"),  # time since the hypotheses were initialized [s]
         ("reopened", "i8"),  # number of re-initializations of the SOC because of an implausible bias
-        ("learned_soc", "f8"),  # charge throughput with LN_Q and OCV nodes learned, up to ``ekf.LEARNING_SOC`` [SOC]
+        ("learned_soc", "f8"),  # charge throughput with LN_Q and OCV nodes learned, up to ``learning_soc`` [SOC]
         ("gap_s", "f8"),  # duration of the last gap that may hide a charge [s]; 0: none
         ("soc_before", "f8"),  # SOC before this gap, less the charge counted since it
         ("std_before", "f8"),  # std of the SOC before this gap

@@ -22,7 +22,7 @@ LIMITS = {
     "nca": (95, 80, 4.9),
     "lfp": (95, 90, 4.1),
     "lmo": (84, 72, 7.0),
-    "lco": (88, 62, 8.0),
+    "lco": (88, 65, 8.0),
     "lto": (95, 85, 7.1),
 }
 """Limits by chemistry: minimum share of time within two std as the mean of the captures, the same for the worst capture, and

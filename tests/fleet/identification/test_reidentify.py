@@ -63,7 +63,7 @@ def test_pack_of_aged_cells_gets_a_better_cell_file(samples):
     assert (cell.cell.name, cell.cell.series_count) == ("of-house", 1)
     assert cell.cell.capacity_ah == pytest.approx(result.capacity_ah)
     r_s_at_half_soc = TRUTH.a[13] * np.exp(-0.5 * TRUTH.a[14]) + TRUTH.a[15]  # series resistance of Chen and Mora
-    assert result.r_s_ohm == pytest.approx(r_s_at_half_soc, rel=0.2)
+    assert result.r_s_ohm == pytest.approx(r_s_at_half_soc, rel=0.05)
 
 
 def test_cell_that_is_not_better_is_not_used(samples):
