@@ -16,6 +16,7 @@ from bms_estimator.kernels.kalman_filter.ocv_correction import (
 from bms_estimator.kernels.kalman_filter.records import NODE, NODES, STATES
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.pack_model.learning import SlowFit
 from tests.estimator.anywhere.cases import OXIDE, Case, cell_file, load_a
 from tests.estimator.anywhere.truth import simulate
 
@@ -62,11 +63,12 @@ def test_an_ocv_with_a_plateau_is_not_learned() -> None:
 
 
 def simulate_partial_cycles(
-    cell: CellModel, cycles: int, passes: float = math.inf
+    cell: CellModel, cycles: int, passes: float = math.inf, *, slow_fit: bool = False
 ) -> tuple[np.ndarray, np.ndarray, Estimator]:
     """Run an estimator whose initial SOC is 0.1 too high; return the error of the SOC, its std, and the estimator.
 
-    The run ends after a charge throughput of ``passes`` times the capacity. Each cycle is a drive from SOC 0.85 to about 0.35, a rest, a charge and a rest.
+    The run ends after a charge throughput of ``passes`` times the capacity. Each cycle is a drive from SOC 0.85 to about 0.35,
+    a rest, a charge and a rest.
     """
     pieces, soc, charge_c, rest_s = [], 0.85, 0.35, 2400
     for n in range(cycles):
@@ -86,7 +88,7 @@ def simulate_partial_cycles(
     )
     estimator = Estimator(cell, initial_soc=soc + 0.1)
     throughput = np.cumsum(np.abs(current_a)) / 3600.0 / OXIDE.capacity_ah
-    trace = estimator.run(samples[throughput < passes])
+    trace = (SlowFit(estimator) if slow_fit else estimator).run(samples[throughput < passes])
     true_soc = true_soc[: trace.size]
     return trace["soc"] - true_soc, trace["soc_std"].copy(), estimator
 
@@ -118,3 +120,17 @@ def test_the_ocv_of_a_generic_cell_is_learned_in_the_first_pass_only() -> None:
     correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], soc)
     assert (correction_v == 0.0).all()
     assert std_v == pytest.approx(np.interp(soc, CURVE_GRID, p["curve_error_v"]), rel=1e-6)
+
+
+def test_the_slow_fit_learns_the_ocv_of_a_generic_cell_as_far_as_the_soc_is_known() -> None:
+    """The slow fit learns the curve over all cycles. Neither SOC nor OCV becomes certain."""
+    soc, grid = np.linspace(0.4, 0.8, 9), np.linspace(0.0, 1.0, 401)
+    error, std, estimator = simulate_partial_cycles(GENERIC, cycles=6, slow_fit=True)
+    assert (np.abs(error[900:]) < 2.0 * std[900:]).mean() > 0.95
+    p, file = estimator.settings_record[0]["filter"], estimator.cell_file_settings
+    before_v = np.interp(soc, grid, OXIDE.ocv_v - file["ocv_v"])
+    after_v = np.interp(soc, grid, OXIDE.ocv_v - p["ocv_v"])
+    std_v = np.interp(soc, CURVE_GRID, p["curve_error_v"])
+    assert (np.abs(after_v) < 2.0 * std_v).all()
+    assert (std_v < 0.8 * np.interp(soc, CURVE_GRID, file["curve_error_v"])).all()
+    assert np.std(after_v) < 0.5 * np.std(before_v)
