@@ -24,8 +24,8 @@ SLOPE_REACH = 0.01
 
 
 DIRECTION_OF_ERROR, DIRECTION_STD_V = 0.5, (2e-3, 6e-3)
-"""Std of the OCV's error by direction as a fraction of the OCV's std, and its limits [V]. Simulated weeks of measured cells
-have 2 to 3 mV, generic cells up to 6 mV."""
+"""Std of the OCV's error by direction as a fraction of the OCV's std, and its limits [V]. The upper
+limit is assumed for generic cells, and the lower one for cells whose file was fitted to their own captures."""
 DROP_OF_R_STD, DROP_STD = 0.25, (0.04, 0.08)
 """Relative std of the overpotential at one SOC as a fraction of the std of ln R, and its limits."""
 

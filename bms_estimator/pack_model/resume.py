@@ -15,7 +15,7 @@ from bms_estimator.pack_model.history import History
 def resume_history(
     h: np.void, f: np.void, history: History, gap_s: float, capacity_as: float, *, restored: bool
 ) -> None:
-    """Append what the checkpoint knows beyond the saved rows, and begin a segment with an unused number.
+    """Append the rows of the checkpoint that are not in the saved history, and begin a segment with an unused number.
 
     Args:
         h: Record of dtype HISTORY: restored from a checkpoint, or new.
