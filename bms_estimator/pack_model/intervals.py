@@ -93,14 +93,19 @@ class Links:
         k = k[k > 0]
         is_gap, before, after = is_new[k], rows[starts[k] - 1], rows[starts[k]]
 
-        def counted(name: str, since: Floats) -> Floats:
-            """Return the increase of a counter, which restarts with each segment."""
-            return np.asarray(after[name] - np.where(is_gap, 0.0, since))
-
         first = rows[starts[k - 1]]
-        counted_as = counted("charge_as", before["charge_as"])
-        throughput_soc = counted("throughput_soc", first["throughput_soc"])
-        variance_as2 = np.maximum(counted("charge_variance_as2", first["charge_variance_as2"]), 0.0)
+
+        def counted(name: str) -> Floats:
+            """Return the increase of a counter, which restarts with each segment."""
+            return np.asarray(before[name] - first[name] + counted_since(before, name))
+
+        def counted_since(row: NDArray[np.void], name: str) -> Floats:
+            """Return the increase of a counter since a row that lies before the gap, if there is one."""
+            return np.asarray(after[name] - np.where(is_gap, 0.0, row[name]))
+
+        counted_as = counted_since(before, "charge_as")
+        throughput_soc = counted("throughput_soc")
+        variance_as2 = np.maximum(counted("charge_variance_as2"), 0.0)
         between_s = np.where(is_gap, 0.0, after["elapsed_s"] - before["elapsed_s"])
         days = np.maximum(after["elapsed_s"] - first["elapsed_s"], HOUR_S) / INTERVAL_S
         return cls(
