@@ -20,7 +20,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month observability resolution unseen nats ble chapter5 ablation learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month observability resolution unseen nats ble chapter5 ablation ablation-weeks learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -56,7 +56,7 @@ demo-fleet: venv ## a fleet's server, 1,000 simulated packs, two workers of whic
 	@$(BIN)/bms-estimator fleet demo $(ARGS)
 
 fleet: venv ## cost of a fleet, in processes on this machine, e.g. make fleet ARGS="--packs 10000 --minutes 5"
-	@$(BIN)/python -m tests.benchmarks.fleet $(ARGS)
+	@$(BIN)/python -m tests.benchmarks.fleet.processes $(ARGS)
 
 fleet-kills: venv ## workers and server nodes killed 100 times, with one node and with three, states compared bit by bit: 15 minutes
 	for nodes in $(NODES); do KILLS=$(KILLS) NODES=$$nodes $(BIN)/python -m pytest -s --timeout=7200 \
@@ -78,7 +78,7 @@ ble: ## a BMS over Bluetooth with a simulated BlueZ; the extra needs Python 3.12
 	$(BLE)/bin/python -m pytest -o addopts= --noconftest -rs tests/sources/bluetooth/test_source.py tests/sources/bluetooth/test_client.py $(ARGS)
 
 benchmark: venv ## the table of measured times, rates and memory
-	@$(BIN)/python tests/benchmarks $(ARGS)
+	@$(BIN)/python -m tests.benchmarks.speed $(ARGS)
 
 compare: ## comparison of methods, including PyBOP, on all real captures, e.g. make compare ARGS="NCR Leaf": minutes
 	@[ -x $(COMPARE)/bin/python ] || $(PYTHON) -m venv $(COMPARE)
@@ -92,11 +92,11 @@ anywhere: venv ## SOC error from any starting point of real captures, e.g. make 
 month: venv ## SOC error over simulated weeks of use, day by day, e.g. make month ARGS="A123 --days 30 --seeds 1 2": minutes
 	@$(BIN)/python -m tests.estimator.month $(ARGS)
 
-observability: venv ## the smallest honest std of the SOC by cell and SOC window, e.g. make observability ARGS="lfp --window 0.5 0.95"
+observability: venv ## the lower bound of the std of the SOC by cell and SOC window, e.g. make observability ARGS="lfp --window 0.5 0.95"
 	@$(BIN)/python -m tests.benchmarks.observability $(ARGS)
 
 chapter5: venv ## the experiments of the thesis's chapter 5 on real captures, beside Tables 11 and 13
-	@$(BIN)/python -m tests.benchmarks.chapter5
+	@$(BIN)/python -m tests.benchmarks.thesis.chapter5
 
 resolution: venv ## SOC error by rate, steps and delay of a source, simulated, e.g. make resolution ARGS=house: two minutes
 	@$(BIN)/python -m tests.benchmarks.resolution $(ARGS)
@@ -107,17 +107,20 @@ unseen: venv ## SOC error through kills, restarts and gaps, on real captures: mi
 ablation: venv ## ablation of the filter on real captures, e.g. make ablation ARGS=LFP: minutes
 	@$(BIN)/python -m tests.benchmarks.ablation $(ARGS)
 
+ablation-weeks: venv ## ablation of the slow fit over simulated weeks, e.g. make ablation-weeks ARGS="solar --parts slow Huber": hours
+	@$(BIN)/python -m tests.benchmarks.weeks $(ARGS)
+
 fuelcell: venv ## figures of the fuel cell, docs/theory/fuel-cell.md: half a minute
-	@$(BIN)/python -m tests.benchmarks.fuel_cell
+	@$(BIN)/python -m tests.benchmarks.thesis.fuel_cell
 
 learning: venv ## ablation of the learning law, simulated
-	@$(BIN)/python -m tests.benchmarks.learning_law
+	@$(BIN)/python -m tests.benchmarks.thesis.learning_law
 
 fuzz: venv ## edited inputs to all readers of foreign bytes, e.g. make fuzz INPUTS=1000 ARGS="-k jbd": half an hour
 	INPUTS=$(INPUTS) $(BIN)/python -m pytest --numprocesses=2 --hypothesis-profile=long --timeout=7200 --show-capture=no tests/fuzz $(ARGS)
 
 load: venv ## 5,000 frames/s for 10 min over a PTY, a day of serial bytes, attacks on listeners, alarms and a fleet, e.g. make load ARGS="--minutes 1 --hours 2"
-	@$(BIN)/python -m tests.benchmarks.endurance $(ARGS)
+	@$(BIN)/python -m tests.benchmarks.long_runs.endurance $(ARGS)
 
 audit: ## known vulnerabilities of requirements.lock; exit code of .ci/audit.py 3 where the data cannot be reached
 	@[ -x $(AUDIT)/bin/python ] || $(PYTHON) -m venv $(AUDIT)
@@ -125,10 +128,10 @@ audit: ## known vulnerabilities of requirements.lock; exit code of .ci/audit.py 
 	@$(AUDIT)/bin/python .ci/audit.py
 
 page: apt venv ## cost of the live page in a real Chromium at 10 Hz, e.g. make page ARGS=60: minutes
-	@$(BIN)/python -m tests.benchmarks.page $(ARGS)
+	@$(BIN)/python -m tests.benchmarks.speed.page $(ARGS)
 
 fleet-page: venv ## cost of the page of a fleet of 100,000 packs, e.g. make fleet-page ARGS="--packs 10000": four minutes
-	@$(BIN)/python -m tests.benchmarks.fleet_page $(ARGS)
+	@$(BIN)/python -m tests.benchmarks.fleet.page $(ARGS)
 
 screenshots: apt venv ## the pictures of the live page and of the page of a fleet in docs
 	@$(BIN)/python -m tests.page.screenshots

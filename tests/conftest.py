@@ -40,6 +40,7 @@ LONG_FILES = (
     "tests/service/test_process.py",
     "tests/end_to_end/test_whole_way.py",
     "tests/telemetry/test_alarms.py",
+    "tests/estimator/month/test_summary.py",
     "tests/estimator/test_faults.py",
     "tests/reports/test_errata.py",
     "tests/firmware/test_firmware.py",

@@ -31,7 +31,7 @@ class HistoryFile:
     Args:
         folder: Folder of the file.
         settings: The pack's settings.
-        cell: Model of the whole pack.
+        cell: Model of battery or fuel cell, with the values of the whole pack.
     """
 
     def __init__(self, folder: Path, settings: Settings, cell: PackModel) -> None:

@@ -10,7 +10,7 @@ from bms_estimator.settings.charge_limits import ChargeLimits
 VOLTAGE_ERROR = 0.005
 """Relative error of the voltage of charger and source. A BMS seldom measures the voltage of a pack more accurately."""
 NEARLY_FULL_SOC = 0.995
-"""SOC whose OCV is high enough for the default full voltage. It differs from ``VOLTAGE_ERROR`` where the curve is steep:
+"""SOC whose OCV is the maximum of the default full voltage. Where the curve is steep, it is lower than ``VOLTAGE_ERROR`` allows:
 chargers of LFP cells end between 3.5 and 3.65 V, within 0.4 % of SOC."""
 TAIL_C = 0.05
 """Default tail current, as a C-rate. At C/20 the overpotential is some 10 mV, which is 1 % of SOC in oxide cells."""
@@ -31,12 +31,12 @@ MAX_EMPTY_SOC = 0.05
 
 
 def anchor_settings(
-    cell: CellModel, ocv_v: NDArray[np.float64], limits: ChargeLimits, voltage_resolution_v: float
+    pack: CellModel, ocv_v: NDArray[np.float64], limits: ChargeLimits, voltage_resolution_v: float
 ) -> NDArray[np.void]:
     """Return the settings record of the anchors.
 
     Args:
-        cell: The pack as one two-terminal object.
+        pack: The pack as one two-terminal object.
         ocv_v: Open-circuit voltage from ``settings_records.ocv_grid`` [V].
         limits: Limits of charger and protection.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
@@ -45,17 +45,17 @@ def anchor_settings(
         Shape (1,), dtype ``ANCHOR_SETTINGS``.
     """
     record = np.zeros(1, dtype=ANCHOR_SETTINGS)
-    p, one_c = record[0], cell.cell.capacity_ah
+    p, one_c_a = record[0], pack.cell.capacity_ah
     full_v, min_v = limits.full_voltage_v, np.inf
     if full_v is None:
         full_v, min_v = ocv_v[-1], np.interp(NEARLY_FULL_SOC, _soc_grid(ocv_v), ocv_v)
     p["full_v"] = min((1.0 - VOLTAGE_ERROR) * full_v, min_v) - voltage_resolution_v
     p["corrects_full"] = soc_at_full(ocv_v, limits) >= MIN_FULL_SOC
     if limits.tail_current_a is None:
-        p["tail_a"], p["small_a"] = TAIL_C * one_c, MAX_END_C * one_c
+        p["tail_a"], p["small_a"] = TAIL_C * one_c_a, MAX_END_C * one_c_a
     else:
         p["tail_a"], p["small_a"] = limits.tail_current_a, MAX_END_RATIO * limits.tail_current_a
-    p["trickle_a"] = min(TRICKLE_C * one_c, 0.5 * p["tail_a"])
+    p["trickle_a"] = min(TRICKLE_C * one_c_a, 0.5 * p["tail_a"])
     cutoff_v = ocv_v[0] if limits.cutoff_voltage_v is None else limits.cutoff_voltage_v
     p["cutoff_v"] = (1.0 + CUTOFF_MARGIN) * cutoff_v + voltage_resolution_v
     p["corrects_empty"] = soc_at_cutoff(ocv_v, limits) <= MAX_EMPTY_SOC

@@ -160,6 +160,7 @@ def _add_voltage_gain_error(p: np.void, gain_std: float) -> None:
     """
     ocv_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_v"].size), p["ocv_v"])
     p["curve_error_v"] = np.hypot(p["curve_error_v"], gain_std * ocv_v)
+    p["voltage_gain_std"] = gain_std
 
 
 def _ladder_resistances(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:

@@ -191,7 +191,7 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
     """
     record, settings = estimator.record[0], estimator.settings_record[0]
     capacity = relative_capacity(record)
-    (ln_r0, r0_std), (ln_r, r_std) = _state_and_std(record, LN_R0), _state_and_std(record, LN_R)
+    ln_r0, ln_r, r_std = _resistance_scales(estimator)
     middle = fitted_resistance_factors(estimator, np.array([0.5]))[0]
     r0_factor, pair_factor = math.exp(ln_r0) * middle[0], math.exp(ln_r) * float(np.median(middle[1:]))
     values = cell.model_dump()
@@ -206,10 +206,24 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
         factors = scales[:, None] * fitted_resistance_factors(estimator, np.array(cell.ladder.soc)).T
         for name in ("weak_ohm", "strong_ohm"):
             values["ladder"][name] = (factors * np.array(values["ladder"][name])).tolist()
-        values["ladder"]["std"] = max(r0_std, r_std)
+        values["ladder"]["std"] = r_std
     if settings["filter"]["learned"] > 0.0:
         values["ocv"] = _corrected_ocv(estimator, cell, series)
     return CellModel.model_validate(values)
+
+
+def _resistance_scales(estimator: Estimator) -> tuple[float, float, float]:
+    """Return ln of the factors on R_0 and on the RC pairs of the filter's curves, and the relative std of the resistances.
+
+    The curves of a slow fit contain the pack's resistances over weeks. The filter's scales relative to these curves follow the
+    load of the last hours and are not used.
+    """
+    p = estimator.settings_record[0]["filter"]
+    if not np.array_equal(p["weak_ohm"], estimator.cell_file_settings["weak_ohm"]):  # the curves of a slow fit
+        return 0.0, 0.0, float(p["r_std"])
+    record = estimator.record[0]
+    (ln_r0, r0_std), (ln_r, r_std) = _state_and_std(record, LN_R0), _state_and_std(record, LN_R)
+    return ln_r0, ln_r, max(r0_std, r_std)
 
 
 def _corrected_ocv(estimator: Estimator, cell: CellModel, series: int) -> dict[str, Any]:

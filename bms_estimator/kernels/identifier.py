@@ -9,7 +9,14 @@ import math
 
 from bms_estimator.kernels.accumulators.history import add_reference, add_window, begin_segment
 from bms_estimator.kernels.cell_model.chen_mora import delta
-from bms_estimator.kernels.kalman_filter.anchors import EMPTY, FULL, NO_ANCHOR, apply_anchor, detect_anchor
+from bms_estimator.kernels.kalman_filter.anchors import (
+    EMPTY,
+    FULL,
+    NO_ANCHOR,
+    apply_anchor,
+    detect_anchor,
+    gap_begins_empty,
+)
 from bms_estimator.kernels.kalman_filter.element_map import (
     CAPACITANCES,
     ELEMENTS,
@@ -75,6 +82,8 @@ def identifier_step(
     change_a = current_a - f.current_a
     if gap and f.window.samples > 0:
         update_from_window(s, p)  # measurements before the gap give no information on the charge in it
+    if gap and not c.suspects & UNUSABLE and gap_begins_empty(s.anchors, dt_s):
+        correct_at_anchor(s, p, EMPTY)
     integrate_current(f, p.filter, dt_s, gap, current_a, temperature_c)
     if dt_s > p.filter.unmeasured_s:
         s.unlearned_s[:] += dt_s
@@ -136,7 +145,9 @@ def update_from_window(s: Record, p: Record) -> None:
     add_window(s.history, f, p.filter)
     voltage_v = f.window.sum_v / f.window.samples
     update_hypotheses(f, p.filter)
-    correct_at_anchor(s, p, dt_s, voltage_v)
+    kind = detect_anchor(s.anchors, p.anchors, f, p.filter, dt_s, c.mean_a, voltage_v)
+    if kind != NO_ANCHOR:
+        correct_at_anchor(s, p, kind)
     restore_if_not_finite(c, s.counters, f, p.filter, dt_s)
     update_input_faults(c, f, p.filter, dt_s)
     write_equivalent_circuit(f, p.filter, s.elements)
@@ -145,12 +156,9 @@ def update_from_window(s: Record, p: Record) -> None:
 
 
 @njit(cache=True)
-def correct_at_anchor(s: Record, p: Record, dt_s: float, voltage_v: float) -> None:
-    """Correct the SOC if the window of ``dt_s`` with mean voltage ``voltage_v`` [V] completes a charge or discharge."""
+def correct_at_anchor(s: Record, p: Record, kind: int) -> None:
+    """Correct the SOC at the end of a charge (``FULL``) or of a discharge (``EMPTY``)."""
     f, c, a = s.filter, s.checks, s.anchors
-    kind = detect_anchor(a, p.anchors, f, p.filter, dt_s, c.mean_a, voltage_v)
-    if kind == NO_ANCHOR:
-        return
     if kind == FULL:
         add_reference(s.history, kind, 1.0, a.full_std)
     else:

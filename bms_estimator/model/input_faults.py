@@ -39,6 +39,6 @@ _TEXTS = {
     "and that the source does not repeat an old value",
     InputFault.CURRENT: "the current stays the same to the last digit though the voltage changes: check the current sensor, "
     "and that all loads flow through it",
-    InputFault.PACK: "the SOC before and after a gap differs by more than a charge in the gap explains: check whether the pack "
+    InputFault.PACK: "SOC or voltages after a gap do not fit the pack before it: check whether the pack "
     "was exchanged, because capacity and resistances were learned from the pack before; the request forget_pack discards them",
 }

@@ -16,18 +16,19 @@ from bms_estimator.model.arrays import Floats
 SOC_GRID = np.linspace(0.0, 1.0, GRID)
 """SOC grid of resistances, hysteresis and OCV error. Shape (GRID,)."""
 MIN_END_SLOPE_V, MAX_END_SLOPE_V = 1.0, 8.0
-"""Limits of the slope with which the OCV is extrapolated beyond SOC 0 and 1 [V]."""
+"""Limits of the slope with which the OCV is extrapolated beyond SOC 0 and 1 [V per unit SOC]. Assumed: the slope at the end of a
+measured table is uncertain."""
 ZERO_C_K = 273.15
 """Temperature 0 C in kelvin."""
 SLOPE_REACH = 0.01
 """Half width of the secant that gives the slope of the OCV [SOC]."""
-
-
-DIRECTION_OF_ERROR, DIRECTION_STD_V = 0.5, (2e-3, 6e-3)
-"""Std of the OCV's error by direction as a fraction of the OCV's std, and its limits [V]. The upper
-limit is assumed for generic cells, and the lower one for cells whose file was fitted to their own captures."""
-DROP_OF_R_STD, DROP_STD = 0.25, (0.04, 0.08)
-"""Relative std of the overpotential at one SOC as a fraction of the std of ln R, and its limits."""
+DIRECTION_ERROR_FRACTION, DIRECTION_STD_RANGE_V = 0.5, (2e-3, 6e-3)
+"""Error by direction: the part of the OCV's error that differs between charge, rest and discharge. Its std is this fraction of
+the OCV's std, within these limits [V]. Generic cells are assumed to be at the upper limit, and cells whose file was fitted to
+their own captures at the lower one."""
+OVERPOTENTIAL_STD_FRACTION, OVERPOTENTIAL_STD_RANGE = 0.25, (0.04, 0.08)
+"""Relative std by which the overpotential at one SOC differs between charge and discharge: this fraction of the std of ln R,
+within these limits."""
 
 
 class CellCurves:
@@ -45,18 +46,30 @@ class CellCurves:
         self._soc = np.linspace(0.0, 1.0, settings["ocv_v"].size)
         self._ocv_v = settings["ocv_v"] / series
         slope_v = settings["ocv_slope_v"] / series
+        # the outermost points of an interpolated table have one-sided slopes
         self._low_slope_v, self._high_slope_v = np.clip(slope_v[[1, -2]], MIN_END_SLOPE_V, MAX_END_SLOPE_V)
-        self.error_v = settings["curve_error_v"] / series
+        self.gain_std = float(settings["voltage_gain_std"])
+        """Relative std of the voltage sensor's gain."""
+        gain_v = self.gain_std * self.ocv(SOC_GRID)
+        self.error_v = np.sqrt(np.maximum((settings["curve_error_v"] / series) ** 2 - gain_v**2, 0.0))
+        """Std of the cell file's OCV at ``SOC_GRID`` [V], without the error of the voltage sensor."""
         self.hysteresis_v = settings["hysteresis_v"] / series
         self.per_kelvin_v = settings["per_kelvin_v"] / series
         self._parts_ohm = np.hstack([settings["weak_ohm"], settings["strong_ohm"]]) / series
         self.r_std, self.capacity_std = float(settings["r_std"]), float(settings["capacity_std"])
-        self.direction_std_v = float(np.clip(DIRECTION_OF_ERROR * np.median(self.error_v), *DIRECTION_STD_V))
+        self.direction_std_v = float(
+            np.clip(DIRECTION_ERROR_FRACTION * np.median(self.error_v), *DIRECTION_STD_RANGE_V)
+        )
         """Std of the OCV's error that differs between charge, rest and discharge [V]."""
-        self.drop_std = float(np.clip(DROP_OF_R_STD * self.r_std, *DROP_STD))
+        self.drop_std = float(np.clip(OVERPOTENTIAL_STD_FRACTION * self.r_std, *OVERPOTENTIAL_STD_RANGE))
         """Relative std of the overpotential at one SOC, which differs between charge and discharge."""
-        self.charge_error, self.aged_soc = float(settings["charge_error"]), float(settings["aged_soc"])
+        self.charge_error = float(settings["charge_error"])
+        """Std of the SOC counted over a charge throughput of 1."""
+        self.aged_soc = float(settings["aged_soc"])
+        """Charge throughput to which the std of aging refers [SOC]: 500 full cycles."""
         self.event_probability, self.event_s = float(settings["event_probability"]), float(settings["event_s"])
+        """Probability that a long gap hides a charge or an exchange of the pack, and the time constant with which the
+        probability grows with the gap's duration [s]."""
         self.offset_s = float(settings["offset_s"])
         self.offset_std_a = float(settings["offset_c"]) * self.one_c_a
 

@@ -1,4 +1,8 @@
-"""Change of the curves to which the filter's state is relative: R_s and resistances keep their values in ohm."""
+"""Change of the curves in the filter's settings.
+
+The filter stores R_s and its other resistances as ratios to these curves. The ratios are rescaled, so that the resistances in
+ohm stay the same.
+"""
 
 import math
 
@@ -27,7 +31,9 @@ def present_ohm(settings: np.void, f: np.void) -> Floats:
 
 
 def keep_series_resistance(f: np.void, before: Floats, after: Floats) -> None:
-    """Keep R_s as learned from current steps, which is stored relative to R_0 of the curves.
+    """Rescale ``step.ln_ratio`` = ln(R_s / R_0), so that R_s keeps its value in ohm when R_0 of the curves changes.
+
+    R_s is the series resistance learned from current steps, and R_0 that of the curves.
 
     Args:
         f: Record of dtype EKF_STATE.
@@ -55,6 +61,7 @@ def return_to_cell_file(estimator: Estimator) -> None:
     for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):
         mean[LN_R0] += math.log(before[0] / after[0])
         mean[LN_R] += math.log(before[1:].sum() / after[1:].sum())
+        # The learned variances hold relative to the fitted curves. Relative to the cell file only the prior is known.
         for j in (LN_R0, LN_R):
             covariance[j, :] = covariance[:, j] = 0.0
             covariance[j, j] = variance

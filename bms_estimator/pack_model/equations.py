@@ -82,7 +82,8 @@ class Equations:
         self.prior = Prior(cell, self.intervals, self.u)
         self.model = VoltageModel(cell, self.intervals, self.u, reference)
         self.voltage_v = rows["voltage_v"] / cell.series
-        self.weight = (rows["duration_s"] > 0.0) / np.sqrt(self.model.variance_v2)
+        # the rows of a pass (``rows_of_pass``) have the weight of one row
+        self.weight = (rows["duration_s"] > 0.0) / np.sqrt(self.model.variance_v2 * self.intervals.rows_of_pass())
         """Inverse of the std of each row's voltage [1/V]; 0 for rows without a voltage."""
         self.known = np.flatnonzero(np.isfinite(rows["reference_soc"]))
         self.known_soc: Floats = rows["reference_soc"][self.known]
@@ -139,8 +140,8 @@ class Equations:
     def _link(self, x: Floats) -> tuple[float, Block]:
         """Return cost and residuals of the SOC at the start of an interval, counted from the start of the one before.
 
-        A gap may hide a charge, so that any SOC is possible with the probability of such an event. The error is then
-        weighted by the probability that there was none.
+        A gap may hide a charge, so that any SOC is possible with the probability of such an event: the SOC after it is
+        uniform over 0..1, with a density of 1. The error is then weighted by the probability that there was no event.
         """
         u, links = self.u, self.links
         later, k = links.interval, links.interval - 1
@@ -171,5 +172,5 @@ def huber_cost(residual: Floats) -> float:
 
 
 def huber_weight(residual: Floats) -> Floats:
-    """Return the factor on a residual and its derivatives whose square has the gradient of Huber's cost."""
+    """Return the factor on residuals and their derivatives with which least squares has the gradient of Huber's cost."""
     return np.sqrt(HUBER / np.maximum(np.abs(residual), HUBER))

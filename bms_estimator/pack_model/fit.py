@@ -1,7 +1,7 @@
 """Fit of the pack's model to its history, from several starts, as a mixture of local minima."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,16 @@ from bms_estimator.kernels.kalman_filter.records import NODES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition
 from bms_estimator.pack_model.equations import Equations
+from bms_estimator.pack_model.exchange import is_exchanged
 from bms_estimator.pack_model.prediction import Reference
 from bms_estimator.pack_model.solve import Minimum, minimize
 from bms_estimator.pack_model.unknowns import CURVE_NODES, SCALES, SHAPE_NODES
 
 STARTS = ((0.0, 0.0), (0.08, 0.0), (-0.08, 0.0), (0.16, 0.0), (-0.16, 0.0), (0.0, 0.08), (0.0, -0.08))
 """Starts of the minimization: shift of all SOCs, and ln of the true over the declared capacity."""
-LIKELIHOOD_EXPONENT = 0.2
-"""Exponent of the likelihood in the weights of minima. It is below 1, because errors of successive rows are not independent."""
+LIKELIHOOD_EXPONENT = 0.5
+"""Exponent of the likelihood in the weights of minima. It is below 1, because errors of different passes are not quite
+independent."""
 SAME_COST, SAME_SOC = 0.3, 0.01
 """Differences of cost and SOC below which two minima count as one."""
 NODE_SOC = np.linspace(0.0, 1.0, NODES)
@@ -55,7 +57,11 @@ class PackFit:
     cost: float
     """Cost of the best minimum."""
     curves: tuple[Floats, ...]
-    """OCV error and error by direction of each minimum, the best first, as starts of the next fit."""
+    """Start of the next fit for each minimum, the best first: nodes of the OCV's error and of the error by direction."""
+    first_segment: float = 0.0
+    """Segment of the first fitted row. Rows of earlier segments are those of another pack."""
+    is_exchanged: bool = False
+    """True: the pack was exchanged in the gap before the last segment, so that only this segment is fitted."""
 
 
 FINITE_FIELDS = tuple(
@@ -69,7 +75,7 @@ class FitError(ValueError):
 
 
 def fit(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None = None) -> PackFit:
-    """Fit the pack's model.
+    """Fit the pack's model. If the last gap hides an exchange of the pack, fit only the rows after it.
 
     Args:
         cell: Curves of the cell file.
@@ -82,9 +88,12 @@ def fit(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None = Non
     _require_finite(rows)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite is refused below
-            if previous is None:
-                previous = _fit(cell, rows, Reference(rows["soc"], np.zeros(SCALES)), None)
-            result = _fit(cell, rows, reference_of(previous, rows), previous)
+            if previous is not None:
+                rows = rows[rows["segment"] >= previous.first_segment]
+            result = _fit_at_reference(cell, rows, previous)
+            if result.is_exchanged:
+                last = rows[rows["segment"] == rows["segment"][-1]]
+                result = replace(_fit_at_reference(cell, last, None), is_exchanged=True)
     except np.linalg.LinAlgError as error:
         raise FitError(f"the equations of {rows.size} history rows have no solution: {error}") from error
     if not (np.isfinite(result.mean).all() and np.isfinite(result.covariance).all()):
@@ -109,6 +118,13 @@ def reference_of(previous: PackFit, rows: NDArray[np.void]) -> Reference:
     return Reference(soc, previous.mean[LN_R])
 
 
+def _fit_at_reference(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None) -> PackFit:
+    """Fit the rows. Their std is computed at the previous fit; without one, at a preliminary fit."""
+    if previous is None:
+        previous = _fit(cell, rows, Reference(rows["soc"], np.zeros(SCALES)), None)
+    return _fit(cell, rows, reference_of(previous, rows), previous)
+
+
 def _fit(cell: CellCurves, rows: NDArray[np.void], reference: Reference, previous: PackFit | None) -> PackFit:
     equations = Equations(cell, rows, reference)
     minima: list[Minimum] = []
@@ -121,7 +137,9 @@ def _fit(cell: CellCurves, rows: NDArray[np.void], reference: Reference, previou
 
 def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
     """Return the starts of the minimization: those near the previous fit, then the filter's SOC with ``STARTS``."""
-    results = [] if previous is None else [continued(equations, previous, curves) for curves in previous.curves[1::-1]]
+    results: list[Floats] = []
+    if previous is not None:  # its two best minima; their order decides only which of two equal results is kept
+        results += [start_near(equations, previous, curves) for curves in previous.curves[1::-1]]
     for shift, ln_q in STARTS:
         x = equations.prior.mean.copy()
         x[equations.u.soc] = filter_soc(equations, ln_q) + shift
@@ -137,7 +155,7 @@ def filter_soc(equations: Equations, ln_q: float) -> Floats:
     return np.asarray(equations.rows["soc"][intervals.ends] + drawn_soc)
 
 
-def continued(equations: Equations, previous: PackFit, curves: Floats) -> Floats:
+def start_near(equations: Equations, previous: PackFit, curves: Floats) -> Floats:
     """Return a start near the previous fit.
 
     Args:
@@ -150,11 +168,11 @@ def continued(equations: Equations, previous: PackFit, curves: Floats) -> Floats
     x[u.curve.start :] = curves
     x[u.ln_q], x[u.offset] = previous.mean[LN_Q], previous.mean[OFFSET]
     x[u.ln_r] = previous.mean[LN_R]
-    x[u.soc] = continued_soc(equations, previous)
+    x[u.soc] = start_soc_near(equations, previous)
     return x
 
 
-def continued_soc(equations: Equations, previous: PackFit) -> Floats:
+def start_soc_near(equations: Equations, previous: PackFit) -> Floats:
     """Return the SOC at the start of each interval.
 
     It is that of the previous fit, up to its last row. Later it is counted on from the interval before, or is that of the
@@ -183,11 +201,12 @@ def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
     minima = sorted(minima, key=lambda minimum: minimum.cost)
     weights = np.exp(-0.5 * LIKELIHOOD_EXPONENT * (np.array([m.cost for m in minima]) - minima[0].cost))
     weights /= weights.sum()
-    matrix = [_results(equations, m) for m in minima]
-    means = np.array([mean for mean, _ in matrix])
+    moments = [_results(equations, m) for m in minima]
+    means = np.array([mean for mean, _ in moments])
     mean = weights @ means
     covariance: Floats = sum(
-        w * (cov + np.outer(part - mean, part - mean)) for w, part, (_, cov) in zip(weights, means, matrix, strict=True)
+        w * (cov + np.outer(part - mean, part - mean))
+        for w, part, (_, cov) in zip(weights, means, moments, strict=True)
     )
     u, rows = equations.u, equations.rows
     last = rows[-1]
@@ -206,6 +225,8 @@ def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
         row_soc=weights @ np.array([equations.model.soc(m.x) for m in minima]),
         cost=minima[0].cost,
         curves=tuple(m.x[u.curve.start :] for m in minima),
+        first_segment=float(rows["segment"][0]),
+        is_exchanged=is_exchanged(rows, equations.residuals(minima[0].x)),
     )
 
 

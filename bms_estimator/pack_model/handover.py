@@ -1,9 +1,13 @@
-"""Hand-over of a fit to the filter: the cell's curves become its settings, the SOC and its covariances its state."""
+"""Hand-over of a fit to the filter.
+
+The fitted curves replace those in the filter's settings. SOC, capacity and offset of the fit, with their covariance, replace
+those in the filter's state.
+"""
 
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.filter_settings import MIN_SOC_STD
+from bms_estimator.estimator.filter_settings import MIN_BIAS_OF_R_STD, MIN_SOC_STD
 from bms_estimator.kernels.kalman_filter.ekf import MAX_SOC, MIN_SOC
 from bms_estimator.kernels.kalman_filter.mixture import clear_hypothesis, copy_hypothesis, mixture_moments
 from bms_estimator.kernels.kalman_filter.records import (
@@ -15,23 +19,29 @@ from bms_estimator.kernels.kalman_filter.records import (
     NODES,
     OFFSET,
     SOC,
+    Noise,
 )
 from bms_estimator.model.arrays import Floats
-from bms_estimator.pack_model import fit as result
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
+from bms_estimator.pack_model.fit import CURVE as FIT_CURVE
+from bms_estimator.pack_model.fit import LN_Q as FIT_LN_Q
+from bms_estimator.pack_model.fit import LN_R as FIT_LN_R
 from bms_estimator.pack_model.fit import NODE_SOC, PackFit
+from bms_estimator.pack_model.fit import OFFSET as FIT_OFFSET
+from bms_estimator.pack_model.fit import SOC as FIT_SOC
 from bms_estimator.pack_model.intervals import HOUR_S
 from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS
 
-MIN_CURVE_V = 0.003
-"""Minimum std of the OCV of one cell [V]."""
+MIN_CURVE_STD_V = 0.003
+"""Minimum std of the OCV of one cell [V]. Assumed."""
 MIN_R_STD = 0.1
-"""Minimum relative std of the resistances."""
+"""Minimum relative std of the resistances. Equal to ``Noise.r_std``, the default without a std in the cell file."""
 MIN_SOC_STD_FRACTION = 0.55
-"""Minimum std of the published SOC, as a fraction of that of the cell file."""
+"""Minimum std of the published SOC, as a fraction of that of the cell file, which applies to a cell that was not measured. The
+fraction is assumed."""
 FILTER_STATES = np.array([SOC, LN_Q, OFFSET, *range(NODE, NODE + NODES)])
 """States of the filter that a fit determines jointly."""
-FIT_RESULTS = np.array([result.SOC, result.LN_Q, result.OFFSET, *range(result.CURVE.start, result.CURVE.stop)])
+FIT_RESULTS = np.array([FIT_SOC, FIT_LN_Q, FIT_OFFSET, *range(FIT_CURVE.start, FIT_CURVE.stop)])
 """Results of a fit in the order of ``FILTER_STATES``."""
 FIRST_PARAMETER = 1
 """Position in ``FILTER_STATES`` of the first state after the SOC."""
@@ -50,7 +60,7 @@ def adopt_curves(settings: np.void, file_settings: np.void, fit: PackFit) -> Non
     ocv_v = file_settings["ocv_v"] + series * np.interp(soc, SOC_GRID, fit.curve_v)
     settings["ocv_v"] = np.maximum.accumulate(ocv_v)  # an OCV increases with the SOC
     settings["ocv_slope_v"] = np.maximum(np.gradient(settings["ocv_v"], soc), 1e-3 * series)
-    node_v2 = np.maximum(np.interp(SOC_GRID, NODE_SOC, np.diag(fit.covariance)[result.CURVE]), MIN_CURVE_V**2)
+    node_v2 = np.maximum(np.interp(SOC_GRID, NODE_SOC, np.diag(fit.covariance)[FIT_CURVE]), MIN_CURVE_STD_V**2)
     total_v2 = node_v2 + CellCurves(file_settings).direction_std_v ** 2
     settings["curve_error_v"] = series * np.sqrt(total_v2)
     settings["learned"] = node_v2.mean() / total_v2.mean()
@@ -59,14 +69,29 @@ def adopt_curves(settings: np.void, file_settings: np.void, fit: PackFit) -> Non
     middle = SOC_GRID.size // 2
     settings["middle_ohm"] = settings["weak_ohm"][middle].sum() + settings["strong_ohm"][middle].sum()
     settings["r_std"] = r_std(fit)
-    settings["bias_relative"] = min(float(file_settings["bias_relative"]), max(0.03, 0.15 * r_std(fit)))
-    settings["min_soc_std"] = max(MIN_SOC_STD, MIN_SOC_STD_FRACTION * file_settings["min_soc_std"])
+    settings["bias_relative"] = min(
+        float(file_settings["bias_relative"]), max(Noise.bias_relative, MIN_BIAS_OF_R_STD * r_std(fit))
+    )
+    file_std = MIN_SOC_STD_FRACTION * float(file_settings["min_soc_std"])
+    settings["min_soc_std"] = max(MIN_SOC_STD, file_std, smallest_soc_std(fit))
     settings["hysteresis_v"] = fit.hysteresis * file_settings["hysteresis_v"]
+
+
+def smallest_soc_std(fit: PackFit) -> float:
+    """Return the std of the SOC where it is best known: at the SOC at which errors of SOC and capacity cancel.
+
+    The fit has used the voltages of weeks. Voltages until the next fit repeat the errors of these, so that they cannot lower
+    the std of any SOC.
+    """
+    covariance = fit.covariance
+    capacity_variance = max(covariance[FIT_LN_Q, FIT_LN_Q], np.finfo(float).tiny)
+    by_capacity = covariance[FIT_SOC, FIT_LN_Q] ** 2 / capacity_variance
+    return float(np.sqrt(max(covariance[FIT_SOC, FIT_SOC] - by_capacity, 0.0)))
 
 
 def r_std(fit: PackFit) -> float:
     """Return the relative std of the resistances."""
-    return max(float(np.sqrt(np.diag(fit.covariance)[result.LN_R].max())), MIN_R_STD)
+    return max(float(np.sqrt(np.diag(fit.covariance)[FIT_LN_R].max())), MIN_R_STD)
 
 
 def adopt_state(estimator: Estimator, fit: PackFit) -> None:
@@ -76,15 +101,15 @@ def adopt_state(estimator: Estimator, fit: PackFit) -> None:
     """
     f, h = estimator.record[0]["filter"], estimator.record[0]["history"]
     p = estimator.settings_record[0]["filter"]
-    f["learned_soc"] = p["learning_soc"]  # the filter holds capacity and curve from now on
+    f["learned_soc"] = p["learning_soc"]  # its maximum ends the learning: the filter holds capacity and curve
     if h["segment"] != fit.segment:
         for q in range(int(f["count"])):
             _adopt_parameters(f["mean"][q], f["covariance"][q], fit, p, FIRST_PARAMETER)
         return
     if f["best"] != 0:
         copy_hypothesis(f, int(f["best"]), 0)
-    drawn_soc = (h["charge_as"] - fit.charge_as) / p["capacity_as"] * np.exp(-fit.mean[result.LN_Q])
-    f["mean"][0][SOC] = np.clip(fit.mean[result.SOC] - drawn_soc, MIN_SOC, MAX_SOC)
+    drawn_soc = (h["charge_as"] - fit.charge_as) / p["capacity_as"] * np.exp(-fit.mean[FIT_LN_Q])
+    f["mean"][0][SOC] = np.clip(fit.mean[FIT_SOC] - drawn_soc, MIN_SOC, MAX_SOC)
     _adopt_parameters(f["mean"][0], f["covariance"][0], fit, p, 0)
     f["count"], f["best"], f["ln_weight"][0] = 1, 0, 0.0
     for q in range(1, HYPOTHESES):
@@ -103,7 +128,7 @@ def _adopt_parameters(mean: Floats, covariance: Floats, fit: PackFit, p: np.void
         p: Record of dtype EKF_SETTINGS with the fitted curves.
         first: First of ``FILTER_STATES`` whose covariance is written: 0 includes that of the SOC.
     """
-    mean[LN_Q], mean[OFFSET] = fit.mean[result.LN_Q], fit.mean[result.OFFSET] * p["capacity_as"] / HOUR_S
+    mean[LN_Q], mean[OFFSET] = fit.mean[FIT_LN_Q], fit.mean[FIT_OFFSET] * p["capacity_as"] / HOUR_S
     mean[NODE : NODE + NODES] = mean[LN_R0] = mean[LN_R] = 0.0  # the fitted curves are those of the settings
     states = FILTER_STATES[first:]
     _decouple(covariance, [*states, LN_R0, LN_R])

@@ -7,6 +7,8 @@ from bms_estimator.kernels.accumulators.history import HISTORY_ROW, ROW_SOC
 
 MAX_ROWS = 5000
 """Maximum number of rows; older days are thinned, then dropped."""
+KEPT_FRACTION = 0.8
+"""Maximum number of rows after thinning, as a fraction of ``MAX_ROWS``, so that the next row does not thin the history again."""
 MAX_SEGMENTS = 100
 """Maximum number of segments; older ones are dropped. Each adds about five unknowns to the fit, whose time grows with
 the cube of their number: with 100 segments a fit of 30 days takes four times as long as with one."""
@@ -28,10 +30,10 @@ class History:
         self.rows: NDArray[np.void] = np.zeros(0, HISTORY_ROW) if rows is None else rows
 
     def append(self, rows: NDArray[np.void], capacity_as: float) -> None:
-        """Append rows, and thin the history if it is too long."""
+        """Append rows. Thin a history that is too long, and drop its oldest rows if it is still too long."""
         self.rows = newest_segments(np.concatenate([self.rows, rows]))
         if self.rows.size > MAX_ROWS:
-            self.rows = thinned(self.rows, capacity_as)[-MAX_ROWS * 4 // 5 :]
+            self.rows = thinned(self.rows, capacity_as)[-int(KEPT_FRACTION * MAX_ROWS) :]
 
 
 def newest_segments(rows: NDArray[np.void]) -> NDArray[np.void]:
@@ -41,7 +43,7 @@ def newest_segments(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def thinned(rows: NDArray[np.void], capacity_as: float) -> NDArray[np.void]:
-    """Return rows of which those of one segment, day, SOC bin and direction are merged, except on the last two days."""
+    """Return the rows with those older than two days merged: one row for each segment, day, SOC bin and direction."""
     is_old = (rows["elapsed_s"] < rows["elapsed_s"][-1] - 2.0 * DAY_S) & (rows["duration_s"] > 0.0)
     old = rows[is_old]
     if old.size == 0:

@@ -5,18 +5,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.accumulators.history import ROW_SOC
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import CellCurves
 
-INTERVAL_S = 86400.0
+DAY_S = 86400.0
+"""Length of a day [s]."""
+INTERVAL_S = DAY_S
 """Maximum duration of an interval [s]."""
 COUNTED_STD = 0.015
 """Std of the charge counted in an interval, as a fraction of the capacity, at which the interval ends. A sensor with a dead
 band reports no current at night, so that a day's count may be wrong by several percent."""
+MAX_INTERVALS = 200
+"""Maximum number of intervals, unless there are more segments. Each adds three unknowns. Intervals of a longer history, or of
+a sensor whose count is worse, are longer."""
 HOUR_S = 3600.0
 """Length of an hour [s]."""
-DAY_SOC = 0.002
-"""Std of the SOC counted over a day in addition to that by its throughput."""
+DAILY_STD_SOC = 0.002
+"""Std of the SOC counted over a day in addition to that by its throughput. Assumed, for charge that is not
+counted at rest, such as self-discharge."""
 
 
 class Intervals:
@@ -37,13 +44,25 @@ class Intervals:
 
     def __init__(self, cell: CellCurves, rows: NDArray[np.void]) -> None:
         self.rows = rows
-        self.starts, self.of_row = split(rows, (COUNTED_STD * cell.capacity_as) ** 2)
+        self.starts, self.of_row = bounded_split(rows, COUNTED_STD * cell.capacity_as)
         self.ends = np.r_[self.starts[1:], rows.size] - 1
         start = rows[self.starts]
         self.is_new_segment = np.r_[True, start["segment"][1:] != start["segment"][:-1]]
         self.segment = (np.cumsum(self.is_new_segment) - 1)[self.of_row]
         self.drawn_soc: Floats = (rows["charge_as"] - start["charge_as"][self.of_row]) / cell.capacity_as
         self.hours: Floats = (rows["elapsed_s"] - start["elapsed_s"][self.of_row]) / HOUR_S
+
+    def rows_of_pass(self) -> NDArray[np.intp]:
+        """Return, for each row, the number of rows of the same pass and direction, itself included.
+
+        A pass lasts until the charge leaves its bin, and the errors of its rows are nearly the same. A small current that
+        changes between rest and load divides a pass into many rows.
+        """
+        charge_bin = np.floor(self.drawn_soc / ROW_SOC)
+        number = np.cumsum(np.diff(charge_bin, prepend=charge_bin[:1]) != 0.0)
+        key = np.column_stack([self.of_row, number, self.rows["direction"], self.rows["duration_s"] > 0.0])
+        _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+        return np.asarray(count[group.ravel()])
 
     @property
     def count(self) -> int:
@@ -56,14 +75,28 @@ class Intervals:
         return int(self.is_new_segment.sum())
 
 
-def split(rows: NDArray[np.void], max_variance_as2: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first row of each interval, and the interval of each row."""
+def bounded_split(rows: NDArray[np.void], max_std_as: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first row of each interval, and the interval of each row.
+
+    The limits of duration and std are doubled until there are at most ``MAX_INTERVALS``, or until each segment is one
+    interval.
+    """
+    segments, scale = np.unique(rows["segment"]).size, 1.0
+    starts, of_row = split(rows, INTERVAL_S, max_std_as**2)
+    while starts.size > max(MAX_INTERVALS, segments):
+        scale *= 2.0
+        starts, of_row = split(rows, scale * INTERVAL_S, (scale * max_std_as) ** 2)
+    return starts, of_row
+
+
+def split(rows: NDArray[np.void], max_s: float, max_variance_as2: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first row of each interval, and the interval of each row, for limits of duration and variance."""
     segment, elapsed_s = rows["segment"].tolist(), rows["elapsed_s"].tolist()
     variance_as2 = rows["charge_variance_as2"].tolist()
     starts, of_row = [0], np.zeros(rows.size, np.intp)
     for j in range(1, rows.size):
         first = starts[-1]
-        is_long = elapsed_s[j] - elapsed_s[first] > INTERVAL_S
+        is_long = elapsed_s[j] - elapsed_s[first] > max_s
         if segment[j] != segment[j - 1] or is_long or variance_as2[j] - variance_as2[first] > max_variance_as2:
             starts.append(j)
         of_row[j] = len(starts) - 1
@@ -91,27 +124,30 @@ class Links:
         rows, starts, is_new = intervals.rows, intervals.starts, intervals.is_new_segment
         k = np.flatnonzero(np.isfinite(rows["gap_s"][starts]) | ~is_new)
         k = k[k > 0]
-        is_gap, before, after = is_new[k], rows[starts[k] - 1], rows[starts[k]]
+        is_gap = is_new[k]
+        first, before, after = rows[starts[k - 1]], rows[starts[k] - 1], rows[starts[k]]
 
-        first = rows[starts[k - 1]]
+        def last_increase(name: str) -> Floats:
+            """Return the increase of a counter from the earlier interval's last row to the later interval's first row.
 
-        def counted(name: str) -> Floats:
-            """Return the increase of a counter, which restarts with each segment."""
-            return np.asarray(before[name] - first[name] + counted_since(before, name))
+            After a gap the counter has restarted, so that its value is the increase.
+            """
+            return np.asarray(after[name] - np.where(is_gap, 0.0, before[name]))
 
-        def counted_since(row: NDArray[np.void], name: str) -> Floats:
-            """Return the increase of a counter since a row that lies before the gap, if there is one."""
-            return np.asarray(after[name] - np.where(is_gap, 0.0, row[name]))
+        def increase(name: str) -> Floats:
+            """Return the increase of a counter from start to start."""
+            return np.asarray(before[name] - first[name] + last_increase(name))
 
-        counted_as = counted_since(before, "charge_as")
-        throughput_soc = counted("throughput_soc")
-        variance_as2 = np.maximum(counted("charge_variance_as2"), 0.0)
+        throughput_soc = increase("throughput_soc")
+        variance_as2 = np.maximum(increase("charge_variance_as2"), 0.0)
         between_s = np.where(is_gap, 0.0, after["elapsed_s"] - before["elapsed_s"])
-        days = np.maximum(after["elapsed_s"] - first["elapsed_s"], HOUR_S) / INTERVAL_S
+        days = np.maximum(after["elapsed_s"] - first["elapsed_s"], HOUR_S) / DAY_S
         return cls(
             interval=k,
-            drawn_soc=intervals.drawn_soc[starts[k] - 1] + counted_as / cell.capacity_as,
+            drawn_soc=intervals.drawn_soc[starts[k] - 1] + last_increase("charge_as") / cell.capacity_as,
             hours=intervals.hours[starts[k] - 1] + between_s / HOUR_S,
-            std=np.sqrt(cell.charge_error**2 * throughput_soc + DAY_SOC**2 * days + variance_as2 / cell.capacity_as**2),
+            std=np.sqrt(
+                cell.charge_error**2 * throughput_soc + DAILY_STD_SOC**2 * days + variance_as2 / cell.capacity_as**2
+            ),
             event_probability=np.where(is_gap, cell.event_probability * -np.expm1(-after["gap_s"] / cell.event_s), 0.0),
         )

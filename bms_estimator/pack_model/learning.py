@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
+from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD
 from bms_estimator.kernels.kalman_filter.input_checks import store_last_good_state
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.pack_model import fit as result
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.curve_change import keep_series_resistance, present_ohm, return_to_cell_file
 from bms_estimator.pack_model.fit import PackFit, fit
@@ -22,14 +24,21 @@ from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.resume import resume_history
 
 FIT_INTERVAL_S = 3600.0
-"""Interval between two fits, on the clock of the samples [s]."""
+"""Maximum interval between two fits, on the clock of the samples [s]."""
+MIN_INTERVAL_S = 1800.0
+"""Minimum interval between two fits [s]. In a load of a few hours the first half hour already determines the SOC better
+than the filter."""
+INTERVAL_OF_AGE = 1.0 / 12.0
+"""Interval between two fits as a fraction of the age of the history, within its limits: an hour after twelve hours. A row
+changes the fit of a short history more than that of a long one."""
 ADOPT_DELAY_S = 120.0
 """Time from the start of a fit to the adoption of its result, on the clock of the samples [s]. The service fits in
 another thread meanwhile; a replay, which waits for the fit, adopts it at the same sample."""
 MIN_ROWS = 8
 """Minimum number of new rows for a fit."""
 MIN_THROUGHPUT_SOC = 1.0
-"""Minimum throughput of the history before the first fit is adopted [SOC]. Before, the filter's own estimate is as good."""
+"""Minimum throughput of the history before a fit with a large std of the SOC is adopted [SOC]. Before, the filter's
+hypotheses represent several possible SOCs better than the single normal distribution of a fit."""
 MIN_CHANGE = 0.01
 """Minimum change of the SOC, or of the capacity relative to the cell file's, that is reported as an event."""
 
@@ -66,12 +75,13 @@ class SlowFit:
     Args:
         estimator: Estimator of a battery with the identifier enabled; its history is switched on.
         submit: Runs a fit, for example in another thread, and returns its future.
-        interval_s: Interval between two fits, on the clock of the samples [s].
+        interval_s: Maximum interval between two fits, on the clock of the samples [s]. A history that is younger than
+            ``interval_s / INTERVAL_OF_AGE`` is fitted more often. Infinite: no fits.
         on_failure: Called with the exception of a failed fit. The previous fit stays.
 
     Attributes:
         history: Rows of this and earlier runs.
-        saved_fit: The last fit of the history, adopted or not; None: none.
+        saved_fit: The latest fit of the history, adopted or not, which is saved with it; None: none.
         fit: The adopted fit, to whose curves the filter's state is relative; None: the curves are the cell file's.
         fits: Number of adopted fits.
         late: Number of fits that were not done when due, so that they were adopted at a later sample.
@@ -101,7 +111,7 @@ class SlowFit:
         self._new_rows = 0  # number of rows since the last fit
         self.saved_fit: PackFit | None = None
         h = self._h
-        h["enabled"], h["event_s"] = 1, interval_s
+        h["enabled"], h["event_s"] = 1, self._interval()
 
     def run(self, block: SampleBlock) -> NDArray[np.void]:
         """Process a block of samples. Return one row of dtype TRACE for each accepted sample."""
@@ -120,14 +130,16 @@ class SlowFit:
         Args:
             history: Rows of earlier runs.
             fit: Last fit of the history; None: none.
-            state_fit: Fit to whose curves the state that will be restored is relative; None: the cell file's curves, or
-                there is no such state.
+            state_fit: Fit that was in use when the state to be restored was saved; None: the cell file's curves were in use,
+                or no state will be restored.
         """
         self.history, self.saved_fit = history, fit
         self._adopt_curves(state_fit)
 
     def resume(self, gap_s: float, *, restored: bool) -> None:
         """Continue the history in a new segment, after the estimator's state was restored or found unusable.
+
+        A fit that is already due begins at the first sample, and the next one after at most an interval.
 
         Args:
             gap_s: Time since the state was saved [s]; infinite if unknown.
@@ -142,7 +154,7 @@ class SlowFit:
         fitted_s = -math.inf if saved is None else saved.elapsed_s
         self._new_rows = int((self.history.rows["elapsed_s"] > fitted_s).sum())
         next_s = float(h["event_s"]) if restored else math.inf
-        h["enabled"], h["event_s"] = 1, min(max(next_s, h["elapsed_s"]), h["elapsed_s"] + self._interval_s)
+        h["enabled"], h["event_s"] = 1, min(max(next_s, h["elapsed_s"]), h["elapsed_s"] + self._interval())
         is_adopted = restored and self.fit is not None and saved is not None and self.fit.elapsed_s >= saved.elapsed_s
         if saved is not None and not is_adopted:  # its capacity and offset are adopted like those of a new fit
             self._pending = run_now(lambda: saved)
@@ -154,7 +166,7 @@ class SlowFit:
         self.history, self._is_late, self._new_rows, self.unsaved_rows = History(), False, 0, 0
         return_to_cell_file(self.estimator)
         self.estimator.restart()
-        self._h["enabled"], self._h["event_s"] = 1, self._interval_s
+        self._h["enabled"], self._h["event_s"] = 1, self._interval()
         self.revision += 1
 
     def adopt(self, fitted: PackFit) -> None:
@@ -163,6 +175,8 @@ class SlowFit:
         before = float(estimator.state["soc"][0]), relative_capacity(record).value
         self._adopt_curves(fitted)
         adopt_state(estimator, fitted)
+        if fitted.is_exchanged:
+            record["filter"]["exchanged"] = 1  # raises the input diagnostic of an exchange
         store_last_good_state(record["checks"], record["filter"])
         self.fits += 1
         self.saved_fit = fitted
@@ -186,6 +200,12 @@ class SlowFit:
         record: np.void = self.estimator.record[0]["history"]
         return record
 
+    def _interval(self) -> float:
+        """Return the interval until the next fit [s]; infinite if there are no fits."""
+        if math.isinf(self._interval_s):
+            return math.inf
+        return min(max(INTERVAL_OF_AGE * float(self._h["elapsed_s"]), MIN_INTERVAL_S), self._interval_s)
+
     def _handle_event(self) -> None:
         h = self._h
         if self._pending is None:
@@ -193,7 +213,7 @@ class SlowFit:
         elif self._pending.done():
             self._end_fit(self._pending)
             self._pending, self._is_late = None, False
-            h["event_s"] += self._interval_s - ADOPT_DELAY_S
+            h["event_s"] += self._interval() - ADOPT_DELAY_S
         elif not self._is_late:  # ``event_s`` has passed, so that the next sample asks again
             self.late += 1
             self._is_late = True
@@ -201,30 +221,41 @@ class SlowFit:
     def _begin_fit(self) -> None:
         """Begin a fit if there is enough new data, and set the time of the next event."""
         h = self._h
-        if self._new_rows >= MIN_ROWS and self._throughput() >= MIN_THROUGHPUT_SOC:
+        if self._new_rows >= MIN_ROWS:
             self._new_rows = 0
             rows, previous = self.history.rows, self.saved_fit
             self._pending = self._submit(lambda: fit(self.cell, rows, previous))
             h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
             return
-        h["event_s"] = h["elapsed_s"] + self._interval_s
+        h["event_s"] = h["elapsed_s"] + self._interval()
         if self.unsaved_rows:
             self.unsaved_rows = 0
             self.revision += 1
 
     def _end_fit(self, done: "Future[PackFit]") -> None:
-        """Adopt the result of a completed fit, or report its failure."""
+        """Adopt the result of a completed fit if it is better than the filter, or report its failure."""
         error = done.exception()
         if error is not None:
             self.failed += 1
             self._on_failure(error)
-        else:
+        elif self._is_better(done.result()):
             self.adopt(done.result())
+        else:
+            self.saved_fit = done.result()
         self.unsaved_rows = 0
         self.revision += 1
 
+    def _is_better(self, fitted: PackFit) -> bool:
+        """Return True if one hypothesis represents the SOC of a fit, or if the history is long enough."""
+        is_certain = fitted.covariance[result.SOC, result.SOC] <= MAX_SINGLE_STD**2
+        return bool(is_certain) or self._throughput() >= MIN_THROUGHPUT_SOC
+
     def _throughput(self) -> float:
-        """Return the throughput of the history [SOC]; infinite with a known SOC or a second segment."""
+        """Return the throughput of the history [SOC].
+
+        It counts as infinite with a known SOC or a second segment, because the filter learns neither capacity nor OCV from an
+        end of charge, and stops learning at a gap.
+        """
         rows = self.history.rows
         if np.isfinite(rows["reference_soc"]).any() or rows["segment"][0] != rows["segment"][-1]:
             return math.inf

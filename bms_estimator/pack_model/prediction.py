@@ -3,8 +3,8 @@
     v = E(z, T) + c(z) + M (m_1 h_1 + m_2 h_2) - sum of scaled resistances times currents + error by direction
     z = z_interval - (charge - offset t) / (Q e^q)
 
-All voltages are of one cell. What recurs at each pass of an SOC in one direction is one unknown (error by direction), so
-that passing an SOC often does not determine the curve better than to the size of that error.
+All voltages are of one cell. An error that repeats whenever the pack passes an SOC in one direction is one unknown: the error
+by direction. However often the pack passes, the curve is known no better than that error.
 """
 
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.accumulators.history import HYSTERESIS_SOC, ROW_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, TAUS, WEAK_J
 from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.aging import RESISTANCE, AgingVariance
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition, arrhenius
 from bms_estimator.pack_model.intervals import Intervals
 from bms_estimator.pack_model.prior import variance_between_nodes
@@ -27,14 +28,17 @@ from bms_estimator.pack_model.unknowns import (
     Unknowns,
 )
 
-PASS_DROP = 0.75
-"""Std of the overpotential that differs from pass to pass, as a fraction of the std that recurs."""
-COUNT_SOC, KNEE_SOC, KNEE_WIDTH_SOC = 0.004, 0.015, 0.12
-"""Std of a row's SOC by counting, additional std of the place of the knee near empty, and width of the knee [SOC]."""
+PASS_FRACTION = 0.75
+"""Std of the overpotential's error that differs from pass to pass, as a fraction of the std of the error that repeats."""
+COUNT_STD_SOC, KNEE_STD_SOC, KNEE_WIDTH_SOC = 0.004, 0.015, 0.12
+"""Std of a row's SOC by counting, additional std by the place of the knee near empty, and width of the knee [SOC]. With a knee
+at a known place, a slow first charge from empty gave an SOC 6 to 8 % wrong, because offset, capacity and place of the knee look
+alike."""
 EMPTY_RELATIVE, EMPTY_WIDTH_SOC = 0.4, 0.04
-"""Relative error of the overpotential at empty, and SOC within which it decays."""
+"""Relative std of the overpotential at SOC 0, and SOC within which it decays. Assumed: resistances near empty depend on the
+cell and on the load."""
 START_LOAD_C = 0.6
-"""Std of the load before the RC pairs were reset, as a C-rate."""
+"""Std of the load before the RC pairs were reset, as a C-rate. Assumed."""
 GROUP_STARTS = [RESISTANCE_GROUPS.index(group) for group in range(SCALES)]
 """First resistance of each group."""
 
@@ -97,16 +101,17 @@ class VoltageModel:
         self.cell, self.u, self.intervals = cell, u, intervals
         rows = intervals.rows
         temperature_c: Floats = rows["temperature_c"]
-        self.warm_k: Floats = temperature_c - REFERENCE_C
+        self.above_25_c_k: Floats = temperature_c - REFERENCE_C
         self.weak, self.strong = arrhenius(WEAK_J, temperature_c), arrhenius(STRONG_J, temperature_c)
         self.hysteresis_factor = arrhenius(HYSTERESIS_J, temperature_c)
         self.current_a = np.column_stack([rows["current_a"], rows["x_a"]])
         self.counted_h: Floats = rows["hysteresis"]
-        # the hysteresis at the start of the segment decays with the throughput
+        # the hysteresis at the start of the segment, an unknown, decays with the throughput
         self.start_h_decay = np.exp(-rows["throughput_soc"][:, None] / np.array(HYSTERESIS_SOC))
         self.start_h_at = u.start_hysteresis.start + 2 * intervals.segment
         # the unknown load before the reset of the RC pairs decays with their time constants
         self.start_load_a = START_LOAD_C * cell.one_c_a * np.exp(-rows["settled_s"][:, None] / TAUS)
+        self.aging_trend = AgingVariance(RESISTANCE, cell, intervals).trend[intervals.of_row]
         direction = (rows["direction"] + 1.0).astype(np.intp)
         self.direction_start = u.direction.start + direction * DIRECTION_NODES
         z = np.clip(reference.soc, 0.0, 1.0)
@@ -125,10 +130,10 @@ class VoltageModel:
         cell = self.cell
         by_pass_v2 = (
             cell.direction_std_v**2
-            + (PASS_DROP * cell.drop_std * drop_v) ** 2
+            + (PASS_FRACTION * cell.drop_std * drop_v) ** 2
             + (EMPTY_RELATIVE * at_empty * drop_v) ** 2
         )
-        by_soc_v2 = (cell.slope(z) * (COUNT_SOC + KNEE_SOC * near_empty)) ** 2
+        by_soc_v2 = (cell.slope(z) * (COUNT_STD_SOC + KNEE_STD_SOC * near_empty)) ** 2
         by_start_v2 = ((self.start_load_a * ohm[:, 1:]) ** 2).sum(axis=1)
         return np.asarray(by_pass_v2 + by_soc_v2 + by_start_v2)
 
@@ -159,7 +164,7 @@ class VoltageModel:
         shape_at, curve_at = NodePosition.of(z, SHAPE_NODES), NodePosition.of(z, CURVE_NODES)
         direction_at = NodePosition.of(z, DIRECTION_NODES)
         ohm = cell.resistances(z, self.weak, self.strong)
-        ln_shape = shape_at.interpolate(x[u.shape]) + x[u.arrhenius] * self.warm_k
+        ln_shape = shape_at.interpolate(x[u.shape]) + x[u.arrhenius] * self.above_25_c_k + x[u.aging] * self.aging_trend
         scale = np.exp(x[u.ln_r] + ln_shape[:, None])
         true_a = self.current_a - (x[u.offset][self.intervals.of_row] * cell.one_c_a)[:, None]
         drops_v = scale * by_group(ohm * true_a)
@@ -167,7 +172,7 @@ class VoltageModel:
         hysteresis_v = self.hysteresis_factor * np.interp(z, SOC_GRID, cell.hysteresis_v)
         h = self.counted_h + self.start_h_decay * np.column_stack([x[self.start_h_at], x[self.start_h_at + 1]])
         ocv_v = cell.ocv(z) + curve_at.interpolate(x[u.curve])
-        ocv_v += self.warm_k * (x[u.entropy] + np.interp(z, SOC_GRID, cell.per_kelvin_v))
+        ocv_v += self.above_25_c_k * (x[u.entropy] + np.interp(z, SOC_GRID, cell.per_kelvin_v))
         by_direction_v = self.direction_v * direction_at.interpolate(x, self.direction_start)
         return Prediction(
             voltage_v=ocv_v - drop_v + hysteresis_v * (h @ x[u.hysteresis]) + by_direction_v,
@@ -202,12 +207,13 @@ class VoltageModel:
         terms = [
             *zip(soc_columns.T, by_soc.T, strict=True),
             *((np.full(n, u.ln_r.start + j), -p.drops_v[:, j]) for j in range(SCALES)),
+            (np.full(n, u.aging.start), -self.aging_trend * p.drop_v),
             (u.shape.start + p.shape_at.below, -shape_low * p.drop_v),
             (u.shape.start + p.shape_at.below + 1, -shape_high * p.drop_v),
             *((np.full(n, u.hysteresis.start + j), p.hysteresis_v * p.h[:, j]) for j in range(2)),
             *((self.start_h_at + j, by_start_h[:, j]) for j in range(2)),
-            (np.full(n, u.entropy.start), self.warm_k),
-            (np.full(n, u.arrhenius.start), -self.warm_k * p.drop_v),
+            (np.full(n, u.entropy.start), self.above_25_c_k),
+            (np.full(n, u.arrhenius.start), -self.above_25_c_k * p.drop_v),
             (u.curve.start + p.curve_at.below, curve_low),
             (u.curve.start + p.curve_at.below + 1, curve_high),
             (direction_at, self.direction_v * direction_low),
@@ -221,6 +227,7 @@ class VoltageModel:
         slope_v = self.cell.slope(p.soc) if smooth else self._slope_v(x, p.soc)
         columns, by_soc = self.soc_derivatives(x)
         by_soc *= slope_v[:, None]
+        # the offset (column 1) also lowers the current through the resistances
         by_soc[:, 1] += (p.scale * by_group(p.ohm)).sum(axis=1) * self.cell.one_c_a
         return columns, by_soc
 

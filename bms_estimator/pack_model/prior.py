@@ -10,6 +10,7 @@ from bms_estimator.kernels.kalman_filter.ekf import INDEPENDENT_R_STD
 from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
 from bms_estimator.kernels.kalman_filter.ocv_correction import CORRELATION_SOC
 from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.aging import CAPACITY, RESISTANCE, AgingVariance
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.intervals import Intervals
 from bms_estimator.pack_model.unknowns import (
@@ -22,42 +23,46 @@ from bms_estimator.pack_model.unknowns import (
 )
 
 SLIP_SOC = 0.02
-"""Std of the place of a feature of the OCV along SOC."""
+"""Std of the slip: the distance along SOC by which knees and steps of the OCV lie elsewhere than in the file."""
 SLIP_CORRELATION_SOC = 0.3
-"""Correlation length of that place [SOC]."""
+"""Correlation length of the slip [SOC]."""
 MAX_SLIP_PART = 0.85
-"""Maximum std of the slip as a fraction of the OCV's std."""
+"""Maximum std of the slip, as a voltage, as a fraction of the OCV's std. The rest is an error of voltage, which remains for any
+slope of the curve."""
 MAX_SLIP_SLOPE_V = 5.0
-"""Maximum slope of the OCV that converts a slip to a voltage [V]."""
+"""Maximum slope of the OCV that converts a slip to a voltage [V per unit SOC], as in ``filter_settings.MAX_SLOPE_V``: the SOC is
+better defined at the steep ends."""
 ROUNDING_V2 = 1e-10
 """Variance added to each node of the OCV's error, so that rounding leaves its covariance positive definite [V^2]."""
 DIRECTION_CORRELATION_SOC = 0.1
 """Correlation length of the error by direction [SOC]."""
 SHAPE_STD, SHAPE_CORRELATION_SOC = 0.15, 0.4
 """Relative std of the resistances over SOC, and its correlation length."""
+EMPTY_SHAPE_STD = 0.5
+"""Relative std of the resistances at SOC 0. Near empty they depend on the cell and on the load: at SOC 0 they are 1.4 to 3.4
+times those at SOC 0.5 in the cell files of Leaf, NCR18650, A123 and PF."""
 RC_CORRELATION = 0.7
 """Prior correlation of the scales of the fast and slow RC pairs."""
 HYSTERESIS_MEAN, HYSTERESIS_STD = 0.5, 0.5
 """Prior of the fraction of the cell file's hysteresis in each of its two parts."""
 ENTROPY_STD_V = 1.5e-4
-"""Std of the temperature coefficient of the OCV [V/K]."""
+"""Std of the OCV's temperature coefficient beyond that of the cell file [V/K]."""
 ARRHENIUS_STD = 0.004
 """Std of the relative change of the resistances beyond that of the cell file [1/K]."""
 MIN_FULL_STD = 0.006
 """Minimum std of the SOC at which this pack's charger ends, common to all charges."""
 FULL_REPEAT_STD = 0.01
 """Std of the SOC of one end of charge about the mean of this pack's charges."""
-CALENDAR_STD = 0.05
-"""Std of the change of the capacity in a year without use."""
 MIN_CAPACITY_STD, MIN_AGING_STD = 1e-4, 1e-4
 """Minimum std of ln of the capacity, and of its change between two intervals, so that the precision is finite."""
-MIN_OFFSET_STD_C, MIN_DAYS = 1e-6, 1e-4
-"""Minimum std of the offset as a C-rate, and minimum time from interval to interval [days], so that the precision is
-finite."""
+DRIFT_FRACTION = 0.05
+"""Fraction of the variance of the current sensor's offset that drifts; the rest is constant. Assumed: the offset changes by a
+tenth of its std from day to day, as by temperature. If all of it drifted, counting over a week would tell nothing."""
+MIN_OFFSET_STD_C, ROUNDING_FRACTION = 1e-6, 1e-6
+"""Minimum std of the offset as a C-rate, and fraction of its variance that is independent in each interval, so that the precision
+is finite."""
 NEW_SEGMENT_SOC, NEW_SEGMENT_STD = 0.5, 1.0
 """Mean and std of the SOC after a gap. Any charge may be hidden in it."""
-DAY_S, YEAR_DAYS = 86400.0, 365.0
-"""Length of a day [s] and of a year [days]."""
 
 
 class Prior:
@@ -77,14 +82,14 @@ class Prior:
         self.mean, self.precision = np.zeros(u.size), np.zeros((u.size, u.size))
         self._add_constants(u)
         self._add_functions_of_soc(cell, u)
-        self.precision[u.ln_r, u.ln_r] = np.linalg.inv(scale_covariance(cell.r_std))
+        self._add_resistances(cell, intervals, u)
         self._add_square([u.full.start], [1.0], full_std(intervals.rows))
         self._add_soc(intervals, u)
         self._add_offset(cell, intervals, u)
         self._add_capacity(cell, intervals, u)
 
     def _add_square(self, at: list[int], factors: list[float], std: float) -> None:
-        """Add the squared sum of factors times deviations over the variance."""
+        """Add the square of (sum of factors times deviations from the mean) / ``std`` to the cost."""
         self.precision[np.ix_(at, at)] += np.outer(factors, factors) / std**2
 
     def _add_constants(self, u: Unknowns) -> None:
@@ -96,6 +101,7 @@ class Prior:
             (u.start_hysteresis, HYST_STD),
             (u.entropy, ENTROPY_STD_V),
             (u.arrhenius, ARRHENIUS_STD),
+            (u.aging, 1.0),
         ):
             diagonal[part] = 1.0 / std**2
 
@@ -106,7 +112,9 @@ class Prior:
         self.precision[u.curve, u.curve] = np.linalg.inv(covariance)
         by_direction = node_precision(DIRECTION_NODES, DIRECTION_CORRELATION_SOC)
         self.precision[u.direction, u.direction] = np.kron(np.eye(DIRECTIONS), by_direction)
-        self.precision[u.shape, u.shape] = node_precision(SHAPE_NODES, SHAPE_CORRELATION_SOC) / SHAPE_STD**2
+        shape_std = np.array([EMPTY_SHAPE_STD, *[SHAPE_STD] * (SHAPE_NODES - 1)])
+        by_shape = node_precision(SHAPE_NODES, SHAPE_CORRELATION_SOC)
+        self.precision[u.shape, u.shape] = by_shape / np.outer(shape_std, shape_std)
 
     def _add_soc(self, intervals: Intervals, u: Unknowns) -> None:
         """Add the SOC at the start of each segment."""
@@ -115,34 +123,33 @@ class Prior:
             self._add_square([u.soc.start + k], [1.0], NEW_SEGMENT_STD)
 
     def _add_offset(self, cell: CellCurves, intervals: Intervals, u: Unknowns) -> None:
-        """Add the current offset, which drifts as a first-order Gauss-Markov process."""
+        """Add the current offset: a constant part and a first-order Gauss-Markov process."""
         std = max(cell.offset_std_a / cell.one_c_a, MIN_OFFSET_STD_C)
-        self._add_square([u.offset.start], [1.0], std)
-        for k, days in enumerate(days_between(intervals), start=1):
-            keep = math.exp(-max(days, MIN_DAYS) * DAY_S / cell.offset_s)
-            self._add_square([u.offset.start + k, u.offset.start + k - 1], [1.0, -keep], std * math.sqrt(1.0 - keep**2))
+        start_s = intervals.rows["elapsed_s"][intervals.starts]
+        drift = np.exp(-np.abs(start_s[:, None] - start_s) / cell.offset_s)
+        correlation = 1.0 - DRIFT_FRACTION + DRIFT_FRACTION * drift + ROUNDING_FRACTION * np.eye(intervals.count)
+        self.precision[u.offset, u.offset] = np.linalg.inv(correlation) / std**2
 
     def _add_capacity(self, cell: CellCurves, intervals: Intervals, u: Unknowns) -> None:
         """Add ln of the capacity, which changes by use and by time as a random walk."""
-        rows, starts = intervals.rows, intervals.starts
-        self._add_square([u.ln_q.start], [1.0], max(cell.capacity_std, MIN_CAPACITY_STD))
-        used_soc = rows["throughput_soc"][intervals.ends] - rows["throughput_soc"][starts]
-        for k, days in enumerate(days_between(intervals), start=1):
-            by_use = 2.0 * cell.capacity_std**2 * max(float(used_soc[k - 1]), 0.0) / cell.aged_soc
-            variance = by_use + CALENDAR_STD**2 * days / YEAR_DAYS + MIN_AGING_STD**2
-            self._add_square([u.ln_q.start + k, u.ln_q.start + k - 1], [1.0, -1.0], math.sqrt(variance))
+        aging = AgingVariance(CAPACITY, cell, intervals)
+        std = math.sqrt(cell.capacity_std**2 + aging.before)
+        self._add_square([u.ln_q.start], [1.0], max(std, MIN_CAPACITY_STD))
+        for k, variance in enumerate(np.diff(aging.at_start).tolist(), start=1):
+            std = math.sqrt(variance + MIN_AGING_STD**2)
+            self._add_square([u.ln_q.start + k, u.ln_q.start + k - 1], [1.0, -1.0], std)
 
-
-def days_between(intervals: Intervals) -> list[float]:
-    """Return the time from the start of each interval to that of the next [days]."""
-    days: list[float] = (np.diff(intervals.rows["elapsed_s"][intervals.starts]) / DAY_S).tolist()
-    return days
+    def _add_resistances(self, cell: CellCurves, intervals: Intervals, u: Unknowns) -> None:
+        """Add the scales of the resistances in the last interval. Aging has changed them since the pack's first row."""
+        aging = AgingVariance(RESISTANCE, cell, intervals)
+        covariance = scale_covariance(cell.r_std) + aging.before + aging.at_start[-1]
+        self.precision[u.ln_r, u.ln_r] = np.linalg.inv(covariance)
 
 
 def full_std(rows: NDArray[np.void]) -> float:
     """Return the std of the SOC at which the charger ends, common to all charges.
 
-    The charger of the cell file may end at another point, in the same way with each charge.
+    The owner's charger may end at another SOC than the charge that defined SOC 1 of the cell file, with each charge alike.
     """
     is_full = rows["reference_kind"] == FULL
     if not is_full.any():
@@ -163,7 +170,7 @@ def scale_covariance(r_std: float) -> Floats:
 def curve_covariance(cell: CellCurves, soc: Floats) -> Floats:
     """Return the prior covariance of the OCV's error at each pair of SOCs, shape (n, n) [V^2].
 
-    One part is an error of voltage, the other a displacement of the curve's features along SOC.
+    It has three parts: an error of voltage, the slip of the curve's knees and steps along SOC, and the voltage sensor's gain.
     """
     error_v = np.interp(soc, SOC_GRID, cell.error_v)
     slope_v = np.minimum(cell.slope(soc, SLIP_SOC), MAX_SLIP_SLOPE_V)
@@ -172,11 +179,16 @@ def curve_covariance(cell: CellCurves, soc: Floats) -> Floats:
     distance = np.abs(soc[:, None] - soc)
     slip_v2 = np.outer(slip_v, slip_v) * np.exp(-distance / SLIP_CORRELATION_SOC)
     level_v2 = np.outer(level_v, level_v) * np.exp(-distance / CORRELATION_SOC)
-    return np.asarray(slip_v2 + level_v2)
+    gain_v = cell.gain_std * cell.ocv(soc)
+    return np.asarray(slip_v2 + level_v2 + np.outer(gain_v, gain_v))
 
 
 def variance_between_nodes(cell: CellCurves, soc: Floats) -> Floats:
-    """Return the mean variance of the OCV's error about its interpolation between two nodes [V^2]."""
+    """Return the mean variance of the OCV's error about its interpolation between two nodes [V^2].
+
+    For an exponential correlation it is (1 - correlation of the two nodes) / 3 of the variance, to first order in their
+    distance.
+    """
     correlation = math.exp(-1.0 / (CURVE_NODES - 1) / CORRELATION_SOC)
     return np.asarray(np.interp(soc, SOC_GRID, cell.error_v) ** 2 * (1.0 - correlation) / 3.0)
 

@@ -51,18 +51,19 @@ def _append_saved(h: np.void, f: np.void, history: History, capacity_as: float) 
         if last["segment"] > h["segment"]:
             return False
         rows = rows[rows["elapsed_s"] > last["elapsed_s"]]
-        # rows may be lost between the last saved one and those of a later segment, so that the charge is unknown
+        # If the first of these rows is of a later segment than the last saved row, rows between them may be lost. The charge
+        # in the gap before that segment is then unknown.
         rows["gap_s"][(rows["segment"] > last["segment"]) & (rows["segment"] == rows["segment"][:1])] = math.inf
         history.append(rows, capacity_as)
     else:
         history.append(rows, capacity_as)
         if not rows.size:
             return False
-    history.append(_count_row(h, f, history.rows[-1]), capacity_as)
+    history.append(_row_at_checkpoint(h, f, history.rows[-1]), capacity_as)
     return True
 
 
-def _count_row(h: np.void, f: np.void, last: np.void) -> np.ndarray:
+def _row_at_checkpoint(h: np.void, f: np.void, last: np.void) -> np.ndarray:
     """Return a row without a voltage, with the charge up to the checkpoint.
 
     The next segment is linked to it. ``last`` is the last saved row.

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
-from bms_estimator.kernels.kalman_filter.records import NODES
 from bms_estimator.pack_model.cell_curves import SOC_GRID
-from bms_estimator.pack_model.fit import PackFit
+from bms_estimator.pack_model.fit import CURVE, PackFit
 from bms_estimator.pack_model.history import MAX_ROWS, History
 
 SAVED_MINIMA = 2
 """Number of a fit's minima that are saved; the next fit starts from no more."""
-_RESULTS = 6 + NODES
+_RESULTS = CURVE.stop
+"""Number of results of a fit. ``CURVE`` is the last part of them."""
 _SHAPES = {
     "elapsed_s": (),
     "segment": (),
@@ -26,9 +26,12 @@ _SHAPES = {
     "ln_r": (SOC_GRID.size, 3),
     "hysteresis": (),
     "cost": (),
+    "first_segment": (),
 }
 """Fields of a fit on which the curves and the handed-over state depend, with their shapes."""
-_HISTORY_FIELDS = "row_elapsed_s", "row_soc", "curves"
+_ALL_ROWS: Mapping[str, NDArray[Any]] = {"first_segment": np.zeros(())}
+"""Field of a fit that was saved before exchanges of the pack were noticed: the fit used all rows."""
+_START_FIELDS = "row_elapsed_s", "row_soc", "curves"
 """Fields of a fit from which the next fit starts."""
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -48,8 +51,9 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
     if not arrays:
         return None
     values: dict[str, Any] = {}
+    saved = {**_ALL_ROWS, **arrays}
     for name, shape in _SHAPES.items():
-        value = arrays.get(name)
+        value = saved.get(name)
         if value is None or value.shape != shape or not np.isfinite(value).all():
             raise ValueError(f"{name} of the fit is missing or damaged")
         values[name] = value if shape else float(value)
@@ -58,7 +62,7 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
 
 
 def neutral_fit() -> PackFit:
-    """Return a fit that confirms the cell file."""
+    """Return a fit without corrections. The service adopts it to compile the code before the first sample."""
     values: dict[str, Any] = {name: np.zeros(shape) if shape else 0.0 for name, shape in _SHAPES.items()}
     values |= {"covariance": np.eye(_RESULTS), "hysteresis": 1.0}
     none = np.zeros(0)
@@ -92,7 +96,7 @@ def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
     fit = fit_of_curves({name: value for name, value in arrays.items() if name in _SHAPES})
     if fit is None:
         return History(rows), None
-    elapsed_s, soc, starts = (arrays.get(name, np.zeros(0)) for name in _HISTORY_FIELDS)
+    elapsed_s, soc, starts = (arrays.get(name, np.zeros(0)) for name in _START_FIELDS)
     if elapsed_s.shape != soc.shape or elapsed_s.ndim != 1 or not np.isfinite(starts).all():
         raise ValueError("the starts of the next fit are damaged")
     return History(rows), replace(fit, row_elapsed_s=elapsed_s, row_soc=soc, curves=tuple(starts))

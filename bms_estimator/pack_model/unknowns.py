@@ -29,9 +29,11 @@ class Unknowns:
     ln_q: slice
     """ln of the true over the declared capacity in each interval."""
     ln_r: slice
-    """ln of the true over the file's resistances: series resistance, RC pairs 1-3, RC pairs 4-6."""
+    """ln of the true over the file's resistances in the last interval: series resistance, RC pairs 1-3, RC pairs 4-6."""
+    aging: slice
+    """Rate at which aging changes the resistances over the history, relative to its std: factor on ``AgingVariance.trend``."""
     shape: slice
-    """ln of the true over the file's resistances at ``SHAPE_NODES`` SOCs."""
+    """Addition to ``ln_r`` that depends on the SOC, at ``SHAPE_NODES`` SOCs, common to all resistances."""
     hysteresis: slice
     """Fraction of the file's hysteresis in its fast and in its slow part."""
     start_hysteresis: slice
@@ -41,7 +43,7 @@ class Unknowns:
     arrhenius: slice
     """Relative change of the resistances by temperature beyond the file's [1/K]."""
     full: slice
-    """Deviation of the SOC at which the charger ends."""
+    """1 minus the SOC at which this pack's charger ends."""
     curve: slice
     """Error of the file's OCV at ``CURVE_NODES`` SOCs [V]."""
     direction: slice
@@ -55,6 +57,6 @@ class Unknowns:
     @classmethod
     def of(cls, intervals: int, segments: int) -> "Unknowns":
         """Return the positions for a number of intervals and segments."""
-        sizes = (intervals, intervals, intervals, SCALES, SHAPE_NODES, 2, 2 * segments, 1, 1, 1)
+        sizes = (intervals, intervals, intervals, SCALES, 1, SHAPE_NODES, 2, 2 * segments, 1, 1, 1)
         ends = np.cumsum([*sizes, CURVE_NODES, DIRECTIONS * DIRECTION_NODES]).tolist()
         return cls(*(slice(a, b) for a, b in zip([0, *ends], ends, strict=False)))

@@ -52,7 +52,7 @@ class FitThread:
     """
 
     def __init__(self, clock: Clock, executor: Executor | None = None) -> None:
-        self._clock, self._executor = clock, executor or DiskThread("fit")
+        self._clock, self._executor = clock, executor or DiskThread("fit")  # for its daemon thread
         self._logged_s: dict[str, float] = {}
         self.times = FitTimes(None, None)
 

@@ -29,6 +29,9 @@ def restore_pack(
 ) -> tuple[RunCounters, str]:
     """Restore a valid checkpoint and a valid history; rejected files are quarantined.
 
+    The curves are adopted first, because the state is relative to them. The history is resumed last, because it depends on
+    whether the state was restored.
+
     Args:
         estimator: New estimator.
         pack_model: New slow fit of the estimator; None: the estimator runs without one.
@@ -48,12 +51,10 @@ def restore_pack(
         pack_model.load(rows, fit, state_fit)
     elif state_fit:
         adopt_curves(estimator.settings_record[0]["filter"], estimator.cell_file_settings, state_fit)
-    outcome = content.reason
-    if not outcome:
-        error = restore_state(estimator, content.state, content.unseen_s)
-        outcome = f"{REJECTED}{error}" if error else f"restored{_soc_text(estimator)}"
-    restored = outcome.startswith("restored")
+    restored, outcome = _restore_state(estimator, content)
     if content.curves and (pack_model is None or state_fit is None):
+        # Without a slow fit the resistances are converted to the curves of the cell file. If the saved curves are damaged, the
+        # resistances are relative to unknown curves, and their std becomes that of the cell file again.
         return_to_cell_file(estimator)
     if pack_model:
         pack_model.resume(content.unseen_s if restored else math.inf, restored=restored)
@@ -71,6 +72,15 @@ def _fit_of_state(content: CheckpointContent) -> PackFit | None:
     except ValueError as error:
         log.warning("the state is restored with the curves of the cell file", reason=str(error))
         return None
+
+
+def _restore_state(estimator: Estimator, content: CheckpointContent) -> tuple[bool, str]:
+    """Restore the state of a checkpoint. Return whether it was restored, and the outcome as text."""
+    if content.reason:
+        return False, content.reason
+    if error := restore_state(estimator, content.state, content.unseen_s):
+        return False, f"{REJECTED}{error}"
+    return True, f"restored{_soc_text(estimator)}"
 
 
 def _load_history(file: HistoryFile | None) -> tuple[History, PackFit | None]:

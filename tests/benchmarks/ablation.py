@@ -16,8 +16,9 @@ from rich.table import Table
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import CURVE_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import GRID, REFERENCE_C
-from bms_estimator.kernels.kalman_filter.mixture import copy_hypothesis, mixture_moments
-from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, SOC
+from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD, spawn_hypotheses
+from bms_estimator.kernels.kalman_filter.mixture import mixture_moments
+from bms_estimator.kernels.kalman_filter.records import SOC
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
@@ -74,6 +75,7 @@ PARTS: dict[str, Change] = {
     "entropy": change_settings(per_kelvin_v=0.0),
     "error of the OCV": change_settings(curve_error_v=0.0),
     "learned OCV": change_settings(learned=0.0),
+    "learned OCV and capacity": change_settings(learning_soc=0.0),
     "larger error at the knees of the OCV": change_settings(curve_soc=CURVE_SOC),
     "hysteresis": change_settings(hysteresis_v=0.0),
     "offset": change_settings(offset_c=0.0),
@@ -125,20 +127,17 @@ def score_without(part: str, cell: CellModel, samples: SampleBlock, truth: Float
         samples["temperature_c"] = REFERENCE_C
     first_row = estimator.run(samples[:1])
     if part == ONE_FILTER:
-        merge_all_hypotheses(estimator.record[0]["filter"], estimator.settings_record[0]["filter"])
+        restart_with_one_hypothesis(estimator.record[0]["filter"], estimator.settings_record[0]["filter"], start_soc)
     trace = np.concatenate([first_row, estimator.run(samples[1:])])
     true_soc = np.interp(trace["time_s"], samples["time_s"], truth)
     return score(trace["time_s"], trace["soc"], trace["soc_std"], true_soc)
 
 
-def merge_all_hypotheses(state: np.void, settings: np.void) -> None:
-    """Replace all hypotheses by the middle one, with the standard deviation that the SOC has over all hypotheses."""
-    if state["count"] == HYPOTHESES:
-        copy_hypothesis(state, HYPOTHESES // 2, 0)
-        state["count"], state["best"] = 1, 0
-        state["ln_weight"][0] = 0.0
-        state["covariance"][0, SOC, SOC] = settings["soc_std"] ** 2
-        mixture_moments(state)
+def restart_with_one_hypothesis(state: np.void, settings: np.void, start_soc: float) -> None:
+    """Replace all hypotheses by one at the initial SOC, with the standard deviation that the SOC has over all of them."""
+    spawn_hypotheses(state, settings, start_soc, MAX_SINGLE_STD)
+    state["covariance"][0, SOC, SOC] = settings["soc_std"] ** 2
+    mixture_moments(state)
 
 
 if __name__ == "__main__":

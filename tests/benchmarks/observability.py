@@ -1,4 +1,4 @@
-"""What voltages can tell about the SOC after infinite time: ``make observability``.
+"""Std of the SOC that voltages leave after infinite time: ``make observability``.
 
 A pack passes a window of SOC again and again. Every error that differs from pass to pass averages out. What remains is the
 error of the cell file's OCV curve, and an error by direction (charge, discharge, rest) that recurs at each pass. The
@@ -7,8 +7,8 @@ small deviations:
 
     voltage error = slope (dSOC + (SOC - middle) d ln Q) + hysteresis + curve + error by direction
 
-The std that follows is the smallest honest one: no estimator that knows no more than the cell file can have a smaller error on
-average. Resistances are left out, because rests separate them: with their prior and currents of 0.4 C the std changes by
+This std is a lower bound: no estimator that knows no more than the cell file can have a smaller error on average over the
+possible cells and over the window. At single SOCs, as near full, the std may be smaller than this mean. Resistances are left out, because rests separate them: with their prior and currents of 0.4 C the std changes by
 less than 0.01 %.
 """
 
@@ -73,8 +73,8 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Direction:
-    """Changes of the unknowns that leave the voltages as they are, of the size of one std of the result."""
+class UnseenChange:
+    """Common change of the unknowns that no voltage shows, of the size of one std of the result."""
 
     soc: float
     """Change of the SOC in the middle of the window."""
@@ -119,12 +119,12 @@ class Observability:
             h = np.column_stack([slope_v, slope_v * (self.soc - self.middle), sign * half_v, np.eye(self.soc.size)])
             total += h.T @ precision @ h
         if self.window.full:
-            at_full = self.of_soc(np.ones(1))[0]
+            at_full = self.soc_derivatives(np.ones(1))[0]
             total += np.outer(at_full, at_full) / MIN_FULL_STD**2
         return total
 
-    def of_soc(self, soc: Floats) -> Floats:
-        """Return the derivative of the SOC by the unknowns where the pack is believed to be at ``soc``."""
+    def soc_derivatives(self, soc: Floats) -> Floats:
+        """Return the derivatives of the SOC by the unknowns for each estimated SOC in ``soc``, shape (n, unknowns)."""
         rows = np.zeros((soc.size, CURVE + self.soc.size))
         rows[:, SOC], rows[:, LN_Q] = 1.0, soc - self.middle
         return rows
@@ -142,9 +142,9 @@ class Observability:
         return int((self.spectrum[0] > INFORMATIVE).sum())
 
     def std(self, soc: Floats) -> Floats:
-        """Return the std of the SOC where the pack is believed to be at ``soc``."""
+        """Return the std of the SOC for each estimated SOC in ``soc``."""
         values, vectors = self.spectrum
-        return np.sqrt((self.of_soc(soc) @ vectors) ** 2 @ (1.0 / (1.0 + values)))
+        return np.sqrt((self.soc_derivatives(soc) @ vectors) ** 2 @ (1.0 / (1.0 + values)))
 
     @property
     def capacity_std(self) -> float:
@@ -157,15 +157,18 @@ class Observability:
         """Mean of the std over the window."""
         return float(self.std(self.soc).mean())
 
-    def uncertain_directions(self) -> tuple[Direction, Direction]:
-        """Return what remains unknown of the SOC with all that changes with it, and of the capacity at a given SOC."""
+    def unseen_changes(self) -> tuple[UnseenChange, UnseenChange]:
+        """Return one std of the SOC, and one std of the capacity at a given SOC.
+
+        Each includes the changes of the other unknowns that are correlated with it.
+        """
         values, vectors = self.spectrum
         covariance = vectors @ (vectors / (1.0 + values)).T
         shift = covariance[:, SOC] / np.sqrt(covariance[SOC, SOC])
         covariance -= np.outer(shift, shift)
         stretch = covariance[:, LN_Q] / np.sqrt(covariance[LN_Q, LN_Q])
         ends = CURVE + np.array([0, self.soc.size // 2, self.soc.size - 1])
-        first, second = (Direction(float(d[SOC]), float(d[LN_Q]), d[ends]) for d in (shift, stretch))
+        first, second = (UnseenChange(float(d[SOC]), float(d[LN_Q]), d[ends]) for d in (shift, stretch))
         return first, second
 
 
@@ -175,7 +178,7 @@ def curves(cell: CellModel) -> CellCurves:
 
 
 def bound(cell: CellCurves, window: tuple[float, float], *, full: bool) -> float:
-    """Return the smallest honest std of the SOC after infinite time, mean over a window.
+    """Return the lower bound of the std of the SOC after infinite time, mean over a window.
 
     Args:
         cell: Curves and prior of the cell.
@@ -187,7 +190,7 @@ def bound(cell: CellCurves, window: tuple[float, float], *, full: bool) -> float
 
 def std_table(cells: list[str], windows: list[Window]) -> Table:
     """Return the std of the SOC for each cell and window [%]."""
-    table = Table(title="smallest honest std of the SOC after infinite time [%]")
+    table = Table(title="lower bound of the std of the SOC after infinite time [%]")
     for column in ("cell", "window", "full seen", *(f"{soc:g}" for soc in SOCS), "mean", "capacity", "rank"):
         table.add_column(column, justify="right")
     for name in cells:
@@ -220,7 +223,7 @@ def direction_table(cells: list[str], window: Window) -> Table:
     for column in ("cell", "SOC, middle [%]", "capacity [%]", *curve):
         table.add_column(column, justify="right")
     for name in cells:
-        for d in Observability(curves(load_cell(name, RATED_AH)), window).uncertain_directions():
+        for d in Observability(curves(load_cell(name, RATED_AH)), window).unseen_changes():
             curve_mv = (f"{1e3 * volts:+.0f}" for volts in d.curve_v)
             table.add_row(name, f"{100.0 * d.soc:+.1f}", f"{100.0 * d.ln_q:+.1f}", *curve_mv)
     return table

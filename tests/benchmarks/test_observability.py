@@ -1,4 +1,4 @@
-"""The smallest honest std of the SOC: its documented table, its limits, and a simulation."""
+"""Lower bound of the std of the SOC: its documented table, its limits, and a simulation."""
 
 from pathlib import Path
 
@@ -75,7 +75,7 @@ def test_the_voltages_cannot_separate_soc_and_capacity_from_the_curve() -> None:
     result = Observability(cell, window)
     assert (result.spectrum[0] < 1e-6).sum() == 2
     ends_soc = window.soc[[0, window.soc.size // 2, -1]]
-    for change in result.uncertain_directions():
+    for change in result.unseen_changes():
         soc = change.soc + change.ln_q * (ends_soc - result.middle)
         assert change.curve_v == pytest.approx(-cell.slope(ends_soc) * soc, abs=6e-3)
 

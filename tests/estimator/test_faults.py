@@ -10,7 +10,7 @@ import pytest
 from bms_estimator import Estimator, load_capture, load_cell
 from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.estimator.simulated_cell import TRUTH, pulses
 
 FAULT_S = 3600.0, 7200.0
@@ -306,3 +306,31 @@ def test_an_implausible_temperature_is_ignored(wrong_c: float) -> None:
     trace = Estimator(TRUTH, initial_soc=0.9).run(block)
     assert np.array_equal(trace["soc"], without_temperature["soc"])
     assert np.array_equal(trace["soc_std"], without_temperature["soc_std"])
+
+
+def small_loads_of_a_large_pack(days: float) -> SampleBlock:
+    """Return samples every 10 s of a cell of 20 Ah whose load changes every 10 min: the voltage changes by less than its noise."""
+    rng, steps = np.random.default_rng(2), int(days * 8640.0)
+    block = np.zeros(steps, dtype=SAMPLE)
+    block["time_s"], block["temperature_c"] = 10.0 * np.arange(steps), 25.0
+    current_a = np.repeat(rng.gamma(1.5, 0.2, steps // 60 + 1), 60)[:steps]
+    current_a -= current_a.mean()
+    block["current_a"] = np.round(current_a, 2)
+    voltage_v = 3.3 - 0.0008 * current_a + 0.001 * rng.standard_normal(steps)
+    block["voltage_v"] = np.round(voltage_v, 3)
+    return block
+
+
+@pytest.mark.parametrize("fault", [leave_unchanged, reverse_current])
+def test_noise_of_the_voltage_is_no_fault_of_the_current_s_sign(fault: Fault) -> None:
+    """The noise alone does not show a wrong sign. A load of 10 A, whose changes exceed the noise, shows it."""
+    block = small_loads_of_a_large_pack(days=6.0)
+    if fault is reverse_current:
+        block["voltage_v"] -= 0.0008 * 20.0 * block["current_a"]
+        block["current_a"] *= 20.0
+        fault(block, np.ones(block.size, dtype=bool))
+    estimator, suspects = Estimator(load_cell("lfp", 20.0)), 0
+    for first in range(0, block.size, BLOCK_SAMPLES):
+        estimator.run(block[first : first + BLOCK_SAMPLES])
+        suspects |= int(estimator.record["checks"]["suspects"][0])
+    assert bool(suspects & InputFault.SIGN_OF_CURRENT) == (fault is reverse_current)

@@ -38,8 +38,9 @@ def days_with_a_charge() -> tuple[SampleBlock, Floats]:
     samples = np.zeros(current_a.size, dtype=SAMPLE)
     samples["time_s"], samples["temperature_c"] = np.arange(current_a.size), 25.0
     curves = OXIDE.ocv_v, OXIDE.per_kelvin_v, OXIDE.hysteresis_v, OXIDE.ohm
+    soc, hysteresis = 0.9, -1.0  # at rest after a discharge
     limits = {"low_v": float(OXIDE.ocv_v[0]), "high_v": FULL_V}
-    voltage_v, soc = simulate(1.0, current_a, samples["temperature_c"], 0.9, -1.0, CAPACITY_AH, *curves, **limits)
+    voltage_v, soc = simulate(1.0, current_a, samples["temperature_c"], soc, hysteresis, CAPACITY_AH, *curves, **limits)
     samples["current_a"] = np.round(current_a + rng.normal(0.0, 2e-3, soc.size), 3)
     samples["voltage_v"] = np.round(voltage_v + rng.normal(0.0, 5e-4, soc.size), 3)
     return samples, np.minimum(soc + 1.0 - soc.max(), 1.0)
@@ -82,6 +83,27 @@ def test_an_end_of_charge_that_contradicts_the_ocv_curve_is_reported_and_correct
     assert anchor is not None
     assert anchor.kind == "full"
     assert anchor.soc_after == anchor.soc_before == pytest.approx(0.92, abs=0.03)
+
+
+@pytest.mark.parametrize(("gap_s", "anchors"), [(7200.0, 1), (20.0, 0)])
+def test_a_gap_that_begins_at_the_cutoff_voltage_under_load_ends_the_discharge(gap_s: float, anchors: int) -> None:
+    """The protection disconnects the electronics, too, so that no rest is measured. The pack is charged in the gap."""
+    curves = OXIDE.ocv_v, OXIDE.per_kelvin_v, OXIDE.hysteresis_v, OXIDE.ohm
+    current_a = np.full(6 * 3600, 0.2 * CAPACITY_AH)
+    voltage_v, _ = simulate(1.0, current_a, np.full(current_a.size, 25.0), 0.6, -1.0, CAPACITY_AH, *curves)
+    end = int(np.argmax(voltage_v < OXIDE.ocv_v[0])) + 10
+    samples = np.zeros(end + 30, dtype=SAMPLE)
+    samples["time_s"], samples["temperature_c"] = np.arange(samples.size), 25.0
+    samples["current_a"][:end], samples["voltage_v"][:end] = current_a[:end], voltage_v[:end]
+    samples["time_s"][end:] += gap_s
+    samples["voltage_v"][end:] = OXIDE.ocv_v[-1]
+    estimator = Estimator(load_cell("nmc", CAPACITY_AH), limits=ChargeLimits(cutoff_voltage_v=float(OXIDE.ocv_v[0])))
+    estimator.run(samples)
+    assert identifier_counters(estimator.record[0])["empty_anchors"] == anchors
+    if anchors:
+        anchor = last_anchor(estimator.record[0])
+        assert anchor is not None
+        assert anchor.soc_after < anchor.soc_before < 0.06
 
 
 def anchors_of(path: Path, chemistry: str, capacity_ah: float) -> Estimator:

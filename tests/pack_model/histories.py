@@ -1,4 +1,4 @@
-"""Histories of rows that the slow fit's own model predicts without noise, for known unknowns."""
+"""Histories without noise: the voltages are those that the slow fit's model predicts for given true values."""
 
 from dataclasses import dataclass
 
@@ -12,6 +12,7 @@ from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.equations import Equations
 from bms_estimator.pack_model.prediction import Reference
 from bms_estimator.pack_model.unknowns import SCALES, Unknowns
+from bms_estimator.settings.sampling import EXACT, Sampling
 
 CAPACITY_AH = 3.0
 REST_ROWS_S = (60.0, 120.0, 600.0, 1800.0, 3600.0)
@@ -34,9 +35,10 @@ class Truth:
     """ln of the true over the file's resistances of each group."""
 
 
-def cell_curves(chemistry: str = "nmc") -> CellCurves:
+def cell_curves(chemistry: str = "nmc", sampling: Sampling = EXACT) -> CellCurves:
     """Return the curves of a generic cell."""
-    return CellCurves(Estimator(load_cell(chemistry, CAPACITY_AH)).settings_record[0]["filter"])
+    estimator = Estimator(load_cell(chemistry, CAPACITY_AH), sampling=sampling)
+    return CellCurves(estimator.settings_record[0]["filter"])
 
 
 def phases(days: int) -> list[tuple[float, float]]:
@@ -61,6 +63,7 @@ def measured_rows(cell: CellCurves, days: int = 3, *, segment: int = 0, gap_s: f
     for row, (rate_c, duration_s) in zip(rows, profile, strict=True):
         current_a = rate_c * cell.one_c_a
         moved_soc = rate_c * duration_s / 3600.0
+        # a row has the values in its middle, therefore the state advances by two halves of the row
         keep = np.exp(-0.5 * duration_s / TAUS)
         x_a = current_a + (x_a - current_a) * keep
         keep_h = np.exp(-0.5 * abs(moved_soc) / np.array(HYSTERESIS_SOC))
@@ -138,6 +141,7 @@ def spreads(u: Unknowns) -> tuple[tuple[slice, float], ...]:
     """Return the std of the random values of each kind of unknown that is not a state of charge."""
     return (
         (u.shape, 0.1),
+        (u.aging, 0.5),
         (u.hysteresis, 0.2),
         (u.start_hysteresis, 0.3),
         (u.entropy, 1e-4),

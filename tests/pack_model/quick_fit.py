@@ -1,4 +1,4 @@
-"""Fit for tests of its use: a fixed result instead of a minimization."""
+"""Stand-in for the fit in tests of its callers: it returns a fixed result at once."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,5 +34,5 @@ def quick_fit(_: CellCurves, rows: NDArray[np.void], previous: PackFit | None = 
         row_elapsed_s=rows["elapsed_s"].copy(),
         row_soc=rows["soc"].copy(),
         cost=1.0,
-        curves=(np.zeros(9), np.ones(9)),
+        curves=(np.zeros(9), np.ones(9)),  # two minima; only saved and restored, therefore of any length
     )

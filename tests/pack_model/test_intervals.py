@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.pack_model.intervals import DAY_SOC, Intervals, Links
+from bms_estimator.pack_model.intervals import DAILY_STD_SOC, Intervals, Links
 from tests.pack_model.histories import cell_curves, measured_rows
 
 COUNTED_STD = 0.01
@@ -22,5 +22,5 @@ def test_std_of_link_across_gap_contains_charge_before_and_after_it() -> None:
     assert links.interval.tolist() == [1]
     throughput_soc = before["throughput_soc"][-1] - before["throughput_soc"][0] + after["throughput_soc"][0]
     days = (after["elapsed_s"][0] - before["elapsed_s"][0]) / 86400.0
-    variance = 2.0 * COUNTED_STD**2 + cell.charge_error**2 * throughput_soc + DAY_SOC**2 * days
+    variance = 2.0 * COUNTED_STD**2 + cell.charge_error**2 * throughput_soc + DAILY_STD_SOC**2 * days
     assert links.std[0] ** 2 == pytest.approx(variance, rel=1e-9)

@@ -1,4 +1,4 @@
-"""History and fit as arrays, and what the rest of the program calls relative to the cell file."""
+"""Saving of history and fit, and the published values that are relative to the cell file."""
 
 from dataclasses import fields
 from typing import Any
@@ -65,6 +65,14 @@ def test_a_missing_field_of_the_curves_is_rejected() -> None:
         fit_of_curves(arrays)
 
 
+def test_fit_of_a_version_without_exchanges_used_all_rows() -> None:
+    arrays = curve_arrays(quick_fit(None, some_rows()))  # type: ignore[arg-type]
+    del arrays["first_segment"]
+    restored = fit_of_curves(arrays)
+    assert restored is not None
+    assert restored.first_segment == 0.0
+
+
 def fitted_estimator(cell: CellModel = CELL) -> Estimator:
     """Return an estimator at rest with the curves of a fit."""
     estimator = new_estimator(Settings(), cell.pack(SERIES, 1))
@@ -80,7 +88,7 @@ def test_r_s_is_relative_to_the_cell_file() -> None:
     ratio = make_parameters_payload(estimator, 0.0).state_of_health["r_s"]
     direct = relative_series_resistance(estimator.record[0], estimator.settings_record[0], estimator.cell_file_settings)
     assert direct.value == pytest.approx(np.exp(LN_SERIES), rel=0.02)
-    assert ratio.value is None or ratio.source == "configured" or ratio.value == direct.value
+    assert (ratio.source, ratio.value) == ("configured", 1.0)  # at rest no data identifies R_s
 
 
 def test_the_published_curve_contains_the_fit() -> None:

@@ -19,13 +19,13 @@ from bms_estimator.reports.procedure import Capture, Kind, Procedure, kind_of, p
 from bms_estimator.reports.report_items import Reproduction
 from bms_estimator.reports.thesis_claims import CLAIMS, Claim, Result, claim
 from bms_estimator.sources.captures.replay import load_capture
-from tests.benchmarks import chapter5
+from tests.benchmarks.thesis import chapter5
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps
 from tests.calibration.simulated_relaxation import relaxation
 
 CAPACITY_AH = TRUTH.cell.capacity_ah
 KIND_BY_NAME = {"relaxation": Kind.RELAXATION, "slow": Kind.CONSTANT, "constant": Kind.CONSTANT, "steps": Kind.STEPS}
-RESULTS_DOCUMENT = Path(__file__).parents[1] / "benchmarks" / "chapter5_results.md"
+RESULTS_DOCUMENT = Path(__file__).parents[1] / "benchmarks" / "thesis" / "chapter5_results.md"
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Rows of the pack's history: means over runs of one direction of the current and a small charge.
+"""Rows of the pack's history: means over times in which the current keeps its direction and moves a small charge.
 
 The slow fit (``bms_estimator.pack_model``) estimates the pack's curve, capacity and resistances from these rows. The RC
 currents and the hysteresis are linear in time, so that the mean voltage of a row depends on their means.
@@ -23,11 +23,14 @@ FIRST_REST_S = 60.0
 REST_GROWTH = 0.5
 """Maximum duration of a later row of a rest, as a fraction of the time since the rest began."""
 DIRECTION_C = 0.015
-"""Minimum current of a discharge or a charge, averaged over the RC pair ``TREND``, as a C-rate."""
+"""Minimum current of a discharge or a charge, averaged over 120 s (``x_a[TREND]``), as a C-rate."""
 HYSTERESIS_SOC = 0.03, 0.15
 """Charge constants of the fast and the slow part of the hysteresis [SOC]."""
 COMPLETED_ROWS = 16
 """Number of completed rows that the state can hold."""
+FREE_ROWS = 3
+"""Free places at which the caller must take the completed rows: one sample may complete rows at the end of a run, at a known
+SOC and at a gap."""
 
 HISTORY_ROW = np.dtype(
     [
@@ -125,7 +128,7 @@ def add_window(h: Record, f: Record, p: Record) -> None:
     h.row_as += w.charge_as
     r, n = h.sums, w.samples
     if r.duration_s == 0.0:
-        r.settled_s = f.seeded_s
+        r.settled_s = f.seeded_s  # the RC pairs were reset when the hypotheses were initialized
     r.duration_s += dt_s
     r.elapsed_s += dt_s * h.elapsed_s
     r.voltage_v += dt_s * w.sum_v / n
@@ -224,4 +227,4 @@ def add_reference(h: Record, kind: int, soc: float, std: float) -> None:
 @njit(cache=True)
 def needs_caller(h: Record) -> bool:
     """Return True if the caller must take the completed rows, or if its event is due."""
-    return h.enabled != 0 and (h.count >= COMPLETED_ROWS - 3 or h.elapsed_s >= h.event_s)
+    return h.enabled != 0 and (h.count >= COMPLETED_ROWS - FREE_ROWS or h.elapsed_s >= h.event_s)

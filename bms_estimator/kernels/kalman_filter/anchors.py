@@ -3,10 +3,12 @@
 Full: the voltage was at the full voltage for 15 s while the charge current was small, and the charge then ended. A
 charge that ends at the full voltage with a large current is not full: its voltage includes the overpotential of that
 current. Chargers without a constant-voltage phase and a protection that reacts to one high cell end charges in this way.
-A charger that never ends is full after an hour at the full voltage with less than the tail current. Waiting for the end
-matters for a slow charge with a constant current, which passes the full voltage, less its tolerance, up to 2.5 % early.
+A charger that never ends is full after an hour at the full voltage with less than the tail current. The charge must have
+ended, because a slow charge with a constant current reaches the full voltage, less its tolerance, up to 2.5 % of SOC before it
+is full.
 
-Empty: a protection disconnected the pack when its voltage was below the cut-off voltage. The overpotential of the load
+Empty: a protection disconnected the pack when its voltage was below the cut-off voltage. Then the current is zero for a
+minute, or, if the protection also disconnects the electronics, no samples come. The overpotential of the load
 counts in the std of this anchor. In the cold, and at a high rate, the std is so large that there is no anchor: a Panasonic
 18650PF at 0 C reaches 2.5 V at C/5 with 15 % of its charge left.
 
@@ -43,8 +45,8 @@ AT_FULL_S = 15.0
 """Minimum time at the full voltage with a small charge current [s]. A fast charger takes 20 s from C/8 to C/20 in an LFP
 cell. Regeneration is mostly shorter."""
 MAX_AT_FULL_S = 2.0 * AT_FULL_S
-"""Maximum of the counted time when voltage or current leaves its limits [s]. A charge that goes on outside the limits
-is no longer full after 15 s."""
+"""Maximum of the counted time when voltage or current leaves its limits [s]. Outside them the time counts down, so that after
+15 s the end of the charge no longer counts as full."""
 FLOAT_S = 3600.0
 """Time at the full voltage after which a charge below the tail current counts as ended [s]: chargers that never end."""
 MAX_COUNTED_S = 0.5 * AT_FULL_S
@@ -56,7 +58,8 @@ DISCONNECTED_S = 60.0
 IDLE_C = 0.02
 """Maximum current of a pack that a protection has disconnected, as a C-rate. It is above the offset of most sensors."""
 MAX_EMPTY_STD = 0.05
-"""Maximum std of the SOC when empty. It is exceeded below some 10 C, where cells are empty early by more than their std."""
+"""Maximum std of the SOC when empty. It is exceeded at temperatures below some 10 C, where cells are empty early by
+more than their std."""
 MAX_STDS = 3.0
 """Maximum difference of anchor and filter in std of the difference. A filter that differs by more has a wrong SOC, which
 its biases have absorbed."""
@@ -77,7 +80,7 @@ ANCHOR_SETTINGS = np.dtype(
 
 ANCHORS = np.dtype(
     [
-        ("at_full_s", "f8"),  # time at the full voltage with a small charge current, less the time since [s]
+        ("at_full_s", "f8"),  # counts up at the full voltage with a small charge current, and down otherwise [s]
         ("full_wait_soc", "f8"),  # charge to be drawn before the next full anchor [SOC]
         ("below_cutoff", "i8"),  # 1: the voltage was below the cut-off voltage under the last load
         ("idle_s", "f8"),  # time without current [s]
@@ -145,9 +148,8 @@ def charge_ends_full(
     """
     was_at_full_s = a.at_full_s
     is_small = -p.small_a <= current_a <= -p.trickle_a
-    if (
-        voltage_v >= p.full_v and is_small and f.x_a[CHARGE] <= -p.trickle_a
-    ):  # regeneration is too short for that filter
+    is_charge = f.x_a[CHARGE] <= -p.trickle_a  # averaged over 500 s, which is longer than regeneration
+    if voltage_v >= p.full_v and is_small and is_charge:
         a.at_full_s = min(was_at_full_s + min(dt_s, MAX_COUNTED_S), FLOAT_S)
         a.full_std = full_std(f, ekf, current_a)
     else:
@@ -174,11 +176,24 @@ def discharge_ends_empty(
 
 
 @njit(cache=True)
+def gap_begins_empty(a: Record, gap_s: float) -> bool:
+    """Return True, and count the anchor, if a gap of ``gap_s`` [s] began at the cut-off voltage under load.
+
+    The protection then disconnected the pack and with it the electronics, so that no samples show the time without current.
+    """
+    if gap_s < DISCONNECTED_S or a.below_cutoff == 0 or a.empty_wait_soc > 0.0 or a.empty_std > MAX_EMPTY_STD:
+        return False
+    a.empty_wait_soc, a.below_cutoff = REARM_SOC, 0
+    a.empty_anchors += 1
+    return True
+
+
+@njit(cache=True)
 def full_std(f: Record, ekf: Record, current_a: float) -> float:
     """Return the std of the SOC at the end of a charge with ``current_a`` [A].
 
-    It consists of ``FULL_STD`` and of the SOC that the OCV curve lacks by the overpotential of that current. Full by the
-    owner's charger need not be full by the charger of the cell file, which may have ended at another current.
+    It consists of ``FULL_STD`` and of the SOC that is missing to 1 because the voltage contains the overpotential of that
+    current. The charge that defined SOC 1 of the cell file may have ended at another current than the owner's.
     """
     open_v = ocv(1.0, ekf.ocv_v, ekf.ocv_slope_v) + overpotential(f, ekf, 1.0, current_a)
     return math.hypot(FULL_STD, 1.0 - soc_from_ocv(open_v, ekf.ocv_v, ekf.ocv_slope_v))

@@ -19,8 +19,10 @@ between the samples. It is 1/12 for loads that last much longer than a
 sample period, 0.10 and 0.18 for loads of 20 s sampled every 10 s and every 60 s, and 1/4 for independent samples."""
 MAX_EQUAL_STEPS = 1.5
 """Maximum difference between two reported currents that count as equal, in steps of the resolution."""
-IDLE_C = 0.1
+MIN_UNMEASURED_STD_C = 0.1
 """Minimum std of an unmeasured current, as a C-rate: a multiple of the current that empties the cell in an hour."""
+RESTING_C = 0.1
+"""Maximum mean current over 10 min of a resting pack, as a C-rate."""
 
 
 @njit(cache=True)
@@ -55,6 +57,11 @@ def expected_excess_charge(s: Record, held_a: float, dt_s: float) -> float:
     """Return the expected charge in a gap of ``dt_s`` beyond ``held_a`` x ``dt_s`` [A s].
 
     The present load is expected to end at random with the mean duration ``LOAD_S``.
+
+    Args:
+        s: Record of EKF_STATE.
+        held_a: Current that the caller counts over the gap [A].
+        dt_s: Duration of the gap [s].
     """
     return (s.mean_a - held_a) * LOAD_S * (1.0 - math.exp(-dt_s / LOAD_S))
 
@@ -69,15 +76,15 @@ def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
     present_share = math.exp(-dt_s / LOAD_S)
     present_a2 = s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a
     usual_a2 = s.usual_a2 - 2.0 * held_a * s.usual_a + held_a * held_a
-    idle_a = IDLE_C * p.capacity_as / 3600.0
+    min_std_a = MIN_UNMEASURED_STD_C * p.capacity_as / 3600.0
     mean_a2 = present_share * present_a2 + (1.0 - present_share) * usual_a2
-    return math.sqrt(max(mean_a2, idle_a * idle_a)) * dt_s
+    return math.sqrt(max(mean_a2, min_std_a * min_std_a)) * dt_s
 
 
 @njit(cache=True)
 def is_resting(s: Record, p: Record) -> bool:
-    """Return True if the mean current over 10 min is that of an idle pack."""
-    return abs(s.mean_a) < IDLE_C * p.capacity_as / 3600.0
+    """Return True if the mean current over 10 min is that of a resting pack."""
+    return abs(s.mean_a) < RESTING_C * p.capacity_as / 3600.0
 
 
 @njit(cache=True)

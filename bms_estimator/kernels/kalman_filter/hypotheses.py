@@ -71,15 +71,20 @@ from bms_estimator.numba_cache import njit
 
 MAX_SINGLE_STD = 0.06
 """Maximum std of an initial SOC for which one filter suffices."""
+MAX_KEPT_STD = 1.0 / (HYPOTHESES - 2)
+"""Maximum std of the SOC after the usual load in a gap for which one hypothesis represents this load. It is the distance
+between the other hypotheses, which represent a wider distribution as well. They have no polarization and no biases from before
+the gap."""
 SPREAD_STDS = 2.25
 """Distance of the outermost hypotheses from the initial SOC, in std of that SOC."""
 OVERLAP = 0.62
 """Std of a hypothesis, as a fraction of the distance between neighbours."""
 BEYOND_STD = 0.03
-"""Std in SOC of the prior weight of a hypothesis beyond ``MIN_SOC`` or ``MAX_SOC``, whose SOC is limited."""
+"""Std of the prior weight of a hypothesis beyond ``MIN_SOC`` or ``MAX_SOC``, over the distance by which it is moved to that
+limit [SOC]."""
 HYST_STD = 0.7
 """Initial std of the hysteresis state h."""
-HISTORY_S = 1800.0
+EARLIER_LOAD_S = 1800.0
 """Time constant with which effects of the unknown load before switch-on decay [s]."""
 REINITIALIZE_STDS = 4.0
 """Bias above which the SOC is re-initialized, in standard deviations. A wrong SOC is more likely than such a model error."""
@@ -158,7 +163,8 @@ def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
 def forget_state_of_charge(s: Record, p: Record, q: int) -> None:
     """Set all states of hypothesis ``q`` except those of sensor and cell to their prior, with an SOC of 0 without variance.
 
-    The RC pairs have the prior of an unknown load up to the present current, including the current in ``s.x_a``.
+    The unknown part of the RC pairs' currents has the prior of a load that ended with the present current. It contains
+    the known part ``s.x_a``, too, which the caller sets to 0.
     """
     mean, covariance = s.mean[q], s.covariance[q]
     for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
@@ -193,8 +199,9 @@ def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
 
     In the gap the pack may have been charged, discharged or exchanged, with a prior probability that grows with ``gap_s``
     [s]. Hypotheses with the same estimates of sensor and cell therefore cover SOC 0 to 1 evenly. One hypothesis remains
-    beside them: the usual load if one filter suffices for its std, or else a rest that continued. If the voltage cannot
-    distinguish them, the remaining one stays likely. The weights of the others represent the rest of the usual load.
+    beside them: the usual load if its std is at most ``MAX_KEPT_STD``, or else a rest that continued. If the voltage cannot
+    distinguish them, the remaining one stays likely. The weights of the others contain the remaining
+    probability of the usual load.
 
     Args:
         s: Record of EKF_STATE; hypothesis 0 was propagated with the usual load, and hypothesis 1 with a rest if ``rested``.
@@ -205,19 +212,20 @@ def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
     soc, std = s.mean[0, SOC], math.sqrt(s.covariance[0, SOC, SOC])
     event = p.event_probability * (1.0 - math.exp(-gap_s / p.event_s))
     kept, kept_probability = -1, 0.0
-    if std <= MAX_SINGLE_STD:
+    if std <= MAX_KEPT_STD:
         kept, kept_probability = 0, 1.0 - event
     elif rested:
         kept, kept_probability = 1, (1.0 - event) * math.exp(-gap_s / USUAL_S)
     even = HYPOTHESES if kept < 0 else HYPOTHESES - 1
     spacing = 1.0 / (even - 1)
-    row = HYPOTHESES  # row of the remaining hypothesis; rows are in the order of SOC
+    row = HYPOTHESES  # index of the remaining hypothesis, in the order of SOC; HYPOTHESES: none remains
     if kept >= 0:
         row = min(max(math.ceil(s.mean[kept, SOC] / spacing), 0), even)
         if row != kept:
             copy_hypothesis(s, kept, row)
         for k in range(BRANCHES):
-            s.mean[row, X + k] += s.x_a[k]
+            s.mean[row, X + k] += s.x_a[k]  # s.x_a becomes 0 below
+    # hypothesis ``first`` keeps the estimates of sensor and cell only, and is copied to the other evenly spaced ones
     first = 1 if row == 0 else 0
     if row != HYPOTHESES:
         copy_hypothesis(s, row, first)
@@ -288,7 +296,7 @@ def update_hypotheses(s: Record, p: Record) -> None:
         s.learned_soc += w.throughput_as / p.capacity_as
         if s.learned_soc >= p.learning_soc:
             end_learning(s, p)
-    s.soc_before -= w.charge_as / p.capacity_as
+    s.soc_before -= w.charge_as / p.capacity_as  # for its comparison with the present SOC in detect_exchange
     variance_v2 = measurement_variance(s, p, dt_s, w.samples)
     scale, best = innovation_scale(s, p), 0
     for q in range(s.count):
@@ -330,7 +338,10 @@ def innovation_scale(s: Record, p: Record) -> float:
     at a distance of ``OUTSIDE_K``.
     """
     return min(
-        max(math.exp(-s.seeded_s / HISTORY_S), p.min_innovation_scale * extrapolation_factor(p, s.temperature_c) ** 2),
+        max(
+            math.exp(-s.seeded_s / EARLIER_LOAD_S),
+            p.min_innovation_scale * extrapolation_factor(p, s.temperature_c) ** 2,
+        ),
         1.0,
     )
 

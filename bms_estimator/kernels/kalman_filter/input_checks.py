@@ -46,6 +46,10 @@ MIN_EVIDENCE = 0.1
 WRONG_SIGN_SLOPE = 0.25
 """Minimum ratio of voltage to current changes for a fault of the sign, in multiples of R_s. A right sign gives -1, a wrong
 sign gives 1."""
+MIN_CORRELATION = 0.5
+"""Minimum correlation of voltage and current changes for a fault of the sign. A right sign gives -1 and a wrong sign 1 if the
+changes exceed the noise of the voltage. If the noise dominates, as with small loads of a large pack, the correlation over
+``SIGN_S`` is random, with a std of 0.13 for one sample in 10 s."""
 MAX_CHANGE_RATIO = 5.0
 """Limit of a voltage change, in multiples of the change that the resistances explain, so that a glitch to zero does not
 dominate the average."""
@@ -91,6 +95,7 @@ CHECKS = np.dtype(
         ("sign_evidence", "f8"),  # filled fraction of the averages change_v_a and change_a2, 0..1
         ("change_v_a", "f8"),  # running mean of fast voltage change times fast current change [V A]
         ("change_a2", "f8"),  # running mean of the squared fast current change [A^2]
+        ("change_v2", "f8"),  # running mean of the squared fast voltage change, which includes the noise [V^2]
         ("last_v", "f8"),  # voltage of the previous sample [V]; 0: none
         ("last_a", "f8"),  # current of the previous sample [A]
         ("step_v", "f8"),  # smallest observed change of the voltage [V]; 0: none yet
@@ -227,10 +232,10 @@ def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: floa
 
 @njit(cache=True)
 def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> None:
-    """Average fast voltage change times fast current change, and the squared fast current change.
+    """Average fast voltage change times fast current change, and the squares of both changes.
 
-    The ratio of both averages is -R_s if the sign is right. A ramp does not count as a change, because at the ends of the OCV
-    curve the voltage changes slowly even under constant current.
+    The ratio of the product to the squared current change is -R_s if the sign is right. A ramp does not count as a change,
+    because at the ends of the OCV curve the voltage changes slowly even under constant current.
     """
     if dt_s > FAST_S or c.slow_v == 0.0:  # the step is too long for a fast change, or this is the first sample
         c.slow_v = c.slower_v = voltage_v
@@ -250,6 +255,7 @@ def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, volt
     c.sign_evidence += weight * (1.0 - c.sign_evidence)
     c.change_v_a += weight * (change_v * change_a - c.change_v_a)
     c.change_a2 += weight * (change_a * change_a - c.change_a2)
+    c.change_v2 += weight * (change_v * change_v - c.change_v2)
 
 
 @njit(cache=True)
@@ -263,8 +269,10 @@ def unusable_input_bits(c: Record, p: Record) -> int:
 @njit(cache=True)
 def sign_is_wrong(c: Record, p: Record) -> bool:
     """Return True if the voltage rises with a reported discharge. A present fault ends only when the voltage falls."""
-    limit_v_a = WRONG_SIGN_SLOPE * reference_series_resistance(p) * c.change_a2
-    return c.change_v_a > (0.0 if c.suspects & SIGN_OF_CURRENT else limit_v_a) and c.sign_evidence > MIN_EVIDENCE
+    by_resistance_v_a = WRONG_SIGN_SLOPE * reference_series_resistance(p) * c.change_a2
+    by_noise_v_a = MIN_CORRELATION * math.sqrt(c.change_v2 * c.change_a2)
+    limit_v_a = 0.0 if c.suspects & SIGN_OF_CURRENT else max(by_resistance_v_a, by_noise_v_a)
+    return c.change_v_a > limit_v_a and c.sign_evidence > MIN_EVIDENCE
 
 
 @njit(cache=True)

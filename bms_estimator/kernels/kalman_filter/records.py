@@ -117,7 +117,8 @@ EKF_SETTINGS = np.dtype(
         ("series", "f8"),  # cells in series
         ("ocv_v", "f8", OCV_POINTS),  # E_o over SOC 0..1 at 25 C [V]
         ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
-        ("curve_error_v", "f8", GRID),  # std of E_o [V]
+        ("curve_error_v", "f8", GRID),  # std of E_o, including the voltage sensor's gain [V]
+        ("voltage_gain_std", "f8"),  # relative std of the voltage sensor's gain
         ("learned", "f8"),  # constant fraction of the variance of E_o, which is learned: ``ocv_correction``
         ("curve_soc", "f8", GRID),  # charge throughput over which the varying error of E_o changes [SOC]
         ("per_kelvin_v", "f8", GRID),  # dE_o/dT [V/K]
@@ -188,7 +189,7 @@ EKF_STATE = np.dtype(
         ("gap_s", "f8"),  # duration of the last gap that may hide a charge [s]; 0: none
         ("soc_before", "f8"),  # SOC before this gap, less the charge counted since it
         ("std_before", "f8"),  # std of the SOC before this gap
-        ("exchanged", "i8"),  # 1: no charge or discharge in this gap explains the SOC after it
+        ("exchanged", "i8"),  # 1: SOC or voltages after this gap are those of another pack
         ("window", WINDOW),
         ("current_a", "f8"),  # current of the last sample [A]
         ("same_s", "f8"),  # time for which the reported current has been constant within its resolution [s]

@@ -25,7 +25,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from tests.benchmarks.baselines import fixed_ekf, joint_ekf, rls_arx, simulate_arx
+from tests.benchmarks.side_by_side.baselines import fixed_ekf, joint_ekf, rls_arx, simulate_arx
 
 ParameterReader = Callable[[Estimator, CellModel], Floats]
 """Function that returns a1..a15 of an estimator after learning. Shape (16,)."""
@@ -325,7 +325,7 @@ def offline_fit(seed: int) -> Learn:
     """Return the function that fits constant elements by PyBOP with the random seed ``seed``."""
 
     def learn(cell: CellModel, samples: SampleBlock, initial_soc: float) -> Learned | None:
-        from tests.benchmarks.pybop_fit import fit  # noqa: PLC0415 - an optional, heavy package
+        from tests.benchmarks.side_by_side.pybop_fit import fit  # noqa: PLC0415 - an optional, heavy package
 
         _, r_s, r1, tau1, r2, tau2 = ekf_parameters(cell).tolist()
         start = {"R0 [Ohm]": r_s, "R1 [Ohm]": r1, "C1 [F]": tau1 / r1, "R2 [Ohm]": r2, "C2 [F]": tau2 / r2}

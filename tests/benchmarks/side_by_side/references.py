@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from bms_estimator.calibration.cleaning.rests import resting_samples, true_runs
 from bms_estimator.model.arrays import Floats
-from tests.benchmarks.pulses import MEDIAN_PULSES, find_pulses
+from tests.benchmarks.side_by_side.pulses import MEDIAN_PULSES, find_pulses
 from tests.benchmarks.side_by_side.trials import Block
 
 MIN_REST_S, WINDOW_S = 600.0, 1200.0

@@ -19,6 +19,7 @@ from bms_estimator.kernels.kalman_filter.records import LN_Q
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.pack_model.learning import SlowFit
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, rising
 from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.truth import GRID, curve_of, measured_curve, simulate, smooth
@@ -167,10 +168,10 @@ SUMMARY_PATH = Path(__file__).with_name("cycles.csv")
 
 
 def row(cycle: Cycle) -> CycleRow:
-    """Run the estimator with the generic cell file and without an initial SOC."""
+    """Run the estimator and its slow fit with the generic cell file and without an initial SOC."""
     samples, soc = capture(cycle)
     estimator = Estimator(load_cell(cycle.chemistry, CAPACITY_AH))
-    trace = estimator.run(samples)
+    trace = SlowFit(estimator).run(samples)
     result = score(samples["time_s"], trace["soc"], trace["soc_std"], soc, AFTER_S)
     assert result is not None
     f = estimator.record[0]["filter"]

@@ -1,4 +1,8 @@
-"""Table of weeks of simulated use: ``python -m tests.estimator.month [filters] [--days N] [--seeds 1 2]``."""
+"""Table of weeks of simulated use: ``python -m tests.estimator.month [filters] [--days N] [--seeds 1 2]``.
+
+``python -m tests.estimator.month --summary`` writes the checked-in summary of some short runs, after an intended change of
+the estimator.
+"""
 
 import argparse
 import sys
@@ -7,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tests.conftest import SHARED_DATA
+from tests.estimator.month import summary
 from tests.estimator.month.cases import CASES, Case
 from tests.estimator.month.packs import REAL_CAPTURES
 from tests.estimator.month.run import run
@@ -15,8 +20,12 @@ from tests.estimator.month.table import header, line
 
 
 def main() -> None:
-    """Print a line for each run, or save the samples."""
+    """Print a line for each run, or save the samples, or write the summary."""
     arguments = parse()
+    if arguments.summary:
+        summary.write(summary.table())
+        write(str(summary.SUMMARY_PATH))
+        return
     if not arguments.save:
         write(header(arguments.days))
     for case in chosen(arguments.filters, arguments.data):
@@ -43,6 +52,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--save", type=Path, metavar="FOLDER", help="write samples and truth as .npz instead of the table"
     )
+    parser.add_argument("--summary", action="store_true", help="write the checked-in summary instead of the table")
     parser.add_argument("--data", type=Path, default=SHARED_DATA, metavar="FOLDER", help="folder of the real captures")
     return parser.parse_args()
 

@@ -32,6 +32,6 @@ def group_score(days: Iterable[Day], group: tuple[int, int]) -> Score | None:
 
 
 def mean_bound(days: Iterable[Day], group: tuple[int, int]) -> float:
-    """Return the mean of the smallest honest std over the scored days of a group; NaN if none of them is scored."""
+    """Return the mean of the lower bound of the std over the scored days of a group; NaN if none of them is scored."""
     bounds = [day.bound for day in days if group[0] <= day.number <= group[1] and day.score is not None]
     return float(np.mean(bounds)) if bounds else float("nan")

@@ -1,4 +1,4 @@
-"""True packs: eight-process cells with the OCV of real cells, and the generic cell file of their chemistry."""
+"""True packs, with a cell file for each. The cells have eight overpotential processes and the OCV of real cells."""
 
 import zlib
 from dataclasses import dataclass
@@ -12,7 +12,16 @@ from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.sources.captures.replay import load_capture
 from tests.estimator.anywhere.cases import OCV_STD_V, OXIDE, PHOSPHATE, own_file
 from tests.estimator.anywhere.cycles import Cycle, total_ohm, true_curve
-from tests.estimator.anywhere.truth import GRID, TAPER_C, Truth, measured_curve
+from tests.estimator.anywhere.truth import (
+    ENERGY_J,
+    GAS_J,
+    GRID,
+    KELVIN,
+    REFERENCE_K,
+    TAPER_C,
+    Truth,
+    measured_curve,
+)
 
 CAPACITY_STD = 0.04
 """Std of ln of the true capacity over the declared one. Real cells differ from their data sheet by 2-6 %."""
@@ -47,11 +56,13 @@ class Pack:
     declared_ah: float
     """Capacity in the cell file [Ah]."""
 
-    @property
-    def charger_v(self) -> float:
-        """Voltage limit at which the current has fallen to C/20 when the SOC reaches 1, at 25 C [V]."""
+    def charger_v(self, temperature_c: float = 25.0) -> float:
+        """Return the voltage limit at which the current has fallen to C/20 when the SOC reaches 1 [V]."""
         truth = self.truth
-        return float(truth.ocv_v[-1] + truth.hysteresis_v[-1] + TAPER_C * truth.capacity_ah * truth.ohm[-1].sum())
+        inverse_k = (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K) / GAS_J
+        ohm = float(truth.ohm[-1] @ np.exp(ENERGY_J * inverse_k))
+        ocv_v = truth.ocv_v[-1] + truth.hysteresis_v[-1] + (temperature_c - 25.0) * truth.per_kelvin_v[-1]
+        return float(ocv_v + TAPER_C * truth.capacity_ah * ohm)
 
     @property
     def generic_file(self) -> CellModel:
@@ -97,7 +108,10 @@ def open_circuit(cell: str, seed: int, data: Path) -> tuple[Floats, Floats]:
     low_v, high_v = (slow_curve(data / f"{name}.csv.gz", sign) for name, sign in ((discharge, 1), (charge, -1)))
     # a slight slope keeps the mean rising where both curves are flat
     mean_v = np.maximum.accumulate(0.5 * (low_v + high_v)) + 1e-5 * GRID
-    return mean_v, np.maximum(0.5 * (high_v - low_v), 0.0) if cell == "A123" else OXIDE.hysteresis_v
+    if cell == "A123":
+        return mean_v, np.maximum(0.5 * (high_v - low_v), 0.0)
+    # half of the difference also contains the overpotential; only in LFP at C/30 most of it is hysteresis
+    return mean_v, OXIDE.hysteresis_v
 
 
 def slow_curve(path: Path, sign: int) -> Floats:

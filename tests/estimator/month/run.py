@@ -1,4 +1,4 @@
-"""Run of the estimator over a simulated month, judged day by day."""
+"""Run of the estimator over simulated weeks, scored day by day."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,8 @@ AFTER_S = 900.0
 FULL_SOC = 0.99
 """SOC at which a charge counts as full."""
 UNSEEN_CHARGES = ("bicycle",)
-"""Uses whose charges are not seen, so that regeneration above ``FULL_SOC`` is the end of no charge."""
+"""Uses that are charged while the electronics are off. A charge current above ``FULL_SOC`` is then regeneration, and not the end
+of a charge."""
 BLOCK = 100_000
 """Samples between two copies of the trace, whose rows take 200 bytes."""
 
@@ -39,7 +40,8 @@ class Day:
     capacity_std: float
     """Std of the learned capacity divided by the true capacity."""
     bound: float
-    """Smallest honest std of the SOC after infinite time in the window of SOCs that was passed until the end of the day."""
+    """Lower bound of the std of the SOC, as a mean over the window of SOCs that was passed until the end of the day
+    (``tests.benchmarks.observability``)."""
 
 
 def run(case: Case, data: Path) -> list[Day]:
@@ -47,14 +49,14 @@ def run(case: Case, data: Path) -> list[Day]:
     recording = case.draw(data)
     samples, truth = recording.samples, recording.truth
     estimator = Estimator(recording.cell, voltage_resolution_v=case.source.volt_step, sampling=case.source.sampling)
-    runner = SlowFit(estimator, interval_s=DAY_S)
+    slow_fit = SlowFit(estimator, interval_s=DAY_S)
     results: list[Day] = []
     cell = curves(recording.cell)
     for number in range(case.days):
         begin, end = np.searchsorted(samples["time_s"], (number * DAY_S, (number + 1) * DAY_S))
         if begin == end:
             continue
-        time_s, soc, soc_std = run_blocks(runner, samples[begin:end])
+        time_s, soc, soc_std = run_blocks(slow_fit, samples[begin:end])
         true_soc = truth["soc"][np.searchsorted(samples["time_s"], time_s)]
         result = score(time_s, soc, soc_std, true_soc, 0.0 if results else AFTER_S)
         learned = relative_capacity(estimator.record[0])
@@ -66,18 +68,18 @@ def run(case: Case, data: Path) -> list[Day]:
 
 
 def bound_of(case: Case, cell: CellCurves, truth: np.ndarray) -> float:
-    """Return the smallest honest std of the SOC in the window of a history, with a full charge if one was seen."""
+    """Return the lower bound of the std of the SOC for the window of a history, with a full charge if one was seen."""
     soc = truth["soc"]
     is_full = (soc > FULL_SOC) & (truth["current_a"] < 0.0)
     full = case.use not in UNSEEN_CHARGES and bool(is_full.any())
     return bound(cell, (float(soc.min()), float(soc.max())), full=full)
 
 
-def run_blocks(estimator: SlowFit, samples: SampleBlock) -> tuple[Floats, Floats, Floats]:
+def run_blocks(slow_fit: SlowFit, samples: SampleBlock) -> tuple[Floats, Floats, Floats]:
     """Run the estimator over samples, and return time, SOC and std of the SOC at each accepted sample."""
     parts = []
     for begin in range(0, samples.size, BLOCK):
-        trace = estimator.run(samples[begin : begin + BLOCK])
+        trace = slow_fit.run(samples[begin : begin + BLOCK])
         parts.append([trace[name].copy() for name in ("time_s", "soc", "soc_std")])
     time_s, soc, soc_std = np.concatenate(parts, axis=1)
     return time_s, soc, soc_std

@@ -33,7 +33,6 @@ class Source:
     """Std of the current's gain that the owner configures."""
     voltage_period_s: float = 0.0
     """Time between two voltages that come on a topic of their own [s]; 0: a voltage in each sample."""
-
     fast_day: int = 0
     """Number of the day on which a board delivers 100 samples a second; 0: none."""
 
@@ -44,9 +43,11 @@ class Source:
 
 
 BOARD = Source("board")
-"""Board of the firmware, of which one sample a second is used."""
+"""Measuring board with this project's firmware, at one sample a second."""
+SLOW_BOARD = Source("board, 10 s", step_s=10.0)
+"""The same board at one sample in ten seconds."""
 FAST_BOARD = Source("board, 100 Hz on day 2", fast_day=2)
-"""Board of the firmware. A month at 100 Hz would take too long, therefore only one day is at this rate."""
+"""Measuring board whose samples have the firmware's rate on one day. Weeks at 100 Hz would take too long."""
 BMS_GAINS = {"voltage_gain_std": 0.005, "current_gain_std": 0.005}
 """Default of the service for a BMS."""
 BMS = Source("bms", volt_step=0.01, volt_noise_std=0.0, ampere_step=0.1, **BMS_GAINS)
@@ -79,10 +80,7 @@ def rounded(values: Floats, step: float) -> Floats:
 
 
 def pair_with_last_voltage(samples: SampleBlock, period: int) -> SampleBlock:
-    """Return the samples with the last voltage received, of which one in ``period`` samples arrives.
-
-    A source that receives voltage and current on separate topics marks the other voltages as held.
-    """
+    """Return samples of which one in ``period`` has a new voltage. The others repeat the last one and are marked as held."""
     last = np.arange(samples.size) // period * period
     samples["voltage_v"] = samples["voltage_v"][last]
     samples["status"][last != np.arange(samples.size)] = SampleStatus.VOLTAGE_HELD

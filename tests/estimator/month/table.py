@@ -6,9 +6,9 @@ from tests.estimator.month.run import Day
 
 
 def header(days: int) -> str:
-    """Return the lines above the results of so many days."""
+    """Return the lines above the results of ``days`` days."""
     columns = ["case", "seed", *(title(g) for g in GROUPS if g[0] <= days), "capacity / true"]
-    return f"RMSE / inside / std / score (smallest honest std) [%]\n\n{row(columns)}\n{row(['---'] * len(columns))}"
+    return f"RMSE / inside / std / score (lower bound of the std) [%]\n\n{row(columns)}\n{row(['---'] * len(columns))}"
 
 
 def line(case: Case, days: list[Day]) -> str:

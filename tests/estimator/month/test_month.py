@@ -13,12 +13,12 @@ from tests.estimator.anywhere.use import DAY_S
 from tests.estimator.month.cases import NEW, Case, Recording
 from tests.estimator.month.packs import draw_pack
 from tests.estimator.month.run import FULL_SOC, bound_of, run
-from tests.estimator.month.simulation import FAST_SAMPLES, Ageing, SimulatedPack
+from tests.estimator.month.simulation import FAST_SAMPLES, Aging, SimulatedPack
 from tests.estimator.month.sources import BMS, BOARD, SOLAR, SPLIT, Source
 from tests.estimator.month.summary import Table, changes, read, write
 from tests.estimator.month.uses import SHED_SOC, USES, Phase
 
-AGED = Ageing("1 % a day", 0.01, 0.02)
+AGED = Aging("1 % a day", 0.01, 0.02)
 TWO_DAYS = Case("LG M50", "full_nightly", days=2)
 
 
@@ -36,7 +36,7 @@ def step_s(use: str) -> float:
 def test_the_true_soc_is_the_counted_charge_over_the_present_capacity(use: str) -> None:
     """Electronics that are off hide samples of the bicycle, so the SOC is compared within each run of samples."""
     source = SOLAR if step_s(use) > 1.0 else BOARD
-    truth = draw(Case("LFP", use, source, days=2, ageing=AGED)).truth
+    truth = draw(Case("LFP", use, source, days=2, aging=AGED)).truth
     is_next = np.isclose(np.diff(truth["time_s"]), step_s(use))
     counted = -truth["current_a"][:-1] * step_s(use) / 3600.0 / truth["capacity_ah"][:-1]
     assert is_next.mean() > 0.99
@@ -88,7 +88,7 @@ def test_the_electronics_of_a_bicycle_are_off_during_each_charge() -> None:
 def test_a_pack_loses_capacity_and_gains_resistance_with_time() -> None:
     voltage_v, capacity_ah = [], []
     for days in (0, 10):
-        pack = SimulatedPack(draw_pack("LG M50", 3.0, 1, SHARED_DATA), 1.0, AGED, 0.5)
+        pack = SimulatedPack(draw_pack("LG M50", 3.0, 1, SHARED_DATA), USES["full_nightly"], AGED, 0.5)
         pack.time_s = days * DAY_S
         history = pack.run(Phase(np.array([0.0, 3.0])))
         voltage_v.append(history["voltage_v"][0] - history["voltage_v"][1])
@@ -114,7 +114,10 @@ def test_a_simulation_in_two_parts_equals_one_in_a_single_part() -> None:
 
 def test_the_day_at_the_rate_of_a_board_has_a_hundred_samples_a_second() -> None:
     phase = Phase(np.linspace(-3.0, 3.0, 60))
-    packs = [SimulatedPack(draw_pack("LG M50", 3.0, 1, SHARED_DATA), 1.0, NEW, 0.5, fast_day) for fast_day in (0, 1)]
+    packs = [
+        SimulatedPack(draw_pack("LG M50", 3.0, 1, SHARED_DATA), USES["full_nightly"], NEW, 0.5, fast_day)
+        for fast_day in (0, 1)
+    ]
     slow, fast = (pack.run(phase) for pack in packs)
     assert fast.size == FAST_SAMPLES * slow.size
     assert fast["time_s"][::FAST_SAMPLES] == pytest.approx(slow["time_s"])
@@ -123,7 +126,7 @@ def test_the_day_at_the_rate_of_a_board_has_a_hundred_samples_a_second() -> None
     assert packs[1].time_s == pytest.approx(60.0)
 
 
-def test_a_run_is_judged_day_by_day_and_repeats_exactly() -> None:
+def test_a_run_is_scored_day_by_day_and_repeats_exactly() -> None:
     case = Case("LG M50", "bicycle", days=2)
     days = run(case, SHARED_DATA)
     assert [day.number for day in days] == [1, 2]
@@ -132,7 +135,7 @@ def test_a_run_is_judged_day_by_day_and_repeats_exactly() -> None:
     assert days == run(case, SHARED_DATA)
 
 
-def test_only_a_full_charge_that_is_seen_lowers_the_smallest_honest_std() -> None:
+def test_only_a_full_charge_that_is_seen_lowers_the_bound() -> None:
     recording = draw(replace(TWO_DAYS, use="bicycle"))
     cell = curves(recording.cell)
     assert recording.truth["soc"].max() > FULL_SOC

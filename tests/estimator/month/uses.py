@@ -1,8 +1,8 @@
-"""Uses of a pack for weeks: phases of requested current, which depend on the SOC that the phases before have left."""
+"""Uses of a pack for weeks: phases of requested current, which depend on the SOC after the earlier phases."""
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal, Protocol
 
@@ -18,6 +18,10 @@ MAX_CHARGE_S = 14 * HOUR_S
 """Maximum duration of a charge; the charger ends it earlier [s]."""
 FULL_AFTER_S = 5.5 * DAY_S
 """Time after a full charge from which on the next charge is a full one [s]. With the wait for this charge, it makes a week."""
+LOAD_C, LOAD_S = (0.25, 2.0), 60
+"""Range of the random loads of ``full_often`` [C], and duration of each [s]."""
+YEAR_STEP_S = 10
+"""Time between two samples of a simulated year [s]. At 1 s it would take too long."""
 SHED_SOC, CURTAIL_SOC = 0.3, 0.9
 """SOC at which a solar system sheds its loads, and SOC above which it curtails the charge."""
 SOLAR_STEP_S = 10
@@ -32,8 +36,9 @@ class Phase:
 
     current_a: Floats
     """Requested current at each sample [A]."""
-    end: Literal["time", "empty", "charged", "charged_to"] = "time"
-    """Condition that may end the phase before its last sample: SOC below ``soc``, charger finished, or SOC above ``soc``."""
+    end: Literal["time", "empty", "stopped", "charged_to"] = "time"
+    """Condition that may end the phase before its last sample. ``empty``: SOC below ``soc``; ``charged_to``: SOC above ``soc``;
+    ``stopped``: no current, because charger or protection have stopped it."""
     soc: float = np.nan
     room_c: float = 25.0
     is_seen: bool = True
@@ -56,15 +61,21 @@ class PackState(Protocol):
         """Current of 1 C by the declared capacity [A]."""
 
 
+PhasesOf = Callable[[np.random.Generator, PackState], Iterator[Phase]]
+"""Function that yields the phases of a use."""
+
+
 @dataclass(frozen=True)
 class Use:
     """Kind of use."""
 
-    phases: Callable[[np.random.Generator, PackState], Iterator[Phase]]
+    phases: PhasesOf
     step_s: float = 1.0
     """Time between two samples [s]."""
     initial_soc: tuple[float, float] = field(default=(0.4, 0.9))
     """Range of the SOC at the first sample."""
+    charger_c: float = 25.0
+    """Temperature at which the voltage limit of the charger gives SOC 1 [C]."""
 
 
 def rest(rng: np.random.Generator, low_h: float, high_h: float, room_c: float = 25.0) -> Phase:
@@ -79,7 +90,7 @@ def trip(rng: np.random.Generator, pack: PackState, empty_soc: float = EMPTY_SOC
 
 def full_charge(pack: PackState, rate_c: float) -> Phase:
     """Return a charge to the voltage limit of the charger and C/20."""
-    return Phase(np.full(MAX_CHARGE_S, -rate_c * pack.one_c), "charged")
+    return Phase(np.full(MAX_CHARGE_S, -rate_c * pack.one_c), "stopped")
 
 
 def charge_to(pack: PackState, rate_c: float, soc: float) -> Phase:
@@ -121,6 +132,17 @@ def full_weekly(rng: np.random.Generator, pack: PackState) -> Iterator[Phase]:
             yield rest(rng, 0.5, 8.0)
 
 
+def empty_weekly(rng: np.random.Generator, pack: PackState) -> Iterator[Phase]:
+    """Yield the phases of ``never_full``, but discharge the pack once a week until its protection disconnects it."""
+    phases, due_s = never_full(rng, pack), rng.uniform(1.0, 5.5) * DAY_S
+    while True:
+        yield next(phases)
+        if pack.time_s > due_s:
+            yield Phase(np.full(12 * HOUR_S, 0.15 * pack.one_c), "stopped")
+            due_s = pack.time_s + FULL_AFTER_S
+            yield rest(rng, 0.5, 2.0)
+
+
 def full_nightly(rng: np.random.Generator, pack: PackState) -> Iterator[Phase]:
     """Yield two to four drives by day and a full charge each night."""
     while True:
@@ -129,6 +151,26 @@ def full_nightly(rng: np.random.Generator, pack: PackState) -> Iterator[Phase]:
             yield rest(rng, 0.5, 3.0)
         yield full_charge(pack, 0.3)
         yield Phase(np.zeros(int(-pack.time_s % DAY_S)))
+
+
+def full_often(rng: np.random.Generator, pack: PackState, room_c: float) -> Iterator[Phase]:
+    """Yield about eight full charges a day, each after a random load that the protection stops."""
+    while True:
+        load_c = np.repeat(rng.uniform(*LOAD_C, 3 * HOUR_S // LOAD_S), LOAD_S)
+        yield Phase(pack.one_c * load_c, "stopped", room_c=room_c)
+        yield rest(rng, 0.2, 0.7, room_c)
+        yield replace(full_charge(pack, 1.0), room_c=room_c)
+        yield rest(rng, 0.2, 0.7, room_c)
+
+
+def sampled(use: PhasesOf, step_s: int) -> PhasesOf:
+    """Return a use at one sample in ``step_s`` seconds. Its current is constant between two samples."""
+
+    def phases(rng: np.random.Generator, pack: PackState) -> Iterator[Phase]:
+        for phase in use(rng, pack):
+            yield replace(phase, current_a=phase.current_a[::step_s])
+
+    return phases
 
 
 def solar(rng: np.random.Generator, pack: PackState) -> Iterator[Phase]:
@@ -144,7 +186,8 @@ def solar_full_weekly(rng: np.random.Generator, pack: PackState) -> Iterator[Pha
         yield night(rng, pack)
         if day % 7 == 6:
             sunny = sunny_day(rng, pack, 1.0)
-            yield Phase(np.minimum(1.5 * sunny.current_a, -2.0 * TAPER_C * pack.one_c), "charged")
+            # the sun gives more than needed, and never less than the current at which the charger ends (C/20)
+            yield Phase(np.minimum(1.5 * sunny.current_a, -2.0 * TAPER_C * pack.one_c), "stopped")
         else:
             yield sunny_day(rng, pack, rng.uniform(max(pack.soc, 0.5), max(pack.soc, CURTAIL_SOC)))
 
@@ -195,8 +238,11 @@ USES = {
     "never_full_above_0.50": Use(
         partial(never_full, empty_soc=0.5, charge_below_soc=0.7, least_soc=0.8), initial_soc=(0.6, 0.9)
     ),
+    "empty_weekly": Use(empty_weekly),
     "full_nightly": Use(full_nightly),
     "full_weekly": Use(full_weekly),
+    "full_weekly_10_s": Use(sampled(full_weekly, YEAR_STEP_S), step_s=YEAR_STEP_S),
+    "full_often_40_C": Use(partial(full_often, room_c=40.0), charger_c=40.0),
     "solar": Use(solar, step_s=SOLAR_STEP_S),
     "solar_full_weekly": Use(solar_full_weekly, step_s=SOLAR_STEP_S),
     "bicycle": Use(bicycle, initial_soc=(0.95, 0.98)),

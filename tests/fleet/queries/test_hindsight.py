@@ -6,7 +6,7 @@ import pytest
 from bms_estimator import load_capture, load_cell
 from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.fleet.queries.parquet_files import write
-from tests.benchmarks.hindsight import limits, normalized_errors, slots
+from tests.benchmarks.fleet.hindsight import limits, normalized_errors, slots
 
 SLOT_S = 60.0
 """Duration of a slot of a capture, which stands for an hour of a fleet [s]."""

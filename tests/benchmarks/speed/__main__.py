@@ -3,12 +3,9 @@
 import sys
 from itertools import chain
 
-import capture
-import kernel
-import live
-import packs
-import partition
-from table import show
+from tests.benchmarks.fleet import partition
+from tests.benchmarks.speed import capture, kernel, live, packs
+from tests.benchmarks.table import show
 
 GROUPS = {  # each function yields the rows of the table
     "kernel": kernel.rows,

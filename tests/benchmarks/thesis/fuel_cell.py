@@ -28,7 +28,7 @@ from tests import mann_stack
 from tests.mann_stack import CURVE_A, Record
 
 PEM = load_fuel_cell("pem_30w")
-DATA = Path(__file__).parents[1] / "data" / "fuel_cell"
+DATA = Path(__file__).parents[2] / "data" / "fuel_cell"
 MIN_A = 0.1
 """Minimum current of the measured points that are used; the measured cells have 1 cm2 [A]."""
 WRONG_FACTORS = np.array([1.0, 1.5, 0.8, 1.05, 2.0, 0.5, 1.3, 0.5, *[1.0] * 8])

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from load import CELL, RATE_HZ, pulses
-from table import Row
-from wire import hello, sample_frames
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware.framing import SAMPLE_FRAME_BYTES, crc16
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
+from tests.benchmarks.load import CELL, RATE_HZ, pulses
+from tests.benchmarks.table import Row
+from tests.benchmarks.wire import hello, sample_frames
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")
 HOURS = (4, 16)

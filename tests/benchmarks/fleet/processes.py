@@ -28,7 +28,7 @@ from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker.worker import CHECKPOINT_S
 from bms_estimator.service.kernel_warm_up import load_kernels
-from tests.benchmarks.fleet_rig import Rig, cpu_s, create_streams, rig, rss_mib
+from tests.benchmarks.fleet.rig import Rig, cpu_s, create_streams, rig, rss_mib
 from tests.patience import LONG_S
 
 SEED, DAY_S, PARTITIONS = 1, 86_400.0, 64

@@ -14,15 +14,13 @@ from pathlib import Path
 import aiomqtt
 import numpy as np
 import psutil
-from load import CELL, pulses
 from numpy.typing import NDArray
-from table import Row
 
 from bms_estimator.protocols.firmware.messages import SampleMessage
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.benchmarks.load import CELL, pulses
+from tests.benchmarks.table import Row
 from tests.mosquitto import MOSQUITTO, Broker
 
 PROGRAM = Path(sys.executable).with_name("bms-estimator")

@@ -28,8 +28,8 @@ from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
-from tests.benchmarks import edge_token, lost_sensor
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V
+from tests.benchmarks.long_runs import edge_token, lost_sensor
 from tests.benchmarks.table import Row, show
 from tests.benchmarks.wire import hello, sample_frames
 from tests.fleet.nats_cluster import running

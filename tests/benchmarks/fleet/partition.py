@@ -5,8 +5,6 @@ import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from load import CELL, pulses
-from table import Row
 
 from bms_estimator.edge.block import Block, decode, encode
 from bms_estimator.fleet.worker import hour_summary
@@ -18,6 +16,8 @@ from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 from bms_estimator.telemetry.state import make_state_payload
+from tests.benchmarks.load import CELL, pulses
+from tests.benchmarks.table import Row
 
 PACKS, MINUTES, SAMPLES = 100, 90, 60
 """Number of packs, number of blocks (one a minute) of each pack, and number of samples of a block."""

@@ -1,8 +1,6 @@
 """The observer in C has the results of the kernel, so that the benchmark compares equal work."""
 
 import shutil
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +9,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.observer import ObserverSettings
-
-sys.path.insert(0, str(Path(__file__).parent))
-from load import CELL, pulses
-from observer_in_c import ObserverInC
+from tests.benchmarks.load import CELL, pulses
+from tests.benchmarks.speed.observer_in_c import ObserverInC
 
 
 @pytest.mark.parametrize(

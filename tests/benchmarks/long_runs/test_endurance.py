@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from tests.benchmarks.endurance import process_bytes
-from tests.benchmarks.lost_sensor import ALARM_OF_QUANTITY, lose_quantities
+from tests.benchmarks.long_runs.endurance import process_bytes
+from tests.benchmarks.long_runs.lost_sensor import ALARM_OF_QUANTITY, lose_quantities
 from tests.mosquitto import Broker
 
 

@@ -12,8 +12,19 @@ from typing import Any
 
 import aiomqtt
 import psutil
-from live import MEASURE_S, MOSQUITTO, PATIENCE_S, PROGRAM, SETTLE_S, Broker, TimedBoard, broker, pack_file
-from table import Row
+
+from tests.benchmarks.speed.live import (
+    MEASURE_S,
+    MOSQUITTO,
+    PATIENCE_S,
+    PROGRAM,
+    SETTLE_S,
+    Broker,
+    TimedBoard,
+    broker,
+    pack_file,
+)
+from tests.benchmarks.table import Row
 
 PACKS, RATE_HZ, PUBLISH_RATE_HZ = 20, 10, 1.0
 MAX_CPU, MAX_MIB = 0.25, 400.0

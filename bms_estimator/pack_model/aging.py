@@ -1,0 +1,66 @@
+"""Aging of the pack: variances by which capacity and resistances change with use and with time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.intervals import Intervals
+
+YEAR_S = 365.0 * 86400.0
+"""Length of a year [s]."""
+MIN_VARIANCE = 1e-12
+"""Minimum variance by which the trend is divided. In a history of one interval the variance is 0."""
+
+
+@dataclass(frozen=True)
+class Aging:
+    """Stds of the change of ln of a quantity. The variance grows in proportion to use and to time."""
+
+    by_use: float
+    """Std of the change in a charge throughput of ``CellCurves.aged_soc``: 500 full cycles."""
+    by_time: float
+    """Std of the change in a year without use."""
+
+
+CAPACITY = Aging(0.11, 0.05)
+"""Aging of the capacity. Cells lose 5 to 20 % in 500 full cycles; the change by time is assumed."""
+RESISTANCE = Aging(0.3, 0.1)
+"""Aging of the resistances, which grow by two to five times the fraction of the capacity that is lost."""
+
+
+class AgingVariance:
+    """Variance of the change of ln of a quantity over a history.
+
+    Args:
+        aging: Aging of the quantity.
+        cell: Curves of the cell file.
+        intervals: Intervals of the history.
+
+    Attributes:
+        before: Variance of the change from the pack's first row, which may have been dropped, to the first row of the history.
+            Use in that time is assumed to be as intense as in the history.
+        at_start: Variance of the change from the first row to the start of each interval.
+    """
+
+    def __init__(self, aging: Aging, cell: CellCurves, intervals: Intervals) -> None:
+        rows, starts = intervals.rows, intervals.starts
+        # an interval's use lasts until the next one begins, or until its last row before a gap
+        last = np.append(np.where(intervals.is_new_segment[1:], intervals.ends[:-1], starts[1:]), rows.size - 1)
+        used_soc = np.maximum(rows["throughput_soc"][last] - rows["throughput_soc"][starts], 0.0)
+        elapsed_s = np.append(rows["elapsed_s"][starts], rows["elapsed_s"][-1])
+        steps = aging.by_use**2 * used_soc / cell.aged_soc + aging.by_time**2 * np.diff(elapsed_s) / YEAR_S
+        self.at_start: Floats = np.append(0.0, np.cumsum(steps)[:-1])
+        duration_s = float(elapsed_s[-1] - elapsed_s[0])
+        rate = float(steps.sum()) / duration_s if duration_s > 0.0 else 0.0
+        self.before = rate * float(elapsed_s[0])
+
+    @property
+    def trend(self) -> Floats:
+        """Change of the quantity at the start of each interval relative to the last one, for aging at a constant rate.
+
+        The rate is such that the change over the history is one std: minus the std in the first interval, 0 in the last.
+        """
+        relative = self.at_start - self.at_start[-1]
+        return np.asarray(relative / np.sqrt(max(self.at_start[-1], MIN_VARIANCE)))
