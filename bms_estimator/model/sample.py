@@ -53,7 +53,7 @@ class SampleStatus(IntFlag):
     RESET = 8
     GAP = 16
     VOLTAGE_HELD = 32
-    """The voltage is not a new measurement but that of an earlier sample. Current and temperature are new."""
+    """The voltage repeats an earlier measurement. Current and temperature are new."""
 
 
 def remove_implausible(values: NDArray[np.float64], low: float, high: float) -> int:

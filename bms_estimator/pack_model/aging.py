@@ -6,9 +6,9 @@ import numpy as np
 
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.intervals import Intervals
+from bms_estimator.pack_model.intervals import DAY_S, Intervals
 
-YEAR_S = 365.0 * 86400.0
+YEAR_S = 365.0 * DAY_S
 """Length of a year [s]."""
 MIN_VARIANCE = 1e-12
 """Minimum variance by which the trend is divided. In a history of one interval the variance is 0."""

@@ -114,7 +114,7 @@ class NodePosition:
 
     @classmethod
     def of(cls, soc: Floats, nodes: int) -> "NodePosition":
-        """Return the position of each SOC; those beyond 0..1 have that of the nearest end."""
+        """Return the position of each SOC. An SOC beyond 0..1 gets the position of the nearest end."""
         position = np.clip(soc, 0.0, 1.0) * (nodes - 1)
         below = np.minimum(position.astype(np.intp), nodes - 2)
         return cls(below, position - below)
@@ -125,6 +125,6 @@ class NodePosition:
         return 1.0 - self.fraction, self.fraction
 
     def interpolate(self, values: Floats, offset: NDArray[np.intp] | int = 0) -> Floats:
-        """Return the function with the given values at its nodes, of which the first is at index ``offset``."""
+        """Return the function with the given values at its nodes. The first node is ``values[offset]``."""
         at, (low, high) = self.below + offset, self.weights
         return np.asarray(low * values[at] + high * values[at + 1])

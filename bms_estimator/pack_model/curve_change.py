@@ -33,7 +33,7 @@ def present_ohm(settings: np.void, f: np.void) -> Floats:
 def keep_series_resistance(f: np.void, before: Floats, after: Floats) -> None:
     """Rescale ``step.ln_ratio`` = ln(R_s / R_0), so that R_s keeps its value in ohm when R_0 of the curves changes.
 
-    R_s is the series resistance learned from current steps, and R_0 that of the curves.
+    R_s is the series resistance learned from current steps, and R_0 the series resistance of the curves.
 
     Args:
         f: Record of dtype EKF_STATE.
@@ -44,7 +44,7 @@ def keep_series_resistance(f: np.void, before: Floats, after: Floats) -> None:
 
 
 def return_to_cell_file(estimator: Estimator) -> None:
-    """Replace the curves of a fit by those of the cell file.
+    """Replace a fit's curves by the cell file's curves.
 
     SOC, capacity and the resistances at the present SOC stay. The correction of the OCV starts from its prior.
     """

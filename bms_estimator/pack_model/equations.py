@@ -1,7 +1,7 @@
 """Residuals of the slow fit, their cost, and the normal equations of a Gauss-Newton step.
 
 The cost is twice the negative log of the posterior density, up to a constant. It is the sum of squared residuals in
-standard deviations, of which those of the voltages are limited by Huber's function.
+standard deviations. Huber's function limits the weight of large voltage residuals.
 """
 
 import math
@@ -166,7 +166,7 @@ def matrix(columns: NDArray[np.intp], values: Floats, size: int) -> sparse.csr_m
 
 
 def huber_cost(residual: Floats) -> float:
-    """Return the sum of squares, of which those of large residuals grow linearly."""
+    """Return the sum of Huber's function: the square of a small residual; a large residual counts linearly."""
     size = np.abs(residual)
     return float(np.where(size > HUBER, 2.0 * HUBER * size - HUBER**2, residual**2).sum())
 

@@ -24,7 +24,7 @@ residuals contain the error of the file's temperature dependence."""
 
 
 def is_exchanged(rows: NDArray[np.void], residuals: Residuals) -> bool:
-    """Return True if the rows after the last gap are those of another pack.
+    """Return True if another pack was measured after the last gap.
 
     Args:
         rows: Shape (n,), dtype HISTORY_ROW, in order of time.

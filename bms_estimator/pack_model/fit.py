@@ -59,7 +59,7 @@ class PackFit:
     curves: tuple[Floats, ...]
     """Start of the next fit for each minimum, the best first: nodes of the OCV's error and of the error by direction."""
     first_segment: float = 0.0
-    """Segment of the first fitted row. Rows of earlier segments are those of another pack."""
+    """Segment of the first fitted row. Earlier segments were measured on another pack."""
     is_exchanged: bool = False
     """True: the pack was exchanged in the gap before the last segment, so that only this segment is fitted."""
 
@@ -175,8 +175,8 @@ def start_near(equations: Equations, previous: PackFit, curves: Floats) -> Float
 def start_soc_near(equations: Equations, previous: PackFit) -> Floats:
     """Return the SOC at the start of each interval.
 
-    It is that of the previous fit, up to its last row. Later it is counted on from the interval before, or is that of the
-    filter after a gap.
+    Up to the last row of the previous fit, that fit supplies the SOC. Later the SOC is counted on from the interval before, or,
+    after a gap, taken from the filter.
     """
     intervals, links, ln_q = equations.intervals, equations.links, previous.mean[LN_Q]
     start_s = equations.rows["elapsed_s"][intervals.starts]

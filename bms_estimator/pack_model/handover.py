@@ -34,11 +34,11 @@ from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS
 
 MIN_CURVE_STD_V = 0.003
 """Minimum std of the OCV of one cell [V]. Assumed."""
-MIN_R_STD = 0.1
-"""Minimum relative std of the resistances. Equal to ``Noise.r_std``, the default without a std in the cell file."""
+MIN_R_STD = Noise.r_std
+"""Minimum relative std of the resistances: the default without a std in the cell file."""
 MIN_SOC_STD_FRACTION = 0.55
-"""Minimum std of the published SOC, as a fraction of that of the cell file, which applies to a cell that was not measured. The
-fraction is assumed."""
+"""Minimum std of the published SOC after a fit, as a fraction of the minimum by the cell file. A pack that was fitted is known
+better than a cell that was not measured. The fraction is assumed."""
 FILTER_STATES = np.array([SOC, LN_Q, OFFSET, *range(NODE, NODE + NODES)])
 """States of the filter that a fit determines jointly."""
 FIT_RESULTS = np.array([FIT_SOC, FIT_LN_Q, FIT_OFFSET, *range(FIT_CURVE.start, FIT_CURVE.stop)])
@@ -126,10 +126,10 @@ def _adopt_parameters(mean: Floats, covariance: Floats, fit: PackFit, p: np.void
         covariance: Covariance of the hypothesis; written.
         fit: Fit of the history.
         p: Record of dtype EKF_SETTINGS with the fitted curves.
-        first: First of ``FILTER_STATES`` whose covariance is written: 0 includes that of the SOC.
+        first: First of ``FILTER_STATES`` whose covariance is written: 0 includes the SOC.
     """
     mean[LN_Q], mean[OFFSET] = fit.mean[FIT_LN_Q], fit.mean[FIT_OFFSET] * p["capacity_as"] / HOUR_S
-    mean[NODE : NODE + NODES] = mean[LN_R0] = mean[LN_R] = 0.0  # the fitted curves are those of the settings
+    mean[NODE : NODE + NODES] = mean[LN_R0] = mean[LN_R] = 0.0  # the settings contain the fitted curves
     states = FILTER_STATES[first:]
     _decouple(covariance, [*states, LN_R0, LN_R])
     covariance[np.ix_(states, states)] = _state_covariance(fit, p)[first:, first:]

@@ -15,9 +15,9 @@ from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD
 from bms_estimator.kernels.kalman_filter.input_checks import store_last_good_state
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.pack_model import fit as result
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.curve_change import keep_series_resistance, present_ohm, return_to_cell_file
+from bms_estimator.pack_model.fit import SOC as FIT_SOC
 from bms_estimator.pack_model.fit import PackFit, fit
 from bms_estimator.pack_model.handover import adopt_curves, adopt_state
 from bms_estimator.pack_model.history import History
@@ -30,7 +30,7 @@ MIN_INTERVAL_S = 1800.0
 than the filter."""
 INTERVAL_OF_AGE = 1.0 / 12.0
 """Interval between two fits as a fraction of the age of the history, within its limits: an hour after twelve hours. A row
-changes the fit of a short history more than that of a long one."""
+changes a fit of a short history more than a fit of a long one."""
 ADOPT_DELAY_S = 120.0
 """Time from the start of a fit to the adoption of its result, on the clock of the samples [s]. The service fits in
 another thread meanwhile; a replay, which waits for the fit, adopts it at the same sample."""
@@ -48,7 +48,7 @@ Submit = Callable[[Callable[[], PackFit]], "Future[PackFit]"]
 
 @dataclass(frozen=True)
 class FitChange:
-    """Change of the estimates by the adoption of a fit. Capacities are relative to that of the cell file."""
+    """Change of the estimates by the adoption of a fit. Capacities are relative to the cell file's."""
 
     soc_before: float
     soc_after: float
@@ -156,7 +156,7 @@ class SlowFit:
         next_s = float(h["event_s"]) if restored else math.inf
         h["enabled"], h["event_s"] = 1, min(max(next_s, h["elapsed_s"]), h["elapsed_s"] + self._interval())
         is_adopted = restored and self.fit is not None and saved is not None and self.fit.elapsed_s >= saved.elapsed_s
-        if saved is not None and not is_adopted:  # its capacity and offset are adopted like those of a new fit
+        if saved is not None and not is_adopted:  # adopt its capacity and offset, like those of a new fit
             self._pending = run_now(lambda: saved)
             h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
 
@@ -247,7 +247,7 @@ class SlowFit:
 
     def _is_better(self, fitted: PackFit) -> bool:
         """Return True if one hypothesis represents the SOC of a fit, or if the history is long enough."""
-        is_certain = fitted.covariance[result.SOC, result.SOC] <= MAX_SINGLE_STD**2
+        is_certain = fitted.covariance[FIT_SOC, FIT_SOC] <= MAX_SINGLE_STD**2
         return bool(is_certain) or self._throughput() >= MIN_THROUGHPUT_SOC
 
     def _throughput(self) -> float:

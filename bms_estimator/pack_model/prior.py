@@ -46,9 +46,9 @@ RC_CORRELATION = 0.7
 HYSTERESIS_MEAN, HYSTERESIS_STD = 0.5, 0.5
 """Prior of the fraction of the cell file's hysteresis in each of its two parts."""
 ENTROPY_STD_V = 1.5e-4
-"""Std of the OCV's temperature coefficient beyond that of the cell file [V/K]."""
+"""Std of the OCV's temperature coefficient beyond the cell file's [V/K]."""
 ARRHENIUS_STD = 0.004
-"""Std of the relative change of the resistances beyond that of the cell file [1/K]."""
+"""Std of the relative change of the resistances by temperature, beyond the cell file's [1/K]."""
 MIN_FULL_STD = 0.006
 """Minimum std of the SOC at which this pack's charger ends, common to all charges."""
 FULL_REPEAT_STD = 0.01

@@ -83,7 +83,7 @@ def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
 
 @njit(cache=True)
 def is_resting(s: Record, p: Record) -> bool:
-    """Return True if the mean current over 10 min is that of a resting pack."""
+    """Return True if the pack rests: its mean current over 10 min is small."""
     return abs(s.mean_a) < RESTING_C * p.capacity_as / 3600.0
 
 

@@ -189,7 +189,7 @@ EKF_STATE = np.dtype(
         ("gap_s", "f8"),  # duration of the last gap that may hide a charge [s]; 0: none
         ("soc_before", "f8"),  # SOC before this gap, less the charge counted since it
         ("std_before", "f8"),  # std of the SOC before this gap
-        ("exchanged", "i8"),  # 1: SOC or voltages after this gap are those of another pack
+        ("exchanged", "i8"),  # 1: SOC or voltages after this gap show another pack
         ("window", WINDOW),
         ("current_a", "f8"),  # current of the last sample [A]
         ("same_s", "f8"),  # time for which the reported current has been constant within its resolution [s]

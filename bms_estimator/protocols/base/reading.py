@@ -24,7 +24,7 @@ class Reading(NamedTuple):
     time_s: float = nan
     """Timestamp by the device's clock, with any origin [s]; NaN: not reported."""
     voltage_held: bool = False
-    """True if the voltage is that of an earlier reading, and only the other values are new."""
+    """True if the voltage repeats an earlier reading, and only the other values are new."""
 
 
 VOLTAGE_HELD = "voltage_held"
@@ -143,7 +143,7 @@ def sample_json_line(
         temperature_c: None or NaN: not measured [degC].
         cells_v: Cell voltages, from the first on; None or NaN: not measured [V].
         time_s: Timestamp by the device's clock, with any origin [s]; None: not reported.
-        voltage_held: True if the voltage is that of an earlier sample.
+        voltage_held: True if the voltage repeats an earlier sample.
 
     Raises:
         ValueError: Voltage or current is not finite.
