@@ -132,6 +132,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: Arguments without the program's name; None: those of the process.
     """
+    # The slow fit's matrices are small: with more threads OpenBLAS needs twice the time, and a replay on another number of
+    # cores could differ in the last bit. numpy, which reads this once, is not imported yet.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         _run(arguments)
     except UserError as error:
