@@ -1,29 +1,32 @@
-"""Settings record of the anchors from cell file and settings."""
+"""Settings record of the anchors (ends of charge and discharge) from cell file and settings."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.kalman_filter.anchors import ANCHOR_SETTINGS
+from bms_estimator.kernels.kalman_filter.anchors import ANCHOR_SETTINGS, FULL_STD
 from bms_estimator.model.cell import CellModel
 from bms_estimator.settings.charge_limits import ChargeLimits
 
 VOLTAGE_ERROR = 0.005
 """Relative error of the voltage of charger and source. A BMS seldom measures the voltage of a pack more accurately."""
 NEARLY_FULL_SOC = 0.995
-"""SOC whose OCV is the maximum of the default full voltage. Where the curve is steep, it is lower than ``VOLTAGE_ERROR`` allows:
+"""SOC whose OCV limits the default full voltage. Where the curve is steep, ``VOLTAGE_ERROR`` alone would leave a too high voltage:
 chargers of LFP cells end between 3.5 and 3.65 V, within 0.4 % of SOC."""
 TAIL_C = 0.05
-"""Default tail current, as a C-rate. At C/20 the overpotential is some 10 mV, which is 1 % of SOC in oxide cells."""
+"""Default tail current, as a C-rate. At C/20 the overpotential is about 10 mV, which is 1 % of SOC in oxide cells."""
 MAX_END_C = 0.125
 """Maximum current at which a charge may end with the default tail current, as a C-rate. Chargers end at C/50 to C/10."""
+MAX_STEEP_END_C = 0.25
+"""``MAX_END_C`` of a cell in which the overpotential of this current hides less than ``FULL_STD``, because the curve is steep when
+full. The voltage of such a cell is constant for less than ``AT_FULL_S`` if a charge with C/5 ends at C/10."""
 MAX_END_RATIO = 1.5
 """Maximum current at which a charge may end, in multiples of a configured tail current."""
 TRICKLE_C = 0.01
-"""Minimum charge current, as a C-rate. It exceeds the std of a current sensor's offset (``Noise.offset_c``), and an LG M50
-charges another 0.8 % between C/50 and C/100."""
+"""Minimum charge current, as a C-rate. It exceeds the std of a current sensor's offset (``Noise.offset_c``). It is not C/50,
+because an LG M50 charges another 0.8 % between C/50 and C/100."""
 CUTOFF_MARGIN = 0.02
-"""Relative margin of the cut-off voltage. Near empty the voltage falls by some 50 mV between two samples of a slow source,
-which is less than 0.2 % of SOC."""
+"""Relative margin of the cut-off voltage. Near empty the voltage falls by about 50 mV between two samples of a slow source. This
+fall is less than 0.2 % of SOC."""
 MIN_FULL_SOC = 0.98
 """Minimum SOC of the OCV curve at the full voltage for a correction of the filter: 2 std of the anchor below 1."""
 MAX_EMPTY_SOC = 0.05
@@ -31,13 +34,14 @@ MAX_EMPTY_SOC = 0.05
 
 
 def anchor_settings(
-    pack: CellModel, ocv_v: NDArray[np.float64], limits: ChargeLimits, voltage_resolution_v: float
+    pack: CellModel, ocv_v: NDArray[np.float64], max_ohm: float, limits: ChargeLimits, voltage_resolution_v: float
 ) -> NDArray[np.void]:
     """Return the settings record of the anchors.
 
     Args:
         pack: The pack as one two-terminal object.
         ocv_v: Open-circuit voltage from ``settings_records.ocv_grid`` [V].
+        max_ohm: Total resistance at SOC 1 plus two std [ohm].
         limits: Limits of charger and protection.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
 
@@ -49,10 +53,13 @@ def anchor_settings(
     full_v, min_v = limits.full_voltage_v, np.inf
     if full_v is None:
         full_v, min_v = ocv_v[-1], np.interp(NEARLY_FULL_SOC, _soc_grid(ocv_v), ocv_v)
+    p["charger_v"] = full_v
     p["full_v"] = min((1.0 - VOLTAGE_ERROR) * full_v, min_v) - voltage_resolution_v
     p["corrects_full"] = soc_at_full(ocv_v, limits) >= MIN_FULL_SOC
     if limits.tail_current_a is None:
-        p["tail_a"], p["small_a"] = TAIL_C * one_c_a, MAX_END_C * one_c_a
+        steep_v = MAX_STEEP_END_C * one_c_a * max_ohm
+        is_steep = ocv_v[-1] - np.interp(1.0 - FULL_STD, _soc_grid(ocv_v), ocv_v) >= steep_v
+        p["tail_a"], p["small_a"] = TAIL_C * one_c_a, (MAX_STEEP_END_C if is_steep else MAX_END_C) * one_c_a
     else:
         p["tail_a"], p["small_a"] = limits.tail_current_a, MAX_END_RATIO * limits.tail_current_a
     p["trickle_a"] = min(TRICKLE_C * one_c_a, 0.5 * p["tail_a"])

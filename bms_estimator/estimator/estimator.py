@@ -44,7 +44,7 @@ class Estimator:
 
     Args:
         cell: The pack as one two-terminal object (``CellModel.pack``). A fuel cell has no SOC (NaN), and its
-            parameters are always learned, whatever ``observer.law`` is.
+            parameters are learned with any ``observer.law``.
         observer: The adaptive observer's settings.
         identifier: Settings of the identifier, the Kalman filter; None: only the adaptive observer runs.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
@@ -56,8 +56,8 @@ class Estimator:
     Attributes:
         record: Shape (1,), dtype ``ESTIMATOR_STATE``: the complete state, which can be copied, saved and restored.
         settings_record: Shape (1,), dtype ``ESTIMATOR_SETTINGS``.
-        cell_file_settings: The filter's part of ``settings_record`` by the cell file, record of dtype ``EKF_SETTINGS``. The
-            slow fit (``bms_estimator.pack_model``) changes the curves in ``settings_record``.
+        cell_file_settings: Copy of the filter's part of ``settings_record``, dtype ``EKF_SETTINGS``, with the curves of the
+            cell file. The slow fit (``bms_estimator.pack_model``) changes the curves in ``settings_record``.
         state: The observer's part of ``record``, shape (1,), dtype ``OBSERVER_STATE``.
         settings: The observer's part of ``settings_record``, shape (1,), dtype ``OBSERVER_SETTINGS``.
     """
@@ -128,7 +128,7 @@ class Estimator:
         return self._trace[: self.run_part(block, self._trace)[1]]
 
     def run_part(self, block: SampleBlock, trace: TraceBlock) -> tuple[int, int]:
-        """Process samples until the recording of the history needs its caller, or to the end of the block.
+        """Process samples until the caller must take history rows or handle an event, or to the end of the block.
 
         Args:
             block: Samples.
@@ -179,7 +179,7 @@ class Estimator:
             unseen_s: Duration of the gap before the next sample [s]; infinite if unknown. The load may have changed in
                 the gap.
         """
-        # inf: the next sample begins a time base of its own
+        # inf: the time of the next sample is not compared with that of the last one
         self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
         if self.identifying:
             self.record["filter"]["soc"] = self.state["soc"]
@@ -206,7 +206,7 @@ def make_estimator(settings: Settings, cell: PackModel) -> Estimator:
 
 
 def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
-    """Create the estimator of a pack, and compile or load all its kernels, so that nothing compiles once samples arrive."""
+    """Create the estimator of a pack after compiling or loading all kernels, so that no sample waits for a compilation."""
     make_estimator(settings, cell).run(np.zeros(1, dtype=SAMPLE))
     return make_estimator(settings, cell)
 

@@ -33,24 +33,24 @@ CURVE_SOC = 0.3
 KNEE_V = 1.0
 """Slope dOCV/dSOC per cell that counts as an angle of 45 degrees [V]."""
 KNEE_DECORRELATION = 4.0
-"""Loss of correlation of the OCV's error per radian of slope angle. On a plateau the error is an error of voltage, at a
-knee an error of SOC. The correlation of both is e^-(KNEE_DECORRELATION x angle)."""
+"""Decrease of ln of the correlation of the OCV's error per radian of slope angle. On a plateau the curve has an error of voltage
+and at a knee an error of SOC, and both are nearly independent."""
 COUNT_ERROR_SOC = 0.004
-"""Minimum std of the OCV curve in SOC, because the SOC of the cell that was measured has an error."""
+"""Minimum std of the OCV curve along SOC, due to the error of the SOC in the measurement of the cell."""
 SLOW_DIFFUSION = 0.2
 """Resistance of diffusion slower than both RC pairs, as a fraction of each pair's resistance."""
 BRANCHES_STD = 0.35
 """Relative std of resistances derived from two RC pairs."""
 MIN_BIAS_OF_R_STD = 0.15
-"""Minimum of ``bias_relative``, as a fraction of the resistances' relative std, because the ratios of uncertain
-resistances are uncertain, too."""
+"""Minimum of ``bias_relative``, as a fraction of the resistances' relative std. Resistances with a large std also have uncertain
+ratios, which the scales LN_R0 and LN_R cannot correct."""
 ROOM_C = 15.0, 35.0
 """Lower and upper end of the temperature range of resistances without a declared range, as in a room [C]."""
 MIN_SOC_STD = 0.005
 """Minimum std of the published SOC, because full and empty of a cell are not defined better."""
 MIN_SOC_STD_OF_R_STD = 0.03
-"""Minimum std of the published SOC, as a fraction of the std of ln R. A cell that was not measured is full at another point of
-the curve."""
+"""Minimum std of the published SOC, as a fraction of the std of ln R. Without measurements of the cell, the point of the OCV curve
+at which it is full is uncertain."""
 MIN_RESISTANCE = 1e-4
 """Minimum of each resistance, as a fraction of the sum at SOC 0.5. Equivalent time constants are weighted by resistance
 and need weights above 0."""
@@ -92,11 +92,21 @@ def filter_settings(
     mid_soc = GRID // 2
     p["middle_ohm"] = weak_ohm[mid_soc].sum() + strong_ohm[mid_soc].sum()
     p["weak_ohm"], p["strong_ohm"] = np.maximum(weak_ohm, MIN_RESISTANCE * p["middle_ohm"]), strong_ohm
-    r_std = float(np.hypot(r_std, sampling.current_gain_std))
     noise_v = 0.5 * voltage_resolution_v if voltage_noise_v is None else voltage_noise_v
     p["sensor_v2"] = noise_v**2 + voltage_resolution_v**2 / 12.0  # noise and rounding
     p["unmeasured_s"] = unmeasured_s(sampling)
     p["current_step_a"], p["dead_band_a"] = sampling.current_resolution_a, sampling.current_dead_band_a
+    noise = _noise(cell, identifier, sampling, r_std)
+    p["min_soc_std"] = max(MIN_SOC_STD, MIN_SOC_STD_OF_R_STD * noise.r_std)
+    for field in fields(noise):
+        p[field.name] = getattr(noise, field.name)
+    p["model_v"] *= series  # it is configured for one cell
+    return record
+
+
+def _noise(cell: CellModel, identifier: IdentifierSettings, sampling: Sampling, file_r_std: float) -> Noise:
+    """Return the uncertainties of cell and source. ``file_r_std`` is the std of ln R in the cell file."""
+    r_std = float(np.hypot(file_r_std, sampling.current_gain_std))
     noise = Noise(r_std=r_std)
     if identifier.current_offset_std_a is not None:
         noise = replace(noise, offset_c=identifier.current_offset_std_a / cell.cell.capacity_ah)
@@ -104,14 +114,17 @@ def filter_settings(
     for name, configured in (("capacity_std", capacity_std), ("soc_std", identifier.soc_std)):
         if configured is not None:
             noise = replace(noise, **{name: configured})
-    # a current sensor with a wrong gain counts the charge of a cell with another capacity
-    noise = replace(noise, capacity_std=float(np.hypot(noise.capacity_std, sampling.current_gain_std)))
-    p["min_soc_std"] = max(MIN_SOC_STD, MIN_SOC_STD_OF_R_STD * noise.r_std)
-    noise = replace(noise, bias_relative=max(noise.bias_relative, MIN_BIAS_OF_R_STD * r_std))
-    for field in fields(noise):
-        p[field.name] = getattr(noise, field.name)
-    p["model_v"] *= series  # it is configured for one cell
-    return record
+    return replace(
+        noise,
+        # a gain error of the current sensor has the same effect as an error of the capacity
+        capacity_std=float(np.hypot(noise.capacity_std, sampling.current_gain_std)),
+        bias_relative=max(noise.bias_relative, MIN_BIAS_OF_R_STD * r_std),
+    )
+
+
+def max_ohm(p: np.void) -> float:
+    """Return the total resistance at SOC 1 and 25 C plus two std [ohm]. ``p`` is a record of dtype EKF_SETTINGS."""
+    return float((1.0 + 2.0 * p["r_std"]) * (p["weak_ohm"][-1] + p["strong_ohm"][-1]).sum())
 
 
 def unmeasured_s(sampling: Sampling) -> float:

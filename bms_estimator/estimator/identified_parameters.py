@@ -111,7 +111,7 @@ def _series_ohm(f: np.void, p: np.void) -> float:
 
 
 def fitted_ocv_correction(estimator: Estimator, soc: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the correction of the cell file's OCV by the slow fit [V]. The filter's correction is relative to the sum."""
+    """Return the correction of the cell file's OCV by the slow fit [V]. The filter's own correction is not included."""
     p, cell_file = estimator.settings_record[0]["filter"], estimator.cell_file_settings
     difference_v: NDArray[np.float64] = p["ocv_v"] - cell_file["ocv_v"]
     return np.asarray(np.interp(soc, np.linspace(0.0, 1.0, difference_v.size), difference_v))
@@ -215,8 +215,8 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
 def _resistance_scales(estimator: Estimator) -> tuple[float, float, float]:
     """Return ln of the factors on R_0 and on the RC pairs of the filter's curves, and the relative std of the resistances.
 
-    The curves of a slow fit contain the pack's resistances over weeks. The filter's scales relative to these curves follow the
-    load of the last hours and are not used.
+    The curves of a slow fit already contain the pack's resistances over weeks. The filter's factors on these curves follow the
+    load of the last hours. They are not used.
     """
     p = estimator.settings_record[0]["filter"]
     if not np.array_equal(p["weak_ohm"], estimator.cell_file_settings["weak_ohm"]):  # the curves of a slow fit
@@ -227,7 +227,7 @@ def _resistance_scales(estimator: Estimator) -> tuple[float, float, float]:
 
 
 def _corrected_ocv(estimator: Estimator, cell: CellModel, series: int) -> dict[str, Any]:
-    """Return the corrected OCV of a cell as a table, with the other columns of the given table."""
+    """Return the section ``ocv`` of a cell file with the corrected OCV, its std, and the fitted hysteresis."""
     table = cell.ocv.model_dump() if isinstance(cell.ocv, TableOcv) else {"form": "table", "soc": EVEN_SOC}
     soc = np.array(table["soc"])
     correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], soc)
@@ -235,11 +235,15 @@ def _corrected_ocv(estimator: Estimator, cell: CellModel, series: int) -> dict[s
     ocv_v = np.array(table["ocv_v"]) if "ocv_v" in table else np.array([emf(x, cell.a) for x in soc])
     rising_v = np.maximum.accumulate(ocv_v + correction_v / series) + MIN_RISE_V * np.arange(soc.size)
     if table.get("hysteresis_v"):
-        fitted_v, file_v = (
-            estimator.settings_record[0]["filter"]["hysteresis_v"],
-            estimator.cell_file_settings["hysteresis_v"],
-        )
-        if file_v.any():
-            factor = float(fitted_v.sum() / file_v.sum())
-            table = table | {"hysteresis_v": [factor * v for v in table["hysteresis_v"]]}
+        factor = _fitted_hysteresis_factor(estimator)
+        table = table | {"hysteresis_v": [factor * v for v in table["hysteresis_v"]]}
     return table | {"ocv_v": rising_v.tolist(), "error_v": (std_v / series).tolist()}
+
+
+def _fitted_hysteresis_factor(estimator: Estimator) -> float:
+    """Return the slow fit's factor on the hysteresis of the cell file."""
+    fitted_v, file_v = (
+        estimator.settings_record[0]["filter"]["hysteresis_v"],
+        estimator.cell_file_settings["hysteresis_v"],
+    )
+    return float(fitted_v.sum() / file_v.sum()) if file_v.any() else 1.0

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.anchor_settings import anchor_settings
-from bms_estimator.estimator.filter_settings import filter_settings, unmeasured_s
+from bms_estimator.estimator.filter_settings import filter_settings, max_ohm, unmeasured_s
 from bms_estimator.estimator.fuel_cell_settings import fuel_cell_settings
 from bms_estimator.estimator.learning_settings import learning_settings
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, PARAMETERS, emf
@@ -95,8 +95,8 @@ def estimator_settings(
     for i in range(1, PARAMETERS):
         p["lower"][i], p["upper"][i] = cell.bounds(i).lower, cell.bounds(i).upper
     grid = p["observer"]["ocv_v"], p["observer"]["ocv_slope_v"]
-    p["anchors"] = anchor_settings(cell, grid[0], limits, voltage_resolution_v)[0]
     p["filter"] = filter_settings(cell, grid, identifier, voltage_resolution_v, voltage_noise_v, sampling)[0]
+    p["anchors"] = anchor_settings(cell, grid[0], max_ohm(p["filter"]), limits, voltage_resolution_v)[0]
     return record
 
 

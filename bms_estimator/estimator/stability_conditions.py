@@ -10,7 +10,7 @@ CAPACITANCE_INDICES = (7, 9), (10, 12)
 
 @dataclass(frozen=True)
 class Condition:
-    """Condition of Lemma 4.1.1: the inequality left < right, and True in ``holds`` if it is satisfied."""
+    """Condition of Lemma 4.1.1: the inequality ``left`` < ``right``. ``holds`` is True if it is satisfied."""
 
     name: str
     holds: bool

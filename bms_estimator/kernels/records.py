@@ -33,9 +33,19 @@ ESTIMATOR_SETTINGS = np.dtype(
     align=True,
 )
 
+PENDING_VOLTAGE = np.dtype(
+    [
+        ("age_s", "f8"),  # time from the last measured current to this voltage [s]; 0: none
+        ("voltage_v", "f8"),  # [V]
+    ],
+    align=True,
+)
+"""Voltage that waits for the next measured current."""
+
 ESTIMATOR_STATE = np.dtype(
     [
         ("observer", OBSERVER_STATE),
+        ("pending", PENDING_VOLTAGE),
         ("learning", LEARNING_STATE),
         ("series_resistance", SERIES_RESISTANCE),
         ("filter", EKF_STATE),

@@ -13,6 +13,7 @@ from bms_estimator.kernels.identifier import identifier_step
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
 from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
+from bms_estimator.kernels.kalman_filter.window import widen_by_interpolation
 from bms_estimator.kernels.observer.learning_law import learning_step
 from bms_estimator.kernels.observer.observer import count_charge, initialize, observer_step
 from bms_estimator.kernels.observer.series_resistance import (
@@ -43,6 +44,7 @@ _REPEATED = int(SampleOutcome.REPEATED)
 _SATURATED = int(SampleOutcome.SATURATED)
 _SATURATED_BITS = int(SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED)
 _VOLTAGE_HELD = int(SampleStatus.VOLTAGE_HELD)
+_CURRENT_HELD = int(SampleStatus.CURRENT_HELD)
 
 
 @njit(cache=True)
@@ -82,6 +84,9 @@ def step(
     sample initializes the estimator with its voltage in any case. The observer of the thesis has the voltage as its only
     input, which it holds between measurements.
 
+    A sample with a held current is stored until the next measured current, because the current at its time is then
+    interpolated. Until then only the last of several such voltages is stored.
+
     Args:
         state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
         settings: Shape (1,), dtype ESTIMATOR_SETTINGS.
@@ -105,6 +110,12 @@ def step(
         return outcome
     store_temperature(state[0].learning, temperature_c)
     dt_s = time_s - s.time_s
+    pending = state[0].pending
+    if status & _CURRENT_HELD and dt_s > 0.0:
+        if not status & _VOLTAGE_HELD:
+            pending.age_s, pending.voltage_v = dt_s, voltage_v
+        return outcome
+    pending_s, pending.age_s = pending.age_s, 0.0
     s.time_s = time_s
     new_clock = dt_s == -math.inf  # ``Estimator.resume`` has set the time of the last sample to infinity
     if new_clock:
@@ -120,9 +131,43 @@ def step(
             s.time_steps_back += 1
         return outcome
     gap = new_clock or is_gap(s, p, dt_s)
+    measured_v = math.nan if status & _VOLTAGE_HELD else voltage_v
+    if 0.0 < pending_s < dt_s and not gap:
+        change_a = current_a - s.current_a
+        pending_a = s.current_a + pending_s / dt_s * change_a
+        widen_by_interpolation(state[0].filter.window, change_a, pending_s, dt_s)
+        advance(state, settings, pending_s, False, pending_a, pending.voltage_v, pending.voltage_v, temperature_c)
+        dt_s -= pending_s
+    advance(state, settings, dt_s, gap, current_a, measured_v, voltage_v, temperature_c)
+    return outcome
+
+
+@njit(cache=True)
+def advance(
+    state: Records,
+    settings: Records,
+    dt_s: float,
+    gap: bool,
+    current_a: float,
+    measured_v: float,
+    voltage_v: float,
+    temperature_c: float,
+) -> None:
+    """Advance all parts of the estimator by ``dt_s``.
+
+    Args:
+        state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
+        settings: Shape (1,), dtype ESTIMATOR_SETTINGS.
+        dt_s: Time step [s].
+        gap: True if samples are missing in the step.
+        current_a: Current at the end of the step [A].
+        measured_v: Voltage at the end of the step [V]; NaN if it was not measured.
+        voltage_v: Last measured voltage [V].
+        temperature_c: Temperature of the cell [C]; NaN without a sensor.
+    """
+    s, p = state[0].observer, settings[0].observer
     previous_a, previous_soc = s.current_a, s.soc
     count_charge(s, p, dt_s, current_a)
-    measured_v = math.nan if status & _VOLTAGE_HELD else voltage_v
     s.voltage_age_s += dt_s
     if settings[0].identify:
         identifier_step(state[0], settings[0], dt_s, gap, current_a, measured_v, temperature_c)
@@ -136,7 +181,6 @@ def step(
         series_resistance_step(state[0], settings[0], dt_s, previous_a, previous_soc, measured_v)
     if math.isfinite(measured_v):
         s.voltage_age_s = 0.0
-    return outcome
 
 
 @njit(cache=True)
@@ -209,8 +253,8 @@ def write_filter_trace(row: Record, s: Record, p: Record) -> None:
 
     Without the filter, ``innovation_v`` is the observer's output error e, ``r_s_ohm`` is R_s by (4.2) if enabled, and the
     other columns are NaN. ``soc_ocv`` is then NaN, because the observer's v_ts and v_tl absorb any error of the SOC, so that
-    the inverted OCV (7.1) would return the observer's own SOC. It is also NaN with a held voltage, which does not belong to
-    the present current.
+    the inverted OCV (7.1) would return the observer's own SOC. It is also NaN with a held voltage or current, because both
+    do not belong to one time.
     """
     if not p.identify:
         row.innovation_v = s.observer.innovation_v
@@ -222,7 +266,7 @@ def write_filter_trace(row: Record, s: Record, p: Record) -> None:
     f, e = s.filter, s.elements
     row.innovation_v = f.innovation_v
     row.soc_ocv = math.nan
-    if s.observer.voltage_age_s == 0.0:
+    if s.observer.voltage_age_s == 0.0 and s.observer.time_s == row.time_s:
         e_o = open_circuit(f, p.filter, e, row.current_a, row.voltage_v)
         row.soc_ocv = soc_from_ocv(e_o, p.filter.ocv_v, p.filter.ocv_slope_v)
     row.soc_std = weakest_cell_soc_std(f, p.filter)

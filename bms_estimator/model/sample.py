@@ -54,6 +54,8 @@ class SampleStatus(IntFlag):
     GAP = 16
     VOLTAGE_HELD = 32
     """The voltage repeats an earlier measurement. Current and temperature are new."""
+    CURRENT_HELD = 64
+    """The current repeats an earlier measurement. Voltage and temperature are new."""
 
 
 def remove_implausible(values: NDArray[np.float64], low: float, high: float) -> int:

@@ -1,4 +1,4 @@
-"""Aging of the pack: variances by which capacity and resistances change with use and with time."""
+"""Aging of the pack: variance of the change of capacity and resistances with use and time."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,17 @@ from bms_estimator.pack_model.intervals import DAY_S, Intervals
 YEAR_S = 365.0 * DAY_S
 """Length of a year [s]."""
 MIN_VARIANCE = 1e-12
-"""Minimum variance by which the trend is divided. In a history of one interval the variance is 0."""
+"""Minimum variance in the divisor of the trend. The variance over a history of one interval is 0."""
 
 
 @dataclass(frozen=True)
 class Aging:
-    """Stds of the change of ln of a quantity. The variance grows in proportion to use and to time."""
+    """Stds of the change of ln of a quantity by aging. Its variance is proportional to use plus time."""
 
     by_use: float
-    """Std of the change in a charge throughput of ``CellCurves.aged_soc``: 500 full cycles."""
+    """Std of the change over a charge throughput of ``CellCurves.aged_soc`` (500 full cycles)."""
     by_time: float
-    """Std of the change in a year without use."""
+    """Std of the change over a year without use."""
 
 
 CAPACITY = Aging(0.11, 0.05)
@@ -58,9 +58,9 @@ class AgingVariance:
 
     @property
     def trend(self) -> Floats:
-        """Change of the quantity at the start of each interval relative to the last one, for aging at a constant rate.
+        """Difference of ln of the quantity between the start of each interval and the last start, for a change of one std.
 
-        The rate is such that the change over the history is one std: minus the std in the first interval, 0 in the last.
+        The change is proportional to the variance, so that the trend rises from minus one std to 0.
         """
         relative = self.at_start - self.at_start[-1]
         return np.asarray(relative / np.sqrt(max(self.at_start[-1], MIN_VARIANCE)))

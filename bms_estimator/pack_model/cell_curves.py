@@ -1,4 +1,4 @@
-"""Curves of one cell as functions of SOC and temperature, from the filter's settings record."""
+"""Curves of one cell over SOC and temperature, from the filter's settings record."""
 
 from dataclasses import dataclass
 
@@ -16,19 +16,22 @@ from bms_estimator.model.arrays import Floats
 SOC_GRID = np.linspace(0.0, 1.0, GRID)
 """SOC grid of resistances, hysteresis and OCV error. Shape (GRID,)."""
 MIN_END_SLOPE_V, MAX_END_SLOPE_V = 1.0, 8.0
-"""Limits of the slope with which the OCV is extrapolated beyond SOC 0 and 1 [V per unit SOC]. Assumed: the slope at the end of a
-measured table is uncertain."""
+"""Limits of the slope with which the OCV is extrapolated beyond SOC 0 and 1 [V per unit SOC]. They are assumed, because the
+slope at the end of a measured table is uncertain."""
 ZERO_C_K = 273.15
 """Temperature 0 C in kelvin."""
-SLOPE_REACH = 0.01
-"""Half width of the secant that gives the slope of the OCV [SOC]."""
-DIRECTION_ERROR_FRACTION, DIRECTION_STD_RANGE_V = 0.5, (2e-3, 6e-3)
-"""Error by direction: the part of the OCV's error that differs between charge, rest and discharge. Its std is this fraction of
-the OCV's std, within these limits [V]. Generic cells are assumed to be at the upper limit, and cells whose file was fitted to
-their own captures at the lower one."""
-OVERPOTENTIAL_STD_FRACTION, OVERPOTENTIAL_STD_RANGE = 0.25, (0.04, 0.08)
-"""Relative std by which the overpotential at one SOC differs between charge and discharge: this fraction of the std of ln R,
-within these limits."""
+SECANT_HALF_WIDTH_SOC = 0.01
+"""Half width of the secant that gives the slope of the OCV [SOC]: the secant covers the SOC range of a row (``ROW_SOC``)."""
+DIRECTION_STD_FRACTION = 0.5
+"""Std of the error by direction, as a fraction of the OCV's std. The error by direction is the part of the OCV's error that
+differs between charge, rest and discharge."""
+DIRECTION_STD_RANGE_V = 2e-3, 6e-3
+"""Limits of the std of the error by direction [V]. The lower one is assumed for cells whose file was fitted to their own
+captures, and the upper one for generic cells."""
+OVERPOTENTIAL_STD_FRACTION = 0.25
+"""Relative std by which the overpotential at one SOC differs between charge and discharge, as a fraction of the std of ln R."""
+OVERPOTENTIAL_STD_RANGE = 0.04, 0.08
+"""Limits of this relative std of the overpotential."""
 
 
 class CellCurves:
@@ -51,26 +54,27 @@ class CellCurves:
         self.gain_std = float(settings["voltage_gain_std"])
         """Relative std of the voltage sensor's gain."""
         gain_v = self.gain_std * self.ocv(SOC_GRID)
-        self.error_v = np.sqrt(np.maximum((settings["curve_error_v"] / series) ** 2 - gain_v**2, 0.0))
+        self.ocv_std_v = np.sqrt(np.maximum((settings["curve_error_v"] / series) ** 2 - gain_v**2, 0.0))
         """Std of the cell file's OCV at ``SOC_GRID`` [V], without the error of the voltage sensor."""
         self.hysteresis_v = settings["hysteresis_v"] / series
         self.per_kelvin_v = settings["per_kelvin_v"] / series
         self._parts_ohm = np.hstack([settings["weak_ohm"], settings["strong_ohm"]]) / series
         self.r_std, self.capacity_std = float(settings["r_std"]), float(settings["capacity_std"])
         self.direction_std_v = float(
-            np.clip(DIRECTION_ERROR_FRACTION * np.median(self.error_v), *DIRECTION_STD_RANGE_V)
+            np.clip(DIRECTION_STD_FRACTION * np.median(self.ocv_std_v), *DIRECTION_STD_RANGE_V)
         )
-        """Std of the OCV's error that differs between charge, rest and discharge [V]."""
+        """Std of the error by direction [V]."""
         self.drop_std = float(np.clip(OVERPOTENTIAL_STD_FRACTION * self.r_std, *OVERPOTENTIAL_STD_RANGE))
-        """Relative std of the overpotential at one SOC, which differs between charge and discharge."""
+        """Relative std by which the overpotential at one SOC differs between charge and discharge."""
         self.charge_error = float(settings["charge_error"])
         """Std of the SOC counted over a charge throughput of 1."""
         self.aged_soc = float(settings["aged_soc"])
-        """Charge throughput to which the std of aging refers [SOC]: 500 full cycles."""
+        """Charge throughput of the std ``Aging.by_use`` [SOC]: 500 full cycles."""
         self.event_probability, self.event_s = float(settings["event_probability"]), float(settings["event_s"])
         """Probability that a long gap hides a charge or an exchange of the pack, and the time constant with which the
         probability grows with the gap's duration [s]."""
         self.offset_s = float(settings["offset_s"])
+        """Correlation time of the drifting part of the current sensor's offset [s]."""
         self.offset_std_a = float(settings["offset_c"]) * self.one_c_a
 
     def ocv(self, soc: Floats) -> Floats:
@@ -79,17 +83,17 @@ class CellCurves:
         below, above = np.minimum(soc, 0.0), np.maximum(soc - 1.0, 0.0)
         return np.asarray(inside + self._low_slope_v * below + self._high_slope_v * above)
 
-    def slope(self, soc: Floats, reach: float = SLOPE_REACH) -> Floats:
-        """Return the slope of the OCV as a secant over ``soc`` +- ``reach`` [V per unit SOC]."""
-        return np.asarray((self.ocv(soc + reach) - self.ocv(soc - reach)) / (2.0 * reach))
+    def slope(self, soc: Floats, half_width: float = SECANT_HALF_WIDTH_SOC) -> Floats:
+        """Return the slope of the OCV as a secant over ``soc`` +- ``half_width`` [V per unit SOC]."""
+        return np.asarray((self.ocv(soc + half_width) - self.ocv(soc - half_width)) / (2.0 * half_width))
 
     def resistances(self, soc: Floats, weak: Floats, strong: Floats) -> Floats:
         """Return the resistances at each SOC, shape (n, RESISTANCES) [ohm].
 
         Args:
             soc: SOCs.
-            weak: Factor by temperature on the weakly temperature-dependent part; see ``arrhenius``.
-            strong: Factor by temperature on the strongly temperature-dependent part.
+            weak: Arrhenius factor of the part of the resistances with the low activation energy.
+            strong: Arrhenius factor of the part with the high activation energy.
         """
         position = NodePosition.of(soc, GRID)
         i, (low, high) = position.below, position.weights
@@ -98,7 +102,7 @@ class CellCurves:
 
 
 def arrhenius(energy_j: float, temperature_c: Floats) -> Floats:
-    """Return the factor on a resistance with an activation energy [J/mol]; 1 at 25 C."""
+    """Return the Arrhenius factor on a resistance with an activation energy [J/mol]; 1 at 25 C."""
     inverse_k = 1.0 / (temperature_c + ZERO_C_K) - 1.0 / (REFERENCE_C + ZERO_C_K)
     return np.asarray(np.exp(energy_j / GAS_J * inverse_k))
 

@@ -1,7 +1,6 @@
-"""Change of the curves in the filter's settings.
+"""Rescaling of the filter's state when the curves in its settings change.
 
-The filter stores R_s and its other resistances as ratios to these curves. The ratios are rescaled, so that the resistances in
-ohm stay the same.
+The filter stores resistances as ratios to these curves. The ratios are rescaled, so that the resistances in ohm do not change.
 """
 
 import math
@@ -17,7 +16,7 @@ from bms_estimator.model.arrays import Floats
 
 
 def present_ohm(settings: np.void, f: np.void) -> Floats:
-    """Return the resistances of the curves at the present SOC and temperature, shape (RESISTANCES,) [ohm].
+    """Return the resistances of the settings' curves at the present SOC and temperature, shape (RESISTANCES,) [ohm].
 
     Args:
         settings: Record of dtype EKF_SETTINGS.
@@ -44,9 +43,9 @@ def keep_series_resistance(f: np.void, before: Floats, after: Floats) -> None:
 
 
 def return_to_cell_file(estimator: Estimator) -> None:
-    """Replace a fit's curves by the cell file's curves.
+    """Replace the curves of a fit by those of the cell file.
 
-    SOC, capacity and the resistances at the present SOC stay. The correction of the OCV starts from its prior.
+    SOC, capacity and the resistances at the present SOC do not change. The correction of the OCV is reset to its prior.
     """
     f, settings = estimator.record[0]["filter"], estimator.settings_record["filter"]
     if not f["started"]:
@@ -61,7 +60,7 @@ def return_to_cell_file(estimator: Estimator) -> None:
     for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):
         mean[LN_R0] += math.log(before[0] / after[0])
         mean[LN_R] += math.log(before[1:].sum() / after[1:].sum())
-        # The learned variances hold relative to the fitted curves. Relative to the cell file only the prior is known.
+        # the learned variances are relative to the fitted curves; relative to the cell file only the prior is known
         for j in (LN_R0, LN_R):
             covariance[j, :] = covariance[:, j] = 0.0
             covariance[j, j] = variance

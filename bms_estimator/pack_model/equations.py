@@ -21,8 +21,10 @@ from bms_estimator.pack_model.unknowns import Unknowns
 
 HUBER = 3.0
 """Residual beyond which the cost of a voltage grows linearly, in std."""
-BEYOND_SOC, BEYOND_STD = 0.03, 0.01
-"""Tolerated SOC beyond 0..1, and std of the cost of a larger excess."""
+BEYOND_SOC = 0.03
+"""Distance of an SOC from the range 0..1 up to which it has no cost. Assumed."""
+BEYOND_STD = 0.01
+"""Excess over ``BEYOND_SOC`` that costs as much as a residual of 1 std [SOC]. Assumed."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Block:
     """Residuals of one kind, with the non-zero derivatives of their predictions."""
 
     error: Floats
-    """Measured minus predicted value in std, shape (n,)."""
+    """Measured minus predicted value, in std of the measurement, shape (n,)."""
     columns: NDArray[np.intp]
     """Indices of the unknowns, shape (n, k)."""
     values: Floats
@@ -82,7 +84,7 @@ class Equations:
         self.prior = Prior(cell, self.intervals, self.u)
         self.model = VoltageModel(cell, self.intervals, self.u, reference)
         self.voltage_v = rows["voltage_v"] / cell.series
-        # the rows of a pass (``rows_of_pass``) have the weight of one row
+        # the rows of one pass together have the weight of one row, because their errors are nearly equal
         self.weight = (rows["duration_s"] > 0.0) / np.sqrt(self.model.variance_v2 * self.intervals.rows_of_pass())
         """Inverse of the std of each row's voltage [1/V]; 0 for rows without a voltage."""
         self.known = np.flatnonzero(np.isfinite(rows["reference_soc"]))
@@ -90,7 +92,7 @@ class Equations:
         kind = rows["reference_kind"][self.known]
         self.is_full = kind == FULL
         std = np.where(self.is_full, FULL_REPEAT_STD, rows["reference_std"][self.known])
-        # all ends of discharge together count as one, because their error recurs
+        # all ends of discharge together have the weight of one, because they have the same error
         self.known_std = std * np.where(kind == EMPTY, math.sqrt(max(int((kind == EMPTY).sum()), 1)), 1.0)
 
     def residuals(self, x: Floats) -> Residuals:
@@ -105,24 +107,24 @@ class Equations:
         cost += link_cost + reference @ reference + beyond @ beyond
         return Residuals(x, float(cost), p, voltage, links, reference, beyond)
 
-    def normal_equations(self, r: Residuals, *, smooth: bool = False) -> NormalEquations:
+    def normal_equations(self, r: Residuals, *, use_file_slope: bool = False) -> NormalEquations:
         """Return the normal equations at the unknowns of ``r``.
 
         Args:
             r: Residuals.
-            smooth: True: derivatives by the SOC use the slope of the cell file's OCV; see ``VoltageModel.derivatives``.
+            use_file_slope: See ``VoltageModel.derivatives``.
         """
         precision = self.prior.precision
         a, b = precision.copy(), -precision @ (r.x - self.prior.mean)
-        for block in (self._voltage_block(r, smooth=smooth), r.links, *self._soc_blocks(r)):
+        for block in (self._voltage_block(r, use_file_slope=use_file_slope), r.links, *self._soc_blocks(r)):
             if block.error.size:
                 jacobian = matrix(block.columns, block.values, self.u.size)
                 a += (jacobian.T @ jacobian).toarray()
                 b += jacobian.T @ block.error
         return NormalEquations(a, b)
 
-    def _voltage_block(self, r: Residuals, *, smooth: bool) -> Block:
-        columns, values = self.model.derivatives(r.x, r.prediction, smooth=smooth)
+    def _voltage_block(self, r: Residuals, *, use_file_slope: bool) -> Block:
+        columns, values = self.model.derivatives(r.x, r.prediction, use_file_slope=use_file_slope)
         limit = huber_weight(r.voltage)
         return Block(limit * r.voltage, columns, (limit * self.weight)[:, None] * values)
 
@@ -138,10 +140,10 @@ class Equations:
         )
 
     def _link(self, x: Floats) -> tuple[float, Block]:
-        """Return cost and residuals of the SOC at the start of an interval, counted from the start of the one before.
+        """Return cost and residuals of the SOC at the start of each interval, counted from the start of the previous interval.
 
-        A gap may hide a charge, so that any SOC is possible with the probability of such an event: the SOC after it is
-        uniform over 0..1, with a density of 1. The error is then weighted by the probability that there was no event.
+        The SOC after a gap has the density of a mixture: normal about the counted SOC, and, with the probability of a hidden
+        charge, uniform over 0..1 with a density of 1. The residual is weighted by the probability that no charge was hidden.
         """
         u, links = self.u, self.links
         later, k = links.interval, links.interval - 1
@@ -149,11 +151,11 @@ class Equations:
         drawn = (links.drawn_soc - x[u.offset][k] * links.hours) * inverse_q
         error = -(x[u.soc][later] - x[u.soc][k] + drawn) / links.std
         event = links.event_probability
-        usual = (1.0 - event) * np.exp(-0.5 * error**2) / links.std / math.sqrt(2.0 * math.pi)
+        normal = (1.0 - event) * np.exp(-0.5 * error**2) / links.std / math.sqrt(2.0 * math.pi)
         is_gap = event > 0.0
-        total = np.where(is_gap, usual + event, 1.0)
+        total = np.where(is_gap, normal + event, 1.0)
         cost = np.where(is_gap, -2.0 * np.log(total), error**2).sum()
-        weight = np.where(is_gap, np.sqrt(usual / total), 1.0)
+        weight = np.where(is_gap, np.sqrt(normal / total), 1.0)
         columns = np.column_stack([u.soc.start + later, u.soc.start + k, u.ln_q.start + k, u.offset.start + k])
         values = np.column_stack([np.ones(k.size), -np.ones(k.size), -drawn, -links.hours * inverse_q])
         return float(cost), Block(weight * error, columns, (weight / links.std)[:, None] * values)

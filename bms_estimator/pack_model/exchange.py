@@ -1,9 +1,8 @@
-"""Exchange of the pack in a gap, shown by voltages after the gap that the model of the pack before it does not explain.
+"""Detection of an exchange of the pack in a gap, by large residuals after the gap.
 
-The std of a row covers the differences between cell file and cell. The residuals of one pack are therefore a small
-fraction of their std, after a gap as before it: 0.1 to 0.4 (RMS) for real captures of three cells with generic files. With
-another pack after the gap, one fit of all rows agrees with neither: the residuals after the gap are 0.5 to 2.4 after 20 min to
-an hour of use.
+The std of a row covers the differences between cell file and cell. The RMS residuals of one pack are therefore only 0.1 to
+0.4 std (real captures of three cells with generic files). With another pack after the gap, no common fit explains the rows of
+both packs, and the RMS residual after the gap is 0.5 to 2.4 std after 20 min to an hour of use.
 """
 
 import numpy as np
@@ -13,14 +12,14 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.equations import Residuals
 
 MAX_RATIO = 3.0
-"""RMS residual after the last gap, divided by that before it, above which the pack was exchanged."""
+"""Ratio of the RMS residuals after and before the last gap above which the pack was exchanged."""
 MIN_RESIDUAL = 0.15
-"""Lower limit of the RMS residual before the gap in this ratio [std], because few rows are fitted too well."""
+"""Minimum of the RMS residual before the gap in the ratio [std]. A fit of a small number of rows leaves too small residuals."""
 MIN_ROWS_AFTER, MIN_ROWS_BEFORE = 5, 50
-"""Minimum numbers of rows with a voltage after and before the gap. The pack before it must be known better."""
+"""Minimum numbers of rows with a voltage after and before the gap."""
 MARGIN_K = 5.0
-"""Maximum distance of the mean temperature after the gap from the range of temperatures before it [K]. Farther away, the
-residuals contain the error of the file's temperature dependence."""
+"""Maximum distance of the mean temperature after the gap from the temperature range before it [K]. At a larger distance the
+error of the file's temperature dependence dominates the residuals."""
 
 
 def is_exchanged(rows: NDArray[np.void], residuals: Residuals) -> bool:

@@ -17,31 +17,33 @@ from bms_estimator.pack_model.solve import Minimum, minimize
 from bms_estimator.pack_model.unknowns import CURVE_NODES, SCALES, SHAPE_NODES
 
 STARTS = ((0.0, 0.0), (0.08, 0.0), (-0.08, 0.0), (0.16, 0.0), (-0.16, 0.0), (0.0, 0.08), (0.0, -0.08))
-"""Starts of the minimization: shift of all SOCs, and ln of the true over the declared capacity."""
+"""Starts of the minimization: shift of all SOCs, and ln of the true over the declared capacity. The cost of a flat curve has
+several minima over the SOC."""
 LIKELIHOOD_EXPONENT = 0.5
 """Exponent of the likelihood in the weights of minima. It is below 1, because errors of different passes are not quite
 independent."""
 SAME_COST, SAME_SOC = 0.3, 0.01
-"""Differences of cost and SOC below which two minima count as one."""
+"""Differences of cost and SOC below which two minima count as one. They exceed the differences that an unfinished minimization
+leaves (``solve.CONVERGED``)."""
 NODE_SOC = np.linspace(0.0, 1.0, NODES)
 """SOCs of the filter's OCV nodes."""
 SOC, LN_Q, OFFSET, LN_R, CURVE = 0, 1, 2, slice(3, 6), slice(6, 6 + NODES)
-"""Positions in the vector of results."""
+"""Positions in the vector of results, ``PackFit.mean``."""
 
 
 @dataclass(frozen=True)
 class PackFit:
-    """Result of a fit: the present state of the pack, and its curves. Voltages and resistances are of one cell."""
+    """Result of a fit: the state of the pack at the last row, and its curves. Voltages and resistances are of one cell."""
 
     elapsed_s: float
     """Time of the history's last row [s]."""
     segment: float
     """Segment of the last row."""
     charge_as: float
-    """Charge of the last row [A s]."""
+    """``charge_as`` of the last row [A s]."""
     mean: Floats
-    """SOC at the last row, ln of the true over the declared capacity, current offset as a C-rate, three scales of the
-    resistances as ln, and the OCV's correction at ``NODES`` SOCs [V]."""
+    """Mean of the results: SOC at the last row, ln of the true over the declared capacity, current offset as a C-rate, ln of
+    three factors on the resistances, and the OCV's correction at ``NODES`` SOCs [V]."""
     covariance: Floats
     """Covariance of ``mean``."""
     curve_v: Floats
@@ -57,9 +59,9 @@ class PackFit:
     cost: float
     """Cost of the best minimum."""
     curves: tuple[Floats, ...]
-    """Start of the next fit for each minimum, the best first: nodes of the OCV's error and of the error by direction."""
+    """Nodes of the OCV's error and of the error by direction at each minimum, the best first. The next fit starts there."""
     first_segment: float = 0.0
-    """Segment of the first fitted row. Earlier segments were measured on another pack."""
+    """Number of the first fitted segment. Earlier segments were measured on another pack."""
     is_exchanged: bool = False
     """True: the pack was exchanged in the gap before the last segment, so that only this segment is fitted."""
 
@@ -71,7 +73,7 @@ FINITE_FIELDS = tuple(
 
 
 class FitError(ValueError):
-    """A history that gives no finite fit, for example because a row is not finite."""
+    """Error of a history without a finite fit, for example because a row is not finite."""
 
 
 def fit(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None = None) -> PackFit:
@@ -80,14 +82,14 @@ def fit(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None = Non
     Args:
         cell: Curves of the cell file.
         rows: Shape (n,), dtype HISTORY_ROW, in order of time.
-        previous: Previous fit, near which one start lies.
+        previous: Previous fit. Its best minima are additional starts.
 
     Raises:
         FitError: ``rows`` is empty, or the fit is not finite.
     """
     _require_finite(rows)
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite is refused below
+        with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite raises an error below
             if previous is not None:
                 rows = rows[rows["segment"] >= previous.first_segment]
             result = _fit_at_reference(cell, rows, previous)
@@ -112,7 +114,7 @@ def _require_finite(rows: NDArray[np.void]) -> None:
 
 
 def reference_of(previous: PackFit, rows: NDArray[np.void]) -> Reference:
-    """Return SOC and resistances of the previous fit. Later rows have the SOC of the filter, which continued from it."""
+    """Return SOC and resistances of the previous fit. Rows after that fit have the filter's SOC, which is based on it."""
     is_fitted = rows["elapsed_s"] <= previous.elapsed_s
     soc = np.where(is_fitted, np.interp(rows["elapsed_s"], previous.row_elapsed_s, previous.row_soc), rows["soc"])
     return Reference(soc, previous.mean[LN_R])
@@ -121,11 +123,14 @@ def reference_of(previous: PackFit, rows: NDArray[np.void]) -> Reference:
 def _fit_at_reference(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None) -> PackFit:
     """Fit the rows. Their std is computed at the previous fit; without one, at a preliminary fit."""
     if previous is None:
-        previous = _fit(cell, rows, Reference(rows["soc"], np.zeros(SCALES)), None)
-    return _fit(cell, rows, reference_of(previous, rows), previous)
+        previous = _minimize_from_all_starts(cell, rows, Reference(rows["soc"], np.zeros(SCALES)), None)
+    return _minimize_from_all_starts(cell, rows, reference_of(previous, rows), previous)
 
 
-def _fit(cell: CellCurves, rows: NDArray[np.void], reference: Reference, previous: PackFit | None) -> PackFit:
+def _minimize_from_all_starts(
+    cell: CellCurves, rows: NDArray[np.void], reference: Reference, previous: PackFit | None
+) -> PackFit:
+    """Return the mixture of the different minima that are reached from all starts."""
     equations = Equations(cell, rows, reference)
     minima: list[Minimum] = []
     for start in starts(equations, previous):
@@ -136,9 +141,9 @@ def _fit(cell: CellCurves, rows: NDArray[np.void], reference: Reference, previou
 
 
 def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
-    """Return the starts of the minimization: those near the previous fit, then the filter's SOC with ``STARTS``."""
+    """Return the starts of the minimization: those near the previous fit, then those around the filter's SOC."""
     results: list[Floats] = []
-    if previous is not None:  # its two best minima; their order decides only which of two equal results is kept
+    if previous is not None:  # two best minima, the best last
         results += [start_near(equations, previous, curves) for curves in previous.curves[1::-1]]
     for shift, ln_q in STARTS:
         x = equations.prior.mean.copy()
@@ -149,7 +154,7 @@ def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
 
 
 def filter_soc(equations: Equations, ln_q: float) -> Floats:
-    """Return the SOC at the start of each interval, counted back from the filter's SOC at the interval's end."""
+    """Return the SOC at the start of each interval by the filter's SOC at its end and the charge counted in it."""
     intervals = equations.intervals
     drawn_soc = intervals.drawn_soc[intervals.ends] * math.exp(-ln_q)
     return np.asarray(equations.rows["soc"][intervals.ends] + drawn_soc)
@@ -161,7 +166,7 @@ def start_near(equations: Equations, previous: PackFit, curves: Floats) -> Float
     Args:
         equations: Equations of the present history.
         previous: Previous fit.
-        curves: OCV error and error by direction of one of its minima.
+        curves: One of ``previous.curves``.
     """
     u = equations.u
     x = equations.prior.mean.copy()
@@ -173,10 +178,10 @@ def start_near(equations: Equations, previous: PackFit, curves: Floats) -> Float
 
 
 def start_soc_near(equations: Equations, previous: PackFit) -> Floats:
-    """Return the SOC at the start of each interval.
+    """Return a first estimate of the SOC at the start of each interval.
 
-    Up to the last row of the previous fit, that fit supplies the SOC. Later the SOC is counted on from the interval before, or,
-    after a gap, taken from the filter.
+    Up to its last row, the previous fit supplies the SOC. The start of a later interval has the SOC of the interval before
+    plus the charge counted since then, or, after a gap, the filter's SOC.
     """
     intervals, links, ln_q = equations.intervals, equations.links, previous.mean[LN_Q]
     start_s = equations.rows["elapsed_s"][intervals.starts]
@@ -196,7 +201,7 @@ def _is_same(equations: Equations, a: Minimum, b: Minimum) -> bool:
 def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
     """Return mean and covariance of the mixture of minima, weighted by their cost.
 
-    The weights contain no determinants of covariances: these would favour a larger capacity.
+    The weights contain no determinants of covariances, which would favor a larger capacity.
     """
     minima = sorted(minima, key=lambda minimum: minimum.cost)
     weights = np.exp(-0.5 * LIKELIHOOD_EXPONENT * (np.array([m.cost for m in minima]) - minima[0].cost))
@@ -231,7 +236,7 @@ def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
 
 
 def _results(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:
-    """Return mean and covariance of the results of one minimum."""
+    """Return mean and covariance of the results at one minimum. The results are linear functions of the unknowns."""
     u, x, model = equations.u, minimum.x, equations.model
     select = np.zeros((CURVE.stop, u.size))
     columns, values = model.soc_derivatives(x)

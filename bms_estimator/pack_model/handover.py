@@ -37,14 +37,16 @@ MIN_CURVE_STD_V = 0.003
 MIN_R_STD = Noise.r_std
 """Minimum relative std of the resistances: the default without a std in the cell file."""
 MIN_SOC_STD_FRACTION = 0.55
-"""Minimum std of the published SOC after a fit, as a fraction of the minimum by the cell file. A pack that was fitted is known
-better than a cell that was not measured. The fraction is assumed."""
+"""Minimum std of the published SOC after a fit, as a fraction of the minimum with the curves of the cell file. Assumed: a fitted
+pack is known better than a cell that was not measured."""
 FILTER_STATES = np.array([SOC, LN_Q, OFFSET, *range(NODE, NODE + NODES)])
 """States of the filter that a fit determines jointly."""
 FIT_RESULTS = np.array([FIT_SOC, FIT_LN_Q, FIT_OFFSET, *range(FIT_CURVE.start, FIT_CURVE.stop)])
 """Results of a fit in the order of ``FILTER_STATES``."""
 FIRST_PARAMETER = 1
 """Position in ``FILTER_STATES`` of the first state after the SOC."""
+MIN_SLOPE_V = 1e-3
+"""Minimum slope of the fitted OCV of one cell [V per unit SOC], because a slope of 0 has no inverse."""
 
 
 def adopt_curves(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
@@ -55,15 +57,28 @@ def adopt_curves(settings: np.void, file_settings: np.void, fit: PackFit) -> Non
         file_settings: Record of dtype EKF_SETTINGS by the cell file.
         fit: Fit of the history.
     """
+    _adopt_ocv(settings, file_settings, fit)
+    _adopt_resistances(settings, file_settings, fit)
+    settings["hysteresis_v"] = fit.hysteresis * file_settings["hysteresis_v"]
+    file_std = MIN_SOC_STD_FRACTION * float(file_settings["min_soc_std"])
+    settings["min_soc_std"] = max(MIN_SOC_STD, file_std, smallest_soc_std(fit))
+
+
+def _adopt_ocv(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
+    """Write the fitted OCV and its std. The error by direction is the varying part of the variance (``CURVE``)."""
     series = float(file_settings["series"])
     soc = np.linspace(0.0, 1.0, file_settings["ocv_v"].size)
     ocv_v = file_settings["ocv_v"] + series * np.interp(soc, SOC_GRID, fit.curve_v)
     settings["ocv_v"] = np.maximum.accumulate(ocv_v)  # an OCV increases with the SOC
-    settings["ocv_slope_v"] = np.maximum(np.gradient(settings["ocv_v"], soc), 1e-3 * series)
+    settings["ocv_slope_v"] = np.maximum(np.gradient(settings["ocv_v"], soc), MIN_SLOPE_V * series)
     node_v2 = np.maximum(np.interp(SOC_GRID, NODE_SOC, np.diag(fit.covariance)[FIT_CURVE]), MIN_CURVE_STD_V**2)
     total_v2 = node_v2 + CellCurves(file_settings).direction_std_v ** 2
     settings["curve_error_v"] = series * np.sqrt(total_v2)
     settings["learned"] = node_v2.mean() / total_v2.mean()
+
+
+def _adopt_resistances(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
+    """Write the fitted resistances and their std."""
     for name in ("weak_ohm", "strong_ohm"):
         settings[name] = file_settings[name] * np.exp(fit.ln_r)[:, RESISTANCE_GROUPS]
     middle = SOC_GRID.size // 2
@@ -72,16 +87,13 @@ def adopt_curves(settings: np.void, file_settings: np.void, fit: PackFit) -> Non
     settings["bias_relative"] = min(
         float(file_settings["bias_relative"]), max(Noise.bias_relative, MIN_BIAS_OF_R_STD * r_std(fit))
     )
-    file_std = MIN_SOC_STD_FRACTION * float(file_settings["min_soc_std"])
-    settings["min_soc_std"] = max(MIN_SOC_STD, file_std, smallest_soc_std(fit))
-    settings["hysteresis_v"] = fit.hysteresis * file_settings["hysteresis_v"]
 
 
 def smallest_soc_std(fit: PackFit) -> float:
-    """Return the std of the SOC where it is best known: at the SOC at which errors of SOC and capacity cancel.
+    """Return the std at the SOC that is known best: the SOC at which errors of SOC and capacity cancel.
 
-    The fit has used the voltages of weeks. Voltages until the next fit repeat the errors of these, so that they cannot lower
-    the std of any SOC.
+    The voltages until the next fit have the same errors as the fitted ones. They therefore cannot lower the std of the SOC
+    below this value.
     """
     covariance = fit.covariance
     capacity_variance = max(covariance[FIT_LN_Q, FIT_LN_Q], np.finfo(float).tiny)
@@ -90,7 +102,7 @@ def smallest_soc_std(fit: PackFit) -> float:
 
 
 def r_std(fit: PackFit) -> float:
-    """Return the relative std of the resistances."""
+    """Return the relative std of the fitted resistances."""
     return max(float(np.sqrt(np.diag(fit.covariance)[FIT_LN_R].max())), MIN_R_STD)
 
 
@@ -101,7 +113,7 @@ def adopt_state(estimator: Estimator, fit: PackFit) -> None:
     """
     f, h = estimator.record[0]["filter"], estimator.record[0]["history"]
     p = estimator.settings_record[0]["filter"]
-    f["learned_soc"] = p["learning_soc"]  # its maximum ends the learning: the filter holds capacity and curve
+    f["learned_soc"] = p["learning_soc"]  # the first pass is complete: voltages change neither capacity nor curve
     if h["segment"] != fit.segment:
         for q in range(int(f["count"])):
             _adopt_parameters(f["mean"][q], f["covariance"][q], fit, p, FIRST_PARAMETER)

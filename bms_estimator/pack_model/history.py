@@ -1,4 +1,4 @@
-"""Bounded history of a pack: rows of means, thinned with age."""
+"""History of a pack with a bounded number of rows. Old rows are merged."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,17 +6,20 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, ROW_SOC
 
 MAX_ROWS = 5000
-"""Maximum number of rows; older days are thinned, then dropped."""
+"""Maximum number of rows."""
 KEPT_FRACTION = 0.8
-"""Maximum number of rows after thinning, as a fraction of ``MAX_ROWS``, so that the next row does not thin the history again."""
+"""Maximum number of rows after merging, as a fraction of ``MAX_ROWS``. Without this reserve each new row would begin another
+merge."""
 MAX_SEGMENTS = 100
 """Maximum number of segments; older ones are dropped. Each adds about five unknowns to the fit, whose time grows with
 the cube of their number: with 100 segments a fit of 30 days takes four times as long as with one."""
 DAY_S = 86400.0
 """Length of a day [s]."""
-MEAN_FIELDS = ("elapsed_s", "voltage_v", "current_a", "x_a", "settled_s", "temperature_c", "charge_as",
+MEAN_FIELDS = ("elapsed_s", "voltage_v", "current_a", "between_a2", "skew_a2", "x_a", "settled_s", "temperature_c", "charge_as",
                "charge_variance_as2", "throughput_soc", "hysteresis", "soc")  # fmt: skip
 """Fields of which a merged row has the mean, weighted by duration."""
+OLD_S = 2.0 * DAY_S
+"""Age from which on rows are merged [s]."""
 
 
 class History:
@@ -30,10 +33,10 @@ class History:
         self.rows: NDArray[np.void] = np.zeros(0, HISTORY_ROW) if rows is None else rows
 
     def append(self, rows: NDArray[np.void], capacity_as: float) -> None:
-        """Append rows. Thin a history that is too long, and drop its oldest rows if it is still too long."""
+        """Append rows. If there are too many, merge old rows, and drop the oldest if there are still too many."""
         self.rows = newest_segments(np.concatenate([self.rows, rows]))
         if self.rows.size > MAX_ROWS:
-            self.rows = thinned(self.rows, capacity_as)[-int(KEPT_FRACTION * MAX_ROWS) :]
+            self.rows = thin_old_rows(self.rows, capacity_as)[-int(KEPT_FRACTION * MAX_ROWS) :]
 
 
 def newest_segments(rows: NDArray[np.void]) -> NDArray[np.void]:
@@ -42,9 +45,9 @@ def newest_segments(rows: NDArray[np.void]) -> NDArray[np.void]:
     return rows[starts[-MAX_SEGMENTS] :] if starts.size > MAX_SEGMENTS else rows
 
 
-def thinned(rows: NDArray[np.void], capacity_as: float) -> NDArray[np.void]:
-    """Return the rows with those older than two days merged: one row for each segment, day, SOC bin and direction."""
-    is_old = (rows["elapsed_s"] < rows["elapsed_s"][-1] - 2.0 * DAY_S) & (rows["duration_s"] > 0.0)
+def thin_old_rows(rows: NDArray[np.void], capacity_as: float) -> NDArray[np.void]:
+    """Return rows in which those older than ``OLD_S`` are merged to one for each segment, day, SOC bin and direction."""
+    is_old = (rows["elapsed_s"] < rows["elapsed_s"][-1] - OLD_S) & (rows["duration_s"] > 0.0)
     old = rows[is_old]
     if old.size == 0:
         return rows
@@ -57,11 +60,11 @@ def thinned(rows: NDArray[np.void], capacity_as: float) -> NDArray[np.void]:
         ]
     )
     _, group = np.unique(key, axis=0, return_inverse=True)
-    both = np.concatenate([merged(old, group.ravel()), rows[~is_old]])
-    return both[np.lexsort((both["elapsed_s"], both["segment"]))]
+    result = np.concatenate([merge_groups(old, group.ravel()), rows[~is_old]])
+    return result[np.lexsort((result["elapsed_s"], result["segment"]))]
 
 
-def merged(rows: NDArray[np.void], group: NDArray[np.intp]) -> NDArray[np.void]:
+def merge_groups(rows: NDArray[np.void], group: NDArray[np.intp]) -> NDArray[np.void]:
     """Return one row for each group, with the sum of durations and the means weighted by duration.
 
     Args:

@@ -15,15 +15,14 @@ INTERVAL_S = DAY_S
 """Maximum duration of an interval [s]."""
 COUNTED_STD = 0.015
 """Std of the charge counted in an interval, as a fraction of the capacity, at which the interval ends. A sensor with a dead
-band reports no current at night, so that a day's count may be wrong by several percent."""
+band reports no current at night, so that the charge counted in a day may be wrong by several percent."""
 MAX_INTERVALS = 200
-"""Maximum number of intervals, unless there are more segments. Each adds three unknowns. Intervals of a longer history, or of
-a sensor whose count is worse, are longer."""
+"""Maximum number of intervals, unless there are more segments. Each interval adds three unknowns."""
 HOUR_S = 3600.0
 """Length of an hour [s]."""
 DAILY_STD_SOC = 0.002
-"""Std of the SOC counted over a day in addition to that by its throughput. Assumed, for charge that is not
-counted at rest, such as self-discharge."""
+"""Std of the SOC counted over a day without throughput, due to charge that is not counted at rest, such as self-discharge.
+Assumed."""
 
 
 class Intervals:
@@ -53,10 +52,10 @@ class Intervals:
         self.hours: Floats = (rows["elapsed_s"] - start["elapsed_s"][self.of_row]) / HOUR_S
 
     def rows_of_pass(self) -> NDArray[np.intp]:
-        """Return, for each row, the number of rows of the same pass and direction, itself included.
+        """Return, for each row, the number of rows of its pass and direction, itself included.
 
-        A pass lasts until the charge leaves its bin, and the errors of its rows are nearly the same. A small current that
-        changes between rest and load divides a pass into many rows.
+        A pass is a time in which the charge stays in one bin of ``ROW_SOC``. The errors of its rows are nearly equal. A small
+        current that changes between rest and load divides a pass into many rows.
         """
         charge_bin = np.floor(self.drawn_soc / ROW_SOC)
         number = np.cumsum(np.diff(charge_bin, prepend=charge_bin[:1]) != 0.0)
@@ -105,18 +104,18 @@ def split(rows: NDArray[np.void], max_s: float, max_variance_as2: float) -> tupl
 
 @dataclass(frozen=True)
 class Links:
-    """Charge from the start of one interval to the start of the next, for pairs without a gap of unknown duration."""
+    """Charge from the start of one interval to the start of the next. A gap of unknown duration has no link."""
 
     interval: NDArray[np.intp]
-    """Later interval of each pair."""
+    """Later interval of each link."""
     drawn_soc: Floats
     """Charge between the two starts, as a fraction of the declared capacity."""
     hours: Floats
-    """Time between the two starts during which the sensor's offset was counted [h]."""
+    """Measured time between the two starts, in which the sensor's offset was counted as charge [h]."""
     std: Floats
     """Std of the SOC at the later start, counted from the earlier one."""
     event_probability: Floats
-    """Probability that a gap between the two hides a charge; 0 without a gap."""
+    """Probability that the gap between the two intervals hides a charge; 0 without a gap."""
 
     @classmethod
     def of(cls, cell: CellCurves, intervals: Intervals) -> "Links":
@@ -127,16 +126,16 @@ class Links:
         is_gap = is_new[k]
         first, before, after = rows[starts[k - 1]], rows[starts[k] - 1], rows[starts[k]]
 
-        def last_increase(name: str) -> Floats:
+        def increase_between_rows(name: str) -> Floats:
             """Return the increase of a counter from the earlier interval's last row to the later interval's first row.
 
-            After a gap the counter has restarted, so that its value is the increase.
+            In a new segment the counter begins at 0 before the gap, so that its value is the increase.
             """
             return np.asarray(after[name] - np.where(is_gap, 0.0, before[name]))
 
         def increase(name: str) -> Floats:
             """Return the increase of a counter from start to start."""
-            return np.asarray(before[name] - first[name] + last_increase(name))
+            return np.asarray(before[name] - first[name] + increase_between_rows(name))
 
         throughput_soc = increase("throughput_soc")
         variance_as2 = np.maximum(increase("charge_variance_as2"), 0.0)
@@ -144,7 +143,7 @@ class Links:
         days = np.maximum(after["elapsed_s"] - first["elapsed_s"], HOUR_S) / DAY_S
         return cls(
             interval=k,
-            drawn_soc=intervals.drawn_soc[starts[k] - 1] + last_increase("charge_as") / cell.capacity_as,
+            drawn_soc=intervals.drawn_soc[starts[k] - 1] + increase_between_rows("charge_as") / cell.capacity_as,
             hours=intervals.hours[starts[k] - 1] + between_s / HOUR_S,
             std=np.sqrt(
                 cell.charge_error**2 * throughput_soc + DAILY_STD_SOC**2 * days + variance_as2 / cell.capacity_as**2

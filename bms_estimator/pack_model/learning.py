@@ -1,4 +1,4 @@
-"""Estimator with a slow fit: records the history, fits the pack's model at intervals, and hands it to the filter."""
+"""Estimator that records a history, fits the pack's model to it at intervals, and hands each fit to the filter."""
 
 import math
 from collections.abc import Callable
@@ -26,21 +26,21 @@ from bms_estimator.pack_model.resume import resume_history
 FIT_INTERVAL_S = 3600.0
 """Maximum interval between two fits, on the clock of the samples [s]."""
 MIN_INTERVAL_S = 1800.0
-"""Minimum interval between two fits [s]. In a load of a few hours the first half hour already determines the SOC better
-than the filter."""
+"""Minimum interval between two fits [s]. Under load, a fit to the first half hour already determines the SOC better than the
+filter."""
 INTERVAL_OF_AGE = 1.0 / 12.0
 """Interval between two fits as a fraction of the age of the history, within its limits: an hour after twelve hours. A row
 changes a fit of a short history more than a fit of a long one."""
 ADOPT_DELAY_S = 120.0
-"""Time from the start of a fit to the adoption of its result, on the clock of the samples [s]. The service fits in
-another thread meanwhile; a replay, which waits for the fit, adopts it at the same sample."""
+"""Time from the start of a fit to the adoption of its result, on the clock of the samples [s]. In this time the service fits in
+another thread. A replay waits for the fit, and adopts it at the same sample."""
 MIN_ROWS = 8
 """Minimum number of new rows for a fit."""
 MIN_THROUGHPUT_SOC = 1.0
-"""Minimum throughput of the history before a fit with a large std of the SOC is adopted [SOC]. Before, the filter's
-hypotheses represent several possible SOCs better than the single normal distribution of a fit."""
+"""Minimum throughput of the history for the adoption of a fit with a large std of the SOC [SOC]. In a shorter history several
+separate SOCs may be possible, which the filter's hypotheses represent and the single normal distribution of a fit does not."""
 MIN_CHANGE = 0.01
-"""Minimum change of the SOC, or of the capacity relative to the cell file's, that is reported as an event."""
+"""Minimum change of the SOC, or of the ratio of the capacity to the declared one, that is reported as an event."""
 
 Submit = Callable[[Callable[[], PackFit]], "Future[PackFit]"]
 """Function that runs a fit and returns its future."""
@@ -48,7 +48,7 @@ Submit = Callable[[Callable[[], PackFit]], "Future[PackFit]"]
 
 @dataclass(frozen=True)
 class FitChange:
-    """Change of the estimates by the adoption of a fit. Capacities are relative to the cell file's."""
+    """Change of the estimates by the adoption of a fit. Capacities are ratios to the declared capacity."""
 
     soc_before: float
     soc_after: float
@@ -77,17 +77,17 @@ class SlowFit:
         submit: Runs a fit, for example in another thread, and returns its future.
         interval_s: Maximum interval between two fits, on the clock of the samples [s]. A history that is younger than
             ``interval_s / INTERVAL_OF_AGE`` is fitted more often. Infinite: no fits.
-        on_failure: Called with the exception of a failed fit. The previous fit stays.
+        on_failure: Called with the exception of a failed fit. The previous fit stays in use.
 
     Attributes:
         history: Rows of this and earlier runs.
-        saved_fit: The latest fit of the history, adopted or not, which is saved with it; None: none.
-        fit: The adopted fit, to whose curves the filter's state is relative; None: the curves are the cell file's.
+        saved_fit: The latest fit, adopted or not, which is saved with the history; None: no fit yet.
+        fit: The adopted fit, whose curves the filter uses; None: the filter uses the curves of the cell file.
         fits: Number of adopted fits.
         late: Number of fits that were not done when due, so that they were adopted at a later sample.
         failed: Number of fits that raised an exception.
         changes: Number of fits that changed the SOC or the capacity by more than ``MIN_CHANGE``.
-        last_change: The last of these changes; None: none yet.
+        last_change: The last of these changes; None: no change yet.
         unsaved_rows: Number of rows since the last increase of ``revision``.
         revision: Number that increases when history and fit should be saved.
     """
@@ -125,11 +125,11 @@ class SlowFit:
         return trace[:rows]
 
     def load(self, history: History, fit: PackFit | None, state_fit: PackFit | None) -> None:
-        """Take over history and fit of earlier runs, and adopt the curves.
+        """Set history and fit of earlier runs, and adopt the curves.
 
         Args:
             history: Rows of earlier runs.
-            fit: Last fit of the history; None: none.
+            fit: Last fit of the history; None: no fit yet.
             state_fit: Fit that was in use when the state to be restored was saved; None: the cell file's curves were in use,
                 or no state will be restored.
         """
@@ -139,24 +139,27 @@ class SlowFit:
     def resume(self, gap_s: float, *, restored: bool) -> None:
         """Continue the history in a new segment, after the estimator's state was restored or found unusable.
 
-        A fit that is already due begins at the first sample, and the next one after at most an interval.
+        If a fit is due, it begins at the first sample. Otherwise the next fit begins within an interval.
 
         Args:
             gap_s: Time since the state was saved [s]; infinite if unknown.
             restored: True if the state was restored. Otherwise the last fit supplies the curves.
         """
+        h, f = self._h, self.estimator.record[0]["filter"]
+        if not restored and self.saved_fit is not None:
+            self._adopt_curves(self.saved_fit)
+        resume_history(h, f, self.history, gap_s, self.cell.capacity_as, restored=restored)
+        self._schedule_after_restart(restored=restored)
+
+    def _schedule_after_restart(self, *, restored: bool) -> None:
+        """Set the time of the next event. If the state does not contain the saved fit, this event adopts it like a new fit."""
         h, saved = self._h, self.saved_fit
-        if not restored and saved is not None:
-            self._adopt_curves(saved)
-        resume_history(
-            h, self.estimator.record[0]["filter"], self.history, gap_s, self.cell.capacity_as, restored=restored
-        )
         fitted_s = -math.inf if saved is None else saved.elapsed_s
         self._new_rows = int((self.history.rows["elapsed_s"] > fitted_s).sum())
         next_s = float(h["event_s"]) if restored else math.inf
         h["enabled"], h["event_s"] = 1, min(max(next_s, h["elapsed_s"]), h["elapsed_s"] + self._interval())
         is_adopted = restored and self.fit is not None and saved is not None and self.fit.elapsed_s >= saved.elapsed_s
-        if saved is not None and not is_adopted:  # adopt its capacity and offset, like those of a new fit
+        if saved is not None and not is_adopted:
             self._pending = run_now(lambda: saved)
             h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
 
@@ -193,7 +196,7 @@ class SlowFit:
             self._new_rows += count
             self.unsaved_rows += count
             h["count"] = 0
-            h["rows"] = np.zeros(1, HISTORY_ROW)  # so that the state does not depend on the division into blocks
+            h["rows"] = np.zeros(1, HISTORY_ROW)  # unused rows would depend on the division of the samples into blocks
 
     @property
     def _h(self) -> np.void:
@@ -207,6 +210,7 @@ class SlowFit:
         return min(max(INTERVAL_OF_AGE * float(self._h["elapsed_s"]), MIN_INTERVAL_S), self._interval_s)
 
     def _handle_event(self) -> None:
+        """Begin a fit, or end a pending one, at the time ``event_s`` of the record of the history."""
         h = self._h
         if self._pending is None:
             self._begin_fit()
@@ -214,7 +218,7 @@ class SlowFit:
             self._end_fit(self._pending)
             self._pending, self._is_late = None, False
             h["event_s"] += self._interval() - ADOPT_DELAY_S
-        elif not self._is_late:  # ``event_s`` has passed, so that the next sample asks again
+        elif not self._is_late:  # ``event_s`` does not change, so that this function runs again after the next sample
             self.late += 1
             self._is_late = True
 
@@ -233,28 +237,28 @@ class SlowFit:
             self.revision += 1
 
     def _end_fit(self, done: "Future[PackFit]") -> None:
-        """Adopt the result of a completed fit if it is better than the filter, or report its failure."""
+        """Adopt the result of a completed fit if it is ready for use, or report its failure."""
         error = done.exception()
         if error is not None:
             self.failed += 1
             self._on_failure(error)
-        elif self._is_better(done.result()):
+        elif self._is_adoptable(done.result()):
             self.adopt(done.result())
         else:
             self.saved_fit = done.result()
         self.unsaved_rows = 0
         self.revision += 1
 
-    def _is_better(self, fitted: PackFit) -> bool:
-        """Return True if one hypothesis represents the SOC of a fit, or if the history is long enough."""
+    def _is_adoptable(self, fitted: PackFit) -> bool:
+        """Return True if one normal distribution represents the SOC: its std is small, or the history is long."""
         is_certain = fitted.covariance[FIT_SOC, FIT_SOC] <= MAX_SINGLE_STD**2
         return bool(is_certain) or self._throughput() >= MIN_THROUGHPUT_SOC
 
     def _throughput(self) -> float:
         """Return the throughput of the history [SOC].
 
-        It counts as infinite with a known SOC or a second segment, because the filter learns neither capacity nor OCV from an
-        end of charge, and stops learning at a gap.
+        It is infinite if the history has a known SOC or a second segment. Then the fit knows more than the filter, which learns
+        neither capacity nor OCV from an end of charge, and stops learning at a gap.
         """
         rows = self.history.rows
         if np.isfinite(rows["reference_soc"]).any() or rows["segment"][0] != rows["segment"][-1]:

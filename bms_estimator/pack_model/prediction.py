@@ -1,10 +1,12 @@
 """Predicted voltage of each history row, with its variance and its derivatives by the unknowns x.
 
-    v = E(z, T) + c(z) + M (m_1 h_1 + m_2 h_2) - sum of scaled resistances times currents + error by direction
-    z = z_interval - (charge - offset t) / (Q e^q)
+    v = OCV(z, T) + error of the OCV(z) + hysteresis - sum of scaled resistances times currents + error by direction
+    z = SOC at the start of the interval - (charge - offset t) / (capacity)
 
-All voltages are of one cell. An error that repeats whenever the pack passes an SOC in one direction is one unknown: the error
-by direction. However often the pack passes, the curve is known no better than that error.
+All voltages are of one cell. docs/theory/pack-model.md has the complete equations.
+
+An error that repeats whenever the pack passes an SOC in one direction is one unknown, the error by direction. More passes
+therefore do not lower the std of the curve below the std of this error.
 """
 
 from dataclasses import dataclass
@@ -29,14 +31,16 @@ from bms_estimator.pack_model.unknowns import (
 )
 
 PASS_FRACTION = 0.75
-"""Std of the overpotential's error that differs from pass to pass, as a fraction of the std of the error that repeats."""
-COUNT_STD_SOC, KNEE_STD_SOC, KNEE_WIDTH_SOC = 0.004, 0.015, 0.12
-"""Std of a row's SOC by counting, additional std by the place of the knee near empty, and width of the knee [SOC]. With a knee
-at a known place, a slow first charge from empty gave an SOC 6 to 8 % wrong, because offset, capacity and place of the knee look
-alike."""
+"""Std of the part of the overpotential's error that differs from pass to pass, as a fraction of the std of the part that
+repeats (``CellCurves.drop_std``)."""
+COUNT_STD_SOC = 0.004
+"""Std of the SOC of a row due to counting [SOC]."""
+KNEE_STD_SOC, KNEE_WIDTH_SOC = 0.015, 0.12
+"""Std of the position of the OCV's knee near empty, and SOC over which it decays [SOC]. Without this std, a slow first charge
+from empty gave an SOC 6 to 8 % wrong, because errors of offset, capacity and knee have equal effects on the voltage."""
 EMPTY_RELATIVE, EMPTY_WIDTH_SOC = 0.4, 0.04
-"""Relative std of the overpotential at SOC 0, and SOC within which it decays. Assumed: resistances near empty depend on the
-cell and on the load."""
+"""Relative std of the overpotential at SOC 0, and SOC over which it decays. Both are assumed, because resistances near empty
+depend on the cell and on the load."""
 START_LOAD_C = 0.6
 """Std of the load before the RC pairs were reset, as a C-rate. Assumed."""
 GROUP_STARTS = [RESISTANCE_GROUPS.index(group) for group in range(SCALES)]
@@ -48,7 +52,7 @@ Derivatives = tuple[NDArray[np.intp], Floats]
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted voltages of n rows, and the terms they consist of."""
+    """Predicted voltages of n rows, and their terms."""
 
     voltage_v: Floats
     """Predicted voltage [V]."""
@@ -78,7 +82,7 @@ class Prediction:
 class Reference:
     """Estimate of SOC and resistances at which the std of each row is computed.
 
-    A std that depended on the unknowns would draw the fit to SOCs and resistances with a large std.
+    If the std depended on the unknowns, the fit would prefer SOCs and resistances with a large std.
     """
 
     soc: Floats
@@ -88,7 +92,7 @@ class Reference:
 
 
 class VoltageModel:
-    """Model of the voltages of one history. Attributes do not depend on the unknowns.
+    """Model of the voltages of one history. Its attributes are computed once, because they do not depend on the unknowns.
 
     Args:
         cell: Curves of the cell file.
@@ -109,8 +113,9 @@ class VoltageModel:
         # the hysteresis at the start of the segment, an unknown, decays with the throughput
         self.start_h_decay = np.exp(-rows["throughput_soc"][:, None] / np.array(HYSTERESIS_SOC))
         self.start_h_at = u.start_hysteresis.start + 2 * intervals.segment
-        # the unknown load before the reset of the RC pairs decays with their time constants
-        self.start_load_a = START_LOAD_C * cell.one_c_a * np.exp(-rows["settled_s"][:, None] / TAUS)
+        # currents that the RC pairs keep from a load of one std before their reset; the load is an unknown
+        self.start_load_a = START_LOAD_C * cell.one_c_a * kept_fraction(rows)
+        self.start_load_at = u.start_load.start + intervals.segment
         self.aging_trend = AgingVariance(RESISTANCE, cell, intervals).trend[intervals.of_row]
         direction = (rows["direction"] + 1.0).astype(np.intp)
         self.direction_start = u.direction.start + direction * DIRECTION_NODES
@@ -121,10 +126,11 @@ class VoltageModel:
             cell.direction_std_v**2 + (cell.drop_std * drop_v) ** 2 + variance_between_nodes(cell, z)
         )
         """Std of the error by direction [V]."""
-        self.variance_v2 = self._variance(z, drop_v, ohm)
+        scaled_ohm = ohm * np.exp(reference.ln_r)[np.array(RESISTANCE_GROUPS)]
+        self.variance_v2 = self._variance(z, drop_v) + by_sampling(rows, scaled_ohm)
         """Variance of each row's voltage about its prediction [V^2]."""
 
-    def _variance(self, z: Floats, drop_v: Floats, ohm: Floats) -> Floats:
+    def _variance(self, z: Floats, drop_v: Floats) -> Floats:
         """Return the variance of each row's voltage about its prediction [V^2]."""
         near_empty, at_empty = np.exp(-((z / KNEE_WIDTH_SOC) ** 2)), np.exp(-((z / EMPTY_WIDTH_SOC) ** 2))
         cell = self.cell
@@ -134,8 +140,7 @@ class VoltageModel:
             + (EMPTY_RELATIVE * at_empty * drop_v) ** 2
         )
         by_soc_v2 = (cell.slope(z) * (COUNT_STD_SOC + KNEE_STD_SOC * near_empty)) ** 2
-        by_start_v2 = ((self.start_load_a * ohm[:, 1:]) ** 2).sum(axis=1)
-        return np.asarray(by_pass_v2 + by_soc_v2 + by_start_v2)
+        return np.asarray(by_pass_v2 + by_soc_v2)
 
     def soc(self, x: Floats) -> Floats:
         """Return the SOC of each row."""
@@ -167,6 +172,7 @@ class VoltageModel:
         ln_shape = shape_at.interpolate(x[u.shape]) + x[u.arrhenius] * self.above_25_c_k + x[u.aging] * self.aging_trend
         scale = np.exp(x[u.ln_r] + ln_shape[:, None])
         true_a = self.current_a - (x[u.offset][self.intervals.of_row] * cell.one_c_a)[:, None]
+        true_a += x[self.start_load_at][:, None] * self.start_load_a
         drops_v = scale * by_group(ohm * true_a)
         drop_v = drops_v.sum(axis=1)
         hysteresis_v = self.hysteresis_factor * np.interp(z, SOC_GRID, cell.hysteresis_v)
@@ -188,20 +194,21 @@ class VoltageModel:
             direction_at=direction_at,
         )
 
-    def derivatives(self, x: Floats, p: Prediction, *, smooth: bool) -> Derivatives:
+    def derivatives(self, x: Floats, p: Prediction, *, use_file_slope: bool) -> Derivatives:
         """Return the derivatives of the predicted voltages.
 
         Args:
             x: Unknowns.
             p: Prediction at ``x``.
-            smooth: True: the derivative by SOC is the slope of the cell file's OCV. The slope of the fitted correction is
-                rough and would pass for information on the SOC.
+            use_file_slope: True: the derivative by SOC is the slope of the cell file's OCV, for the covariance. The fitted
+                correction is rough, and its slopes would count as information on the SOC.
         """
         u, n, m = self.u, p.soc.size, x[self.u.hysteresis]
-        soc_columns, by_soc = self._derivatives_by_soc(x, p, smooth=smooth)
+        soc_columns, by_soc = self._derivatives_by_soc(x, p, use_file_slope=use_file_slope)
         shape_low, shape_high = p.shape_at.weights
         curve_low, curve_high = p.curve_at.weights
         direction_low, direction_high = p.direction_at.weights
+        by_start_load = -(p.scale * by_group(p.ohm * self.start_load_a)).sum(axis=1)
         by_start_h = p.hysteresis_v[:, None] * m * self.start_h_decay
         direction_at = self.direction_start + p.direction_at.below
         terms = [
@@ -212,6 +219,7 @@ class VoltageModel:
             (u.shape.start + p.shape_at.below + 1, -shape_high * p.drop_v),
             *((np.full(n, u.hysteresis.start + j), p.hysteresis_v * p.h[:, j]) for j in range(2)),
             *((self.start_h_at + j, by_start_h[:, j]) for j in range(2)),
+            (self.start_load_at, by_start_load),
             (np.full(n, u.entropy.start), self.above_25_c_k),
             (np.full(n, u.arrhenius.start), -self.above_25_c_k * p.drop_v),
             (u.curve.start + p.curve_at.below, curve_low),
@@ -222,9 +230,9 @@ class VoltageModel:
         columns, values = zip(*terms, strict=True)
         return np.column_stack(columns), np.column_stack(values)
 
-    def _derivatives_by_soc(self, x: Floats, p: Prediction, *, smooth: bool) -> Derivatives:
+    def _derivatives_by_soc(self, x: Floats, p: Prediction, *, use_file_slope: bool) -> Derivatives:
         """Return the derivatives by SOC, offset and capacity of the interval."""
-        slope_v = self.cell.slope(p.soc) if smooth else self._slope_v(x, p.soc)
+        slope_v = self.cell.slope(p.soc) if use_file_slope else self._slope_v(x, p.soc)
         columns, by_soc = self.soc_derivatives(x)
         by_soc *= slope_v[:, None]
         # the offset (column 1) also lowers the current through the resistances
@@ -234,10 +242,33 @@ class VoltageModel:
     def _slope_v(self, x: Floats, z: Floats) -> Floats:
         """Return the slope of the predicted voltages over SOC [V per unit SOC], as a secant over the SOC range of a row.
 
-        The fitted curves are piecewise linear, so that their slope at a point does not hold for a step to the next node.
+        The fitted curves are piecewise linear, so that the slope at a point changes at the next node.
         """
-        above_v, below_v = (self._predict_at(x, z + reach).voltage_v for reach in (ROW_SOC / 2.0, -ROW_SOC / 2.0))
+        above_v, below_v = (self._predict_at(x, z + shift).voltage_v for shift in (ROW_SOC / 2.0, -ROW_SOC / 2.0))
         return (above_v - below_v) / ROW_SOC
+
+
+def by_sampling(rows: NDArray[np.void], ohm: Floats) -> Floats:
+    """Return the variance of each row's voltage by slow or skewed sampling [V^2].
+
+    The current through R_0 is measured with the voltage unless they have different times. The current through the RC pairs
+    is always interpolated between samples.
+
+    Args:
+        rows: Shape (n,), dtype HISTORY_ROW.
+        ohm: Resistances, shape (n, RESISTANCES) [ohm].
+    """
+    return np.asarray(ohm[:, 0] ** 2 * rows["skew_a2"] + ohm[:, 1:].sum(axis=1) ** 2 * rows["between_a2"])
+
+
+def kept_fraction(rows: NDArray[np.void]) -> Floats:
+    """Return the fraction that each resistance's current keeps of its value at the reset of the RC pairs, shape (n, RESISTANCES).
+
+    It is a mean over the row, and 0 for the series resistance.
+    """
+    from_reset, duration = rows["settled_s"][:, None] / TAUS, np.maximum(rows["duration_s"], 1.0)[:, None] / TAUS
+    pairs = np.exp(-from_reset) * -np.expm1(-duration) / duration
+    return np.column_stack([np.zeros(rows.size), pairs])
 
 
 def by_group(values: Floats) -> Floats:

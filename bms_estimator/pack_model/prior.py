@@ -1,4 +1,7 @@
-"""Prior of the slow fit's unknowns: mean and precision (inverse covariance)."""
+"""Prior of the slow fit's unknowns: mean and precision (inverse covariance).
+
+Values of constants without a stated reason are assumed. ``make ablation-weeks`` shows the effect of each part of the prior.
+"""
 
 import math
 
@@ -23,46 +26,47 @@ from bms_estimator.pack_model.unknowns import (
 )
 
 SLIP_SOC = 0.02
-"""Std of the slip: the distance along SOC by which knees and steps of the OCV lie elsewhere than in the file."""
+"""Std of the slip: distance along SOC between a knee or step of the pack's OCV and that of the file."""
 SLIP_CORRELATION_SOC = 0.3
 """Correlation length of the slip [SOC]."""
-MAX_SLIP_PART = 0.85
-"""Maximum std of the slip, as a voltage, as a fraction of the OCV's std. The rest is an error of voltage, which remains for any
-slope of the curve."""
+MAX_SLIP_FRACTION = 0.85
+"""Maximum std of the voltage error by the slip, as a fraction of the OCV's std. The remaining error does not depend on the slope
+of the curve."""
 MAX_SLIP_SLOPE_V = 5.0
-"""Maximum slope of the OCV that converts a slip to a voltage [V per unit SOC], as in ``filter_settings.MAX_SLOPE_V``: the SOC is
-better defined at the steep ends."""
+"""Maximum slope of the OCV that converts a slip to a voltage [V per unit SOC], equal to ``filter_settings.MAX_SLOPE_V``. The SOC
+is better defined at the steep ends."""
 ROUNDING_V2 = 1e-10
 """Variance added to each node of the OCV's error, so that rounding leaves its covariance positive definite [V^2]."""
 DIRECTION_CORRELATION_SOC = 0.1
 """Correlation length of the error by direction [SOC]."""
 SHAPE_STD, SHAPE_CORRELATION_SOC = 0.15, 0.4
-"""Relative std of the resistances over SOC, and its correlation length."""
+"""Std and correlation length [SOC] of the relative error with which the file describes the resistances over SOC."""
 EMPTY_SHAPE_STD = 0.5
-"""Relative std of the resistances at SOC 0. Near empty they depend on the cell and on the load: at SOC 0 they are 1.4 to 3.4
+"""Std of this relative error at SOC 0. Resistances near empty depend on the cell and on the load: at SOC 0 they are 1.4 to 3.4
 times those at SOC 0.5 in the cell files of Leaf, NCR18650, A123 and PF."""
 RC_CORRELATION = 0.7
 """Prior correlation of the scales of the fast and slow RC pairs."""
 HYSTERESIS_MEAN, HYSTERESIS_STD = 0.5, 0.5
-"""Prior of the fraction of the cell file's hysteresis in each of its two parts."""
+"""Mean and std of the factors on the cell file's hysteresis in its fast and in its slow part."""
 ENTROPY_STD_V = 1.5e-4
-"""Std of the OCV's temperature coefficient beyond the cell file's [V/K]."""
+"""Std of the error of the OCV's temperature coefficient [V/K]."""
 ARRHENIUS_STD = 0.004
-"""Std of the relative change of the resistances by temperature, beyond the cell file's [1/K]."""
+"""Std of the error of the relative change of the resistances by temperature [1/K]."""
 MIN_FULL_STD = 0.006
 """Minimum std of the SOC at which this pack's charger ends, common to all charges."""
 FULL_REPEAT_STD = 0.01
-"""Std of the SOC of one end of charge about the mean of this pack's charges."""
+"""Std of the SOC at one end of charge about the mean over the ends of charge of this pack."""
 MIN_CAPACITY_STD, MIN_AGING_STD = 1e-4, 1e-4
-"""Minimum std of ln of the capacity, and of its change between two intervals, so that the precision is finite."""
+"""Minimum std of ln of the capacity, and of its change between two intervals. A std of 0 has no finite precision."""
 DRIFT_FRACTION = 0.05
-"""Fraction of the variance of the current sensor's offset that drifts; the rest is constant. Assumed: the offset changes by a
-tenth of its std from day to day, as by temperature. If all of it drifted, counting over a week would tell nothing."""
+"""Fraction of the variance of the current sensor's offset that drifts. The rest is constant. Assumed: temperature changes the
+offset by a tenth of its std from day to day. If all of the offset drifted, a charge counted over a week would have no
+information."""
 MIN_OFFSET_STD_C, ROUNDING_FRACTION = 1e-6, 1e-6
-"""Minimum std of the offset as a C-rate, and fraction of its variance that is independent in each interval, so that the precision
-is finite."""
+"""Minimum std of the offset as a C-rate, and fraction of its variance that is independent in each interval. Both keep the
+precision finite."""
 NEW_SEGMENT_SOC, NEW_SEGMENT_STD = 0.5, 1.0
-"""Mean and std of the SOC after a gap. Any charge may be hidden in it."""
+"""Mean and std of the SOC at the start of a segment. The gap before it may hide any charge."""
 
 
 class Prior:
@@ -89,16 +93,17 @@ class Prior:
         self._add_capacity(cell, intervals, u)
 
     def _add_square(self, at: list[int], factors: list[float], std: float) -> None:
-        """Add the square of (sum of factors times deviations from the mean) / ``std`` to the cost."""
+        """Add a squared residual to the cost: sum of factors times deviations from the mean, divided by ``std``."""
         self.precision[np.ix_(at, at)] += np.outer(factors, factors) / std**2
 
     def _add_constants(self, u: Unknowns) -> None:
-        """Add the unknowns that are single numbers."""
+        """Add hysteresis, temperature coefficients and the rate of aging."""
         self.mean[u.hysteresis] = HYSTERESIS_MEAN
         diagonal = self.precision.ravel()[:: u.size + 1]
         for part, std in (
             (u.hysteresis, HYSTERESIS_STD),
             (u.start_hysteresis, HYST_STD),
+            (u.start_load, 1.0),
             (u.entropy, ENTROPY_STD_V),
             (u.arrhenius, ARRHENIUS_STD),
             (u.aging, 1.0),
@@ -106,7 +111,7 @@ class Prior:
             diagonal[part] = 1.0 / std**2
 
     def _add_functions_of_soc(self, cell: CellCurves, u: Unknowns) -> None:
-        """Add the nodes of OCV, error by direction and resistances over SOC."""
+        """Add the nodes of the OCV's error, of the error by direction, and of the resistances' error over SOC."""
         nodes = np.linspace(0.0, 1.0, CURVE_NODES)
         covariance = curve_covariance(cell, nodes) + ROUNDING_V2 * np.eye(CURVE_NODES)
         self.precision[u.curve, u.curve] = np.linalg.inv(covariance)
@@ -140,26 +145,26 @@ class Prior:
             self._add_square([u.ln_q.start + k, u.ln_q.start + k - 1], [1.0, -1.0], std)
 
     def _add_resistances(self, cell: CellCurves, intervals: Intervals, u: Unknowns) -> None:
-        """Add the scales of the resistances in the last interval. Aging has changed them since the pack's first row."""
+        """Add the factors on the resistances in the last interval, with the variance of all aging since the pack's first row."""
         aging = AgingVariance(RESISTANCE, cell, intervals)
         covariance = scale_covariance(cell.r_std) + aging.before + aging.at_start[-1]
         self.precision[u.ln_r, u.ln_r] = np.linalg.inv(covariance)
 
 
 def full_std(rows: NDArray[np.void]) -> float:
-    """Return the std of the SOC at which the charger ends, common to all charges.
+    """Return the std of the mean SOC at which this pack's charger ends.
 
-    The owner's charger may end at another SOC than the charge that defined SOC 1 of the cell file, with each charge alike.
+    All charges of this charger may end at another SOC than the charge that defined SOC 1 of the cell file.
     """
     is_full = rows["reference_kind"] == FULL
     if not is_full.any():
         return MIN_FULL_STD
-    common = float(np.mean(rows["reference_std"][is_full] ** 2)) - FULL_REPEAT_STD**2
-    return math.sqrt(max(common, MIN_FULL_STD**2))
+    variance = float(np.mean(rows["reference_std"][is_full] ** 2)) - FULL_REPEAT_STD**2
+    return math.sqrt(max(variance, MIN_FULL_STD**2))
 
 
 def scale_covariance(r_std: float) -> Floats:
-    """Return the prior covariance of the scales of the resistances, shape (SCALES, SCALES)."""
+    """Return the prior covariance of ln of the factors on the resistances, shape (SCALES, SCALES)."""
     common = max(r_std**2 - INDEPENDENT_R_STD**2, 0.0)
     own = r_std**2 - common
     covariance = np.full((SCALES, SCALES), common) + np.diag(np.full(SCALES, own))
@@ -170,12 +175,12 @@ def scale_covariance(r_std: float) -> Floats:
 def curve_covariance(cell: CellCurves, soc: Floats) -> Floats:
     """Return the prior covariance of the OCV's error at each pair of SOCs, shape (n, n) [V^2].
 
-    It has three parts: an error of voltage, the slip of the curve's knees and steps along SOC, and the voltage sensor's gain.
+    It has three parts: an error of voltage, the slip of knees and steps along SOC, and the error of the voltage sensor's gain.
     """
-    error_v = np.interp(soc, SOC_GRID, cell.error_v)
+    std_v = np.interp(soc, SOC_GRID, cell.ocv_std_v)
     slope_v = np.minimum(cell.slope(soc, SLIP_SOC), MAX_SLIP_SLOPE_V)
-    slip_v = np.minimum(SLIP_SOC * slope_v, MAX_SLIP_PART * error_v)
-    level_v = np.sqrt(error_v**2 - slip_v**2)
+    slip_v = np.minimum(SLIP_SOC * slope_v, MAX_SLIP_FRACTION * std_v)
+    level_v = np.sqrt(std_v**2 - slip_v**2)
     distance = np.abs(soc[:, None] - soc)
     slip_v2 = np.outer(slip_v, slip_v) * np.exp(-distance / SLIP_CORRELATION_SOC)
     level_v2 = np.outer(level_v, level_v) * np.exp(-distance / CORRELATION_SOC)
@@ -190,7 +195,7 @@ def variance_between_nodes(cell: CellCurves, soc: Floats) -> Floats:
     distance.
     """
     correlation = math.exp(-1.0 / (CURVE_NODES - 1) / CORRELATION_SOC)
-    return np.asarray(np.interp(soc, SOC_GRID, cell.error_v) ** 2 * (1.0 - correlation) / 3.0)
+    return np.asarray(np.interp(soc, SOC_GRID, cell.ocv_std_v) ** 2 * (1.0 - correlation) / 3.0)
 
 
 def node_precision(nodes: int, length_soc: float) -> Floats:

@@ -1,7 +1,7 @@
 """Continuation of a history after a restart of the service.
 
-A checkpoint is saved each minute, the history each hour. Therefore the checkpoint's record of the history may be newer
-than the saved rows, or, after a crash between both writes, older.
+A checkpoint is saved each minute, and the history each hour. The checkpoint's record of the history is therefore newer than
+the saved rows, or, after a crash between both writes, older.
 """
 
 import math
@@ -15,7 +15,7 @@ from bms_estimator.pack_model.history import History
 def resume_history(
     h: np.void, f: np.void, history: History, gap_s: float, capacity_as: float, *, restored: bool
 ) -> None:
-    """Append the rows of the checkpoint that are not in the saved history, and begin a segment with an unused number.
+    """Append the checkpoint's rows that are not in the saved history, and begin a segment with an unused number.
 
     Args:
         h: Record of dtype HISTORY: restored from a checkpoint, or new.
@@ -40,9 +40,9 @@ def resume_history(
 
 
 def _append_saved(h: np.void, f: np.void, history: History, capacity_as: float) -> bool:
-    """Append the rows of the checkpoint that are not saved, and a row with its count of the charge.
+    """Append the checkpoint's rows that are not in the saved history, and a row with its counted charge.
 
-    Return True if the charge is counted without interruption to the checkpoint.
+    Return True if the charge was counted without interruption up to the checkpoint.
     """
     complete_row(h)
     rows = h["rows"][: int(h["count"])].copy()
@@ -51,14 +51,12 @@ def _append_saved(h: np.void, f: np.void, history: History, capacity_as: float) 
         if last["segment"] > h["segment"]:
             return False
         rows = rows[rows["elapsed_s"] > last["elapsed_s"]]
-        # If the first of these rows is of a later segment than the last saved row, rows between them may be lost. The charge
-        # in the gap before that segment is then unknown.
+        # if the first of these rows belongs to a later segment than the last saved row, rows between them may be lost, and the
+        # charge between both segments is unknown
         rows["gap_s"][(rows["segment"] > last["segment"]) & (rows["segment"] == rows["segment"][:1])] = math.inf
-        history.append(rows, capacity_as)
-    else:
-        history.append(rows, capacity_as)
-        if not rows.size:
-            return False
+    elif not rows.size:
+        return False
+    history.append(rows, capacity_as)
     history.append(_row_at_checkpoint(h, f, history.rows[-1]), capacity_as)
     return True
 

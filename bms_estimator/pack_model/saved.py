@@ -13,7 +13,7 @@ from bms_estimator.pack_model.fit import CURVE, PackFit
 from bms_estimator.pack_model.history import MAX_ROWS, History
 
 SAVED_MINIMA = 2
-"""Number of a fit's minima that are saved; the next fit starts from no more."""
+"""Number of a fit's minima that are saved. The next fit starts from two minima (``fit.starts``)."""
 _RESULTS = CURVE.stop
 """Number of results of a fit. ``CURVE`` is the last part of them."""
 _SHAPES = {
@@ -29,8 +29,10 @@ _SHAPES = {
     "first_segment": (),
 }
 """Fields of a fit on which the curves and the handed-over state depend, with their shapes."""
-_ALL_ROWS: Mapping[str, NDArray[Any]] = {"first_segment": np.zeros(())}
-"""Field of a fit that was saved before exchanges of the pack were noticed: the fit used all rows."""
+_DEFAULTS: Mapping[str, NDArray[Any]] = {"first_segment": np.zeros(())}
+"""Fields that an earlier version did not save, with their values: its fits used all segments."""
+_NEW_ROW_FIELDS = {"between_a2", "skew_a2"}
+"""Fields of a row that an earlier version did not save. They are variances, which it assumed to be 0."""
 _START_FIELDS = "row_elapsed_s", "row_soc", "curves"
 """Fields of a fit from which the next fit starts."""
 
@@ -38,7 +40,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def curve_arrays(fit: PackFit | None) -> dict[str, NDArray[Any]]:
-    """Return the curves and results of a fit by name; empty without one."""
+    """Return the curves and results of a fit by name; empty without a fit."""
     return {} if fit is None else {name: np.array(getattr(fit, name)) for name in _SHAPES}
 
 
@@ -51,7 +53,7 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
     if not arrays:
         return None
     values: dict[str, Any] = {}
-    saved = {**_ALL_ROWS, **arrays}
+    saved = {**_DEFAULTS, **arrays}
     for name, shape in _SHAPES.items():
         value = saved.get(name)
         if value is None or value.shape != shape or not np.isfinite(value).all():
@@ -61,8 +63,21 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
     return PackFit(**values, row_elapsed_s=none, row_soc=none, curves=())
 
 
+def _with_present_fields(rows: NDArray[Any] | None) -> NDArray[Any] | None:
+    """Return rows with the fields that an earlier version did not save; other rows are returned unchanged."""
+    kept = [name for name in HISTORY_ROW.names or () if name not in _NEW_ROW_FIELDS]
+    if rows is None or [*(rows.dtype.names or ())] != kept:
+        return rows
+    if any(rows.dtype[name] != HISTORY_ROW[name] for name in kept):
+        return rows
+    result = np.zeros(rows.shape, HISTORY_ROW)
+    for name in kept:
+        result[name] = rows[name]
+    return result
+
+
 def neutral_fit() -> PackFit:
-    """Return a fit without corrections. The service adopts it to compile the code before the first sample."""
+    """Return a fit that corrects nothing. The service adopts it before the first sample to compile the code."""
     values: dict[str, Any] = {name: np.zeros(shape) if shape else 0.0 for name, shape in _SHAPES.items()}
     values |= {"covariance": np.eye(_RESULTS), "hysteresis": 1.0}
     none = np.zeros(0)
@@ -84,7 +99,7 @@ def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
     Raises:
         ValueError: A field is missing, has another layout or is not finite.
     """
-    rows = arrays.get("rows")
+    rows = _with_present_fields(arrays.get("rows"))
     if rows is None or rows.dtype != HISTORY_ROW or rows.ndim != 1 or rows.size > MAX_ROWS:
         raise ValueError("its rows have another layout")
     if not all(

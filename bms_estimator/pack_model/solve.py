@@ -11,13 +11,13 @@ from bms_estimator.pack_model.equations import Equations, NormalEquations
 MAX_ITERATIONS = 30
 """Maximum number of steps from one start."""
 MAX_STEP_SOC = 0.15
-"""Maximum change of an SOC in one step."""
+"""Maximum change of an SOC in one step, because the curves are not linear over a longer one."""
 CONVERGED = 0.02
 """Decrease of the cost at which the minimization ends."""
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
 """Relative damping of the diagonal at the start, and its limits."""
 LESS_DAMPING, MORE_DAMPING = 0.2, 8.0
-"""Factors on the damping after a step that lowers the cost, and after one that does not."""
+"""Factors on the damping after a step that lowers the cost, and after a step that does not."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def minimize(equations: Equations, start: Floats) -> Minimum:
             damping *= MORE_DAMPING
             if damping > MAX_DAMPING:
                 break
-    precision = equations.normal_equations(now, smooth=True).a
+    precision = equations.normal_equations(now, use_file_slope=True).a
     return Minimum(now.x, now.cost, solve(precision, np.eye(now.x.size)))
 
 

@@ -1,7 +1,7 @@
 """Vector of the slow fit's unknowns.
 
-The SOC is one unknown at the start of each interval of about a day. Offset and capacity of each interval follow those of
-the interval before with a small change.
+SOC at the start, offset and capacity are unknowns of each interval of about a day. Offset and capacity change little from one
+interval to the next.
 """
 
 from dataclasses import dataclass
@@ -31,17 +31,20 @@ class Unknowns:
     ln_r: slice
     """ln of the true over the file's resistances in the last interval: series resistance, RC pairs 1-3, RC pairs 4-6."""
     aging: slice
-    """Rate at which aging changes the resistances over the history, relative to its std: factor on ``AgingVariance.trend``."""
+    """Factor on ``AgingVariance.trend``: change of ln of the resistances over the history by aging, in std."""
     shape: slice
-    """Addition to ``ln_r`` that depends on the SOC, at ``SHAPE_NODES`` SOCs, common to all resistances."""
+    """Error of ln of all resistances at ``SHAPE_NODES`` SOCs, added to ``ln_r``."""
     hysteresis: slice
-    """Fraction of the file's hysteresis in its fast and in its slow part."""
+    """Factors on the file's hysteresis in its fast and in its slow part."""
     start_hysteresis: slice
     """Fast and slow part of the hysteresis at the start of each segment."""
+    start_load: slice
+    """Load before the RC pairs were reset at the start of each segment, as far as the slow pairs have kept it, relative to its
+    std."""
     entropy: slice
-    """Temperature coefficient of the OCV beyond the file's [V/K]."""
+    """Error of the OCV's temperature coefficient [V/K]."""
     arrhenius: slice
-    """Relative change of the resistances by temperature beyond the file's [1/K]."""
+    """Error of the relative change of the resistances by temperature [1/K]."""
     full: slice
     """1 minus the SOC at which this pack's charger ends."""
     curve: slice
@@ -57,6 +60,6 @@ class Unknowns:
     @classmethod
     def of(cls, intervals: int, segments: int) -> "Unknowns":
         """Return the positions for a number of intervals and segments."""
-        sizes = (intervals, intervals, intervals, SCALES, 1, SHAPE_NODES, 2, 2 * segments, 1, 1, 1)
+        sizes = (intervals, intervals, intervals, SCALES, 1, SHAPE_NODES, 2, 2 * segments, segments, 1, 1, 1)
         ends = np.cumsum([*sizes, CURVE_NODES, DIRECTIONS * DIRECTION_NODES]).tolist()
         return cls(*(slice(a, b) for a, b in zip([0, *ends], ends, strict=False)))

@@ -28,6 +28,8 @@ CONVERSIONS: Mapping[Unit, tuple[float, float]] = {
     "K": (1.0, -273.15),
 }
 """Factor and offset that convert a value to V, A, C or s, by unit. Values in other units are not converted."""
+STALE_PERIODS, MIN_STALE_S = 3.0, 30.0
+"""Default age at which a voltage or current is stale: in sample periods, and its minimum [s]."""
 DEFAULT_RESOLUTION_V = 0.01
 """Voltage resolution of a publisher without a profile [V]."""
 
@@ -106,9 +108,16 @@ class MqttSource(BaseSource):
     )
     settle_s: Annotated[float, Field(ge=0, le=60)] = Field(
         default=0.5,
-        description="time for which a new current waits for a new voltage; then the last voltage is used, and the estimator only counts the current. A new voltage waits for a new current at least as long, up to interval_s",
+        description="time for which a new voltage and a new current wait for each other. After it the last value of the other is used and marked as held; the estimator interpolates the current at the time of the voltage",
     )
-    max_age_s: Positive = Field(default=30.0, description="maximum age of a voltage or current in a sample")
+    max_age_s: Positive | None = Field(
+        default=None,
+        description="maximum age of a voltage or current in a sample; default: three times interval_s, and at least 30 s; one interval_s longer than max_silent_s if that is set",
+    )
+    max_silent_s: Positive | None = Field(
+        default=None,
+        description="longest time between two messages of a publisher that sends only changes; meanwhile the last values are used again; default: the publisher sends a value in each interval_s",
+    )
     slow_max_age_s: Positive = Field(
         default=300.0, description="maximum age of a temperature or cell voltage in a sample"
     )
@@ -205,6 +214,12 @@ class MqttSource(BaseSource):
     def period_s(self) -> float:
         """Expected time between two samples [s]."""
         return self.interval_s
+
+    @property
+    def stale_s(self) -> float:
+        """Maximum age of a voltage or current in a sample [s]."""
+        default_s = max(STALE_PERIODS * self.interval_s, MIN_STALE_S, (self.max_silent_s or 0.0) + self.interval_s)
+        return self.max_age_s or default_s
 
     @property
     def short_description(self) -> str:

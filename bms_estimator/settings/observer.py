@@ -89,8 +89,8 @@ class ObserverSettings(Strict):
         return table
 
 
-class IdentifierSettings(Strict):
-    """Identifier: joint Kalman filter for the SOC, its standard deviation, and the cell's parameters."""
+class _IdentifierSwitches(Strict):
+    """Switches of ``[identifier]``. The workers of a fleet always run the identifier, and never the fit of a pack's history."""
 
     enabled: bool = Field(
         default=True,
@@ -101,6 +101,11 @@ class IdentifierSettings(Strict):
         repr=False,  # not part of the digest of a fleet's settings, because a fleet's worker does not fit
         description="a fit to the pack's history of weeks, each hour, gives its own OCV curve, capacity and resistances; false: these are the cell file's with the corrections that the filter learns",
     )
+
+
+class IdentifierValues(Strict):
+    """Settings of ``[identifier]`` that are also columns of a fleet's table of packs."""
+
     map_memory_h: Annotated[float, Field(ge=1)] = Field(
         default=336.0, description="time constant with which old values of learned parameters lose weight"
     )
@@ -119,3 +124,7 @@ class IdentifierSettings(Strict):
         default=None,
         description="OCV of one cell after charge minus its OCV after discharge; default: hysteresis in the cell file",
     )
+
+
+class IdentifierSettings(IdentifierValues, _IdentifierSwitches):
+    """Identifier: joint Kalman filter for the SOC, its standard deviation, and the cell's parameters."""

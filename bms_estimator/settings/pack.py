@@ -35,8 +35,8 @@ DEVICE_NAME = r"^[A-Za-z0-9_-]{1,64}$"
 DeviceName = Annotated[str, Field(pattern=DEVICE_NAME)]
 
 
-class PackSettings(Strict):
-    """Name and initial SOC of the pack; type, capacity and number of its cells."""
+class _PackNames(Strict):
+    """Names in ``[pack]``. A fleet's table of packs has its own columns for them."""
 
     name: DeviceName = Field(
         default="pack", description="name of the pack, also in MQTT topics: letters, digits, _ and -"
@@ -45,6 +45,11 @@ class PackSettings(Strict):
         default="ncr18650",
         description="generic cell (lfp, nmc, nca, lco, lmo or lto; requires capacity_ah), name of a shipped cell, or path of a cell file",
     )
+
+
+class PackValues(Strict):
+    """Settings of ``[pack]`` that are also columns of a fleet's table of packs."""
+
     capacity_ah: Positive | None = Field(
         default=None,
         description="capacity of the cell, or of the module that the cell file describes; default: capacity in the cell file",
@@ -64,7 +69,7 @@ class PackSettings(Strict):
     )
     tail_current_a: Positive | None = Field(
         default=None,
-        description="current at full_voltage_v at which the charger ends a charge; default: C/20, and up to C/8 where the charge ends",
+        description="current at full_voltage_v at which the charger ends a charge; default: C/20, and up to C/8 where the charge ends (LFP, LMO and LTO: C/4)",
     )
     cutoff_voltage_v: Positive | None = Field(
         default=None,
@@ -77,6 +82,15 @@ class PackSettings(Strict):
         if full_v is not None and cutoff_v is not None and full_v <= cutoff_v:
             raise ValueError(f"full_voltage_v = {full_v:g}: must be above cutoff_voltage_v = {cutoff_v:g}")
         return self
+
+    @property
+    def charge_limits(self) -> ChargeLimits:
+        """Limits of charger and protection."""
+        return ChargeLimits(self.full_voltage_v, self.tail_current_a, self.cutoff_voltage_v)
+
+
+class PackSettings(PackValues, _PackNames):
+    """Name and initial SOC of the pack; type, capacity and number of its cells."""
 
 
 class PublishSettings(Strict):
@@ -191,8 +205,7 @@ class Settings(Strict):
     @property
     def charge_limits(self) -> ChargeLimits:
         """Limits of charger and protection."""
-        pack = self.pack
-        return ChargeLimits(pack.full_voltage_v, pack.tail_current_a, pack.cutoff_voltage_v)
+        return self.pack.charge_limits
 
     @property
     def sampling(self) -> Sampling:

@@ -1,4 +1,4 @@
-"""Histories without noise: the voltages are those that the slow fit's model predicts for given true values."""
+"""Histories without noise. The model of the slow fit computes their voltages for given true values."""
 
 from dataclasses import dataclass
 
@@ -64,26 +64,33 @@ def measured_rows(cell: CellCurves, days: int = 3, *, segment: int = 0, gap_s: f
         current_a = rate_c * cell.one_c_a
         moved_soc = rate_c * duration_s / 3600.0
         # a row has the values in its middle, therefore the state advances by two halves of the row
-        keep = np.exp(-0.5 * duration_s / TAUS)
-        x_a = current_a + (x_a - current_a) * keep
-        keep_h = np.exp(-0.5 * abs(moved_soc) / np.array(HYSTERESIS_SOC))
-        hysteresis = -np.sign(moved_soc) + (hysteresis + np.sign(moved_soc)) * keep_h if moved_soc else hysteresis
+        x_a = filtered_currents(x_a, current_a, duration_s / 2)
+        hysteresis = moved_hysteresis(hysteresis, moved_soc / 2)
         row["elapsed_s"], row["duration_s"], row["settled_s"] = time_s + duration_s / 2, duration_s, time_s
         row["direction"], row["current_a"], row["x_a"] = np.sign(rate_c), current_a, x_a
         row["charge_as"] = charge_as + current_a * duration_s / 2
         row["throughput_soc"], row["hysteresis"] = throughput_soc + abs(moved_soc) / 2, hysteresis
         row["temperature_c"] = 22.0 + 6.0 * np.sin(time_s / 20000.0)
-        x_a = current_a + (x_a - current_a) * keep
-        if moved_soc:
-            hysteresis = -np.sign(moved_soc) + (hysteresis + np.sign(moved_soc)) * keep_h
-        time_s, charge_as, throughput_soc = (
-            time_s + duration_s,
-            charge_as + current_a * duration_s,
-            throughput_soc + abs(moved_soc),
-        )
+        x_a = filtered_currents(x_a, current_a, duration_s / 2)
+        hysteresis = moved_hysteresis(hysteresis, moved_soc / 2)
+        time_s, charge_as = time_s + duration_s, charge_as + current_a * duration_s
+        throughput_soc += abs(moved_soc)
     rows["segment"], rows["gap_s"] = segment, gap_s
     rows["reference_soc"] = rows["reference_std"] = np.nan
     return rows
+
+
+def filtered_currents(x_a: np.ndarray, current_a: float, time_s: float) -> np.ndarray:
+    """Return the filtered currents of the RC pairs after ``time_s`` of a constant current [A]."""
+    return current_a + (x_a - current_a) * np.exp(-time_s / TAUS)
+
+
+def moved_hysteresis(hysteresis: np.ndarray, moved_soc: float) -> np.ndarray:
+    """Return both parts of the hysteresis after a discharge (positive) or charge of ``moved_soc``."""
+    if moved_soc == 0.0:
+        return hysteresis
+    target = -np.sign(moved_soc)
+    return target + (hysteresis - target) * np.exp(-abs(moved_soc) / np.array(HYSTERESIS_SOC))
 
 
 def equations_of(cell: CellCurves, rows: np.ndarray) -> Equations:
@@ -129,7 +136,7 @@ def reference_row(rows: np.ndarray, soc: float, std: float) -> np.ndarray:
 
 
 def random_unknowns(equations: Equations, seed: int = 1) -> np.ndarray:
-    """Return plausible unknowns: true SOCs with random values of all other kinds."""
+    """Return plausible unknowns: the SOCs of a true history, with random values of all other unknowns."""
     rng, u = np.random.default_rng(seed), equations.u
     x = unknowns_of(equations, Truth(ln_q=0.05, offset_c=0.002, ln_r=(0.2, -0.1, 0.3)))
     for part, std in spreads(u):
@@ -138,12 +145,13 @@ def random_unknowns(equations: Equations, seed: int = 1) -> np.ndarray:
 
 
 def spreads(u: Unknowns) -> tuple[tuple[slice, float], ...]:
-    """Return the std of the random values of each kind of unknown that is not a state of charge."""
+    """Return the std of the random values of the unknowns."""
     return (
         (u.shape, 0.1),
         (u.aging, 0.5),
         (u.hysteresis, 0.2),
         (u.start_hysteresis, 0.3),
+        (u.start_load, 0.5),
         (u.entropy, 1e-4),
         (u.arrhenius, 3e-3),
         (u.full, 5e-3),

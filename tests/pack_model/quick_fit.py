@@ -34,5 +34,5 @@ def quick_fit(_: CellCurves, rows: NDArray[np.void], previous: PackFit | None = 
         row_elapsed_s=rows["elapsed_s"].copy(),
         row_soc=rows["soc"].copy(),
         cost=1.0,
-        curves=(np.zeros(9), np.ones(9)),  # two minima; only saved and restored, therefore of any length
+        curves=(np.zeros(9), np.ones(9)),  # two minima of arbitrary length, which are only saved and restored
     )

@@ -8,8 +8,10 @@ from bms_estimator.pack_model.fit import LN_Q, fit
 from bms_estimator.pack_model.intervals import Intervals
 from tests.pack_model.histories import Truth, cell_curves, measured_rows, with_voltages
 
-DAY_S, DAYS = 86400.0, 150
-"""Length of a day [s], and number of days in which resistances grow."""
+DAY_S = 86400.0
+"""Length of a day [s]."""
+DAYS = 150
+"""Number of days of ``histories.DAY`` in which resistances grow."""
 VISITED = slice(16, 33)
 """Points of ``SOC_GRID`` from SOC 0.4 to 0.8."""
 
@@ -22,7 +24,7 @@ def measured_cell() -> CellCurves:
 
 
 def aged_rows(cell: CellCurves, ln_r: float) -> np.ndarray:
-    """Return the rows of one day in twelve of half a year, in which ln of all resistances grows linearly to ``ln_r``."""
+    """Return every twelfth cycle of a history in which the resistances grow linearly by a factor of exp(``ln_r``)."""
     rows = measured_rows(cell, days=DAYS)
     new, old = (with_voltages(cell, rows, Truth(ln_r=(r, r, r))) for r in (0.0, ln_r))
     part = rows["elapsed_s"] / rows["elapsed_s"][-1]

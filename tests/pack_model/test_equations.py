@@ -17,7 +17,7 @@ from tests.pack_model.histories import (
     with_voltages,
 )
 
-LINEAR = ("hysteresis", "start_hysteresis", "entropy", "curve", "direction")
+LINEAR = ("hysteresis", "start_hysteresis", "start_load", "entropy", "curve", "direction")
 """Kinds of unknowns in which the voltage is linear."""
 EXPONENTIAL = ("ln_r", "shape", "arrhenius", "aging")
 """Kinds of unknowns that scale the resistances."""
@@ -33,7 +33,7 @@ def equations() -> Equations:
 def analytical(equations: Equations, x: np.ndarray) -> np.ndarray:
     """Return the derivatives of all voltages by all unknowns, shape (n, unknowns)."""
     model = equations.model
-    columns, values = model.derivatives(x, model.predict(x), smooth=False)
+    columns, values = model.derivatives(x, model.predict(x), use_file_slope=False)
     jacobian = np.zeros((columns.shape[0], equations.u.size))
     np.add.at(jacobian, (np.arange(columns.shape[0])[:, None], columns), values)
     return jacobian

@@ -1,4 +1,4 @@
-"""Exchange of the pack in a gap: noticed in the first hour of use, and not averaged with the pack before."""
+"""Exchange of the pack in a gap. It is detected in the first hour of use, and the fit does not average both packs."""
 
 from dataclasses import replace
 
@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAUS, WEAK_J
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.pack_model import learning
-from bms_estimator.pack_model.fit import PackFit, fit
+from bms_estimator.pack_model.cell_curves import arrhenius
+from bms_estimator.pack_model.fit import SOC, PackFit, fit
 from bms_estimator.pack_model.learning import SlowFit
 from tests.estimator.simulated_cell import TRUTH, measured
 from tests.pack_model.histories import Truth, cell_curves, measured_rows, with_voltages
@@ -45,10 +47,30 @@ def fitted(rows: np.ndarray) -> PackFit:
         (replace(OLD, ln_q=-0.02, ln_r=(0.05, 0.05, 0.05)), False),
     ],
 )
-def test_aged_pack_after_a_gap_is_noticed_within_an_hour_of_use(truth: Truth, exchanged: bool) -> None:
+def test_only_another_pack_after_a_gap_is_an_exchange(truth: Truth, exchanged: bool) -> None:
     result = fitted(after_gap(truth, hours=1.0))
     assert result.is_exchanged == exchanged
     assert result.first_segment == exchanged
+
+
+@pytest.mark.parametrize("hours", [0.5, 1.0])
+def test_load_that_continues_over_a_gap_is_no_exchange(hours: float) -> None:
+    """The RC pairs are reset at the gap, so that the polarization by the load before it is unknown."""
+    rows = after_gap(OLD, hours)
+    is_after = rows["segment"] == 1.0
+    rows["voltage_v"][is_after] -= drop_by_earlier_load(rows[is_after], load_c=1.5)
+    result = fitted(rows)
+    assert not result.is_exchanged
+    assert abs(result.mean[SOC] - rows["soc"][-1]) < 0.015
+
+
+def drop_by_earlier_load(rows: np.ndarray, load_c: float) -> np.ndarray:
+    """Return the voltage drop that the RC pairs keep from a constant load before the first row [V]."""
+    cell, temperature_c = cell_curves(), rows["temperature_c"]
+    ohm = cell.resistances(rows["soc"], arrhenius(WEAK_J, temperature_c), arrhenius(STRONG_J, temperature_c))[:, 1:]
+    middle_s = rows["settled_s"] + 0.5 * rows["duration_s"]
+    kept_a = load_c * cell.one_c_a * np.exp(-middle_s[:, None] / TAUS)
+    return np.asarray(cell.series * (ohm * kept_a).sum(axis=1))
 
 
 def test_exchanged_packs_are_not_averaged() -> None:

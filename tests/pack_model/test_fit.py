@@ -1,4 +1,4 @@
-"""Fits of histories with known true values, and of odd histories."""
+"""Fits of histories with known true values, and of unusual histories."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def end_soc(cell: CellCurves, rows: np.ndarray, truth: Truth) -> float:
 
 
 def test_resistances_that_rise_more_near_empty_do_not_move_the_soc() -> None:
-    """At SOC 0 the resistances are twice those of the file. Without knowing of such a rise, the RMSE is 3.1 %."""
+    """At SOC 0 the resistances are twice those of the file. Without ``EMPTY_SHAPE_STD`` the RMSE is 3.1 %."""
     cell, truth = cell_curves("nca"), Truth(soc=0.72)
     rows = with_voltages(cell, measured_rows(cell, days=2), truth)
     equations = equations_of(cell, rows)
@@ -70,13 +70,13 @@ def test_resistances_that_rise_more_near_empty_do_not_move_the_soc() -> None:
     assert np.sqrt(np.mean(error**2)) < 0.015
 
 
-def test_known_soc_pulls_the_soc() -> None:
+def test_known_soc_corrects_the_soc_and_lowers_its_std() -> None:
     cell = cell_curves()
     rows = with_voltages(cell, measured_rows(cell, days=1), Truth())
     free = fit(cell, rows)
-    wanted = rows["soc"][-1] + 0.04
-    known = fit(cell, np.concatenate([rows, reference_row(rows, wanted, 0.005)]))
-    assert abs(known.mean[SOC] - wanted) < 0.5 * abs(free.mean[SOC] - wanted)
+    known_soc = rows["soc"][-1] + 0.04
+    known = fit(cell, np.concatenate([rows, reference_row(rows, known_soc, 0.005)]))
+    assert abs(known.mean[SOC] - known_soc) < 0.5 * abs(free.mean[SOC] - known_soc)
     assert std_of(known)[SOC] < std_of(free)[SOC]
 
 
@@ -109,7 +109,7 @@ def test_fits_are_bit_identical() -> None:
 
 
 def test_next_fit_starts_at_the_previous_one() -> None:
-    """From its own result a fit of the same rows finds no minimum that is worse."""
+    """A second fit of the same rows, which starts at the result of the first, finds no worse minimum."""
     cell = cell_curves()
     rows = with_voltages(cell, measured_rows(cell), Truth(soc=0.88, ln_q=-0.05), 0.1)
     first = fit(cell, rows)
@@ -146,7 +146,7 @@ def single_rows(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
-ODD = {
+UNUSUAL = {
     "one row": lambda rows: rows[:1],
     "two rows": lambda rows: rows[:2],
     "no voltages": without_voltages,
@@ -156,11 +156,11 @@ ODD = {
 }
 
 
-@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize("name", UNUSUAL)
 @pytest.mark.parametrize("chemistry", ["nmc", "lfp"])
-def test_odd_history_gives_a_finite_fit(name: str, chemistry: str) -> None:
+def test_unusual_history_gives_a_finite_fit(name: str, chemistry: str) -> None:
     cell = cell_curves(chemistry)
-    rows = ODD[name](with_voltages(cell, measured_rows(cell, days=1), Truth()))
+    rows = UNUSUAL[name](with_voltages(cell, measured_rows(cell, days=1), Truth()))
     first = fit(cell, rows)
     for fitted in (first, fit(cell, rows, first)):
         assert np.isfinite(fitted.mean).all()
@@ -206,7 +206,7 @@ def test_any_finite_history_gives_a_finite_fit(
     assert np.all(np.linalg.eigvalsh(fitted.covariance) > -1e-9)
 
 
-def test_no_rows_and_rows_that_are_not_finite_are_refused() -> None:
+def test_no_rows_and_rows_that_are_not_finite_raise_an_error() -> None:
     cell = cell_curves()
     rows = with_voltages(cell, measured_rows(cell, days=1), Truth())
     with pytest.raises(FitError, match="no rows"):

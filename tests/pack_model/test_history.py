@@ -6,7 +6,7 @@ import pytest
 from bms_estimator.kernels.accumulators.history import ROW_SOC
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import CURVE, LN_Q, SOC, fit
-from bms_estimator.pack_model.history import DAY_S, MAX_ROWS, MAX_SEGMENTS, MEAN_FIELDS, History, thinned
+from bms_estimator.pack_model.history import DAY_S, MAX_ROWS, MAX_SEGMENTS, MEAN_FIELDS, History, thin_old_rows
 from tests.pack_model.histories import Truth, cell_curves, measured_rows, reference_row, with_voltages
 
 
@@ -29,7 +29,7 @@ def is_old(rows: np.ndarray) -> np.ndarray:
 
 
 def test_durations_and_weighted_means_are_preserved(rows: np.ndarray) -> None:
-    few = thinned(rows, cell_curves().capacity_as)
+    few = thin_old_rows(rows, cell_curves().capacity_as)
     assert few.size < 0.6 * rows.size
     for field in MEAN_FIELDS:
         before = np.tensordot(rows["duration_s"], rows[field], 1)
@@ -39,7 +39,7 @@ def test_durations_and_weighted_means_are_preserved(rows: np.ndarray) -> None:
 
 def test_last_two_days_and_known_socs_are_unchanged(rows: np.ndarray) -> None:
     known = reference_row(rows[:200], 0.8, 0.01)
-    few = thinned(np.concatenate([rows[:200], known, rows[200:]]), cell_curves().capacity_as)
+    few = thin_old_rows(np.concatenate([rows[:200], known, rows[200:]]), cell_curves().capacity_as)
     recent = rows[~is_old(rows)]
     assert few[-recent.size :].tobytes() == recent.tobytes()
     assert few[few["duration_s"] == 0.0].tobytes() == known.tobytes()
@@ -49,7 +49,7 @@ def test_merged_rows_have_one_segment_day_bin_and_direction(rows: np.ndarray) ->
     rows = rows.copy()
     rows["segment"][rows.size // 3 :] = 1
     capacity_as = cell_curves().capacity_as
-    few = thinned(rows, capacity_as)
+    few = thin_old_rows(rows, capacity_as)
     assert np.all(np.diff(few["segment"]) >= 0.0)
     assert np.all((np.diff(few["elapsed_s"]) > 0.0) | (np.diff(few["segment"]) > 0.0))
     old = few[is_old(few)]
@@ -97,7 +97,7 @@ def test_fit_of_the_thinned_history_differs_by_less_than_its_std(rows: np.ndarra
     cell = cell_curves()
     known = reference_row(rows, float(rows["soc"][-1]), 0.01)
     whole = np.concatenate([rows, known])
-    before, after = fit(cell, whole), fit(cell, thinned(whole, cell.capacity_as))
+    before, after = fit(cell, whole), fit(cell, thin_old_rows(whole, cell.capacity_as))
     std = np.sqrt(np.diag(before.covariance))
     difference = np.abs(after.mean - before.mean)
     assert np.all(difference[[SOC, LN_Q]] < std[[SOC, LN_Q]])

@@ -13,6 +13,7 @@ from bms_estimator.kernels.accumulators.history import (
 )
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.settings.sampling import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured
 
 WINDOW_S = 1.0
@@ -38,9 +39,9 @@ def samples() -> SampleBlock:
 
 @pytest.fixture(scope="module")
 def rows(samples: SampleBlock) -> np.ndarray:
-    learner = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
-    learner.run(samples)
-    return learner.history.rows
+    slow_fit = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
+    slow_fit.run(samples)
+    return slow_fit.history.rows
 
 
 def ends_s(rows: np.ndarray) -> np.ndarray:
@@ -115,9 +116,9 @@ def test_rows_of_a_rest_grow_with_its_duration(rows: np.ndarray) -> None:
 def test_gap_that_may_hide_a_charge_begins_a_segment(samples: SampleBlock) -> None:
     later = samples.copy()
     later["time_s"][3000:] += 7200.0
-    learner = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
-    learner.run(later)
-    rows = learner.history.rows
+    slow_fit = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
+    slow_fit.run(later)
+    rows = slow_fit.history.rows
     assert np.unique(rows["segment"]).size == 2
     first, second = rows[rows["segment"] == rows["segment"][0]], rows[rows["segment"] == rows["segment"][-1]]
     assert ends_s(first)[-1] == pytest.approx(3000.0, abs=60.0)
@@ -129,8 +130,29 @@ def test_gap_that_may_hide_a_charge_begins_a_segment(samples: SampleBlock) -> No
 
 
 def test_blocks_of_any_size_record_the_same_rows(samples: SampleBlock, rows: np.ndarray) -> None:
-    learner = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
+    slow_fit = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
     for part in np.array_split(samples, 97):
-        learner.run(part)
-    assert learner.history.rows.tobytes() == rows[: learner.history.rows.size].tobytes()
-    assert learner.history.rows.size > 0.8 * rows.size
+        slow_fit.run(part)
+    assert slow_fit.history.rows.tobytes() == rows[: slow_fit.history.rows.size].tobytes()
+    assert slow_fit.history.rows.size > 0.8 * rows.size
+
+
+@pytest.mark.parametrize("step_s", [1, 60])
+def test_rows_of_a_slow_source_contain_the_uncertainty_of_the_current_between_samples(step_s: int) -> None:
+    """The true mean current deviates from the measured one by about the std of the row."""
+    rng = np.random.default_rng(1)
+    levels_a = np.repeat(CAPACITY_AH * rng.choice([0.1, 0.4, 0.8], 900), 12)
+    block, _ = measured(levels_a, 0.95, rng)
+    slow = block[::step_s]
+    slow_fit = SlowFit(Estimator(TRUTH, initial_soc=0.95, sampling=Sampling(period_s=float(step_s))), interval_s=np.inf)
+    slow_fit.run(slow)
+    rows = slow_fit.history.rows
+    assert (rows["skew_a2"] == 0.0).all()
+    if step_s == 1:
+        assert (rows["between_a2"] == 0.0).all()
+        return
+    charge_as = np.cumsum(np.append(0.0, levels_a))
+    ends = np.rint(rows["elapsed_s"][:, None] + rows["duration_s"][:, None] * [-0.5, 0.5]).astype(int)
+    true_a = (charge_as[ends[:, 1]] - charge_as[ends[:, 0]]) / rows["duration_s"]
+    ratio = np.sqrt(np.mean((true_a - rows["current_a"]) ** 2) / np.mean(rows["between_a2"]))
+    assert 0.5 < ratio < 2.0

@@ -12,7 +12,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET, SOC, STATES
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.pack_model import fit as result
+from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import FitError, PackFit
@@ -34,13 +34,13 @@ def samples() -> SampleBlock:
     return block
 
 
-def learner() -> SlowFit:
+def new_slow_fit() -> SlowFit:
     return SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah), initial_soc=0.5), interval_s=INTERVAL_S)
 
 
 def run_in_parts(samples: SampleBlock, sizes: tuple[int, ...]) -> tuple[SlowFit, np.ndarray]:
-    """Return the learner and its trace after blocks of the given sizes in turn."""
-    slow_fit, traces, start, turn = learner(), [], 0, 0
+    """Return the slow fit and its trace after blocks of the given sizes in turn."""
+    slow_fit, traces, start, turn = new_slow_fit(), [], 0, 0
     while start < samples.size:
         size = sizes[turn % len(sizes)]
         traces.append(slow_fit.run(samples[start : start + size]).copy())
@@ -83,8 +83,8 @@ def test_fit_that_fails_leaves_the_previous_one_in_use(samples: SampleBlock, mon
 
 
 def test_adopted_state_is_that_of_the_fit(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The SOC is counted on from the fit's last row. Covariances with the curve are in the filter's units."""
-    slow_fit = learner()
+    """The charge since the fit's last row is subtracted. Covariances with the curve are in the filter's units."""
+    slow_fit = new_slow_fit()
     adopted: list[tuple[np.ndarray, np.ndarray, float, float]] = []
     adopt_state = learning.adopt_state
 
@@ -99,14 +99,14 @@ def test_adopted_state_is_that_of_the_fit(samples: SampleBlock, monkeypatch: pyt
     fitted, p = slow_fit.fit, slow_fit.estimator.settings_record[0]["filter"]
     assert fitted is not None
     assert slow_fit.fits == len(adopted)
-    drawn_soc = (charge_as - fitted.charge_as) / p["capacity_as"] * np.exp(-fitted.mean[result.LN_Q])
-    assert mean[SOC] == pytest.approx(fitted.mean[result.SOC] - drawn_soc, abs=1e-12)
+    drawn_soc = (charge_as - fitted.charge_as) / p["capacity_as"] * np.exp(-fitted.mean[fit_module.LN_Q])
+    assert mean[SOC] == pytest.approx(fitted.mean[fit_module.SOC] - drawn_soc, abs=1e-12)
     assert soc == pytest.approx(min(mean[SOC], 1.0), abs=1e-9)
-    assert mean[LN_Q] == fitted.mean[result.LN_Q]
+    assert mean[LN_Q] == fitted.mean[fit_module.LN_Q]
     one_c_a = float(p["capacity_as"]) / 3600.0
-    assert mean[OFFSET] == pytest.approx(fitted.mean[result.OFFSET] * one_c_a)
+    assert mean[OFFSET] == pytest.approx(fitted.mean[fit_module.OFFSET] * one_c_a)
     assert np.all(mean[NODE : NODE + NODES] == 0.0)
-    assert covariance[LN_Q, OFFSET] == pytest.approx(fitted.covariance[result.LN_Q, result.OFFSET] * one_c_a)
+    assert covariance[LN_Q, OFFSET] == pytest.approx(fitted.covariance[fit_module.LN_Q, fit_module.OFFSET] * one_c_a)
     assert covariance[LN_R0, LN_R0] == covariance[LN_R, LN_R] == p["r_std"] ** 2
     np.testing.assert_array_equal(covariance, covariance.T)
     block = covariance[np.ix_(FILTER_STATES, FILTER_STATES)]
@@ -114,8 +114,8 @@ def test_adopted_state_is_that_of_the_fit(samples: SampleBlock, monkeypatch: pyt
 
 
 def test_hypotheses_keep_their_soc_if_a_gap_followed_the_fit(samples: SampleBlock) -> None:
-    """The gap may hide a charge, so that the fit says nothing about the present SOC."""
-    slow_fit = learner()
+    """The gap may hide a charge, so that the fit has no information on the present SOC."""
+    slow_fit = new_slow_fit()
     slow_fit.run(samples)
     later = samples[:3].copy()
     later["time_s"] += samples["time_s"][-1] + 86400.0
@@ -130,7 +130,7 @@ def test_hypotheses_keep_their_soc_if_a_gap_followed_the_fit(samples: SampleBloc
     learning.adopt_state(estimator, fitted)
     assert f["count"] == count
     np.testing.assert_array_equal(f["mean"][:count, SOC], before)
-    assert np.all(f["mean"][:count, LN_Q] == fitted.mean[result.LN_Q])
+    assert np.all(f["mean"][:count, LN_Q] == fitted.mean[fit_module.LN_Q])
 
 
 @pytest.mark.parametrize(("soc_std", "first_s"), [(0.05, 1800.0), (0.07, 5400.0)])
@@ -141,11 +141,11 @@ def test_a_fit_of_less_than_a_cycle_is_adopted_only_if_its_std_is_small(
 
     def fit_with_std(*args: object) -> PackFit:
         fitted = quick_fit(*args)  # type: ignore[arg-type]
-        fitted.covariance[result.SOC, result.SOC] = soc_std**2
+        fitted.covariance[fit_module.SOC, fit_module.SOC] = soc_std**2
         return fitted
 
     monkeypatch.setattr(learning, "fit", fit_with_std)
-    slow_fit = learner()
+    slow_fit = new_slow_fit()
     begin = int(first_s)
     slow_fit.run(samples[:begin])
     assert slow_fit.fits == 0
@@ -168,7 +168,7 @@ def test_a_short_history_is_fitted_more_often(samples: SampleBlock, monkeypatch:
     intervals_s = np.diff(times_s)
     assert intervals_s[0] == pytest.approx(1800.0, abs=15.0)
     assert intervals_s[-1] == pytest.approx(3600.0, abs=15.0)
-    # half hours in which too few rows were added have no fit
+    # the median, because a half hour with too few new rows has no fit
     assert np.median(intervals_s[np.array(times_s[:-1]) < 6.0 * 3600.0]) == pytest.approx(1800.0, abs=15.0)
 
 

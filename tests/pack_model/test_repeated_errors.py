@@ -26,8 +26,6 @@ from tests.pack_model.quick_fit import quick_fit
 
 GAIN_STD = 0.005
 """Std of the voltage gain of a BMS."""
-
-
 TRUTH = Truth(soc=0.95)
 
 
@@ -36,7 +34,7 @@ def history(cell: CellCurves) -> np.ndarray:
 
 
 def minimum(cell: CellCurves, rows: np.ndarray) -> tuple[float, float]:
-    """Return SOC at the start of the last interval, and its std, of the minimum next to the true values."""
+    """Return SOC and std at the start of the last interval, at the minimum next to the true values."""
     equations = equations_of(cell, rows)
     found = minimize(equations, unknowns_of(equations, TRUTH))
     last = equations.u.soc.stop - 1
@@ -44,7 +42,7 @@ def minimum(cell: CellCurves, rows: np.ndarray) -> tuple[float, float]:
 
 
 def test_an_uncertain_voltage_gain_hardly_widens_the_soc_of_a_flat_curve() -> None:
-    """It moves the whole curve by one voltage, and therefore leaves the bends by which the SOC is found."""
+    """A gain error moves the whole flat curve by nearly one voltage. The bends of the curve still determine the SOC."""
     exact, uncertain = cell_curves("lfp"), cell_curves("lfp", Sampling(voltage_gain_std=GAIN_STD))
     rows = history(exact)
     assert minimum(uncertain, rows)[1] < 1.15 * minimum(exact, rows)[1]
@@ -70,7 +68,7 @@ def test_more_rows_of_the_same_pass_are_no_more_information() -> None:
 
 
 def test_most_of_the_offset_is_constant() -> None:
-    """Over a day it changes by a tenth of its std, which is also its std on the last day."""
+    """The offset has the same std on each day, and changes by a tenth of this std from day to day."""
     cell = cell_curves()
     equations = equations_of(cell, history(cell))
     part = equations.u.offset
@@ -100,8 +98,8 @@ def test_an_interval_never_crosses_a_segment() -> None:
     assert intervals.count == intervals.segments
 
 
-def test_the_soc_does_not_become_surer_between_two_fits() -> None:
-    """A fit by voltages of weeks leaves 3 % of SOC uncertain, of which a third is due to the capacity."""
+def test_the_minimum_std_after_a_fit_is_that_of_the_best_known_soc() -> None:
+    """A fit has an SOC std of 3 %. A third of this variance is correlated with the capacity and vanishes at another SOC."""
     estimator = Estimator(load_cell("nmc", 3.0))
     fitted = quick_fit(cell_curves(), measured_rows(cell_curves(), days=1))
     covariance = fitted.covariance.copy()

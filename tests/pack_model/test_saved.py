@@ -1,4 +1,4 @@
-"""Saving of history and fit, and the published values that are relative to the cell file."""
+"""Saving of history and fit, and published values relative to the cell file."""
 
 from dataclasses import fields
 from typing import Any
@@ -63,6 +63,18 @@ def test_a_missing_field_of_the_curves_is_rejected() -> None:
     del arrays["ln_r"]
     with pytest.raises(ValueError, match="ln_r"):
         fit_of_curves(arrays)
+
+
+def test_rows_of_a_version_without_the_variances_of_slow_samples_are_read() -> None:
+    rows = some_rows()
+    names = [name for name in HISTORY_ROW.names or () if name not in ("between_a2", "skew_a2")]
+    earlier = np.empty(rows.shape, [(name, HISTORY_ROW[name]) for name in names])
+    for name in names:
+        earlier[name] = rows[name]
+    read = history_of(history_arrays(History(rows), None) | {"rows": earlier})[0].rows
+    assert (read["between_a2"] == 0.0).all()
+    assert (read["skew_a2"] == 0.0).all()
+    assert all(np.array_equal(read[name], rows[name], equal_nan=rows[name].dtype.kind == "f") for name in names)
 
 
 def test_fit_of_a_version_without_exchanges_used_all_rows() -> None:

@@ -167,8 +167,9 @@ async def _upload(
                 continue
             name = cell_name(result.pack)
             cells[name] = result.cell_file.encode()
-            # the new cell file contains the capacity
-            rows[result.pack] = encode_row(spec.model_copy(update={"cell": name, "capacity_ah": None}))
+            # the new cell file contains the capacity and its std
+            new_cell = {"cell": name, "capacity_ah": None, "capacity_std": None}
+            rows[result.pack] = encode_row(spec.model_copy(update=new_cell))
         await put(nc, CELLS_BUCKET, cells)
         await put(nc, PACKS_BUCKET, rows)
     return changed_packs

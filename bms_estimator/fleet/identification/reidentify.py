@@ -17,7 +17,7 @@ import numpy as np
 
 from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.calibration.validate import validate
-from bms_estimator.estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator, make_estimator
 from bms_estimator.estimator.identified_parameters import identified_cell
 from bms_estimator.fleet.packs.pack_row import PackSpec, cell_of, settings_of
 from bms_estimator.kernels.cell_model.chen_mora import r_s
@@ -27,6 +27,7 @@ from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.settings.pack import Settings
 
 TRAINING_FRACTION = 2.0 / 3.0
 """Fraction of the time used for training; the rest is the holdout."""
@@ -45,6 +46,10 @@ MAX_SOC_STD = 0.05
 """Maximum standard deviation of the SOC at which a fit starts."""
 MIN_GAIN = 0.03
 """Minimum relative reduction of the RMS error on the holdout for which a new cell replaces the old cell."""
+PACK_VOLTAGES = {"voltage_resolution_v", "voltage_noise_v", "full_voltage_v", "cutoff_voltage_v"}
+"""Columns with voltages of a whole pack."""
+PACK_CURRENTS = {"current_resolution_a", "current_dead_band_a", "tail_current_a", "current_offset_std_a"}
+"""Columns with currents of a whole pack."""
 MAX_BLOCK_SAMPLES = 65_536
 """Maximum number of samples that are estimated at a time."""
 
@@ -224,22 +229,7 @@ class _Pack:
         return HoldoutError(math.sqrt(squares / count) if count else math.inf, count)
 
     def _estimator(self, cell: CellModel) -> Estimator:
-        settings = settings_of(self._spec)
-        sensor, sampling = settings.sensor, settings.sampling
-        series, parallel = self._spec.series, self._spec.parallel
-        estimator = Estimator(
-            cell,
-            settings.observer,
-            identifier=settings.identifier,
-            voltage_resolution_v=sensor.voltage_resolution_v / series,
-            voltage_noise_v=None if sensor.voltage_noise_v is None else sensor.voltage_noise_v / series,
-            initial_soc=settings.pack.initial_soc,
-            sampling=replace(
-                sampling,
-                current_resolution_a=sampling.current_resolution_a / parallel,
-                current_dead_band_a=sampling.current_dead_band_a / parallel,
-            ),
-        )
+        estimator = make_estimator(single_cell_settings(self._spec), cell)
         # the samples are one recording of hours, all of which the filter may learn from
         estimator.settings_record["filter"]["learning_soc"] = math.inf
         return estimator
@@ -271,6 +261,22 @@ def _single_cell_samples(samples: SampleBlock, spec: PackSpec) -> SampleBlock:
     one["voltage_v"] /= spec.series
     one["current_a"] /= spec.parallel
     return one
+
+
+def single_cell_settings(spec: PackSpec) -> Settings:
+    """Return the settings of a pack, with voltages and currents converted to one cell-file object."""
+    settings = settings_of(spec)
+    scaled = {}
+    for section in ("pack", "sensor", "identifier"):
+        values = getattr(settings, section)
+        scaled[section] = values.model_copy(
+            update={
+                name: getattr(values, name) / (spec.series if name in PACK_VOLTAGES else spec.parallel)
+                for name in PACK_VOLTAGES | PACK_CURRENTS
+                if getattr(values, name, None) is not None
+            }
+        )
+    return settings.model_copy(update=scaled)
 
 
 def _pieces(samples: SampleBlock) -> list[SampleBlock]:

@@ -169,11 +169,13 @@ class _Reader:
             return PackSpec.model_validate(values)
         except ValidationError as error:
             detail = error.errors()[0]
+            message = detail["msg"].removeprefix("Value error, ")
+            if not detail["loc"]:  # a contradiction between columns, which the message names
+                raise _RowError(f"column {message}") from None
             column = str(detail["loc"][0])
             description = PackSpec.model_fields[column].description
             if column not in filled:
                 raise _RowError(f"column {column} is empty; it must be {description}") from None
-            message = detail["msg"].removeprefix("Value error, ")
             raise _RowError(_error_text(column, filled[column], f"{message} ({description})")) from None
 
     def _cell_file(self, value: str) -> str:

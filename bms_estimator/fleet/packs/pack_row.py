@@ -16,36 +16,38 @@ from bms_estimator.model.cell import (
     shipped_fuel_cells,
     with_capacity,
 )
-from bms_estimator.model.config_file import Fraction, NotNegative, Positive, Strict, parse_toml
+from bms_estimator.model.config_file import NotNegative, Positive, Strict, parse_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
 from bms_estimator.model.one_of import OneOf
 from bms_estimator.protocols.registry import DEVICES
-from bms_estimator.settings.pack import DeviceName, PackSettings, Settings
+from bms_estimator.settings.observer import IdentifierSettings, IdentifierValues
+from bms_estimator.settings.pack import DeviceName, PackSettings, PackValues, Settings
 from bms_estimator.settings.sensor import GainStd, SensorSettings
 
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
 """Pattern of a cell's name. It may be longer than a pack's name, because ``fleet identify`` names cell files after
 packs."""
-_COUNT = Field(ge=1, le=10_000)
+_SECTIONS: dict[str, type[Strict]] = {"pack": PackSettings, "sensor": SensorSettings, "identifier": IdentifierSettings}
+"""Sections of a settings file whose values come from a specification."""
 
 
-class PackSpec(Strict):
-    """Specification that many packs share: values of the sections ``[pack]`` and ``[sensor]`` of a settings file.
-
-    A cell-file object is the object that a cell file describes: a cell, a module or a block.
-    """
+class _CellName(Strict):
+    """First column of a specification."""
 
     cell: Annotated[str, Field(pattern=CELL_NAME)] = Field(
         description="generic chemistry lfp, nmc, nca, lco, lmo or lto (with capacity_ah), shipped cell, or cell file "
         "beside the table, whose name ends in .toml"
     )
-    capacity_ah: Positive | None = Field(
-        default=None, description="capacity of one cell-file object; default: that of the cell file"
-    )
-    series: Annotated[int, _COUNT] = Field(default=1, description="cell-file objects in series")
-    parallel: Annotated[int, _COUNT] = Field(default=1, description="cell-file objects in parallel")
-    initial_soc: Fraction | None = Field(default=None, description="SOC 0..1 at start; default: from the OCV")
+
+
+class PackSpec(IdentifierValues, PackValues, _CellName):
+    """Specification that many packs share: values of the sections ``[pack]``, ``[identifier]`` and ``[sensor]`` of a settings file.
+
+    Columns of ``[pack]`` and ``[identifier]`` are those of the settings file. Columns of ``[sensor]`` have another default,
+    that of the protocol.
+    """
+
     protocol: Annotated[str, OneOf(DEVICES)] = Field(
         default="text", description="BMS or meter; sets the default resolutions"
     )
@@ -106,11 +108,13 @@ def settings_of(row: PackSpec) -> Settings:
     values = row.model_dump(exclude_none=True)
     if isinstance(row, PackRow):
         values["name"] = row.pack
-    pack, sensor = (
-        {name: values[name] for name in section.model_fields if name in values}
-        for section in (PackSettings, SensorSettings)
+    values["pack_model"] = False  # a worker does not fit, and a replay with these settings gives its estimates
+    return Settings.model_validate(
+        {
+            section: {name: values[name] for name in model.model_fields if name in values}
+            for section, model in _SECTIONS.items()
+        }
     )
-    return Settings(pack=PackSettings.model_validate(pack), sensor=SensorSettings.model_validate(sensor))
 
 
 def known_cells() -> tuple[str, ...]:

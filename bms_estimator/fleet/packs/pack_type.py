@@ -15,6 +15,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.settings.charge_limits import NO_LIMITS
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 
@@ -56,7 +57,10 @@ class _EstimatorKey:
 
 def config_digest(settings: Settings, cell: PackModel) -> Digest:
     """Return the digest of all values that a pack's estimator is created from."""
-    sensor = settings.sensor
+    sensor, limits = settings.sensor, settings.charge_limits
+    with_limits = (
+        () if limits == NO_LIMITS else (limits,)
+    )  # the digest of a pack without limits is that of earlier versions
     parts = (
         settings.observer,
         settings.identifier,
@@ -66,6 +70,7 @@ def config_digest(settings: Settings, cell: PackModel) -> Digest:
         sensor.voltage_resolution_v,
         sensor.voltage_noise_v,
         sensor.current_sign,
+        *with_limits,
     )
     return _digest(hashlib.sha256(repr(parts).encode()).digest())
 

@@ -1,7 +1,7 @@
-"""Rows of the pack's history: means over times in which the current keeps its direction and moves a small charge.
+"""Rows of the pack's history: means over times with one direction of the current and a small charge.
 
-The slow fit (``bms_estimator.pack_model``) estimates the pack's curve, capacity and resistances from these rows. The RC
-currents and the hysteresis are linear in time, so that the mean voltage of a row depends on their means.
+The slow fit (``bms_estimator.pack_model``) estimates the pack's curve, capacity and resistances from these rows. The voltage
+is linear in the filtered currents of the RC pairs and in the hysteresis, so that its mean depends on their means.
 """
 
 import math
@@ -13,9 +13,9 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 ROW_SOC = 0.02
-"""Maximum charge of a row [SOC]. Within it, OCV and resistances are nearly linear in SOC."""
+"""Maximum charge of a row [SOC]. Over this charge OCV and resistances are nearly linear in SOC."""
 MIN_ROW_S = 20.0
-"""Minimum duration of a row [s]. Shorter runs of one direction carry hardly any information."""
+"""Minimum duration of a row [s]. Shorter rows have hardly any information and are discarded."""
 MAX_ROW_S = 4.0 * 3600.0
 """Maximum duration of a row [s]."""
 FIRST_REST_S = 60.0
@@ -23,28 +23,30 @@ FIRST_REST_S = 60.0
 REST_GROWTH = 0.5
 """Maximum duration of a later row of a rest, as a fraction of the time since the rest began."""
 DIRECTION_C = 0.015
-"""Minimum current of a discharge or a charge, averaged over 120 s (``x_a[TREND]``), as a C-rate."""
+"""Minimum current of a discharge or a charge, filtered over 120 s (``x_a[TREND]``), as a C-rate."""
 HYSTERESIS_SOC = 0.03, 0.15
-"""Charge constants of the fast and the slow part of the hysteresis [SOC]."""
+"""Charge constants with which the fast and the slow part of the hysteresis approach -1 or 1 [SOC]."""
 COMPLETED_ROWS = 16
 """Number of completed rows that the state can hold."""
 FREE_ROWS = 3
-"""Free places at which the caller must take the completed rows: one sample may complete rows at the end of a run, at a known
-SOC and at a gap."""
+"""Number of free rows at which the caller must take the completed ones. One sample may complete three rows: at a change of
+direction, at a known SOC, and at a gap."""
 
 HISTORY_ROW = np.dtype(
     [
         ("elapsed_s", "f8"),  # mean time since the history began [s]
         ("duration_s", "f8"),  # duration of the row [s]; 0: only ``reference_soc`` is valid
-        ("segment", "f8"),  # number of the uninterrupted measurement
+        ("segment", "f8"),  # number of the segment, a time without gaps that may hide a charge
         ("gap_s", "f8"),  # duration of the gap before the segment [s]; infinite if unknown
         ("direction", "f8"),  # 1 discharge, 0 rest, -1 charge
         ("voltage_v", "f8"),
         ("current_a", "f8"),  # positive on discharge
+        ("between_a2", "f8"),  # variance of the true mean current about the measured one, by slow sampling [A^2]
+        ("skew_a2", "f8"),  # variance of ``current_a`` by voltages and currents of different times [A^2]
         ("x_a", "f8", BRANCHES),  # current filtered by the RC pairs since their last reset [A]
         ("settled_s", "f8"),  # time from the reset of the RC pairs to the start of the row [s]
         ("temperature_c", "f8"),
-        ("charge_as", "f8"),  # charge since the last measurement before the segment, positive on discharge [A s]
+        ("charge_as", "f8"),  # charge since the last sample before the segment, positive on discharge [A s]
         ("charge_variance_as2", "f8"),  # variance of that charge by rounding, interpolation and short gaps [A^2 s^2]
         ("throughput_soc", "f8"),  # sum of charge and discharge since the segment began [SOC]
         ("hysteresis", "f8", 2),  # fast and slow part, -1..1; 0 at the start of the segment
@@ -61,7 +63,10 @@ HISTORY = np.dtype(
     [
         ("enabled", "i8"),  # 1: rows are recorded
         ("elapsed_s", "f8"),  # time since the history began [s]
-        ("event_s", "f8"),  # value of elapsed_s at which ``run`` returns to its caller [s]
+        (
+            "event_s",
+            "f8",
+        ),  # elapsed_s at which ``kernels.step.run`` returns to its caller, for example to begin a fit [s]
         ("segment", "i8"),
         ("gap_s", "f8"),
         ("direction", "i8"),
@@ -82,7 +87,7 @@ HISTORY = np.dtype(
 
 @njit(cache=True)
 def begin_segment(h: Record, gap_s: float, charge_as: float, std_as: float) -> None:
-    """Begin a new uninterrupted measurement after a gap that may hide a charge.
+    """Begin a new segment after a gap that may hide a charge.
 
     Args:
         h: Record of HISTORY.
@@ -104,7 +109,7 @@ def begin_segment(h: Record, gap_s: float, charge_as: float, std_as: float) -> N
 
 @njit(cache=True)
 def add_window(h: Record, f: Record, p: Record) -> None:
-    """Add the filter's window of about a second.
+    """Add the filter's window of about a second to the present row.
 
     Args:
         h: Record of HISTORY.
@@ -133,6 +138,8 @@ def add_window(h: Record, f: Record, p: Record) -> None:
     r.elapsed_s += dt_s * h.elapsed_s
     r.voltage_v += dt_s * w.sum_v / n
     r.current_a += dt_s * w.sum_a / n
+    r.between_a2 += w.between_as2
+    r.skew_a2 += dt_s * dt_s * w.skew_a2 / (n * n)
     r.temperature_c += dt_s * f.temperature_c
     r.charge_as += dt_s * h.charge_as
     r.throughput_soc += dt_s * h.throughput_soc
@@ -183,12 +190,13 @@ def complete_row(h: Record) -> None:
         row.elapsed_s, row.duration_s, row.settled_s = scale * r.elapsed_s, r.duration_s, r.settled_s
         row.direction = h.direction
         row.voltage_v, row.current_a = scale * r.voltage_v, scale * r.current_a
+        row.between_a2, row.skew_a2 = scale * scale * r.between_a2, scale * scale * r.skew_a2
         row.temperature_c, row.soc = scale * r.temperature_c, scale * r.soc
         row.charge_as, row.throughput_soc = scale * r.charge_as, scale * r.throughput_soc
         row.x_a[:] = scale * r.x_a
         row.hysteresis[:] = scale * r.hysteresis
     r.duration_s = r.elapsed_s = r.settled_s = r.voltage_v = r.current_a = r.temperature_c = 0.0
-    r.charge_as = r.throughput_soc = r.soc = 0.0
+    r.between_a2 = r.skew_a2 = r.charge_as = r.throughput_soc = r.soc = 0.0
     r.x_a[:] = 0.0
     r.hysteresis[:] = 0.0
     h.row_as = 0.0
@@ -196,7 +204,7 @@ def complete_row(h: Record) -> None:
 
 @njit(cache=True)
 def append_row(h: Record) -> Record:
-    """Return the next row, with its segment and variance and without a known SOC. A full buffer loses its oldest row."""
+    """Return the next row of the buffer, initialized without a known SOC. A full buffer loses its oldest row."""
     if h.count == COMPLETED_ROWS:
         for j in range(COMPLETED_ROWS - 1):
             h.rows[j] = h.rows[j + 1]
@@ -211,13 +219,13 @@ def append_row(h: Record) -> Record:
 
 @njit(cache=True)
 def add_reference(h: Record, kind: int, soc: float, std: float) -> None:
-    """Append a row with a known SOC. ``kind`` is that of ``reference_kind``."""
+    """Append a row with a known SOC. ``kind`` is a value of the field ``reference_kind``."""
     if h.enabled == 0:
         return
     complete_row(h)
     row = append_row(h)
     row.elapsed_s, row.duration_s, row.direction = h.elapsed_s, 0.0, h.direction
-    row.voltage_v = row.current_a = row.temperature_c = row.settled_s = 0.0
+    row.voltage_v = row.current_a = row.temperature_c = row.settled_s = row.between_a2 = row.skew_a2 = 0.0
     row.charge_as, row.throughput_soc = h.charge_as, h.throughput_soc
     row.x_a[:] = 0.0
     row.hysteresis[:] = h.hysteresis
@@ -226,5 +234,5 @@ def add_reference(h: Record, kind: int, soc: float, std: float) -> None:
 
 @njit(cache=True)
 def needs_caller(h: Record) -> bool:
-    """Return True if the caller must take the completed rows, or if its event is due."""
+    """Return True if the caller must take the completed rows, or if ``event_s`` has passed."""
     return h.enabled != 0 and (h.count >= COMPLETED_ROWS - FREE_ROWS or h.elapsed_s >= h.event_s)

@@ -3,14 +3,15 @@
 Full: the voltage was at the full voltage for 15 s while the charge current was small, and the charge then ended. A
 charge that ends at the full voltage with a large current is not full: its voltage includes the overpotential of that
 current. Chargers without a constant-voltage phase and a protection that reacts to one high cell end charges in this way.
-A charger that never ends is full after an hour at the full voltage with less than the tail current. The charge must have
-ended, because a slow charge with a constant current reaches the full voltage, less its tolerance, up to 2.5 % of SOC before it
-is full.
+The std of this anchor contains what voltage, overpotential and diffusion hide.
+The end of the charge is required, because a slow charge at constant current reaches the lower limit of the full voltage up to
+2.5 % of SOC too early. If the charger does not switch off, the pack is full after an hour at the full voltage with less than
+the tail current.
 
-Empty: a protection disconnected the pack when its voltage was below the cut-off voltage. Then the current is zero for a
-minute, or, if the protection also disconnects the electronics, no samples come. The overpotential of the load
-counts in the std of this anchor. In the cold, and at a high rate, the std is so large that there is no anchor: a Panasonic
-18650PF at 0 C reaches 2.5 V at C/5 with 15 % of its charge left.
+Empty: the voltage was below the cut-off voltage under load, and then a protection disconnected the pack. The current is zero
+for a minute, or no samples come because the protection also disconnects the electronics. The std of this anchor includes the
+overpotential of the load. In the cold and at a high rate the std is too large for an anchor: a Panasonic 18650PF at 0 C
+reaches 2.5 V at C/5 with 15 % of its charge left.
 
 An anchor is a direct measurement of the SOC. It corrects neither capacity, offset nor OCV curve, because the same anchor
 recurs with each charge, and the filter would count each recurrence as new information on them.
@@ -41,34 +42,40 @@ NO_ANCHOR, FULL, EMPTY = range(3)
 """Kinds of anchors."""
 FULL_STD = 0.01
 """Minimum std of the SOC when full. The end of charge of one charger at one pack repeats within about 1 %."""
+LEAD_SOC = 0.05
+"""Part of the std of the SOC when full that is caused by diffusion, per C-rate of the charge. The surfaces of the particles are
+full before their interiors: after a charge with C/2 to 3.65 V, LFP cells take in another 2 to 3 % at this voltage."""
 AT_FULL_S = 15.0
 """Minimum time at the full voltage with a small charge current [s]. A fast charger takes 20 s from C/8 to C/20 in an LFP
 cell. Regeneration is mostly shorter."""
 MAX_AT_FULL_S = 2.0 * AT_FULL_S
-"""Maximum of the counted time when voltage or current leaves its limits [s]. Outside them the time counts down, so that after
-15 s the end of the charge no longer counts as full."""
+"""Limit of the counted time after voltage or current has left its range [s]. From then on the time counts down, and the end of
+the charge counts as full for at most another 15 s."""
 FLOAT_S = 3600.0
-"""Time at the full voltage after which a charge below the tail current counts as ended [s]: chargers that never end."""
+"""Time at the full voltage after which a charge below the tail current counts as ended [s], because some chargers do not switch
+off."""
 MAX_COUNTED_S = 0.5 * AT_FULL_S
 """Maximum time that one window counts [s], so that at least two windows show the full voltage."""
 REARM_SOC = 0.02
-"""Charge between two anchors of one kind [SOC]: each charge has one end, also if the charger then trickles for days."""
+"""Minimum charge between two anchors of one kind [SOC]. A charger that trickles for days must not cause an anchor again and
+again."""
 DISCONNECTED_S = 60.0
 """Time without current after which a protection has ended the discharge [s]. Stops of a vehicle are mostly shorter."""
 IDLE_C = 0.02
 """Maximum current of a pack that a protection has disconnected, as a C-rate. It is above the offset of most sensors."""
 MAX_EMPTY_STD = 0.05
-"""Maximum std of the SOC when empty. It is exceeded at temperatures below some 10 C, where cells are empty early by
-more than their std."""
+"""Maximum std of the SOC when empty. It is exceeded below about 10 C, where cells reach the cut-off voltage at a higher SOC than
+this std describes."""
 MAX_STDS = 3.0
-"""Maximum difference of anchor and filter in std of the difference. A filter that differs by more has a wrong SOC, which
-its biases have absorbed."""
+"""Maximum difference of the SOCs of anchor and filter, in std of the difference. If it is larger, the filter's biases have
+absorbed a wrong SOC."""
 
 ANCHOR_SETTINGS = np.dtype(
     [
         ("full_v", "f8"),  # minimum terminal voltage at the end of a charge [V]; infinite: no such anchor
+        ("charger_v", "f8"),  # nominal voltage of the charger, above full_v by the tolerance [V]
         ("tail_a", "f8"),  # charge current below which a pack at full_v is full [A]
-        ("small_a", "f8"),  # maximum charge current that counts as small at full_v, and at which a charge may end [A]
+        ("small_a", "f8"),  # maximum charge current at full_v of a charge that ends full [A]
         ("trickle_a", "f8"),  # minimum charge current that distinguishes a charge from the offset of the sensor [A]
         ("corrects_full", "i8"),  # 0: the OCV curve contradicts SOC 1 at full_v, so that the filter is not corrected
         ("cutoff_v", "f8"),  # maximum terminal voltage at the end of a discharge [V]; -infinite: no such anchor
@@ -151,7 +158,7 @@ def charge_ends_full(
     is_charge = f.x_a[CHARGE] <= -p.trickle_a  # averaged over 500 s, which is longer than regeneration
     if voltage_v >= p.full_v and is_small and is_charge:
         a.at_full_s = min(was_at_full_s + min(dt_s, MAX_COUNTED_S), FLOAT_S)
-        a.full_std = full_std(f, ekf, current_a)
+        a.full_std = full_std(f, ekf, current_a, max(p.charger_v - voltage_v, 0.0))
     else:
         a.at_full_s = max(min(was_at_full_s, MAX_AT_FULL_S) - dt_s, 0.0)
     if was_at_full_s >= AT_FULL_S and current_a > -p.trickle_a:
@@ -189,14 +196,18 @@ def gap_begins_empty(a: Record, gap_s: float) -> bool:
 
 
 @njit(cache=True)
-def full_std(f: Record, ekf: Record, current_a: float) -> float:
-    """Return the std of the SOC at the end of a charge with ``current_a`` [A].
+def full_std(f: Record, ekf: Record, current_a: float, below_v: float) -> float:
+    """Return the std of the SOC at the end of a charge with ``current_a`` [A], ``below_v`` below the charger's voltage [V].
 
-    It consists of ``FULL_STD`` and of the SOC that is missing to 1 because the voltage contains the overpotential of that
-    current. The charge that defined SOC 1 of the cell file may have ended at another current than the owner's.
+    It consists of ``FULL_STD``, of the SOC that is missing to 1 because the voltage is too low and contains the overpotential of
+    the current, and of the SOC by which diffusion delays the particles' interiors. The missing SOC is not subtracted, because the
+    charge that defined SOC 1 of the cell file may have ended at another current than the owner's, and the source may report too low
+    a voltage.
     """
-    open_v = ocv(1.0, ekf.ocv_v, ekf.ocv_slope_v) + overpotential(f, ekf, 1.0, current_a)
-    return math.hypot(FULL_STD, 1.0 - soc_from_ocv(open_v, ekf.ocv_v, ekf.ocv_slope_v))
+    open_v = ocv(1.0, ekf.ocv_v, ekf.ocv_slope_v) - below_v + overpotential(f, ekf, 1.0, current_a)
+    missing_soc = 1.0 - soc_from_ocv(open_v, ekf.ocv_v, ekf.ocv_slope_v)
+    lead_soc = LEAD_SOC * f.weak * f.x_a[CHARGE] * 3600.0 / ekf.capacity_as
+    return math.sqrt(FULL_STD**2 + missing_soc**2 + lead_soc**2)
 
 
 @njit(cache=True)
@@ -251,7 +262,7 @@ def update_by_anchor(f: Record, q: int, soc: float, variance: float) -> None:
 
 @njit(cache=True)
 def restart_at_anchor(f: Record, ekf: Record, soc: float, variance: float) -> None:
-    """Restart the likeliest hypothesis at an SOC, without the biases and the OCV error that have absorbed a wrong SOC.
+    """Restart the likeliest hypothesis at an SOC, without the biases and the CURVE error that have absorbed a wrong SOC.
 
     Capacity, offset, OCV nodes, resistances and polarization do not change.
     """

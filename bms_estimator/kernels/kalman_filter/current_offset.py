@@ -35,8 +35,8 @@ def track_smallest_current(s: Record, current_a: float) -> None:
 def update_offset_at_rest(s: Record, p: Record) -> None:
     """Update the offset of every hypothesis after each minute of rest.
 
-    The std of the information is ``p.zero_std_c`` combined with the current hidden by resolution and dead band. A small
-    reported current may be offset or load, so that the offset is half of it, with the other half as std.
+    A small mean current may be offset or load. The measured offset is therefore half of this current. Its variance is the sum
+    of the squares of this half, of ``p.zero_std_c``, and of the std of a current hidden by resolution or dead band.
     """
     w, one_c = s.window, p.capacity_as / 3600.0
     moved_as2 = w.charge_as * w.charge_as + w.between_as2 + w.unknown_as * w.unknown_as

@@ -28,7 +28,7 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 MIN_REACH = 0.02
-"""Minimum half width of the secant that gives the OCV's slope [SOC]. The half width is one std of the SOC within limits."""
+"""Minimum half width of the secant that gives the OCV's slope [SOC]. Between its limits the half width is one std of the SOC."""
 MAX_REACH = 0.3
 """Maximum half width of the secant that gives the OCV's slope [SOC]."""
 MIN_SLOPE_V = 0.02
@@ -83,14 +83,14 @@ VARYING_C = 0.2
 @njit(cache=True)
 def transition_diagonal(s: Record, p: Record) -> None:
     """Write the diagonal of F over the window to ``s.f``, except CURVE, which depends on the hypothesis."""
-    f, dt_s, through = s.f, s.window.time_s, s.window.throughput_as / p.capacity_as
+    f, dt_s, throughput_soc = s.f, s.window.time_s, s.window.throughput_as / p.capacity_as
     for j in range(STATES):
         f[j] = 1.0
     for k in range(BRANCHES):
         f[X + k] = math.exp(-dt_s / TAUS[k])
     f[B_SLOW], f[B_FAST] = math.exp(-dt_s / p.slow_s), math.exp(-dt_s / p.fast_s)
     f[HYST] = math.exp(-abs(hysteresis_charge(s, p)) / p.capacity_as / p.hysteresis_soc)
-    f[OFFSET], f[LN_Q] = math.exp(-dt_s / p.offset_s), math.exp(-through / p.aged_soc)
+    f[OFFSET], f[LN_Q] = math.exp(-dt_s / p.offset_s), math.exp(-throughput_soc / p.aged_soc)
     if not s.sensed:
         f[LN_R0] = f[LN_R] = math.exp(-dt_s / p.unsensed_s)
 

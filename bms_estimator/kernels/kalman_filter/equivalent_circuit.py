@@ -62,7 +62,7 @@ def write_equivalent_circuit(f: Record, p: Record, e: Record) -> None:
     for k in range(1, RESISTANCES):
         e.ohm[k] *= r_k_factor
     ln_ratio, variance = ln_r_s_ratio(f, p)
-    # measurements do not determine the part of the rise that belongs to R_s; half of the rise is used, with half as std
+    # the measured rise belongs partly to R_s and partly to the RC pairs; R_s gets half of it, and the half is also its std
     half_ohm = 0.5 * branch_rise_within_sample(f, e)
     e.value[R_S] = file_r_0_ohm * math.exp(ln_ratio) + half_ohm
     e.ln_variance[R_S] = variance + (half_ohm / e.value[R_S]) ** 2
@@ -93,9 +93,8 @@ def write_rc_pair(e: Record, first: int, end: int, at: int, scale_variance: floa
         ohm += e.ohm[1 + k]
         ln_tau += e.ohm[1 + k] * LN_TAUS[k]
     ln_tau /= ohm
-    by_r = by_tau = by_c = (
-        0.0  # squared sensitivities of ln R, ln tau and ln C to the errors of the ladder's resistances
-    )
+    # squared sensitivities of ln R, ln tau and ln C to the errors of the ladder's resistances
+    by_r = by_tau = by_c = 0.0
     for k in range(first, end):
         share, deviation = e.ohm[1 + k] / ohm, LN_TAUS[k] - ln_tau
         by_r += share**2

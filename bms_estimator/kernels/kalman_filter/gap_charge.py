@@ -17,6 +17,10 @@ INTERPOLATION_VARIANCE = 0.2
 """Variance of the mean current between two samples by linear interpolation, divided by the squared change of the current
 between the samples. It is 1/12 for loads that last much longer than a
 sample period, 0.10 and 0.18 for loads of 20 s sampled every 10 s and every 60 s, and 1/4 for independent samples."""
+SKEW_VARIANCE = 2.0
+"""Variance of the current at a time between two samples about the straight line, divided by the squared change of the current
+between the samples and by f (1 - f), where f is the fraction of the time that has passed. It is 1 for one step at a random time,
+1.2 and 2.2 for a load whose levels last 20 s, in the middle between samples 10 s and 60 s apart, and 3 for independent values."""
 MAX_EQUAL_STEPS = 1.5
 """Maximum difference between two reported currents that count as equal, in steps of the resolution."""
 MIN_UNMEASURED_STD_C = 0.1
@@ -103,7 +107,7 @@ def rounding_charge_variance(s: Record, p: Record, dt_s: float, current_a: float
     """Advance the time of equal currents ``s.same_s``, and return the variance that ``dt_s`` adds to the charge [A^2 s^2].
 
     The variance is due to the resolution of the current. A constant reported current has a constant error, so that the
-    variance of its charge grows with the square of the time. Each call advances the time.
+    variance of its charge grows with the square of the time.
     """
     error_a2 = p.current_step_a * p.current_step_a / 12.0  # variance of rounding
     if current_a == 0.0 and s.current_a == 0.0:

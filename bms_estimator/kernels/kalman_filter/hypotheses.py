@@ -45,6 +45,7 @@ from bms_estimator.kernels.kalman_filter.noise import (
     measurement_variance,
     offset_variance,
     resistance_std,
+    skew_variance,
 )
 from bms_estimator.kernels.kalman_filter.ocv_correction import reset_ocv_correction
 from bms_estimator.kernels.kalman_filter.records import (
@@ -72,16 +73,15 @@ from bms_estimator.numba_cache import njit
 MAX_SINGLE_STD = 0.06
 """Maximum std of an initial SOC for which one filter suffices."""
 MAX_KEPT_STD = 1.0 / (HYPOTHESES - 2)
-"""Maximum std of the SOC after the usual load in a gap for which one hypothesis represents this load. It is the distance
-between the other hypotheses, which represent a wider distribution as well. They have no polarization and no biases from before
-the gap."""
+"""Maximum std of the SOC after a gap with the usual load for which one hypothesis continues the state before the gap. It equals
+the spacing of the evenly spaced hypotheses, which represent a wider distribution well enough."""
 SPREAD_STDS = 2.25
 """Distance of the outermost hypotheses from the initial SOC, in std of that SOC."""
 OVERLAP = 0.62
 """Std of a hypothesis, as a fraction of the distance between neighbours."""
 BEYOND_STD = 0.03
-"""Std of the prior weight of a hypothesis beyond ``MIN_SOC`` or ``MAX_SOC``, over the distance by which it is moved to that
-limit [SOC]."""
+"""Std over SOC with which the prior weight falls beyond ``MIN_SOC`` and ``MAX_SOC`` [SOC]. A hypothesis there is moved to the
+limit."""
 HYST_STD = 0.7
 """Initial std of the hysteresis state h."""
 EARLIER_LOAD_S = 1800.0
@@ -163,8 +163,8 @@ def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
 def forget_state_of_charge(s: Record, p: Record, q: int) -> None:
     """Set all states of hypothesis ``q`` except those of sensor and cell to their prior, with an SOC of 0 without variance.
 
-    The unknown part of the RC pairs' currents has the prior of a load that ended with the present current. It contains
-    the known part ``s.x_a``, too, which the caller sets to 0.
+    The states X of the RC pairs have the prior of a load that ended with the present current. They then represent the whole
+    filtered currents, so that the caller sets ``s.x_a``, the part due to measured currents, to 0.
     """
     mean, covariance = s.mean[q], s.covariance[q]
     for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
@@ -263,7 +263,7 @@ def end_learning(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def begin_gap(s: Record, p: Record, gap_s: float) -> None:
-    """Store the SOC before a gap of ``gap_s`` [s], or no gap if its duration is infinite, and end the learning."""
+    """Store the SOC before a gap of ``gap_s`` [s], and end the learning. A gap of unknown duration (infinite) is stored as 0."""
     s.gap_s = gap_s if gap_s < math.inf else 0.0
     s.soc_before, s.std_before = s.mean[0, SOC], math.sqrt(s.covariance[0, SOC, SOC])
     s.exchanged = 0
@@ -297,7 +297,7 @@ def update_hypotheses(s: Record, p: Record) -> None:
         if s.learned_soc >= p.learning_soc:
             end_learning(s, p)
     s.soc_before -= w.charge_as / p.capacity_as  # for its comparison with the present SOC in detect_exchange
-    variance_v2 = measurement_variance(s, p, dt_s, w.samples)
+    variance_v2 = measurement_variance(s, p, dt_s, w.samples) + skew_variance(s, p)
     scale, best = innovation_scale(s, p), 0
     for q in range(s.count):
         if dt_s > 0.0:

@@ -160,10 +160,10 @@ def passes_innovation_gate(
         current_a: Current [A].
         voltage_v: Voltage [V].
     """
-    away_a = current_a - c.mean_a
-    predicted_v = f.voltage_v - e.value[R_S] * away_a
+    difference_a = current_a - c.mean_a
+    predicted_v = f.voltage_v - e.value[R_S] * difference_a
     # the voltage may have been measured before the current changed, and the RC pairs may already have followed the change
-    jump_v = (e.value[R_S] + e.value[R_TS] + e.value[R_TL]) * max(abs(away_a), abs(change_a))
+    jump_v = (e.value[R_S] + e.value[R_TS] + e.value[R_TL]) * max(abs(difference_a), abs(change_a))
     limit_v = GATE_STDS * math.sqrt(f.innovation_variance) + jump_v
     if abs(voltage_v - predicted_v) <= limit_v or dt_s > p.unmeasured_s:
         if c.gated_in_row > 0 and not gate_persists(c):
@@ -280,8 +280,8 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     """Process a sample without its voltage, during a fault of ``UNUSABLE``.
 
     A wrong sign of the current causes an SOC error of twice the charge, always in one direction. A frozen current may be
-    any typical load. Afterwards the SOC is re-initialized. Estimates of the cell learned with a wrong sign are useless, so that
-    they are initialized, too, unless the filter already holds them.
+    any typical load. When the fault ends, the SOC is re-initialized. Capacity and OCV are also re-initialized after a wrong
+    sign, unless their learning had ended before.
     """
     counted_soc = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
     error_soc = UNOBSERVED_CHARGE_ERROR * counted_soc

@@ -39,10 +39,10 @@ INDEPENDENT_S = 30.0
 """Time after which the errors of successive windows count as independent [s]. R decreases with the window's duration up to
 this time."""
 UNSENSED_R_STD = 0.25
-"""Std of ln of the resistances without a temperature sensor, as of a deviation of 10 K."""
+"""Std of ln of the resistances without a temperature sensor. It is the effect of a deviation of 10 K."""
 WARMED_R_STD = 0.015
-"""Additional std of ln of the resistances for each kelvin of modelled self-heating [1/K], as of an error of half of the
-heating."""
+"""Additional std of ln of the resistances for each kelvin of modelled self-heating [1/K]. It is the effect of an error of half
+of the heating."""
 AGED_SOC = 400.0
 """Charge throughput over which aging changes the OCV curve of a cell [SOC]: 200 full cycles."""
 HYST_STEADY_STD = 0.17
@@ -94,6 +94,20 @@ def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> flo
         * extrapolation_factor(p, s.temperature_c)
     )
     return model_v * model_v / min(max(dt_s, 1.0), INDEPENDENT_S) + p.sensor_v2 / samples
+
+
+@njit(cache=True)
+def skew_variance(s: Record, p: Record) -> float:
+    """Return the variance of the window's mean voltage by interpolated currents through R_0 [V^2].
+
+    The covariance of the RC pairs contains their part.
+    """
+    x, w = s.mean[s.best], s.window
+    if w.skew_a2 == 0.0:
+        return 0.0
+    resistances(x[SOC], p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
+    r_0_ohm = math.exp(x[LN_R0]) * s.ohm[0]
+    return r_0_ohm * r_0_ohm * w.skew_a2 / (w.samples * w.samples)
 
 
 @njit(cache=True)

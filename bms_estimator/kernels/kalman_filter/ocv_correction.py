@@ -9,8 +9,8 @@ A voltage depends on SOC and curve together, so that its information on the curv
 The joint covariance contains this limit, so that no rule has to select voltages for learning (as in simultaneous
 localization and mapping: Smith, Self and Cheeseman 1990).
 
-The nodes are learned in the first pass of the curve (``Noise.learning_soc``). Afterwards they are considered states with their
-prior: their gain is 0 (Schmidt-Kalman filter).
+The nodes are learned in the first pass of the curve (``Noise.learning_soc``). Then they return to their prior, and their gain
+is 0: their error counts in the std, but voltages do not change them (Schmidt-Kalman filter).
 
 ``x`` is a mean of EKF_STATE, ``p`` a record of EKF_SETTINGS.
 """

@@ -4,7 +4,7 @@ Order of the state vector and of the covariance:
 
 ====  =========  ==============================================================================================
   0   SOC        state of charge z
-1-6   X          filtered currents x_k of the RC pairs, less those due to the current since switch-on [A]
+1-6   X          part of the RC pairs' filtered currents x_k that is due to the load before switch-on [A]
   7   LN_R0      ln of the true over the file's series resistance
   8   LN_R       ln of the true over the file's resistances of the RC pairs, one scale for all
   9   B_SLOW     error of the model that persists for hours [V]
@@ -90,13 +90,13 @@ class Noise:
     load_s: float = 20.0
     """P(0): correlation time of the varying part of the unknown load [s]."""
     learning_soc: float = 1.0
-    """Charge throughput after switch-on in which the filter learns LN_Q and the OCV nodes [SOC]: one pass of the curve. Then it
-    holds them: their errors still count in the std of the SOC, but voltages do not change them. A filter that linearizes each
-    pass about another estimate takes the same errors of the curve for new information, and its std decreases while its error
-    remains. A first gap ends the learning, too, unless the throughput is infinite."""
+    """Charge throughput after switch-on in which the filter learns LN_Q and the OCV nodes [SOC]: one pass of the curve. Then
+    voltages do not change them, but their errors still count in the std of the SOC. The filter linearizes each pass about
+    another estimate. In a second pass it would take the same errors of the curve for new information, and its std would
+    decrease while the error remains. A first gap also ends the learning, unless this throughput is infinite."""
     event_probability: float = 0.5
     """P(0): probability that a long gap hides a charge, a discharge or an exchange of the pack, so that any SOC is possible.
-    Nothing is known about it, so that the odds are even."""
+    The odds are even, because nothing is known about the gap."""
     event_s: float = 3600.0
     """P(0): time constant with which this probability grows with the duration of the gap [s], of the order of a charge."""
     half_likelihood_exponent: float = 0.17
@@ -148,6 +148,7 @@ WINDOW = np.dtype(
         ("unknown_as", "f8"),  # std of the charge in unmeasured gaps [A s]
         ("between_as2", "f8"),  # variance of the charge between samples far apart [A^2 s^2]
         ("rounded_as2", "f8"),  # variance of the charge by rounding of the current [A^2 s^2]
+        ("skew_a2", "f8"),  # sum over the samples of the variance of their interpolated currents [A^2]
         ("gap", "i8"),  # 1: samples are missing; 2: the gap may hide a charge or an exchange of the pack
         ("sum_v", "f8"),
         ("sum_a", "f8"),

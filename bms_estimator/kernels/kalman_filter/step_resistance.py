@@ -17,7 +17,7 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 UNHELD, HELD, STEPPED = range(3)
-"""Phases of ``detect_current_step``: the current changes; is constant; has stepped after it was constant."""
+"""Phases of ``detect_current_step``. UNHELD: the current varies. HELD: it is constant. STEPPED: it changed after HELD."""
 MIN_STEP_C = 0.2
 """Minimum change of the current between two samples of a current step, as a C-rate."""
 MAX_HELD_CHANGE = 0.1

@@ -18,6 +18,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
 from bms_estimator.kernels.kalman_filter.current_offset import track_smallest_current
 from bms_estimator.kernels.kalman_filter.ekf import transition_diagonal
 from bms_estimator.kernels.kalman_filter.gap_charge import (
+    SKEW_VARIANCE,
     expected_excess_charge,
     gap_charge_std,
     interpolation_charge_variance,
@@ -45,7 +46,7 @@ def reset_window(s: Record) -> None:
     w = s.window
     w.samples = w.gap = 0
     w.time_s = w.charge_as = w.throughput_as = w.unknown_as = w.between_as2 = w.rounded_as2 = 0.0
-    w.sum_v = w.sum_a = w.sum_as = 0.0
+    w.skew_a2 = w.sum_v = w.sum_a = w.sum_as = 0.0
     w.sum_x_a[:] = 0.0
 
 
@@ -107,6 +108,24 @@ def add_to_window(s: Record, current_a: float, voltage_v: float) -> None:
     w.sum_as += w.charge_as
     for k in range(BRANCHES):
         w.sum_x_a[k] += s.x_a[k]
+
+
+@njit(cache=True)
+def widen_by_interpolation(w: Record, change_a: float, age_s: float, dt_s: float) -> None:
+    """Add the variances of a sample whose current is interpolated between two measured ones. Call before the sample.
+
+    Args:
+        w: Record of WINDOW.
+        change_a: Change of the current between the measured ones [A].
+        age_s: Time from the first measured current to the sample [s].
+        dt_s: Time between the measured currents [s].
+    """
+    fraction, rest_s = age_s / dt_s, dt_s - age_s
+    w.skew_a2 += SKEW_VARIANCE * fraction * (1.0 - fraction) * change_a * change_a
+    # ``integrate_current`` counts the two parts of the step as if both changes were measured
+    counted_as2 = interpolation_charge_variance(fraction * change_a, age_s)
+    counted_as2 += interpolation_charge_variance((1.0 - fraction) * change_a, rest_s)
+    w.between_as2 += interpolation_charge_variance(change_a, dt_s) - counted_as2
 
 
 @njit(cache=True)

@@ -25,10 +25,12 @@ class Reading(NamedTuple):
     """Timestamp by the device's clock, with any origin [s]; NaN: not reported."""
     voltage_held: bool = False
     """True if the voltage repeats an earlier reading, and only the other values are new."""
+    current_held: bool = False
+    """True if the current repeats an earlier reading, and only the other values are new."""
 
 
-VOLTAGE_HELD = "voltage_held"
-"""Name of the mark of a held voltage in a line."""
+VOLTAGE_HELD, CURRENT_HELD = "voltage_held", "current_held"
+"""Names of the marks of a held voltage and a held current in a line."""
 _VOLT: Mapping[str, float] = {"": 1.0, "v": 1.0, "volt": 1.0, "volts": 1.0, "mv": 1e-3}
 _UNITS: Mapping[str, Mapping[str, float]] = {
     "voltage_v": _VOLT,
@@ -36,6 +38,7 @@ _UNITS: Mapping[str, Mapping[str, float]] = {
     "temperature_c": {"": 1.0, "c": 1.0, "degc": 1.0},
     "time_s": {"s": 1.0},
     VOLTAGE_HELD: {"": 1.0},  # 1: held, 0: measured
+    CURRENT_HELD: {"": 1.0},
     "cells_v": _VOLT,
 }
 _NAMES = {
@@ -44,6 +47,7 @@ _NAMES = {
     "temperature_c": ("T", "temp", "temperature"),  # t may be the time
     "time_s": ("time",),  # only with its unit, because boards print times in any unit
     VOLTAGE_HELD: (VOLTAGE_HELD,),
+    CURRENT_HELD: (CURRENT_HELD,),
     "cells_v": ("cells", "cell_voltages"),
 }
 _QUANTITIES = {
@@ -68,7 +72,7 @@ def read_line(line: bytes) -> Reading | None:
 
     Examples: ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
     ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
-    ``time_s`` is the board's timestamp. ``voltage_held=1`` marks the voltage of an earlier line. A cell that is ``null``
+    ``time_s`` is the board's timestamp. ``voltage_held=1`` and ``current_held=1`` mark a value of an earlier line. A cell that is ``null``
     was not measured. Unknown names are skipped. A repeated name or an unknown unit makes the line invalid.
     """
     if b";" in line and b"." not in line:
@@ -98,7 +102,9 @@ def _pair_values(text: str) -> Iterable[_NamedValues]:
 def _json_values(line: bytes) -> Iterable[_NamedValues]:
     for name, value in json.loads(line.decode(), parse_float=number, parse_constant=number).items():
         values = [nan if v is None else v for v in value] if isinstance(value, list) else [value]
-        if name == VOLTAGE_HELD or all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+        if name in (VOLTAGE_HELD, CURRENT_HELD) or all(
+            isinstance(v, int | float) and not isinstance(v, bool) for v in values
+        ):
             yield name, [float(v) for v in values], ""
 
 
@@ -122,8 +128,9 @@ def _to_reading(named_values: Iterable[_NamedValues]) -> Reading | None:
     (voltage_v,), (current_a,), (temperature_c,), (time_s,) = (
         values_si.get(field, [nan]) for field in ("voltage_v", "current_a", "temperature_c", "time_s")
     )
-    cells_v, (held,) = tuple(values_si.get("cells_v", ())), values_si.get(VOLTAGE_HELD, [0.0])
-    return Reading(voltage_v, current_a, temperature_c, cells_v, time_s, voltage_held=held > 0.0)
+    cells_v = tuple(values_si.get("cells_v", ()))
+    voltage_held, current_held = (values_si.get(name, [0.0])[0] > 0.0 for name in (VOLTAGE_HELD, CURRENT_HELD))
+    return Reading(voltage_v, current_a, temperature_c, cells_v, time_s, voltage_held, current_held)
 
 
 def sample_json_line(
@@ -134,6 +141,7 @@ def sample_json_line(
     cells_v: Sequence[float | None] = (),
     time_s: float | None = None,
     voltage_held: bool = False,
+    current_held: bool = False,
 ) -> bytes:
     """Return the JSON line of one sample.
 
@@ -144,6 +152,7 @@ def sample_json_line(
         cells_v: Cell voltages, from the first on; None or NaN: not measured [V].
         time_s: Timestamp by the device's clock, with any origin [s]; None: not reported.
         voltage_held: True if the voltage repeats an earlier sample.
+        current_held: True if the current repeats an earlier sample.
 
     Raises:
         ValueError: Voltage or current is not finite.
@@ -157,6 +166,8 @@ def sample_json_line(
         line["time_s"] = round(time_s, 6)
     if voltage_held:
         line[VOLTAGE_HELD] = 1
+    if current_held:
+        line[CURRENT_HELD] = 1
     if cells_v:
         line["cells_v"] = [None if v is None or not math.isfinite(v) else round(v, 4) for v in cells_v]
     return json.dumps(line, separators=(",", ":")).encode() + b"\n"

@@ -104,7 +104,7 @@ class TextProtocol(DeviceProtocol):
             block["current_a"] = [self._sign * reading.current_a for reading in readings]
             block["temperature_c"] = [reading.temperature_c for reading in readings]
             self._implausible += remove_implausible(block["temperature_c"], MIN_C, MAX_C)
-            block["status"] = [SampleStatus.VOLTAGE_HELD if reading.voltage_held else 0 for reading in readings]
+            block["status"] = [_status(reading) for reading in readings]
             block["time_s"] = self._times(arrival_s, readings)
         return block
 
@@ -136,6 +136,12 @@ class TextProtocol(DeviceProtocol):
     def _begin_overlong(self, line: bytes) -> None:
         self._overlong_lines += 1
         self._first_invalid = self._first_invalid or line[:MAX_LINE_BYTES]
+
+
+def _status(reading: Reading) -> int:
+    """Return the bits of ``SampleStatus`` of a reading."""
+    voltage_bit = SampleStatus.VOLTAGE_HELD if reading.voltage_held else 0
+    return voltage_bit | (SampleStatus.CURRENT_HELD if reading.current_held else 0)
 
 
 DEVICE = Device(

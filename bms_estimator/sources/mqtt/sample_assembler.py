@@ -18,6 +18,9 @@ from bms_estimator.sources.mqtt.publisher_conflict import MIN_JUMPS, PublisherCo
 
 REQUIRED_QUANTITIES = ("voltage", "current")
 """Quantities without which there is no sample."""
+REPEAT_PERIODS = 1.5
+"""Time without a message after which the last current is used again if the publisher sends only changes, in sample periods. A
+regular message may be half a period late."""
 MAX_STATUS_CHARACTERS = 80
 """Maximum number of characters of the publisher's status that are shown."""
 
@@ -45,9 +48,9 @@ class _TimestampedValue(NamedTuple):
 class SampleAssembler:
     """Assembler of lines, one for each sample, from MQTT messages.
 
-    A sample is complete when voltage and current have arrived. If only one of them arrives in time (``_pairing_s``), the
-    last value of the other is used up to ``max_age_s``, because some publishers send only changes. The line marks a voltage
-    that an earlier sample has used, because the estimator must not use a voltage twice.
+    A sample is complete when voltage and current have arrived. If only one of them arrives within ``settle_s``, the last
+    value of the other is used up to ``stale_s``, because some publishers send only changes. The line marks a value that
+    an earlier sample has used, because the estimator must not use a voltage twice, or with a current of another time.
     Retained messages are rejected, because their age is unknown.
     """
 
@@ -64,6 +67,7 @@ class SampleAssembler:
         self._cells: dict[int, _TimestampedValue] = {}
         self._faults: dict[str, str] = {}  # latest error of each quantity
         self._unused_arrival_s: dict[str, float] = {}  # arrival times of voltage and current since the last sample
+        self._repeat_s = math.inf  # time at which the last current is used again
         self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale", "publisher_errors"), 0)
         self._detectors = {
             (binding.quantity, binding.topic): PublisherConflict(MIN_JUMPS[binding.quantity], settings.interval_s)
@@ -116,8 +120,8 @@ class SampleAssembler:
     def wait_s(self, now_s: float) -> float | None:
         """Return the time until a sample is complete without a further message [s]; None if a message is needed."""
         if not self._unused_arrival_s:
-            return None
-        return max(min(self._unused_arrival_s.values()) + self._pairing_s() - now_s, 0.0)
+            return max(self._repeat_s - now_s, 0.0) if self._repeat_s < math.inf else None
+        return max(min(self._unused_arrival_s.values()) + self._settings.settle_s - now_s, 0.0)
 
     def add_message(self, topic: str, payload: bytes, now_s: float, *, retained: bool) -> None:
         """Store the values of a message.
@@ -152,16 +156,17 @@ class SampleAssembler:
 
     def line(self, now_s: float) -> bytes:
         """Return the line of a complete sample; empty without one."""
-        if not self._unused_arrival_s or (
-            len(self._unused_arrival_s) < len(REQUIRED_QUANTITIES) and (self.wait_s(now_s) or 0.0) > 0.0
-        ):
+        if len(self._unused_arrival_s) < len(REQUIRED_QUANTITIES) and self.wait_s(now_s) != 0.0:
             return b""
-        voltage_held = "voltage" not in self._unused_arrival_s
+        voltage_held, current_held = "voltage" not in self._unused_arrival_s, self._current_is_old()
         self._unused_arrival_s.clear()
-        voltage_v, current_a = (self._value(name, now_s, self._settings.max_age_s) for name in REQUIRED_QUANTITIES)
+        voltage_v, current_a = (self._value(name, now_s, self._settings.stale_s) for name in REQUIRED_QUANTITIES)
         if voltage_v is None or current_a is None:
             self._count_stale("current" if current_a is None else "voltage")
+            self._repeat_s = math.inf
             return b""
+        if self._settings.max_silent_s is not None and not current_held:
+            self._repeat_s = now_s + REPEAT_PERIODS * self._settings.interval_s
         return sample_json_line(
             voltage_v,
             current_a,
@@ -169,18 +174,13 @@ class SampleAssembler:
             cells_v=self._cells_v(now_s),
             time_s=self._value("time", now_s, self._settings.settle_s),  # an older time belongs to an earlier sample
             voltage_held=voltage_held,
+            current_held=current_held,
         )
 
-    def _pairing_s(self) -> float:
-        """Return the time for which a new voltage or current waits for the other [s].
-
-        A voltage is used with the current that is nearest in time, so that it waits for the next current as long as the
-        last one was old. The wait is limited to the expected sample period.
-        """
-        current, arrival_s = self._values.get("current"), self._unused_arrival_s.get("voltage")
-        if current is None or arrival_s is None:
-            return self._settings.settle_s
-        return max(self._settings.settle_s, min(arrival_s - current.arrival_s, self._settings.interval_s))
+    def _current_is_old(self) -> bool:
+        """Return True if a new voltage has no current within ``settle_s``."""
+        current, voltage_s = self._values.get("current"), self._unused_arrival_s.get("voltage")
+        return current is not None and voltage_s is not None and voltage_s - current.arrival_s > self._settings.settle_s
 
     def _store_value(self, binding: _TopicBinding, payload: bytes, cell: int | None, now_s: float) -> None:
         """Store the values of a payload.
@@ -229,7 +229,7 @@ class SampleAssembler:
         self._counters["stale"] += 1
         if name in self._values:
             topics = ", ".join(self._find_topics(name))
-            self._faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.max_age_s:g} s")
+            self._faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.stale_s:g} s")
 
     def _value(self, name: str, now_s: float, max_age_s: float) -> float | None:
         """Return a value unless it is older than ``max_age_s``."""

@@ -50,7 +50,7 @@ def main() -> None:
     parts = [name for name in PARTS if matches(name, options.parts)]
     results: Scores = {}
     for kind, cases in kinds.items():
-        for case in drawn(cases, options):
+        for case in cases_of_seeds(cases, options):
             add_scores(results, kind, case, parts, options.data)
     sys.stdout.write("RMSE / inside / std / score [%]\n\n")
     sys.stdout.writelines(f"| {' | '.join(line)} |\n" for line in lines(results, list(kinds), parts))
@@ -72,8 +72,8 @@ def matches(name: str, beginnings: list[str]) -> bool:
     return not beginnings or any(name.startswith(beginning) for beginning in beginnings)
 
 
-def drawn(cases: tuple[Case, ...], options: argparse.Namespace) -> Iterator[Case]:
-    """Yield the cases of each seed; those without their captures are reported and left out."""
+def cases_of_seeds(cases: tuple[Case, ...], options: argparse.Namespace) -> Iterator[Case]:
+    """Yield each case with each seed. Cases without their captures are reported and left out."""
     for case in cases:
         if case.cell in REAL_CAPTURES and not options.data.is_dir():
             report(f"left out: {case.name}: {options.data} does not exist")

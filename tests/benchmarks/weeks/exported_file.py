@@ -1,11 +1,12 @@
-"""Cell file that ``cell export`` writes after two weeks, compared with other files on other days of the same packs.
+"""Comparison of the cell file that ``cell export`` writes after two weeks with a generic and a laboratory file.
 
 ``python -m tests.benchmarks.weeks.exported_file`` prints the table of docs/cell/export.md: RMSE of the SOC, fraction of time
-inside two std, mean std and interval score, all in %, over days of another use that begin with a wrong SOC. The laboratory
-file is that of another cell of the type.
+inside two std, mean std and interval score, all in %. The test days have another use of the same packs, and begin with a wrong
+SOC. The laboratory file is that of another cell of the type.
 """
 
 import argparse
+import itertools
 import sys
 from pathlib import Path
 
@@ -76,20 +77,21 @@ def main() -> None:
     options = parser.parse_args()
     sys.stdout.write("| cell | generic file | exported file | laboratory file |\n|---|---|---|---|\n")
     for name in options.cells:
-        scores: dict[str, list[Score]] = {"generic": [], "exported": [], "laboratory": []}
-        for seed in options.seeds:
-            case = Case(name, "full_weekly", days=options.days, seed=seed)
-            pack = draw_pack(name, case.declared_ah, seed, options.data)
-            laboratory_file = pack.own_file(generator(name, "own file", seed))
-            files = (pack.generic_file, learned_cell(case, options.data), laboratory_file)
-            for results, file in zip(scores.values(), files, strict=True):
-                results += [
-                    score_of_another_day(case, file, day, soc_error, options.data)
-                    for day in DAYS
-                    for soc_error in SOC_ERRORS
-                ]
-        sys.stdout.write(f"| {' | '.join([name, *map(entry, scores.values())])} |\n")
+        cases = [Case(name, "full_weekly", days=options.days, seed=seed) for seed in options.seeds]
+        by_seed = [scores_by_file(case, options.data) for case in cases]
+        of_each_file = [list(itertools.chain(*scores)) for scores in zip(*by_seed, strict=True)]
+        sys.stdout.write(f"| {' | '.join([name, *map(entry, of_each_file)])} |\n")
         sys.stdout.flush()
+
+
+def scores_by_file(case: Case, data: Path) -> list[list[Score]]:
+    """Return the scores of the test days of one pack with the generic, the exported and the laboratory file."""
+    pack = draw_pack(case.cell, case.declared_ah, case.seed, data)
+    laboratory_file = pack.own_file(generator(case.cell, "own file", case.seed))
+    return [
+        [score_of_another_day(case, file, day, soc_error, data) for day in DAYS for soc_error in SOC_ERRORS]
+        for file in (pack.generic_file, learned_cell(case, data), laboratory_file)
+    ]
 
 
 def entry(scores: list[Score]) -> str:

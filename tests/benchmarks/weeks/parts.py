@@ -1,4 +1,4 @@
-"""Parts of the slow fit and of its surroundings, each with the changes that disable it."""
+"""Parts of the slow fit, of its anchors and of its hand-over, each with the changes that disable it."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -23,7 +23,7 @@ from bms_estimator.pack_model.unknowns import Unknowns
 Patch = tuple[ModuleType | type, str, object]
 """Module or class, the name of its attribute, and the attribute's value while the part is disabled."""
 ZERO = 1e-6
-"""Std of an unknown that is fixed. A std of 0 has no inverse. ``1 / ZERO`` is a limit that is never reached."""
+"""Std of a fixed unknown, because a std of 0 has no inverse. ``1 / ZERO`` serves as a limit that is never reached."""
 NO_AGING = Aging(by_use=0.0, by_time=0.0)
 """Aging that leaves the quantity as it is."""
 FEW_ROWS = 400
@@ -79,7 +79,7 @@ def count_direction_as_noise(model: VoltageModel, *_: object) -> None:
 
 
 def fix_hysteresis(*parts: float | None) -> Patch:
-    """Return a patch that fixes the fast and the slow part of the hysteresis; None leaves a part unknown with mean 1."""
+    """Return a patch that fixes the factors on the fast and the slow part of the hysteresis; None: unknown, with a mean of 1."""
 
     def change(p: Prior, _cell: CellCurves, _intervals: Intervals, u: Unknowns) -> None:
         for at, value in zip(range(u.hysteresis.start, u.hysteresis.stop), parts, strict=True):
@@ -90,7 +90,7 @@ def fix_hysteresis(*parts: float | None) -> Patch:
     return after_init(Prior, change)
 
 
-def of_cell(**values: float) -> Patch:
+def set_in_curves(**values: float) -> Patch:
     """Return a patch that sets attributes of the slow fit's ``CellCurves``."""
 
     def change(cell: CellCurves, *_: object) -> None:
@@ -112,16 +112,16 @@ def count_each_empty(e: Equations, *_: object) -> None:
     e.known_std = np.where(is_empty, e.rows["reference_std"][e.known], e.known_std)
 
 
-def links_without_gaps(cell: CellCurves, of: Intervals) -> Links:
+def links_without_gaps(cell: CellCurves, history_intervals: Intervals) -> Links:
     """Return the links of intervals that no gap separates."""
-    links = ORIGINAL_LINKS(cell, of)
-    is_kept = ~of.is_new_segment[links.interval]
+    links = ORIGINAL_LINKS(cell, history_intervals)
+    is_kept = ~history_intervals.is_new_segment[links.interval]
     return Links(*(getattr(links, name)[is_kept] for name in Links.__dataclass_fields__))
 
 
-def rough_derivatives(model: VoltageModel, x: Any, p: Any, *, smooth: bool) -> Any:
+def rough_derivatives(model: VoltageModel, x: Any, p: Any, *, use_file_slope: bool) -> Any:
     """Return the derivatives by the SOC with the slope of the fitted curve."""
-    return ORIGINAL_DERIVATIVES(model, x, p, smooth=False)
+    return ORIGINAL_DERIVATIVES(model, x, p, use_file_slope=False)
 
 
 ORIGINAL_LINKS = Links.of
@@ -132,7 +132,7 @@ PARTS: dict[str, Part] = {
     NOTHING: Part(),
     "slow fit": Part(has_slow_fit=False),
     "error of the OCV": Part(((prior, "curve_covariance", lambda _, soc: ZERO**2 * np.eye(soc.size)),)),
-    "shift of the OCV along SOC": Part(((prior, "MAX_SLIP_PART", 0.0),)),
+    "shift of the OCV along SOC": Part(((prior, "MAX_SLIP_FRACTION", 0.0),)),
     "error by direction (independent noise instead)": Part((after_init(VoltageModel, count_direction_as_noise),)),
     "error of R over SOC": Part(((prior, "SHAPE_STD", ZERO),)),
     "error of R over temperature": Part(((prior, "ARRHENIUS_STD", ZERO),)),
@@ -142,9 +142,9 @@ PARTS: dict[str, Part] = {
     "hysteresis": Part((fix_hysteresis(0.0, 0.0),)),
     "unknown hysteresis at the start of a segment": Part(((prior, "HYST_STD", ZERO),)),
     "unknown load at the start of a segment": Part(((prediction, "START_LOAD_C", 0.0),)),
-    "offset": Part((of_cell(offset_std_a=0.0),)),
-    "drift of the offset": Part((of_cell(offset_s=1e12),)),
-    "capacity": Part((of_cell(capacity_std=0.0), (prior, "CAPACITY", NO_AGING))),
+    "offset": Part((set_in_curves(offset_std_a=0.0),)),
+    "drift of the offset": Part((set_in_curves(offset_s=1e12),)),
+    "capacity": Part((set_in_curves(capacity_std=0.0), (prior, "CAPACITY", NO_AGING))),
     "drift of the capacity": Part(((prior, "CAPACITY", NO_AGING),)),
     "full anchors": Part(anchors={"full_v": np.inf}),
     "full anchors count once": Part(
@@ -161,7 +161,7 @@ PARTS: dict[str, Part] = {
     ),
     "end of an interval by the std of its charge": Part(((intervals, "COUNTED_STD", np.inf),)),
     "links across gaps": Part(((Links, "of", links_without_gaps),)),
-    "charge hidden in a gap, in the slow fit": Part((of_cell(event_probability=0.0),)),
+    "charge hidden in a gap, in the slow fit": Part((set_in_curves(event_probability=0.0),)),
     "any SOC after a gap, in the filter": Part(settings={"event_probability": 0.0}),
     "several starts": Part(((fit, "STARTS", fit.STARTS[:1]),)),
     "weights of minima with a small exponent": Part(((fit, "LIKELIHOOD_EXPONENT", 1.0),)),
@@ -172,7 +172,7 @@ PARTS: dict[str, Part] = {
     "std of the current gain": Part(gains={"current_gain_std": 0.0}),
     f"rows beyond {FEW_ROWS}, old ones merged": Part(((history, "MAX_ROWS", FEW_ROWS),)),
     f"rows beyond {FEW_ROWS}, old ones dropped": Part(
-        ((history, "MAX_ROWS", FEW_ROWS), (history, "thinned", lambda rows, _: rows))
+        ((history, "MAX_ROWS", FEW_ROWS), (history, "thin_old_rows", lambda rows, _: rows))
     ),
 }
 """Changes that disable each part, by its name in the table."""

@@ -1,4 +1,4 @@
-"""Runs of the estimator over recorded weeks, with a part of it disabled."""
+"""Runs of the estimator over simulated weeks, with a part of it disabled."""
 
 import itertools
 from dataclasses import replace
@@ -16,7 +16,9 @@ from tests.estimator.month.groups import mean_score
 from tests.estimator.month.run import AFTER_S, run_blocks
 
 
-def traced(case: Case, recording: Recording, part: Part, interval_s: float = DAY_S) -> tuple[Floats, Floats, Floats]:
+def run_without(
+    case: Case, recording: Recording, part: Part, interval_s: float = DAY_S
+) -> tuple[Floats, Floats, Floats]:
     """Return time [s], SOC and std of the SOC of a run with a part disabled.
 
     Args:
@@ -35,7 +37,7 @@ def traced(case: Case, recording: Recording, part: Part, interval_s: float = DAY
 
 def score_without(case: Case, recording: Recording, part: Part, first_day: int) -> Score | None:
     """Return the mean score of the days from ``first_day`` to the last, with a part disabled."""
-    time_s, soc, soc_std = traced(case, recording, part)
+    time_s, soc, soc_std = run_without(case, recording, part)
     true_soc = recording.truth["soc"][np.searchsorted(recording.samples["time_s"], time_s)]
     edges = np.searchsorted(time_s, DAY_S * np.arange(first_day - 1, case.days + 1))
     days = [

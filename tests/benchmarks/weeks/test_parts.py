@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.pack_model import fit
 from tests.benchmarks.weeks.parts import FEW_ROWS, NOTHING, PARTS
-from tests.benchmarks.weeks.runs import score_without, traced
+from tests.benchmarks.weeks.runs import run_without, score_without
 from tests.conftest import SHARED_DATA
 from tests.estimator.anywhere.score import score
 from tests.estimator.anywhere.use import DAY_S, drive
@@ -25,9 +25,8 @@ INTERVAL_S = 1.5 * DAY_S
 def everything(rng, pack):
     """Yield discharges to the cut-off, full charges, unseen charges and long rests, at -5 to 30 C: samples for every part."""
     hour = HOUR_S // SOLAR_STEP_S
-    for (
-        count
-    ) in itertools.count():  # every third cycle is discharged to the cut-off; the charge after the next is unseen
+    # every third cycle has a discharge to the cut-off; in the next cycle the charge is unseen
+    for count in itertools.count():
         room_c = rng.uniform(-5.0, 30.0) if count % 3 else 25.0
         yield Phase(drive(rng, pack.one_c, 0.3, 3 * hour), "empty", 0.15, room_c)
         yield Phase(np.zeros(hour), room_c=room_c)
@@ -57,30 +56,30 @@ def few_starts() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def estimates(recording: Recording, few_starts: None) -> np.ndarray:
     """Return SOC and std of the SOC with all parts."""
-    return np.array(traced(CASE, recording, PARTS[NOTHING], INTERVAL_S)[1:])
+    return np.array(run_without(CASE, recording, PARTS[NOTHING], INTERVAL_S)[1:])
 
 
 @pytest.mark.parametrize("name", [name for name in PARTS if name != NOTHING])
 def test_each_part_changes_the_estimates(recording, estimates, name: str) -> None:
-    changed = np.array(traced(CASE, recording, PARTS[name], INTERVAL_S)[1:])
+    changed = np.array(run_without(CASE, recording, PARTS[name], INTERVAL_S)[1:])
     assert np.isfinite(changed).all()
     assert np.abs(changed - estimates).max() > 1e-6
 
 
 def test_merging_old_rows_differs_from_dropping_them(recording) -> None:
     merged, dropped = (
-        traced(CASE, recording, part, INTERVAL_S) for name, part in PARTS.items() if str(FEW_ROWS) in name
+        run_without(CASE, recording, part, INTERVAL_S) for name, part in PARTS.items() if str(FEW_ROWS) in name
     )
     assert np.abs(merged[1] - dropped[1]).max() > 1e-6
 
 
 def test_a_part_is_disabled_in_its_run_only(recording, estimates) -> None:
-    traced(CASE, recording, PARTS["hysteresis"], INTERVAL_S)
-    assert np.array_equal(np.array(traced(CASE, recording, PARTS[NOTHING], INTERVAL_S)[1:]), estimates)
+    run_without(CASE, recording, PARTS["hysteresis"], INTERVAL_S)
+    assert np.array_equal(np.array(run_without(CASE, recording, PARTS[NOTHING], INTERVAL_S)[1:]), estimates)
 
 
 def test_the_score_is_that_of_the_last_days(recording) -> None:
-    time_s, soc, soc_std = traced(CASE, recording, PARTS["slow fit"])
+    time_s, soc, soc_std = run_without(CASE, recording, PARTS["slow fit"])
     is_last = time_s >= 3 * DAY_S
     true_soc = recording.truth["soc"][np.searchsorted(recording.samples["time_s"], time_s)]
     expected = score(time_s[is_last], soc[is_last], soc_std[is_last], true_soc[is_last], after_s=0.0)

@@ -10,7 +10,20 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SampleBlock
 from tests.estimator.month.packs import Pack, draw_pack, generator
 from tests.estimator.month.simulation import Aging, simulate_use
-from tests.estimator.month.sources import BMS, BMS_GAINS, BOARD, FAST_BOARD, SLOW_BOARD, SOLAR, SPLIT, Source, measure
+from tests.estimator.month.sources import (
+    BMS,
+    BMS_GAINS,
+    BOARD,
+    CHANGES,
+    FAST_BOARD,
+    MINUTE_SKEWED,
+    SKEWED,
+    SLOW_BOARD,
+    SOLAR,
+    SPLIT,
+    Source,
+    measure,
+)
 from tests.estimator.month.uses import USES
 
 NEW = Aging()
@@ -62,6 +75,8 @@ class Case:
         history = simulate_use(pack, use, self.aging, self.days, rng, self.source.fast_day)
         samples = measure(self.source, history, generator(self.cell, self.use, self.source.name, self.seed))
         seen = history[history["is_seen"]]
+        if self.source.topics:
+            seen = seen[np.searchsorted(seen["time_s"], samples["time_s"], "right") - 1]
         return Recording(samples, seen, pack.chemistry, pack.declared_ah, self.cell_file(pack))
 
     def cell_file(self, pack: Pack) -> CellModel:
@@ -94,6 +109,8 @@ CASES: tuple[Case, ...] = (
     *(Case(cell, "full_weekly", BMS) for cell in ("LG M50", "PF", "A123")),
     *(Case("NCR", "never_full", source, "own") for source in (BOARD, SPLIT, VOLTAGE_TOO_HIGH, CURRENT_TOO_HIGH)),
     *(Case("PF", "full_weekly", source) for source in (SPLIT, VOLTAGE_TOO_HIGH, CURRENT_TOO_HIGH)),
+    *(Case("NCR", "never_full", source, "own") for source in (SKEWED, MINUTE_SKEWED, CHANGES)),
+    *(Case("PF", "full_weekly", source) for source in (SKEWED, MINUTE_SKEWED, CHANGES)),
     *(Case(cell, "never_full", file="own") for cell in ("LG M50", "A123")),
     Case("PF", "bicycle", file="own"),
     Case("LG M50", "full_nightly", aging=FAST),

@@ -48,7 +48,7 @@ REAL_CAPTURES = {
 
 @dataclass(frozen=True)
 class Pack:
-    """True cell and what its owner declares."""
+    """True cell, its chemistry, and the capacity that its owner declares."""
 
     truth: Truth
     """Cell with its true capacity at the beginning."""
@@ -110,20 +110,20 @@ def open_circuit(cell: str, seed: int, data: Path) -> tuple[Floats, Floats]:
     mean_v = np.maximum.accumulate(0.5 * (low_v + high_v)) + 1e-5 * GRID
     if cell == "A123":
         return mean_v, np.maximum(0.5 * (high_v - low_v), 0.0)
-    # half of the difference also contains the overpotential; only in LFP at C/30 most of it is hysteresis
+    # half of the difference is hysteresis plus overpotential; the overpotential is negligible only for LFP at C/30
     return mean_v, OXIDE.hysteresis_v
 
 
 def slow_curve(path: Path, sign: int) -> Floats:
     """Return the voltage of a slow discharge (``sign`` 1) or charge (-1) at ``GRID`` [V].
 
-    The SOC is counted with the total charge of this load.
+    The SOC is the counted charge divided by the total charge of this discharge or charge.
     """
     capture = load_capture(path)
     steps_s = np.diff(capture["time_s"], prepend=capture["time_s"][0])
     charge_ah = np.cumsum(capture["current_a"] * steps_s) / 3600.0
     is_load = np.sign(np.round(capture["current_a"], 3)) == sign
-    part = np.abs(charge_ah[is_load] - charge_ah[is_load][0])
-    part /= part[-1]
-    curve_v: Floats = np.interp(1.0 - GRID if sign > 0 else GRID, part, capture["voltage_v"][is_load])
+    fraction = np.abs(charge_ah[is_load] - charge_ah[is_load][0])
+    fraction /= fraction[-1]
+    curve_v: Floats = np.interp(1.0 - GRID if sign > 0 else GRID, fraction, capture["voltage_v"][is_load])
     return curve_v

@@ -21,10 +21,9 @@ AFTER_S = 900.0
 FULL_SOC = 0.99
 """SOC at which a charge counts as full."""
 UNSEEN_CHARGES = ("bicycle",)
-"""Uses that are charged while the electronics are off. A charge current above ``FULL_SOC`` is then regeneration, and not the end
-of a charge."""
+"""Uses whose charges happen while the electronics are off. A charge current above ``FULL_SOC`` is then regeneration."""
 BLOCK = 100_000
-"""Samples between two copies of the trace, whose rows take 200 bytes."""
+"""Number of samples between two copies of the trace. It limits the memory, because a row of the trace takes 200 bytes."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ def run(case: Case, data: Path) -> list[Day]:
 
 
 def bound_of(case: Case, cell: CellCurves, truth: np.ndarray) -> float:
-    """Return the lower bound of the std of the SOC for the window of a history, with a full charge if one was seen."""
+    """Return the lower bound of the std of the SOC for the SOCs of a history, with a full charge if the estimator sees one."""
     soc = truth["soc"]
     is_full = (soc > FULL_SOC) & (truth["current_a"] < 0.0)
     full = case.use not in UNSEEN_CHARGES and bool(is_full.any())

@@ -12,7 +12,7 @@ from tests.estimator.month.packs import Pack
 from tests.estimator.month.uses import Phase, Use
 
 FAST_SAMPLES = 100
-"""Samples a second on a day that is simulated at the rate of a board."""
+"""Number of samples a second on the day that is simulated at a board's sample rate."""
 TRUE_VALUES = np.dtype(
     [
         ("time_s", "f8"),
@@ -33,21 +33,21 @@ class Aging:
 
     name: str = ""
     capacity_per_day: float = 0.0
-    """Fraction of the first capacity that is lost each day."""
+    """Loss of capacity each day, as a fraction of the initial capacity."""
     resistance_per_day: float = 0.0
-    """Fraction of the first resistances that is gained each day."""
+    """Increase of the resistances each day, as a fraction of the initial ones."""
     resistance_per_day2: float = 0.0
-    """Fraction of the first resistances that is gained by the square of the time in days."""
+    """Increase of the resistances per day squared, as a fraction of the initial ones."""
     ocv_v_per_day: float = 0.0
-    """Change of the OCV at SOC 0.5 each day [V]; it decreases to 0 at SOC 0 and 1, which the voltage limits define."""
+    """Change of the OCV at SOC 0.5 each day [V]. The change is 0 at SOC 0 and 1, because the voltage limits define these."""
 
     def resistance_ratio(self, days: float) -> float:
-        """Return the resistances divided by the first ones."""
+        """Return the ratio of the resistances to the initial ones."""
         return 1.0 + self.resistance_per_day * days + self.resistance_per_day2 * days**2
 
 
 class SimulatedPack:
-    """Pack whose phases are simulated one after the other, from rest after a charge. It satisfies ``PackState``."""
+    """Pack whose phases are simulated one after the other. It begins at rest after a charge. It satisfies ``PackState``."""
 
     def __init__(self, pack: Pack, use: Use, aging: Aging, soc: float, fast_day: int = 0) -> None:
         self.pack, self.aging, self.fast_day, self.usual_step_s = pack, aging, fast_day, use.step_s
@@ -71,7 +71,7 @@ class SimulatedPack:
         before, step_s = self.state.copy(), self.usual_step_s / self.samples_per_step
         request_a = np.repeat(phase.current_a, self.samples_per_step)
         history = self.simulate(phase, request_a, step_s)
-        count = length(phase, history)
+        count = samples_until_end(phase, history)
         if count < history.size:
             self.state = before  # the next phase begins with the state at the end of this one
             history = self.simulate(phase, request_a[:count], step_s)
@@ -97,7 +97,7 @@ class SimulatedPack:
         return history
 
 
-def length(phase: Phase, history: np.ndarray) -> int:
+def samples_until_end(phase: Phase, history: np.ndarray) -> int:
     """Return the number of samples until the end of a phase."""
     ends = {
         "time": lambda: np.zeros(history.size, dtype=bool),
@@ -108,7 +108,7 @@ def length(phase: Phase, history: np.ndarray) -> int:
     return int(np.argmax(ends)) if ends.any() else history.size
 
 
-def parts(use: Use, pack: SimulatedPack, rng: np.random.Generator, days: int) -> Iterator[np.ndarray]:
+def simulate_phases(use: Use, pack: SimulatedPack, rng: np.random.Generator, days: int) -> Iterator[np.ndarray]:
     """Yield the true values of each phase of these days."""
     phases = use.phases(rng, pack)
     while pack.time_s < days * DAY_S:
@@ -123,5 +123,5 @@ def simulate_use(
     ``fast_day`` is the number of the day with ``FAST_SAMPLES`` times as many samples; 0: none.
     """
     simulated = SimulatedPack(pack, use, aging, rng.uniform(*use.initial_soc), fast_day)
-    history = np.concatenate(list(parts(use, simulated, rng, days)))
+    history = np.concatenate(list(simulate_phases(use, simulated, rng, days)))
     return history[history["time_s"] < days * DAY_S]

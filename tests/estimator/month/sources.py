@@ -7,6 +7,7 @@ import numpy as np
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.settings.sampling import Sampling
+from tests.estimator.month.topics import Topics, paired
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,16 @@ class Source:
     """Std of the current's gain that the owner configures."""
     voltage_period_s: float = 0.0
     """Time between two voltages that come on a topic of their own [s]; 0: a voltage in each sample."""
+    topics: Topics | None = None
+    """Topics of voltage and current, if they are measured at different times."""
     fast_day: int = 0
     """Number of the day on which a board delivers 100 samples a second; 0: none."""
 
     @property
     def sampling(self) -> Sampling:
         """Sampling that the owner configures."""
-        return Sampling(self.step_s, self.ampere_step, self.dead_band_a, self.voltage_gain_std, self.current_gain_std)
+        period_s = self.topics.interval_s if self.topics else self.step_s
+        return Sampling(period_s, self.ampere_step, self.dead_band_a, self.voltage_gain_std, self.current_gain_std)
 
 
 BOARD = Source("board")
@@ -54,6 +58,27 @@ BMS = Source("bms", volt_step=0.01, volt_noise_std=0.0, ampere_step=0.1, **BMS_G
 """BMS with coarse steps, of one cell."""
 SPLIT = Source("split", voltage_period_s=10.0, **BMS_GAINS)
 """Voltage and current on separate topics."""
+SKEWED = Source("5 s skewed", topics=Topics(current_shift_s=5.0), **BMS_GAINS)
+"""Voltage and current on separate topics each 10 s, with 5 s between them."""
+MINUTE_SKEWED = Source(
+    "30 s skewed",
+    topics=Topics(voltage_period_s=60.0, current_period_s=60.0, current_shift_s=30.0, interval_s=60.0),
+    **BMS_GAINS,
+)
+"""Zigbee meter that reports voltage and current each minute, with 30 s between them."""
+CHANGES = Source(
+    "changes",
+    topics=Topics(
+        voltage_period_s=60.0,
+        current_period_s=60.0,
+        current_shift_s=30.0,
+        dead_band_v=0.01,
+        dead_band_a=0.05,
+        interval_s=60.0,
+    ),
+    **BMS_GAINS,
+)
+"""The same meter if it reports only changes, or a value after ten minutes."""
 SOLAR = Source("solar", step_s=10.0, ampere_step=0.01, dead_band_a=0.1, offset_a=0.03, **BMS_GAINS)
 """Charge controller of a solar system, for some tens of ampere-hours. Steps of 10 mV of 16 cells in series are below 1 mV
 of one cell."""
@@ -71,7 +96,7 @@ def measure(source: Source, history: np.ndarray, rng: np.random.Generator) -> Sa
     if source.voltage_period_s:
         samples = pair_with_last_voltage(samples, round(source.voltage_period_s / source.step_s))
     seen: SampleBlock = samples[history["is_seen"]]
-    return seen
+    return paired(source.topics, seen) if source.topics else seen
 
 
 def rounded(values: Floats, step: float) -> Floats:

@@ -1,4 +1,4 @@
-"""Files of simulated samples with the true SOC, for work on a fit of weeks."""
+"""Files of simulated samples with the true SOC, as input of experiments outside the tests."""
 
 from pathlib import Path
 

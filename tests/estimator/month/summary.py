@@ -18,13 +18,13 @@ SMALL_CASES = (
     Case("LFP", "solar", SOLAR, declared_ah=20.0, days=7),
     Case("LG M50", "bicycle", days=7),
 )
-"""Cases of the summary. They need no captures from outside the repository, and together 20 s of one core."""
+"""Cases of the summary. They need no captures from outside the repository. Together they take 20 s of one core."""
 COLUMNS = ("case", "days", "rmse", "cover", "std", "score")
 DIGITS = 2
 """Decimal digits of the table."""
 TOLERANCE = 0.02
-"""Tolerance of the numbers [%]. They are rounded to 0.01, and exp and log of other processors differ in the last bit. A change of
-every voltage by 1e-9 V changes the numbers by at most 0.001."""
+"""Tolerance of the numbers [%], which are rounded to 0.01. The functions exp and log differ in the last bit between processors;
+a change of every voltage by 1e-9 V changes the numbers by at most 0.001."""
 
 Table = dict[tuple[str, str], tuple[float, ...]]
 """RMSE, share inside two std, std and score [%] by case and days."""

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bms_estimator.model.sample import SampleStatus
 from tests.benchmarks.observability import curves
 from tests.conftest import SHARED_DATA
 from tests.estimator.anywhere.truth import rest_state, simulate, simulate_from
@@ -16,6 +17,7 @@ from tests.estimator.month.run import FULL_SOC, bound_of, run
 from tests.estimator.month.simulation import FAST_SAMPLES, Aging, SimulatedPack
 from tests.estimator.month.sources import BMS, BOARD, SOLAR, SPLIT, Source
 from tests.estimator.month.summary import Table, changes, read, write
+from tests.estimator.month.topics import Topics, paired
 from tests.estimator.month.uses import SHED_SOC, USES, Phase
 
 AGED = Aging("1 % a day", 0.01, 0.02)
@@ -34,7 +36,7 @@ def step_s(use: str) -> float:
 
 @pytest.mark.parametrize("use", USES)
 def test_the_true_soc_is_the_counted_charge_over_the_present_capacity(use: str) -> None:
-    """Electronics that are off hide samples of the bicycle, so the SOC is compared within each run of samples."""
+    """The bicycle has gaps, because its electronics are off during charges. The SOC is compared between adjacent samples only."""
     source = SOLAR if step_s(use) > 1.0 else BOARD
     truth = draw(Case("LFP", use, source, days=2, aging=AGED)).truth
     is_next = np.isclose(np.diff(truth["time_s"]), step_s(use))
@@ -63,6 +65,16 @@ def test_a_split_source_repeats_each_voltage_for_ten_seconds() -> None:
     voltage_v = draw(replace(TWO_DAYS, source=SPLIT)).samples["voltage_v"].reshape(-1, 10)
     assert (voltage_v == voltage_v[:, :1]).all()
     assert np.unique(voltage_v[:, 0]).size > 100
+
+
+def test_a_skewed_source_has_each_voltage_and_each_current_once_at_its_own_time() -> None:
+    block = draw(TWO_DAYS).samples[:600]
+    samples = paired(Topics(current_shift_s=5.0), block)
+    for bit, name, shift in ((SampleStatus.VOLTAGE_HELD, "voltage_v", 0), (SampleStatus.CURRENT_HELD, "current_a", 5)):
+        new = samples[samples["status"] & bit == 0][1:-1]
+        assert new["time_s"] % 10.0 == pytest.approx(shift, abs=1.0)
+        assert new[name] == pytest.approx(block[name][np.floor(new["time_s"]).astype(int)], abs=1e-6)
+        assert np.diff(new["time_s"]) == pytest.approx(10.0)
 
 
 def test_the_charger_ends_each_night_within_one_percent_of_full() -> None:

@@ -17,9 +17,9 @@ HOUR_S = 3600
 MAX_CHARGE_S = 14 * HOUR_S
 """Maximum duration of a charge; the charger ends it earlier [s]."""
 FULL_AFTER_S = 5.5 * DAY_S
-"""Time after a full charge from which on the next charge is a full one [s]. With the wait for this charge, it makes a week."""
+"""Time after a full charge from which on the next charge is a full one [s]. The next charge begins about 1.5 days later."""
 LOAD_C, LOAD_S = (0.25, 2.0), 60
-"""Range of the random loads of ``full_often`` [C], and duration of each [s]."""
+"""Range of the random loads of ``full_often``, as C-rates, and duration of each [s]."""
 YEAR_STEP_S = 10
 """Time between two samples of a simulated year [s]. At 1 s it would take too long."""
 SHED_SOC, CURTAIL_SOC = 0.3, 0.9
@@ -89,7 +89,7 @@ def trip(rng: np.random.Generator, pack: PackState, empty_soc: float = EMPTY_SOC
 
 
 def full_charge(pack: PackState, rate_c: float) -> Phase:
-    """Return a charge to the voltage limit of the charger and C/20."""
+    """Return a charge that ends at C/20 at the voltage limit of the charger."""
     return Phase(np.full(MAX_CHARGE_S, -rate_c * pack.one_c), "stopped")
 
 
@@ -103,16 +103,18 @@ def never_full(
     pack: PackState,
     empty_soc: float = EMPTY_SOC,
     charge_below_soc: float = 0.5,
-    least_soc: float = 0.7,
+    min_charged_soc: float = 0.7,
 ) -> Iterator[Phase]:
-    """Yield pairs of drives to ``empty_soc`` with rests, followed by a charge to SOC ``least_soc``..0.95 if the SOC is below
-    ``charge_below_soc``."""
+    """Yield two drives to ``empty_soc`` with rests, and then, below SOC ``charge_below_soc``, a charge.
+
+    The charge ends at a random SOC between ``min_charged_soc`` and 0.95.
+    """
     while True:
         for _ in range(2):
             yield trip(rng, pack, empty_soc)
             yield rest(rng, 0.5, 4.0)
         if pack.soc < charge_below_soc:
-            yield charge_to(pack, 0.3, rng.uniform(least_soc, 0.95))
+            yield charge_to(pack, 0.3, rng.uniform(min_charged_soc, 0.95))
             yield rest(rng, 0.5, 8.0)
 
 
@@ -174,7 +176,7 @@ def sampled(use: PhasesOf, step_s: int) -> PhasesOf:
 
 
 def solar(rng: np.random.Generator, pack: PackState) -> Iterator[Phase]:
-    """Yield nights with a small load and days with sun, SOC 0.3 to 0.9, at 10 s."""
+    """Yield nights with a small load and days with sun, at SOC 0.3 to 0.9."""
     while True:
         yield night(rng, pack)
         yield sunny_day(rng, pack, rng.uniform(max(pack.soc, 0.5), max(pack.soc, CURTAIL_SOC)))
@@ -236,7 +238,7 @@ USES = {
     "never_full": Use(never_full),
     "never_full_above_0.30": Use(partial(never_full, empty_soc=0.3, charge_below_soc=0.6), initial_soc=(0.5, 0.9)),
     "never_full_above_0.50": Use(
-        partial(never_full, empty_soc=0.5, charge_below_soc=0.7, least_soc=0.8), initial_soc=(0.6, 0.9)
+        partial(never_full, empty_soc=0.5, charge_below_soc=0.7, min_charged_soc=0.8), initial_soc=(0.6, 0.9)
     ),
     "empty_weekly": Use(empty_weekly),
     "full_nightly": Use(full_nightly),

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from bms_estimator.fleet.identification.reidentify import reidentify
+from bms_estimator.fleet.identification.reidentify import reidentify, single_cell_settings
 from bms_estimator.fleet.packs.pack_row import PackSpec
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.config_file import parse_toml
+from bms_estimator.settings.charge_limits import ChargeLimits
 from tests.calibration.simulated_load import TRUTH, capture, wrong_start
 
 SERIES, PARALLEL = 14, 4
@@ -99,3 +100,12 @@ def test_samples_at_rest_are_not_enough(samples):
 def test_samples_with_gaps_and_time_steps_back_give_a_cell(samples):
     disordered = np.concatenate([samples[:1800], samples[1860:3000], samples[2900:4000], samples[4200:]])
     assert reidentify("house", disordered, PACK_SPEC, WRONG_CELL_TOML).cell_file
+
+
+def test_limits_and_offset_of_a_pack_are_converted_to_one_cell():
+    limits = {"full_voltage_v": 58.1, "tail_current_a": 2.0, "cutoff_voltage_v": 42.0, "current_offset_std_a": 0.1}
+    settings = single_cell_settings(PACK_SPEC.model_copy(update=limits))
+    assert settings.charge_limits == ChargeLimits(58.1 / SERIES, 2.0 / PARALLEL, 42.0 / SERIES)
+    assert settings.identifier.current_offset_std_a == 0.1 / PARALLEL
+    assert settings.sensor.voltage_resolution_v == 0.01 / SERIES
+    assert settings.sampling.current_resolution_a == 0.01 / PARALLEL

@@ -4,10 +4,22 @@ import pytest
 
 from bms_estimator.fleet.packs.csv_table import check_models, read_table, table_lines
 from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK, PackRegistry
-from bms_estimator.fleet.packs.pack_row import COLUMNS, PackRow, PackSpec, encode_row, known_cells, settings_of
+from bms_estimator.fleet.packs.pack_row import (
+    COLUMNS,
+    PackRow,
+    PackSpec,
+    decode_row,
+    encode_row,
+    known_cells,
+    settings_of,
+)
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.errors import UserError
+from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
+from bms_estimator.settings.observer import IdentifierSettings
+from bms_estimator.settings.pack import PackSettings
+from bms_estimator.settings.sensor import SensorSettings
 
 LFP_SPEC = PackSpec(cell="lfp", capacity_ah=100.0, series=16, voltage_resolution_v=0.01)
 ROW = "house,lfp,100,16"
@@ -53,7 +65,10 @@ def test_table_may_have_either_separator_and_line_end_and_a_byte_order_mark(writ
         ("house,,1,1", "line 2, column cell is empty; it must be generic chemistry lfp, nmc"),
         ("house,../x,1,1", "line 2, column cell = '../x': String should match pattern"),
         ("house,x.toml,1,1", "line 2, column cell = 'x.toml': no such file beside the table"),
-        ("house,lfp,-6.6,1", "line 2, column capacity_ah = '-6.6': Input should be greater than 0 (capacity of one"),
+        (
+            "house,lfp,-6.6,1",
+            "line 2, column capacity_ah = '-6.6': Input should be greater than 0 (capacity of the cell",
+        ),
         ("house,lfp,1e999,1", "line 2, column capacity_ah = '1e999'"),
         ("house,lfp,nan,1", "line 2, column capacity_ah = 'nan': must be a number"),
         ("house,lfp,1,1.5", "line 2, column series = '1.5'"),
@@ -123,6 +138,41 @@ def test_row_of_the_table_gives_the_settings_of_a_pack():
     )
     assert (settings.sensor.voltage_resolution_v, settings.sampling.period_s) == (0.01, 1.0)
     assert settings.sampling.current_dead_band_a == 0.2
+
+
+def test_columns_are_the_settings_of_a_pack_file_that_change_an_estimate():
+    """A new setting must become a column, unless the edge or the worker handles it."""
+    handled_by_the_edge = {"port", "serial", "address", "baud", "sample_rate_hz", "current_sign"}
+    fixed_by_the_worker = {"enabled", "pack_model"}
+    settings = {name for section in (PackSettings, SensorSettings, IdentifierSettings) for name in section.model_fields}
+    assert settings - handled_by_the_edge - fixed_by_the_worker == set(COLUMNS) - {"pack"} | {"name"}
+
+
+def test_limits_and_uncertainties_of_a_row_are_those_of_a_pack_file(write_table):
+    pack = {"full_voltage_v": 54.4, "tail_current_a": 4.0, "cutoff_voltage_v": 44.8}
+    identifier = {"current_offset_std_a": 0.1, "capacity_std": 0.2, "soc_std": 0.1, "hysteresis_v": 0.02}
+    values = pack | identifier
+    header, row = ",".join(values), ",".join(map(str, values.values()))
+    path = write_table(f"pack,cell,capacity_ah,series,{header}\nhouse,lfp,280,16,{row}\n")
+    settings = settings_of(read_table(path).packs["house"].spec)
+    assert settings.charge_limits == ChargeLimits(**pack)
+    assert settings.identifier == IdentifierSettings(**identifier, pack_model=False)
+
+
+def test_full_voltage_below_the_cutoff_voltage_is_reported_as_in_a_pack_file(write_table):
+    message = "full_voltage_v = 44: must be above cutoff_voltage_v = 54"
+    path = write_table("pack,cell,capacity_ah,full_voltage_v,cutoff_voltage_v\nhouse,lfp,280,44,54\n")
+    assert error_of(path) == f"line 2, column {message}"
+    with pytest.raises(ValueError, match=message):
+        PackSettings(full_voltage_v=44.0, cutoff_voltage_v=54.0)
+    with pytest.raises(ValueError, match=message):
+        decode_row(b'{"cell":"lfp","capacity_ah":280,"full_voltage_v":44,"cutoff_voltage_v":54}')
+
+
+def test_row_of_a_version_without_limits_is_read_and_written_as_before():
+    data = b'{"cell":"lfp","capacity_ah":280.0,"series":16,"protocol":"jk"}'
+    assert decode_row(data).charge_limits == NO_LIMITS
+    assert encode_row(decode_row(data)) == data
 
 
 def test_all_shipped_cells_are_valid():

@@ -1,6 +1,7 @@
 """Partition: after any event the state of each pack equals that of an estimator run over its samples."""
 
 import json
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
+from bms_estimator.cli.fleet.packs import pack_files
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator, new_estimator
 from bms_estimator.fleet.hour_row import Hour
+from bms_estimator.fleet.packs.pack_registry import PackRegistry
+from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.fleet.worker import partition as partition_module
 from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY, MAX_EARLY_REPEATS, REQUEST_EVERY
 from bms_estimator.fleet.worker.block_processor import MAX_PART_SAMPLES, BlockProcessor
@@ -19,6 +23,7 @@ from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import load_any
 from bms_estimator.model.payloads import Estimate, ParameterReport
+from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.sources.captures.replay import Replay
@@ -564,3 +569,35 @@ def test_packs_with_different_cells_do_not_affect_each_other(samples) -> None:
         estimator = make_estimator(*row)
         estimator.run(samples[:200])
         assert_state_equals(stream, name, estimator.record)
+
+
+def charge_to(full_v: float) -> SampleBlock:
+    """Return an hour of charge with a small current at a voltage, between two rests."""
+    current_a = np.r_[np.zeros(60), np.full(3600, -0.06 * CELL.cell.capacity_ah), np.zeros(300)]
+    samples = np.zeros(current_a.size, dtype=SAMPLE)
+    samples["time_s"], samples["current_a"], samples["temperature_c"] = np.arange(current_a.size), current_a, 25.0
+    samples["voltage_v"] = np.where(current_a < 0.0, full_v, full_v - 0.01)
+    return samples
+
+
+def test_packs_that_differ_in_their_limits_have_the_states_of_single_services() -> None:
+    """The limits are the only difference, so that a type shared by both packs would give one of them the other's limits."""
+    samples, registry = charge_to(4.1), PackRegistry()
+    specs = {
+        "limited": PackSpec(cell="ncr18650", full_voltage_v=4.1, tail_current_a=0.3, cutoff_voltage_v=3.0),
+        "default": PackSpec(cell="ncr18650"),
+    }
+    for name, spec in specs.items():
+        registry.set_row(name, encode_row(spec))
+    stream = Stream(Partition(5, registry))
+    for data in blocks_of(samples, size=600):
+        for name in specs:
+            stream.send(name, data)
+    full_anchors = []
+    for name in specs:
+        pack_file = tomllib.loads(pack_files(name, registry)["pack.toml"])
+        estimator = make_estimator(Settings.model_validate(pack_file), CELL)
+        estimator.run(samples)
+        assert_state_equals(stream, name, estimator.record)
+        full_anchors.append(estimator.record[0]["anchors"]["full_anchors"])
+    assert full_anchors == [1, 0]

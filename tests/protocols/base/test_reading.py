@@ -65,6 +65,21 @@ def test_a_line_marks_a_held_voltage(line: bytes, held: bool) -> None:
 
 
 @pytest.mark.parametrize(
+    ("line", "held"),
+    [
+        (b'{"voltage_v": 6.6, "current_a": 2, "current_held": true}', True),
+        (b"V=6.6 I=2 current_held=0", False),
+        (sample_json_line(6.6, 2.0, current_held=True), True),
+        (sample_json_line(6.6, 2.0, voltage_held=True), False),
+    ],
+)
+def test_a_line_marks_a_held_current(line: bytes, held: bool) -> None:
+    reading = read_line(line)
+    assert reading is not None
+    assert (reading.voltage_v, reading.current_a, reading.current_held) == (6.6, 2.0, held)
+
+
+@pytest.mark.parametrize(
     "line",
     [b"V=6.6 I=2 cells=3.31,3.29", b'{"V": 6.6, "I": 2, "cells": [3.31, 3.29]}', b"cells_mV=3310,3290 V=6.6 I=2"],
 )

@@ -256,18 +256,35 @@ def test_a_voltage_is_used_once_and_the_samples_of_later_currents_mark_it() -> N
     assert len(samples) >= 20
 
 
-def test_a_voltage_waits_for_the_current_that_is_nearest_in_time() -> None:
+def test_a_voltage_without_a_new_current_is_sent_at_its_own_time_and_marks_the_current() -> None:
     assembler = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, interval_s=10.0))
     assert feed(assembler, [("i", "1"), ("v", "52")]) == [{"voltage_v": 52.0, "current_a": 1.0}]
-    assembler.add_message("v", b"51", 9.0, retained=False)  # 9 s after the last current
-    assert assembler.line(9.9) == b""
-    assembler.add_message("i", b"5", 10.0, retained=False)
-    assert json.loads(assembler.line(10.0)) == {"voltage_v": 51.0, "current_a": 5.0}
-    assembler.add_message("v", b"50", 12.0, retained=False)  # the last current is 2 s old
-    assert assembler.wait_s(12.0) == 2.0
-    assert json.loads(assembler.line(14.0)) == {"voltage_v": 50.0, "current_a": 5.0}
-    assembler.add_message("v", b"50", 36.0, retained=False)
-    assert assembler.wait_s(36.0) == 10.0  # not longer than the expected sample period
+    assert feed(assembler, [("v", "51")], 5.0) == [{"voltage_v": 51.0, "current_a": 1.0, "current_held": 1}]
+    assert feed(assembler, [("i", "5")], 10.0) == [{"voltage_v": 51.0, "current_a": 5.0, "voltage_held": 1}]
+
+
+def test_values_once_a_minute_and_half_a_minute_apart_give_samples_without_further_settings() -> None:
+    assembler = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, interval_s=60.0))
+    samples = []
+    for minute in range(3):
+        samples += feed(assembler, [("v", "52")], 60.0 * minute) + feed(assembler, [("i", "1")], 60.0 * minute + 30.1)
+    assert [sample.get("voltage_held", 0) for sample in samples] == [1, 0, 1, 0, 1]
+    assert [sample.get("current_held", 0) for sample in samples] == [0, 1, 0, 1, 0]
+    assert assembler.counters["stale"] == 1  # the first voltage, before any current
+
+
+def test_the_values_of_a_publisher_that_sends_only_changes_hold_for_its_longest_silence() -> None:
+    settings = source(voltage={"topic": "v"}, current={"topic": "i"}, interval_s=60.0, max_silent_s=300.0)
+    assembler = SampleAssembler(settings)
+    assert feed(assembler, [("v", "52"), ("i", "1")]) == [{"voltage_v": 52.0, "current_a": 1.0}]
+    now_s, repeated_s = 0.0, []
+    while (wait_s := assembler.wait_s(now_s)) is not None:
+        now_s += wait_s
+        if line := assembler.line(now_s):
+            assert json.loads(line) == {"voltage_v": 52.0, "current_a": 1.0, "voltage_held": 1}
+            repeated_s.append(now_s)
+    assert repeated_s == [90.0, 180.0, 270.0, 360.0]
+    assert feed(assembler, [("i", "2")], 500.0) == []  # the voltage is too old
 
 
 def test_temperature_is_used_for_five_minutes() -> None:
