@@ -50,11 +50,11 @@ def anchor_settings(
     """
     record = np.zeros(1, dtype=ANCHOR_SETTINGS)
     p, one_c_a = record[0], pack.cell.capacity_ah
-    full_v, min_v = limits.full_voltage_v, np.inf
+    full_v, max_v = limits.full_voltage_v, np.inf
     if full_v is None:
-        full_v, min_v = ocv_v[-1], np.interp(NEARLY_FULL_SOC, _soc_grid(ocv_v), ocv_v)
+        full_v, max_v = ocv_v[-1], np.interp(NEARLY_FULL_SOC, _soc_grid(ocv_v), ocv_v)
     p["charger_v"] = full_v
-    p["full_v"] = min((1.0 - VOLTAGE_ERROR) * full_v, min_v) - voltage_resolution_v
+    p["full_v"] = min((1.0 - VOLTAGE_ERROR) * full_v, max_v) - voltage_resolution_v
     p["corrects_full"] = soc_at_full(ocv_v, limits) >= MIN_FULL_SOC
     if limits.tail_current_a is None:
         steep_v = MAX_STEEP_END_C * one_c_a * max_ohm

@@ -179,7 +179,7 @@ class Estimator:
             unseen_s: Duration of the gap before the next sample [s]; infinite if unknown. The load may have changed in
                 the gap.
         """
-        # inf: the time of the next sample is not compared with that of the last one
+        # inf: the next time step is not computed from the time of the last sample
         self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
         if self.identifying:
             self.record["filter"]["soc"] = self.state["soc"]

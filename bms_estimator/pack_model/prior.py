@@ -97,7 +97,7 @@ class Prior:
         self.precision[np.ix_(at, at)] += np.outer(factors, factors) / std**2
 
     def _add_constants(self, u: Unknowns) -> None:
-        """Add hysteresis, temperature coefficients and the rate of aging."""
+        """Add hysteresis, loads before segments, temperature coefficients and the rate of aging."""
         self.mean[u.hysteresis] = HYSTERESIS_MEAN
         diagonal = self.precision.ravel()[:: u.size + 1]
         for part, std in (

@@ -39,8 +39,7 @@ class Unknowns:
     start_hysteresis: slice
     """Fast and slow part of the hysteresis at the start of each segment."""
     start_load: slice
-    """Load before the RC pairs were reset at the start of each segment, as far as the slow pairs have kept it, relative to its
-    std."""
+    """Load before the start of each segment, when the RC pairs are reset, in std (``prediction.START_LOAD_C``)."""
     entropy: slice
     """Error of the OCV's temperature coefficient [V/K]."""
     arrhenius: slice

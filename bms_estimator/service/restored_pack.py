@@ -53,8 +53,8 @@ def restore_pack(
         adopt_curves(estimator.settings_record[0]["filter"], estimator.cell_file_settings, state_fit)
     restored, outcome = _restore_state(estimator, content)
     if content.curves and (pack_model is None or state_fit is None):
-        # Without a slow fit the resistances are converted to the curves of the cell file. If the saved curves are damaged, the
-        # resistances are relative to unknown curves, and their std becomes that of the cell file again.
+        # Without a slow fit the resistances are converted to the curves of the cell file. If the saved curves are damaged, this
+        # is impossible, and the resistances start with the std of the cell file again.
         return_to_cell_file(estimator)
     if pack_model:
         pack_model.resume(content.unseen_s if restored else math.inf, restored=restored)

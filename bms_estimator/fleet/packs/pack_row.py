@@ -44,8 +44,7 @@ class _CellName(Strict):
 class PackSpec(IdentifierValues, PackValues, _CellName):
     """Specification that many packs share: values of the sections ``[pack]``, ``[identifier]`` and ``[sensor]`` of a settings file.
 
-    Columns of ``[pack]`` and ``[identifier]`` are those of the settings file. Columns of ``[sensor]`` have another default,
-    that of the protocol.
+    The section ``[sensor]`` has its own columns, because their defaults are those of ``protocol``.
     """
 
     protocol: Annotated[str, OneOf(DEVICES)] = Field(

@@ -58,9 +58,8 @@ class _EstimatorKey:
 def config_digest(settings: Settings, cell: PackModel) -> Digest:
     """Return the digest of all values that a pack's estimator is created from."""
     sensor, limits = settings.sensor, settings.charge_limits
-    with_limits = (
-        () if limits == NO_LIMITS else (limits,)
-    )  # the digest of a pack without limits is that of earlier versions
+    # the digest of a pack without limits is that of earlier versions
+    optional = () if limits == NO_LIMITS else (limits,)
     parts = (
         settings.observer,
         settings.identifier,
@@ -70,7 +69,7 @@ def config_digest(settings: Settings, cell: PackModel) -> Digest:
         sensor.voltage_resolution_v,
         sensor.voltage_noise_v,
         sensor.current_sign,
-        *with_limits,
+        *optional,
     )
     return _digest(hashlib.sha256(repr(parts).encode()).digest())
 

@@ -63,10 +63,7 @@ HISTORY = np.dtype(
     [
         ("enabled", "i8"),  # 1: rows are recorded
         ("elapsed_s", "f8"),  # time since the history began [s]
-        (
-            "event_s",
-            "f8",
-        ),  # elapsed_s at which ``kernels.step.run`` returns to its caller, for example to begin a fit [s]
+        ("event_s", "f8"),  # elapsed_s at which ``kernels.step.run`` returns, for example to begin a fit [s]
         ("segment", "i8"),
         ("gap_s", "f8"),
         ("direction", "i8"),

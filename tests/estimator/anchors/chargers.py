@@ -1,6 +1,6 @@
 """Simulated chargers, and the full anchors that the estimator finds.
 
-    python -m tests.estimator.chargers [PART OF A NAME]
+    python -m tests.estimator.anchors.chargers [PART OF A NAME]
 
 prints the highest true SOC of each case, and the hour, the true SOC and the std of each full anchor, with the SOC of the
 estimator before it. The OCV is that of the cell file. SOC 1 is its end, which a charger reaches only after hours.

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.estimator.chargers import anchors, cases
+from tests.estimator.anchors.chargers import anchors, cases
 
 MAX_STDS = 1.25
 """Maximum error of an anchor in its std. The end of a charge is always too early, so that the error has one sign."""
