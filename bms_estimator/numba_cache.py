@@ -1,4 +1,4 @@
-"""Compile kernels with a disk cache that notices every changed source file.
+"""Compile kernels once for each signature, with a disk cache that notices every changed source file.
 
 numba checks only the file of the compiled function. It does not notice a change in the files of the functions that the
 kernel calls, or of the constants that it compiles in. Therefore the cache folder carries a hash of all these files.
@@ -9,26 +9,46 @@ would run.
 """
 
 import contextlib
+import fcntl
 import hashlib
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, TypeVar, cast
 
 import numba
-from numba import njit
-from numba.core.caching import Cache, IndexDataCacheFile
+from numba import types
+from numba.core.caching import Cache, IndexDataCacheFile, _CacheLocator
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
-__all__ = ["COMPILED_IN", "njit"]
+__all__ = [
+    "CACHE_FOLDER",
+    "COMPILED_IN",
+    "cache_folders",
+    "count_cached_kernels",
+    "count_kernels",
+    "njit",
+    "source_digest",
+]
 
+Function = TypeVar("Function", bound=Callable[..., Any])
 DIGEST_BYTES = 32
+LOCK_FILE = "lock"
+"""File in the cache folder. A process that compiles a kernel locks one byte of this file. Its offset is a hash of the
+kernel's name."""
+OFFSET_BYTES = 7
+"""Length of the hash that is the offset of a lock [bytes]. It is long enough that two kernels have different offsets, and
+short enough for a file offset of 63 bits."""
 # Any, because methods of these classes are replaced below
 _Cache: Any = Cache
 _CacheFile: Any = IndexDataCacheFile
+_Locator: Any = _CacheLocator
 _Dispatcher: Any = Dispatcher
+_numba_njit: Any = numba.njit  # its stubs lack no_cfunc_wrapper
+_unliteral: Any = types.unliteral
 _numba_dump, _numba_load = _CacheFile._dump, _CacheFile._load_data  # noqa: SLF001 - numba has no public hook for a check
 _PACKAGE = Path(__file__).parent
 COMPILED_IN = (
@@ -51,28 +71,107 @@ COMPILED_IN = (
 """Files whose content is compiled into kernels: kernels, frame decoding and their constants."""
 
 
-def _cache_folder() -> Path | None:
-    """Return the folder of compiled kernels: NUMBA_CACHE_DIR, systemd's CacheDirectory, or the user's cache.
+def njit(**options: Any) -> Callable[[Function], Function]:
+    """Return numba's decorator of the same name, without two features that cost compile time and that no kernel needs.
 
-    Return None if none of these folders can be written.
+    numba compiles a kernel again for each constant among the arguments of a call, although the optimizer inserts the
+    constant anyway. It also compiles an entry point for callers in C.
+
+    While one process compiles a kernel, other processes that need it wait and then load it from the cache.
     """
+
+    def decorate(function: Function) -> Function:
+        kernel: Any = _numba_njit(no_cfunc_wrapper=True, **options)(function)
+        numba_template, numba_compile = kernel.get_call_template, kernel.compile
+        name = f"{function.__module__}.{function.__qualname__}"
+
+        def get_call_template(args: Any, keywords: Any) -> Any:
+            return numba_template(
+                [_unliteral(type_) for type_ in args],
+                {keyword: _unliteral(type_) for keyword, type_ in keywords.items()},
+            )
+
+        def compile_or_wait(signature: Any) -> Any:
+            # numba's lock of this process comes first, so that no other thread waits for it with the kernel locked
+            with global_compiler_lock, _kernel_lock(name):
+                return numba_compile(signature)
+
+        kernel.get_call_template, kernel.compile = get_call_template, compile_or_wait
+        return cast("Function", kernel)
+
+    return decorate
+
+
+def source_digest() -> str:
+    """Return a hash of all files in ``COMPILED_IN``, the name of this version's folder within a cache folder."""
     digest = hashlib.sha256()
     for source in COMPILED_IN:
         digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cache_folders() -> list[Path]:
+    """Return the cache folders in the order of preference: NUMBA_CACHE_DIR, systemd's CacheDirectory, the user's cache."""
     home_cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
     candidates = [
         os.environ.get("NUMBA_CACHE_DIR"),
         os.environ.get("CACHE_DIRECTORY"),
         f"{home_cache}/bms_estimator",
     ]
-    for candidate in candidates:
-        if candidate:
-            with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: the user has no home folder
-                folder = Path(candidate).expanduser() / digest.hexdigest()[:16]
-                folder.mkdir(parents=True, exist_ok=True)
-                tempfile.TemporaryFile(dir=folder).close()
-                return folder
+    folders = []
+    for candidate in filter(None, candidates):
+        with contextlib.suppress(RuntimeError):  # the user has no home folder
+            folders.append(Path(candidate).expanduser())
+    return folders
+
+
+def _cache_folder() -> Path | None:
+    """Return this version's folder in the first cache folder that can be written; None without one."""
+    digest = source_digest()
+    for folder in cache_folders():
+        with contextlib.suppress(OSError):
+            version_folder = folder / digest
+            version_folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=version_folder).close()
+            return version_folder
     return None
+
+
+def count_kernels() -> int:
+    """Return the number of kernels of this version."""
+    return sum(source.read_text(encoding="utf-8").count("\n@njit(") for source in COMPILED_IN)
+
+
+def count_cached_kernels() -> int:
+    """Return the number of kernels in the cache, also of those that other processes have compiled.
+
+    Kernels of another installation of the same version are not counted: numba names the folder of a source file by
+    the path of the file.
+    """
+    if CACHE_FOLDER is None:
+        return 0
+    folders = {_Locator.get_suitable_cache_subpath(str(source)) for source in COMPILED_IN}
+    return sum(1 for folder in folders for _ in (CACHE_FOLDER / folder).glob("*.nbi"))
+
+
+@contextlib.contextmanager
+def _kernel_lock(name: str) -> Iterator[None]:
+    """Exclude other processes from compiling the kernel ``name``. Without a cache folder, do nothing.
+
+    A kernel locks the kernels that it calls, never the other way round, so that no two processes wait for each other.
+    The lock ends with the process.
+    """
+    if _lock_file is None:
+        yield
+        return
+    offset = int.from_bytes(hashlib.sha256(name.encode()).digest()[:OFFSET_BYTES])
+    with contextlib.suppress(OSError):  # a file system without locks: both processes compile the kernel
+        fcntl.lockf(_lock_file, fcntl.LOCK_EX, 1, offset)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            fcntl.lockf(_lock_file, fcntl.LOCK_UN, 1, offset)
 
 
 @contextlib.contextmanager
@@ -81,7 +180,7 @@ def _warn_on_cache_error(cache: Any) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        warnings.warn(f"compiled kernels are not kept: {error.strerror}", RuntimeWarning, stacklevel=1)
+        warnings.warn(f"compiled kernels are not stored: {error.strerror}", RuntimeWarning, stacklevel=1)
     except Exception as error:  # noqa: BLE001 - a damaged file may raise anything
         warnings.warn(f"a compiled kernel cannot be read: {error!r}", RuntimeWarning, stacklevel=1)
         with contextlib.suppress(OSError):
@@ -110,7 +209,7 @@ def _load_verified(file: Any, name: str) -> Any:
 def _enable_disk_cache(folder: Path | None) -> None:
     """Let numba store compiled kernels in ``folder``. Without a folder each process compiles them."""
     if folder is None:
-        warnings.warn("compiled kernels are not kept: no folder can be written", RuntimeWarning, stacklevel=1)
+        warnings.warn("compiled kernels are not stored: no folder can be written", RuntimeWarning, stacklevel=1)
         _Dispatcher.enable_caching = lambda _: None
         return
     numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
@@ -119,4 +218,15 @@ def _enable_disk_cache(folder: Path | None) -> None:
     _CacheFile._dump, _CacheFile._load_data = _dump_with_digest, _load_verified  # noqa: SLF001
 
 
-_enable_disk_cache(_cache_folder())
+def _open_lock_file(folder: Path | None) -> BinaryIO | None:
+    """Open the file for the locks of kernels; None if there is no cache."""
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            return (folder / LOCK_FILE).open("ab")
+    return None
+
+
+CACHE_FOLDER = _cache_folder()
+"""Folder of compiled kernels; None if no folder can be written."""
+_lock_file = _open_lock_file(CACHE_FOLDER)
+_enable_disk_cache(CACHE_FOLDER)

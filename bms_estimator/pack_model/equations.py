@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from bms_estimator.kernels.kalman_filter.anchors import EMPTY, FULL
 from bms_estimator.model.arrays import Floats
@@ -118,9 +117,8 @@ class Equations:
         a, b = precision.copy(), -precision @ (r.x - self.prior.mean)
         for block in (self._voltage_block(r, use_file_slope=use_file_slope), r.links, *self._soc_blocks(r)):
             if block.error.size:
-                jacobian = matrix(block.columns, block.values, self.u.size)
-                a += (jacobian.T @ jacobian).toarray()
-                b += jacobian.T @ block.error
+                a += gram_matrix(block.columns, block.values, self.u.size)
+                b += np.bincount(block.columns.ravel(), (block.values * block.error[:, None]).ravel(), self.u.size)
         return NormalEquations(a, b)
 
     def _voltage_block(self, r: Residuals, *, use_file_slope: bool) -> Block:
@@ -161,10 +159,12 @@ class Equations:
         return float(cost), Block(weight * error, columns, (weight / links.std)[:, None] * values)
 
 
-def matrix(columns: NDArray[np.intp], values: Floats, size: int) -> sparse.csr_matrix:
-    """Return the matrix with the given columns and values in each row, shape (n, size)."""
-    n, k = columns.shape
-    return sparse.csr_matrix((values.ravel(), (np.repeat(np.arange(n), k), columns.ravel())), shape=(n, size))
+def gram_matrix(columns: NDArray[np.intp], values: Floats, size: int) -> Floats:
+    """Return J^T J, shape (size, size), of the Jacobian J with the given columns and values in each row."""
+    gram = np.zeros(size * size)
+    for column, value in zip(columns.T, values.T, strict=True):  # all pairs at once would need 100 MB
+        gram += np.bincount((column[:, None] * size + columns).ravel(), (value[:, None] * values).ravel(), size * size)
+    return gram.reshape(size, size)
 
 
 def huber_cost(residual: Floats) -> float:
@@ -175,4 +175,5 @@ def huber_cost(residual: Floats) -> float:
 
 def huber_weight(residual: Floats) -> Floats:
     """Return the factor on residuals and their derivatives with which least squares has the gradient of Huber's cost."""
-    return np.sqrt(HUBER / np.maximum(np.abs(residual), HUBER))
+    weight: Floats = np.sqrt(HUBER / np.maximum(np.abs(residual), HUBER))
+    return weight

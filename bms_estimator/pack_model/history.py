@@ -61,7 +61,8 @@ def thin_old_rows(rows: NDArray[np.void], capacity_as: float) -> NDArray[np.void
     )
     _, group = np.unique(key, axis=0, return_inverse=True)
     result = np.concatenate([merge_groups(old, group.ravel()), rows[~is_old]])
-    return result[np.lexsort((result["elapsed_s"], result["segment"]))]
+    ordered: NDArray[np.void] = result[np.lexsort((result["elapsed_s"], result["segment"]))]
+    return ordered
 
 
 def merge_groups(rows: NDArray[np.void], group: NDArray[np.intp]) -> NDArray[np.void]:

@@ -167,7 +167,7 @@ def scale_covariance(r_std: float) -> Floats:
     """Return the prior covariance of ln of the factors on the resistances, shape (SCALES, SCALES)."""
     common = max(r_std**2 - INDEPENDENT_R_STD**2, 0.0)
     own = r_std**2 - common
-    covariance = np.full((SCALES, SCALES), common) + np.diag(np.full(SCALES, own))
+    covariance: Floats = np.full((SCALES, SCALES), common) + np.diag(np.full(SCALES, own))
     covariance[1, 2] = covariance[2, 1] = common + RC_CORRELATION * own
     return covariance
 

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.equations import Equations, NormalEquations
@@ -63,4 +62,5 @@ def solve(a: Floats, b: Floats) -> Floats:
     Raises:
         numpy.linalg.LinAlgError: a is not positive definite, or not finite.
     """
-    return np.asarray(linalg.cho_solve(linalg.cho_factor(a, lower=True, check_finite=False), b, check_finite=False))
+    np.linalg.cholesky(a)  # raises the error
+    return np.asarray(np.linalg.solve(a, b))

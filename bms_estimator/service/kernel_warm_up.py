@@ -11,19 +11,32 @@ from bms_estimator.pack_model.curve_change import return_to_cell_file
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import neutral_fit
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
+from bms_estimator.service.kernel_subtrees import CELL, second_process
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 
-CELL = "chen_mora"
-"""Cell file of the warm-up. Any file would do, because the kernels do not depend on the cell."""
+COLLECT_AFTER = 50_000
+"""Number of new objects after which garbage is collected while kernels compile. numba creates many objects that stay."""
 
 
 def load_kernels() -> None:
-    """Load the kernels of decoder, estimator and reports; a first start compiles them."""
-    _ = FrameDecoder().clock_ppm
+    """Load the kernels of decoder, estimator and reports; a first start compiles them, in two processes."""
+    thresholds = gc.get_threshold()
+    gc.set_threshold(COLLECT_AFTER)
+    try:
+        with second_process():
+            _call_kernels()
+    finally:
+        gc.set_threshold(*thresholds)
+    gc.collect()
+    gc.freeze()  # a full garbage collection over numba's objects would stop the loop for 100 ms each time
+
+
+def _call_kernels() -> None:
+    """Call all kernels of a live run once."""
     cell = load_cell(CELL)
     estimator = new_estimator(Settings(), cell)
     sample = np.zeros(1, dtype=SAMPLE)
@@ -37,5 +50,4 @@ def load_kernels() -> None:
     SlowFit(estimator).adopt(neutral_fit())
     return_to_cell_file(estimator)
     remaining_charge(estimator, 0.0)
-    gc.collect()
-    gc.freeze()  # a full garbage collection over numba's objects would stop the loop for 100 ms each time
+    _ = FrameDecoder().clock_ppm

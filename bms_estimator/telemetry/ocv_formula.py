@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.monotone_cubic import MonotoneCubic
 
 POINTS = 101
 """Number of evenly spaced SOCs at which (2.10) is fitted."""
@@ -32,11 +33,9 @@ def fit_ocv_formula(cell: CellModel) -> OcvFormulaFit | None:
 
 @cache
 def _fit_table(ocv: TableOcv) -> OcvFormulaFit:
-    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - scipy is needed for tables only
-
     from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora  # noqa: PLC0415
     from bms_estimator.calibration.ocv.points import Points, rms_v  # noqa: PLC0415
 
     soc = np.linspace(0.0, 1.0, POINTS)
-    fit = fit_chen_mora(Points(soc, PchipInterpolator(ocv.soc, ocv.ocv_v)(soc), np.ones(POINTS)))
+    fit = fit_chen_mora(Points(soc, MonotoneCubic(ocv.soc, ocv.ocv_v)(soc), np.ones(POINTS)))
     return OcvFormulaFit(tuple(map(float, fit.a)), tuple(map(float, fit.std)), rms_v(fit.residual_v))

@@ -45,7 +45,9 @@ def test_the_hash_of_the_cache_name_covers_every_file_that_a_kernel_imports() ->
 
 def test_only_numba_cache_imports_njit_from_numba() -> None:
     direct_importers = {
-        path for path in PACKAGE.rglob("*.py") if re.search(r"^from numba import njit", path.read_text(), re.MULTILINE)
+        path
+        for path in PACKAGE.rglob("*.py")
+        if re.search(r"^from numba import .*\bnjit|= numba\.njit", path.read_text(), re.MULTILINE)
     }
     assert direct_importers == {PACKAGE / "numba_cache.py"}
 
@@ -68,18 +70,54 @@ def run_crc16_with_cache_in(folder: Path) -> str:
 
 def test_a_kernel_runs_without_space_for_its_cache(full_disk: Path) -> None:
     warning = run_crc16_with_cache_in(full_disk)
-    assert "RuntimeWarning: compiled kernels are not kept: No space left on device" in warning
+    assert "RuntimeWarning: compiled kernels are not stored: No space left on device" in warning
 
 
 def test_a_kernel_runs_without_a_folder_for_its_cache(disk_without_files: Path) -> None:
     warning = run_crc16_with_cache_in(disk_without_files)
-    assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in warning
+    assert "RuntimeWarning: compiled kernels are not stored: no folder can be written" in warning
 
 
 def test_a_kernel_runs_for_a_user_without_a_home() -> None:
-    assert "RuntimeWarning: compiled kernels are not kept: no folder can be written" in run_crc16_with_cache_in(
+    assert "RuntimeWarning: compiled kernels are not stored: no folder can be written" in run_crc16_with_cache_in(
         Path("~")
     )
+
+
+COMPILES_WHILE_ANOTHER_WAITS = """
+import sys, numpy
+from numba.core import event
+from bms_estimator.protocols.firmware.framing import crc16
+class WaitForInput(event.Listener):
+    waited = False
+    def on_start(self, _):
+        if not self.waited:  # functions of numba that the kernel calls are compiled, too
+            self.waited = True
+            print("compiling", flush=True)
+            sys.stdin.readline()
+    def on_end(self, _): pass
+with event.install_listener("numba:compile", WaitForInput()):
+    print("begins", flush=True)
+    print(crc16(numpy.zeros(4, "u1"), 0, 4), sum(crc16.stats.cache_misses.values()), flush=True)
+"""
+"""Program that waits for a line of input in the middle of the compilation, and prints the number of compilations."""
+
+
+def test_a_kernel_that_another_process_compiles_is_not_compiled_again(tmp_path: Path) -> None:
+    def start() -> subprocess.Popen[str]:
+        command, variables = [sys.executable, "-c", COMPILES_WHILE_ANOTHER_WAITS], {"NUMBA_CACHE_DIR": str(tmp_path)}
+        pipe = subprocess.PIPE
+        return subprocess.Popen(command, env=os.environ | variables, stdin=pipe, stdout=pipe, text=True)
+
+    with start() as first:
+        assert first.stdout.readline() == "begins\n"
+        assert first.stdout.readline() == "compiling\n"
+        with start() as second:
+            assert second.stdout.readline() == "begins\n"
+            first.stdin.write("\n")
+            first.stdin.flush()
+            assert first.stdout.readline() == "33984 1\n"
+            assert second.stdout.readline() == "33984 0\n"
 
 
 @pytest.fixture(scope="module")

@@ -7,14 +7,14 @@ import os
 import signal
 import sys
 from asyncio.subprocess import Process
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import pytest
 
-from tests.command_line import PROGRAM
+from tests.command_line import PROGRAM, running_program
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.serial_line import Line
@@ -78,25 +78,11 @@ main()
 """Program that gets SIGTERM while it loads its kernels."""
 
 
-@contextlib.asynccontextmanager
-async def service(
+def service(
     *packs: Path, stderr: int | IO[str] = asyncio.subprocess.PIPE, program: Sequence[str] = (str(PROGRAM),)
-) -> AsyncIterator[Process]:
+) -> contextlib.AbstractAsyncContextManager[Process]:
     """Run a service as a process, which is killed at the end. ``program`` replaces ``bms-estimator``."""
-    process = await asyncio.create_subprocess_exec(
-        *program,
-        "run",
-        *map(str, packs),
-        stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.DEVNULL,
-        stderr=stderr,
-    )
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
+    return running_program(*program, "run", *packs, stdout=asyncio.subprocess.DEVNULL, stderr=stderr)
 
 
 def checkpoints(state_home: Path) -> list[Path]:

@@ -190,8 +190,10 @@ def complete_row(h: Record) -> None:
         row.between_a2, row.skew_a2 = scale * scale * r.between_a2, scale * scale * r.skew_a2
         row.temperature_c, row.soc = scale * r.temperature_c, scale * r.soc
         row.charge_as, row.throughput_soc = scale * r.charge_as, scale * r.throughput_soc
-        row.x_a[:] = scale * r.x_a
-        row.hysteresis[:] = scale * r.hysteresis
+        for j in range(row.x_a.size):
+            row.x_a[j] = scale * r.x_a[j]
+        for j in range(row.hysteresis.size):
+            row.hysteresis[j] = scale * r.hysteresis[j]
     r.duration_s = r.elapsed_s = r.settled_s = r.voltage_v = r.current_a = r.temperature_c = 0.0
     r.between_a2 = r.skew_a2 = r.charge_as = r.throughput_soc = r.soc = 0.0
     r.x_a[:] = 0.0
@@ -225,7 +227,8 @@ def add_reference(h: Record, kind: int, soc: float, std: float) -> None:
     row.voltage_v = row.current_a = row.temperature_c = row.settled_s = row.between_a2 = row.skew_a2 = 0.0
     row.charge_as, row.throughput_soc = h.charge_as, h.throughput_soc
     row.x_a[:] = 0.0
-    row.hysteresis[:] = h.hysteresis
+    for j in range(row.hysteresis.size):
+        row.hysteresis[j] = h.hysteresis[j]
     row.soc, row.reference_soc, row.reference_kind, row.reference_std = soc, soc, kind, std
 
 

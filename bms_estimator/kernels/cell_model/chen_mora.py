@@ -88,6 +88,15 @@ def ocv(soc: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
 
 
 @njit(cache=True)
+def ocv_of_each(soc: Floats, ocv_v: Floats, ocv_slope_v: Floats) -> Floats:
+    """Return ``ocv`` at each SOC of an array, shape (n,) [V]."""
+    voltage_v = np.empty(soc.size)
+    for j in range(soc.size):
+        voltage_v[j] = ocv(soc[j], ocv_v, ocv_slope_v)
+    return voltage_v
+
+
+@njit(cache=True)
 def soc_from_ocv(voltage_v: float, ocv_v: Floats, ocv_slope_v: Floats) -> float:
     """Return the SOC (0..1) whose open-circuit voltage is ``voltage_v`` [V]: inverse of ``ocv``, section 7.1 of the thesis.
 

@@ -27,7 +27,7 @@ MIN_CAPACITANCE = 1e-3
 
 @njit(cache=True)
 def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
-    """Filter the current with each time constant of the RC ladder.
+    """Filter the current with each time constant of the RC ladder, from rest.
 
     Args:
         time_s: Shape (n,), increasing [s].
@@ -36,7 +36,14 @@ def branch_currents(time_s: Floats, current_a: Floats) -> Floats:
     Returns:
         x_k at each sample, shape (n, BRANCHES) [A].
     """
+    return branch_currents_from(np.zeros(BRANCHES), time_s, current_a)
+
+
+@njit(cache=True)
+def branch_currents_from(first_a: Floats, time_s: Floats, current_a: Floats) -> Floats:
+    """Return ``branch_currents`` with the values ``first_a`` at the first sample, shape (BRANCHES,) [A]."""
     x = np.zeros((time_s.size, BRANCHES))
+    x[0] = first_a
     for j in range(1, time_s.size):
         dt_s = time_s[j] - time_s[j - 1]
         mean_a = interpolated_current(dt_s, current_a[j - 1], current_a[j])

@@ -51,7 +51,7 @@ TAUS = np.array(TAU_S)
 
 def weak_share(soc: Floats) -> Floats:
     """Return the default weak fraction of each resistance at ``soc``, shape (RESISTANCES, n)."""
-    return np.outer(WEAK_SHARE, np.interp(soc, WEAK_FACTOR_SOC, WEAK_FACTOR))
+    return np.outer(np.array(WEAK_SHARE), np.interp(soc, WEAK_FACTOR_SOC, WEAK_FACTOR))
 
 
 @njit(cache=True)

@@ -190,8 +190,10 @@ def gate_persists(c: Record) -> bool:
 @njit(cache=True)
 def store_last_good_state(c: Record, f: Record) -> None:
     """Store the likeliest hypothesis as the last good state."""
-    c.good_mean[:] = f.mean[f.best]
-    c.good_covariance[:, :] = f.covariance[f.best]
+    for j in range(STATES):
+        c.good_mean[j] = f.mean[f.best, j]
+        for k in range(STATES):
+            c.good_covariance[j, k] = f.covariance[f.best, j, k]
     c.good_soc, c.good_soc_std, c.good_age_s = f.soc, f.soc_std, 0.0
 
 
@@ -219,8 +221,10 @@ def restore_if_not_finite(c: Record, n: Record, f: Record, p: Record, dt_s: floa
             store_last_good_state(c, f)
         return
     f.best = 0
-    f.mean[0, :] = c.good_mean
-    f.covariance[0, :, :] = c.good_covariance
+    for j in range(STATES):
+        f.mean[0, j] = c.good_mean[j]
+        for k in range(STATES):
+            f.covariance[0, j, k] = c.good_covariance[j, k]
     if not math.isfinite(f.temperature_c):
         f.temperature_c, f.sensed = REFERENCE_C, 0  # the next temperature is used without smoothing
         f.weak = f.strong = f.hysteresis = 1.0  # Arrhenius factors at REFERENCE_C

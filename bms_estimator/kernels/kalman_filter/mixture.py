@@ -26,8 +26,10 @@ def decorrelate_state(mean: Record, covariance: Record, j: int) -> None:
 @njit(cache=True)
 def copy_hypothesis(s: Record, source: int, to: int) -> None:
     """Copy hypothesis ``source`` to ``to``."""
-    s.mean[to, :] = s.mean[source]
-    s.covariance[to, :, :] = s.covariance[source]
+    for j in range(STATES):
+        s.mean[to, j] = s.mean[source, j]
+        for k in range(STATES):
+            s.covariance[to, j, k] = s.covariance[source, j, k]
     s.ln_weight[to] = s.ln_weight[source]
     s.minute_u[to], s.ten_minutes_u[to] = s.minute_u[source], s.ten_minutes_u[source]
     s.fast_inflation[to], s.slow_inflation[to] = s.fast_inflation[source], s.slow_inflation[source]
