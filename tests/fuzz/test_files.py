@@ -56,6 +56,15 @@ def with_capture_header(data: bytes) -> bytes:
     return MAGIC + len(text).to_bytes(4, "little") + text + crc + crc_and_reads[2:]
 
 
+def with_edited_sheet(sheet: bytes) -> bytes:
+    """Return the workbook of the seeds in which the sheet is replaced by these bytes."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(SEEDS / "workbook" / "seed.xlsx") as seed, zipfile.ZipFile(content, "w") as file:
+        for name in seed.namelist():
+            file.writestr(name, sheet if "sheet1" in name else seed.read(name))
+    return content.getvalue()
+
+
 def with_doubles(array: bytes, doubles: dict[int, float]) -> bytes:
     """Overwrite doubles of a stored array, given by their index modulo the number of doubles."""
     changed = bytearray(array)
@@ -114,6 +123,31 @@ def test_compressed_csv_reader_raises_only_user_errors_that_name_the_file(folder
 @edited_seeds("parquet", b"PAR1")
 def test_parquet_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
     load_file(folder / "table.parquet", load_capture, data)
+
+
+@edited_seeds("export", b"\t", b";", b"0d 00:00:01", b"03/12/2024 1:02:03 PM", b"Volts", b"mA", b"1,5", b"\xff\xfe")
+def test_reader_of_exports_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
+    load_file(folder / "export.txt", load_capture, data)
+
+
+@edited_seeds("zip", b"PK\x03\x04", b"PK\x01\x02")
+def test_reader_of_archives_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
+    load_file(folder / "export.zip", load_capture, data)
+
+
+@edited_seeds("workbook", b"<row>", b"</c>", repair=with_edited_sheet)
+def test_spreadsheet_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
+    load_file(folder / "export.xlsx", load_capture, data)
+
+
+@edited_seeds("nda", b"NEWARE", b"\x55\x00\x01\x00\x00\x00")
+def test_neware_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
+    load_file(folder / "export.nda", load_capture, data)
+
+
+@edited_seeds("mpr", b"MODULE", b"VMP data  ")
+def test_biologic_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
+    load_file(folder / "export.mpr", load_capture, data)
 
 
 @edited_seeds("curve", b"soc", b"ocv_v", b"hysteresis_v", b",,")

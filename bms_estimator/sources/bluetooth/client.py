@@ -4,6 +4,7 @@ import asyncio
 import logging
 import pkgutil
 from collections.abc import AsyncGenerator, Mapping
+from typing import NamedTuple
 
 import aiobmsble.bms
 from aiobmsble.basebms import BaseBMS
@@ -19,6 +20,34 @@ from bms_estimator.sources.line_source import LineProducer, SourceUnavailableErr
 
 SCAN_S = 15.0
 """Timeout of a scan [s]. A BMS advertises every few seconds, but not while a phone is connected to it."""
+
+
+class AdvertisedBms(NamedTuple):
+    """BMS that advertises, and whose kind is known."""
+
+    address: str
+    name: str
+    kind: str
+    """Name of its driver, as in ``source.bms``."""
+
+
+async def discover() -> list[AdvertisedBms]:
+    """Return all BMS of known kinds that advertise within ``SCAN_S``.
+
+    Raises:
+        UserError: There is no Bluetooth.
+    """
+    try:
+        found = await BleakScanner.discover(timeout=SCAN_S, return_adv=True)
+    except (BleakError, EOFError, OSError) as error:
+        raise UserError(f"no Bluetooth: {error or type(error).__name__}") from None
+    result = []
+    for device, advertisement in found.values():
+        driver = await bms_identify(advertisement, device.address)
+        if driver is not None:
+            kind = driver.__module__.rpartition(".")[2].removesuffix("_bms")
+            result.append(AdvertisedBms(device.address, device.name or device.address, kind))
+    return result
 
 
 class BleProducer(LineProducer):

@@ -5,7 +5,8 @@ File format, version 1, numbers little-endian::
     header   8 bytes  "BMSRAW1\n"
              u32      length of the JSON that follows
              JSON     UTF-8: version, started (wall clock, ISO 8601 UTC), mode ("binary", "text" or another protocol),
-                      port, baud, current_sign, address; other names are ignored
+                      port, baud, current_sign, address, voltage_gain, current_gain,
+                      current_zero_a; other names are ignored
              u16      CRC-16/CCITT-FALSE of the JSON
     record   f64      arrival time [s], bit-identical to the decoder's input
              u32      length
@@ -13,8 +14,8 @@ File format, version 1, numbers little-endian::
              u16      CRC-16/CCITT-FALSE of the record up to here
 
 Each read of the line is one record, up to the end of the file. The file is only appended to, with one system call for
-each record. After a crash of the recorder all complete records are valid, and an incomplete last one is ignored. A file whose
-name ends in .gz is read as gzip.
+each record. After a crash of the recorder all complete records are valid, and an incomplete last one is ignored. A file may be
+compressed with gzip.
 """
 
 import binascii
@@ -38,6 +39,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.settings.base_source import BaseSource
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES, split_records
+from bms_estimator.sources.captures.tables.text_file import GZIP_MAGIC
 
 MAGIC = b"BMSRAW1\n"
 """First bytes of a raw capture."""
@@ -74,16 +76,24 @@ class CaptureHeader:
     version: int = VERSION
     address: int | None = None
     """Address of the recorded pack, if the line had several."""
+    voltage_gain: float = 1.0
+    current_gain: float = 1.0
+    current_zero_a: float = 0.0
 
 
+CORRECTIONS = ("voltage_gain", "current_gain", "current_zero_a")
+"""Fields of a header that correct the measured values, as in ``[sensor]``."""
 _VERSION_ADAPTER, _HEADER_ADAPTER = TypeAdapter(_HeaderVersion), TypeAdapter(CaptureHeader)
 
 
 def make_header(sensor: SensorSettings, source: BaseSource | None = None) -> CaptureHeader:
     """Return the header of a capture of ``source``; None: of the serial device of ``sensor``."""
     if source is not None:
-        return CaptureHeader(sensor.protocol, source.short_description, baud=0, current_sign=sensor.current_sign)
-    return CaptureHeader(sensor.protocol, sensor.port, sensor.baud, sensor.current_sign, address=sensor.address)
+        device = CaptureHeader(sensor.protocol, source.short_description)
+    else:
+        device = CaptureHeader(sensor.protocol, sensor.port, sensor.baud, address=sensor.address)
+    decoder_settings = {name: getattr(sensor, name) for name in ("current_sign", *CORRECTIONS)}
+    return dataclasses.replace(device, **decoder_settings)
 
 
 def read_sensor_settings(path: Path) -> SensorSettings:
@@ -95,7 +105,8 @@ def read_sensor_settings(path: Path) -> SensorSettings:
     header = read_header(path)
     try:
         fields = {"protocol": header.mode, "current_sign": header.current_sign, "address": header.address}
-        return SensorSettings.model_validate(fields)
+        corrections = {name: getattr(header, name) for name in CORRECTIONS}
+        return SensorSettings.model_validate(fields | corrections)
     except ValidationError:
         raise UserError(
             f"{path}: recorded with mode {header.mode!r} and current_sign {header.current_sign!r}: "
@@ -258,9 +269,13 @@ def _split(raw: NDArray[np.uint8]) -> tuple[CaptureBatch, int]:
 
 
 def _open(path: Path) -> IO[bytes]:
-    if path.suffix == ".gz":
-        return cast("IO[bytes]", gzip.open(path))
-    return path.open("rb")
+    file = path.open("rb")
+    is_packed = file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+    file.seek(0)
+    if not is_packed:
+        return file
+    file.close()
+    return cast("IO[bytes]", gzip.open(path))
 
 
 def _read_chunk(file: IO[bytes], size: int) -> bytes:

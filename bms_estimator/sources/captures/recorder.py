@@ -1,5 +1,7 @@
 """Recorder of a source's chunks. Its own thread writes them, so that the source never waits for the disk."""
 
+import asyncio
+import contextlib
 import errno
 import queue
 import time
@@ -78,6 +80,11 @@ class CaptureRecorder:
             return
         self.bytes += len(data)
         self._queue.put((arrival_s, data))
+
+    async def wait_for_end(self) -> None:
+        """Wait until the recording has ended. An error of the disk is not raised: see ``fault``."""
+        with contextlib.suppress(OSError):
+            await asyncio.wrap_future(self.ended)
 
     def __enter__(self) -> Self:
         """Return the recorder."""

@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.progress import Progress, no_progress
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, CurrentSign, SampleBlock
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, read_sensor_settings
-from bms_estimator.sources.captures.tables import READERS, ColumnTable, Sign, convert_table, table_reader
+from bms_estimator.sources.captures.tables.column_tables import ColumnTable
+from bms_estimator.sources.captures.tables.current_sign import Sign
+from bms_estimator.sources.captures.tables.layout import ColumnMap
+from bms_estimator.sources.captures.tables.table_reader import convert_table, open_table
 from bms_estimator.sources.source import ReceivedSamples
 
 PACED_INTERVAL_S = 0.05
@@ -35,6 +39,14 @@ class Capture(Protocol):
     @property
     def implausible(self) -> int:
         """Number of implausible readings, which were replaced by NaN."""
+
+    @property
+    def note(self) -> str:
+        """Text that says what was guessed about the file; empty if nothing was."""
+
+    @property
+    def warning(self) -> str:
+        """Contradiction in the file that the user should resolve; empty without one."""
 
     def __iter__(self) -> Iterator[SampleBlock]:
         """Yield blocks of samples.
@@ -56,10 +68,14 @@ class RawCapture:
         decoder: Decoder that has been fed the bytes read so far.
         damaged: True if the next record is damaged; the rest of the file is not read.
         unread_bytes: Number of bytes of an incomplete record at the end, because of a truncated file or a damaged length.
+        note: Empty, because the file describes itself.
+        warning: Empty.
 
     Raises:
         UserError: The file is not a raw capture, or has a later version.
     """
+
+    note = warning = ""
 
     def __init__(
         self, path: Path, sensor: SensorSettings | None = None, current_sign: CurrentSign | None = None
@@ -108,6 +124,10 @@ class Replay:
         speed: Speed relative to the recording; None: full speed.
         max_block_s: At full speed, maximum duration of a block on the samples' clock [s].
         monotonic: Monotonic clock [s].
+
+    Attributes:
+        samples: Number of samples so far.
+        fraction: Fraction of the capture that was replayed, 0..1.
     """
 
     silence_reason: str | None = None
@@ -124,7 +144,7 @@ class Replay:
         self.capture = capture
         self._decoder = capture.decoder if isinstance(capture, RawCapture) else None
         self._speed, self._max_block_s, self._monotonic = speed, max_block_s, monotonic
-        self.samples = 0
+        self.samples, self.fraction = 0, 0.0
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -159,8 +179,14 @@ class Replay:
     async def _unpaced(self) -> AsyncIterator[ReceivedSamples]:
         for block in self.capture:
             cells = self._cells()
+            before = self.fraction
             for part in _parts(block["time_s"], self._max_block_s):
+                self._advance(before, part.stop / block.size)
                 yield ReceivedSamples(block[part], cells[part])
+
+    def _advance(self, before: float, fraction_of_block: float) -> None:
+        """Set ``fraction`` within a block, which began at the fraction ``before``."""
+        self.fraction = before + (self.capture.fraction - before) * fraction_of_block
 
     def _cells(self) -> CellBlock:
         """Return the cell voltages of the capture's last block."""
@@ -171,11 +197,12 @@ class Replay:
         start_s, last_s, elapsed_s = self._monotonic(), math.nan, 0.0
         for block in self.capture:
             due_s = elapsed_s + _elapsed(block["time_s"], last_s)
-            first = 0
+            first, before = 0, self.fraction
             while first < block.size:
                 now_s = speed * (self._monotonic() - start_s)
                 end = int(np.searchsorted(due_s, now_s, side="right"))
                 if end > first:
+                    self._advance(before, end / block.size)
                     yield ReceivedSamples(block[first:end], self._cells()[first:end])
                     first = end
                 else:
@@ -186,7 +213,7 @@ class Replay:
 def _parts(time_s: NDArray[np.float64], max_block_s: float) -> Iterator[slice]:
     """Yield slices that divide a block into parts of limited duration."""
     if math.isinf(max_block_s):
-        yield slice(None)
+        yield slice(0, time_s.size)
         return
     part_number = np.floor(_elapsed(time_s, float(time_s[0])) / max_block_s)
     edges = [0, *(np.flatnonzero(np.diff(part_number)) + 1).tolist(), time_s.size]
@@ -201,49 +228,83 @@ def _elapsed(time_s: NDArray[np.float64], last_s: float) -> NDArray[np.float64]:
 
 
 def open_capture(
-    path: Path, sensor: SensorSettings | None = None, *, current_sign: CurrentSign | None = None
+    path: Path,
+    sensor: SensorSettings | None = None,
+    *,
+    current_sign: CurrentSign | None = None,
+    column_map: ColumnMap | None = None,
 ) -> Capture:
-    """Open a capture: a table by its file name extension, else a raw capture by its first bytes.
+    """Open a capture: a raw capture or a table, by its content.
 
     Args:
         path: The file.
         sensor: Settings that decode a raw capture. Their current sign also applies to a table without one. If None, a raw
-            capture is decoded with the settings in its header, and discharge is positive in a table.
-        current_sign: Direction of positive current, which overrides ``sensor``, header and format.
+            capture is decoded with the settings in its header.
+        current_sign: Direction of positive current, which overrides ``sensor``, header, format and voltage.
+        column_map: Columns of a table by quantity; None: recognize them by their names.
 
     Raises:
         UserError: The file does not exist, or is neither a table nor a raw capture.
     """
     if not path.is_file():
-        raise UserError(f"{path}: {'is a directory' if path.is_dir() else 'no such file'}")
-    table = table_reader(path, Sign(current_sign, sensor.current_sign) if sensor else Sign(current_sign))
-    if table is not None:
-        return table
+        raise UserError(f"{path}: {_why_no_file(path)}")
     if is_capture(path):
         return RawCapture(path, sensor, current_sign)
-    raise UserError(f"{path}: neither a raw capture nor a table; the name of a table ends in {', '.join(READERS)}")
+    return open_table(path, Sign(current_sign, sensor.current_sign if sensor else None), column_map)
 
 
-def load_capture(source: str | Path | ColumnTable, *, current_sign: CurrentSign | None = None) -> Columns:
+def _why_no_file(path: Path) -> str:
+    """Return the reason why a path is not that of a regular file, as text."""
+    if path.is_dir():
+        return "is a directory"
+    return "is a pipe or a device; give - and redirect it to standard input" if path.exists() else "no such file"
+
+
+def load_capture(
+    source: str | Path | ColumnTable,
+    *,
+    current_sign: CurrentSign | None = None,
+    column_map: ColumnMap | None = None,
+) -> Columns:
     """Load all samples of a capture into memory.
 
     Args:
-        source: Path of a raw capture or of a table (CSV, gzipped CSV, Parquet), or a table in memory: a DataFrame, a
-            dict of arrays. A table has our columns or the Battery Data Format's.
+        source: Path of a raw capture or of a table (docs/cell/captures.md), or a table in memory: a DataFrame, a dict of
+            arrays. A table has our columns or those of a cycler.
         current_sign: Direction of positive current, ``discharge_positive`` or ``charge_positive``; None: that of
-            the format, otherwise discharge.
+            the format; if it defines none, that which the voltage shows, otherwise discharge.
+        column_map: Names of a table's columns for ``time``, ``current``, ``voltage`` and, optionally, ``temperature``, and
+            of a spreadsheet's ``sheet``; None: recognize them.
 
     Returns:
         ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor) and
-        ``status``, bits of ``SampleStatus``.
+        ``status``, bits of ``SampleStatus``. Attributes ``note`` and ``warning`` say what was guessed about a table.
 
     Raises:
         UserError: The file does not exist or cannot be read, a column is missing, or ``current_sign`` is not valid.
     """
     if current_sign not in (None, *get_args(CurrentSign)):
         raise UserError(f"current_sign = {current_sign!r}: must be one of {', '.join(get_args(CurrentSign))}")
-    if not isinstance(source, str | Path):
-        return Columns(convert_table(source, Sign(current_sign)), "capture")
-    path = Path(source)
-    blocks = [block.copy() for block in open_capture(path, current_sign=current_sign)]
-    return Columns(np.concatenate(blocks) if blocks else np.zeros(0, dtype=SAMPLE), path.name)
+    capture: Capture
+    if isinstance(source, str | Path):
+        name, capture = Path(source).name, open_capture(Path(source), current_sign=current_sign, column_map=column_map)
+    else:
+        name, capture = "capture", convert_table(source, Sign(current_sign), column_map)
+    return Columns(read_samples(capture), name, capture.note, capture.warning)
+
+
+def read_samples(capture: Capture, progress: Progress = no_progress) -> SampleBlock:
+    """Return all samples of a capture.
+
+    Args:
+        capture: The capture.
+        progress: Receives the fraction of the file that has been read.
+
+    Raises:
+        UserError: The file cannot be read.
+    """
+    blocks = []
+    for block in capture:
+        blocks.append(block.copy())
+        progress(capture.fraction)
+    return np.concatenate(blocks) if blocks else np.zeros(0, dtype=SAMPLE)

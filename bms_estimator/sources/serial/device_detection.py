@@ -175,6 +175,18 @@ class BoardClient:
             raise UserError(f"{self._port}: {command.refusal}")
         return self.hello()
 
+    def zero_current(self) -> None:
+        """Make the board store the present current as its zero, after it has measured for a second.
+
+        Raises:
+            UserError: The board rejects the command, or does not answer.
+        """
+        self.hello()
+        command = self._board.command("current_zero")
+        self._wait_for([self._board, self._text], lambda: command.done or None)
+        if command.refusal:
+            raise UserError(f"{self._port}: {command.refusal}")
+
     def reference_v(self) -> float:
         """Measure the full range of the board's converter against its bandgap [V].
 

@@ -83,11 +83,16 @@ def resolve_port(port: str) -> str:
     raise NoPortError("auto: no USB serial port is connected")
 
 
+def named_ports() -> dict[str, ListPortInfo]:
+    """Return all serial ports by their stable names, or by their device paths if they have none."""
+    names = {os.path.realpath(path): str(path) for path in stable_names()}
+    ports = {port.device: port for port in list_ports.comports()}
+    return {names.get(os.path.realpath(device), device): port for device, port in ports.items()}
+
+
 def board_ports() -> list[str]:
     """Return the ports that may belong to a board, by their stable names if they have one."""
-    names = {os.path.realpath(path): str(path) for path in stable_names()}
-    usb_ports = [port.device for port in list_ports.comports() if may_be_board(port)]
-    return sorted(names.get(os.path.realpath(device), device) for device in usb_ports)
+    return sorted(name for name, port in named_ports().items() if may_be_board(port))
 
 
 def may_be_board(port: ListPortInfo) -> bool:
@@ -113,7 +118,8 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
     except (OSError, termios.error, ValueError, OverflowError) as error:  # a port may die while it is opened
         if isinstance(error, OSError) and error.errno in (errno.EBUSY, errno.EAGAIN):
             raise PortBusyError(path) from None
-        raise NoPortError(f"{path}: cannot be opened: {error}") from None
+        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else error
+        raise NoPortError(f"{path}: cannot be opened: {reason}") from None
 
 
 def holder(port: str) -> str | None:

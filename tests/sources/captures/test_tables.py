@@ -20,7 +20,9 @@ def test_a_table_of_samples_keeps_their_status(tmp_path: Path, suffix: str) -> N
     samples["status"] = [0, SampleStatus.VOLTAGE_HELD, SampleStatus.CURRENT_SATURATED, SampleStatus.VOLTAGE_HELD]
     with table_sink(tmp_path / f"pack{suffix}") as sink:
         sink.write(samples)
-    assert load_capture(tmp_path / f"pack{suffix}").rows.tobytes() == samples.tobytes()
+    rows = load_capture(tmp_path / f"pack{suffix}").rows
+    for name in SAMPLE.names or ():  # the bytes between the fields are not defined
+        np.testing.assert_array_equal(rows[name], samples[name])
 
 
 def test_the_status_of_another_table_is_ignored(tmp_path: Path) -> None:

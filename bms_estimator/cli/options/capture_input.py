@@ -1,0 +1,81 @@
+"""Captures that are given to a command: files or standard input, with a note on stderr about what was guessed."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import typer
+
+from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.model.columns import Columns
+from bms_estimator.model.progress import Progress, no_progress
+from bms_estimator.model.sample import CurrentSign, SampleBlock
+from bms_estimator.sources.captures.replay import Capture, open_capture, read_samples
+from bms_estimator.sources.captures.stdin import standard_input
+from bms_estimator.sources.captures.tables.layout import ColumnMap
+
+LONG_FILE_BYTES = 5_000_000
+"""Size from which a bar is shown while a file is read. Smaller files are read within a few seconds."""
+
+
+@contextmanager
+def capture_file(path: Path) -> Iterator[Path]:
+    """Yield the path of a capture; for ``-`` that of a temporary copy of standard input."""
+    if str(path) != "-":
+        yield path
+        return
+    with standard_input() as copy:
+        yield copy
+
+
+@contextmanager
+def capture_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
+    """Yield the paths of captures; for ``-`` that of a temporary copy of standard input."""
+    with ExitStack() as stack:
+        yield [stack.enter_context(capture_file(path)) for path in paths]
+
+
+def load_captures(
+    paths: Sequence[Path], *, current_sign: CurrentSign | None, column_map: ColumnMap | None
+) -> list[Columns]:
+    """Load captures, and print what was guessed about them.
+
+    Raises:
+        UserError: A capture cannot be read.
+    """
+    loaded = []
+    for path in paths:
+        with capture_file(path) as file:
+            capture = open_capture(file, current_sign=current_sign, column_map=column_map)
+            print_guesses(file.name, capture)
+            rows = read_with_bar(file, capture)
+            loaded.append(Columns(rows, file.name, capture.note, capture.warning))
+    return loaded
+
+
+def read_with_bar(file: Path, capture: Capture) -> SampleBlock:
+    """Return all samples of a capture. A bar is shown while a long file is read.
+
+    Raises:
+        UserError: The file cannot be read.
+    """
+    with long_file_bar("reading", file) as progress:
+        return read_samples(capture, progress)
+
+
+@contextmanager
+def long_file_bar(label: str, file: Path) -> Iterator[Progress]:
+    """Yield the function that draws the fraction of a file on a bar; for a file that is not long, nothing is drawn."""
+    if file.stat().st_size < LONG_FILE_BYTES:
+        yield no_progress
+        return
+    with progress_bar(f"{label} {file.name}") as bar:
+        yield bar.update
+
+
+def print_guesses(name: str, capture: Capture) -> None:
+    """Print on stderr what was guessed about a capture, and what contradicts it."""
+    if capture.note:
+        typer.echo(f"{name}: {capture.note}", err=True)
+    if capture.warning:
+        typer.echo(f"warning: {name}: {capture.warning}", err=True)

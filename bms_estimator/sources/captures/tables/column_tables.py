@@ -1,0 +1,208 @@
+"""Readers of tables that are stored by column: Parquet, and arrays in memory."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind, parser, time_kind
+from bms_estimator.sources.captures.tables.layout import (
+    BLOCK_ROWS,
+    Column,
+    LayoutFinder,
+    RawBlock,
+    Role,
+    with_time_kind,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MICROSECONDS_PER_S = 1_000_000
+
+
+class ColumnTable(Protocol):
+    """Table in memory, such as a dict of arrays or a DataFrame."""
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names of the columns."""
+
+    def __getitem__(self, name: str, /) -> ArrayLike:
+        """Return a column."""
+
+
+class ArrayTable:
+    """Reader of a table in memory, as one block.
+
+    Args:
+        name: Name of the table for messages.
+        table: The columns.
+        finder: Finder of the columns of a sample.
+        description: Kind of the table for messages.
+
+    Raises:
+        UserError: A column is missing or does not contain numbers.
+    """
+
+    fraction = 1.0
+
+    def __init__(
+        self, name: object, table: ColumnTable, finder: LayoutFinder, description: str = "table in memory"
+    ) -> None:
+        self.description = description
+        header = list(table)
+        layout = finder.find([str(column) for column in header])
+        if layout is None:
+            raise finder.no_header()
+        self.layout = layout
+        self._columns = {
+            role: to_floats(name, column, table[header[column.index]]) for role, column in layout.columns.items()
+        }
+
+    def blocks(self) -> Iterator[RawBlock]:
+        """Yield all rows."""
+        yield self._columns
+
+
+class ParquetTable:
+    """Reader of a Parquet file with pyarrow.
+
+    Args:
+        path: The file.
+        finder: Finder of the columns of a sample.
+
+    Raises:
+        UserError: The file cannot be read, or a column is missing.
+    """
+
+    description = "Parquet"
+
+    def __init__(self, path: Path, finder: LayoutFinder) -> None:
+        self._path, self.fraction = path, 0.0
+        with _open_parquet(path) as file:
+            layout = finder.find(file.schema_arrow.names)
+            if layout is None:
+                raise finder.no_header()
+            if file.metadata.num_rows == 0:
+                raise UserError(f"{path}: no samples")
+            self.layout = with_time_kind(layout, _time_kind(file, layout.columns[Role.TIME]))
+
+    def blocks(self) -> Iterator[RawBlock]:
+        """Yield blocks of at most ``BLOCK_ROWS`` rows.
+
+        Raises:
+            UserError: The file cannot be read; the message names file and column.
+        """
+        names = [column.name for column in self.layout.columns.values()]
+        with _open_parquet(self._path) as file:
+            rows = 0
+            for batch in file.iter_batches(BLOCK_ROWS, columns=names):
+                block = {
+                    role: _parquet_values(self._path, column, batch.column(column.name), first_row=rows + 1)
+                    for role, column in self.layout.columns.items()
+                }
+                rows += batch.num_rows
+                self.fraction = rows / file.metadata.num_rows
+                yield block
+
+
+@contextmanager
+def _open_parquet(path: Path) -> "Iterator[pa.parquet.ParquetFile]":
+    """Open a Parquet file.
+
+    Raises:
+        UserError: The file is damaged or cannot be read.
+    """
+    import pyarrow as pa  # noqa: PLC0415 - optional
+    from pyarrow import parquet  # noqa: PLC0415 - optional
+
+    try:
+        with parquet.ParquetFile(path) as file:
+            yield file
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError, MemoryError) as error:
+        raise UserError(f"{path}: damaged, or not a Parquet file: {error}") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _time_kind(file: "pa.parquet.ParquetFile", column: Column) -> CellKind:
+    """Return the kind of the cells in the time column, by its type; if it is text, by its first cell."""
+    import pyarrow as pa  # noqa: PLC0415 - optional
+
+    column_type = file.schema_arrow.field(column.index).type
+    if pa.types.is_timestamp(column_type):
+        return CellKind.DATE_TIME
+    if not _is_text(column_type):
+        return CellKind.NUMBER
+    return time_kind(next(file.iter_batches(1, columns=[column.name])).column(0)[0].as_py() or "")
+
+
+def _is_text(column_type: "pa.DataType") -> bool:
+    from pyarrow import types  # noqa: PLC0415 - optional
+
+    return bool(types.is_string(column_type) or types.is_large_string(column_type) or types.is_dictionary(column_type))
+
+
+def _parquet_values(path: Path, column: Column, values: "pa.Array", first_row: int) -> NDArray[np.float64]:
+    """Convert a column to floats; null becomes NaN.
+
+    Raises:
+        UserError: The column contains values of another type.
+    """
+    import pyarrow as pa  # noqa: PLC0415 - optional
+
+    if column.kind is not CellKind.NUMBER and _is_text(values.type):
+        return parse_column(path, column, values.to_pylist(), first_row)
+    try:
+        if pa.types.is_timestamp(values.type):
+            stamps_us = values.cast(pa.timestamp("us", tz=values.type.tz)).cast(pa.int64()).cast(pa.float64())
+            return np.asarray(stamps_us.to_numpy(zero_copy_only=False)) / MICROSECONDS_PER_S
+        if column.kind is CellKind.DIRECTION:  # a column of numbers does not state the direction
+            return np.zeros(len(values))
+        return np.asarray(values.cast(pa.float64()).to_numpy(zero_copy_only=False))
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
+        raise UserError(f"{path}: column {column.name} is {values.type}: must be numbers") from None
+
+
+def parse_column(path: object, column: Column, cells: list[str | None], first_row: int = 1) -> NDArray[np.float64]:
+    """Parse a column of text, whose first cell is in ``first_row`` of the table; None becomes NaN.
+
+    Raises:
+        UserError: A cell is not valid; the message names its row.
+    """
+    parse = parser(column.kind, decimal_comma=False)
+    values = np.full(len(cells), np.nan)
+    for row, cell in enumerate(cells):
+        if cell is None:
+            continue
+        try:
+            values[row] = parse(cell)
+        except (ValueError, OverflowError):
+            shown = cell[:MAX_TEXT_CHARACTERS]
+            raise UserError(
+                f"{path}: row {first_row + row}: {column.name} = {shown!r}: must be a {column.kind.value}"
+            ) from None
+    return values
+
+
+def to_floats(name: object, column: Column, values: ArrayLike) -> NDArray[np.float64]:
+    """Convert a column of a table in memory to floats; None becomes NaN.
+
+    Raises:
+        UserError: A value is not a number.
+    """
+    array = np.asarray(values)
+    if column.kind is CellKind.DIRECTION:
+        return parse_column(name, column, [str(value) for value in array.ravel().tolist()])
+    if array.dtype.kind == "O" and all(value is None or isinstance(value, int | float) for value in array.flat):
+        array = array.astype(np.float64)
+    if array.dtype.kind not in "fiu" or array.ndim != 1:
+        raise UserError(
+            f"{name}: column {column.name} holds {array.dtype} of shape {array.shape}: must be numbers, one a row"
+        )
+    with np.errstate(invalid="ignore"):  # a signaling NaN
+        return array.astype(np.float64)

@@ -1,0 +1,244 @@
+"""Captures as tables: the reader of a file by its first bytes, and the samples with the sign of their current."""
+
+import zipfile
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import MAX_C, MIN_C, SAMPLE, SampleBlock, remove_implausible
+from bms_estimator.sources.captures.tables.cell_values import CellKind
+from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
+from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction, voltage_response
+from bms_estimator.sources.captures.tables.cycler_files import (
+    MPR_MAGIC,
+    NDA_MAGIC,
+    NDAX_MEMBER,
+    read_biologic,
+    read_neware,
+)
+from bms_estimator.sources.captures.tables.dialects import OWN
+from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layout, LayoutFinder, RawBlock, Role
+from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
+from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
+from bms_estimator.sources.captures.tables.text_table import TextTable
+
+SIGN_ROWS = 262_144
+"""Minimum number of rows at the beginning of a table from which the sign of the current is determined."""
+STEP_S = 1e-6
+"""Time between two rows of a table that have the same time because the current steps [s]."""
+PARQUET_MAGIC, OLE_MAGIC = b"PAR1", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
+"""First bytes of Parquet files and of .xls files."""
+EXCEL_MEMBER, OPEN_DOCUMENT_MEMBER = "[Content_Types].xml", "mimetype"
+"""Members of .xlsx and .ods files, which are zip archives."""
+
+
+class TableReader(Protocol):
+    """Reader of the columns of a sample in a table."""
+
+    @property
+    def layout(self) -> Layout:
+        """Columns of the table."""
+
+    @property
+    def description(self) -> str:
+        """Kind of the file for messages."""
+
+    @property
+    def fraction(self) -> float:
+        """Fraction of the table that has been read, 0..1."""
+
+    def blocks(self) -> Iterator[RawBlock]:
+        """Yield blocks of rows."""
+
+
+class Table:
+    """Samples of a table; a ``Capture``.
+
+    Args:
+        reader: Reader of the columns.
+        configured: Direction of positive current that the user configured.
+
+    Attributes:
+        implausible: Number of implausible temperatures in the rows read so far.
+        note: Text that says how the table is read; empty for a table with this project's columns.
+        warning: Contradiction between the sign of the current and the voltage; empty without one.
+    """
+
+    def __init__(self, reader: TableReader, configured: Sign) -> None:
+        self._reader, self._layout = reader, reader.layout
+        self.implausible = 0
+        response = None if configured.option else voltage_response(self._first_rows())
+        self._direction = find_direction(self._layout, configured, response)
+        self.note = "" if self._layout.dialect is OWN else _note(reader, self._direction.text)
+        self.warning = self._direction.warning
+
+    @property
+    def fraction(self) -> float:
+        """Fraction of the table that has been read, 0..1."""
+        return self._reader.fraction
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Yield blocks of samples, with the current positive on discharge.
+
+        Raises:
+            UserError: The table cannot be read; the message names file, line and column.
+        """
+        self.implausible = 0
+        before = np.empty(0, dtype=SAMPLE)
+        for raw, samples in self._blocks_as_signed_in_table():
+            samples["current_a"] *= self._direction.factor
+            if self._direction.by_state:
+                state = raw[Role.STATE]
+                directed = state * np.abs(samples["current_a"])
+                samples["current_a"] = np.where(np.abs(state) == 1.0, directed, samples["current_a"])
+            if self._layout.dialect is not OWN:  # this project's tables hold the time stamps that a source delivered
+                before = _separate_steps(before, samples)
+            self.implausible += remove_implausible(samples["temperature_c"], MIN_C, MAX_C)
+            yield samples
+
+    def _blocks_as_signed_in_table(self) -> Iterator[tuple[RawBlock, SampleBlock]]:
+        """Yield blocks as read, and their samples, whose current has the sign of the table."""
+        start_s = None
+        for raw in self._reader.blocks():
+            samples = _samples(raw, self._layout)
+            if self._layout.columns[Role.TIME].kind is CellKind.DATE_TIME:
+                start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
+                samples["time_s"] -= start_s
+            yield raw, samples
+
+    def _first_rows(self) -> SampleBlock:
+        """Return samples at the beginning, at least ``SIGN_ROWS`` if the table has as many."""
+        blocks, rows = [], 0
+        for _, samples in self._blocks_as_signed_in_table():
+            blocks.append(samples)
+            rows += samples.size
+            if rows >= SIGN_ROWS:
+                break
+        return np.concatenate(blocks) if blocks else np.empty(0, dtype=SAMPLE)
+
+
+def _samples(raw: RawBlock, layout: Layout) -> SampleBlock:
+    """Return samples in SI units."""
+    with np.errstate(over="ignore"):  # infinite results are dropped like other invalid values
+        values = {role: raw[role] * column.unit.factor + column.unit.offset for role, column in layout.columns.items()}
+    samples = np.zeros(values[Role.TIME].size, dtype=SAMPLE)
+    samples["time_s"], samples["voltage_v"] = values[Role.TIME], values[Role.VOLTAGE]
+    samples["current_a"] = values[Role.CURRENT]
+    if Role.CHARGE_CURRENT in values:
+        discharge_a, charge_a = np.abs(values[Role.CURRENT]), np.abs(values[Role.CHARGE_CURRENT])
+        samples["current_a"] = np.nan_to_num(discharge_a) - np.nan_to_num(charge_a)
+    samples["temperature_c"] = values.get(Role.TEMPERATURE, np.nan)
+    if Role.STATUS in values:
+        samples["status"] = np.nan_to_num(values[Role.STATUS]).clip(0.0, np.iinfo(np.uint32).max)
+    return samples
+
+
+def _separate_steps(before: SampleBlock, samples: SampleBlock) -> SampleBlock:
+    """Add ``STEP_S`` to the time of the last of several rows with the same time, if its current differs from the first.
+
+    Cyclers write the last row of a step and the first row of the next at the same time. Both are needed, because the
+    charge before the step is that of the first current, and the charge after it that of the last.
+
+    Args:
+        before: Last return value of this function; empty for the first block.
+        samples: Block of samples, whose times are changed.
+
+    Returns:
+        The first of the rows that have the time of the block's last row.
+    """
+    rows = np.concatenate([before, samples])
+    time_s, current_a = rows["time_s"], rows["current_a"]
+    repeats = np.concatenate([[False], time_s[1:] == time_s[:-1]])
+    is_last = repeats & ~np.append(repeats[1:], False)
+    first = np.maximum.accumulate(np.where(repeats, 0, np.arange(rows.size)))  # index of the first row with the time
+    is_step = is_last & (current_a != current_a[first])
+    samples["time_s"][is_step[before.size :]] += STEP_S
+    first_of_last_time: SampleBlock = rows[first[-1:]]
+    return first_of_last_time
+
+
+def _first_finite(values: NDArray[np.float64]) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite[0]) if finite.size else 0.0
+
+
+def _note(reader: TableReader, direction: str) -> str:
+    """Return the dialect, the columns with their units and the sign of the current, as text."""
+    layout = reader.layout
+    name = "given columns" if layout.dialect is None else layout.dialect.name
+    columns = [
+        _column_text(role, layout.columns[role]) + (f", {direction}" if role is Role.CURRENT else "")
+        for role in _SHOWN_ROLES
+        if role in layout.columns
+    ]
+    return f"read as {name} ({reader.description}): {'; '.join(columns)}"
+
+
+_SHOWN_ROLES = (Role.TIME, Role.CURRENT, Role.VOLTAGE, Role.TEMPERATURE)
+
+
+def _column_text(role: Role, column: Column) -> str:
+    """Return a quantity with its column and unit, as text."""
+    if column.kind is not CellKind.NUMBER:
+        return f'{role.value} "{column.name}" as {column.kind.value}'
+    return f'{role.value} "{column.name}" in {column.unit.symbol}{" (assumed)" if column.assumed else ""}'
+
+
+def open_table(path: Path, configured: Sign, column_map: ColumnMap | None = None) -> Table:
+    """Open a table; its format is recognized by the first bytes of the file, and for text by its columns.
+
+    Raises:
+        UserError: The file cannot be read, has no columns of a sample, or has no sheets although one is given.
+    """
+    finder = LayoutFinder(path, column_map)
+    reader = _open_reader(path, finder)
+    if finder.sheet is not None and not isinstance(reader, Spreadsheet):
+        raise UserError(f"{path}: sheet {finder.sheet} is given, but the file is not a spreadsheet")
+    return Table(reader, configured)
+
+
+def _open_reader(path: Path, finder: LayoutFinder) -> TableReader:
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(MPR_MAGIC))  # the longest
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+    if head.startswith(ZIP_MAGIC):
+        return _open_archive(path, finder)
+    readers: dict[bytes, Callable[[Path, LayoutFinder], TableReader]] = {
+        PARQUET_MAGIC: ParquetTable,
+        OLE_MAGIC: Spreadsheet,
+        NDA_MAGIC: partial(read_neware, suffix=".nda"),
+        MPR_MAGIC: read_biologic,
+    }
+    reader = next((reader for magic, reader in readers.items() if head.startswith(magic)), TextTable)
+    return reader(path, finder)
+
+
+def _open_archive(path: Path, finder: LayoutFinder) -> TableReader:
+    """Open a zip archive: a Neware file, a spreadsheet or a compressed text."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.namelist()
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        members = []  # the reader of text reports the error
+    if any(member.endswith(NDAX_MEMBER) for member in members):
+        return read_neware(path, finder, ".ndax")
+    if {EXCEL_MEMBER, OPEN_DOCUMENT_MEMBER} & set(members):
+        return Spreadsheet(path, finder)
+    return TextTable(path, finder)
+
+
+def convert_table(table: ColumnTable, configured: Sign, column_map: ColumnMap | None = None) -> Table:
+    """Return the samples of a table in memory.
+
+    Raises:
+        UserError: A column is missing or does not contain numbers.
+    """
+    name = "the table"
+    return Table(ArrayTable(name, table, LayoutFinder(name, column_map)), configured)

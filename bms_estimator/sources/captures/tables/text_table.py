@@ -1,0 +1,175 @@
+"""Reader of delimited text: any preamble, separator and decimal sign, in blocks so that memory does not grow with the file."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind, parser
+from bms_estimator.sources.captures.tables.layout import BLOCK_ROWS, REQUIRED, Column, LayoutFinder, RawBlock, Role
+from bms_estimator.sources.captures.tables.text_file import TextFile
+from bms_estimator.sources.captures.tables.text_format import SEPARATORS, TextFormat, find_format, is_data, split_cells
+
+TEXT_DTYPE = f"U{MAX_TEXT_CHARACTERS}"
+
+
+class TextTable:
+    """Reader of a table in text. Lines that start with # are comments.
+
+    Args:
+        path: The file.
+        finder: Finder of the columns.
+
+    Raises:
+        UserError: The file cannot be read, or no line is a header.
+    """
+
+    def __init__(self, path: Path, finder: LayoutFinder) -> None:
+        self._path, self._file = path, TextFile(path)
+        with self._file.open() as text:
+            self._format = find_format(text, finder)
+        self.layout = self._format.layout
+        self.description = f"text, separator {SEPARATORS[self._format.separator]}" + (
+            ", decimal comma" if self._format.decimal_comma else ""
+        )
+
+    @property
+    def fraction(self) -> float:
+        """Fraction of the file that has been read, 0..1."""
+        return self._file.fraction
+
+    def blocks(self) -> Iterator[RawBlock]:
+        """Yield blocks of at most ``BLOCK_ROWS`` rows.
+
+        Repeated headers, and lines without a number after the last row, are ignored.
+
+        Raises:
+            UserError: A row is not valid; the message names file, line and column.
+        """
+        with self._file.open() as text:
+            line = self._format.first_line
+            for _ in itertools.islice(text, line - 1):
+                pass
+            row_parser = _RowParser(self._path, self._format)
+            count = 0
+            while lines := list(itertools.islice(text, BLOCK_ROWS)):
+                values = self._fast_values(lines)
+                if values is None:
+                    values = row_parser.parse(lines, line)
+                elif row_parser.pending_line:
+                    raise row_parser.pending_error()
+                line += len(lines)
+                if values and values[Role.TIME].size:
+                    count += values[Role.TIME].size
+                    yield values
+            if count == 0:
+                raise UserError(f"{self._path}: no samples after the header in line {self._format.first_line - 1}")
+
+    def _fast_values(self, lines: Sequence[str]) -> RawBlock | None:
+        """Return the columns of some lines with numpy's fast parser; None if a line has an empty cell or is not a row."""
+        columns = self.layout.columns
+        if self._format.decimal_comma:
+            if self._format.separator == ",":  # numbers are quoted, so that only the CSV parser separates them
+                return None
+            lines = [line.replace(",", ".") for line in lines]
+        if not any(line.strip() for line in lines):
+            return {}
+        dtypes = {role.value: "f8" if c.kind is CellKind.NUMBER else TEXT_DTYPE for role, c in columns.items()}
+        try:
+            table = np.loadtxt(
+                lines,
+                dtype=list(dtypes.items()),
+                delimiter=self._format.separator,
+                usecols=[column.index for column in columns.values()],
+                ndmin=1,
+                quotechar='"',
+                comments=None,
+            )
+            return {role: _convert(column, table[role.value]) for role, column in columns.items()}
+        except (ValueError, OverflowError):
+            return None
+
+
+def _convert(column: Column, cells: NDArray[np.float64] | NDArray[np.str_]) -> NDArray[np.float64]:
+    """Convert a column that numpy's parser has read as numbers or as text to floats."""
+    if column.kind is CellKind.NUMBER:
+        return cells.astype(np.float64)
+    parse = parser(column.kind, decimal_comma=False)
+    if column.kind is CellKind.DIRECTION:  # few different words
+        words, index = np.unique(cells, return_inverse=True)
+        return np.array([parse(str(word)) for word in words])[index]
+    return np.array([parse(cell) for cell in cells.tolist()])
+
+
+class _RowParser:
+    """Parser of rows cell by cell, which names line and column of an error.
+
+    Attributes:
+        pending_line: Number of the first line without a number after the last row; 0 without one.
+    """
+
+    def __init__(self, path: Path, text_format: TextFormat) -> None:
+        self._path, self._format = path, text_format
+        self._parsers = {
+            role: parser(column.kind, decimal_comma=text_format.decimal_comma)
+            for role, column in text_format.layout.columns.items()
+        }
+        self._last_index = max(column.index for column in text_format.layout.columns.values())
+        self.pending_line, self._pending_text = 0, ""
+
+    def parse(self, lines: Sequence[str], first_line: int) -> RawBlock:
+        """Return the columns of some lines."""
+        rows = []
+        for number, line in enumerate(lines, first_line):
+            if not is_data(line) or line.strip() == self._format.header.strip():
+                continue
+            cells = split_cells(line, self._format.separator)
+            if not any(cell.strip() for cell in cells):
+                continue
+            if self._has_no_value(cells):
+                if not self.pending_line:
+                    self.pending_line, self._pending_text = number, line
+                continue
+            if self.pending_line:
+                raise self.pending_error()
+            rows.append(self._row(cells, number))
+        return dict(zip(self._format.layout.columns, np.array(rows).T, strict=True)) if rows else {}
+
+    def pending_error(self) -> UserError:
+        """Return the error of a line without a number that rows follow."""
+        text = self._pending_text.strip()[:MAX_TEXT_CHARACTERS]
+        return UserError(f"{self._path}: line {self.pending_line}: {text!r}: not a row of numbers, though rows follow")
+
+    def _has_no_value(self, cells: Sequence[str]) -> bool:
+        """Return True if none of time, current and voltage can be read."""
+        columns = self._format.layout.columns
+        for quantity in REQUIRED:
+            index = columns[Role(quantity)].index
+            if index < len(cells) and cells[index].strip():
+                try:
+                    self._parsers[Role(quantity)](cells[index])
+                except (ValueError, OverflowError):
+                    continue
+                return False
+        return True
+
+    def _row(self, cells: Sequence[str], line: int) -> list[float]:
+        if len(cells) <= self._last_index:
+            raise UserError(
+                f"{self._path}: line {line}: {len(cells)} values, but the header has {self._format.width} columns"
+            )
+        return [self._value(role, column, cells, line) for role, column in self._format.layout.columns.items()]
+
+    def _value(self, role: Role, column: Column, cells: Sequence[str], line: int) -> float:
+        cell = cells[column.index]
+        if not cell.strip():
+            return float("nan")
+        try:
+            return self._parsers[role](cell)
+        except (ValueError, OverflowError):
+            kind = "number" if column.kind is CellKind.NUMBER else column.kind.value
+            shown = cell[:MAX_TEXT_CHARACTERS]
+            raise UserError(f"{self._path}: line {line}: {column.name} = {shown!r}: must be a {kind}") from None
