@@ -4,17 +4,17 @@ Section 5.3 and chapter 6 of the thesis validate in this way. (2.2)-(2.9) of the
 two RC pairs and a series resistance, whose elements are functions of SOC.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, soc_outside
-from bms_estimator.calibration.cleaning.clean_capture import clean_capture
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE
 from bms_estimator.calibration.elements.identify import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.ocv.overpotential import overpotential
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.chen_mora import ocv
+from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
@@ -60,6 +60,9 @@ class Validation:
         with_extra_ohm: Errors over the samples of ``above`` that remain after ``extra_ohm`` was added to the model.
         warnings: Contradictions between capture and cell.
         time_s: Shape (n,), times of the good samples, from 0 [s].
+        current_a: Shape (n,), positive on discharge [A].
+        voltage_v: Shape (n,), measured [V].
+        temperature_c: Shape (n,), temperature of the cell [°C]; NaN where it was not measured.
         error_v: Shape (n,), measured less simulated voltage [V].
         soc: Shape (n,), SOC by coulomb counting.
     """
@@ -77,11 +80,31 @@ class Validation:
     with_extra_ohm: Errors
     warnings: tuple[str, ...]
     time_s: Floats
+    current_a: Floats
+    voltage_v: Floats
+    temperature_c: Floats
     error_v: Floats
     soc: Floats
 
+    @property
+    def named_errors(self) -> dict[str, Errors]:
+        """Errors of the non-empty sets of samples by name. The sets after the second are parts of the second."""
+        named = {
+            "all": self.all,
+            f"SOC > {LOW_SOC:g}": self.above,
+            "at rest": self.resting,
+            "under load": self.loaded,
+            f"with {1e3 * self.extra_ohm:+.2f} mohm in series": self.with_extra_ohm,
+        }
+        return {name: errors for name, errors in named.items() if errors.samples}
 
-def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = None) -> Validation:
+    @property
+    def modeled_v(self) -> Floats:
+        """Shape (n,), simulated voltage [V]."""
+        return self.voltage_v - self.error_v
+
+
+def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = None, from_s: float = 0.0) -> Validation:
     """Simulate a capture's voltage from its current alone and compare it with the measured voltage.
 
     The simulation uses the RC ladder of the cell file at the capture's temperature, or (2.2)-(2.9) without a ladder.
@@ -92,6 +115,7 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
         capture: Raw samples, rows of dtype ``SAMPLE``; it should start from rest.
         cell: Cell to validate.
         initial_soc: SOC 0..1 at the first good sample; None: from the voltage of the first rest.
+        from_s: Time since the first good sample from which on the errors are evaluated [s]. The simulation begins before.
 
     Raises:
         UserError: Most samples lie outside the cell's limits, or SOC runs outside 0..1.
@@ -104,7 +128,8 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
         raise UserError("\n".join(dict.fromkeys([*warnings, f"{capture.name}: {outside}"])))
     soc = start - load.discharged_ah / cell.cell.capacity_ah
     grid = ocv_grid(cell)
-    error_v = load.voltage_v - np.array([ocv(x, *grid) for x in soc]) + overpotential(cell, load, soc)
+    error_v = load.voltage_v - ocv_of_each(soc, *grid) + overpotential(cell, load, soc)
+    load, soc, error_v = _later(load, soc, error_v, from_s)
     above = soc > LOW_SOC
     resting = np.abs(load.current_a) < REST_C_RATE * cell.cell.capacity_ah
     current_a = load.current_a[above]
@@ -124,13 +149,26 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
         with_extra_ohm=_errors(error_v[above] + extra_ohm * current_a, load.voltage_v[above]),
         warnings=tuple(warnings),
         time_s=load.time_s,
+        current_a=load.current_a,
+        voltage_v=load.voltage_v,
+        temperature_c=load.temperature_c,
         error_v=error_v,
         soc=soc,
     )
 
 
+def _later(load: CleanCapture, soc: Floats, error_v: Floats, from_s: float) -> tuple[CleanCapture, Floats, Floats]:
+    """Return the samples from the time ``from_s`` on."""
+    first = int(np.searchsorted(load.time_s, from_s))
+    names = ("time_s", "current_a", "voltage_v", "temperature_c", "discharged_ah")
+    later = replace(load, **{name: getattr(load, name)[first:] for name in names})
+    return later, soc[first:], error_v[first:]
+
+
 def _errors(error_v: Floats, voltage_v: Floats) -> Errors:
     if error_v.size == 0:
         return Errors(0, float("nan"), float("nan"), float("nan"))
-    percent = 100.0 * np.abs(error_v) / voltage_v
+    percent = np.abs(error_v)
+    percent *= 100.0
+    percent /= voltage_v
     return Errors(error_v.size, float(np.sqrt(np.mean(error_v**2))), float(percent.mean()), float(percent.max()))

@@ -49,7 +49,7 @@ def quasi_steady(cell: CellModel, current_a: float) -> QuasiSteady:
     """Simulate a full cell at a constant ``current_a`` [A], and the observer with the a1..a12 of the cell."""
     a, capacity_as = cell.a, cell.cell.capacity_ah * 3600.0
     cell_state = (1.0, 0.0, 0.0)
-    time_s = np.arange(0.0, DURATION_S, STEP_S)
+    time_s = np.arange(0.0, DURATION_S, STEP_S, dtype=np.float64)
     voltage_v = np.empty(time_s.size)
     for n in range(time_s.size):
         voltage_v[n] = terminal_voltage(cell_state, current_a, a)

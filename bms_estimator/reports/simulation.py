@@ -112,7 +112,7 @@ def discharge(cell: CellModel, current_a: float, step_s: float, first_s: Floats 
         first_s: Times of the first samples, after which ``step_s`` applies [s].
     """
     seconds = 0.995 * cell.cell.capacity_ah * 3600.0 / current_a
-    time_s = np.arange(0.0, seconds, step_s)
+    time_s = np.arange(0.0, seconds, step_s, dtype=np.float64)
     if first_s is not None:
         time_s = np.r_[first_s, time_s[time_s > first_s[-1]]]
     currents = np.full(time_s.size, current_a)
@@ -280,7 +280,7 @@ class Simulation:
     @cached_property
     def pulsed(self) -> SampleBlock:
         """Samples of the true cell under a pulsed 1C load, from full to empty."""
-        time_s = np.arange(0.0, 2.0 * 0.97 * 3600.0, 1.0)
+        time_s = np.arange(0.0, 2.0 * 0.97 * 3600.0, 1.0, dtype=np.float64)
         current_a = np.where(time_s % (2.0 * PULSE_S) < PULSE_S, CURRENT_A, 0.0)
         capacity_as = self.cell.cell.capacity_ah * 3600.0
         voltage_v, _ = simulate_cell((1.0, 0.0, 0.0), time_s, current_a, capacity_as, self.cell.a)

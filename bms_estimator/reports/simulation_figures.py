@@ -13,6 +13,8 @@ from bms_estimator.calibration.thesis.prediction import Prediction
 from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_leffler, series_coefficients
 from bms_estimator.model.arrays import Floats
+from bms_estimator.plot.style import COLORS, FAINT
+from bms_estimator.plot.thinning import thin
 from bms_estimator.reports.report_items import Figure, Reproduction
 from bms_estimator.reports.simulation import (
     FINAL_SOC,
@@ -22,7 +24,7 @@ from bms_estimator.reports.simulation import (
     element,
     mean_error_percent,
 )
-from bms_estimator.reports.svg_plot import COLORS, FAINT, plot, thin
+from bms_estimator.reports.svg_plot import plot
 from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
 
 NO_VALUES = "The thesis prints no value of the figure that could be compared."

@@ -6,6 +6,7 @@ from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE, SOC_SLACK, true_runs
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 
 MIN_PEAK_C_RATE = 0.1
@@ -154,7 +155,7 @@ def _wrong_capacity(load: CleanCapture, cell: CellModel, initial_soc: float) -> 
     if outside:
         return outside
     soc = initial_soc - load.discharged_ah / capacity_ah
-    for j in _ends_of_long_rests(load, capacity_ah):
+    for j in ends_of_long_rests(load.time_s, load.current_a, capacity_ah):
         rested_v = float(load.voltage_v[j])
         expected_v, rested_soc = ocv(soc[j], *grid), soc_from_ocv(rested_v, *grid)
         if (
@@ -169,7 +170,7 @@ def _wrong_capacity(load: CleanCapture, cell: CellModel, initial_soc: float) -> 
     return None
 
 
-def _ends_of_long_rests(load: CleanCapture, capacity_ah: float) -> list[int]:
+def ends_of_long_rests(time_s: Floats, current_a: Floats, capacity_ah: float) -> list[int]:
     """Return the index of the last sample of each rest longer than ``LONG_REST_S``."""
-    resting = np.abs(load.current_a) < REST_C_RATE * capacity_ah
-    return [end - 1 for first, end in true_runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]
+    resting = np.abs(current_a) < REST_C_RATE * capacity_ah
+    return [end - 1 for first, end in true_runs(resting) if time_s[end - 1] - time_s[first] > LONG_REST_S]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches
+from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches, selected
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
@@ -23,6 +23,8 @@ RESISTANCE_FACTOR = 3.0
 UNCHANGED_FRACTION = 0.01
 """Maximum change of the voltage at a current spike, as a fraction of the change that the largest resistance
 explains."""
+BLOCK_SAMPLES = 1 << 16
+"""Number of samples whose medians are computed at once. It limits the memory of long captures."""
 MIN_GOOD_FRACTION = 0.5
 """Minimum fraction of samples within the limits of the cell. A smaller fraction means that the cell file is of another
 cell."""
@@ -91,11 +93,12 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
     """
     limits = cell.cell
     voltage_v, current_a = samples["voltage_v"], samples["current_a"]
-    good: SampleBlock = samples[
+    good = selected(
+        samples,
         (voltage_v >= limits.voltage_min_v)
         & (voltage_v <= limits.voltage_max_v)
-        & (np.abs(current_a) <= limits.current_max_a)
-    ]
+        & (np.abs(current_a) <= limits.current_max_a),
+    )
     if good.size < MIN_GOOD_FRACTION * samples.size:
         raise UserError(
             f"{name}: {good.size} of {samples.size} samples lie within the cell's limits ({limits.voltage_min_v:g} to "
@@ -117,13 +120,15 @@ def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
     current_spike = (deviation_a > SPIKE_C * cell.cell.capacity_ah) & (
         deviation_v < UNCHANGED_FRACTION * max_ohm * deviation_a
     )
-    good: SampleBlock = samples[~(voltage_spike | current_spike)]
-    return good
+    return selected(samples, ~(voltage_spike | current_spike))
 
 
 def _deviation_from_median(values: Floats) -> Floats:
     """Return each value less the median of the value and its neighbors; 0 at the ends."""
-    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBORS + 1)
+    windows = np.lib.stride_tricks.sliding_window_view(values, MIN_SAMPLES)
     deviation = np.zeros(values.size)
-    deviation[NEIGHBORS:-NEIGHBORS] = values[NEIGHBORS:-NEIGHBORS] - np.median(windows, axis=1)
+    for begin in range(0, len(windows), BLOCK_SAMPLES):
+        medians = np.median(windows[begin : begin + BLOCK_SAMPLES], axis=1)
+        middle = slice(begin + NEIGHBORS, begin + NEIGHBORS + medians.size)
+        deviation[middle] = values[middle] - medians
     return deviation

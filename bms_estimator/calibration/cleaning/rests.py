@@ -37,7 +37,7 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
         UserError: Nothing is left, most voltages are glitches, or the time goes back.
     """
     finite = np.isfinite(samples["time_s"]) & np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"])
-    good = samples[finite]
+    good = selected(samples, finite)
     if good.size == 0:
         raise UserError(f"{name}: none of {samples.size} samples has finite time, current and voltage")
     positive_v = good["voltage_v"][good["voltage_v"] > 0.0]
@@ -53,7 +53,7 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
             f"{name}: {is_glitch.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
             f"{first['voltage_v']:.3f} V where the median is {median_v:.3f} V: check the sensor's wiring"
         )
-    good = good[~is_glitch]
+    good = selected(good, ~is_glitch)
     latest = np.maximum.accumulate(good["time_s"])
     is_earlier = good["time_s"] < latest
     if is_earlier.mean() > MAX_BACKWARD_FRACTION:
@@ -64,8 +64,12 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
             "contains several captures, or a clock was set; give each stretch as a file of its own"
         )
     is_later = np.r_[True, good["time_s"][1:] > latest[:-1]]
-    increasing: SampleBlock = good[is_later]
-    return increasing
+    return selected(good, is_later)
+
+
+def selected(samples: SampleBlock, mask: NDArray[np.bool_]) -> SampleBlock:
+    """Return the samples for which ``mask`` is True: ``samples`` itself if all are, because a long capture is large."""
+    return samples if mask.all() else samples[mask]
 
 
 def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float = 1.0) -> Floats:

@@ -12,10 +12,21 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.validate import Errors, Validation, validate
-from bms_estimator.cli.options.capture_options import CAPTURE_FORMATS, AsJson, CapacityAh, CellName, SignOfCurrent
+from bms_estimator.cli.options.capture_input import load_captures
+from bms_estimator.cli.options.capture_options import (
+    CAPTURE_FORMATS,
+    AsJson,
+    CapacityAh,
+    CellName,
+    Force,
+    MappedColumns,
+    SignOfCurrent,
+    check_output_file,
+)
 from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.model.arrays import Records, structured_array
 from bms_estimator.model.cell import load_cell
-from bms_estimator.sources.captures.replay import load_capture
+from bms_estimator.sinks.trace_file import table_sink
 
 
 def validate_command(
@@ -29,6 +40,14 @@ def validate_command(
         ),
     ] = None,
     current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="file to which the residuals of each sample are written: .csv, .csv.gz or .parquet", show_default=False
+        ),
+    ] = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a capture's voltage from its current, and compare it with the measured voltage (open loop).
@@ -36,13 +55,33 @@ def validate_command(
     The parameters are constant. The measured voltage is used only for the SOC of the first rest.
     """
     model = load_cell(cell, capacity_ah)
-    validation = validate(load_capture(capture, current_sign=current_sign), model, initial_soc=soc)
+    (loaded,) = load_captures([capture], current_sign=current_sign, column_map=column_map)
+    if out is not None:
+        check_output_file(out, [capture], force=force)
+    residual_sink = table_sink(out) if out else None
+    validation = validate(loaded, model, initial_soc=soc)
     for line in validation.warnings:
         typer.echo(f"warning: {line}", err=True)
+    if residual_sink:
+        with residual_sink:
+            residual_sink.write(_residuals(validation))
     if as_json:
         sys.stdout.write(json.dumps(_json_result(validation)) + "\n")
     else:
         Console().print(_tables(capture, validation))
+
+
+def _residuals(validation: Validation) -> Records:
+    """Return time, measured and modeled voltage, error, SOC and current of each good sample."""
+    columns = {
+        "time_s": validation.time_s,
+        "voltage_v": validation.voltage_v,
+        "modeled_v": validation.modeled_v,
+        "error_v": validation.error_v,
+        "soc": validation.soc,
+        "current_a": validation.current_a,
+    }
+    return structured_array(columns)
 
 
 def _json_result(validation: Validation) -> dict[str, Any]:
@@ -82,16 +121,9 @@ def _tables(capture: Path, validation: Validation) -> Group:
     table = Table(title=capture.name, title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("", "samples", "RMS", "mean", "max"):
         table.add_column(column, justify="left" if not column else "right")
-    rows = {
-        "all": validation.all,
-        "SOC > 0.1": validation.above,
-        "  at rest": validation.resting,
-        "  under load": validation.loaded,
-        f"  with {1e3 * validation.extra_ohm:+.2f} mohm in series": validation.with_extra_ohm,
-    }
-    for name, errors in rows.items():
-        if errors.samples:
-            percents = (f"{errors.mean_abs_percent:.3f} %", f"{errors.max_abs_percent:.2f} %")
-            table.add_row(name, f"{errors.samples:,}", f"{1e3 * errors.voltage_rms_v:.2f} mV", *percents)
+    for row, (name, errors) in enumerate(validation.named_errors.items()):
+        percents = (f"{errors.mean_abs_percent:.3f} %", f"{errors.max_abs_percent:.2f} %")
+        indented = f"  {name}" if row > 1 else name
+        table.add_row(indented, f"{errors.samples:,}", f"{1e3 * errors.voltage_rms_v:.2f} mV", *percents)
     soc = f"SOC {validation.initial_soc:.4f} ({validation.initial_soc_from}) to {validation.final_soc:.4f}"
     return Group(table, f"{soc}; {validation.glitches} glitches skipped")

@@ -1,0 +1,137 @@
+"""Results for a capture in a report: validation, estimates and data quality."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.cleaning.data_quality import data_quality
+from bms_estimator.calibration.validate import Validation, validate
+from bms_estimator.calibration.verdict import SocErrors
+from bms_estimator.cli.options.capture_input import read_with_bar
+from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.identified_parameters import relative_capacity
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.columns import Columns
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.progress import Progress
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.plot.thinning import kept_indices
+from bms_estimator.reports.capture_report import CaptureResult, Estimates
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.captures.replay import Capture, RawCapture
+from bms_estimator.telemetry.health import suspicions
+
+BLOCK_SAMPLES = 1 << 16
+"""Number of samples of a block, so that the memory for the trace does not grow with the capture."""
+ESTIMATE_POINTS = 6000
+"""Maximum number of rows of the trace that remain after thinning."""
+KEPT_EXTREMES = ("soc", "soc_std", "r_s_ohm", "r_ts_ohm", "r_tl_ohm", "tau_ts_s", "tau_tl_s")
+"""Columns of the trace whose extremes remain."""
+
+
+def capture_result(
+    file: Path,
+    name: str,
+    opened: Capture,
+    settings: Settings,
+    model: CellModel,
+    *,
+    initial_soc: float | None,
+) -> CaptureResult:
+    """Return the results for a capture.
+
+    Args:
+        file: File of the capture.
+        name: Name of the capture in the report.
+        opened: The capture, of which nothing has been read.
+        settings: Settings of the estimator.
+        model: Cell, or pack as one object.
+        initial_soc: SOC at the first sample, 0..1; None: from the voltage.
+
+    Raises:
+        UserError: The capture cannot be read, or does not belong to the cell.
+    """
+    with show_compile_progress():
+        rows = read_with_bar(file, opened)
+        quality = data_quality(rows)  # first, because it needs memory for copies of columns
+        validation = validate(Columns(rows, name), model, initial_soc=initial_soc)
+        estimator = new_estimator(settings, model)
+    with progress_bar(f"estimating {name}") as bar:
+        estimates = _estimate(estimator, rows, validation, bar.update)
+    raw = opened if isinstance(opened, RawCapture) else None
+    return CaptureResult(
+        name,
+        validation,
+        estimates,
+        quality,
+        decoder_counters=dict(raw.decoder.counters) if raw else {},
+        clock_ppm=raw.decoder.clock_ppm if raw else None,
+    )
+
+
+class _SocErrorSums:
+    """Sums over the blocks of a trace, from which the errors of its SOC follow.
+
+    Attributes:
+        samples: Number of samples so far.
+    """
+
+    def __init__(self) -> None:
+        self.samples = 0
+        self._squares, self._within_band = 0.0, 0
+
+    def add(self, trace: SampleBlock, counted: Floats) -> None:
+        """Add a block of the trace, with the SOC by coulomb counting at its samples."""
+        error = trace["soc"] - counted
+        self.samples += trace.size
+        self._squares += float(error @ error)
+        self._within_band += int(np.count_nonzero(np.abs(error) <= 2.0 * trace["soc_std"]))
+
+    def errors(self) -> SocErrors:
+        """Return the errors of the samples so far, at least one."""
+        return SocErrors(float(np.sqrt(self._squares / self.samples)), self._within_band / self.samples)
+
+
+def _estimate(estimator: Estimator, rows: SampleBlock, validation: Validation, progress: Progress) -> Estimates:
+    """Run the estimator over the samples of a capture, without the fit to the pack's history.
+
+    Raises:
+        UserError: The estimator accepted no sample.
+    """
+    first_s = float(rows["time_s"][np.isfinite(rows["time_s"])][0])
+    max_rows = max(ESTIMATE_POINTS * BLOCK_SAMPLES // rows.size, 1)
+    sums, traces, counted = _SocErrorSums(), [], []
+    for begin in range(0, rows.size, BLOCK_SAMPLES):
+        block = rows[begin : begin + BLOCK_SAMPLES]
+        block_trace = estimator.run(block)
+        progress((begin + block.size) / rows.size)
+        block_counted = np.interp(block_trace["time_s"] - first_s, validation.time_s, validation.soc)
+        sums.add(block_trace, block_counted)
+        kept = _thinned_indices(block_trace, max_rows)
+        traces.append(block_trace[kept])
+        counted.append(block_counted[kept])
+    if sums.samples == 0:
+        raise UserError("the estimator accepted no sample of the capture")
+    trace = np.concatenate(traces)
+    capacity = relative_capacity(estimator.record[0])
+    rated_ah = float(estimator.settings["capacity_as"][0]) / 3600.0
+    return Estimates(
+        {name: trace[name] for name in trace.dtype.names or ()} | {"time_s": trace["time_s"] - first_s},
+        np.concatenate(counted),
+        sums.errors(),
+        capacity_ah=capacity.value * rated_ah,
+        capacity_std_ah=capacity.std * rated_ah,
+        suspicions=tuple(suspicions(estimator.record[0], estimator.settings_record[0])),
+    )
+
+
+def _thinned_indices(trace: SampleBlock, max_rows: int) -> NDArray[np.int64]:
+    """Return the indices of the rows of a trace that remain, at most about ``max_rows``."""
+    if trace.size <= max_rows:
+        return np.arange(trace.size)
+    return kept_indices(trace["time_s"], tuple(trace[column] for column in KEPT_EXTREMES), max_rows)

@@ -1,0 +1,66 @@
+"""Stored history of a pack for a report."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.learned_state import learned_estimator
+from bms_estimator.estimator.identified_parameters import present_elements, relative_capacity
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.reports.history_report import PackHistory
+from bms_estimator.reports.report_items import number
+from bms_estimator.settings.pack import Settings
+from bms_estimator.store.history_reader import HistoryFile
+from bms_estimator.store.minute import MINUTE_S, Minute
+
+
+def pack_history(settings: Settings, model: PackModel, folder: Path | None, since_s: float) -> PackHistory:
+    """Return the history that the service of a pack has stored.
+
+    Args:
+        settings: Settings of the pack.
+        model: The pack as one object.
+        folder: State folder of the service; None: that of the settings.
+        since_s: Start time [s since 1970].
+
+    Raises:
+        UserError: The history cannot be read, or has no rows.
+    """
+    path = (folder or state_folder(settings)) / f"{settings.pack.name}.sqlite"
+    file, until_s = HistoryFile(path), time.time() + MINUTE_S
+    rows = file.rows(since_s, until_s, MINUTE_S)
+    if not rows:
+        raise UserError(f"{path}: no rows in this period; the service stores one for each minute")
+    table = np.array(rows, dtype=np.float64)  # None becomes NaN
+    columns = dict(zip(Minute._fields, table.T, strict=True))
+    learned: list[tuple[str, str, str]] = []
+    not_learned = ""
+    try:
+        learned = _learned_parameters(settings, model, path.parent)
+    except UserError as error:
+        not_learned = str(error)
+    events = file.events(since_s, until_s)
+    return PackHistory(settings.pack.name, columns["time_s"], columns, events, learned, not_learned)
+
+
+def _learned_parameters(settings: Settings, model: PackModel, folder: Path) -> list[tuple[str, str, str]]:
+    """Return name, value and std of the learned capacity and circuit elements.
+
+    Raises:
+        UserError: There is no valid checkpoint, or the pack is a fuel cell.
+    """
+    if isinstance(model, FuelCellModel):
+        raise UserError("a fuel cell has no capacity and no elements over SOC")
+    estimator = learned_estimator(CheckpointFile(folder, settings, model), settings, model)
+    record, rated_ah = estimator.record[0], model.cell.capacity_ah
+    capacity = relative_capacity(record)
+    rows = [("capacity [Ah]", number(capacity.value * rated_ah), number(capacity.std * rated_ah, 2))]
+    for name, element in present_elements(record).items():
+        symbol, _, unit = name.rpartition("_")
+        scale, label = (1e3, "mΩ") if unit == "ohm" else (1.0, "F")
+        rows.append((f"{symbol.capitalize()} [{label}]", number(scale * element.value), number(scale * element.std, 2)))
+    return rows

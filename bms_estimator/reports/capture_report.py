@@ -1,0 +1,255 @@
+"""Report on captures and the model of their cell."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bms_estimator import plot
+from bms_estimator.calibration.cleaning.capture_checks import ends_of_long_rests
+from bms_estimator.calibration.cleaning.data_quality import DataQuality
+from bms_estimator.calibration.thesis.prediction import open_circuit
+from bms_estimator.calibration.validate import Validation
+from bms_estimator.calibration.verdict import SocErrors, coverage, judge, voltage_errors
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.cell import CellModel
+from bms_estimator.plot.cell_curves import ELEMENTS, PAIRS
+from bms_estimator.reports import printed_values
+from bms_estimator.reports.parameter_table import parameter_group
+from bms_estimator.reports.report_items import number
+from bms_estimator.reports.report_page import Group, Plot, ReportPage, Section
+from bms_estimator.reports.svg_plot import small_plot
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Estimates of the service's estimator over a capture.
+
+    Attributes:
+        columns: Columns of the trace by name, thinned so that the extremes remain; ``time_s`` from 0 at the first sample.
+        counted: SOC by coulomb counting at the same samples.
+        soc_errors: Errors of the SOC over all samples.
+        capacity_ah: Learned capacity [Ah].
+        capacity_std_ah: Standard deviation of the learned capacity [Ah].
+        suspicions: Suspicions of the input at the end, one sentence each.
+    """
+
+    columns: Mapping[str, Floats]
+    counted: Floats
+    soc_errors: SocErrors
+    capacity_ah: float
+    capacity_std_ah: float
+    suspicions: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CaptureResult:
+    """Results for one capture.
+
+    Attributes:
+        name: Name of the capture.
+        validation: Comparison of the cell's model with the capture.
+        estimates: Estimates over the capture.
+        quality: Quality of the data.
+        decoder_counters: Counters of the decoder of a raw capture, such as CRC errors; empty for a table.
+        clock_ppm: Rate error of the device's clock [1e-6]; None if unknown.
+    """
+
+    name: str
+    validation: Validation
+    estimates: Estimates
+    quality: DataQuality
+    decoder_counters: Mapping[str, int]
+    clock_ppm: float | None
+
+
+def capture_report(cell: CellModel, results: Sequence[CaptureResult], written: str) -> ReportPage:
+    """Return the report on captures.
+
+    Args:
+        cell: Cell, or pack as one object, that the captures were compared with.
+        results: Results of each capture.
+        written: Time at which the report is written.
+    """
+    validations = [result.validation for result in results]
+    verdict = judge(voltage_errors(validations, cell), coverage(validations, cell), _soc_errors(results))
+    unknown = f"Not known, because the captures do not show it: {'; '.join(verdict.unknown)}."
+    names = ", ".join(result.name for result in results)
+    ratings = cell.cell
+    return ReportPage(
+        title=f"{ratings.name}: report on {names if len(results) == 1 else f'{len(results)} captures'}",
+        subtitle=f"Cell model {ratings.name}, {ratings.capacity_ah:g} Ah, {ratings.nominal_voltage_v:g} V. Captures: {names}.",
+        grade=verdict.grade.value,
+        sentences=(*verdict.sentences, unknown),
+        sections=tuple(
+            _section(cell, result, position, has_verdict=len(results) > 1) for position, result in enumerate(results, 1)
+        ),
+        written=written,
+    )
+
+
+def _soc_errors(results: Sequence[CaptureResult]) -> SocErrors:
+    """Return the SOC errors over all captures, weighted by their numbers of samples."""
+    samples = np.array([result.quality.samples for result in results], dtype=float)
+    squares = [result.estimates.soc_errors.rms**2 for result in results]
+    within = [result.estimates.soc_errors.within_band for result in results]
+    return SocErrors(float(np.sqrt(np.average(squares, weights=samples))), float(np.average(within, weights=samples)))
+
+
+def _section(cell: CellModel, result: CaptureResult, position: int, *, has_verdict: bool) -> Section:
+    """Return the section of a capture.
+
+    Args:
+        cell: Cell that the capture was compared with.
+        result: Results of the capture.
+        position: Number of the section, which makes ids unique.
+        has_verdict: True if the section has a verdict of its own, because the page is on several captures.
+    """
+    validation = result.validation
+    extent = (
+        f"{result.quality.duration_s / 3600.0:.2f} h, {validation.samples:,} samples, SOC {100 * validation.initial_soc:.1f} % "
+        f"({validation.initial_soc_from}) to {100 * validation.final_soc:.1f} % by coulomb counting."
+    )
+    verdict = judge(voltage_errors([validation], cell), coverage([validation], cell), result.estimates.soc_errors)
+    return Section(
+        title=result.name,
+        sentences=(extent, *(verdict.sentences if has_verdict else ())),
+        warnings=(*validation.warnings, *result.estimates.suspicions),
+        groups=(
+            _over_time(result, f"capture-{position}"),
+            _errors(validation),
+            _ocv(cell, validation, f"ocv-{position}"),
+            _elements(cell, result.estimates, f"elements-{position}"),
+            parameter_group(
+                cell, result.estimates.columns, result.estimates.capacity_ah, result.estimates.capacity_std_ah
+            ),
+            _quality(result),
+        ),
+    )
+
+
+def _over_time(result: CaptureResult, salt: str) -> Group:
+    validation, estimates = result.validation, result.estimates
+    columns = estimates.columns
+    figures = {
+        "Voltage, measured and modeled": lambda ax: plot.voltage(
+            validation.time_s, validation.voltage_v, validation.modeled_v, ax=ax
+        ),
+        "Error of the modeled voltage": lambda ax: plot.voltage_error(validation.time_s, validation.error_v, ax=ax),
+        "SOC with ±2 std": lambda ax: plot.soc(
+            columns["time_s"], columns["soc"], columns["soc_std"], counted=estimates.counted, ax=ax
+        ),
+        "Current": lambda ax: plot.current(validation.time_s, validation.current_a, ax=ax),
+    }
+    if np.isfinite(validation.temperature_c).any():
+        figures["Temperature"] = lambda ax: plot.temperature(validation.time_s, validation.temperature_c, ax=ax)
+    return Group(
+        "Over time",
+        tuple(Plot(title, small_plot(draw, salt=f"{salt}-{title}")) for title, draw in figures.items()),
+        remark="The model's voltage is simulated from the current alone (open loop). The SOC is that of the service's "
+        "estimator, which also uses the voltage.",
+    )
+
+
+def _errors(validation: Validation) -> Group:
+    averages = printed_values.TABLE_11.values()
+    return Group(
+        "Errors of the modeled voltage",
+        columns=("samples at", "number", "RMS [mV]", "mean [%]", "largest [%]"),
+        rows=tuple(
+            (
+                name.replace("mohm", "mΩ"),
+                f"{errors.samples:,}",
+                f"{1e3 * errors.voltage_rms_v:.2f}",
+                f"{errors.mean_abs_percent:.3f}",
+                f"{errors.max_abs_percent:.2f}",
+            )
+            for name, errors in validation.named_errors.items()
+        ),
+        remark="Errors in percent are absolute errors over the measured voltage, as in Table 11 of the thesis, whose averages "
+        f"are {min(averages):.2f} to {max(averages):.2f} %. The last row adds the series resistance that fits the capture "
+        "best, because contacts differ between captures.",
+    )
+
+
+def _ocv(cell: CellModel, validation: Validation, salt: str) -> Group:
+    ends = np.array(ends_of_long_rests(validation.time_s, validation.current_a, cell.cell.capacity_ah), dtype=np.int64)
+    soc, residual_v = validation.soc[ends], validation.error_v[ends]
+    ocv_v = open_circuit(cell, soc) + residual_v
+    curve = Plot("OCV", small_plot(lambda ax: plot.ocv(cell, soc, ocv_v, ax=ax), salt=f"{salt}-curve"))
+    if ends.size == 0:
+        return Group(
+            "Open-circuit voltage", (curve,), remark="The capture has no rest that shows the open-circuit voltage."
+        )
+    residuals = small_plot(lambda ax: plot.ocv_residuals(cell, soc, residual_v, ax=ax), salt=f"{salt}-residuals")
+    rms_mv = 1e3 * float(np.sqrt(np.mean(residual_v**2)))
+    return Group(
+        "Open-circuit voltage",
+        (curve, Plot("Residuals of the OCV", residuals)),
+        remark=f"Points are the ends of {ends.size} rests; the relaxation that the model still expects there is subtracted. "
+        f"They deviate by {rms_mv:.1f} mV RMS.",
+    )
+
+
+def _elements(cell: CellModel, estimates: Estimates, salt: str) -> Group:
+    columns = estimates.columns
+    elements = {name: partial(plot.element, cell, name, columns) for name in ELEMENTS}
+    products = {f"RC product {pair}": partial(plot.rc_product, cell, pair, columns) for pair in PAIRS}
+    figures = [
+        Plot(title, small_plot(partial(_draw_on, draw), salt=f"{salt}-{title}"))
+        for title, draw in (elements | products).items()
+    ]
+    return Group(
+        "Circuit elements and RC products",
+        tuple(figures),
+        remark="Dashed: the cell file, at 25 °C. Solid: what the estimator learned from this capture, with ±2 std. Below a "
+        "stability limit the capacitance of the cell file is negative.",
+    )
+
+
+def _draw_on(draw: Callable[..., object], ax: Any) -> None:
+    """Draw on axes given by position, as ``small_plot`` passes them."""
+    draw(ax=ax)
+
+
+def _quality(result: CaptureResult) -> Group:
+    quality = result.quality
+    short_s, long_s = quality.period_percentiles_s
+    rows = [
+        ("samples", f"{quality.samples:,}, of which {quality.not_finite:,} without a finite time, current or voltage"),
+        (
+            "sample period",
+            f"{number(quality.period_s, 3)} s (median); 98 % are between {number(short_s, 3)} and {number(long_s, 3)} s",
+        ),
+        (
+            "gaps",
+            f"{quality.gaps:,} much longer than the sample period; the longest interval is {number(quality.longest_gap_s, 3)} s",
+        ),
+        ("glitches", f"{result.validation.glitches:,} samples not used"),
+        (
+            "clock",
+            f"{quality.backward_steps:,} steps back, {quality.repeated_times:,} repeated times{_clock_text(result.clock_ppm)}",
+        ),
+        ("voltage resolution", f"{number(1e3 * quality.voltage_resolution_v, 3)} mV"),
+        ("current resolution", f"{number(1e3 * quality.current_resolution_a, 3)} mA"),
+        (
+            "temperature",
+            f"in {100 * quality.temperature_fraction:.0f} % of the samples"
+            if quality.temperature_fraction
+            else "not measured",
+        ),
+        *((name.replace("_", " "), f"{count:,}") for name, count in result.decoder_counters.items() if count),
+    ]
+    return Group(
+        "Data quality",
+        columns=("", "in this capture"),
+        rows=tuple(rows),
+        is_text=True,
+        remark="Resolution is the smallest difference between two values of the capture.",
+    )
+
+
+def _clock_text(clock_ppm: float | None) -> str:
+    return "" if clock_ppm is None else f"; the device's clock deviates by {clock_ppm:+.0f} ppm"

@@ -1,0 +1,75 @@
+"""``convert``: captures as CSV, Parquet and Battery Data Format."""
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+from bms_estimator import load_capture
+from tests.command_line import run
+
+BDF_HEADER = "Test Time / s,Voltage / V,Current / A,Surface Temperature / degC"
+
+
+@pytest.fixture
+def board(data):
+    """Return a raw capture whose first sample has no temperature."""
+    return data / "simulated" / "board_0_1_0.bms"
+
+
+@pytest.mark.parametrize("name", ["out.csv", "out.csv.gz", "out.parquet"])
+def test_our_columns_restore_the_samples_exactly(capsys, tmp_path, board, name):
+    out = tmp_path / name
+    assert run(capsys, "convert", board, "--out", out) == (0, f"{out}: 600 samples\n", "")
+    before, after = load_capture(board), load_capture(out)
+    assert all(np.array_equal(after[column], before[column], equal_nan=True) for column in before)
+
+
+@pytest.mark.parametrize("name", ["out.bdf", "out.bdf.gz", "out.bdf.csv", "out.bdf.csv.gz", "out.bdf.parquet"])
+def test_battery_data_format_restores_the_samples_from_time_zero(capsys, tmp_path, board, name):
+    out = tmp_path / name
+    assert run(capsys, "convert", board, "--out", out) == (0, f"{out}: 600 samples\n", "")
+    before, after = load_capture(board), load_capture(out)
+    assert after["time_s"] == pytest.approx(before["time_s"] - before["time_s"][0], abs=1e-6)
+    for column in ("current_a", "voltage_v", "temperature_c"):
+        assert np.array_equal(after[column], before[column], equal_nan=True)
+
+
+def test_battery_data_format_has_preferred_labels_charge_positive_current_and_empty_cells(capsys, tmp_path, board):
+    run(capsys, "convert", board, "--out", tmp_path / "out.bdf")
+    header, first = (tmp_path / "out.bdf").read_text().splitlines()[:2]
+    assert header == BDF_HEADER
+    capture = load_capture(board)
+    assert first == f"0.0,{capture['voltage_v'][0]},{-capture['current_a'][0]},"
+
+
+def test_battery_data_format_has_no_temperature_column_without_a_sensor(capsys, tmp_path, data):
+    run(capsys, "convert", data / "leaf" / "cc_1c.csv.gz", "--out", tmp_path / "out.bdf.parquet")
+    columns = parquet.read_schema(tmp_path / "out.bdf.parquet").names
+    assert columns == ["Test Time / s", "Voltage / V", "Current / A"]
+
+
+def test_battery_data_format_keeps_unix_times(capsys, tmp_path):
+    (tmp_path / "unix.csv").write_text("time_s,current_a,voltage_v\n1750000000.5,0,3.7\n1750000001.5,1,3.6\n")
+    run(capsys, "convert", tmp_path / "unix.csv", "--out", tmp_path / "out.bdf.csv")
+    assert (tmp_path / "out.bdf.csv").read_text().splitlines() == [
+        "Test Time / s,Voltage / V,Current / A,Unix Time / s",
+        "0.0,3.7,0.0,1750000000.5",
+        "1.0,3.6,-1.0,1750000001.5",
+    ]
+
+
+def test_the_export_of_a_cycler_is_converted_with_a_note_on_what_was_guessed(capsys, tmp_path, data):
+    out = tmp_path / "out.bdf.csv"
+    code, text, err = run(capsys, "convert", data / "fuzz" / "export" / "seed-neware_record", "--out", out)
+    assert code == 0
+    assert err.startswith("seed-neware_record: read as Neware")
+    assert text == f"{out}: {len(out.read_text().splitlines()) - 1} samples\n"
+    assert np.array_equal(
+        load_capture(out)["current_a"], load_capture(data / "fuzz" / "export" / "seed-neware_record")["current_a"]
+    )
+
+
+def test_an_unknown_suffix_is_an_error_that_lists_the_known_ones(capsys, tmp_path, board):
+    code, _, err = run(capsys, "convert", board, "--out", tmp_path / "out.xyz")
+    assert code == 2
+    assert err == f"error: {tmp_path / 'out.xyz'}: the name must end in .csv, .csv.gz, .parquet\n"

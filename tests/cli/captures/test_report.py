@@ -1,0 +1,176 @@
+"""``report`` and the residuals of ``validate``: contents of the pages, a pack's history, and errors of the commands."""
+
+import asyncio
+import csv
+import html
+import re
+
+import numpy as np
+import pytest
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.cli.options.pack_options import load_pack
+from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.sources.captures.replay import load_capture
+from bms_estimator.telemetry.lifetime_totals import new_totals
+from tests.calibration.simulated_load import TRUTH, capture, steps
+from tests.command_line import run
+from tests.store.test_history import record_history, snapshot_at
+
+PACK = '[pack]\nname = "shed"\ncell = "nmc"\ncapacity_ah = 30\nseries = 13\n'
+
+
+def write_table(path, rows):
+    np.savetxt(
+        path,
+        rows[["time_s", "current_a", "voltage_v", "temperature_c"]],
+        delimiter=",",
+        header="time_s,current_a,voltage_v,temperature_c",
+        comments="",
+        fmt="%.4f",
+    )
+    return path
+
+
+def text_of(page):
+    """Return the visible text of a page, with single spaces."""
+    without_plots = re.sub(r"<svg.*?</svg>|<style>.*?</style>", " ", page, flags=re.DOTALL)
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", without_plots)).split())
+
+
+@pytest.fixture(scope="module")
+def steps_csv(tmp_path_factory):
+    """Return a capture of the cell ``ncr18650`` with steps and rests at 25 °C, with a gap."""
+    rows = capture(steps())
+    rows["temperature_c"] = 25.0
+    rows["time_s"][rows["time_s"] > 10_000.0] += 500.0
+    return write_table(tmp_path_factory.mktemp("captures") / "steps.csv", rows)
+
+
+@pytest.fixture
+def page(tmp_path, capsys, steps_csv):
+    """Return the page of a report on ``steps_csv``."""
+    code, out, err = run(capsys, "report", steps_csv, "--cell", "ncr18650", "--out", tmp_path / "report.html")
+    assert (code, err) == (0, "")
+    assert "The model predicts the voltage within" in out
+    return (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_page_on_a_capture_has_verdict_figures_and_tables(page):
+    text = text_of(page)
+    assert re.search(r"The model predicts the voltage within [\d.]+ mV \(RMS per cell.*?: good\.", text)
+    assert "The estimated SOC differs from coulomb counting by" in text
+    assert (
+        "Not known, because the captures do not show it: below 25 °C; above 25 °C; discharge above 1 C; charge." in text
+    )
+    figures = re.findall(r'aria-label="([^"]+)">\s*<svg', page)
+    assert figures == [
+        *("Voltage, measured and modeled", "Error of the modeled voltage", "SOC with ±2 std", "Current", "Temperature"),
+        *("OCV", "Residuals of the OCV", "r_s", "r_ts", "r_tl", "c_ts", "c_tl", "RC product ts", "RC product tl"),
+    ]
+    assert re.search(r"SOC > 0\.1 [\d,]+ [\d.]+ [\d.]+ [\d.]+", text)
+    assert re.search(r"R_s \[mΩ\] 50 % 86\.12 - [\d.]+ [\d.]+ agrees", text)
+    assert "1 much longer than the sample period; the longest interval is 501 s" in text
+
+
+def test_page_loads_nothing_and_ids_are_unique(page):
+    assert "<script" not in page
+    assert not re.search(r"@import|url\(\s*[\"']?(?!#)", page)
+    assert not re.search(r"(?:src|href)\s*=\s*[\"'](?:https?:)?//", page.replace('xmlns:xlink="http', ""))
+    sections = re.findall(r'id="(section-[^"]+)"', page)
+    assert len(sections) == len(set(sections)) > 5
+
+
+def test_several_captures_have_a_section_and_a_verdict_each(tmp_path, capsys, steps_csv):
+    other = write_table(tmp_path / "other.csv", capture(steps(seed=3)))
+    code, _, _ = run(capsys, "report", steps_csv, other, "--cell", "ncr18650", "--out", tmp_path / "report.html")
+    assert code == 0
+    text = text_of((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert "ncr18650: report on 2 captures" in text
+    assert text.count("The model predicts the voltage within") == 3
+
+
+def test_poor_model_is_called_poor(tmp_path, capsys, steps_csv):
+    out = tmp_path / "report.html"
+    code, printed, _ = run(capsys, "report", steps_csv, "--cell", "lmo", "--capacity-ah", 3, "--out", out)
+    assert code == 0
+    assert ": poor." in printed
+    assert 'class="verdict poor"' in out.read_text(encoding="utf-8")
+
+
+async def test_page_on_a_history_has_days_events_and_gaps(tmp_path, capsys):
+    (tmp_path / "pack.toml").write_text(PACK)
+    minutes = [*range(600), *range(700, 1500)]
+    await record_history(
+        tmp_path / "shed.sqlite",
+        [snapshot_at(60.0 * m, 3.0, 48.0, soc=0.9 - m / 2000, soc_std=0.01, temperature_c=21.0) for m in minutes],
+    )
+    arguments = ("--pack", tmp_path / "pack.toml", "--folder", tmp_path, "--out", tmp_path / "report.html")
+    code, out, err = run(capsys, "report", *arguments)
+    assert (code, err) == (0, "")
+    assert "The pack's SOC at the end is 15.0 % ± 2.0 % (2 std)." in " ".join(out.split())
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert re.findall(r'aria-label="([^"]+)">\s*<svg', page) == ["SOC with ±2 std", "Voltage", "Current", "Temperature"]
+    text = text_of(page)
+    assert re.search(r"2023-11-15 .{5,12} 48\.00 … 48\.00 3\.0 … 3\.0 21 … 21", text)
+    assert "1, the longest 100 min" in text
+    assert "no checkpoint to read: none found" in text
+
+
+def test_page_on_a_history_has_the_learned_parameters_of_the_checkpoint(tmp_path, capsys, steps_csv):
+    (tmp_path / "pack.toml").write_text('[pack]\nname = "shed"\ncell = "ncr18650"\n')
+    settings, model = load_pack(tmp_path / "pack.toml")
+    estimator = new_estimator(settings, model)
+    estimator.run(load_capture(steps_csv).rows)
+    CheckpointFile(tmp_path, settings, model).save(estimator.record, RunCounters(0, new_totals(0.0)))
+    asyncio.run(record_history(tmp_path / "shed.sqlite", [snapshot_at(0.0), snapshot_at(90.0)]))
+    arguments = ("--pack", tmp_path / "pack.toml", "--folder", tmp_path, "--out", tmp_path / "report.html")
+    code, _, err = run(capsys, "report", *arguments)
+    assert (code, err) == (0, "")
+    text = text_of((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert float(re.search(r"capacity \[Ah\] ([\d.]+)", text)[1]) == pytest.approx(3.0, rel=0.05)
+    assert float(re.search(r"R_s \[mΩ\] ([\d.]+)", text)[1]) > 86.0
+
+
+def test_user_errors_end_with_code_2(tmp_path, capsys, steps_csv):
+    out = tmp_path / "report.html"
+    (tmp_path / "pack.toml").write_text(PACK)
+    for arguments, message in (
+        ((), "give captures with --cell NAME|CELL.toml, or --pack pack.toml"),
+        ((steps_csv,), "give either --cell"),
+        ((steps_csv, "--cell", "pem_30w"), "is a fuel cell: report needs a battery"),
+        ((steps_csv, steps_csv, "--cell", "ncr18650"), "given twice"),
+        (("--pack", tmp_path / "pack.toml", "--folder", tmp_path), "no history there"),
+    ):
+        code, printed, err = run(capsys, "report", *arguments, "--out", out)
+        assert (code, printed) == (2, "")
+        assert message in " ".join(err.split())
+        assert not out.exists()
+    out.write_text("mine")
+    code, _, err = run(capsys, "report", steps_csv, "--cell", "ncr18650", "--out", out)
+    assert code == 2
+    assert "exists already; --force replaces it" in err
+    assert out.read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["residuals.csv", "residuals.parquet"])
+def test_residuals_are_measured_less_modeled_voltage(tmp_path, capsys, steps_csv, name):
+    code, _, _ = run(capsys, "validate", steps_csv, "--cell", "ncr18650", "--out", tmp_path / name)
+    assert code == 0
+    samples, residuals = load_capture(steps_csv), load_capture(tmp_path / name)
+    assert np.array_equal(residuals["time_s"], samples["time_s"])
+    assert np.array_equal(residuals["voltage_v"], samples["voltage_v"])
+    if name.endswith(".csv"):
+        with (tmp_path / name).open(encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        assert list(rows[0]) == ["time_s", "voltage_v", "modeled_v", "error_v", "soc", "current_a"]
+        for row in rows[::500]:
+            assert float(row["voltage_v"]) - float(row["modeled_v"]) == pytest.approx(float(row["error_v"]), abs=1e-12)
+        assert float(rows[0]["soc"]) == pytest.approx(0.98, abs=2e-3)
+    code, _, err = run(capsys, "validate", steps_csv, "--cell", "ncr18650", "--out", tmp_path / name)
+    assert code == 2
+    assert "exists already" in err
+
+
+def test_rated_capacity_is_that_of_the_cell(page):
+    assert f"Cell model ncr18650, {TRUTH.cell.capacity_ah:g} Ah" in text_of(page)
