@@ -180,6 +180,8 @@ def _check_range(anchors: Sequence[Anchor], p: np.void) -> None:
 def continuous_parts(good: SampleBlock, capacity_ah: float) -> list[tuple[int, int]]:
     """Split a capture at gaps with unknown charge. Each part is (first index, index after the last)."""
     step_s = np.diff(good["time_s"])
+    if not step_s.size:
+        return [(0, good.size)]
     charge_ah = np.abs(good["current_a"][:-1]) * step_s / 3600.0
     gap = np.r_[(step_s > MIN_GAP_PERIODS * np.median(step_s)) & (charge_ah > MIN_GAP_CHARGE * capacity_ah), True]
     edges = np.r_[0, np.flatnonzero(gap) + 1]

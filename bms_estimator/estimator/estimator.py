@@ -11,7 +11,7 @@ from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.accumulators.history import add_reference
 from bms_estimator.kernels.kalman_filter.anchors import NO_ANCHOR
-from bms_estimator.kernels.kalman_filter.hypotheses import USER_SOC_STD, set_soc
+from bms_estimator.kernels.kalman_filter.hypotheses import USER_SOC_STD, set_soc, weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
@@ -143,6 +143,18 @@ class Estimator:
     def identifying(self) -> bool:
         """True if the identifier is enabled."""
         return bool(self.settings_record["identify"][0])
+
+    @property
+    def soc(self) -> float:
+        """State of charge after the last accepted sample, 0..1; NaN before the first one, and for a fuel cell."""
+        return float(self.state["soc"][0]) if self.state["samples"][0] else math.nan
+
+    @property
+    def soc_std(self) -> float:
+        """Standard deviation of ``soc``; NaN without the identifier."""
+        if not (self.identifying and self.state["samples"][0]):
+            return math.nan
+        return float(weakest_cell_soc_std(self.record[0]["filter"], self.settings_record[0]["filter"]))
 
     def set_soc(self, soc: float) -> None:
         """Set the state of charge. Later voltages may correct it. Call this after the first sample.

@@ -18,6 +18,7 @@ from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.model.monotone_cubic import MonotoneCubic
 from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.observer import SCHEME_2_EPSILON, SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
 from bms_estimator.settings.sampling import EXACT, Sampling
@@ -44,10 +45,8 @@ def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]
         a = cell.a
         slope = a[16] * a[17] * np.exp(-a[17] * soc) + a[19] - 2.0 * a[20] * soc + 3.0 * a[21] * soc**2
         return np.array([emf(x, a) for x in soc]), slope
-    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - importing scipy takes half a second
-
-    curve = PchipInterpolator(cell.ocv.soc, cell.ocv.ocv_v)
-    return curve(soc), curve.derivative()(soc)
+    curve = MonotoneCubic(cell.ocv.soc, cell.ocv.ocv_v)
+    return curve(soc), curve.derivative(soc)
 
 
 def estimator_settings(

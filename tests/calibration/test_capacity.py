@@ -6,7 +6,7 @@ The cell files have errors of the size that they declare.
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.capacity import Capacity, measure_capacity
+from bms_estimator.calibration.capacity import Capacity, continuous_parts, measure_capacity
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
@@ -125,3 +125,7 @@ def test_a_rest_on_a_flat_curve_is_no_anchor() -> None:
 def test_captures_without_anchors_are_rejected_with_the_reason(current_a: np.ndarray, reason: str) -> None:
     with pytest.raises(UserError, match=reason):
         capacity_from(simulate_capture(current_a), wrong_cell())
+
+
+def test_a_capture_with_one_sample_is_one_part_without_a_numpy_warning() -> None:
+    assert continuous_parts(simulate_capture(np.zeros(1)), 3.0) == [(0, 1)]

@@ -53,6 +53,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.progress import Progress, WorkCounter, no_progress
 
 REPORTED_SOC = (0.2, 0.5, 0.8)
 """SOCs at which the resistances are reported."""
@@ -90,6 +91,8 @@ MIN_ERROR_V = 1e-5
 COUNT_PASSES = 3
 """Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a
 knee."""
+REGRESSION_WORK = 0.5
+"""Time for the normal equations of a capture, relative to the time for the replays of the capture."""
 EQUAL_SCORE_RATIO = 1.05
 """Ratio up to which two scores count as equal. Four replays do not resolve a smaller difference."""
 
@@ -181,6 +184,7 @@ def identify(
     refine_ocv: bool = True,
     initial_soc: float | None = None,
     temperature_c: float | None = None,
+    progress: Progress = no_progress,
 ) -> Identification:
     """Fit the ladder to captures jointly.
 
@@ -191,6 +195,7 @@ def identify(
         refine_ocv: Correct the open-circuit voltage as well if the correction improves the replays.
         initial_soc: SOC 0..1 at the first sample of each capture; None: from the voltage of its first rest.
         temperature_c: Temperature of captures without a sensor [C]; None: 25 C.
+        progress: Receives the finished fraction of the work.
 
     Raises:
         UserError: No capture has excitation, a capture contradicts the cell (sign of the current, capacity, OCV), a
@@ -204,13 +209,15 @@ def identify(
     contradictions += [line for load in loads for line in _wrong_temperature(load, temperature_c)]
     if contradictions:
         raise UserError("\n".join(contradictions))
-    runs = _recounted(runs, cell, refine_ocv=refine_ocv)
+    variants = (False, True) if refine_ocv else (False,)  # with the given OCV, with a corrected OCV
+    samples = sum(run.soc.size for run in runs)
+    work = WorkCounter(progress, (1 + len(variants) + REGRESSION_WORK * COUNT_PASSES) * samples)
+    runs = _recounted(runs, cell, work, refine_ocv=refine_ocv)
     left_out = tuple(load.name for load in cleaned if without_excitation(load, cell))
     equations = _equations_of(runs, cell)
-    variants = (False, True) if refine_ocv else (False,)  # with the given OCV, with a corrected OCV
     candidates = [_Candidate(runs, equations, cell, refine_ocv=refine) for refine in variants]
-    before = np.array([interval_score(cell, run.load, run.soc) for run in runs])
-    after = [candidate.scores() for candidate in candidates]
+    before = np.array([interval_score(cell, run.load, run.soc, work.part(run.soc.size)) for run in runs])
+    after = [candidate.scores(work) for candidate in candidates]
     best = len(after) - 1  # the last candidate, if no capture has a score
     if np.isfinite(before).any():
         # scores of captures that are not held back favor the variant with more unknowns
@@ -248,9 +255,14 @@ class _Candidate:
         """Return the additional relative error of each capture's charge count at which its voltage matches the fit."""
         return [equations_of_run.miscount(self.fit) for equations_of_run in self._equations]
 
-    def scores(self) -> Floats:
+    def scores(self, work: WorkCounter) -> Floats:
         """Return the score of each capture's replays [%], by a fit without the capture if it is held back."""
-        return np.array([interval_score(self._cell_for(j), run.load, run.soc) for j, run in enumerate(self._runs)])
+        return np.array(
+            [
+                interval_score(self._cell_for(j), run.load, run.soc, work.part(run.soc.size))
+                for j, run in enumerate(self._runs)
+            ]
+        )
 
     def is_held_back(self, j: int) -> bool:
         """Return True if another capture within ``MIN_SPAN_K`` of the temperature of capture ``j`` was given."""
@@ -397,11 +409,12 @@ def _equations_of(runs: list[Run], cell: CellModel) -> list[NormalEquations]:
     ]
 
 
-def _recounted(runs: list[Run], cell: CellModel, *, refine_ocv: bool) -> list[Run]:
+def _recounted(runs: list[Run], cell: CellModel, work: WorkCounter, *, refine_ocv: bool) -> list[Run]:
     """Return the captures with their counted charge rescaled so that knees of voltage and OCV coincide."""
     for _ in range(COUNT_PASSES):
         miscounts = _Candidate(runs, _equations_of(runs, cell), cell, refine_ocv=refine_ocv).miscounts()
         runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
+        work.part(REGRESSION_WORK * sum(run.soc.size for run in runs))(1.0)
     return runs
 
 
@@ -449,7 +462,8 @@ def _curve_error(cell: CellModel) -> Floats:
     if not isinstance(cell.ocv, TableOcv) or cell.ocv.hysteresis_v is None:
         return error_v
     hysteresis_v = REST_SHARE_STD * np.interp(EVEN_SOC, cell.ocv.soc, cell.ocv.hysteresis_v)
-    return np.sqrt(np.maximum(error_v**2 - hysteresis_v**2, (PAIR_V * cell.cell.series_count) ** 2))
+    square_v2: Floats = np.maximum(error_v**2 - hysteresis_v**2, (PAIR_V * cell.cell.series_count) ** 2)
+    return np.sqrt(square_v2)
 
 
 def _per_kelvin(cell: CellModel) -> tuple[float, ...] | None:
@@ -502,9 +516,9 @@ def _worse_replays(outcome: Identification) -> str:
         if np.isfinite(c.score_after)
     ]
     return (
-        "nothing is written: replays that start in mid-load get worse, their interval score (smaller is better) goes from "
-        f"{outcome.score_before:.2f} to {outcome.score_after:.2f} % of SOC; keep the cell file, or give captures with "
-        f"more typical loads\n" + "\n".join(lines)
+        "replays that start in mid-load get worse, their interval score (smaller is better) goes from "
+        f"{outcome.score_before:.2f} to {outcome.score_after:.2f} % of SOC; nothing is written: keep the cell file, or give "
+        f"captures with more typical loads\n" + "\n".join(lines)
     )
 
 

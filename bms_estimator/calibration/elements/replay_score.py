@@ -11,6 +11,7 @@ from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.progress import Progress, no_progress
 from bms_estimator.model.sample import SAMPLE
 
 START_FRACTIONS = (0.2, 0.5)
@@ -29,17 +30,22 @@ PENALTY = 40.0
 """Weight of the distance outside the interval, 2 / alpha, with alpha = 0.05 for an interval of 95 %."""
 
 
-def interval_score(cell: CellModel, load: CleanCapture, soc: Floats) -> float:
+def interval_score(cell: CellModel, load: CleanCapture, soc: Floats, progress: Progress = no_progress) -> float:
     """Return the mean score of the replays of a capture [% of SOC]; NaN when none is long enough.
 
     Args:
         cell: Cell that the estimator uses.
         load: The capture.
         soc: Shape (n,), true SOC.
+        progress: Receives the finished fraction after each replay.
     """
     throughput_as = np.cumsum(np.abs(load.current_a) * np.diff(load.time_s, append=load.time_s[-1]))
     start_indices = [int(np.argmax(throughput_as >= fraction * throughput_as[-1])) for fraction in START_FRACTIONS]
-    scores = [_replay_score(cell, load, soc, start, error) for start in start_indices for error in WRONG_SOC]
+    starts = [(start, error) for start in start_indices for error in WRONG_SOC]
+    scores = []
+    for start, error in starts:
+        scores.append(_replay_score(cell, load, soc, start, error))
+        progress(len(scores) / len(starts))
     finite = [score for score in scores if np.isfinite(score)]
     return float(np.mean(finite)) if finite else float("nan")
 

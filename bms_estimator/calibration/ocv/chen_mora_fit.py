@@ -5,10 +5,11 @@ The formula has the coefficients a16 to a21. ``Points`` of one or more tests are
 parameters is a poor fit.
 """
 
+import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
-from scipy.optimize import least_squares, lsq_linear
 
 from bms_estimator.calibration.ocv.points import Points, check_points
 from bms_estimator.model.arrays import Floats
@@ -23,13 +24,15 @@ Below an exponent of 5 the exponential covers all SOC and cannot be distinguishe
 UPPER = np.array([np.inf, 300.0, np.inf, np.inf, np.inf, np.inf])
 """Upper bounds of a16..a21. At an exponent of 300 the exponential has decayed by SOC 0.01. ``fit_chen_mora`` bounds a16
 by the highest point, so that E_o(0) is not far below 0 V even if the last points are steep."""
-TYPICAL = np.array([0.1, 10.0, 1.0, 1.0, 1.0, 1.0])
-"""Typical sizes of a16..a21, which scale the steps of the fit."""
 AT_BOUND_V = 1e-5
 """Distance from its bound below which an amplitude counts as at the bound: less than the resolution of converters
 [V]."""
 EXPONENTS = np.geomspace(5.0, 300.0, 60)
-"""Candidate exponents a17 from which the search starts."""
+"""Candidate exponents a17. The search continues between the neighbors of the best one."""
+GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+"""Factor by which each step of a golden-section search shortens the interval."""
+SEARCH_STEPS = 40
+"""Number of these steps. They find the exponent to 1e-9 of its value."""
 
 
 @dataclass(frozen=True)
@@ -67,37 +70,45 @@ def chen_mora(a: Floats, soc: Floats) -> Floats:
 def fit_chen_mora(points: Points) -> ChenMoraFit:
     """Fit (2.10) to equally weighted points, with a16..a21 within their bounds.
 
-    For a given exponent a17 the fit is a bounded linear least squares. The best exponent of a grid starts the nonlinear
-    fit of all six parameters.
+    For a given exponent a17 the fit is a bounded linear least squares (variable projection). The exponent with the
+    smallest residual is searched between the neighbors of the best one of a grid.
 
     Raises:
         UserError: Too few points, or points that span too little SOC.
     """
     check_points(points)
     upper = np.r_[points.ocv_v.max(), UPPER[1:]]
-    linear_fits = [_with_exponent(points, exponent, upper) for exponent in EXPONENTS]
-    start_residual2, start_a = min(linear_fits, key=lambda linear_fit: linear_fit[0])
-    strictly_inside = np.clip(start_a, LOWER + 1e-9, upper * 0.999)  # as least_squares requires
-    fit = least_squares(
-        lambda a: chen_mora(a, points.soc) - points.ocv_v,
-        strictly_inside,
-        bounds=(LOWER, upper),
-        x_scale=TYPICAL,
-        xtol=1e-12,
-    )
-    a = fit.x if 2.0 * fit.cost < start_residual2 else start_a  # the cost is half of the squared residual
+    best = min(range(EXPONENTS.size), key=lambda i: _with_exponent(points, float(EXPONENTS[i]), upper)[0])
+    low, high = math.log(EXPONENTS[max(best - 1, 0)]), math.log(EXPONENTS[min(best + 1, EXPONENTS.size - 1)])
+    candidates = [_with_exponent(points, float(EXPONENTS[best]), upper)]
+    for _ in range(SEARCH_STEPS):
+        left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+        fits = [_with_exponent(points, math.exp(ln_exponent), upper) for ln_exponent in (left, right)]
+        low, high = (low, right) if fits[0][0] < fits[1][0] else (left, high)
+        candidates += fits
+    _, a = min(candidates, key=lambda fit: fit[0])
     residual_v = points.ocv_v - chen_mora(a, points.soc)
     return ChenMoraFit(a=a, std=_standard_errors(a, upper, points.soc, residual_v), residual_v=residual_v)
 
 
 def _with_exponent(points: Points, exponent: float, upper: Floats) -> tuple[float, Floats]:
-    """Fit (2.10) with a given a17; return the squared residual and a16..a21."""
+    """Fit (2.10) with a given a17; return the squared residual and a16..a21.
+
+    Only a16 and a18 are bounded. The best solution with each of them free or at a bound is that of the bounded problem.
+    """
     soc = points.soc
     basis = np.column_stack([-np.exp(-exponent * soc), np.ones_like(soc), soc, -(soc**2), soc**3])
-    free = [0, 2, 3, 4, 5]  # indices of all parameters but a17
-    fit = lsq_linear(basis, points.ocv_v, bounds=(LOWER[free], upper[free]), tol=1e-14)
-    a16, a18, a19, a20, a21 = fit.x
-    return 2.0 * float(fit.cost), np.array([a16, exponent, a18, a19, a20, a21])
+    best = (math.inf, np.zeros(6))
+    for a16, a18 in product((math.nan, LOWER[0], upper[0]), (math.nan, LOWER[2])):  # nan: free
+        x = np.array([a16, a18, math.nan, math.nan, math.nan])
+        free = np.isnan(x)
+        x[free] = np.linalg.lstsq(basis[:, free], points.ocv_v - basis[:, ~free] @ x[~free])[0]
+        a = np.array([x[0], exponent, *x[1:]])
+        residual_v = points.ocv_v - basis @ x
+        squared = float(residual_v @ residual_v)
+        if squared < best[0] and (a >= LOWER).all() and (a <= upper).all():
+            best = squared, a
+    return best
 
 
 def _standard_errors(a: Floats, upper: Floats, soc: Floats, residual_v: Floats) -> Floats:

@@ -6,14 +6,16 @@ The model is the RC ladder of the cell, or (2.2)-(2.9) of the thesis.
 import numpy as np
 
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
-from bms_estimator.kernels.cell_model.open_loop import branch_currents, hysteresis, two_branches
-from bms_estimator.kernels.cell_model.rc_ladder import GAS_J, HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
+from bms_estimator.kernels.cell_model.open_loop import branch_currents_from, hysteresis, two_branches
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GAS_J, HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 
 KELVIN = 273.15
 """Temperature of 0 C [K]."""
+BLOCK_SAMPLES = 1 << 16
+"""Number of samples for which voltages are computed at once. It limits the memory of long captures."""
 
 
 def arrhenius(energy_j: float, temperature_c: Floats) -> Floats:
@@ -30,7 +32,8 @@ def linear_interpolation_matrix(soc: Floats, nodes: Floats) -> Floats:
 
 def temperature_of(load: CleanCapture, otherwise_c: float = REFERENCE_C) -> Floats:
     """Return the temperature at each sample, ``otherwise_c`` without a sensor [C]."""
-    return np.where(np.isfinite(load.temperature_c), load.temperature_c, otherwise_c)
+    measured = np.isfinite(load.temperature_c)
+    return load.temperature_c if measured.all() else np.where(measured, load.temperature_c, otherwise_c)
 
 
 def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
@@ -52,11 +55,18 @@ def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
 def ocv_offset(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
     """Return the change of E_o(SOC) by temperature and hysteresis [V]. The hysteresis starts as that after a charge."""
     ocv, added_v, temperature_c = cell.ocv, np.zeros(soc.size), temperature_of(load)
-    if isinstance(ocv, TableOcv) and ocv.per_kelvin_v is not None:
-        added_v += np.interp(soc, ocv.soc, ocv.per_kelvin_v) * (temperature_c - REFERENCE_C)
-    if isinstance(ocv, TableOcv) and ocv.hysteresis_v is not None:
-        hysteresis_v = np.interp(soc, ocv.soc, ocv.hysteresis_v) * arrhenius(HYSTERESIS_J, temperature_c)
-        added_v += hysteresis_v * hysteresis(load.time_s, soc, Noise().hysteresis_soc, 1.0)
+    if not isinstance(ocv, TableOcv):
+        return added_v
+    if ocv.hysteresis_v is not None:
+        added_v += hysteresis(load.time_s, soc, Noise().hysteresis_soc, 1.0)
+    for begin in range(0, soc.size, BLOCK_SAMPLES):
+        block = slice(begin, begin + BLOCK_SAMPLES)
+        if ocv.hysteresis_v is not None:
+            half_width_v = np.interp(soc[block], ocv.soc, ocv.hysteresis_v)
+            added_v[block] *= half_width_v * arrhenius(HYSTERESIS_J, temperature_c[block])
+        if ocv.per_kelvin_v is not None:
+            per_kelvin_v = np.interp(soc[block], ocv.soc, ocv.per_kelvin_v)
+            added_v[block] += per_kelvin_v * (temperature_c[block] - REFERENCE_C)
     return added_v
 
 
@@ -80,8 +90,16 @@ def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Fl
 
 def ladder_overpotential(ladder: Ladder, load: CleanCapture, soc: Floats, temperature_c: Floats) -> Floats:
     """Return the overpotential of the ladder, with its ohmic drop [V]."""
-    currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])
-    node_weights = linear_interpolation_matrix(soc, np.array(ladder.soc))
-    weak_v = ((node_weights @ np.array(ladder.weak_ohm).T) * currents).sum(axis=1)
-    strong_v = ((node_weights @ np.array(ladder.strong_ohm).T) * currents).sum(axis=1)
-    return np.asarray(arrhenius(WEAK_J, temperature_c) * weak_v + arrhenius(STRONG_J, temperature_c) * strong_v)
+    drop_v = np.empty(soc.size)
+    last_a = np.zeros(BRANCHES)
+    for begin in range(0, soc.size, BLOCK_SAMPLES):
+        block, first = slice(begin, begin + BLOCK_SAMPLES), max(begin - 1, 0)
+        branches_a = branch_currents_from(last_a, load.time_s[first : block.stop], load.current_a[first : block.stop])
+        last_a = branches_a[-1]
+        currents = np.column_stack([load.current_a[block], branches_a[begin - first :]])
+        node_weights = linear_interpolation_matrix(soc[block], np.array(ladder.soc))
+        weak_v = ((node_weights @ np.array(ladder.weak_ohm).T) * currents).sum(axis=1)
+        strong_v = ((node_weights @ np.array(ladder.strong_ohm).T) * currents).sum(axis=1)
+        weak, strong = (arrhenius(energy_j, temperature_c[block]) for energy_j in (WEAK_J, STRONG_J))
+        drop_v[block] = weak * weak_v + strong * strong_v
+    return drop_v

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.rests import remove_glitches, soc_by_counting
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, simulate_cell
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv_of_each, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
@@ -128,8 +128,7 @@ def predict(
 
 def open_circuit(cell: CellModel, soc: Floats) -> Floats:
     """Return the open-circuit voltage E_o(SOC) of the cell, interpolated as in the kernels [V]."""
-    grid = ocv_grid(cell)
-    return np.array([ocv(x, *grid) for x in soc])
+    return ocv_of_each(soc, *ocv_grid(cell))
 
 
 def static_elements(a: Floats, soc: float) -> Floats:

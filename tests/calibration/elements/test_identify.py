@@ -51,14 +51,26 @@ def from_warm(warm):
 
 
 @pytest.fixture(scope="module")
-def from_warm_with_given_ocv(warm):
+def fractions():
+    """Return the list to which ``from_warm_with_given_ocv`` appends its progress."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def from_warm_with_given_ocv(warm, fractions):
     """Return the identification from the warm capture, without a correction of the OCV."""
-    return identify([warm], wrong_start(), refine_ocv=False)
+    return identify([warm], wrong_start(), refine_ocv=False, progress=fractions.append)
 
 
 def voltage_rms_mv(cell, samples):
     """Return the RMS error of the predicted voltage above SOC 0.1 [mV]."""
     return 1e3 * validate(Columns(samples, "other"), cell).above.voltage_rms_v
+
+
+def test_the_progress_rises_to_1(from_warm_with_given_ocv, fractions):
+    assert len(fractions) > 5
+    assert fractions == sorted(set(fractions))
+    assert fractions[-1] == pytest.approx(1.0)
 
 
 def test_identified_resistances_at_25_c_are_within_their_errors(identified):
@@ -163,7 +175,10 @@ def test_a_capture_is_held_back_from_its_score_if_another_has_a_similar_temperat
 def test_an_identification_that_makes_replays_worse_is_rejected_with_the_scores(warm, monkeypatch):
     given = wrong_start()
     monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell is given else 5.25)
-    with pytest.raises(UserError, match=r"^nothing is written: .* from 1\.50 to 5\.25 % of SOC") as caught:
+    with pytest.raises(
+        UserError,
+        match=r"^replays that start in mid-load get worse, .* from 1\.50 to 5\.25 % of SOC; nothing is written",
+    ) as caught:
         identify([warm], given)
     assert "warm: 1.50 before, 5.25 after" in str(caught.value)
 

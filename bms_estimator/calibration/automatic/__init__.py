@@ -1,0 +1,1 @@
+"""Calibration of a cell from captures without decisions by the user."""

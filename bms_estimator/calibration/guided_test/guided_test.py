@@ -1,0 +1,287 @@
+"""State machine of a guided test: samples in, instruction and progress out.
+
+The test has no clock of its own: all durations are those of the samples. After a restart, the samples recorded
+before lead to the same state.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from bms_estimator.calibration.guided_test.averages import Average, Averager
+from bms_estimator.calibration.guided_test.load_warnings import limit_warning, load_warning
+from bms_estimator.calibration.guided_test.plan import Limits, Plan
+from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
+
+FULL_MARGIN_V = 0.02
+"""Tolerance below the full voltage at the end of a charge, per cell [V]."""
+RESTED_FULL_MARGIN_V = 0.03
+"""Tolerance below the full voltage for a full pack at rest, per cell [V]. Full charges end up to 30 mV apart."""
+CONFIRM_S = 60.0
+"""Minimum duration of a rest after which a pack counts as full, or a charge as ended too early [s]."""
+EMPTY_SECONDS = 2
+"""Number of successive means at or below the cut-off after which the pack counts as empty."""
+MAX_GAP_S = 60.0
+"""Maximum time between two means [s]. The charge in a longer gap is unknown."""
+MAX_UNPLANNED_CHARGE = 0.01
+"""Maximum charge that may flow in a gap, or against the plan, as a fraction of the capacity."""
+BLOCK_S = 60.0
+"""Time for which a relay disconnects the load after a limit was exceeded [s]."""
+INTERRUPTION_S = 3.0
+"""Duration of a current after which it interrupts a rest [s]."""
+
+
+class Phase(StrEnum):
+    """Part of a test."""
+
+    CHARGE = "charge"
+    FULL_REST = "rest of the full pack"
+    DISCHARGE = "discharge"
+    REST = "rest"
+    DONE = "done"
+
+
+@dataclass(frozen=True)
+class OcvPoint:
+    """Voltage at the end of a rest.
+
+    Attributes:
+        soc: SOC by the charge drawn and the rated capacity, 0..1; it may be below 0.
+        voltage_v: Voltage at the terminals [V].
+    """
+
+    soc: float
+    voltage_v: float
+
+
+class GuidedTest:
+    """A guided test in progress.
+
+    Args:
+        plan: Plan of the test.
+        limits: Limits of the pack.
+        relay: True if a relay connects the load (``load_on``), so that the user need not.
+
+    Attributes:
+        phase: Present phase.
+        points: Voltages at the ends of the rests.
+        begin_s: Time at which the rest of the full pack began [s]; NaN before. The capture for the calibration begins here.
+        restart_reason: Reason why the test began again; empty if it did not, and as soon as the pack is full again.
+        warning: Deviation from the instruction, and its remedy; empty if there is no deviation.
+        latest: Latest mean; None before the first.
+    """
+
+    def __init__(self, plan: Plan, limits: Limits, *, relay: bool = False) -> None:
+        self._plan, self._limits, self._relay = plan, limits, relay
+        self._averager = Averager()
+        self._start_again("")
+        self.latest: Average | None = None
+        self._blocked_until_s = -math.inf
+
+    def feed(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS) -> None:
+        """Advance the test.
+
+        Args:
+            samples: Samples of the pack, whose time continues over restarts.
+            cells_v: Cell voltages of the samples; empty if unknown.
+        """
+        for average in self._averager.feed(samples, cells_v):
+            self._advance(average)
+
+    @property
+    def is_done(self) -> bool:
+        """True after the last rest."""
+        return self.phase is Phase.DONE
+
+    @property
+    def instruction(self) -> str:
+        """Instruction for the user, as a sentence."""
+        if self.phase is Phase.CHARGE:
+            return f"Charge the pack to full ({self._limits.full_v:.2f} V), and wait until the charger ends."
+        if self.phase is Phase.DONE:
+            return "Done: remove the load, and charge the pack."
+        if self.phase is not Phase.DISCHARGE:
+            return f"Let the pack rest: disconnect {'the charger' if self._relay else 'charger and load'}."
+        if self._relay:
+            return f"The relay discharges the pack, and stops at {self._limits.cutoff_v:.2f} V: nothing to do."
+        return (
+            f"Discharge the pack at about {self.load_a:.2g} A, at most {self._limits.max_discharge_a:.2g} A; "
+            f"stop at {self._limits.cutoff_v:.2f} V."
+        )
+
+    @property
+    def load_a(self) -> float:
+        """Current of the discharges [A]."""
+        return min(self._plan.load_c_rate * self._limits.capacity_ah, self._limits.max_discharge_a)
+
+    @property
+    def load_on(self) -> bool:
+        """True if a relay must connect the load."""
+        return self.phase is Phase.DISCHARGE and self.latest is not None and self.latest.time_s >= self._blocked_until_s
+
+    @property
+    def progress(self) -> float:
+        """Fraction of the time after the charge that has passed, 0..1."""
+        if self.phase is Phase.DONE:
+            return 1.0
+        total_s = self._plan.full_rest_s + self._discharge_s(0.0)
+        return max(0.0, min(1.0 - self.remaining_s / total_s, 1.0)) if self.phase is not Phase.CHARGE else 0.0
+
+    @property
+    def remaining_s(self) -> float:
+        """Estimated time until the end, without the charge [s]."""
+        if self.phase is Phase.DONE:
+            return 0.0
+        if self.phase is Phase.CHARGE:
+            return self._plan.full_rest_s + self._discharge_s(0.0)
+        if self._is_empty:
+            return self._remaining_rest_s
+        return (self._remaining_rest_s if self.phase is not Phase.DISCHARGE else 0.0) + self._discharge_s(self.drawn_ah)
+
+    @property
+    def remaining_basis(self) -> str:
+        """Basis of the remaining time, such as the rated capacity and the measured current."""
+        current = f"the measured {self._mean_load_a:.2f} A" if self._load_s else f"a load of {self.load_a:.2g} A"
+        without = ", without the charge" if self.phase is Phase.CHARGE else ""
+        return f"from the rated {self._limits.capacity_ah:g} Ah and {current}{without}"
+
+    @property
+    def drawn_ah(self) -> float:
+        """Charge drawn since the pack was full [Ah]."""
+        return self._drawn_as / 3600.0
+
+    @property
+    def discharge_number(self) -> int:
+        """Number of the present or last discharge, from 1; 0 before the first."""
+        return self._discharges
+
+    @property
+    def expected_discharges(self) -> int:
+        """Expected number of discharges, by the rated capacity."""
+        return max(round(1.0 / self._plan.step_soc), self._discharges)
+
+    @property
+    def _remaining_rest_s(self) -> float:
+        return max(self._rest_goal_s - self._rested_s, 0.0)
+
+    @property
+    def _rest_goal_s(self) -> float:
+        return self._plan.full_rest_s if self.phase is Phase.FULL_REST else self._plan.rest_s
+
+    @property
+    def _mean_load_a(self) -> float:
+        """Mean current of the discharges [A]."""
+        return self._load_as / self._load_s if self._load_s else self.load_a
+
+    def _discharge_s(self, drawn_ah: float) -> float:
+        """Return the time of the remaining discharges and the rests after them [s]."""
+        remaining_ah = max(self._limits.capacity_ah - drawn_ah, 0.0)
+        # one rest for each discharge that begins; the tolerance absorbs rounding
+        rests = math.ceil(remaining_ah / (self._plan.step_soc * self._limits.capacity_ah) - 1e-6)
+        return 3600.0 * remaining_ah / self._mean_load_a + rests * self._plan.rest_s
+
+    def _start_again(self, reason: str) -> None:
+        """Begin with the charge."""
+        self.phase, self.warning, self.restart_reason = Phase.CHARGE, "", reason
+        self.points: list[OcvPoint] = []
+        self.begin_s = math.nan
+        self._reached_full = self._was_charged = self._is_empty = False
+        self._discharges = self._empty_seconds = 0
+        # charges in ampere-seconds: since full, in this discharge, charged against the plan, in all discharges
+        self._drawn_as = self._step_as = self._returned_as = self._load_as = self._load_s = 0.0
+        self._rested_s = self._confirm_s = self._interrupted_s = 0.0
+
+    def _advance(self, now: Average) -> None:
+        """Advance the test by a mean; begin again if too much charge may have flowed in a gap before it."""
+        step_s = 0.0 if self.latest is None else now.time_s - self.latest.time_s
+        last_a = 0.0 if self.latest is None else self.latest.current_a
+        self.latest = now
+        lost_as = abs(last_a) * step_s if step_s > MAX_GAP_S else 0.0
+        if lost_as > MAX_UNPLANNED_CHARGE * 3600.0 * self._limits.capacity_ah and self.phase is not Phase.CHARGE:
+            self._start_again(f"Up to {lost_as / 3600.0:.2f} Ah flowed while nothing was measured; begin again.")
+            return
+        self.warning = ""
+        if self.phase is not Phase.CHARGE:
+            self._count(now, step_s)
+        if self.phase is Phase.CHARGE:
+            self._advance_charge(now, step_s)
+        elif self.phase is Phase.DISCHARGE:
+            self._advance_discharge(now, step_s)
+        elif self.phase is not Phase.DONE:
+            self._advance_rest(now, step_s)
+        if warning := limit_warning(now, self._limits):
+            self.warning, self._blocked_until_s = warning, now.time_s + BLOCK_S
+
+    def _count(self, now: Average, step_s: float) -> None:
+        """Count the charge since the pack was full; begin again if it is charged, or discharged too early."""
+        max_as = MAX_UNPLANNED_CHARGE * 3600.0 * self._limits.capacity_ah
+        self._drawn_as += now.current_a * step_s
+        if self.phase in (Phase.DISCHARGE, Phase.REST):
+            self._returned_as += max(-now.current_a - self._limits.rest_a, 0.0) * step_s
+        if self._returned_as > max_as:
+            self._start_again("The pack was charged during the test; begin again.")
+        elif self.phase is Phase.FULL_REST and self._drawn_as > max_as:
+            self._start_again("The pack was discharged before the rest of the full pack ended; begin again.")
+
+    def _advance_charge(self, now: Average, step_s: float) -> None:
+        """Wait until the pack is full."""
+        cells, full_v = self._limits.series_count, self._limits.full_v
+        if now.current_a < -self._limits.rest_a:
+            self._was_charged = True
+        self._reached_full |= self._was_charged and now.voltage_v >= full_v - FULL_MARGIN_V * cells
+        if self._reached_full and abs(now.current_a) <= max(self._limits.tail_a, self._limits.rest_a):
+            self._enter(Phase.FULL_REST, now)
+            return
+        is_resting = abs(now.current_a) <= self._limits.rest_a
+        self._confirm_s = self._confirm_s + step_s if is_resting else 0.0
+        if is_resting and self._confirm_s >= CONFIRM_S:
+            if now.voltage_v >= full_v - RESTED_FULL_MARGIN_V * cells:
+                self._enter(Phase.FULL_REST, now)
+            elif self._was_charged:
+                self.warning = (
+                    f"The charge ended at {now.voltage_v:.2f} V, below {full_v:.2f} V: charge further, or set "
+                    "pack.full_voltage_v to the voltage at which your charger ends."
+                )
+        elif now.current_a > self._limits.rest_a:
+            self.warning = f"The pack is discharged at {now.current_a:.2f} A: remove the load, and connect the charger."
+
+    def _advance_rest(self, now: Average, step_s: float) -> None:
+        """Wait until the rest is over. A current begins the rest again."""
+        if abs(now.current_a) > self._limits.rest_a:
+            self._interrupted_s += step_s
+            verb = "discharged" if now.current_a > 0.0 else "charged"
+            self.warning = f"The pack is {verb} at {abs(now.current_a):.2f} A: disconnect it, the rest begins again."
+            if self._interrupted_s > INTERRUPTION_S:
+                self._rested_s = 0.0
+                if self.phase is Phase.FULL_REST and now.current_a < 0.0:  # a full pack that is charged stays full
+                    self.begin_s, self._drawn_as = now.time_s, 0.0
+            return
+        self._interrupted_s = 0.0
+        self._rested_s += step_s
+        if self._rested_s < self._rest_goal_s:
+            return
+        self.points.append(OcvPoint(1.0 - self.drawn_ah / self._limits.capacity_ah, now.voltage_v))
+        self._enter(Phase.DONE if self._is_empty else Phase.DISCHARGE, now)
+
+    def _advance_discharge(self, now: Average, step_s: float) -> None:
+        """Wait until the charge of a step is drawn, or the pack is empty."""
+        if now.current_a > self._limits.rest_a:
+            self._step_as += now.current_a * step_s
+            self._load_as += now.current_a * step_s
+            self._load_s += step_s
+        self.warning = load_warning(now, self._limits)
+        is_low = now.voltage_v <= self._limits.cutoff_v or now.min_cell_v <= self._limits.min_cell_v
+        self._empty_seconds = self._empty_seconds + 1 if is_low else 0
+        self._is_empty = self._empty_seconds >= EMPTY_SECONDS
+        if self._is_empty or self._step_as >= self._plan.step_soc * 3600.0 * self._limits.capacity_ah:
+            self._enter(Phase.REST, now)
+
+    def _enter(self, phase: Phase, now: Average) -> None:
+        self.phase = phase
+        self._rested_s = self._interrupted_s = self._step_as = 0.0
+        if phase is Phase.FULL_REST:
+            self.begin_s, self._drawn_as, self._returned_as = now.time_s, 0.0, 0.0
+            self.restart_reason = ""
+        if phase is Phase.DISCHARGE:
+            self._discharges += 1
+            self._empty_seconds = 0

@@ -1,0 +1,237 @@
+"""``bms-estimator calibrate``: cell file from captures of any kind, or from tests of a pack that the command guides."""
+
+import json
+import sys
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from bms_estimator.calibration.automatic.calibrate import Calibration, calibrate
+from bms_estimator.calibration.guided_test.plan import LONG, SHORT
+from bms_estimator.calibration.ocv.sources import ExternalCurve
+from bms_estimator.cli.cell.calibrate_live import RelayOptions, run_guided_test
+from bms_estimator.cli.cell.calibration_input import load_captures_and_curves
+from bms_estimator.cli.cell.calibration_output import json_result, remarks, result_text
+from bms_estimator.cli.cell.calibration_session import open_session
+from bms_estimator.cli.options.capture_input import capture_files
+from bms_estimator.cli.options.capture_options import (
+    CAPTURE_FORMATS,
+    CELL_HELP,
+    AsJson,
+    Force,
+    MappedColumns,
+    SignOfCurrent,
+    TemperatureWithoutSensor,
+    check_output_file,
+    name_of,
+    reject_duplicates,
+)
+from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.cli.options.pack_options import single_cell_of
+from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.columns import Columns
+from bms_estimator.model.config_file import write_text
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import CurrentSign
+from bms_estimator.settings.pack import load_settings
+from bms_estimator.sources.captures.curves import read_curve
+from bms_estimator.sources.captures.tables.layout import ColumnMap
+
+
+class PlanName(StrEnum):
+    """Guided tests."""
+
+    SHORT = SHORT.name
+    LONG = LONG.name
+
+
+class RelayLevel(StrEnum):
+    """Levels of a relay pin."""
+
+    HIGH = "high"
+    LOW = "low"
+
+
+def calibrate_command(
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="[PACK.toml] CAPTURE...",
+            help=f"settings file of the pack, and captures of it, each a {CAPTURE_FORMATS}, or an OCV curve (CSV)",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="cell file to write")] = Path("cell.toml"),
+    cell: Annotated[
+        str | None, typer.Option(help=f"{CELL_HELP}; default: the cell of PACK.toml", show_default=False)
+    ] = None,
+    capacity_ah: Annotated[
+        float | None,
+        typer.Option(
+            "--capacity-ah",
+            "--capacity",
+            parser=decimal(1e-6),
+            help="rated capacity of the cell [Ah]; required for a generic cell; default: that of PACK.toml",
+            show_default=False,
+        ),
+    ] = None,
+    series: Annotated[
+        int | None,
+        typer.Option(
+            parser=whole(1), help="number of cells in series in the captures; default: that of PACK.toml, or 1"
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(help="HTML file for a report on all captures with the new cell file", show_default=False),
+    ] = None,
+    temperature_c: TemperatureWithoutSensor = None,
+    current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
+    test: Annotated[
+        PlanName,
+        typer.Option(
+            help="test beside the pack, if no captures are given; it takes 3 h 15 min or 13 h after the charge"
+        ),
+    ] = PlanName.SHORT,
+    restart: Annotated[bool, typer.Option("--restart", help="begin a new test, even if one was interrupted")] = False,
+    relay: Annotated[
+        RelayLevel | None,
+        typer.Option(help="level of the board's relay pin that connects the load; default: the user connects it"),
+    ] = None,
+    relay_command: Annotated[
+        str | None,
+        typer.Option(
+            help="program that connects the load with the argument on, and disconnects it with off", show_default=False
+        ),
+    ] = None,
+    relay_silent_s: Annotated[
+        int,
+        typer.Option(
+            parser=whole(1, 3600),
+            help="with --relay: time without a command after which the board itself disconnects the load [s]",
+        ),
+    ] = 10,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate a cell: measure its capacity, OCV, hysteresis and resistances, and write a cell file.
+
+    Each capture is used for what it determines: a slow discharge and charge, a relaxation test, HPPC or drive cycle.
+    One capture is enough. Captures that determine the OCV begin with a full cell.
+
+    With PACK.toml alone, the command reads the pack's device and gives instructions: charge, discharge, rest. It recognizes
+    from voltage and current when a step is done, and records all samples. After an interruption, run the same command again.
+
+    The model is validated on data that are held back from the fit. The command prints the errors, and what the captures do
+    not show.
+    """
+    pack, paths = _split_inputs(inputs)
+    for written in (out, report):
+        if written is not None:
+            check_output_file(written, inputs, force=force)
+    reject_duplicates(paths)
+    given, series_count, parallel_count = _given_cell(pack, cell, capacity_ah, series)
+    session = None
+    with capture_files(paths) as files:
+        captures = files
+        if captures:
+            recordings, curves = load_captures_and_curves(captures, current_sign=current_sign, column_map=column_map)
+        elif pack is not None:
+            settings = load_settings(pack)
+            cells = f"{settings.pack.name}, {given.cell.capacity_ah:g} Ah, {series_count}s{parallel_count}p"
+            session = open_session(out, test.value, cells, restart=restart)
+            relay_options = RelayOptions(relay.value if relay else None, relay_command, relay_silent_s)
+            capture = run_guided_test(settings, given.pack(series_count, parallel_count), session, relay_options)
+            if capture is None:
+                typer.echo("interrupted; the same command continues", err=True)
+                return
+            recordings, curves, captures = [capture], [], [session.write_capture(capture)]
+        else:
+            raise UserError("give captures, or the settings file of a pack")
+        cell_captures = [_of_one_cell(each, series_count, parallel_count) for each in recordings]
+        calibration = _calibrate(cell_captures, curves, given, name_of(out), temperature_c)
+        for line in calibration.warnings:
+            typer.echo(f"warning: {line}", err=True)
+        write_cell(out, calibration.model.cell, remarks(calibration))
+        if session is not None:
+            session.end()
+        if as_json:
+            sys.stdout.write(json.dumps(json_result(out, calibration)) + "\n")
+        else:
+            Console().print(result_text(out, calibration))
+        if report is not None:
+            _write_report(report, captures, pack, out, calibration, current_sign, column_map)
+
+
+def _write_report(
+    report: Path,
+    captures: list[Path],
+    pack: Path | None,
+    cell: Path,
+    calibration: Calibration,
+    current_sign: CurrentSign | None,
+    column_map: ColumnMap | None,
+) -> None:
+    """Write a report on the captures with the new cell file."""
+    from bms_estimator.cli.captures.report import open_captures, report_on_captures  # noqa: PLC0415 - optional packages
+
+    files = [file for file in captures if read_curve(file) is None]
+    opened = open_captures(files, pack, current_sign, column_map)
+    page = report_on_captures(files, opened, pack, str(cell), calibration.model.cell.cell.capacity_ah, None)
+    write_text(report, page.html())
+    typer.echo(f"{report}: written", err=True)
+
+
+def _calibrate(
+    recordings: list[Columns], curves: list[ExternalCurve], given: CellModel, name: str, temperature_c: float | None
+) -> Calibration:
+    """Calibrate, and show the progress on a terminal."""
+    with progress_bar("calibrating") as bar:
+        return calibrate(
+            recordings,
+            given,
+            name=name,
+            curves=curves,
+            temperature_c=temperature_c,
+            report=bar.update,
+        )
+
+
+def _split_inputs(inputs: list[Path]) -> tuple[Path | None, list[Path]]:
+    """Return the settings file of the pack, if the first argument is one, and the captures."""
+    if inputs[0].suffix == ".toml":
+        return inputs[0], inputs[1:]
+    return None, inputs
+
+
+def _given_cell(
+    pack: Path | None, cell: str | None, capacity_ah: float | None, series: int | None
+) -> tuple[CellModel, int, int]:
+    """Return the cell with the rated capacity, and the numbers of cells in series and in parallel.
+
+    Raises:
+        UserError: Neither a pack nor a cell is given, or a file cannot be read.
+    """
+    if pack is None:
+        if cell is None:
+            raise UserError("give --cell NAME and --capacity AH, or the settings file of a pack before the captures")
+        return load_cell(cell, capacity_ah), series or 1, 1
+    settings = load_settings(pack)
+    capacity_ah = capacity_ah or settings.pack.capacity_ah
+    given = single_cell_of(pack, settings) if cell is None else load_cell(cell, capacity_ah)
+    return given, series or settings.pack.series, settings.pack.parallel
+
+
+def _of_one_cell(capture: Columns, series: int, parallel: int) -> Columns:
+    """Return the capture of a pack scaled to the mean cell."""
+    rows = capture.rows.copy()
+    rows["voltage_v"] /= series
+    rows["current_a"] /= parallel
+    return replace(capture, rows=rows)

@@ -1,0 +1,87 @@
+"""Calibration from captures of any kind: recognition, capacity, data held back, and the model."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.calibration.automatic.calibrate import calibrate
+from bms_estimator.calibration.automatic.capacity_estimate import estimate_capacity
+from bms_estimator.calibration.automatic.hold_back import hold_back
+from bms_estimator.calibration.automatic.recognition import recognize
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.columns import Columns
+from bms_estimator.model.errors import UserError
+from tests.calibration.simulated_load import TRUTH, capture, constant, steps
+from tests.calibration.simulated_relaxation import relaxation
+
+GIVEN = load_cell("nca", 3.0)
+CAPTURES = {
+    "relaxation": Columns(relaxation(), "relaxation"),
+    "drive": Columns(capture(steps(seed=3), soc=1.0), "drive"),
+    "pulses": Columns(
+        capture(np.r_[np.zeros(60), np.tile(np.r_[np.full(30, 6.0), np.zeros(300)], 60)], soc=1.0), "pulses"
+    ),
+    "constant": Columns(capture(constant(), soc=1.0), "constant"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "gives_ocv"),
+    [
+        ("relaxation", "relaxation test, 20 rests", True),
+        ("pulses", "pulses, 57 rests", True),
+        ("constant", "constant discharge at 0.25 C", False),
+    ],
+)
+def test_a_capture_is_recognized_by_its_content(name, kind, gives_ocv) -> None:
+    recognized = recognize(CAPTURES[name], TRUTH)
+    assert (recognized.kind, recognized.gives_ocv, recognized.gives_resistances) == (kind, gives_ocv, True)
+
+
+def test_a_charge_above_the_rated_capacity_is_the_capacity() -> None:
+    small = load_cell("nca", 2.5)
+    estimate = estimate_capacity([CAPTURES["relaxation"]], small)
+    assert estimate.capacity_ah == pytest.approx(0.97 * TRUTH.cell.capacity_ah, rel=0.01)  # it ends at SOC 0.03
+    assert "relaxation, more than the rated 2.5 Ah" in estimate.origin
+
+
+def test_rests_measure_the_capacity_by_an_ocv_of_the_cell() -> None:
+    wrong = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": 4.0})})
+    estimate = estimate_capacity([CAPTURES[name] for name in ("relaxation", "pulses", "drive")], wrong)
+    assert "rests" in estimate.origin
+    assert estimate.capacity_ah == pytest.approx(TRUTH.cell.capacity_ah, rel=0.04)
+
+
+def test_a_capture_without_ocv_is_held_back_first() -> None:
+    recognized = [recognize(CAPTURES[name], TRUTH) for name in ("relaxation", "constant", "pulses")]
+    split = hold_back(recognized)
+    assert split.held_back is recognized[1]
+    assert [each.capture.name for each in split.resistances] == ["relaxation", "pulses"]
+
+
+def test_the_end_of_a_single_capture_is_held_back_from_the_resistances() -> None:
+    recognized = recognize(CAPTURES["relaxation"], TRUTH)
+    split = hold_back([recognized])
+    first_part = split.resistances[0].capture.rows
+    assert split.held_back is recognized
+    assert first_part["time_s"][-1] < split.held_back_from_s <= first_part["time_s"][-1] + 1.0
+    assert split.ocv == (recognized,)
+
+
+def test_one_relaxation_test_gives_a_model_with_errors_of_millivolts() -> None:
+    calibration = calibrate([CAPTURES["relaxation"]], GIVEN, name="mine")
+    cell = calibration.model.cell
+    assert calibration.has_held_back_data
+    assert calibration.model.identification is not None
+    assert cell.cell.name == "mine"
+    difference_v = ocv_grid(cell)[0] - ocv_grid(TRUTH)[0]
+    middle = slice(difference_v.size // 5, -difference_v.size // 20)
+    assert np.abs(difference_v[middle]).max() < 0.01
+    assert calibration.validations[0].above.voltage_rms_v < 0.02
+    assert "Not known: the effect of temperature" in calibration.verdict.text
+
+
+def test_captures_that_determine_nothing_are_listed_with_their_kind() -> None:
+    rest = Columns(capture(np.zeros(7200), soc=0.5), "shelf")
+    with pytest.raises(UserError, match=r"no capture determines the OCV or resistances(.|\n)*shelf: rest"):
+        calibrate([rest], GIVEN, name="mine")
