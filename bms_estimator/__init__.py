@@ -10,24 +10,38 @@ from typing import TYPE_CHECKING, Any
 from bms_estimator.version import __version__
 
 if TYPE_CHECKING:
+    from bms_estimator.calibration.automatic.calibrate import calibrate
     from bms_estimator.calibration.elements.identify import identify
     from bms_estimator.calibration.validate import validate
     from bms_estimator.estimator import Estimator, estimate
     from bms_estimator.model.cell import load_cell
+    from bms_estimator.model.cell_file import write_cell
     from bms_estimator.sources.captures.replay import load_capture
 
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 """numba highlights error messages with colorama, whose exit handler would block on an unread terminal."""
 
-__all__ = ["Estimator", "__version__", "estimate", "identify", "load_capture", "load_cell", "validate"]
+__all__ = [
+    "Estimator",
+    "__version__",
+    "calibrate",
+    "estimate",
+    "identify",
+    "load_capture",
+    "load_cell",
+    "validate",
+    "write_cell",
+]
 
 _MODULES = {
     "Estimator": "estimator",
+    "calibrate": "calibration.automatic.calibrate",
     "estimate": "estimator",
     "identify": "calibration.elements.identify",
     "load_capture": "sources.captures.replay",
     "load_cell": "model.cell",
     "validate": "calibration.validate",
+    "write_cell": "model.cell_file",
 }
 """Module of each public name, imported on first use: importing numba alone would make ``bms-estimator --help`` too
 slow."""

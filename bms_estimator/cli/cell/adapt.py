@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.calibration.thesis.adapt import Adaptation, adapt
+from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     AsJson,
     CapacityAh,
@@ -18,6 +19,7 @@ from bms_estimator.cli.options.capture_options import (
     CellName,
     Force,
     InitialSoc,
+    MappedColumns,
     NewCellFile,
     SignOfCurrent,
     check_output_file,
@@ -25,7 +27,6 @@ from bms_estimator.cli.options.capture_options import (
     write_cell_named_as_file,
 )
 from bms_estimator.model.cell import load_cell
-from bms_estimator.sources.captures.replay import load_capture
 
 
 def adapt_command(
@@ -35,6 +36,7 @@ def adapt_command(
     capacity_ah: CapacityAh = None,
     soc: InitialSoc = None,
     current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -52,7 +54,7 @@ def adapt_command(
     check_output_file(out, captures, force=force)
     reject_duplicates(captures)
     model = load_cell(cell, capacity_ah)
-    adaptation = adapt([load_capture(path, current_sign=current_sign) for path in captures], model, soc=soc)
+    adaptation = adapt(load_captures(captures, current_sign=current_sign, column_map=column_map), model, soc=soc)
     write_cell_named_as_file(out, adaptation.cell, _remarks(cell, adaptation))
     if as_json:
         sys.stdout.write(json.dumps(_json_result(out, adaptation)) + "\n")

@@ -12,11 +12,19 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.capacity import Anchor, Capacity, measure_capacity
-from bms_estimator.cli.options.capture_options import CAPTURE_FORMATS, CELL_HELP, AsJson, CapacityAh, SignOfCurrent
+from bms_estimator.cli.options.capture_input import load_captures
+from bms_estimator.cli.options.capture_options import (
+    CAPTURE_FORMATS,
+    CELL_HELP,
+    AsJson,
+    CapacityAh,
+    MappedColumns,
+    SignOfCurrent,
+    complete_battery,
+)
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.replay import load_capture
 
 MAX_SHOWN_ANCHORS = 30
 """Maximum number of printed anchors, which are rests with an SOC; ``--json`` prints all."""
@@ -59,7 +67,12 @@ def capacity(
         list[Path],
         typer.Argument(help=f"captures of one cell, with rests; each a {CAPTURE_FORMATS}", show_default=False),
     ],
-    cell: Annotated[str, typer.Option(help=f"{CELL_HELP}; only the OCV of the cell is used", show_default=False)],
+    cell: Annotated[
+        str,
+        typer.Option(
+            help=f"{CELL_HELP}; only the OCV of the cell is used", autocompletion=complete_battery, show_default=False
+        ),
+    ],
     capacity_ah: CapacityAh = None,
     current_offset_std_a: Annotated[
         float | None,
@@ -70,6 +83,7 @@ def capacity(
         ),
     ] = None,
     current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure a cell's capacity from rests and the charge that is counted between them.
@@ -80,7 +94,7 @@ def capacity(
     and its standard deviation divided by the capacity as `cell.capacity_std`.
     """
     model = load_cell(cell, capacity_ah)
-    loaded = [load_capture(path, current_sign=current_sign) for path in captures]
+    loaded = load_captures(captures, current_sign=current_sign, column_map=column_map)
     measured = measure_capacity(loaded, model, offset_std_a=current_offset_std_a)
     if not 1.0 / MAX_CAPACITY_RATIO < measured.capacity_ah / model.cell.capacity_ah < MAX_CAPACITY_RATIO:
         raise UserError(

@@ -1,4 +1,4 @@
-"""``bms-estimator cell``: cell file from the learned state of a pack's service."""
+"""``bms-estimator cell export``: cell file from the learned state of a pack's service."""
 
 import json
 import math
@@ -10,27 +10,23 @@ import numpy as np
 import typer
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.restore import restore_state
-from bms_estimator.cli.options.capture_options import AsJson, Force, NewCellFile, check_output_file, name_of
+from bms_estimator.checkpoint.learned_state import learned_estimator
+from bms_estimator.cli.options.capture_options import (
+    AsJson,
+    Force,
+    NewCellFile,
+    check_output_file,
+    write_cell_named_as_file,
+)
 from bms_estimator.cli.options.pack_options import load_pack, single_cell_of
-from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import (
     fitted_ocv_correction,
     identified_cell,
     ocv_correction_with_std,
     relative_capacity,
 )
-from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.pack_model.handover import adopt_curves
-from bms_estimator.pack_model.saved import fit_of_curves
 from bms_estimator.process.state_folder import state_folder
-
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    help="Write a cell file from the learned state of a pack's live service.",
-)
 
 TABULATED_SOC = np.linspace(0.0, 1.0, 11)
 """SOC at which corrections and errors of the OCV are printed."""
@@ -52,12 +48,6 @@ class ExportResult:
     """Standard deviation of the corrected OCV at SOC 0, 0.1 ... 1, for the cell or module that the cell file describes."""
 
 
-@app.callback()
-def _group() -> None:
-    """Make ``export`` a subcommand. Without this callback, typer would drop the command's name, because it is the only one."""
-
-
-@app.command()
 def export(
     pack: Annotated[Path, typer.Argument(help="settings file of the pack, pack.toml", show_default=False)],
     out: NewCellFile,
@@ -82,26 +72,8 @@ def export(
     check_output_file(out, [pack, file.path], force=force)
     if checkpoint and not checkpoint.exists():
         raise UserError(f"--checkpoint {checkpoint}: no such file")
-    content = file.load()
-    if content.reason:
-        raise UserError(
-            f"{file.path}: no checkpoint to export: {content.reason}; a service with the settings {pack} saves a checkpoint every "
-            f"{settings.state.checkpoint_s:g} s (give another file with --checkpoint)"
-        )
-    estimator = new_estimator(settings, model)
-    try:
-        fit = fit_of_curves(content.curves)
-    except ValueError as error:
-        raise UserError(f"{file.path}: nothing to export: {error}") from error
-    if fit:
-        adopt_curves(estimator.settings_record[0]["filter"], estimator.cell_file_settings, fit)
-    reason = restore_state(estimator, content.state, unseen_s=0.0)
-    if reason or not estimator.record[0]["filter"]["started"]:
-        raise UserError(
-            f"{file.path}: nothing to export: {reason or 'the identifier was off, so that nothing was learned'}"
-        )
+    estimator = learned_estimator(file, settings, model)
     learned = identified_cell(estimator, cell, series)
-    renamed = learned.model_copy(update={"cell": learned.cell.model_copy(update={"name": name_of(out)})})
     correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], TABULATED_SOC)
     correction_v += fitted_ocv_correction(estimator, TABULATED_SOC)
     capacity, cell_ah = relative_capacity(estimator.record[0]), cell.cell.capacity_ah
@@ -114,7 +86,7 @@ def export(
         ocv_correction_mv=(1e3 * correction_v / series).tolist(),
         ocv_error_mv=(1e3 * std_v / series).tolist(),
     )
-    write_cell(out, renamed, _remarks(result, settings.pack.cell))
+    write_cell_named_as_file(out, learned, _remarks(result, settings.pack.cell))
     typer.echo(json.dumps(asdict(result)) if as_json else _text(result, settings.pack.cell))
 
 

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.elements.identify import CaptureFit, Identification, identify
 from bms_estimator.cli.cell.identify_fuel_cell import identify_fuel_cell
+from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CELL_OR_FUEL_CELL_HELP,
     AsJson,
@@ -21,38 +22,39 @@ from bms_estimator.cli.options.capture_options import (
     CapturesFromRest,
     Force,
     InitialSoc,
+    MappedColumns,
     NewCellFile,
     SignOfCurrent,
+    TemperatureWithoutSensor,
     check_output_file,
+    complete_cell,
     reject_duplicates,
     write_cell_named_as_file,
 )
-from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.cell import is_fuel_cell, load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.replay import load_capture
 
 
 def identify_command(
     captures: CapturesFromRest,
     cell: Annotated[
-        str, typer.Option(help=f"cell that supplies capacity and OCV: {CELL_OR_FUEL_CELL_HELP}", show_default=False)
+        str,
+        typer.Option(
+            help=f"cell that supplies capacity and OCV: {CELL_OR_FUEL_CELL_HELP}",
+            autocompletion=complete_cell,
+            show_default=False,
+        ),
     ],
     out: NewCellFile,
     capacity_ah: CapacityAh = None,
     soc: InitialSoc = None,
-    temperature_c: Annotated[
-        float | None,
-        typer.Option(
-            parser=decimal(),
-            help="temperature of the captures that have no column temperature_c [°C]; default: 25",
-            show_default=False,
-        ),
-    ] = None,
+    temperature_c: TemperatureWithoutSensor = None,
     keep_ocv: Annotated[
         bool, typer.Option(help="keep the OCV of --cell unchanged; default: correct the OCV", show_default=False)
     ] = False,
     current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -72,12 +74,28 @@ def identify_command(
     if is_fuel_cell(cell):
         if capacity_ah is not None or soc is not None or keep_ocv:
             raise UserError(f"{cell} is a fuel cell: --capacity-ah, --soc and --keep-ocv apply only to batteries")
-        identify_fuel_cell(captures, cell, out, temperature_c=temperature_c, current_sign=current_sign, as_json=as_json)
+        identify_fuel_cell(
+            captures,
+            cell,
+            out,
+            temperature_c=temperature_c,
+            current_sign=current_sign,
+            column_map=column_map,
+            as_json=as_json,
+        )
         return
     model = load_cell(cell, capacity_ah)
-    loaded = [load_capture(path, current_sign=current_sign) for path in captures]
+    loaded = load_captures(captures, current_sign=current_sign, column_map=column_map)
     started_s = time.perf_counter()
-    identification = identify(loaded, model, refine_ocv=not keep_ocv, initial_soc=soc, temperature_c=temperature_c)
+    with progress_bar("identifying") as bar:
+        identification = identify(
+            loaded,
+            model,
+            refine_ocv=not keep_ocv,
+            initial_soc=soc,
+            temperature_c=temperature_c,
+            progress=bar.update,
+        )
     duration_s = time.perf_counter() - started_s
     initial_cell = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
     write_cell_named_as_file(out, identification.cell, _remarks(initial_cell, identification))

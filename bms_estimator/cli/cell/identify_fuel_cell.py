@@ -15,6 +15,7 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, fit_fuel_cell
+from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import name_of, unique_names
 from bms_estimator.kernels.kalman_filter.temperature import MAX_PLAUSIBLE_C, MIN_PLAUSIBLE_C
 from bms_estimator.model.arrays import Floats
@@ -23,7 +24,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.captures.curves import read_polarisation
-from bms_estimator.sources.captures.replay import load_capture
+from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 DIGITS = 4
 """Significant digits of printed values."""
@@ -51,6 +52,7 @@ def identify_fuel_cell(
     *,
     temperature_c: float | None,
     current_sign: CurrentSign | None,
+    column_map: ColumnMap | None,
     as_json: bool,
 ) -> None:
     """Identify the parameters, write the file and print the result; arguments as in ``identify_command``."""
@@ -61,7 +63,7 @@ def identify_fuel_cell(
     initial_model = load_fuel_cell(cell)
     names = unique_names([name_of(path) for path in paths], paths)
     sources = [
-        _read_source(name, path, initial_model, temperature_c, current_sign)
+        _read_source(name, path, initial_model, temperature_c, current_sign, column_map)
         for name, path in zip(names, paths, strict=True)
     ]
     started_s = time.perf_counter()
@@ -88,7 +90,12 @@ def identify_fuel_cell(
 
 
 def _read_source(
-    name: str, path: Path, model: FuelCellModel, temperature_c: float | None, sign: CurrentSign | None
+    name: str,
+    path: Path,
+    model: FuelCellModel,
+    temperature_c: float | None,
+    sign: CurrentSign | None,
+    column_map: ColumnMap | None,
 ) -> Source:
     """Read a polarization curve, or a capture if the file has times; drop samples outside the stack's limits."""
     curve = read_polarisation(path)
@@ -97,7 +104,7 @@ def _read_source(
         current_a, voltage_v, sensed_c = curve.T
         current_a = -current_a if sign == "charge_positive" else current_a
     else:
-        record = load_capture(path, current_sign=sign)
+        (record,) = load_captures([path], current_sign=sign, column_map=column_map)
         time_s, current_a, voltage_v, sensed_c = (
             record[name] for name in ("time_s", "current_a", "voltage_v", "temperature_c")
         )

@@ -2,89 +2,40 @@
 
 import json
 import sys
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.calibration.cleaning.rests import remove_glitches
-from bms_estimator.calibration.elements.generic_prior import curve as generic_curve
-from bms_estimator.calibration.elements.generic_prior import nearest_generic_cell, scaled_generic_ladder
-from bms_estimator.calibration.elements.initial_elements import initial_elements
-from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv.points import Points, max_v, rms_v
-from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
-from bms_estimator.calibration.ocv.sources import (
-    ExternalCurve,
-    OcvSources,
-    Recording,
-    center_on_typical_hysteresis,
-    find_sources,
-    has_plateau,
-    subtract_rc_overpotential,
-)
-from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
+from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit
+from bms_estimator.calibration.ocv.points import max_v, rms_v
+from bms_estimator.calibration.ocv.sources import OcvSources, Recording
+from bms_estimator.calibration.ocv.table_fit import TableFit
+from bms_estimator.calibration.ocv_cell import OcvCell, OcvForm, determine_ocv
+from bms_estimator.cli.cell.calibration_input import load_captures_and_curves
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     AsJson,
     Force,
+    MappedColumns,
     NewCellFile,
     SignOfCurrent,
     check_output_file,
     name_of,
     reject_duplicates,
-    unique_names,
 )
 from bms_estimator.cli.options.number_options import decimal, whole
-from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
-from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder
 from bms_estimator.model.cell_file import write_cell
-from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.curves import read_curve
-from bms_estimator.sources.captures.replay import load_capture
 
-TYPICAL_CELL_V = 3.7
-"""Voltage of one Li-ion cell at half charge [V], from which the number of cells in series is estimated."""
-MIN_CELL_V = 1.5
-"""Minimum plausible voltage of one cell at half charge [V]."""
-MAX_CELL_V = 4.5
-"""Maximum plausible voltage of one cell at half charge [V]."""
-MAX_CELLS = 300
-"""Maximum plausible number of cells in series."""
-MIN_VOLTAGE_RATIO = 0.55
-"""Minimum voltage of a valid sample as a fraction of the OCV at SOC 0.5: 2.0 V for a cell of 3.7 V, below usual cut-offs."""
-MAX_VOLTAGE_RATIO = 1.06
-"""Maximum voltage of a valid sample as a fraction of the OCV at SOC 1: 4.45 V for a cell of 4.2 V, above usual overcharge."""
-MIN_EMPTY_RATIO = 0.25
-"""Minimum plausible ratio of the OCV at SOC 0 to that at SOC 0.5."""
-MEASURED_CAPACITY_STD = 0.03
-"""Relative standard deviation of a capacity measured by a slow discharge. It covers the gain of the current sensor,
-differences between cells of the type, and ageing over some years."""
-MIN_CURRENT_LIMIT_C = 5.0
-"""Minimum C-rate of ``current_max_a`` in the written cell file, the limit above which a sample is not valid [1/h]."""
-PEAK_CURRENT_MARGIN = 1.5
-"""Minimum ratio of ``current_max_a`` in the written cell file to the largest current in the captures."""
 STEEP_SOC = 0.05
 """Width of the ranges at both ends of the SOC in which OCV curves are steep."""
 TABULATED_SOC = np.linspace(0.0, 1.0, 11)
 """SOC at which the error of the table is printed."""
-
-
-class Form(StrEnum):
-    """Form of the open-circuit voltage in the cell file."""
-
-    CHEN_MORA = "chen-mora"
-    """Function (2.10) of the thesis, after Chen and Mora."""
-    TABLE = "table"
-    """Smooth table over SOC."""
 
 
 @dataclass(frozen=True)
@@ -155,11 +106,11 @@ def ocv(
         ),
     ] = None,
     form: Annotated[
-        Form,
+        OcvForm,
         typer.Option(
             help="form of the OCV in the cell file: smooth table, or the function of Chen and Rincón-Mora's cell model"
         ),
-    ] = Form.TABLE,
+    ] = OcvForm.TABLE,
     soc: Annotated[
         float,
         typer.Option(
@@ -176,6 +127,7 @@ def ocv(
         ),
     ] = None,
     current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -192,85 +144,23 @@ def ocv(
     """
     check_output_file(out, captures, force=force)
     reject_duplicates(captures)
-    recordings, curves = [], []
-    for name, path in zip(unique_names([path.name for path in captures], captures), captures, strict=True):
-        columns = read_curve(path)
-        if columns is None:
-            recordings.append(Recording(name, load_capture(path, current_sign=current_sign).rows))
-        else:
-            curves.append(ExternalCurve(name, *columns))
-    voltages_v = [_checked_voltage(recording) for recording in recordings]
-    series_count = _cells_in_series(np.concatenate([*voltages_v, *(curve.ocv_v for curve in curves)]), series)
-    ocv_sources = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=series_count)
-    fit_curve: Callable[[Points], ChenMoraFit | TableFit] = fit_table if form is Form.TABLE else fit_chen_mora
-    # unpaired curves still contain the overpotential of RC pairs, which are known only with the generic cell
-    preliminary_v = fit_curve(ocv_sources.points)(NODES)
-    generic = nearest_generic_cell(NODES, preliminary_v, ocv_sources.capacity_ah, series_count)
-    ladder, elements = _elements(generic, ocv_sources, recordings)
-    ocv_sources = subtract_rc_overpotential(ocv_sources, ladder)
-    # the two phases of a plateau cause hysteresis, which the form chen-mora does not have
-    if form is Form.TABLE and ocv_sources.hysteresis_v is None and has_plateau(NODES, preliminary_v, series_count):
-        ocv_sources = center_on_typical_hysteresis(
-            ocv_sources, np.interp(NODES, *generic_curve(generic, "hysteresis_v"))
-        )
-    fit = fit_curve(ocv_sources.points)
-    _check_ends(fit, ocv_sources)
-    result = _result(form, generic, fit, ocv_sources)
-    sections = _cell_and_ocv_sections(name_of(out), series_count, fit, ocv_sources, recordings)
-    write_cell(out, CellModel.model_validate({**sections, "ladder": ladder, **elements}), _remarks(result))
+    loaded, curves = load_captures_and_curves(captures, current_sign=current_sign, column_map=column_map)
+    recordings = [Recording(each.name, each.rows) for each in loaded]
+    determined = determine_ocv(
+        recordings, curves, form=form, capacity_ah=capacity_ah, initial_soc=soc, series_count=series, name=name_of(out)
+    )
+    result = _result(form, determined)
+    write_cell(out, determined.cell, _remarks(result))
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
         console = Console()
-        console.print(_table(out, result, ocv_sources))
+        console.print(_table(out, result, determined.sources))
         console.print(_sources_table(result))
 
 
-def _checked_voltage(recording: Recording) -> NDArray[np.float64]:
-    """Return the voltage without glitches [V].
-
-    Raises:
-        UserError: The voltage is constant.
-    """
-    voltage_v = remove_glitches(recording.samples, recording.name)["voltage_v"]
-    if np.ptp(voltage_v) == 0.0:
-        raise UserError(f"{recording.name}: the voltage is {voltage_v[0]:g} V throughout: is the sensor connected?")
-    return voltage_v
-
-
-def _cells_in_series(voltage_v: NDArray[np.float64], configured: int | None) -> int:
-    """Return the configured number of cells in series, or an estimate from the median voltage.
-
-    Raises:
-        UserError: The voltage of one cell would be implausible.
-    """
-    median_v = float(np.median(voltage_v))
-    count = configured or max(round(median_v / TYPICAL_CELL_V), 1)
-    if not configured and count > MAX_CELLS:
-        raise UserError(
-            f"the median voltage is {median_v:g} V, as of {count} cells in series; if the column is in millivolts, convert it to volts, otherwise give --series"
-        )
-    if not MIN_CELL_V <= median_v / count <= MAX_CELL_V:
-        raise UserError(f"--series {count}: {median_v:g} V would be {median_v / count:.2f} V per cell")
-    return count
-
-
-def _check_ends(fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> None:
-    """Check that the curve, extrapolated beyond its points, does not fall to 0 V.
-
-    Raises:
-        UserError: The OCV at SOC 0 is implausible.
-    """
-    empty_v, half_full_v = (float(v) for v in fit(np.array([0.0, 0.5])))
-    if empty_v > MIN_EMPTY_RATIO * half_full_v:
-        return
-    raise UserError(
-        f"the points begin at SOC {ocv_sources.points.soc[0]:.2f}, and their curve would be {empty_v:.2f} V at SOC 0: give captures "
-        f"down to empty; if the cell was emptied, the capacity of {ocv_sources.capacity_ah:g} Ah is too large (--capacity-ah)"
-    )
-
-
-def _result(form: Form, generic: CellModel, fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> OcvResult:
+def _result(form: OcvForm, determined: OcvCell) -> OcvResult:
+    fit, ocv_sources, generic = determined.fit, determined.sources, determined.generic
     tests, points = ocv_sources.tests, ocv_sources.points
     parameters: dict[str, dict[str, float | None]] = {}
     if isinstance(fit, ChenMoraFit):
@@ -319,49 +209,6 @@ def _source_results(fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> lis
 
 def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def _elements(
-    generic: CellModel, ocv_sources: OcvSources, recordings: list[Recording]
-) -> tuple[Ladder, dict[str, object]]:
-    """Return resistances over SOC, and the thesis's parameters a1..a15 of R_s and two RC pairs by section of the file.
-
-    Both come from the rests of the capture nearest to 25 °C; without rests, from the generic cell.
-    """
-    test = _nearest_to_reference(ocv_sources.tests)
-    if test is None:
-        return scaled_generic_ladder(generic, None), {element: getattr(generic, element) for element in ELEMENTS}
-    samples = next(recording.samples for recording in recordings if recording.name == test.name)
-    rest_elements = initial_elements(samples, test, ocv_sources.capacity_ah)
-    temperature_c = float(np.nan_to_num(test.temperature_c, nan=REFERENCE_C))
-    return scaled_generic_ladder(generic, rest_elements, temperature_c), dict(rest_elements.sections)
-
-
-def _cell_and_ocv_sections(
-    name: str, series_count: int, fit: ChenMoraFit | TableFit, ocv_sources: OcvSources, recordings: list[Recording]
-) -> dict[str, object]:
-    """Return the section ``cell``, which contains the limits of a valid sample, and the section ``ocv``."""
-    half_full_v, full_v = (float(v) for v in fit(np.array([0.5, 1.0])))
-    empty_v = float(fit(np.array([0.0]))[0])
-    peak_a = max((float(np.nanmax(np.abs(each.samples["current_a"]))) for each in recordings), default=0.0)
-    cell = Cell(
-        name=name,
-        capacity_ah=round(ocv_sources.capacity_ah, 4),
-        capacity_std=MEASURED_CAPACITY_STD if ocv_sources.capacity_ah == ocv_sources.measured_ah else None,
-        series_count=series_count,
-        nominal_voltage_v=round(half_full_v, 2),
-        voltage_min_v=round(min(MIN_VOLTAGE_RATIO * half_full_v, empty_v), 2),
-        voltage_max_v=round(MAX_VOLTAGE_RATIO * full_v, 2),
-        current_max_a=round(max(MIN_CURRENT_LIMIT_C * ocv_sources.capacity_ah, PEAK_CURRENT_MARGIN * peak_a), 3),
-    )
-    ocv = fit.ocv if isinstance(fit, ChenMoraFit) else fit.table(ocv_sources.hysteresis_v, ocv_sources.hysteresis_std_v)
-    return {"cell": cell, "ocv": ocv}
-
-
-def _nearest_to_reference(tests: Sequence[RelaxationTest]) -> RelaxationTest | None:
-    """Return the test nearest to 25 °C; the first test if none has a temperature."""
-    distance_k = [np.nan_to_num(abs(test.temperature_c - REFERENCE_C), nan=np.inf) for test in tests]
-    return tests[int(np.argmin(distance_k))] if tests else None
 
 
 def _remarks(result: OcvResult) -> list[str]:

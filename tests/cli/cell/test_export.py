@@ -100,7 +100,7 @@ def test_missing_checkpoint_is_an_error(tmp_path, capsys, pack):
     other.write_text(pack.read_text().replace(str(pack.parent), str(tmp_path)))
     code, _, err = run(capsys, "cell", "export", other, "--out", tmp_path / "x.toml")
     assert code == 2
-    assert "no checkpoint to export: none found" in err
+    assert "no checkpoint to read: none found" in err
     assert not (tmp_path / "x.toml").exists()
 
 

@@ -116,6 +116,6 @@ def test_cell_file_with_worse_replays_is_not_written(tables, tmp_path, capsys, m
     out = tmp_path / "worse.toml"
     code, text, err = run(capsys, "identify", tables / "steps0.csv", "--cell", "ncr18650", "--out", out)
     assert (code, text) == (2, "")
-    assert "nothing is written: replays that start in mid-load get worse" in err
+    assert "replays that start in mid-load get worse" in err
     assert "from 1.00 to 9.00 % of SOC" in err
     assert not out.exists()

@@ -1,0 +1,88 @@
+"""``bms-estimator convert``: a capture in another format."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses
+from bms_estimator.cli.options.capture_options import (
+    CAPTURE_HELP,
+    Force,
+    MappedColumns,
+    SignOfCurrent,
+    check_output_file,
+)
+from bms_estimator.conversion.bdf import bdf_rows, is_bdf_name
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.progress import Progress
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.sinks.trace_file import CsvSink, TableSink, table_sink
+from bms_estimator.sources.captures.replay import Capture, open_capture
+
+
+def convert(
+    capture: Annotated[Path, typer.Argument(help=CAPTURE_HELP, show_default=False)],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="file to write: .csv, .csv.gz or .parquet; Battery Data Format: .bdf, .bdf.gz, .bdf.csv or .bdf.parquet",
+            show_default=False,
+        ),
+    ],
+    current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
+    force: Force = False,
+) -> None:
+    """Write a capture as CSV or Parquet, with the columns of this project or of the Battery Data Format (BDF).
+
+    The current is positive on discharge in this project's columns, and positive on charge in BDF.
+    """
+    check_output_file(out, [capture], force=force)
+    sink, rows = _sink(out), 0
+    with capture_file(capture) as path, sink, long_file_bar("converting", path) as progress:
+
+        def reopen() -> Capture:
+            return open_capture(path, current_sign=current_sign, column_map=column_map)
+
+        source = reopen()
+        print_guesses(path.name, source)
+        for block in _bdf_blocks(reopen, progress) if is_bdf_name(out.name) else _blocks(source, progress):
+            sink.write(block)
+            rows += block.size
+    if rows == 0:
+        raise UserError(f"{capture}: no samples")
+    typer.echo(f"{out}: {rows:,} samples")
+
+
+def _sink(out: Path) -> TableSink:
+    """Return the sink of a file name. Missing values are empty in BDF, because most of its readers parse ``nan`` as text."""
+    is_bdf_text = is_bdf_name(out.name) and not out.name.lower().endswith(".parquet")
+    return CsvSink(out, nan="") if is_bdf_text else table_sink(out)
+
+
+def _blocks(capture: Capture, progress: Progress) -> Iterator[SampleBlock]:
+    """Yield the samples of a capture, and report the fraction of the file that has been read."""
+    for block in capture:
+        yield block
+        progress(capture.fraction)
+
+
+def _bdf_blocks(reopen: Callable[[], Capture], progress: Progress) -> Iterator[NDArray[np.void]]:
+    """Yield the samples of a capture in the Battery Data Format.
+
+    The first pass reads up to the first temperature, to decide whether the file has a column for it.
+
+    Args:
+        reopen: Function that opens the capture for one pass.
+        progress: Receives the fraction of the file that has been converted.
+    """
+    with_temperature = any(np.isfinite(block["temperature_c"]).any() for block in reopen())
+    first_s = None
+    for block in _blocks(reopen(), progress):
+        if first_s is None:
+            first_s = float(block["time_s"][0])
+        yield bdf_rows(block, first_s, with_temperature=with_temperature)

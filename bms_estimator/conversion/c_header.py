@@ -1,0 +1,164 @@
+"""C header with the tables of a cell, for firmware that estimates or predicts the cell's voltage."""
+
+import re
+
+import numpy as np
+
+from bms_estimator.conversion.circuit import OcvTable, ladder_table, ocv_table
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.cell_model.chen_mora import ocv
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    BRANCHES,
+    GAS_J,
+    HYSTERESIS_J,
+    STRONG_J,
+    TAU_S,
+    TREND,
+    WEAK_J,
+)
+from bms_estimator.kernels.kalman_filter.records import Noise
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.cell import CellModel
+from bms_estimator.version import __version__
+
+FINE_POINTS = 2001
+"""Number of points at which the error of a linear interpolation is computed."""
+INTERPOLATION_ERROR_V = 2e-4
+"""Maximum error of a linear interpolation of the OCV between the nodes of the header, per cell in series [V]."""
+EXTREME_TEMPERATURE_DIFFERENCE_K = 40.0
+"""Difference from 25 °C up to which ``INTERPOLATION_ERROR_V`` also holds for the temperature coefficient [K]."""
+LINE_VALUES = 6
+"""Number of values on a line of a table."""
+
+HEADER = """\
+/*
+ * {name}{description}
+ * Written by bms-estimator {version}. Values describe {series_count} cell(s) in series as one two-terminal object.
+ *
+ * Current I is positive on discharge. State: SOC, x[0] to x[5], m, h.
+ *   d SOC/dt = -I / CELL_CAPACITY_AS
+ *   d x[k]/dt = (I - x[k]) / CELL_TAU_S[k]                       current filtered by RC pair k [A]
+ *   d m/dt = (SOC - m) / CELL_TAU_S[CELL_TREND]                  filtered SOC
+ *   d h/dm = (sign(dm) - h) / CELL_HYSTERESIS_SOC * sign(dm)     hysteresis state: -1 after discharge, 1 after charge
+ *   f(B) = exp(B (1/T - 1/298.15))                               T: temperature [K], B: temperature constant [K]
+ *   R[k] = f(CELL_WEAK_K) CELL_WEAK_OHM[k](SOC) + f(CELL_STRONG_K) CELL_STRONG_OHM[k](SOC)
+ *   V = CELL_OCV_V(SOC) + (T - 298.15) CELL_OCV_V_PER_K(SOC) + h f(CELL_HYSTERESIS_K) CELL_HYSTERESIS_V(SOC)
+ *       - I R[0] - x[0] R[1] - ... - x[5] R[6]
+ * Tables are linear between their nodes and constant outside. The capacitance of RC pair k is CELL_TAU_S[k] / R[k + 1].
+ *
+ * AVR: compile with -std=gnu99 -DCELL_MEMORY=__flash, so that the tables stay in flash.
+ */
+#ifndef CELL_{guard}_H
+#define CELL_{guard}_H
+
+#ifndef CELL_MEMORY
+#define CELL_MEMORY
+#endif
+
+#define CELL_CAPACITY_AS {capacity_as}
+#define CELL_RC_PAIRS {pairs}
+#define CELL_OCV_NODES {ocv_nodes}
+#define CELL_OHM_NODES {ohm_nodes}
+#define CELL_TREND {trend}
+#define CELL_WEAK_K {weak_k}
+#define CELL_STRONG_K {strong_k}
+#define CELL_HYSTERESIS_K {hysteresis_k}
+#define CELL_HYSTERESIS_SOC {hysteresis_soc}
+
+{tables}
+#endif /* CELL_{guard}_H */
+"""
+
+
+def c_header(cell: CellModel) -> str:
+    """Return the text of a C99 header with tables of the OCV and of the RC ladder, and the equations as a comment."""
+    curve, ladder, ratings = _thinned(cell), ladder_table(cell), cell.cell
+    ocv_shape, ohm_shape = "[CELL_OCV_NODES]", "[CELL_OHM_NODES]"
+    tables = [
+        _table("CELL_TAU_S[CELL_RC_PAIRS]", np.array(TAU_S)),
+        _table(f"CELL_OCV_SOC{ocv_shape}", curve.soc),
+        _table(f"CELL_OCV_V{ocv_shape}", curve.ocv_v),
+        _table(f"CELL_OCV_V_PER_K{ocv_shape}", curve.per_kelvin_v),
+        _table(f"CELL_HYSTERESIS_V{ocv_shape}", curve.hysteresis_v),
+        _table(f"CELL_OHM_SOC{ohm_shape}", ladder.soc),
+        _matrix(f"CELL_WEAK_OHM[CELL_RC_PAIRS + 1]{ohm_shape}", ladder.weak_ohm),
+        _matrix(f"CELL_STRONG_OHM[CELL_RC_PAIRS + 1]{ohm_shape}", ladder.strong_ohm),
+    ]
+    return HEADER.format(
+        name=_comment(ratings.name),
+        description=f": {_comment(ratings.description)}" if ratings.description else "",
+        version=__version__,
+        series_count=ratings.series_count,
+        guard=re.sub(r"\W", "_", ratings.name, flags=re.ASCII).upper(),
+        capacity_as=_float(3600.0 * ratings.capacity_ah),
+        pairs=BRANCHES,
+        ocv_nodes=curve.soc.size,
+        ohm_nodes=ladder.soc.size,
+        trend=TREND,
+        weak_k=_float(WEAK_J / GAS_J),
+        strong_k=_float(STRONG_J / GAS_J),
+        hysteresis_k=_float(HYSTERESIS_J / GAS_J),
+        hysteresis_soc=_float(Noise().hysteresis_soc),
+        tables="\n".join(tables),
+    )
+
+
+def _thinned(cell: CellModel) -> OcvTable:
+    """Return the OCV at the fewest nodes between which linear interpolation is within ``INTERPOLATION_ERROR_V``.
+
+    The table of the cell file is interpolated by a cubic curve, which firmware need not evaluate.
+    """
+    table, soc, grid = ocv_table(cell), np.linspace(0.0, 1.0, FINE_POINTS), ocv_grid(cell)
+    curve = OcvTable(
+        soc,
+        np.array([ocv(x, *grid) for x in soc]),
+        np.interp(soc, table.soc, table.per_kelvin_v),
+        np.interp(soc, table.soc, table.hysteresis_v),
+    )
+    voltages = np.array([curve.ocv_v, EXTREME_TEMPERATURE_DIFFERENCE_K * curve.per_kelvin_v, curve.hysteresis_v])
+    nodes = _linear_nodes(soc, voltages, INTERPOLATION_ERROR_V * cell.cell.series_count)
+    return OcvTable(soc[nodes], curve.ocv_v[nodes], curve.per_kelvin_v[nodes], curve.hysteresis_v[nodes])
+
+
+def _linear_nodes(x: Floats, rows: Floats, tolerance: float) -> list[int]:
+    """Return the indices of nodes between which all rows are linear within ``tolerance``. Each step is as long as possible."""
+    nodes, last = [0], x.size - 1
+    while nodes[-1] < last:
+        first, end = nodes[-1], nodes[-1] + 1
+        while end < last and _linear_error(x, rows, first, end + 1) <= tolerance:
+            end += 1
+        nodes.append(end)
+    return nodes
+
+
+def _linear_error(x: Floats, rows: Floats, first: int, end: int) -> float:
+    """Return the largest deviation of the rows from the straight line between two nodes."""
+    between = slice(first, end + 1)
+    weight = (x[between] - x[first]) / (x[end] - x[first])
+    return float(np.abs(rows[:, between] - rows[:, [first]] - weight * (rows[:, [end]] - rows[:, [first]])).max())
+
+
+def _table(declaration: str, values: Floats) -> str:
+    return f"static const CELL_MEMORY float {declaration} = {{\n{_lines(values, 4)}\n}};\n"
+
+
+def _matrix(declaration: str, rows: Floats) -> str:
+    text = ",\n".join(f"    {{\n{_lines(row, 8)}\n    }}" for row in rows)
+    return f"static const CELL_MEMORY float {declaration} = {{\n{text}\n}};\n"
+
+
+def _lines(values: Floats, indent: int) -> str:
+    texts = [_float(x) for x in values.tolist()]
+    lines = (", ".join(texts[i : i + LINE_VALUES]) for i in range(0, len(texts), LINE_VALUES))
+    return ",\n".join(" " * indent + line for line in lines)
+
+
+def _float(value: float) -> str:
+    """Return a float constant of C with the nine digits that restore each single-precision number."""
+    text = f"{value:.9g}"
+    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+
+
+def _comment(text: str) -> str:
+    """Return a text for a C comment: without line breaks, and without the end of a comment, because cell files may be from anyone."""
+    return " ".join(text.replace("*/", "* /").split())
