@@ -24,14 +24,10 @@ class LazyGroup(TyperGroup):
 
     entries: ClassVar[dict[str, LazyCommand]]
 
-    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002 - the signature is the base's
-        """Return the names of all commands in the order of ``entries``."""
-        return list(self.entries)
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """Return a placeholder with the help text of a command, for the list of commands; None if there is no such command."""
-        entry = self.entries.get(cmd_name)
-        return TyperCommand(cmd_name, help=entry.help) if entry else None
+    def __init__(self, **attributes: Any) -> None:
+        """Add a placeholder with the help text of each command, for the list and suggestions of commands."""
+        super().__init__(**attributes)
+        self.commands = {name: TyperCommand(name, help=entry.help) for name, entry in self.entries.items()}
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Import and return the command that is called."""

@@ -20,6 +20,7 @@ from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.suggestion import suggestion
 
 ELEMENTS = {
     "r_ts": (1, "amplitude_ohm", "offset_ohm"),  # (2.5)
@@ -306,6 +307,16 @@ def shipped_fuel_cells() -> list[str]:
     return _shipped_names("cells/fuel_cell")
 
 
+def battery_names() -> list[str]:
+    """Return the names of the generic and the shipped cells."""
+    return [*generic_cells(), *shipped_cells()]
+
+
+def cell_names() -> list[str]:
+    """Return the names of the generic cells, the shipped cells and the shipped fuel cells."""
+    return [*battery_names(), *shipped_fuel_cells()]
+
+
 def is_fuel_cell(name_or_path: str | Path) -> bool:
     """Return True for the name or readable file of a fuel cell, which has a section ``[fuel_cell]``."""
     if str(name_or_path) in shipped_fuel_cells():
@@ -374,5 +385,6 @@ def cell_file_path(text: str) -> Path:
         raise UserError(
             f"{text or '(empty name)'}: no such cell file, nor a shipped cell ({', '.join(shipped_cells())}), "
             f"nor a generic one ({', '.join(generic_cells())}), nor a fuel cell ({', '.join(shipped_fuel_cells())})"
+            f"{suggestion(text, cell_names())}"
         )
     return path

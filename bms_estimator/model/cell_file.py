@@ -17,7 +17,7 @@ DIGITS = 8
 """Number of significant digits of a written number. The rounding error of a cell's voltage is below 0.1 uV."""
 
 
-def write_cell(path: Path, cell: PackModel, remarks: Sequence[str] = ()) -> None:
+def write_cell(path: str | Path, cell: PackModel, remarks: Sequence[str] = ()) -> None:
     """Write a cell file that ``load_any`` reads.
 
     Args:
@@ -28,7 +28,7 @@ def write_cell(path: Path, cell: PackModel, remarks: Sequence[str] = ()) -> None
     Raises:
         UserError: The file cannot be written.
     """
-    write_text(path, cell_text(cell, remarks))
+    write_text(Path(path), cell_text(cell, remarks))
 
 
 def cell_text(cell: PackModel, remarks: Sequence[str] = ()) -> str:

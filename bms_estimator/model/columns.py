@@ -15,10 +15,14 @@ class Columns(Mapping[str, NDArray[Any]]):
     Attributes:
         rows: Shape (n,), structured array with the columns as fields, as in ``Estimator.run``.
         name: Name of the capture for messages.
+        note: Text that says what was guessed about the file of the capture; empty if nothing was.
+        warning: Contradiction in the file that the user should resolve; empty without one.
     """
 
     rows: NDArray[np.void]
     name: str = ""
+    note: str = ""
+    warning: str = ""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         if name not in self.names:

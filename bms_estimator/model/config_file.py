@@ -1,8 +1,8 @@
 """Reader of TOML files into pydantic models, with errors that name file, key, value and constraint."""
 
 import re
+import shutil
 import tomllib
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -16,6 +16,7 @@ from pydantic import (
 from pydantic_core.core_schema import CoreSchema, no_info_before_validator_function
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.suggestion import suggestion
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -75,6 +76,16 @@ MESSAGES = {
 """Replacements for messages of pydantic that only programmers understand, by error type."""
 
 
+def error_reason(detail: Any) -> str:
+    """Return the reason of a validation error in the words of this program.
+
+    Args:
+        detail: One of the errors of a ``ValidationError``.
+    """
+    text: str = detail["msg"].removeprefix("Value error, ").replace("Input should be", "must be", 1)
+    return MESSAGES.get(detail["type"], text)
+
+
 def read_toml(path: Path, model: type[T]) -> T:
     """Load and validate a TOML file.
 
@@ -122,8 +133,12 @@ def _error_line(path: str, model: type[BaseModel], table: object, detail: Any) -
     if detail["type"] == "extra_forbidden":
         return f"{path}: {full_key}: unknown key{_suggestion(model, keys)}"
     if detail["type"] == "union_tag_invalid":
-        return f"{path}: {full_key}.{_discriminator(detail)} = {detail['ctx']['tag']!r}: must be one of {detail['ctx']['expected_tags']}"
-    message = MESSAGES.get(detail["type"], detail["msg"].removeprefix("Value error, "))
+        tag, expected = detail["ctx"]["tag"], detail["ctx"]["expected_tags"]
+        similar = suggestion(tag, _quoted(expected))
+        return f"{path}: {full_key}.{_discriminator(detail)} = {tag!r}: must be one of {expected}{similar}"
+    message = error_reason(detail)
+    if detail["type"] == "literal_error" and (expected := _quoted(detail["ctx"]["expected"])):
+        message = f"must be one of {', '.join(expected)}{suggestion(str(detail['input']), expected)}"
     if detail["type"] == "string_pattern_mismatch" and not hint:
         message = detail["msg"]  # without a description of the form, the pattern is better than nothing
     if isinstance(detail["input"], dict):  # a whole section is too long for the message
@@ -148,6 +163,11 @@ def _key_path(table: object, detail: Any) -> list[str]:
     return [*keys, *map(str, last_key), *missing_key]
 
 
+def _quoted(text: str) -> list[str]:
+    """Return the words in single quotes, the form in which pydantic lists allowed values."""
+    return re.findall(r"'([^']*)'", text)
+
+
 def _discriminator(detail: Any) -> str:
     """Return the key that selects one of several models."""
     return str(detail["ctx"]["discriminator"]).strip("'")
@@ -157,8 +177,8 @@ def _suggestion(model: type[BaseModel], keys: list[str]) -> str:
     """Return a suggestion for an unknown key: a similar key, or all keys if they are few; otherwise an empty text."""
     models = _models_at(model, keys[:-1])
     known = list(dict.fromkeys(field.alias or name for m in models for name, field in m.model_fields.items()))
-    if close := get_close_matches(keys[-1], known, n=1):
-        return f"; is {close[0]} meant?"
+    if similar := suggestion(keys[-1], known):
+        return similar
     return f"; there are {', '.join(known)}" if len(models) == 1 and 0 < len(known) <= MAX_LISTED_KEYS else ""
 
 
@@ -200,10 +220,10 @@ def without_secrets(text: str) -> str:
 
 
 def write_text(path: Path, text: str, *, make_folder: bool = False) -> None:
-    """Write a file in UTF-8.
+    """Write a file in UTF-8, atomically: after a failure the old file is unchanged, and no part of the new one remains.
 
     Args:
-        path: Path of the file, which is overwritten if it exists.
+        path: Path of the file, which is replaced if it exists.
         text: Contents of the file.
         make_folder: True to create a missing folder.
 
@@ -213,6 +233,25 @@ def write_text(path: Path, text: str, *, make_folder: bool = False) -> None:
     try:
         if make_folder:
             path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8", newline="")
+        if path.exists() and not path.is_file():  # a device or a pipe, which cannot be replaced
+            path.write_text(text, encoding="utf-8", newline="")
+        else:
+            _replace(path.resolve(), text)
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a file under another name, then rename it. The permissions of an existing file remain.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    new_path = path.with_name(f".{path.name}.new")
+    try:
+        new_path.write_text(text, encoding="utf-8", newline="")
+        if path.exists():
+            shutil.copymode(path, new_path)
+        new_path.replace(path)
+    finally:
+        new_path.unlink(missing_ok=True)

@@ -8,6 +8,8 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_after_validator_function
 
+from bms_estimator.model.suggestion import suggestion
+
 
 @dataclass(frozen=True)
 class OneOf:
@@ -23,5 +25,5 @@ class OneOf:
 
     def _check(self, name: str) -> str:
         if name not in self.names:
-            raise ValueError(f"must be one of {', '.join(self.names)}")
+            raise ValueError(f"must be one of {', '.join(self.names)}{suggestion(name, self.names)}")
         return name

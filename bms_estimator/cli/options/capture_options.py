@@ -8,19 +8,35 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell import CellModel, battery_names, cell_names
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
+from bms_estimator.sources.captures.tables.layout import ColumnMap, parse_column_map
 
 AsJson = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
 """Option that prints the result as JSON."""
 CELL_HELP = "generic cell (lfp, nmc, nca, lco, lmo, lto), name of a shipped cell, or path of a cell file"
 CELL_OR_FUEL_CELL_HELP = f"{CELL_HELP}; for a fuel cell: pem_30w or path of a fuel-cell file"
-CAPTURE_FORMATS = "file of `record` or `run --record`, CSV (.csv, .csv.gz) or Parquet"
+CAPTURE_FORMATS = (
+    "file of `record` or `run --record`, or a table: CSV, Parquet, spreadsheet or the export of a cycler; "
+    "-: read standard input"
+)
 """Formats of a capture in help texts."""
-CAPTURE_HELP = f"capture to read: {CAPTURE_FORMATS}; -: read standard input"
-CellName = Annotated[str, typer.Option(help=CELL_HELP, show_default=False)]
+CAPTURE_HELP = f"capture to read: {CAPTURE_FORMATS}"
+
+
+def complete_battery(incomplete: str) -> list[str]:
+    """Return the names of battery cells that begin with ``incomplete``."""
+    return [name for name in battery_names() if name.startswith(incomplete)]
+
+
+def complete_cell(incomplete: str) -> list[str]:
+    """Return the names of battery cells and fuel cells that begin with ``incomplete``."""
+    return [name for name in cell_names() if name.startswith(incomplete)]
+
+
+CellName = Annotated[str, typer.Option(help=CELL_HELP, autocompletion=complete_battery, show_default=False)]
 CapacityAh = Annotated[
     float | None,
     typer.Option(
@@ -46,21 +62,43 @@ SignOfCurrent = Annotated[
     typer.Option(
         metavar="SIGN",
         help="direction of positive current in the capture: discharge_positive or charge_positive; default: "
-        "as the capture states it, otherwise discharge_positive",
+        "that of the format; if it defines none, that which the voltage shows",
+    ),
+]
+TemperatureWithoutSensor = Annotated[
+    float | None,
+    typer.Option(
+        "--temperature-c",
+        parser=decimal(),
+        help="temperature of the captures that have no column temperature_c [°C]; default: 25",
+        show_default=False,
+    ),
+]
+MappedColumns = Annotated[
+    ColumnMap | None,
+    typer.Option(
+        "--map",
+        parser=parse_column_map,
+        metavar="time=COLUMN,...",
+        help="columns of a table with unknown names, for time, current, voltage and, optionally, temperature; "
+        "sheet=SHEET chooses a sheet of a spreadsheet",
+        show_default=False,
     ),
 ]
 
 
 def check_output_file(out: Path, inputs: Sequence[Path], *, force: bool) -> None:
-    """Reject an output file that exists, unless ``force`` is set, and any output file that is also an input.
+    """Reject an output file that exists, unless ``force`` is set, that is also an input, or whose folder does not exist.
 
     Raises:
-        UserError: ``out`` is one of ``inputs``, or exists and ``force`` is not set.
+        UserError: ``out`` is one of ``inputs``, has no folder, or exists and ``force`` is not set.
     """
     if any(out.exists() and path.exists() and out.samefile(path) for path in inputs):
         raise UserError(f"--out {out}: is also an input; name another file")
     if out.is_file() and not force:
         raise UserError(f"--out {out}: exists already; --force replaces it")
+    if not out.parent.is_dir():
+        raise UserError(f"--out {out}: cannot be written: there is no folder {out.parent}; create it")
 
 
 def reject_duplicates(captures: Sequence[Path]) -> None:
@@ -86,6 +124,11 @@ def name_of(path: Path) -> str:
     return path.name.split(".")[0]
 
 
+def named_as_file(out: Path, cell: CellModel) -> CellModel:
+    """Return the cell with the name of a file."""
+    return cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name_of(out)})})
+
+
 def write_cell_named_as_file(out: Path, cell: CellModel, remarks: list[str]) -> None:
     """Write a cell file. Its cell is named after the file, and ``remarks`` become comments at its beginning."""
-    write_cell(out, cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name_of(out)})}), remarks)
+    write_cell(out, named_as_file(out, cell), remarks)

@@ -1,6 +1,6 @@
-"""Progress line on stderr while kernels compile.
+"""Progress bar on stderr while kernels compile.
 
-A first start takes a minute or two. Later starts load the kernels from the cache.
+A first start compiles for 22 s on two idle cores. Later starts load the kernels from the cache.
 """
 
 import signal
@@ -10,18 +10,23 @@ from contextlib import ExitStack, contextmanager
 
 from numba.core import event
 from rich.console import Console
-from rich.progress import Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 
-COMPILE_TEXT = "compiling the kernels; this takes a minute or two, and later starts use the cache"
-"""Text of the progress line."""
+from bms_estimator.cli.options.bar import new_bar
+from bms_estimator.numba_cache import count_cached_kernels, count_kernels
+
+COMPILE_TEXT = "compiling the kernels; this takes up to a minute, and later starts use the cache"
+"""Line on a stderr that is not a terminal."""
+COMPILE_LABEL = "compiling kernels (first start only)"
+"""Label of the bar."""
 
 
 @contextmanager
 def show_compile_progress(report: Callable[[str], object] | None = None) -> Iterator[None]:
-    """Show a line with the elapsed time as soon as a kernel compiles. No line appears if all kernels are cached.
+    """Show a bar with the time left as soon as a kernel compiles. No bar appears if all kernels are cached.
 
     Args:
-        report: Called with the line, without the elapsed time, if stderr is not a terminal; default: write to stderr.
+        report: Called with ``COMPILE_TEXT`` if stderr is not a terminal; default: write to stderr.
 
     Raises:
         KeyboardInterrupt: SIGINT arrived. The error is raised only at the next kernel, because an exception inside the
@@ -32,12 +37,11 @@ def show_compile_progress(report: Callable[[str], object] | None = None) -> Iter
 
         def show() -> None:
             if console.is_terminal:
-                progress = Progress(TextColumn(COMPILE_TEXT), TimeElapsedColumn(), console=console, transient=True)
-                stack.enter_context(progress).add_task("")
+                listener.on_kernel = _CompileBar(stack.enter_context(new_bar(console))).update
             else:
                 (report or _to_stderr)(COMPILE_TEXT)
 
-        listener = _Listener(show)
+        listener = CompileListener(show)
         previous_handler = signal.signal(signal.SIGINT, listener.on_interrupt)
         stack.callback(signal.signal, signal.SIGINT, previous_handler)
         with event.install_listener("numba:compile", listener):
@@ -45,11 +49,13 @@ def show_compile_progress(report: Callable[[str], object] | None = None) -> Iter
     listener.raise_if_interrupted()
 
 
-class _Listener(event.Listener):
+class CompileListener(event.Listener):
     """Listener for functions that numba compiles. Cached functions cause no event."""
 
     def __init__(self, show: Callable[[], None]) -> None:
         self._show, self._is_shown, self._interrupted = show, False, False
+        self.on_kernel: Callable[[], None] = lambda: None
+        """Function that is called before each kernel is compiled. ``show`` may replace it by that of a bar."""
 
     def on_interrupt(self, *_: object) -> None:
         """Remember SIGINT."""
@@ -61,14 +67,26 @@ class _Listener(event.Listener):
             raise KeyboardInterrupt
 
     def on_start(self, _: event.Event) -> None:
-        """Raise KeyboardInterrupt after SIGINT; otherwise show the line, once."""
+        """Raise KeyboardInterrupt after SIGINT; otherwise show the bar, once."""
         self.raise_if_interrupted()
         if not self._is_shown:
             self._is_shown = True
             self._show()
+        self.on_kernel()
 
     def on_end(self, _: event.Event) -> None:
         """Do nothing: the end of a compilation is not needed."""
+
+
+class _CompileBar:
+    """Bar with the fraction of all kernels that are in the cache."""
+
+    def __init__(self, bar: Progress) -> None:
+        self._bar, self._task = bar, bar.add_task(COMPILE_LABEL, total=count_kernels())
+
+    def update(self) -> None:
+        """Draw the number of kernels in the cache. Other processes may compile some of them."""
+        self._bar.update(self._task, completed=count_cached_kernels())
 
 
 def _to_stderr(text: str) -> None:

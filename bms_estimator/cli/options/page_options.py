@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from bms_estimator.model.config_file import error_reason
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.page import PageSettings
 
@@ -25,7 +26,7 @@ def page_settings(settings: PageSettings, **options: Any) -> PageSettings:
     try:
         return PageSettings.model_validate(settings.model_dump() | given)
     except ValidationError as error:
-        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        reason = error_reason(error.errors()[0])
         raise UserError(f"--listen {given.get('listen', settings.listen)}: {reason}") from None
 
 

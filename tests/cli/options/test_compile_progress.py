@@ -1,17 +1,21 @@
 """Line about the compilation of kernels at a first start."""
 
 import os
+import re
 import signal
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.options.compile_progress import COMPILE_TEXT, show_compile_progress
+from bms_estimator import numba_cache
+from bms_estimator.cli.options.compile_progress import COMPILE_LABEL, COMPILE_TEXT, show_compile_progress
 from bms_estimator.kernels.cell_model import chen_mora
-from bms_estimator.numba_cache import njit
+from bms_estimator.numba_cache import count_cached_kernels, count_kernels, njit
+from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
+from tests.pseudo_terminal import PseudoTerminal
 
 
 @pytest.mark.parametrize("command", [pytest.param("demo", marks=pytest.mark.thorough), "replay", "run"])
@@ -46,11 +50,36 @@ def test_first_start_reports_the_compilation_and_can_be_interrupted(command: str
 
 def test_line_is_printed_once_and_only_if_a_kernel_is_compiled() -> None:
     lines: list[str] = []
-    kernel = njit(chen_mora.min_stable_exponent.py_func)  # not in the cache
+    kernel = njit()(chen_mora.min_stable_exponent.py_func)  # not in the cache
     with show_compile_progress(lines.append):
         kernel(0.5, 1.0, 2.0)
-        njit(chen_mora.delta.py_func)(0.5, 1.0, 2.0)
+        njit()(chen_mora.delta.py_func)(0.5, 1.0, 2.0)
     assert lines == [COMPILE_TEXT]
     with show_compile_progress(lines.append):
         kernel(0.6, 1.0, 2.0)
     assert lines == [COMPILE_TEXT]
+
+
+def test_a_terminal_shows_the_fraction_of_the_kernels_that_are_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    table = tmp_path / "table.csv"
+    table.write_text("time_s,current_a,voltage_v\n0,0,3.7\n1,0,3.7\n")
+    with PseudoTerminal("replay", str(table), "--cell", "ncr18650") as terminal:
+        terminal.until(lambda: re.search(rf"{re.escape(COMPILE_LABEL)}.* [1-9]\d?%", terminal.output) is not None)
+
+
+def test_a_compiled_kernel_counts_as_cached_and_all_kernels_are_counted() -> None:
+    load_kernels()
+    assert count_kernels() > 100
+    assert 0.8 * count_kernels() < count_cached_kernels()
+
+
+def test_kernels_of_another_installation_of_the_same_version_are_not_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numba_cache, "CACHE_FOLDER", tmp_path)
+    (tmp_path / "kernels_of_another_path").mkdir()
+    (tmp_path / "kernels_of_another_path/step.run-1.py311.nbi").touch()
+    assert count_cached_kernels() == 0

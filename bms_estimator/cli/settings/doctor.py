@@ -1,0 +1,112 @@
+"""``bms-estimator doctor``: examination of device, broker, service and machine."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.options.capture_options import AsJson
+from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.pack_options import load_pack
+from bms_estimator.cli.options.silenced_log import silenced_log
+from bms_estimator.doctor.device_check import load_decoder
+from bms_estimator.doctor.examine import examine
+from bms_estimator.doctor.finding import Finding, Level, fault
+from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.systemd_unit import unit_of
+from bms_estimator.model.errors import UserError
+
+DEFAULT_PACKS = (Path("pack.toml"), Path("/etc/bms-estimator/pack.toml"))
+"""Settings files that are examined by default, the first that exists."""
+COLORS = {Level.OK: "green", Level.WARNING: "yellow", Level.FAULT: "red"}
+"""Color of each level on a terminal."""
+LEVEL_WIDTH = max(map(len, Level)) + 2
+"""Width of the column of the level [characters]."""
+NAME_WIDTH = len("kernel cache") + 2
+"""Width of the column of the check's name [characters]."""
+
+MIN_TEXT_WIDTH = 40
+"""Minimum width of the wrapped text [characters]."""
+
+
+def doctor(
+    pack: Annotated[
+        Path | None,
+        typer.Argument(
+            help="settings file of the pack; default: pack.toml here, otherwise /etc/bms-estimator/pack.toml",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Examine settings, device, broker, service and machine, and name a remedy for each fault.
+
+    Nothing is changed. A device that a service or another process uses is not opened; opening a free port may reset a board.
+    The exit code is 1 if there is a fault, otherwise 0.
+    """
+    path = pack or next(filter(os.path.isfile, DEFAULT_PACKS), DEFAULT_PACKS[0])
+    findings = list[Finding]()
+    with silenced_log():
+        for finding in _examine(path):
+            findings.append(finding)
+            if not as_json:
+                _print(finding)
+    has_fault = any(finding.level is Level.FAULT for finding in findings)
+    if as_json:
+        result = {"ok": not has_fault, "findings": [asdict(finding) for finding in findings]}
+        sys.stdout.write(json.dumps(result) + "\n")
+    raise typer.Exit(int(has_fault))
+
+
+def _examine(path: Path) -> Iterator[Finding]:
+    """Yield the findings on a pack; only those on the machine if the settings cannot be used."""
+    subject = load_subject(path)
+    if isinstance(subject, Finding):
+        yield subject
+        yield from examine(None)
+    else:
+        with show_compile_progress():
+            load_decoder(subject)
+        yield from examine(subject)
+
+
+def load_subject(path: Path) -> Subject | Finding:
+    """Return the pack and its service, or a finding if the settings cannot be used."""
+    try:
+        settings, model = load_pack(path)
+    except UserError as error:
+        return fault("settings", str(error), _remedy(path))
+    try:
+        unit = unit_of(path)
+    except (OSError, subprocess.TimeoutExpired):  # without an answer of systemd, the pack counts as not served by it
+        unit = None
+    return Subject(path, settings, model, unit)
+
+
+def _remedy(path: Path) -> str:
+    """Return the command for a settings file that cannot be used."""
+    if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if the folder cannot be read
+        return f"bms-estimator config init {path}"
+    command = "bms-estimator config check" if os.access(path, os.R_OK) else "sudo bms-estimator doctor"
+    return f"{command} {path}"
+
+
+def _print(finding: Finding) -> None:
+    """Print a finding. On a terminal its text is wrapped, but not its remedy, so that a command can be copied."""
+    indent = " " * (LEVEL_WIDTH + NAME_WIDTH)
+    text = finding.text
+    if sys.stdout.isatty():
+        width = max(shutil.get_terminal_size().columns - len(indent), MIN_TEXT_WIDTH)
+        text = f"\n{indent}".join(textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False))
+    level = typer.style(f"{finding.level:{LEVEL_WIDTH}}", fg=COLORS[finding.level])
+    typer.echo(f"{level}{finding.check:{NAME_WIDTH}}{text}")
+    if finding.remedy:
+        typer.secho(f"{indent}remedy: {finding.remedy}", bold=True)

@@ -1,0 +1,1 @@
+"""Examination of an installation: device, broker, service and machine, with a remedy for each fault."""

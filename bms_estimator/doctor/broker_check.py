@@ -1,0 +1,141 @@
+"""Check of the MQTT brokers: whether they can be reached, and whether the pack's topics may be published and read.
+
+The only message that is published is ``offline``, not retained, on the pack's availability topic, and only while no service
+of the pack is online. A test of other topics would send false values to their subscribers. A running service reports denied
+topics itself, in its health.
+"""
+
+import asyncio
+import json
+import secrets
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import replace
+
+from bms_estimator.doctor.finding import Finding, Level, fault, ok, warning
+from bms_estimator.doctor.subject import Subject
+from bms_estimator.mqtt.broker_config import Broker, brokers
+from bms_estimator.mqtt.client import Timeouts
+from bms_estimator.mqtt.connection import BrokerConnectionError, Connection, ConnectOptions
+from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.process.systemd import is_for_the_service
+from bms_estimator.settings.broker import BrokerSettings
+from bms_estimator.sinks.mqtt.messages import AVAILABILITY
+
+NAME = "broker"
+RETAINED_S = 0.5
+"""Time within which a broker sends retained messages after a subscription [s]."""
+ECHO_S = 2.0
+"""Time within which a broker returns a message [s]."""
+TIMEOUTS = Timeouts(connect_s=4.0, acknowledge_s=3.0)
+ACCESS_LIST_REMEDY = "correct the broker's access list, for Mosquitto: deploy/mosquitto/pack.acl"
+"""Remedy for a denied topic."""
+
+
+def check_broker(subject: Subject) -> Iterator[Finding]:
+    """Yield whether each broker and each fleet server can be reached, and what a broker denies.
+
+    Raises:
+        UserError: A setting of ``[mqtt]`` or ``[edge]`` cannot be used.
+    """
+    pack = subject.settings.pack.name
+    if mqtt := subject.settings.mqtt:
+        yield from _check_section(subject, mqtt, f"{mqtt.base_topic}/{pack}")
+    if edge := subject.settings.edge:
+        yield from _check_section(subject, edge, None)
+
+
+def _check_section(subject: Subject, settings: BrokerSettings, pack_topic: str | None) -> Iterator[Finding]:
+    """Yield the findings on the brokers of a section.
+
+    Args:
+        subject: The pack.
+        settings: The section.
+        pack_topic: Topic of the pack, below which rights are checked; None: rights are not checked.
+    """
+    if settings.password_file and is_for_the_service(settings.password_file):
+        text = f"{', '.join(settings.urls)}: not checked, because only the running service can read its password"
+        unit = subject.unit.name if subject.unit else "bms-estimator"
+        yield warning(NAME, text, f"read the log of the service: journalctl -u {unit}")
+        return
+    yield from asyncio.run(_examine_all(settings, pack_topic))
+
+
+async def _examine_all(settings: BrokerSettings, pack_topic: str | None) -> list[Finding]:
+    """Return the findings on all brokers, which are examined at the same time."""
+    results = await asyncio.gather(*(_examine(settings, broker, pack_topic) for broker in brokers(settings)))
+    has_connection = any(connection.level is Level.OK for connection, *_ in results)
+    findings = []
+    for connection, *rights in results:
+        if connection.level is Level.FAULT and has_connection:  # the service uses a broker that it can reach
+            connection = replace(connection, level=Level.WARNING)  # noqa: PLW2901
+        findings += [connection, *rights]
+    return findings
+
+
+async def _examine(settings: BrokerSettings, broker: Broker, pack_topic: str | None) -> list[Finding]:
+    """Return the findings on one broker: first on the connection, then on the rights."""
+    options = ConnectOptions(f"bms-doctor-{secrets.token_hex(4)}", will=None, on_message_lost=lambda *_: None)
+    try:
+        async with BrokerConnector(settings, TIMEOUTS)(broker, options) as connection:
+            findings = [ok(NAME, f"{broker.url}: connected by {connection.protocol}")]
+            if pack_topic:
+                findings += [finding async for finding in _examine_rights(connection, pack_topic)]
+            return findings
+    except BrokerConnectionError as error:
+        remedy = f"start the broker, or correct {settings.section}.url: nc -vz {broker.host} {broker.port}"
+        return [fault(NAME, f"{broker.url}: {error}", remedy)]
+
+
+async def _examine_rights(connection: Connection, pack_topic: str) -> AsyncIterator[Finding]:
+    """Yield whether the pack's topics may be read and written."""
+    topic = f"{pack_topic}/{AVAILABILITY}"
+    denied = await connection.subscribe(f"{pack_topic}/request/+", [topic, f"{pack_topic}/health"])
+    denied.pop(f"{pack_topic}/health", None)  # the service itself need not read it
+    for name, reason in denied.items():
+        yield fault(NAME, f"may not read {name}: {reason}", ACCESS_LIST_REMEDY)
+    retained = await _retained_messages(connection)
+    if retained.get(topic) == b"online":
+        yield _report_of_service(retained.get(f"{pack_topic}/health", b""))
+        return
+    rejection = await connection.publish(Message(topic, b"offline", 1, retain=False))
+    if rejection:
+        yield fault(NAME, f"may not write {topic}: {rejection.reason}", ACCESS_LIST_REMEDY)
+    elif topic not in denied and not await _is_echoed(connection, topic):
+        yield fault(NAME, f"{topic} is not returned: it may not be read, or not be written", ACCESS_LIST_REMEDY)
+    elif not denied:
+        yield ok(NAME, f"may write and read {topic}, and read {pack_topic}/request/+")
+
+
+async def _retained_messages(connection: Connection) -> dict[str, bytes]:
+    """Return the payloads of retained messages by topic."""
+    retained = dict[str, bytes]()
+    try:
+        async with asyncio.timeout(RETAINED_S):
+            while True:
+                message = await connection.receive()
+                retained[message.topic] = message.payload
+    except TimeoutError:
+        return retained
+
+
+async def _is_echoed(connection: Connection, topic: str) -> bool:
+    """Return True if a message on ``topic`` arrives."""
+    try:
+        async with asyncio.timeout(ECHO_S):
+            while (await connection.receive()).topic != topic:
+                pass
+    except TimeoutError:
+        return False
+    return True
+
+
+def _report_of_service(health: bytes) -> Finding:
+    """Return what the health of the running service says about denied topics."""
+    try:
+        topics = json.loads(health)["refused_topics"]
+    except (ValueError, KeyError, TypeError):  # its health may not be read
+        return ok(NAME, "the pack's service is online; its log names denied topics")
+    if topics:
+        return fault(NAME, f"the broker denies the running service: {', '.join(topics)}", ACCESS_LIST_REMEDY)
+    return ok(NAME, "the pack's service is online; the broker denies no topic")

@@ -1,0 +1,142 @@
+"""Check of the device: does it send samples, and is it the calibrated board of the pack?
+
+The device is opened as by the service, but only if no service runs and no other process has the port open.
+"""
+
+import asyncio
+import contextlib
+import math
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from bms_estimator.doctor.finding import Finding, fault, ok, warning
+from bms_estimator.doctor.subject import Subject
+from bms_estimator.protocols.registry import make_protocol
+from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.port_list import NoPortError, holder, resolve_port
+from bms_estimator.sources.serial.serial_source import SerialSource
+
+NAME = "device"
+FIRST_SAMPLE_S = 8.0
+"""Time within which a device must send a sample [s]. Opening the port may reset a board, whose boot loader takes 2 s."""
+PSEUDO_TERMINALS = "/dev/pts/"
+"""Folder of pseudo-terminals, on which simulated devices are."""
+UNCALIBRATED_BANDGAP_V = "1.1"
+"""Bandgap voltage that a board reports before it is calibrated."""
+SERIAL_REMEDY = "check cable, sensor.protocol and sensor.baud; see which device answers: bms-estimator ports --probe"
+"""Remedy for a silent device on a serial port."""
+SOURCE_REMEDY = "check the device and the section [source]"
+"""Remedy for a silent device that is not on a serial port."""
+CALIBRATION_FIELDS = ("divider", "volts_per_ampere", "bandgap_v")
+"""Fields of a board's hello that its calibration changes."""
+
+
+class NoSampleError(Exception):
+    """A device sends no sample."""
+
+
+@dataclass(frozen=True)
+class FirstSample:
+    """First sample of a device."""
+
+    voltage_v: float
+    current_a: float
+    board: Mapping[str, str]
+    """Properties that the device reported; empty without any."""
+
+    def __str__(self) -> str:
+        """Describe the sample and the device."""
+        current = "no current" if math.isnan(self.current_a) else f"{self.current_a:.3f} A"
+        names = ", ".join(f"{name} {self.board[name]}" for name in ("firmware", "serial") if self.board.get(name))
+        return f"{self.voltage_v:.3f} V, {current}{f'; {names}' if names else ''}"
+
+
+def load_decoder(subject: Subject) -> None:
+    """Load the kernel that decodes a board's frames; without a cache it is compiled, which takes longer than a check may."""
+    if subject.settings.source is None and not subject.is_running:
+        make_protocol(subject.settings.sensor).feed(0.0, b"\0\n")  # ends a frame, or a line of text
+
+
+def check_device(subject: Subject) -> Iterator[Finding]:
+    """Yield whether the device sends samples, and whether its board is calibrated and known."""
+    source = subject.settings.source
+    name = source.short_description if source else subject.settings.sensor.port
+    if subject.is_running:
+        yield ok(NAME, f"{name}: in use by the running service; not opened")
+        return
+    if source is None:
+        try:
+            other = _port_holder(name)
+        except NoPortError:  # ``check_port`` reports it
+            return
+        if other:
+            remedy = "end that process, then run the command again"
+            yield warning(NAME, f"{name}: in use by {other}; not opened", remedy)
+            return
+    try:
+        sample = asyncio.run(_first_sample(subject))
+    except NoSampleError as error:
+        yield fault(NAME, str(error), SERIAL_REMEDY if source is None else SOURCE_REMEDY)
+        return
+    yield ok(NAME, f"{name}: {sample}")
+    if sample.board.get("bandgap_v"):
+        yield from check_board(subject, sample.board)
+
+
+def _port_holder(port: str) -> str | None:
+    """Return the process that has the port open; None without one.
+
+    A pseudo-terminal counts as free, because the program that simulates its device has it open, too.
+
+    Raises:
+        NoPortError: The port does not exist.
+    """
+    path = resolve_port(port)
+    return None if os.path.realpath(path).startswith(PSEUDO_TERMINALS) else holder(path)
+
+
+async def _first_sample(subject: Subject) -> FirstSample:
+    """Return the first sample of the pack's source.
+
+    Raises:
+        NoSampleError: No sample arrives. The message is the reason.
+    """
+    source = open_line_source(subject.settings) or SerialSource(subject.settings.sensor)
+    async with source:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(FIRST_SAMPLE_S):
+                async for received in source:
+                    last = received.samples[-1]
+                    return FirstSample(float(last["voltage_v"]), float(last["current_a"]), dict(source.board))
+        raise NoSampleError(source.silence_reason or f"no sample within {FIRST_SAMPLE_S:g} s")
+
+
+def check_board(subject: Subject, board: Mapping[str, str]) -> Iterator[Finding]:
+    """Yield whether a board is calibrated, and whether it is the board of the pack.
+
+    Args:
+        subject: The pack.
+        board: Properties from the board's hello.
+    """
+    if board["bandgap_v"] == UNCALIBRATED_BANDGAP_V:
+        text = "the bandgap is not calibrated, so that the voltage may be 10 % wrong"
+        remedy = "measure between AREF and GND with a multimeter, then: bms-estimator board --aref-v VOLTS"
+        yield warning("board", text, remedy)
+    else:
+        gains = ", ".join(f"{name} {board[name]}" for name in CALIBRATION_FIELDS if board.get(name))
+        yield ok("board", f"calibrated: {gains}")
+    file = KnownBoardFile(subject.state_folder, subject.settings.pack.name)
+    try:
+        known = {} if file.is_missing() else file.load()
+    except PermissionError:
+        yield warning("board", f"{file.path}: cannot be read by this user; not compared", subject.command_as_root)
+        return
+    accept = f"sudo {file.accept_command} {subject.path}"
+    if known.get("serial") and known["serial"] != board.get("serial"):
+        yield fault("board", f"board {board.get('serial')} is connected, but the pack's is {known['serial']}", accept)
+    elif changes := [name for name in CALIBRATION_FIELDS if known.get(name) and known[name] != board.get(name)]:
+        changed = ", ".join(f"{name} {known[name]} to {board.get(name)}" for name in changes)
+        text = f"calibrated differently since the service last ran: {changed}"
+        yield warning("board", text, "nothing, if you have calibrated it; otherwise calibrate it again")

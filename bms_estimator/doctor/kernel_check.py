@@ -1,0 +1,52 @@
+"""Check of the cache of compiled kernels: complete, writable, and free of earlier versions."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from bms_estimator.doctor.finding import Finding, ok, warning
+from bms_estimator.doctor.subject import Subject
+from bms_estimator.numba_cache import cache_folders, source_digest
+
+NAME = "kernel cache"
+STEP_KERNELS = "kernels_*/step.*.nbi"
+"""Pattern of the files of the estimator's step, which is compiled last."""
+MAX_OLD_VERSIONS = 3
+"""Maximum number of folders with kernels of earlier versions without a warning. Each may take more than 100 MB."""
+
+
+def check_kernels(subject: Subject | None) -> Iterator[Finding]:
+    """Yield whether kernels are compiled, and whether those of this version can be stored."""
+    folder = (subject and subject.unit_cache_folder) or _users_cache_folder()
+    if folder is None:
+        text = "no folder can be written: every start compiles the kernels, which may take minutes"
+        yield warning(NAME, text, "set a folder that can be written: export NUMBA_CACHE_DIR=FOLDER")
+        return
+    version_folder = folder / source_digest()
+    if not os.access(folder, os.R_OK | os.X_OK):
+        yield warning(NAME, f"{folder}: cannot be read by this user; not checked", _command_as_root(subject))
+        return
+    size_mb = size_of(version_folder) / 1e6
+    if any(version_folder.glob(STEP_KERNELS)):
+        yield ok(NAME, f"{version_folder}: compiled, {size_mb:.0f} MB")
+    else:
+        text = f"{version_folder}: not compiled yet: the first start may take minutes"
+        yield warning(NAME, text, "start the service, or run any replay, once")
+    old_versions = [each for each in folder.iterdir() if each.is_dir() and each != version_folder]
+    if len(old_versions) > MAX_OLD_VERSIONS:
+        remedy = f"find {folder} -mindepth 1 -maxdepth 1 ! -name {version_folder.name} -exec rm -r {{}} +"
+        yield warning(NAME, f"{folder}: kernels of {len(old_versions)} earlier versions take space", remedy)
+
+
+def size_of(folder: Path) -> int:
+    """Return the size of all files below a folder [bytes]; 0 if it does not exist."""
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+def _users_cache_folder() -> Path | None:
+    """Return the first cache folder that this user can write; None without one."""
+    return next((folder for folder in cache_folders() if os.access(folder, os.W_OK | os.X_OK)), None)
+
+
+def _command_as_root(subject: Subject | None) -> str:
+    return subject.command_as_root if subject else "sudo bms-estimator doctor"

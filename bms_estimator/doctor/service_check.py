@@ -1,0 +1,51 @@
+"""Check of the service: systemd unit installed, running, and the outcome of its last run."""
+
+from collections.abc import Iterator
+
+from bms_estimator.doctor.finding import Finding, fault, ok, warning
+from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.systemd_unit import SystemdUnit
+
+NAME = "service"
+INVALID_SETTING = 2
+"""Exit code of the service for an invalid setting, after which systemd does not restart it."""
+
+
+def check_service(subject: Subject) -> Iterator[Finding]:
+    """Yield whether the pack is served, and by which systemd unit."""
+    unit = subject.unit
+    if unit is None:
+        if subject.is_running:
+            yield ok(NAME, "runs, but not by systemd")
+        else:
+            text = f"does not run, and no systemd unit runs {subject.path}"
+            yield warning(
+                NAME, text, f"sudo bms-estimator install {subject.path}; or: bms-estimator run {subject.path}"
+            )
+        return
+    yield describe_unit(unit)
+    if not unit.is_enabled:
+        text = f"{unit.name}: does not start with the machine"
+        yield warning(NAME, text, f"sudo systemctl enable {unit.name}")
+
+
+def describe_unit(unit: SystemdUnit) -> Finding:
+    """Return whether a systemd unit runs, and otherwise how its last run ended."""
+    restarts = f", {unit.restarts} restarts" if unit.restarts else ""
+    journal = f"journalctl -u {unit.name} -n 20"
+    if unit.active_state == "active":
+        status = f"; {unit.status_text}" if unit.status_text else ""
+        return ok(NAME, f"{unit.name}: runs{restarts}{status}")
+    if unit.active_state in ("activating", "reloading"):
+        text = f"{unit.name}: is starting{restarts}; the last run ended with {_ending(unit)}"
+        return warning(NAME, text, f"the reason is in its log: {journal}")
+    if unit.result == "success" and unit.exit_status == 0:
+        return fault(NAME, f"{unit.name}: is stopped", f"sudo systemctl start {unit.name}")
+    if unit.exit_status == INVALID_SETTING:
+        return fault(NAME, f"{unit.name}: ended because of an invalid setting", f"the setting is in its log: {journal}")
+    return fault(NAME, f"{unit.name}: ended with {_ending(unit)}", f"the reason is in its log: {journal}")
+
+
+def _ending(unit: SystemdUnit) -> str:
+    """Return how the last run of a unit ended."""
+    return f"{unit.result}, status {unit.exit_status}"
