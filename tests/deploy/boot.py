@@ -1,11 +1,10 @@
-"""Container with a small Debian, booted from this machine's /usr, in which the documented commands install the service."""
+"""Container with a small Debian, booted from this machine's /usr, in which the Debian package and its service run."""
 
 import os
 import re
 import shutil
 import subprocess
 import sys
-import sysconfig
 import uuid
 from pathlib import Path
 
@@ -13,24 +12,21 @@ from tests.deploy import kernel_cache
 
 PROJECT = Path(__file__).parents[2]
 ROOT_LINKS = {"bin": "usr/bin", "sbin": "usr/sbin", "lib": "usr/lib", "lib64": "usr/lib64"}
-OWN_FOLDERS = ("etc/systemd/system/multi-user.target.wants", "etc/udev/rules.d", "opt/bms-estimator/bin", "root/bin")
-MOUNT_POINTS = ("usr", "var", "run", "tmp", "proc", "sys", "dev", "home", "opt/python", "opt/packages", "opt/project")
-COPIED_FILES = ("passwd", "group", "os-release", "nsswitch.conf")
-"""Files of /etc that the container has from this machine."""
+OWN_FOLDERS = ("etc/systemd/system", "etc/udev/rules.d", "root/bin", "root/house", "var/lib/dpkg")
+MOUNT_POINTS = ("usr", "run", "tmp", "proc", "sys", "dev", "home", "opt/package")
+COPIED_FILES = ("etc/passwd", "etc/group", "etc/os-release", "etc/nsswitch.conf", "etc/debian_version")
+"""Files that the container has from this machine."""
+OVERLAYS = ("/usr", "/var/lib/dpkg")
+"""Folders of this machine: its programs and the list of its packages. The container's changes to them end with it."""
+PACKAGE = Path(f"/usr/lib/bms-estimator/lib/python3.{sys.version_info.minor}/site-packages/bms_estimator")
+"""Python package in the Debian package."""
+PACKAGE_COPY = Path("/opt") / PACKAGE.relative_to("/usr/lib")
+"""Python package in the copy of a program from a home folder."""
 
-PYTHON_COMMAND = f"""#!/bin/sh
-export PYTHONPATH=/opt/project:/opt/packages PYTHONDONTWRITEBYTECODE=1 LD_LIBRARY_PATH=/opt/python/lib
-exec /opt/python/bin/python{sys.version_info.major}.{sys.version_info.minor} -P -c \\
-"""
-"""Beginning of a shell script that runs Python code with the packages and the project of this machine."""
-PROGRAM = f"""{PYTHON_COMMAND}    'from bms_estimator.cli.main import main; main()' "$@"
-"""
-"""Program ``bms-estimator`` of the container."""
-CLOCK_PROGRAM = f"""{PYTHON_COMMAND}    '
+CLOCK_PROGRAM = """#!/usr/lib/bms-estimator/bin/python3
 import ctypes
 from bms_estimator.process.boot_clock import synchronised
 print("clock", ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)), synchronised(), flush=True)
-'
 """
 """Program that prints the clock's state as seen in the service's sandbox."""
 
@@ -50,8 +46,7 @@ SECRET = "open-sesame-4711"
 
 DROP_IN = """
 [Service]
-ExecStartPost=/opt/bms-estimator/bin/clock
-LoadCredential=mqtt-password:/root/mqtt-password
+ExecStartPost=-/opt/clock
 WatchdogSec=5
 RestartSec=100ms
 # The board is on a pseudo-terminal.
@@ -80,12 +75,10 @@ ExecStart=/root/container-script
 
 REPLACED_PROGRAMS = {
     "sudo": 'exec "$@"',
-    "apt": "",
-    "python3": "",  # the environment exists
-    "udevadm": "",  # containers have no udev
-    "journalctl": "",  # it would follow the journal without end
+    # this machine's packages have no archive in the container
+    "apt": 'case $1 in install) exec dpkg -i /opt/package/*.deb ;; remove) exec dpkg -r "$2" ;; purge) exec dpkg -P "$2" ;; esac',
 }
-"""Programs of the documentation page that do nothing here."""
+"""Programs of the documentation page that the container replaces."""
 
 
 def commands_of_page(section: str, block: int = 0, page: str = "service") -> str:
@@ -104,28 +97,24 @@ def make_root(root: Path) -> None:
     for name, target in ROOT_LINKS.items():
         (root / name).symlink_to(target)
     for name in COPIED_FILES:
-        if (Path("/etc") / name).exists():
-            shutil.copy(Path("/etc") / name, root / "etc")
+        if (Path("/") / name).exists():
+            shutil.copy(Path("/") / name, root / name)
     (root / "etc/machine-id").write_text(f"{uuid.uuid4().hex}\n")
-    write_program(root / "opt/bms-estimator/bin/bms-estimator", PROGRAM)
-    write_program(root / "opt/bms-estimator/bin/clock", CLOCK_PROGRAM)
-    write_program(root / "opt/bms-estimator/bin/pip", "#!/bin/sh\n")
+    (root / "etc/hosts").write_text("127.0.0.1 localhost\n")
     for name, body in REPLACED_PROGRAMS.items():
         write_program(root / "root/bin" / name, f"#!/bin/sh\n{body}\n")
+    write_program(root / "opt/clock", CLOCK_PROGRAM)
     write_program(root / "root/container-script", Path(__file__).with_name("container_script.sh").read_text())
-    for name, port in (("pack", "board"), ("second", "absent")):
-        (root / f"root/{name}.toml").write_text(PACK_FILE.format(name=name, port=port))
-    # the page asks the user to edit the file of ``config init``; here it is replaced
-    edit = "cp /root/pack.toml /root/second.toml /etc/bms-estimator/"
-    install = re.sub(r"(?m)^.*config init .*$", rf"\g<0>\n{edit}", commands_of_page("Install"))
-    for name, commands in (
-        ("install", install),
-        ("clock", commands_of_page("Install", block=1)),
-        ("uninstall", commands_of_page("Uninstall")),
+    (root / "root/house/pack.toml").write_text(PACK_FILE.format(name="pack", port="board"))
+    (root / "root/house/mqtt-password").write_text(SECRET)
+    (root / "root/house/mqtt-password").chmod(0o600)
+    (root / "root/second.toml").write_text(PACK_FILE.format(name="second", port="absent"))
+    for name, section, block in (
+        ("install", "Install", 0),
+        ("remove", "Uninstall", 0),
+        ("purge", "Uninstall", 1),
     ):
-        (root / "root" / name).write_text(commands)
-    (root / "etc/hosts").write_text("127.0.0.1 localhost\n")
-    (root / "root/mqtt-password").write_text(SECRET)
+        (root / "root" / name).write_text(commands_of_page(section, block).lstrip("\n"))
     (root / "root/bms.conf").write_text(BROKER_CONFIG)
     acl = PROJECT / "deploy/mosquitto"
     packs = [(acl / "pack.acl").read_text().replace("PACK", name) for name in ("pack", "second")]
@@ -135,18 +124,14 @@ def make_root(root: Path) -> None:
     for unit in ("bms-estimator", "bms-estimator@"):
         (system / f"{unit}.service.d").mkdir()
         (system / f"{unit}.service.d/container.conf").write_text(DROP_IN)
-    shutil.copy(PROJECT / "deploy/bms-estimator@.service", system)
-    shutil.copy(PROJECT / "deploy/bms-estimator@.service.d/pack.conf", system / "bms-estimator@.service.d")
     (system / "container-script.service").write_text(SCRIPT_UNIT)
-    state = root / "var/lib/private/bms-estimator"
-    for folder in (state.parent, state):
-        folder.mkdir(mode=0o700, parents=True)  # mode required by systemd
+    state = root / "var/lib/bms-estimator"
+    state.mkdir()
     # a checkpoint of an earlier version, with the name that the service gives to those of this pack
     shutil.copy(PROJECT / "tests/checkpoint/checkpoint_format_7.npz", state / "pack-5613cbc0.npz")
-    private = root / "var/cache/private"
-    private.mkdir(mode=0o700, parents=True)  # mode required by systemd
-    kernel_cache.fill(private / "bms-estimator", Path("/opt/project/bms_estimator"))
-    shutil.copytree(private / "bms-estimator", root / "root/cache")
+    kernel_cache.fill(root / "var/cache/bms-estimator", PACKAGE)
+    kernel_cache.fill(root / "root/cache-of-copy", PACKAGE_COPY, omitted=None)
+    shutil.copytree(root / "var/cache/bms-estimator", root / "root/cache")
 
 
 def write_program(path: Path, text: str) -> None:
@@ -155,8 +140,14 @@ def write_program(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
-def boot(root: Path, systemd_nspawn: str, timeout_s: float) -> str:
+def boot(root: Path, package: Path, systemd_nspawn: str, timeout_s: float) -> str:
     """Boot the container until its script powers it off.
+
+    Args:
+        root: Root folder of ``make_root``.
+        package: Debian package of the program.
+        systemd_nspawn: Path of this program.
+        timeout_s: Maximum duration [s].
 
     Returns:
         Report of ``container_script.sh``; the console output if there is none.
@@ -164,15 +155,9 @@ def boot(root: Path, systemd_nspawn: str, timeout_s: float) -> str:
     Raises:
         TimeoutError: The container did not end in time. The message has the end of the console output.
     """
-    binds = {
-        "/usr": "/usr",
-        sys.base_prefix: "/opt/python",
-        sysconfig.get_path("purelib"): "/opt/packages",
-        str(PROJECT): "/opt/project",
-    }
     command = [systemd_nspawn, "--quiet", "--register=no", "--keep-unit", "--private-network", f"--directory={root}"]
     command += ["--capability=CAP_SYS_TIME"]  # otherwise the container itself forbids adjtimex
-    command += [f"--bind-ro={source}:{target}" for source, target in binds.items()]
+    command += [f"--bind-ro={package.parent}:/opt/package", *(f"--overlay={folder}::{folder}" for folder in OVERLAYS)]
     command += ["--boot", "systemd.unit=container-script.service", "systemd.mask=systemd-networkd.service"]
     environment = {"PATH": os.environ["PATH"], "SYSTEMD_SECCOMP": os.environ.get("SYSTEMD_SECCOMP", "1")}
     try:

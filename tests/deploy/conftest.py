@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.installation.system_files import FILES
+
 DEPLOY = Path(__file__).parents[2] / "deploy"
 
 
@@ -30,3 +32,9 @@ def find_program() -> Callable[[str], str]:
 def deploy() -> Path:
     """Return the folder with the files to deploy."""
     return DEPLOY
+
+
+@pytest.fixture
+def unit_text() -> str:
+    """Return the text of the service's unit."""
+    return (FILES / "bms-estimator.service").read_text(encoding="utf-8")

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Runs inside the container as root: installs the service, exposes it to faults, and uninstalls it. The report has a
-# headline with the name of each part. test_boot.py checks the report.
+# Runs inside the container as root: installs the package and the service, exposes it to faults, upgrades and removes it.
+# The report has a headline with the name of each part. test_boot.py checks the report.
 part() { echo "== $1"; }
 until_true() { # reports a timeout, which the tests detect
     for _ in $(seq 300); do eval "$1" >/dev/null 2>&1 && return; sleep 0.1; done
@@ -11,25 +11,32 @@ main_pid() { systemctl show "${1:-bms-estimator}" -P MainPID; }
 # runs commands of the documentation, with the replaced programs of boot.py first in the path
 run_page() { PATH="/root/bin:$PATH" bash -ex "$1"; }
 lines() { journalctl --no-pager -o cat -u "${1:-bms-estimator}"; }
-cache=/var/cache/private/bms-estimator
+traces() { # files of the service outside the program's package
+    find /etc /usr/local /opt /var/lib /var/cache -xdev -path /var/lib/dpkg -prune -o -path /opt/package -prune -o -name "*bms-estimator*" -printf "%u %p\n"
+    id bms-estimator 2>&1 | tr -d "\047‘’"
+}
+cache=/var/cache/bms-estimator
 
 part install
-mosquitto_passwd -b /root/bms.passwd pack "$(cat /root/mqtt-password)"
-mosquitto_passwd -b /root/bms.passwd second "$(cat /root/mqtt-password)"
+mosquitto_passwd -b /root/bms.passwd pack "$(cat /root/house/mqtt-password)"
+mosquitto_passwd -b /root/bms.passwd second "$(cat /root/house/mqtt-password)"
 mosquitto_passwd -b /root/bms.passwd dashboard two
 systemd-run --quiet --unit=broker mosquitto -c /root/bms.conf
+cd /root/house && head -n 1 /root/install >/root/install-package && tail -n +2 /root/install >/root/install-service
+run_page /root/install-package
 # a simulated board, which prints the path of its line
 systemd-run --quiet --unit=board --setenv=NUMBA_CACHE_DIR=/root/cache sh -c \
-    '/opt/bms-estimator/bin/bms-estimator simulate --cell chen_mora --rate-hz 10 >/run/board'
+    'bms-estimator simulate --cell chen_mora --rate-hz 10 >/run/board'
 until_true 'grep -q /dev/pts/ /run/board'
 chgrp dialout "$(cat /run/board)" && chmod 660 "$(cat /run/board)" && mkdir /dev/bms && ln -s "$(cat /run/board)" /dev/bms/board
-cd /opt/project && run_page /root/install
+run_page /root/install-service
 
 part first
 until_true "ls $cache/*/*"
 until_true 'journalctl -u bms-estimator | grep -q "port opened"'
 until_true 'timeout 5 mosquitto_sub -C 1 -u dashboard -P two -t bms/pack/state'
 show
+systemctl is-enabled bms-estimator
 systemctl show bms-estimator -p WatchdogUSec
 grep -E "^(Uid|NoNewPrivs|Seccomp|CapEff):" "/proc/$(main_pid)/status"
 tr '\0' '\n' <"/proc/$(main_pid)/environ" | grep BMS_BOOT_ID
@@ -39,7 +46,7 @@ nsenter -t "$(main_pid)" -m sh -c 'ls -A /home /root; touch /root/x /etc/x' 2>&1
 
 # each of the next four counts must be 0
 part secret
-secret=$(cat /root/mqtt-password)
+secret=$(cat /root/house/mqtt-password)
 lines | grep -c "$secret"
 tr '\0' '\n' <"/proc/$(main_pid)/environ" | grep -c "$secret"
 ps -eo args | grep -v grep | grep -c "$secret"
@@ -58,26 +65,52 @@ show
 part second
 systemctl stop bms-estimator
 systemctl show bms-estimator -p Result
-ls /var/lib/private/bms-estimator
+ls /var/lib/bms-estimator
+cp /root/second.toml /etc/bms-estimator/
 systemctl start bms-estimator@second
 systemctl show bms-estimator@second -p StatusText
 ls -d $cache/* | wc -l
 systemctl stop bms-estimator@second
 
-# the state folder becomes a full file system
+# the state folder becomes a full file system; chrony appears, for which the installation adds a drop-in
 part full
-mount -t tmpfs -o size=4k,mode=700 none /var/lib/private/bms-estimator
-dd if=/dev/zero of=/var/lib/private/bms-estimator/full bs=4k count=1 status=none
-run_page /root/clock # which starts it again
+mount -t tmpfs -o size=4k,mode=700 none /var/lib/bms-estimator
+dd if=/dev/zero of=/var/lib/bms-estimator/full bs=4k count=1 status=none
+touch /usr/sbin/chronyd
+bms-estimator install
 until_true 'timeout 5 mosquitto_sub -C 1 -u dashboard -P two -t bms/pack/health | grep -q "No space left"'
 show
 systemctl stop bms-estimator
-umount /var/lib/private/bms-estimator
+umount /var/lib/bms-estimator
+
+part upgrade
+systemctl start bms-estimator
+before=$(main_pid)
+echo "# edited" >>/etc/bms-estimator/pack.toml
+run_page /root/install-package
+until_true "systemctl is-active bms-estimator && [ \$(systemctl show bms-estimator -P MainPID) != $before ]"
+tail -n 1 /etc/bms-estimator/pack.toml
+show
+lines | grep restored | tail -n 1
 
 part journal
 lines
 lines bms-estimator@second
 
-part uninstall
-run_page /root/uninstall
-find /etc /opt /var/lib /var/cache /run -xdev -path /opt/project -prune -o -path /opt/packages -prune -o -name "*bms-estimator*" -print
+part remove
+cp -a /usr/lib/bms-estimator /root/program
+run_page /root/remove
+traces
+
+part purge
+run_page /root/purge
+traces
+
+# a program in a home folder, which the service cannot read there
+part home
+cp -a /root/cache-of-copy /var/cache/bms-estimator
+/root/program/bin/python3 /root/program/bin/bms-estimator install /root/house/pack.toml
+show
+systemctl show bms-estimator -p ExecStart
+bms-estimator uninstall --purge
+traces

@@ -1,4 +1,4 @@
-"""Kernel cache for a service with its own cache folder: the tests' compiled kernels except one."""
+"""Kernel cache for a service with its own cache folder, from the tests' compiled kernels."""
 
 import shutil
 from pathlib import Path
@@ -15,8 +15,11 @@ OMITTED = "step.run-"
 """Prefix of the files of the kernel that the service has to compile."""
 
 
-def fill(cache: Path, package: Path = PACKAGE) -> None:
-    """Copy the tests' compiled kernels to ``cache``, for a process that imports the package from ``package``."""
+def fill(cache: Path, package: Path = PACKAGE, omitted: str | None = OMITTED) -> None:
+    """Copy the tests' compiled kernels, except those whose files begin with ``omitted``, to ``cache``.
+
+    A process that imports the package from ``package`` can use them.
+    """
     load_kernels()
     compiled = Path(numba.config.CACHE_DIR)
     subfolder_of = _CacheLocator.get_suitable_cache_subpath  # numba's name for the folder of a source file
@@ -26,5 +29,5 @@ def fill(cache: Path, package: Path = PACKAGE) -> None:
             shutil.copytree(
                 cached,
                 cache / compiled.name / subfolder_of(str(package / folder / "any.py")),
-                ignore=shutil.ignore_patterns(f"{OMITTED}*", "*.tmp.*"),
+                ignore=shutil.ignore_patterns("*.tmp.*", *([f"{omitted}*"] if omitted else [])),
             )

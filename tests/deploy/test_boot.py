@@ -1,14 +1,20 @@
-"""Units under a real systemd: installed by the commands of docs/pack/service.md, tested with faults, and uninstalled."""
+"""Package and service under a real systemd: installed by docs/pack/service.md, tested with faults, upgraded and removed."""
 
 import os
 import re
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
-from tests.deploy.boot import SECRET, boot, make_root
+from tests.deploy.boot import PROJECT, SECRET, boot, make_root
 from tests.deploy.kernel_cache import OMITTED
 from tests.patience import LONG_S
+
+PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
+NO_USER = "id: bms-estimator: no such user"
 
 pytestmark = pytest.mark.thorough
 
@@ -24,18 +30,35 @@ def report(tmp_path_factory) -> dict[str, str]:
     for name in ("mosquitto", "mosquitto_sub"):
         if shutil.which(name, path="/usr/bin:/usr/sbin") is None:
             pytest.skip(f"{name} is not installed (apt install mosquitto mosquitto-clients)")
+    package = build_package(tmp_path_factory.mktemp("deb") / "deb")
     root = tmp_path_factory.mktemp("boot") / "root"
     make_root(root)
-    text = boot(root, systemd_nspawn, LONG_S)
+    text = boot(root, package, systemd_nspawn, LONG_S)
     if "== first" not in text:
         pytest.skip(f"no container boots on this machine: {text[-300:]}")
     assert SECRET not in text
     return dict(re.findall(r"(?ms)^== (\w+)\n(.*?)(?=^== |\Z)", text))
 
 
+def build_package(folder: Path) -> Path:
+    """Build the Debian package, without compression, which would take minutes. Return its path."""
+    if shutil.which("dpkg-deb") is None or not Path("/usr/bin", PYTHON).exists():
+        pytest.skip(f"dpkg-deb or /usr/bin/{PYTHON} is missing, as on a distribution other than Debian")
+    command = [sys.executable, PROJECT / "deploy/debian/build.py", folder, "--compression", "none"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return Path(done.stdout.splitlines()[-1])
+
+
+def test_package_is_not_started_without_settings(report):
+    assert "The service starts when it has settings" in report["install"], report
+    assert "The service starts when it has settings" in report["install"].partition("bms-estimator install")[0]
+
+
 def test_documented_commands_install_the_service(report):
-    assert "/etc/bms-estimator/pack.toml: valid; pack" in report["install"]
-    assert "+ journalctl -u bms-estimator -f" in report["install"]
+    assert "pack.toml: valid; pack" in report["install"]
+    assert re.search(r"^service +started$", report["install"], re.MULTILINE), report
+    assert "\nenabled\n" in report["first"]
 
 
 def test_the_service_runs_and_publishes(report):
@@ -106,7 +129,40 @@ def test_service_stops_cleanly(report):
     assert "Traceback" not in report["journal"]
 
 
-def test_documented_commands_uninstall_everything(report):
-    lines = report["uninstall"].splitlines()
-    assert [line for line in lines if not line.startswith(("+", "Removed"))] == []
-    assert len(lines) > 5
+def test_upgrade_keeps_settings_and_state_and_restarts_the_service(report):
+    assert "never true" not in report["upgrade"], report
+    assert "\n# edited\n" in report["upgrade"]
+    assert "ActiveState=active" in report["upgrade"]
+    assert '"outcome": "restored: SOC' in report["upgrade"]
+
+
+def test_removal_of_the_package_keeps_settings_and_state_of_root(report):
+    assert "Remaining: " in report["remove"], report
+    assert traces(report["remove"]) == [
+        "root /etc/bms-estimator",
+        "root /etc/systemd/system/bms-estimator.service.d",
+        "root /etc/systemd/system/bms-estimator@.service.d",
+        "root /var/lib/bms-estimator",
+        NO_USER,
+    ]
+
+
+def test_purge_of_the_package_leaves_nothing(report):
+    assert traces(report["purge"]) == [NO_USER]
+
+
+def test_program_in_a_home_folder_is_copied_and_its_service_runs(report):
+    assert "copying the program to /opt/bms-estimator" in report["home"], report
+    assert "ActiveState=active" in report["home"]
+    assert "path=/opt/bms-estimator/bin/bms-estimator ;" in report["home"]
+
+
+def test_uninstall_with_purge_also_removes_the_copy(report):
+    assert "Remaining: nothing" in report["home"], report
+    assert traces(report["home"]) == [NO_USER]
+
+
+def traces(part: str) -> list[str]:
+    """Return the lines at the end of a part of the report that name files and user of the service, without the order."""
+    lines = part.splitlines()
+    return [*sorted(line for line in lines[:-1] if re.match(r"[\w-]+ /", line)), lines[-1]]

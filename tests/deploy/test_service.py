@@ -115,11 +115,11 @@ def test_missing_kernel_is_compiled_into_the_cache_once(tmp_path):
     assert second == first
 
 
-def test_wrong_setting_ends_with_code_2_after_which_systemd_does_not_restart(tmp_path, deploy):
+def test_wrong_setting_ends_with_code_2_after_which_systemd_does_not_restart(tmp_path, unit_text):
     (tmp_path / "pack.toml").write_text("[pack]\nseries = 0\n")
     command = [PROGRAM, "run", tmp_path / "pack.toml"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
     assert done.returncode == 2
     assert "pack.series = 0" in done.stderr
     assert "Traceback" not in done.stderr
-    assert "RestartPreventExitStatus=2\n" in (deploy / "bms-estimator.service").read_text()
+    assert "RestartPreventExitStatus=2\n" in unit_text

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.installation.system_files import FILES
+
 # Mounts an empty /run/udev, copies the rules ($1) there, and lets udevadm ($2) test a device ($3). It runs in a mount
 # namespace of its own, which ends with the shell.
 READ_RULES_SCRIPT = (
@@ -30,8 +32,8 @@ def messages_about(find_program, rules: Path) -> list[str]:
     return [line for line in messages if not line.startswith("Reading rules file")]
 
 
-def test_udev_reports_no_error_in_the_rule(find_program, deploy):
-    assert messages_about(find_program, deploy / "99-bms-estimator.rules") == []
+def test_udev_reports_no_error_in_the_rule(find_program):
+    assert messages_about(find_program, FILES / "99-bms-estimator.rules") == []
 
 
 def test_udev_reports_a_misspelled_key(find_program, tmp_path):

@@ -7,23 +7,21 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.installation import places
+from bms_estimator.installation.machine import Machine
+from bms_estimator.installation.system_files import system_files
+
 MAX_EXPOSURE = 1.5
 """Maximum exposure by `systemd-analyze security`, of 0 to 10."""
 
 
-@pytest.fixture(params=["bms-estimator.service", "bms-estimator@house.service"])
-def unit(request, deploy, tmp_path) -> Path:
-    """Return the unit of one pack, or an instance of the template, with a program that exists on this machine."""
-    template = request.param.replace("house", "")
-    files = [deploy / template, *deploy.glob(f"{template}.d/*.conf")]
-    assert len(files) == (2 if "@" in template else 1)  # the template has a drop-in
-    for file in files:
-        text, changed = re.subn(r"(?m)^ExecStart=/\S+", f"ExecStart={sys.executable}", file.read_text())
-        assert changed == 1
-        path = tmp_path / file.relative_to(deploy)
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(text)
-    return tmp_path / request.param
+@pytest.fixture(params=[places.UNIT, places.TEMPLATE], ids=["one pack", "several packs"])
+def unit(request, tmp_path) -> Path:
+    """Return the installed unit of one pack, or an instance of the template, with a program of this machine."""
+    texts = {file.path: file.text for file in system_files(Machine(tmp_path), Path(sys.executable))}
+    unit = tmp_path / request.param.name
+    unit.write_text(texts[request.param])
+    return unit.with_name(unit.name.replace("@", "@house"))
 
 
 def verify(systemd_analyze: str, unit: Path) -> str:
@@ -36,14 +34,14 @@ def test_systemd_reports_no_error_in_the_unit(find_program, unit):
 
 
 def test_systemd_reports_a_misspelled_key(find_program, unit):
-    file = unit.with_name(unit.name.replace("house", ""))
+    file = unit.with_name(unit.name.replace("@house", "@"))
     file.write_text(file.read_text().replace("ProtectHome=", "ProtectHomes="))
     assert "ProtectHomes" in verify(find_program("systemd-analyze", "systemd"), unit)
 
 
 @pytest.mark.parametrize(("device_group", "driver"), [("char-ttyACM", "cdc_acm"), ("char-ttyUSB", "usbserial")])
-def test_usb_serial_driver_is_loaded_before_its_device_is_allowed(deploy, device_group, driver):
-    settings = [line.partition("=")[::2] for line in (deploy / "bms-estimator.service").read_text().splitlines()]
+def test_usb_serial_driver_is_loaded_before_its_device_is_allowed(unit_text, device_group, driver):
+    settings = [line.partition("=")[::2] for line in unit_text.splitlines()]
     assert f"{device_group} rw" in [value for key, value in settings if key == "DeviceAllow"]
     for relation in ("Wants", "After"):
         assert f"modprobe@{driver}.service" in " ".join(value for key, value in settings if key == relation).split()
@@ -57,11 +55,11 @@ def test_exposure_is_at_most_1_5(find_program, unit):
     assert float(exposure[1]) <= MAX_EXPOSURE
 
 
-def test_memory_deny_write_execute_is_not_set(deploy):
+def test_memory_deny_write_execute_is_not_set(unit_text):
     """Check that MemoryDenyWriteExecute is not set, because the import of numba fails under it."""
-    keys = [line.split("=")[0] for line in (deploy / "bms-estimator.service").read_text().splitlines()]
+    keys = [line.split("=")[0] for line in unit_text.splitlines()]
     assert "MemoryDenyWriteExecute" not in keys
 
 
-def test_memory_of_the_service_is_limited(deploy):
-    assert "\nMemoryMax=1G\n" in (deploy / "bms-estimator.service").read_text()
+def test_memory_of_the_service_is_limited(unit_text):
+    assert "\nMemoryMax=1G\n" in unit_text

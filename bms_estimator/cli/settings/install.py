@@ -1,0 +1,155 @@
+"""``bms-estimator install`` and ``uninstall``: the service on this machine."""
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.installation import places
+from bms_estimator.installation.install import PackFiles, install, restart_running, start
+from bms_estimator.installation.machine import Machine
+from bms_estimator.installation.pack_files import is_hidden, named_files
+from bms_estimator.installation.program_copy import copy_program, system_python
+from bms_estimator.installation.uninstall import uninstall
+from bms_estimator.model.errors import UserError
+from bms_estimator.settings.pack import load_settings
+
+Root = Annotated[
+    Path,
+    typer.Option(
+        "--root", help="root directory of the machine; another directory than / is an image, which is not started"
+    ),
+]
+
+
+def install_command(
+    pack: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[PACK.toml]",
+            help="settings of the pack, copied to /etc/bms-estimator; without it, installed settings are kept",
+            show_default=False,
+        ),
+    ] = None,
+    root: Root = Path("/"),
+    no_start: Annotated[bool, typer.Option("--no-start", help="do not start the service")] = False,
+) -> None:
+    """Install the service, or upgrade it: user, settings, systemd units and udev rule. Requires root.
+
+    An upgrade keeps settings and state. A program in a home folder is copied to /opt/bms-estimator, because services
+    have no access to home folders.
+    """
+    machine = _machine(root, "install", [str(pack.resolve())] if pack else [])
+    files = _check(pack) if pack else None
+    program = _program(machine)
+    with _errors_of_files():
+        may_start = install(machine, program, files, _report)
+    settings = machine.path(places.PACK_FILE)
+    if not settings.exists():
+        if machine.is_running and not no_start:
+            restart_running()
+        typer.echo("\nThe service starts when it has settings:")
+        _show_next((f"sudo {places.NAME} install PACK.toml", "install the settings of a pack"))
+        return
+    if may_start and machine.is_running and not no_start:
+        typer.echo("starting; the first start compiles the kernels, which may take minutes", err=True)
+        start()
+        _report("service", "started")
+    page = load_settings(settings).page
+    typer.echo("\nNext:")
+    _show_next(
+        (f"systemctl status {places.NAME}", "show the state of charge, or why no samples arrive"),
+        (f"journalctl -u {places.NAME} -f", "show the log"),
+        *([(f"http://{page.listen}", "live page")] if page else []),
+        (f"sudoedit {places.PACK_FILE}", "change the settings"),
+        (f"sudo systemctl restart {places.NAME}", "use the changed settings"),
+        (f"sudo {places.NAME} uninstall", "remove the service; settings and state remain"),
+    )
+
+
+def uninstall_command(
+    root: Root = Path("/"),
+    purge: Annotated[bool, typer.Option("--purge", help="also remove settings and state")] = False,
+) -> None:
+    """Stop and remove the service, its user, systemd units and udev rule. Settings and state remain. Requires root."""
+    machine = _machine(root, "uninstall", ["--purge"] if purge else [])
+    program = _own_path()
+    with _errors_of_files():
+        remaining = uninstall(machine, purge=purge, report=_report)
+    if program.exists():
+        remaining.append(program)
+    typer.echo(f"\nRemaining: {', '.join(map(str, remaining)) or 'nothing'}")
+
+
+@contextmanager
+def _errors_of_files() -> Iterator[None]:
+    """Convert an error of a file or folder to UserError, for example that of a read-only file system."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{error.filename}: cannot be changed: {error.strerror}; then repeat the command") from None
+
+
+def _machine(root: Path, command: str, arguments: Sequence[str]) -> Machine:
+    """Return the machine with a root directory.
+
+    Raises:
+        UserError: The user is not root, or the directory is not that of a system.
+    """
+    if os.geteuid() != 0:
+        options = [] if root == Path("/") else [f"--root={root.resolve()}"]
+        raise UserError(f"requires root: sudo {' '.join([str(_own_path()), command, *options, *arguments])}")
+    if not root.is_dir():
+        raise UserError(f"--root {root}: is not a directory")
+    if not (root / "etc").is_dir():
+        raise UserError(f"--root {root}: is not the root directory of a system, because it has no directory etc")
+    return Machine(root.resolve())
+
+
+def _check(pack: Path) -> PackFiles:
+    """Check a pack file as ``config check`` does. Return it with the files that it names.
+
+    Raises:
+        UserError: The settings are invalid, or name a file that the service cannot read.
+    """
+    from bms_estimator.cli.settings.config import check  # noqa: PLC0415 - it loads numba, which an upgrade does not need
+
+    check(pack)
+    return PackFiles(pack, named_files(pack, load_settings(pack)))
+
+
+def _program(machine: Machine) -> Path:
+    """Return the path on the machine of a program that the service can run: this one, or a copy of it.
+
+    Raises:
+        UserError: The program is in a home folder, and cannot be copied.
+    """
+    program = _own_path()
+    if not is_hidden(program):
+        return program
+    python = system_python()
+    target = machine.path(places.PROGRAM_COPY)
+    typer.echo(f"copying the program to {target}, because services cannot read {program.parent}", err=True)
+    copy_program(target, installed_as=places.PROGRAM_COPY, python=python)
+    _report("program", str(places.PROGRAM_COPY))
+    return places.PROGRAM_COPY / "bin" / places.NAME
+
+
+def _own_path() -> Path:
+    """Return the absolute path of this program."""
+    return Path(sys.argv[0]).resolve()
+
+
+def _report(subject: str, text: str) -> None:
+    typer.echo(f"{subject:<10} {text}")
+
+
+def _show_next(*lines: tuple[str, str]) -> None:
+    """Print commands, each with what it does."""
+    width = max(len(command) for command, _ in lines)
+    for command, text in lines:
+        typer.echo(f"  {command:<{width}}  {text}")

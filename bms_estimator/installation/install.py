@@ -1,0 +1,134 @@
+"""Installation and upgrade of the service."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bms_estimator.installation import places
+from bms_estimator.installation.machine import Machine, run, tree
+from bms_estimator.installation.system_files import SYSUSERS_LINES, system_files
+from bms_estimator.model.errors import UserError
+
+UDEV_CONTROL = Path("/run/udev/control")
+"""Socket of udev, which does not run in containers."""
+Report = Callable[[str, str], None]
+"""Function that shows a finished step: its subject, and what was done."""
+
+
+@dataclass(frozen=True)
+class PackFiles:
+    """Files of a pack to install.
+
+    Attributes:
+        settings: Settings file of the pack.
+        named: Files that the settings name.
+    """
+
+    settings: Path
+    named: Sequence[Path]
+
+
+def install(machine: Machine, program: Path, pack: PackFiles | None, report: Report) -> bool:
+    """Write the files of the service, create its user, and enable it. Keep state and settings of an earlier installation.
+
+    Args:
+        machine: Machine of the service.
+        program: Absolute path of the program on the machine.
+        pack: Files to install; None: keep those of an earlier installation.
+        report: Called after each step.
+
+    Returns:
+        True if the service may be started; False if it has no settings, or if the user has disabled it.
+
+    Raises:
+        UserError: A file cannot be written, or a program of the system is missing or fails.
+    """
+    is_upgrade = machine.path(places.UNIT).exists()
+    _link_program(machine, program, report)
+    machine.run("systemd-sysusers", "--inline", *SYSUSERS_LINES)
+    group = machine.group_id(places.NAME)
+    if group is None:
+        raise UserError(f"systemd-sysusers did not create the group {places.NAME}")
+    report("user", f"{places.NAME}, in group dialout")
+    if pack is not None:
+        _write_settings(machine, pack, group, report)
+    _give_settings_to(machine, group)
+    for file in system_files(machine, program):
+        machine.write(file.path, file.text.encode())
+        report(file.kind, str(file.path))
+    if machine.is_running:
+        reload_system()
+    if not machine.path(places.PACK_FILE).exists() or (is_upgrade and pack is None and not _is_enabled(machine)):
+        return False
+    machine.run("systemctl", "enable", "--quiet", places.UNIT.name)
+    report("service", "enabled: it starts with the machine")
+    return True
+
+
+def start() -> None:
+    """Start or restart the service of this machine, and restart the running units of other packs.
+
+    Raises:
+        UserError: The service does not start.
+    """
+    restart_running()
+    try:
+        run(["systemctl", "restart", places.UNIT.name])
+    except UserError:
+        raise UserError(
+            f"the service does not start; its log says why: journalctl -u {places.NAME} -n 20\n"
+            f"after a change of {places.PACK_FILE}: systemctl restart {places.NAME}"
+        ) from None
+
+
+def restart_running() -> None:
+    """Restart the running units of other packs (``bms-estimator@NAME``), so that they run the upgraded program."""
+    run(["systemctl", "try-restart", f"{places.NAME}@*.service"])
+
+
+def reload_system() -> None:
+    """Make systemd and udev of this machine read their files again."""
+    run(["systemctl", "daemon-reload"])
+    if UDEV_CONTROL.exists():
+        run(["udevadm", "control", "--reload"])
+        run(["udevadm", "trigger", "--subsystem-match=tty"])
+
+
+def _link_program(machine: Machine, program: Path, report: Report) -> None:
+    """Link the program from the search path of root, unless a program of this name is there."""
+    folders = [machine.path(folder) for folder in places.SEARCH_PATH.split(":")]
+    if any((folder / places.NAME).exists() for folder in folders):
+        return
+    link = machine.path(places.PROGRAM_LINK)
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.unlink(missing_ok=True)
+    link.symlink_to(program)
+    report("program", f"{places.PROGRAM_LINK}, a link to {program}")
+
+
+def _write_settings(machine: Machine, pack: PackFiles, group: int, report: Report) -> None:
+    """Copy a pack file and the files that it names. Back up the installed settings if they differ."""
+    installed = machine.path(places.PACK_FILE)
+    content = pack.settings.read_bytes()
+    if installed.exists() and not installed.samefile(pack.settings) and installed.read_bytes() != content:
+        backup = places.PACK_FILE.with_suffix(".toml.old")
+        machine.write(backup, installed.read_bytes(), mode=0o640, group=group)
+        report("settings", f"{backup}, the previous settings")
+    for source, name in (*((file, file.name) for file in pack.named), (pack.settings, places.PACK_FILE.name)):
+        machine.write(places.SETTINGS / name, source.read_bytes(), mode=0o640, group=group)
+        report("settings", str(places.SETTINGS / name))
+
+
+def _give_settings_to(machine: Machine, group: int) -> None:
+    """Let a group read the folder of the settings. An earlier installation may have had a group with another id."""
+    folder = machine.path(places.SETTINGS)
+    folder.mkdir(mode=0o755, parents=True, exist_ok=True)
+    for path in tree(folder):
+        os.chown(path, -1, group, follow_symlinks=False)
+
+
+def _is_enabled(machine: Machine) -> bool:
+    """Return True if the service starts with the machine."""
+    folders = machine.path(places.UNIT).parent.glob("*.wants")
+    return any((folder / places.UNIT.name).is_symlink() for folder in folders)

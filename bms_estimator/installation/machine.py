@@ -1,0 +1,103 @@
+"""Machine on which the service is installed: root directory, files, users and systemd."""
+
+import os
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bms_estimator.model.errors import UserError
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Root directory of a machine: ``/`` is this machine, any other directory is an image that does not run."""
+
+    root: Path = Path("/")
+
+    def path(self, name: str | Path) -> Path:
+        """Return the path that a file of the machine has for this process.
+
+        Args:
+            name: Absolute path of the file on the machine.
+
+        Raises:
+            UserError: A symbolic link to a folder leads out of the root directory. On the machine, the same link leads
+                to another folder.
+        """
+        path = self.root / str(name).lstrip("/")
+        folder = path if path.is_dir() else path.parent
+        if not folder.resolve().is_relative_to(self.root):
+            raise UserError(f"{path}: a symbolic link leads out of {self.root}; replace it by a relative link")
+        return path
+
+    @property
+    def is_running(self) -> bool:
+        """True if systemd runs this machine, so that a service can be started."""
+        return self.root == Path("/") and Path("/run/systemd/system").is_dir()
+
+    def run(self, program: str, *arguments: str, root_option: str = "--root") -> None:
+        """Run a program that changes the machine.
+
+        Args:
+            program: Name of the program.
+            arguments: Its arguments.
+            root_option: Option by which the program takes the root directory of an image.
+
+        Raises:
+            UserError: The program is missing or fails.
+        """
+        run([program, *([] if self.root == Path("/") else [f"{root_option}={self.root}"]), *arguments])
+
+    def write(self, name: str | Path, content: bytes, *, mode: int = 0o644, group: int = 0) -> None:
+        """Write a file that belongs to root. Create its folder; replace an existing file atomically.
+
+        Args:
+            name: Absolute path of the file on the machine.
+            content: Content of the file.
+            mode: Permissions.
+            group: Id of the group.
+
+        Raises:
+            UserError: The file cannot be written.
+        """
+        path = self.path(name)
+        new = path.with_name(f".{path.name}.new")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            new.unlink(missing_ok=True)
+            new.touch(mode=0o600)
+            new.write_bytes(content)
+            os.chown(new, 0, group)
+            new.chmod(mode)
+            new.replace(path)
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+    def group_id(self, name: str) -> int | None:
+        """Return the id of a group of the machine; None if there is no such group."""
+        file = self.path("/etc/group")
+        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        return next((int(line.split(":")[2]) for line in lines if line.startswith(f"{name}:")), None)
+
+
+def run(command: Sequence[str]) -> None:
+    """Run a program.
+
+    Raises:
+        UserError: The program is missing or fails.
+    """
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - only programs of the system
+    except FileNotFoundError:
+        raise UserError(f"{command[0]} is not installed: the service needs a Linux system with systemd") from None
+    if done.returncode:
+        reason = done.stderr.strip() or f"exit code {done.returncode}"
+        raise UserError(f"{' '.join(command)}: {reason}")
+
+
+def tree(folder: Path) -> Iterator[Path]:
+    """Yield a folder and all files and folders in it, without following symbolic links."""
+    yield folder
+    for parent, folders, files in os.walk(folder):
+        yield from (Path(parent, name) for name in (*folders, *files))

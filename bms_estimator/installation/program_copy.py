@@ -1,0 +1,158 @@
+"""Copy of this program and the packages that it requires, in a virtual environment of its own."""
+
+import re
+import shutil
+import sys
+from collections.abc import Iterable, Iterator
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from importlib.util import cache_from_source
+from pathlib import Path
+
+from bms_estimator.installation.pack_files import is_hidden
+from bms_estimator.model.errors import UserError
+
+DISTRIBUTION = "bms_estimator"
+PACKAGE = Path(__file__).parents[1]
+"""Folder of this program's package."""
+PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
+SITE_PACKAGES = Path("lib", PYTHON, "site-packages")
+"""Folder of the packages in a virtual environment."""
+CREATOR = "creator = bms-estimator install"
+"""Line of pyvenv.cfg that marks a copy."""
+SCRIPT = """#!{python}
+import sys
+from bms_estimator.cli.main import main
+sys.exit(main())
+"""
+_REQUIREMENT = re.compile(r"([\w.-]+)\s*(?:\[([^]]*)\])?")
+_EXTRA = re.compile(r"extra\s*==\s*['\"]([\w.-]+)['\"]")
+
+
+def is_program_copy(folder: Path) -> bool:
+    """Return True if the folder is an environment that ``create_environment`` made."""
+    config = folder / "pyvenv.cfg"
+    return config.is_file() and CREATOR in config.read_text(encoding="utf-8").splitlines()
+
+
+def system_python() -> Path:
+    """Return a Python of this version that services can run.
+
+    Raises:
+        UserError: No Python of this version is outside of home folders.
+    """
+    for folder in (Path(sys.base_prefix, "bin"), Path("/usr/bin"), Path("/usr/local/bin")):
+        python = folder / PYTHON
+        if python.exists() and not is_hidden(python.resolve()):
+            return python
+    raise UserError(
+        f"{sys.base_prefix}: a service cannot run a Python in a home folder; "
+        f"install {PYTHON} for all users, or create the environment with the system's python3"
+    )
+
+
+def create_environment(folder: Path, *, installed_as: Path, python: Path) -> Path:
+    """Create a virtual environment without packages, and a script that starts this program.
+
+    Args:
+        folder: Folder of the environment, which is created.
+        installed_as: Absolute path under which the environment will be used.
+        python: Interpreter of the environment.
+
+    Returns:
+        Folder for the packages.
+    """
+    site_packages = folder / SITE_PACKAGES
+    site_packages.mkdir(parents=True)
+    (folder / "bin").mkdir()
+    (folder / "bin/python3").symlink_to(python)
+    (folder / "pyvenv.cfg").write_text(f"home = {python.parent}\ninclude-system-site-packages = false\n{CREATOR}\n")
+    script = folder / "bin/bms-estimator"
+    script.write_text(SCRIPT.format(python=installed_as / "bin/python3"))
+    script.chmod(0o755)
+    return site_packages
+
+
+def copy_program(target: Path, *, installed_as: Path, python: Path) -> None:
+    """Copy this program, and the packages that it requires and can use, to a virtual environment.
+
+    Args:
+        target: Folder of the environment. An earlier copy is replaced.
+        installed_as: Absolute path under which the environment will be used; different from ``target`` in an image.
+        python: Interpreter of the environment.
+
+    Raises:
+        UserError: The folder exists, and is no copy.
+    """
+    if target.exists() and not is_program_copy(target):
+        raise UserError(
+            f"{target}: exists, and was not created by this command; run {target}/bin/bms-estimator install"
+        )
+    new = target.with_name(f".{target.name}.new")
+    shutil.rmtree(new, ignore_errors=True)
+    site_packages = create_environment(new, installed_as=installed_as, python=python)
+    extras = distribution(DISTRIBUTION).metadata.get_all("Provides-Extra") or []
+    copy_packages(required_packages(extras), site_packages)
+    _copy_own_package(site_packages)
+    shutil.rmtree(target, ignore_errors=True)
+    new.rename(target)
+
+
+def required_packages(extras: Iterable[str]) -> list[Distribution]:
+    """Return the installed packages that this program requires, directly or indirectly, sorted by name.
+
+    Args:
+        extras: Extras of this program whose packages are included, as far as they are installed.
+    """
+    found: dict[str, Distribution] = {}
+    pending = list(_requirements(distribution(DISTRIBUTION), set(extras)))
+    seen = set()
+    while pending:
+        name, extras_of_package = requirement = pending.pop()
+        if requirement in seen:
+            continue
+        seen.add(requirement)
+        try:
+            package = distribution(name)
+        except PackageNotFoundError:  # required on another platform, or by an extra that is not installed
+            continue
+        found[package.name] = package
+        pending += _requirements(package, set(extras_of_package))
+    return [found[name] for name in sorted(found)]
+
+
+def _requirements(package: Distribution, extras: set[str]) -> Iterator[tuple[str, frozenset[str]]]:
+    """Yield name and extras of each requirement of a package that applies with the given extras of the package."""
+    for line in package.requires or []:
+        requirement, _, marker = line.partition(";")
+        extra = _EXTRA.search(marker)
+        match = _REQUIREMENT.match(requirement)
+        if match and (extra is None or extra[1] in extras):
+            yield match[1], frozenset(part.strip() for part in (match[2] or "").split(",") if part.strip())
+
+
+def copy_packages(packages: Iterable[Distribution], site_packages: Path) -> None:
+    """Copy the files of installed packages, with compiled Python files and without scripts."""
+    for package in packages:
+        for file in package.files or []:
+            if ".." in file.parts or "__pycache__" in file.parts:
+                continue
+            _copy(Path(str(file.locate())), site_packages / file)
+
+
+def _copy_own_package(site_packages: Path) -> None:
+    """Copy this program's package and its metadata. A package in a checkout is not among its distribution's files."""
+    shutil.copytree(PACKAGE, site_packages / PACKAGE.name)
+    for file in distribution(DISTRIBUTION).files or []:
+        if file.parts[0].endswith(".dist-info"):
+            _copy(Path(str(file.locate())), site_packages / file)
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file with its modification time, and the compiled file of a Python file, which is valid only for this time."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy2(source, target)
+    if source.suffix == ".py":
+        compiled, copied = (Path(cache_from_source(str(path))) for path in (source, target))
+        if compiled.exists():
+            copied.parent.mkdir(exist_ok=True)
+            shutil.copy2(compiled, copied)

@@ -1,0 +1,204 @@
+"""``bms-estimator install`` and ``uninstall`` in a root directory that is not this machine's."""
+
+import os
+import shutil
+import stat
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.installation import program_copy
+from tests.command_line import PROGRAM, run
+
+PACK = """
+[pack]
+name = "house"
+cell = "lfp"
+capacity_ah = 100
+series = 4
+[sensor]
+port = "/dev/bms/absent"
+[mqtt]
+username = "house"
+password_file = "mqtt-password"
+"""
+UNITS = ("etc/systemd/system/bms-estimator.service", "etc/systemd/system/bms-estimator@.service")
+RULE = "etc/udev/rules.d/99-bms-estimator.rules"
+
+
+@pytest.fixture
+def root(tmp_path, monkeypatch) -> Path:
+    """Return an empty root directory. The program of the test is that of the environment."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can create users in a root directory")
+    for name in ("systemd-sysusers", "systemctl", "userdel"):
+        if shutil.which(name) is None:
+            pytest.skip(f"{name} is not installed (apt install systemd passwd)")
+    monkeypatch.setattr("sys.argv", ["/opt/venv/bin/bms-estimator"])
+    (tmp_path / "root/etc").mkdir(parents=True)
+    return tmp_path / "root"
+
+
+@pytest.fixture
+def pack(tmp_path) -> Path:
+    """Return a pack file with a password file beside it."""
+    (tmp_path / "mqtt-password").write_text("secret")
+    (tmp_path / "pack.toml").write_text(PACK)
+    return tmp_path / "pack.toml"
+
+
+def group_of_service(root: Path) -> int:
+    """Return the id of the service's group."""
+    lines = (root / "etc/group").read_text().splitlines()
+    return next(int(line.split(":")[2]) for line in lines if line.startswith("bms-estimator:"))
+
+
+def test_units_run_the_installed_program(root, pack, capsys):
+    code, _, err = run(capsys, "install", "--root", root, pack)
+    assert code == 0, err
+    one, several = ((root / unit).read_text() for unit in UNITS)
+    assert "\nExecStart=/opt/venv/bin/bms-estimator run /etc/bms-estimator/pack.toml\n" in one
+    assert "\nExecStart=/opt/venv/bin/bms-estimator run /etc/bms-estimator/%i.toml\n" in several
+    assert (root / "etc/systemd/system/multi-user.target.wants/bms-estimator.service").is_symlink()
+    assert (root / "usr/local/bin/bms-estimator").readlink() == Path("/opt/venv/bin/bms-estimator")
+    assert (root / RULE).exists()
+
+
+def test_only_root_and_the_service_can_read_settings_and_password(root, pack, capsys):
+    run(capsys, "install", "--root", root, pack)
+    for name in ("pack.toml", "mqtt-password"):
+        status = (root / "etc/bms-estimator" / name).stat()
+        assert (stat.S_IMODE(status.st_mode), status.st_uid, status.st_gid) == (0o640, 0, group_of_service(root))
+
+
+def test_user_of_the_service_is_in_group_dialout(root, pack, capsys):
+    run(capsys, "install", "--root", root, pack)
+    groups = dict(line.split(":")[::3] for line in (root / "etc/group").read_text().splitlines())
+    assert "bms-estimator" in groups["dialout"].split(",")
+
+
+def test_upgrade_keeps_edited_settings_and_changes_the_program(root, pack, capsys, monkeypatch):
+    run(capsys, "install", "--root", root, pack)
+    installed = root / "etc/bms-estimator/pack.toml"
+    installed.write_text(f"{PACK}# edited\n")
+    monkeypatch.setattr("sys.argv", ["/opt/other/bin/bms-estimator"])
+    assert run(capsys, "install", "--root", root)[0] == 0
+    assert installed.read_text().endswith("# edited\n")
+    assert "ExecStart=/opt/other/bin/bms-estimator run" in (root / UNITS[0]).read_text()
+
+
+def test_upgrade_does_not_enable_a_disabled_service(root, pack, capsys):
+    run(capsys, "install", "--root", root, pack)
+    link = root / "etc/systemd/system/multi-user.target.wants/bms-estimator.service"
+    link.unlink()
+    run(capsys, "install", "--root", root)
+    assert not link.is_symlink()
+
+
+def test_other_settings_are_backed_up(root, pack, capsys):
+    run(capsys, "install", "--root", root, pack)
+    pack.write_text(PACK.replace("house", "shed"))
+    run(capsys, "install", "--root", root, pack)
+    folder = root / "etc/bms-estimator"
+    assert (folder / "pack.toml").read_text() == pack.read_text()
+    assert (folder / "pack.toml.old").read_text() == PACK
+
+
+def test_invalid_settings_change_nothing(root, pack, capsys):
+    pack.write_text(PACK.replace("series = 4", "series = 0"))
+    code, _, err = run(capsys, "install", "--root", root, pack)
+    assert code == 2
+    assert "pack.series = 0" in err
+    assert list((root / "etc").iterdir()) == []
+
+
+def test_file_in_a_home_folder_is_rejected(root, pack, capsys):
+    pack.write_text(PACK.replace('"mqtt-password"', '"/home/pi/mqtt-password"'))
+    code, _, err = run(capsys, "install", "--root", root, pack)
+    assert code == 2
+    assert "mqtt.password_file = /home/pi/mqtt-password" in err
+    assert not (root / UNITS[0]).exists()
+
+
+def test_a_program_in_a_home_folder_is_copied_into_the_root_directory(root, pack, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/home/pi/venv/bin/bms-estimator"])
+    monkeypatch.setattr(program_copy, "required_packages", lambda _extras: [])  # they are large
+    monkeypatch.setattr("bms_estimator.cli.settings.install.system_python", lambda: Path("/usr/bin/python3"))
+    code, _, err = run(capsys, "install", "--root", root, pack)
+    assert code == 0, err
+    script = root / "opt/bms-estimator/bin/bms-estimator"
+    assert script.read_text().startswith("#!/opt/bms-estimator/bin/python3\n")
+    assert (root / "usr/local/bin/bms-estimator").readlink() == Path("/opt/bms-estimator/bin/bms-estimator")
+    run(capsys, "uninstall", "--root", root)
+    assert not (root / "opt/bms-estimator").exists()
+
+
+def test_a_root_directory_without_etc_is_rejected_and_stays_empty(root, pack, capsys):
+    (root / "etc").rmdir()
+    code, _, err = run(capsys, "install", "--root", root, pack)
+    assert code == 2
+    assert f"--root {root}: is not the root directory of a system" in err
+    assert list(root.iterdir()) == []
+
+
+def test_installation_without_settings_enables_nothing(root, capsys):
+    code, out, _ = run(capsys, "install", "--root", root)
+    assert code == 0
+    assert "bms-estimator install PACK.toml" in out
+    assert not (root / "etc/systemd/system/multi-user.target.wants").exists()
+
+
+def test_uninstall_keeps_settings_and_state_for_root(root, pack, capsys):
+    run(capsys, "install", "--root", root, pack)
+    state = root / "var/lib/bms-estimator/pack.sqlite"
+    state.parent.mkdir(parents=True)
+    state.touch()
+    os.chown(state, 0, group_of_service(root))
+    code, out, err = run(capsys, "uninstall", "--root", root)
+    assert code == 0, err
+    assert "Remaining: /etc/bms-estimator, /var/lib/bms-estimator" in out
+    assert not any((root / name).exists() for name in (*UNITS, RULE))
+    assert "bms-estimator:" not in (root / "etc/passwd").read_text() + (root / "etc/group").read_text()
+    assert [path.stat().st_gid for path in (state, root / "etc/bms-estimator/pack.toml")] == [0, 0]
+
+
+def test_uninstall_with_purge_leaves_nothing(root, pack, capsys):
+    run(capsys, "install", "--root", root, pack)
+    (root / "var/lib/bms-estimator").mkdir(parents=True)
+    assert run(capsys, "uninstall", "--purge", "--root", root)[1].endswith("Remaining: nothing\n")
+    assert list(root.rglob("*bms-estimator*")) == []
+
+
+def test_uninstall_without_an_installation_changes_nothing(root, capsys):
+    code, out, _ = run(capsys, "uninstall", "--root", root)
+    assert (code, out) == (0, "\nRemaining: nothing\n")
+
+
+def test_without_root_the_error_has_the_whole_command(pack, capsys, monkeypatch):
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    monkeypatch.setattr("sys.argv", [str(PROGRAM)])
+    code, _, err = run(capsys, "install", pack)
+    assert code == 2
+    assert err == f"error: requires root: sudo {PROGRAM.resolve()} install {pack}\n"
+
+
+@pytest.mark.parametrize("command", ["install", "uninstall"])
+def test_link_that_leads_out_of_the_root_directory_is_rejected(root, pack, capsys, command):
+    run(capsys, "install", "--root", root, pack)
+    settings, outside = root / "etc/bms-estimator", root.parent / "outside"
+    shutil.rmtree(settings)
+    outside.mkdir()
+    settings.symlink_to(outside)
+    code, _, err = run(capsys, command, "--root", root, *([pack] if command == "install" else []))
+    assert code == 2
+    assert "a symbolic link leads out of" in err
+    assert list(outside.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["etc/bms-estimator/pack.toml/folder", "usr/local/bin"])
+def test_file_of_another_kind_in_the_place_of_one_of_the_service_is_an_error(root, pack, capsys, name):
+    (root / name).parent.mkdir(parents=True)
+    (root / name).touch()
+    code, _, err = run(capsys, "install", "--root", root, pack)
+    assert code == 2
+    assert str(root / name.removesuffix("/folder")) in err
