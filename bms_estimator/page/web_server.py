@@ -1,4 +1,4 @@
-"""Read-only HTTP server of a page: static files, event stream, queries."""
+"""HTTP server of a page: static files, event stream, queries, forms."""
 
 import asyncio
 import contextlib
@@ -6,6 +6,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple, Self, cast
 
 import structlog
@@ -70,6 +71,7 @@ class WebServer:
         files: Static files by the path of their URL.
         latest: Content of the event stream ``/events``.
         handlers: Handlers of queries, by path.
+        forms: Handlers of submitted forms, by path.
         on_listening: Called with the address once the server listens.
         retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
@@ -84,6 +86,7 @@ class WebServer:
         latest: LatestValues,
         handlers: Mapping[str, Handler],
         *,
+        forms: Mapping[str, Handler] = MappingProxyType({}),
         on_listening: Callable[[str], object] = str,
         retry: bool = True,
     ) -> None:
@@ -92,6 +95,7 @@ class WebServer:
         self._configured_address, self._listening = settings.address, settings.address
         self._files = {path: _load_file(file) for path, file in files.items()}
         self._handlers = {**dict.fromkeys(files, self._file), "/events": self._stream_events, **handlers}
+        self._forms = forms
         self._streams: dict[Reader, _Stream] = {}
         self._runner: web.AppRunner | None = None
         self._listener: Listener | None = None
@@ -114,6 +118,8 @@ class WebServer:
         app.on_response_prepare.append(_protect)
         for path, handler in self._handlers.items():
             app.router.add_get(path, handler)
+        for path, handler in self._forms.items():
+            app.router.add_post(path, handler)
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=SHUTDOWN_TIMEOUT_S)
         await self._runner.setup()
         try:

@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from bms_estimator.model.config_file import Strict
+from bms_estimator.model.suggestion import suggestion
 
 Name = Annotated[str, Field(min_length=1)]
 
@@ -42,5 +43,5 @@ def merge_profile(table: object, profiles: Mapping[str, Mapping[str, object]]) -
     if not isinstance(table, dict) or not isinstance(name := table.get("profile"), str):
         return table
     if name not in profiles:
-        raise ValueError(f"profile: {name!r} must be one of {', '.join(profiles)}")
+        raise ValueError(f"profile: {name!r} must be one of {', '.join(profiles)}{suggestion(name, profiles)}")
     return {**profiles[name], **table}

@@ -6,6 +6,7 @@ from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
 from bms_estimator.model.config_file import NotNegative, Positive, Strict
 from bms_estimator.model.one_of import OneOf
+from bms_estimator.protocols.base.sensor_correction import SensorCorrection
 from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS
 from bms_estimator.settings.sampling import BOARD_GAIN_STD
 
@@ -17,6 +18,9 @@ default, so that a file that contains all defaults is valid. The protocol text i
 MAX_GAIN_STD = 0.2
 """Maximum relative std of a gain. A sensor with a larger error must be calibrated."""
 GainStd = Annotated[float, Field(ge=0.0, le=MAX_GAIN_STD)]
+MIN_GAIN, MAX_GAIN = 0.5, 2.0
+"""Range of a gain. A factor beyond it is a wrong unit or a wrong divider."""
+Gain = Annotated[float, Field(ge=MIN_GAIN, le=MAX_GAIN)]
 
 
 def _with_device_defaults(sensor: dict[str, object]) -> dict[str, object]:
@@ -55,7 +59,7 @@ class SensorSettings(Strict):
     )
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
         default="discharge_positive",
-        description="direction of positive current in the values of the device, or in the columns of a CSV or Parquet file; default: that of the protocol",
+        description="direction of positive current in the values of the device, or in the columns of a table; default: that of the protocol",
     )
     voltage_resolution_v: Positive = Field(
         default=25.0 / 1024,  # 10-bit converter behind a common divider module for 0 to 25 V
@@ -81,6 +85,16 @@ class SensorSettings(Strict):
         default=BOARD_GAIN_STD,
         description="relative standard deviation of the current's gain; default: that of the device, 0.005 except for a board, which is calibrated",
     )
+    voltage_gain: Gain = Field(
+        default=1.0,
+        description="factor by which the measured pack voltage is multiplied, from a comparison with a multimeter; cell voltages are not changed",
+    )
+    current_gain: Gain = Field(
+        default=1.0, description="factor by which the measured current is multiplied after current_zero_a is subtracted"
+    )
+    current_zero_a: float = Field(
+        default=0.0, description="current that the device reports while no current flows, with the sign of the device"
+    )
     period_s: Positive | None = Field(
         default=None, description="sample period of a device that sends at a fixed rate; default: that of the device"
     )
@@ -102,6 +116,12 @@ class SensorSettings(Strict):
                 f"serial: only a binary board reports its serial number, but sensor.protocol is {self.protocol}; remove serial"
             )
         return self
+
+    @property
+    def correction(self) -> SensorCorrection:
+        """Correction of samples, whose current is positive on discharge."""
+        sign = 1.0 if self.current_sign == "discharge_positive" else -1.0
+        return SensorCorrection(self.voltage_gain, self.current_gain, sign * self.current_zero_a)
 
     @property
     def sample_period_s(self) -> float:

@@ -13,15 +13,22 @@ import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from playwright.async_api import Browser
 
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.settings.page import PageSettings
+from bms_estimator.setup.page.setup_server import SetupServer
+from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.simulation.virtual_adc import Reading
+from tests.device_line import running_device
 from tests.free_port import free_port
 from tests.mosquitto import Broker
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import SERIES, Service, simulated
+from tests.page.test_setup import answer_questions, compare_voltage, search_and_choose
 from tests.sinks.snapshots import CELL_SNAPSHOT
 from tests.store.test_history import record_history
 
@@ -116,9 +123,29 @@ async def shoot_all(service: Service, browser: Browser) -> None:
         await shoot(page_tab, "alarm", top=True)
 
 
+async def shoot_setup(folder: Path, browser: Browser) -> None:
+    """Write screenshots of two steps of the setup page."""
+    bms = SimulatedBms("jk", lambda _: Reading(5.0, 26.4, 21.0), cells=8)
+    page = PageSettings(listen="127.0.0.1:0")
+    installed = patch("sys.executable", "/opt/bms-estimator/bin/python3")  # the page names the program beside it
+    with running_device(bms) as path, contextlib.chdir(folder), installed:
+        async with (
+            SetupServer(page, Path("pack.toml")) as server,
+            tab(browser, server.url, size=PHONE, device_scale_factor=1.5) as page_tab,
+        ):
+            await search_and_choose(page_tab.page, path)
+            await compare_voltage(page_tab.page)
+            await page_tab.page.screenshot(path=DOCS / "setup-multimeter.png")
+            await answer_questions(page_tab.page)
+            await page_tab.until("() => document.getElementById('wait').hidden")
+            await page_tab.page.screenshot(path=DOCS / "setup-estimate.png")
+
+
 async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
+        async with chromium() as browser:
+            await shoot_setup(folder, browser)
         await record_history(folder / "attic.sqlite", make_day_before())
         broker = Broker(folder).start()
         try:

@@ -8,12 +8,8 @@ import pytest
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.settings.pack import Settings, load_settings
-from bms_estimator.simulation.simulated_bms import SimulatedBms
-from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.factory import KINDS
 from tests.command_line import run
-from tests.device_line import running_device
-from tests.patience import LONG_S
 
 
 @pytest.fixture
@@ -65,36 +61,6 @@ def test_file_of_init_contains_all_settings_and_is_valid_with_all_of_them_uncomm
         assert loaded.sensor.model_dump(include=checked_fields) == Settings().sensor.model_dump(include=checked_fields)
 
 
-@pytest.fixture
-def long_probe(monkeypatch):
-    """Shorten the wait for a board, and lengthen the wait for answers in other protocols."""
-    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.1)
-    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
-
-
-def test_init_configures_the_detected_device(pack, capsys, long_probe):
-    device = SimulatedBms("jk", lambda _: Reading(1.0, 26.4, 21.0), cells=8)
-    with running_device(device) as path:
-        code, out, err = run(capsys, "config", "init", pack, "--probe", "--port", path)
-    assert (code, err) == (0, "")
-    assert out.startswith(f"{path}: JK-BMS, 8 cells, software SIMULATED; protocol jk, 115200 baud\n{pack}: written")
-    settings = load_settings(pack)
-    assert (settings.sensor.port, settings.sensor.protocol, settings.sensor.baud) == (path, "jk", 115_200)
-    assert settings.pack.series == 8
-    assert tomllib.loads(pack.read_text())["sensor"] == {"port": path, "protocol": "jk"}
-
-
-def test_init_without_a_device_writes_nothing(pack, capsys, tmp_path):
-    code, out, err = run(capsys, "config", "init", pack, "--probe", "--port", tmp_path / "none")
-    assert (code, out) == (2, "")
-    assert "no known device was found" in err
-    assert "cannot be opened" in err
-    assert not pack.exists()
-    code, _, err = run(capsys, "config", "init", pack, "--port", "/dev/ttyUSB0")
-    assert code == 2
-    assert "requires --probe" in err
-
-
 def test_init_does_not_overwrite_a_file(pack, capsys):
     pack.write_text("mine\n")
     code, out, err = run(capsys, "config", "init", pack)
@@ -112,6 +78,12 @@ def test_init_does_not_overwrite_a_file(pack, capsys):
         ("[prometeus]\n", ["prometeus: unknown key; is prometheus meant?"]),
         ("[page]\nport = 1\n", ["page.port: unknown key; there are listen, token_file, hosts"]),
         ('[source]\nkind = "mqt"\n', ["source.kind = 'mqt': must be one of 'mqtt', 'linux'"]),
+        ('[source]\nkind = "mqt"\n', ["; is mqtt meant?"]),
+        ('[source]\nkind = "mqtt"\nprofile = "esphome_jk"\n', ["must be one of batmon-ha", "; is esphome-jk meant?"]),
+        ('[source]\nkind = "modbus"\nprofile = "victron"\n', ["'victron' must be one of", "; is victron-gx meant?"]),
+        ('[sensor]\nprotocol = "JDB"\n', ["must be one of binary", "; is jbd meant?"]),
+        ('[pack]\ncell = "chenmora"\n', ["chenmora: no such cell file", "; is chen_mora meant?"]),
+        ('[log]\nlevel = "warnin"\n', ["; is warning meant?"]),
         ('[source]\nkind = "mqtt"\nprofil = "x"\n', ["source.profil: unknown key; is profile meant?"]),
         ("[observer]\nlamda = 1\n", ["observer.lamda: unknown key; is lambda meant?"]),
         ("[alarms]\nsoc_low = 20\n", ["alarms.soc_low = 20: must be a table"]),

@@ -30,16 +30,22 @@ def settings_file(model: type[BaseModel], given: GivenSettings = MappingProxyTyp
 
     Args:
         model: Model of the whole file; each of its fields is a section.
-        given: Settings that are written without ``#``.
+        given: Settings that are written without ``#``. An optional section is written without ``#`` if it is given.
     """
     lines = [HEAD]
     for name, field in model.model_fields.items():
         is_optional = field.default is None
         effect_of_omission = f" {_sentence(field.description)}" if is_optional and field.description else ""
         for section in _models(field.annotation):  # [source] has one model for each kind of source
+            values = given[name] if name in given and _is_kind(section, given[name]) else {}
             lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{effect_of_omission}")
-            lines += [f"{'#' if is_optional else ''}[{name}]", *_setting_lines(section, given.get(name, {})), ""]
+            lines += [f"{'#' if is_optional and not values else ''}[{name}]", *_setting_lines(section, values), ""]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _is_kind(section: type[BaseModel], given: Mapping[str, object]) -> bool:
+    """Return True if ``given`` are settings of this model, which matters only for the kinds of ``[source]``."""
+    return "kind" not in given or given["kind"] in get_args(section.model_fields["kind"].annotation)
 
 
 def _setting_lines(section: type[BaseModel], given: Mapping[str, object]) -> Iterator[str]:

@@ -1,0 +1,119 @@
+"""Prompts of the comparison with a multimeter."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from functools import partial
+
+import typer
+
+from bms_estimator.cli.options.status_line import show_status
+from bms_estimator.cli.settings.prompts import Prompts
+from bms_estimator.model.decimal_text import number
+from bms_estimator.model.errors import UserError
+from bms_estimator.setup.answers import InvalidAnswerError
+from bms_estimator.setup.comparison import Comparison
+from bms_estimator.setup.found_device import FoundDevice
+
+
+@dataclass(frozen=True)
+class MultimeterOptions:
+    """Options of the comparison; None: not given."""
+
+    compare: bool | None
+    voltmeter_v: float | None
+    """Voltage by the multimeter [V]."""
+    zero: bool
+    """True if no current flows."""
+    ammeter_a: float | None
+    """Current by the multimeter [A], positive on discharge."""
+    direction: str | None
+    """Direction of the present current: discharging or charging."""
+
+    @property
+    def has_current(self) -> bool:
+        """True if an option states a current or its direction."""
+        return self.ammeter_a is not None or self.direction is not None
+
+    @property
+    def has_values(self) -> bool:
+        """True if an option answers a part of the comparison. Then the other parts are skipped."""
+        return self.voltmeter_v is not None or self.zero or self.has_current
+
+
+def compare_with_multimeter(
+    prompts: Prompts, device: FoundDevice, options: MultimeterOptions
+) -> tuple[tuple[str, object], ...]:
+    """Compare voltage and current with a multimeter; return the settings of ``[sensor]``, as key and value.
+
+    Raises:
+        UserError: An option is invalid or missing, or the device does not answer.
+    """
+    comparison = Comparison(device)
+    if options.has_values:
+        _compare_options(comparison, options)
+    elif prompts.confirm("Compare the device with a multimeter?", "--compare", options.compare, default=False):
+        if not prompts.is_interactive:
+            raise UserError(
+                "--compare: give --voltmeter-v, --zero, --ammeter-a or --direction, because there is no terminal to ask"
+            )
+        _compare_interactively(comparison)
+    else:
+        return ()
+    return asyncio.run(comparison.finish())
+
+
+def _compare_options(comparison: Comparison, options: MultimeterOptions) -> None:
+    if options.zero and options.has_current:
+        raise UserError("--zero: no current flows, but --ammeter-a or --direction states one; give only one of them")
+    try:
+        if options.voltmeter_v is not None:
+            _run(lambda: comparison.compare_voltage(options.voltmeter_v or 0.0))
+        if options.zero:
+            _run(comparison.take_zero)
+        if options.ammeter_a is not None:
+            _run(lambda: comparison.compare_current(options.ammeter_a or 0.0))
+        elif options.direction is not None:
+            _run(lambda: comparison.compare_direction(options.direction or ""))
+    except InvalidAnswerError as error:
+        raise UserError(f"comparison with the multimeter: {error}") from None
+
+
+def _compare_interactively(comparison: Comparison) -> None:
+    typer.echo("Press Enter without a value to skip a step.")
+    first_v = "Voltage at the terminals of the pack by the multimeter [V]"
+    if _step(first_v, lambda text: comparison.compare_voltage(_number(text))):
+        second_v = "Voltage again at another state of charge, after you charged or discharged the pack [V]"
+        _step(second_v, lambda text: comparison.compare_voltage(_number(text)))
+    _step("Switch off all loads and chargers; then enter 0", lambda _: comparison.take_zero())
+    load = "Switch on a load; its current by the multimeter [A], negative while the pack is charged"
+    if not _step(load, lambda text: comparison.compare_current(_number(text))):
+        _step("The pack is now discharging or charging", lambda text: comparison.compare_direction(text.lower()))
+
+
+def _step(text: str, compare: Callable[[str], Awaitable[str]]) -> bool:
+    """Ask for a value until the comparison accepts it. Return False if the step is skipped."""
+    while answer := str(typer.prompt(text, default="", show_default=False)).strip():
+        try:
+            _run(partial(compare, answer))
+        except (InvalidAnswerError, UserError) as error:
+            typer.echo(f"  {error}")
+        else:
+            return True
+    return False
+
+
+def _run(compare: Callable[[], Awaitable[str]]) -> None:
+    async def run() -> str:
+        return await compare()
+
+    with show_status("measuring"):
+        result = asyncio.run(run())
+    typer.echo(f"  {result}")
+
+
+def _number(text: str) -> float:
+    try:
+        return number(text.replace(",", "."))
+    except ValueError:
+        raise InvalidAnswerError(f"{text}: must be a number") from None

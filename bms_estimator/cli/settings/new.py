@@ -1,0 +1,209 @@
+"""``bms-estimator new``: wizard that finds the device of a pack and writes its settings file."""
+
+import asyncio
+import subprocess
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.cli.options.status_line import show_status
+from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
+from bms_estimator.cli.settings.prompts import Prompts
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.log_setup import configure_logs
+from bms_estimator.service.kernel_warm_up import load_kernels
+from bms_estimator.settings.pack_file import require_new
+from bms_estimator.setup.answers import Answers, InvalidAnswerError
+from bms_estimator.setup.first_estimate import estimate_text, run_estimator
+from bms_estimator.setup.found_device import FoundDevice
+from bms_estimator.setup.measurement import Measurement, measure
+from bms_estimator.setup.new_pack import create_pack, install_command
+from bms_estimator.setup.questions import QUESTIONS, Question
+from bms_estimator.setup.search import SearchResult, default_places, search
+
+ESTIMATE_S = 5.0
+"""Time over which the first estimates are shown [s]."""
+
+
+def new(
+    file: Annotated[Path, typer.Argument(help="settings file to create")] = Path("pack.toml"),
+    search_at: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--search",
+            help="where to search: path of a serial port, URL of an MQTT broker, host name of a Modbus device, or bluetooth; may be repeated; default: all USB serial ports, the MQTT broker on this machine, Bluetooth",
+            show_default=False,
+        ),
+    ] = None,
+    device: Annotated[
+        str | None,
+        typer.Option(help="device to use, by its name in the list of found devices; a serial port is searched alone"),
+    ] = None,
+    compare: Annotated[
+        bool | None,
+        typer.Option("--compare/--no-compare", help="compare the device with a multimeter", show_default=False),
+    ] = None,
+    voltmeter_v: Annotated[
+        float | None,
+        typer.Option(parser=decimal(0.0), help="present voltage of the pack by a multimeter [V]", show_default=False),
+    ] = None,
+    zero: Annotated[
+        bool, typer.Option("--zero", help="no current flows now: take the present current as the zero of the sensor")
+    ] = False,
+    ammeter_a: Annotated[
+        float | None,
+        typer.Option(
+            parser=decimal(), help="present current by a multimeter [A], positive on discharge", show_default=False
+        ),
+    ] = None,
+    direction: Annotated[
+        str | None,
+        typer.Option(help="direction of the present current, discharging or charging, which checks its sign"),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help=QUESTIONS[0].help, show_default=False)] = None,
+    cell: Annotated[str | None, typer.Option(help=QUESTIONS[1].help, show_default=False)] = None,
+    capacity_ah: Annotated[str | None, typer.Option(help=QUESTIONS[2].help, show_default=False)] = None,
+    series: Annotated[str | None, typer.Option(help=QUESTIONS[3].help, show_default=False)] = None,
+    parallel: Annotated[str | None, typer.Option(help=QUESTIONS[4].help, show_default=False)] = None,
+    broker: Annotated[str | None, typer.Option(help=QUESTIONS[5].help, show_default=False)] = None,
+    estimate: Annotated[
+        bool, typer.Option("--estimate/--no-estimate", help="run the estimator for some seconds, and show the SOC")
+    ] = True,
+    install: Annotated[
+        bool | None,
+        typer.Option("--install/--no-install", help="install the service with sudo", show_default=False),
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="take the default of each question that no option answers")
+    ] = False,
+) -> None:
+    """Find the device of a pack, ask for the values of the pack, and write its settings file.
+
+    Each question is asked on the terminal unless its option answers it.
+    Without a terminal, a missing option is an error.
+    """
+    require_new(file)
+    configure_logs(deque[str](maxlen=1))  # the wizard reports faults itself
+    prompts = Prompts(yes=yes)
+    result = _search(search_at or ([device] if device and device.startswith("/") else _default_places()))
+    answers = _choose_device(prompts, result, device)
+    measured = _measure(answers.device)
+    options = MultimeterOptions(compare, voltmeter_v, zero, ammeter_a, direction)
+    sensor = compare_with_multimeter(prompts, answers.device, options) if measured else ()
+    voltage_v = measured.voltage_v if measured else None
+    answers = replace(answers, voltage_v=voltage_v, name=file.stem, sensor=sensor)
+    given = (name, cell, capacity_ah, series, parallel, broker)
+    for question, option in zip(QUESTIONS, given, strict=True):
+        answers = _ask(prompts, question, option, answers)
+    pack = create_pack(file, answers)
+    for warning in pack.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+    typer.echo(f"{file}: written; {pack.summary}")
+    if estimate and measured:
+        with show_compile_progress():
+            load_kernels()
+        show = lambda each: typer.echo(estimate_text(each))  # noqa: E731
+        asyncio.run(run_estimator(pack.settings, pack.cell, show, seconds=ESTIMATE_S))
+    _offer_install(prompts, file, install)
+
+
+def _default_places() -> list[str]:
+    """Return the places that are searched by default. Print that there is no serial port among them if so."""
+    places = default_places()
+    if not any(place.startswith("/") for place in places):
+        typer.echo("-  no USB serial port is connected; another serial port can be named below")
+    return places
+
+
+def _search(places: Sequence[str]) -> SearchResult:
+    """Search the places, and print what was found."""
+    with show_status(f"searching {', '.join(places)}: up to 20 s"):
+        result = asyncio.run(search(places))
+    for number, device in enumerate(result.devices, start=1):
+        typer.echo(f"{number}  {device.name}: {device}")
+    for failure in result.failures:
+        typer.echo(f"-  {failure}")
+    return result
+
+
+def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -> Answers:
+    """Return the answers with the chosen device. On a terminal, an answer may also be a further place to search.
+
+    Raises:
+        UserError: No device was found, or there is no clear choice and no terminal.
+    """
+    if not result.devices and not prompts.is_interactive:
+        raise UserError("--search: no device was found; name another place")
+    text = "Number of the device, or another place to search (serial port, mqtt://host, Modbus host)"
+    may_search = prompts.is_interactive and device is None
+    while True:
+        parse = partial(_parse_device, result=result, may_search=may_search)
+        default = "1" if len(result.devices) == 1 else ""
+        chosen = prompts.ask(text, "--device", device, parse, default=default)
+        if isinstance(chosen, FoundDevice):
+            return Answers(chosen, heard_broker=result.broker)
+        result = _search([chosen])
+
+
+def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> FoundDevice | str:
+    """Return the device with this name or number; if ``may_search`` is True, any other text is a place to search.
+
+    Raises:
+        InvalidAnswerError: There is no device with this number or name.
+    """
+    for number, device in enumerate(result.devices, start=1):
+        if text in (str(number), device.name):
+            return device
+    if text.isdigit() or not may_search:
+        names = ", ".join(device.name for device in result.devices) or "no device"
+        raise InvalidAnswerError(f"{text}: was not found; found: {names}")
+    return text
+
+
+def _measure(device: FoundDevice) -> Measurement | None:
+    """Return and print the present values; None if no sample arrives."""
+    try:
+        with show_status("measuring"):
+            measured = asyncio.run(measure(device.settings))
+    except UserError as error:
+        typer.echo(f"warning: {error}", err=True)
+        return None
+    typer.echo(f"measured: {measured}")
+    return measured
+
+
+def _ask(prompts: Prompts, question: Question, given: str | None, answers: Answers) -> Answers:
+    if prompts.is_interactive and given is None:
+        for choice, description in question.choices:
+            typer.echo(f"  {choice:4} {description}")
+    return prompts.ask(
+        question.text,
+        question.option,
+        given,
+        lambda text: question.answer(text, answers),
+        default=question.suggest(answers),
+    )
+
+
+def _offer_install(prompts: Prompts, file: Path, given: bool | None) -> None:
+    """Install the service, or print the command that does.
+
+    Raises:
+        typer.Exit: The installation failed.
+    """
+    command = install_command(file)
+    if prompts.confirm(
+        "Install the service, which runs at each start of this machine?", "--install", given, default=False
+    ):
+        code = subprocess.run(command, check=False).returncode  # noqa: S603 - the program of this process
+        if code:
+            raise typer.Exit(code)
+        return
+    typer.echo(f"run it here: bms-estimator run {file}\ninstall the service: {' '.join(command)}")

@@ -1,0 +1,55 @@
+"""``bms-estimator setup``: the wizard as a web page."""
+
+import asyncio
+from collections import deque
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.options.number_options import whole
+from bms_estimator.cli.options.page_options import open_browser, page_settings
+from bms_estimator.process.log_setup import configure_logs
+from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.settings.pack_file import require_new
+from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
+from bms_estimator.setup.page.setup_server import SetupServer
+
+
+def setup(
+    file: Annotated[Path, typer.Argument(help="settings file to create")] = Path("pack.toml"),
+    port: Annotated[
+        int | None,
+        typer.Option(
+            parser=whole(0, 65535), help="port of the page on this machine; 0: any free port", show_default=False
+        ),
+    ] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            help=f"host:port of the page, for other machines; requires --token-file; default: {DEFAULT_LISTEN}",
+            show_default=False,
+        ),
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(help="file with the access token of the page", show_default=False)
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
+    ] = True,
+) -> None:
+    """Serve a web page that asks what `bms-estimator new` asks, until Ctrl-C."""
+    require_new(file)
+    address = listen if port is None else f"127.0.0.1:{port}"
+    page = page_settings(PageSettings(), listen=address, token_file=token_file)
+    configure_logs(deque[str](maxlen=1))  # the page reports faults itself
+    asyncio.run(_serve(page, file, browser=browser))
+
+
+async def _serve(page: PageSettings, file: Path, *, browser: bool) -> None:
+    stop = stop_on_signal()
+    async with SetupServer(page, file) as server:
+        typer.echo(f"setup page: {server.url}")
+        if browser:
+            open_browser(server.url)
+        await stop.wait()

@@ -1,0 +1,46 @@
+"""Answers about a new pack, and the settings that follow from them."""
+
+from dataclasses import dataclass
+
+from bms_estimator.settings.settings_template import GivenSettings
+from bms_estimator.setup.found_device import FoundDevice
+
+
+class InvalidAnswerError(Exception):
+    """An answer cannot be right. The message gives the answer and the reason."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Answers so far; None: not answered yet."""
+
+    device: FoundDevice
+    voltage_v: float | None = None
+    """Measured voltage of the pack [V]; None: not measured."""
+    name: str | None = None
+    cell: str | None = None
+    capacity_ah: float | None = None
+    """Capacity of one cell [Ah]."""
+    series: int | None = None
+    parallel: int | None = None
+    broker: str | None = None
+    """URL of the broker to which the service publishes; empty: no broker."""
+    heard_broker: str | None = None
+    """URL of a broker that answered during the search; None: no broker answered."""
+    sensor: tuple[tuple[str, object], ...] = ()
+    """Settings of ``[sensor]`` from the comparison with a multimeter, as key and value."""
+
+    @property
+    def tables(self) -> GivenSettings:
+        """Settings of the pack by section and key."""
+        pack = {key: getattr(self, key) for key in ("name", "cell", "capacity_ah", "series", "parallel")}
+        tables: dict[str, dict[str, object]] = {"pack": pack}
+        for section, values in self.device.tables.items():
+            tables[section] = dict(values)
+        if self.sensor:
+            tables["sensor"] = {**tables.get("sensor", {}), **dict(self.sensor)}
+        if self.broker:
+            tables["mqtt"] = {"url": self.broker}
+        if self.device.broker and self.device.broker != self.broker:
+            tables["source"]["url"] = self.device.broker
+        return tables

@@ -1,0 +1,78 @@
+"""First estimates of a new pack, without saving or publishing anything."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Self
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.payloads import Estimate, Snapshot
+from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.settings.pack import Settings
+from bms_estimator.setup.measurement import FIRST_SAMPLE_PERIODS, FIRST_SAMPLE_S, open_pack_source
+
+
+class EstimateSink:
+    """Sink that passes each estimate to a function.
+
+    Args:
+        on_estimate: Called with each estimate.
+    """
+
+    def __init__(self, on_estimate: Callable[[Estimate], object]) -> None:
+        self._on_estimate = on_estimate
+
+    async def __aenter__(self) -> Self:
+        """Return the sink."""
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Do nothing, because the sink holds no resources."""
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Pass the estimate of a snapshot to the function."""
+        if snapshot.estimate is not None:
+            self._on_estimate(snapshot.estimate)
+
+
+async def run_estimator(
+    settings: Settings, cell: PackModel, on_estimate: Callable[[Estimate], object], *, seconds: float
+) -> None:
+    """Run the estimator, and pass each estimate to a function.
+
+    Args:
+        settings: Settings of the pack.
+        cell: The pack as one object (``CellModel.pack``).
+        on_estimate: Called with each estimate.
+        seconds: Time after the first estimate until the end [s].
+
+    Raises:
+        UserError: No sample arrives.
+    """
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    timeout_s = FIRST_SAMPLE_S + FIRST_SAMPLE_PERIODS * settings.sensor.sample_period_s
+    timer = loop.call_later(timeout_s, stop.set)
+    count = 0
+
+    def take(received: Estimate) -> None:
+        nonlocal timer, count
+        if not count:
+            timer.cancel()
+            timer = loop.call_later(seconds, stop.set)
+        count += 1
+        on_estimate(received)
+
+    source = open_pack_source(settings)
+    await run_estimation_loop(settings, cell, source=source, sinks=[EstimateSink(take)], stop=stop)
+    timer.cancel()
+    if not count:
+        raise UserError(f"no sample within {timeout_s:g} s: {source.silence_reason}")
+
+
+def estimate_text(estimate: Estimate) -> str:
+    """Return SOC, voltage and current of an estimate as text."""
+    values = f"{estimate.voltage_v:.2f} V, {estimate.current_a:.2f} A"
+    if estimate.soc is None:
+        return values
+    band = "" if estimate.soc_std is None else f" ± {2.0 * estimate.soc_std:.1%} (2 standard deviations)"
+    return f"SOC {estimate.soc:.1%}{band}, {values}"

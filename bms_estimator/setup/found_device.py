@@ -1,0 +1,44 @@
+"""Device that the search has found, and the settings that describe it."""
+
+from dataclasses import dataclass
+
+from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.settings_template import GivenSettings
+
+CHOICE_SEPARATOR = ":"
+"""Separator of a profile and the name of its device in ``FoundDevice.name``."""
+
+
+@dataclass(frozen=True)
+class FoundDevice:
+    """Device that measures a pack."""
+
+    name: str
+    """Value of the option ``--device``: path of the serial port, or profile and address of the device."""
+    description: str
+    tables: GivenSettings
+    """Settings of the device: ``[sensor]`` or ``[source]``."""
+    cells: int | None = None
+    """Number of cells in series, if the device reports it."""
+    values: str = ""
+    """Values that were received during the search, as text; empty if the search received none."""
+    broker: str | None = None
+    """URL of the broker to which an MQTT device publishes; None: another kind of device."""
+
+    @property
+    def settings(self) -> Settings:
+        """Settings of a pack with this device, otherwise with default values. Nothing is published."""
+        source = dict(self.tables.get("source", {}))
+        if self.broker is not None:
+            source["url"] = self.broker
+        return Settings.model_validate({**self.tables, **({"source": source} if source else {})})
+
+    def __str__(self) -> str:
+        """Describe the device with the received values."""
+        return f"{self.description}; {self.values}" if self.values else self.description
+
+
+def values_text(voltage_v: float, current_a: float) -> str:
+    """Return voltage and current as text; the current is positive on discharge."""
+    direction = "discharging" if current_a > 0.0 else "charging" if current_a < 0.0 else "no current"
+    return f"{voltage_v:.2f} V, {abs(current_a):.2f} A, {direction}" if current_a else f"{voltage_v:.2f} V, {direction}"

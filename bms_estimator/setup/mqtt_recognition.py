@@ -1,0 +1,144 @@
+"""Recognition of battery publishers in MQTT messages by the topics of the known profiles. It does no I/O."""
+
+import functools
+import re
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+from bms_estimator.settings.mqtt_profiles import DISCHARGE, PROFILES, ProfileName
+from bms_estimator.settings.mqtt_source import MqttSource, ValueLocation
+from bms_estimator.setup.found_device import CHOICE_SEPARATOR, FoundDevice, values_text
+from bms_estimator.sources.mqtt.payload_value import InvalidValueError, read_cells, read_value
+
+MAX_PUBLISHERS = 1000
+"""Maximum number of publishers that are stored. Messages of further publishers are ignored."""
+_PLACEHOLDER = re.compile(r"\{(prefix|instance|cell)\}")
+_PATTERNS = {"prefix": ".+", "instance": "[^/]*", "cell": "[0-9]{1,3}"}
+"""Pattern of the text that replaces a placeholder of a topic."""
+
+
+class Publisher(NamedTuple):
+    """Battery in the topics of a profile."""
+
+    profile: ProfileName
+    prefix: str
+    instance: str
+
+
+class _Template(NamedTuple):
+    """Topic of a quantity in a profile."""
+
+    profile: ProfileName
+    quantity: str
+    location: ValueLocation
+    pattern: re.Pattern[str]
+
+
+class PublisherRecognition:
+    """Collection of the values that publishers of known profiles send."""
+
+    def __init__(self) -> None:
+        self._values: dict[Publisher, dict[str, float]] = {}
+        self._topics: dict[Publisher, str] = {}  # topic of the voltage
+
+    def add_message(self, topic: str, payload: bytes) -> None:
+        """Store the values that a message has for any profile."""
+        recognized = set[tuple[ProfileName, str]]()
+        for template in _templates():
+            key = (template.profile, template.quantity)
+            match = template.pattern.fullmatch(topic)
+            if match is None or key in recognized:
+                continue
+            publisher = _publisher(template.profile, match.groupdict())
+            if publisher not in self._values and len(self._values) >= MAX_PUBLISHERS:
+                continue
+            values = _values(template, publisher, topic, payload)
+            if values:
+                recognized.add(key)
+                self._values.setdefault(publisher, {}).update(values)
+                if template.quantity == "voltage":
+                    self._topics[publisher] = topic
+
+    def devices(self, broker: str) -> list[FoundDevice]:
+        """Return the publishers of voltage and current, those with most values first.
+
+        Several profiles may contain one topic. The publisher with most values is returned for each voltage topic; if
+        two have equally many, both are returned.
+
+        Args:
+            broker: URL of the broker that sent the messages.
+        """
+        complete = {p: values for p, values in self._values.items() if {"voltage", "current"} <= values.keys()}
+        most = dict[str, int]()
+        for publisher, values in complete.items():
+            topic = self._topics[publisher]
+            most[topic] = max(most.get(topic, 0), len(values))
+        best = [p for p, values in complete.items() if len(values) == most[self._topics[p]]]
+        return [_device(p, complete[p], broker) for p in sorted(best, key=lambda p: (-len(complete[p]), p))]
+
+
+@functools.cache
+def _templates() -> tuple[_Template, ...]:
+    """Return the topics of all profiles."""
+    return tuple(_iter_templates())
+
+
+def _iter_templates() -> Iterator[_Template]:
+    for name, profile in PROFILES.items():
+        for quantity in ("voltage", "current", "temperature", "cells"):
+            if quantity not in profile.table:
+                continue
+            location = ValueLocation.model_validate(profile.table[quantity])
+            for topic in location.topics:
+                yield _Template(name, quantity, location, _topic_pattern(topic))
+
+
+def _topic_pattern(topic: str) -> re.Pattern[str]:
+    """Return the pattern of a topic; its groups are the placeholders."""
+    pattern, end, seen = "", 0, set[str]()
+    for match in _PLACEHOLDER.finditer(topic):
+        name = match[1]
+        pattern += re.escape(topic[end : match.start()])
+        pattern += f"(?P={name})" if name in seen else f"(?P<{name}>{_PATTERNS[name]})"
+        seen.add(name)
+        end = match.end()
+    return re.compile(pattern + re.escape(topic[end:]))
+
+
+def _publisher(profile: ProfileName, groups: Mapping[str, str]) -> Publisher:
+    table = PROFILES[profile].table
+    return Publisher(profile, groups.get("prefix", ""), groups.get("instance", table.get("instance", "")))
+
+
+def _values(template: _Template, publisher: Publisher, topic: str, payload: bytes) -> dict[str, float]:
+    """Return the values of a payload by name; cells are named by their numbers. Without a valid value it is empty."""
+    path = template.location.path.replace("{prefix}", publisher.prefix).replace("{instance}", publisher.instance)
+    cell = template.pattern.fullmatch(topic)
+    try:
+        if template.quantity != "cells":
+            return {template.quantity: read_value(payload, template.location, path)}
+        if cell and "cell" in cell.groupdict():
+            return {f"cell {int(cell['cell'])}": read_value(payload, template.location, path)}
+        return {f"cell {number}": v for number, v in read_cells(payload, template.location, path).items()}
+    except InvalidValueError:
+        return {}
+
+
+def _device(publisher: Publisher, values: Mapping[str, float], broker: str) -> FoundDevice:
+    profile = PROFILES[publisher.profile]
+    source = {"kind": "mqtt", "profile": publisher.profile}
+    for key in ("prefix", "instance"):
+        value = getattr(publisher, key)
+        if value and value != profile.table.get(key):
+            source[key] = value
+    sign = 1.0 if profile.current_sign == DISCHARGE else -1.0
+    name = CHOICE_SEPARATOR.join(filter(None, (publisher.profile, source.get("prefix"), source.get("instance"))))
+    cells = sum(key.startswith("cell ") for key in values)
+    return FoundDevice(
+        name=name,
+        description=f"{MqttSource.model_validate(source).short_description}, {broker}",
+        tables={"source": source},
+        cells=cells or None,
+        values=values_text(values["voltage"], sign * values["current"]),
+        broker=broker,
+    )

@@ -1,0 +1,1 @@
+"""Setup as a web page."""

@@ -1,0 +1,122 @@
+"""Server of the setup page."""
+
+import asyncio
+import functools
+import json
+import secrets
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from aiohttp import web
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads import Estimate
+from bms_estimator.page.event_stream import LatestValues
+from bms_estimator.page.page_server import FILES as PAGE_FILES
+from bms_estimator.page.web_server import File, WebServer
+from bms_estimator.settings.page import PageSettings
+from bms_estimator.setup.answers import InvalidAnswerError
+from bms_estimator.setup.page.session import SetupSession
+from bms_estimator.setup.page.view import KEY_FIELD, page
+
+STATIC = Path(__file__).with_name("static")
+FILES = {
+    "/style.css": PAGE_FILES["/style.css"],
+    "/icon.svg": PAGE_FILES["/icon.svg"],
+    "/setup.css": File(STATIC / "setup.css", "text/css"),
+    "/setup.js": File(STATIC / "setup.js", "text/javascript"),
+}
+"""Static files by URL path."""
+
+Fields = Any
+"""Fields of a form, by name."""
+
+
+class SetupServer(WebServer):
+    """Server of the setup page of one pack; a context manager.
+
+    Args:
+        settings: Address and access of the page.
+        file: Settings file to create.
+
+    Raises:
+        UserError: The token cannot be read.
+    """
+
+    def __init__(self, settings: PageSettings, file: Path) -> None:
+        self._latest_estimate = LatestValues()
+        self._session = SetupSession(file, self._show)
+        self._form_key, self._lock = secrets.token_hex(16), asyncio.Lock()
+        steps: dict[str, Callable[[Fields], Awaitable[None]]] = {
+            "/search": self._search,
+            "/device": self._choose_device,
+            "/compare/voltage": functools.partial(self._compare, "voltage"),
+            "/compare/zero": functools.partial(self._compare, "zero"),
+            "/compare/current": functools.partial(self._compare, "current"),
+            "/compare/direction": functools.partial(self._compare, "direction"),
+            "/continue": self._continue,
+            "/pack": self._create,
+        }
+        super().__init__(
+            settings,
+            FILES,
+            self._latest_estimate,
+            {"/": self._page},
+            forms={path: functools.partial(self._run_step, step) for path, step in steps.items()},
+            retry=False,
+        )
+
+    async def __aexit__(self, *error: object) -> None:
+        """End the search or the estimator, and the server."""
+        await self._session.close()
+        await super().__aexit__(*error)
+
+    def _show(self, estimate: Estimate) -> None:
+        """Send an estimate to the page."""
+        values = {
+            "soc": estimate.soc and 100.0 * estimate.soc,
+            "band": estimate.soc_std and 200.0 * estimate.soc_std,
+            "voltage": estimate.voltage_v,
+            "current": estimate.current_a,
+        }
+        self._latest_estimate.set_value("estimate", json.dumps(values))
+
+    async def _page(self, _: web.Request) -> web.StreamResponse:
+        return web.Response(
+            text=page(self._session, self._form_key), content_type="text/html", headers={"Cache-Control": "no-store"}
+        )
+
+    async def _run_step(self, step: Callable[[Fields], Awaitable[None]], request: web.Request) -> web.StreamResponse:
+        """Run a step with the fields of a form, then show the page again.
+
+        A form without the key of this server comes from another page and is rejected.
+        """
+        fields = await request.post()
+        if not secrets.compare_digest(str(fields.get(KEY_FIELD, "")).encode(), self._form_key.encode()):
+            raise web.HTTPForbidden(text="this form is of an earlier start of the program; open the page again\n")
+        async with self._lock:
+            self._session.error = ""
+            try:
+                await step(fields)
+            except (UserError, InvalidAnswerError) as error:
+                self._session.error = str(error)
+        return web.Response(status=303, headers={"Location": "/"})
+
+    async def _search(self, fields: Fields) -> None:
+        places = str(fields.get("places", "")).split()
+        if not places:
+            raise UserError("name at least one place to search")
+        self._session.start_search(places)
+
+    async def _choose_device(self, fields: Fields) -> None:
+        await self._session.choose_device(str(fields.get("device", "")))
+
+    async def _compare(self, quantity: str, fields: Fields) -> None:
+        await self._session.compare(quantity, str(fields.get("value", "")).strip())
+
+    async def _continue(self, _: Fields) -> None:
+        await self._session.finish_comparison()
+
+    async def _create(self, fields: Fields) -> None:
+        self._session.create({name: str(value) for name, value in fields.items()})

@@ -1,0 +1,162 @@
+"""HTML of the setup page. Every step is a form that works without a script."""
+
+import shlex
+from collections.abc import Iterable
+from html import escape
+
+from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
+from bms_estimator.setup.new_pack import install_command
+from bms_estimator.setup.page.session import SetupSession, Step
+from bms_estimator.setup.questions import QUESTIONS, Question
+
+TITLES = {
+    Step.SEARCH: "Search",
+    Step.SEARCHING: "Search",
+    Step.DEVICE: "Device",
+    Step.MULTIMETER: "Multimeter",
+    Step.PACK: "Pack",
+    Step.DONE: "First estimate",
+}
+"""Title of each step."""
+REFRESH_S = 2
+"""Interval at which the page is loaded again while the search runs [s]."""
+KEY_FIELD = "form_key"
+"""Name of the hidden field with the key of the forms."""
+
+
+def page(session: SetupSession, form_key: str) -> str:
+    """Return the page of the present step.
+
+    Args:
+        session: State of the setup.
+        form_key: Key that every form sends, so that a foreign page cannot send one.
+    """
+    refresh = f'<meta http-equiv="refresh" content="{REFRESH_S}">' if session.step is Step.SEARCHING else ""
+    steps = "".join(
+        f"<li{' aria-current=step' if title == TITLES[session.step] else ''}>{title}</li>"
+        for title in dict.fromkeys(TITLES.values())
+    )
+    error = f'<p id="why" role="alert">{escape(session.error)}</p>' if session.error else ""
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">{refresh}<title>Set up a pack - bms_estimator</title>
+<link rel="icon" href="/icon.svg"><link rel="stylesheet" href="/style.css"><link rel="stylesheet" href="/setup.css">
+<script type="module" src="/setup.js"></script></head>
+<body class="setup"><header><img src="/icon.svg" alt="" width="30" height="30"><div class="who"><h1>Set up a pack</h1>
+<p id="what">{escape(str(session.file))}</p></div></header>
+<ol class="steps">{steps}</ol>{error}<main>{_BODIES[session.step](session, form_key)}</main></body></html>"""
+
+
+def _form(action: str, form_key: str, content: str, button: str, *, secondary: bool = False) -> str:
+    css_class = ' class="secondary"' if secondary else ""
+    return (
+        f'<form method="post" action="/{action}"><input type="hidden" name="{KEY_FIELD}" value="{form_key}">'
+        f"{content}<button{css_class}>{button}</button></form>"
+    )
+
+
+def _search(session: SetupSession, form_key: str) -> str:
+    places = escape("\n".join(session.places))
+    content = (
+        '<label>Where to search<textarea name="places" rows="4">' + places + "</textarea></label>"
+        '<p class="note">One place per line: path of a serial port, URL of an MQTT broker (mqtt://host), host name of a '
+        "Modbus device, or bluetooth. A serial port takes up to 20 s.</p>"
+    )
+    found = session.step is Step.DEVICE and bool(session.result.devices)
+    button = "Search again" if session.step is Step.DEVICE else "Search"
+    return f'<section class="card">{_form("search", form_key, content, button, secondary=found)}</section>'
+
+
+def _searching(session: SetupSession, _: str) -> str:
+    return (
+        '<section class="card"><h2>Searching</h2>'
+        f"<ul>{_items(session.places)}</ul><p class='note'>This takes up to 20 s.</p></section>"
+    )
+
+
+def _device(session: SetupSession, form_key: str) -> str:
+    devices = "".join(
+        f'<label class="choice"><input type="radio" name="device" value="{escape(device.name)}"'
+        f"{' checked' if len(session.result.devices) == 1 else ''} required>"
+        f"<span><b>{escape(device.name)}</b> {escape(str(device))}</span></label>"
+        for device in session.result.devices
+    )
+    form = _form("device", form_key, devices, "Use this device") if devices else "<p>No device was found.</p>"
+    failures = f'<ul class="note">{_items(session.result.failures)}</ul>' if session.result.failures else ""
+    return f'<section class="card"><h2>Found</h2>{form}{failures}</section>{_search(session, form_key)}'
+
+
+def _multimeter(session: SetupSession, form_key: str) -> str:
+    results = f"<ul>{_items(session.comparisons)}</ul>" if session.comparisons else ""
+    voltage = _number_field("value", "Voltage at the terminals of the pack by the multimeter [V]")
+    current = _number_field("value", "Current of a load by the multimeter [A], negative while the pack is charged")
+    direction = (
+        '<label>Or without a multimeter: the pack is now<select name="value">'
+        f"<option>{DISCHARGING}</option><option>{CHARGING}</option></select></label>"
+    )
+    return (
+        f'<section class="card"><h2>Measured by the device</h2><p class="big">{escape(str(session.measured))}</p>'
+        f"{results}{_form('continue', form_key, '', 'Continue')}</section>"
+        '<section class="card"><h2>Compare with a multimeter</h2><p class="note">Each comparison may be left out. '
+        "A second voltage at another state of charge makes the gain more exact.</p>"
+        f"{_form('compare/voltage', form_key, voltage, 'Compare voltage', secondary=True)}"
+        f"{_form('compare/zero', form_key, '<p>Switch off all loads and chargers.</p>', 'Take the zero', secondary=True)}"
+        f"{_form('compare/current', form_key, current, 'Compare current', secondary=True)}"
+        f"{_form('compare/direction', form_key, direction, 'Check the sign', secondary=True)}</section>"
+    )
+
+
+def _pack(session: SetupSession, form_key: str) -> str:
+    fields = "".join(_question(session, question) for question in QUESTIONS)
+    return f'<section class="card">{_form("pack", form_key, fields, "Write the settings file")}</section>'
+
+
+def _done(session: SetupSession, _: str) -> str:
+    if session.pack is None:
+        return ""
+    warnings = f"<ul class='bad'>{_items(session.pack.warnings)}</ul>" if session.pack.warnings else ""
+    command = escape(shlex.join(install_command(session.file)))
+    return (
+        '<section class="card"><h2>State of charge</h2><p class="huge"><b data-q="soc">&nbsp;</b><small>%</small></p>'
+        '<p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p>'
+        '<p id="wait" role="status">Waiting for the first estimate. The first start compiles the kernels, which takes a '
+        'minute or two.</p><p>measured <b data-q="voltage"></b> V, <b data-q="current"></b> A</p></section>'
+        f'<section class="card"><h2>{escape(str(session.file))} is written</h2><p>{escape(session.pack.summary)}</p>'
+        f"{warnings}<p>End this program, then install the service:</p><pre>{command}</pre></section>"
+    )
+
+
+_BODIES = {
+    Step.SEARCH: _search,
+    Step.SEARCHING: _searching,
+    Step.DEVICE: _device,
+    Step.MULTIMETER: _multimeter,
+    Step.PACK: _pack,
+    Step.DONE: _done,
+}
+
+
+def _question(session: SetupSession, question: Question) -> str:
+    """Return the field of a question, with the default or the rejected answer in it."""
+    default = question.suggest(session.answers) if session.answers else ""
+    entered = session.texts.get(question.name, default)
+    reason = session.invalid.get(question.name)
+    error = f'<span class="bad" role="alert">{escape(reason)}</span>' if reason else ""
+    if question.choices:
+        options = "".join(
+            f'<option value="{name}"{" selected" if name == entered else ""}>{escape(text)}</option>'
+            for name, text in question.choices
+        )
+        control = f'<select name="{question.name}" required><option value=""></option>{options}</select>'
+    else:
+        hint = "empty: the number that fits the measured voltage" if question.name == "series" and not default else ""
+        control = f'<input name="{question.name}" value="{escape(entered)}" placeholder="{hint}" autocomplete="off">'
+    return f"<label>{escape(question.text)}{control}{error}</label>"
+
+
+def _number_field(name: str, text: str) -> str:
+    return f'<label>{text}<input name="{name}" inputmode="decimal" autocomplete="off" required></label>'
+
+
+def _items(texts: Iterable[str]) -> str:
+    return "".join(f"<li>{escape(text)}</li>" for text in texts)

@@ -1,0 +1,178 @@
+"""Questions about a new pack. The terminal and the page ask them in this order; each answer is also an option."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from bms_estimator.estimator.settings_plausibility import MAX_CAPACITY_AH
+from bms_estimator.model.cell import generic_cells, shipped_cells
+from bms_estimator.model.config_file import error_reason, without_secrets
+from bms_estimator.model.decimal_text import number
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.pack import PackSettings
+from bms_estimator.setup.answers import Answers, InvalidAnswerError
+from bms_estimator.setup.series_count import cell_voltages, possible_counts, suggest_count
+
+CHEMISTRIES: Mapping[str, str] = {
+    "lfp": "LFP, LiFePO4: 3.2 V per cell",
+    "nmc": "NMC: 3.7 V per cell, most e-bikes and cars",
+    "nca": "NCA: 3.6 V per cell, many 18650 cells",
+    "lco": "LCO: 3.7 V per cell, phones and laptops",
+    "lmo": "LMO: 3.8 V per cell",
+    "lto": "LTO, titanate: 2.4 V per cell",
+}
+"""Descriptions of the generic cells by name."""
+SYNONYMS = {
+    synonym.lower(): name
+    for name, description in CHEMISTRIES.items()
+    for synonym in description.partition(":")[0].split(", ")
+}
+"""Names of the generic cells by the names of the chemistry in the descriptions."""
+NO_BROKER = "none"
+"""Answer by which the service publishes nothing over MQTT."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """Question about the pack."""
+
+    name: str
+    """Name of the answer in ``Answers``. The option is the same name with dashes."""
+    text: str
+    help: str
+    parse: Callable[[str, Answers], object]
+    """Convert the text of an answer; raises InvalidAnswerError."""
+    suggest: Callable[[Answers], str]
+    """Return the default answer; empty without one."""
+    choices: tuple[tuple[str, str], ...] = ()
+    """Usual answers with their descriptions."""
+
+    @property
+    def option(self) -> str:
+        """Option of the command line."""
+        return f"--{self.name.replace('_', '-')}"
+
+    def answer(self, text: str, answers: Answers) -> Answers:
+        """Return the answers with this one.
+
+        Raises:
+            InvalidAnswerError: The answer cannot be right.
+        """
+        values: dict[str, Any] = {self.name: self.parse(text.strip(), answers)}
+        return replace(answers, **values)
+
+
+def _validated(model: type[BaseModel], key: str, value: object) -> object:
+    """Return a value after checking it against its setting.
+
+    Raises:
+        InvalidAnswerError: The setting rejects the value.
+    """
+    try:
+        return getattr(model.model_validate({key: value}), key)
+    except ValidationError as error:
+        detail = error.errors()[0]
+        description = model.model_fields[key].description
+        raise InvalidAnswerError(f"{without_secrets(str(value))}: {error_reason(detail)} ({description})") from None
+
+
+def _parse_name(text: str, _: Answers) -> object:
+    return _validated(PackSettings, "name", text)
+
+
+def _parse_cell(text: str, answers: Answers) -> object:
+    name = SYNONYMS.get(text.lower(), text.lower())
+    if name not in (*generic_cells(), *shipped_cells()):
+        raise InvalidAnswerError(f"{text}: must be one of {', '.join((*generic_cells(), *shipped_cells()))}")
+    if answers.voltage_v is not None and not possible_counts(answers.voltage_v, cell_voltages(name)):
+        raise InvalidAnswerError(
+            f"{text}: {answers.voltage_v:.2f} V is the voltage of no number of such cells in series"
+        )
+    return name
+
+
+def _parse_capacity(text: str, _: Answers) -> object:
+    value = _validated(PackSettings, "capacity_ah", _number(text))
+    if isinstance(value, float) and value > MAX_CAPACITY_AH:
+        raise InvalidAnswerError(f"{text}: no cell has more than {MAX_CAPACITY_AH:g} Ah; is it in mAh?")
+    return value
+
+
+def _parse_series(text: str, answers: Answers) -> object:
+    series = _validated(PackSettings, "series", _integer(text))
+    reported = answers.device.cells
+    if reported is not None and series != reported:
+        raise InvalidAnswerError(f"{text}: the device reports {reported} cells in series")
+    if answers.voltage_v is None or answers.cell is None or not isinstance(series, int):
+        return series
+    possible = possible_counts(answers.voltage_v, cell_voltages(answers.cell))
+    if series not in possible:
+        raise InvalidAnswerError(
+            f"{text}: the pack has {answers.voltage_v:.2f} V, which is {answers.voltage_v / series:.2f} V per cell; "
+            f"{possible.start} to {possible.stop - 1} {answers.cell} cells in series are possible"
+        )
+    return series
+
+
+def _parse_parallel(text: str, _: Answers) -> object:
+    return _validated(PackSettings, "parallel", _integer(text))
+
+
+def _parse_broker(text: str, _: Answers) -> object:
+    return "" if text == NO_BROKER else _validated(MqttSettings, "url", text)
+
+
+def _suggest_series(answers: Answers) -> str:
+    if answers.device.cells is not None:
+        return str(answers.device.cells)
+    if answers.voltage_v is None or answers.cell is None:
+        return ""
+    return str(suggest_count(answers.voltage_v, cell_voltages(answers.cell)) or "")
+
+
+def _number(text: str) -> float:
+    try:
+        return number(text.replace(",", "."))
+    except ValueError:
+        raise InvalidAnswerError(f"{text}: must be a number") from None
+
+
+def _integer(text: str) -> int:
+    value = _number(text)
+    if value != int(value):
+        raise InvalidAnswerError(f"{text}: must be a whole number")
+    return int(value)
+
+
+QUESTIONS = (
+    Question(
+        "name",
+        "Name of the pack",
+        "name of the pack, also in MQTT topics: letters, digits, _ and -",
+        _parse_name,
+        lambda answers: answers.name or "pack",
+    ),
+    Question(
+        "cell",
+        "Chemistry of the cells",
+        "chemistry (lfp, nmc, nca, lco, lmo or lto) or shipped cell",
+        _parse_cell,
+        lambda _: "",
+        tuple(CHEMISTRIES.items()),
+    ),
+    Question(
+        "capacity_ah", "Capacity of one cell [Ah]", "rated capacity of one cell [Ah]", _parse_capacity, lambda _: ""
+    ),
+    Question("series", "Cells in series", "number of cells in series", _parse_series, _suggest_series),
+    Question("parallel", "Cells in parallel", "number of cells in parallel", _parse_parallel, lambda _: "1"),
+    Question(
+        "broker",
+        "MQTT broker to publish to",
+        f"URL of the MQTT broker to which the service publishes, mqtt://host:port; {NO_BROKER}: no broker",
+        _parse_broker,
+        lambda answers: answers.device.broker or answers.heard_broker or NO_BROKER,
+    ),
+)
+"""Questions in their order."""

@@ -1,0 +1,180 @@
+"""Search for devices: serial ports, MQTT publishers, Modbus, Bluetooth."""
+
+import asyncio
+import importlib.util
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from pydantic import ValidationError
+
+from bms_estimator.model.config_file import without_secrets
+from bms_estimator.model.errors import UserError
+from bms_estimator.mqtt.broker_config import brokers, check
+from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.settings.modbus_source import PROFILES as MODBUS_PROFILES
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.sensor import SensorSettings
+from bms_estimator.setup.found_device import CHOICE_SEPARATOR, FoundDevice
+from bms_estimator.setup.measurement import measure
+from bms_estimator.setup.mqtt_recognition import PublisherRecognition
+from bms_estimator.sources.serial.device_detection import DetectedDevice, probe
+from bms_estimator.sources.serial.port_list import board_ports
+
+LISTEN_S = 12.0
+"""Time for which MQTT messages are received [s]. The publishers with default settings send at least every 10 s."""
+MODBUS_S = 3.0
+"""Timeout of the first sample of a Modbus device [s], which answers a request within a second."""
+MAX_WAITING = 10_000
+"""Maximum number of received messages that wait to be read. A broker sends all retained messages at once."""
+BLUETOOTH = "bluetooth"
+"""Name of the place where Bluetooth devices are searched."""
+DEFAULT_BROKER = str(MqttSettings.model_fields["url"].default)
+"""URL of the broker that is searched by default."""
+
+
+@dataclass
+class SearchResult:
+    """Devices that were found, and reasons why others were not."""
+
+    devices: list[FoundDevice] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    """Places without a device, each with the reason."""
+    broker: str | None = None
+    """URL of the broker that answered; None: no broker."""
+
+
+def default_places() -> list[str]:
+    """Return the places that are searched by default: ports that may belong to a board or BMS, a local broker, Bluetooth."""
+    return [*board_ports(), DEFAULT_BROKER, BLUETOOTH]
+
+
+async def search(places: Sequence[str]) -> SearchResult:
+    """Search all places at the same time.
+
+    Args:
+        places: Paths of serial ports, URLs of MQTT brokers, ``BLUETOOTH``, and Modbus devices as ``host`` or ``host:port``.
+
+    Raises:
+        UserError: A URL cannot be used.
+    """
+    result = SearchResult()
+    await asyncio.gather(*(_search_place(place, result) for place in places))
+    result.devices.sort(key=lambda device: device.broker is not None)  # serial devices first
+    return result
+
+
+async def _search_place(place: str, result: SearchResult) -> None:
+    if place == BLUETOOTH:
+        await _search_bluetooth(result)
+    elif "://" in place:
+        await _search_mqtt(place, result)
+    elif "/" in place:
+        await _search_serial_port(place, result)
+    else:
+        await _search_modbus_host(place, result)
+
+
+async def _search_serial_port(port: str, result: SearchResult) -> None:
+    """Identify the device on a serial port. A device that no protocol recognizes is polled as a known Modbus device."""
+    found = await asyncio.to_thread(probe, port)
+    if isinstance(found, DetectedDevice):
+        result.devices.append(serial_device(port, found))
+        return
+    result.failures.append(f"{port}: {found}")
+    if found == "silent":
+        await _search_modbus({"port": port}, port, result)
+
+
+def serial_device(port: str, found: DetectedDevice) -> FoundDevice:
+    """Return the device on a serial port with its settings."""
+    sensor: dict[str, object] = {"port": port, "protocol": found.protocol}
+    if found.baud != SensorSettings.model_validate(sensor).baud:
+        sensor["baud"] = found.baud
+    return FoundDevice(port, str(found), {"sensor": sensor}, found.cells)
+
+
+async def _search_mqtt(url: str, result: SearchResult) -> None:
+    """Listen to all messages of a broker, and find the publishers of known profiles.
+
+    Raises:
+        UserError: The URL cannot be used.
+    """
+    try:
+        settings = MqttSettings(url=url)
+    except ValidationError:
+        raise UserError(f"{without_secrets(url)}: must be mqtt://host:port, or mqtts://host:port for TLS") from None
+    check(settings)
+    recognition = PublisherRecognition()
+    options = ConnectOptions(
+        f"bms-search-{secrets.token_hex(4)}", will=None, on_message_lost=lambda *_: None, max_waiting=MAX_WAITING
+    )
+    try:
+        async with BrokerConnector(settings)(brokers(settings)[0], options) as connection:
+            result.broker = url
+            for topic, reason in (await connection.subscribe(None, ["#"])).items():
+                result.failures.append(f"{url}: not allowed to read {topic}: {reason}")
+                return
+            try:
+                async with asyncio.timeout(LISTEN_S):
+                    while True:
+                        message = await connection.receive()
+                        recognition.add_message(message.topic, message.payload)
+            except TimeoutError:
+                pass
+    except BrokerConnectionError as error:
+        result.failures.append(f"{url}: {error}")
+        return
+    found = recognition.devices(url)
+    result.devices += found
+    if not found:
+        result.failures.append(f"{url}: no message of a known publisher within {LISTEN_S:g} s")
+
+
+async def _search_modbus_host(place: str, result: SearchResult) -> None:
+    """Poll a Modbus TCP device or gateway, ``host`` or ``host:port``, as each known device."""
+    host, separator, port = place.partition(":")
+    if separator and not port.isdecimal():
+        raise UserError(f"{place}: must be a host or host:port")
+    await _search_modbus({"host": host} | ({"tcp_port": int(port)} if port else {}), place, result)
+
+
+async def _search_modbus(address: dict[str, object], name: str, result: SearchResult) -> None:
+    if importlib.util.find_spec("pymodbus") is None:
+        if "host" in address:  # a serial port is reported already
+            result.failures.append(f"{name}: Modbus was not searched: pip install 'bms_estimator[modbus]'")
+        return
+    is_serial = "port" in address
+    profiles = [name for name, table in MODBUS_PROFILES.items() if not is_serial or "baud" in table]
+    for profile in profiles:
+        source = {"kind": "modbus", "profile": profile, **address}
+        device = FoundDevice(
+            f"{profile}{CHOICE_SEPARATOR}{name}", f"Modbus device {profile} at {name}", {"source": source}
+        )
+        try:
+            values = await measure(device.settings, MODBUS_S)
+        except UserError as error:
+            if "host" in address:
+                result.failures.append(f"{name}: {profile}: {error}")
+        else:
+            result.devices.append(FoundDevice(device.name, device.description, device.tables, values=str(values)))
+
+
+async def _search_bluetooth(result: SearchResult) -> None:
+    """Find the Bluetooth BMS that advertise, if the optional package is installed."""
+    if importlib.util.find_spec("aiobmsble") is None:
+        result.failures.append("Bluetooth: not searched: pip install 'bms_estimator[ble]'")
+        return
+    from bms_estimator.sources.bluetooth.client import discover  # noqa: PLC0415 - needs an optional package
+
+    try:
+        found = await discover()
+    except UserError as error:
+        result.failures.append(f"Bluetooth: {error}")
+        return
+    for bms in found:
+        source = {"kind": "ble", "address": bms.address}
+        result.devices.append(FoundDevice(bms.address, f"Bluetooth BMS {bms.name}, {bms.kind}", {"source": source}))
+    if not found:
+        result.failures.append("Bluetooth: no BMS advertises")

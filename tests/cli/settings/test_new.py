@@ -1,0 +1,266 @@
+"""``new``: the wizard finds the device, asks, compares with a multimeter, writes the file and shows the first estimate."""
+
+import asyncio
+import os
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.protocols.firmware.messages import Hello
+from bms_estimator.settings.pack import load_settings
+from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.sources.serial.device_detection import BoardClient
+from tests.command_line import PROGRAM, run
+from tests.device_line import running_device
+from tests.mosquitto import Broker, Listener
+from tests.patience import LONG_S
+from tests.pseudo_terminal import PseudoTerminal
+from tests.simavr_board import SimavrBoard, write_readings
+
+ESTIMATE = re.compile(r"SOC [0-9.]+% ± [0-9.]+% \(2 standard deviations\), 26\.66 V, 5\.50 A")
+ANSWERS = {
+    "--name": "house",
+    "--cell": "lfp",
+    "--capacity-ah": "100",
+    "--series": "8",
+    "--parallel": "1",
+    "--broker": "none",
+}
+"""Answers about a pack of eight cells."""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "pack.toml"
+
+
+@pytest.fixture
+def long_probe(monkeypatch):
+    """Shorten the wait for a board, and lengthen the wait for answers in other protocols."""
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
+    monkeypatch.setattr("bms_estimator.setup.measurement.FIRST_SAMPLE_S", LONG_S)
+    monkeypatch.setattr("bms_estimator.setup.measurement.AVERAGE_S", 0.1)
+
+
+def jk_bms(current_a: float = 5.0) -> SimulatedBms:
+    return SimulatedBms("jk", lambda _: Reading(current_a, 26.4, 21.0), cells=8)
+
+
+def options(**changes: str | None) -> list[str]:
+    """Return the options of ``ANSWERS`` with changes; None removes an option."""
+    given = ANSWERS | {f"--{name.replace('_', '-')}": value for name, value in changes.items()}
+    return [text for name, value in given.items() if value is not None for text in (name, value)]
+
+
+def dialog(path: str) -> list[tuple[str, str, str]]:
+    """Return questions, answers and replies of a session in which each kind of wrong answer occurs."""
+    return [
+        ("Number of the device", "7", "7: was not found"),
+        ("Number of the device", "/dev/none", "-  /dev/none: cannot be opened: No such file or directory\n"),
+        ("Number of the device", "", "an answer is required"),
+        ("Number of the device", path, f"1  {path}: JK-BMS"),
+        ("Number of the device", "", "measured: 26.40 V, 5.00 A, discharging"),
+        ("Compare the device with a multimeter", "y", "Press Enter without a value to skip a step"),
+        ("Voltage at the terminals", "2.6", "which differs by more than 20%"),
+        ("Voltage at the terminals", "26,664", "voltage: device 26.400 V, multimeter 26.664 V: gain 1.0100"),
+        ("Voltage again", "", "Switch off all loads"),
+        ("Switch off all loads", "0", "is everything switched off?"),
+        ("Switch off all loads", "", "Switch on a load"),
+        ("Switch on a load", "0.1", "switch on a larger load"),
+        ("Switch on a load", "5.5", "gain 1.1000"),
+        ("Name of the pack", "my pack", "my pack: is not of the form"),
+        ("Name of the pack", "house", "lfp  LFP, LiFePO4"),
+        ("Chemistry of the cells", "lead", "lead: must be one of"),
+        ("Chemistry of the cells", "LiFePO4", "Capacity of one cell"),
+        ("Capacity of one cell", "100000", "is it in mAh?"),
+        ("Capacity of one cell", "-100", "-100.0: must be greater than 0"),
+        ("Capacity of one cell", "much", "much: must be a number"),
+        ("Capacity of one cell", "100", "Cells in series"),
+        ("Cells in series", "4", "4: the device reports 8 cells in series"),
+        ("Cells in series", "", "Cells in parallel"),
+        ("Cells in parallel", "1.5", "1.5: must be a whole number"),
+        ("Cells in parallel", "", "MQTT broker"),
+        ("MQTT broker", "localhost", "localhost: must be mqtt://host:port"),
+        ("MQTT broker", "none", "pack.toml: written; house: lfp, 8 in series"),
+        ("Install the service", "n", "bms-estimator install"),
+    ]
+
+
+def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
+    with running_device(jk_bms()) as path, PseudoTerminal("new", str(file), "--search", path, columns=200) as terminal:
+        for question, answer, reply in dialog(path):
+            terminal.until(lambda question=question: re.search(f"{question}[^\n]*[:?] $", plain(terminal.output)))
+            terminal.output = ""
+            terminal.press(f"{answer}\r".encode())
+            terminal.until(lambda reply=reply: reply in plain(terminal.output))
+            if reply.startswith("pack.toml"):
+                terminal.until(lambda: ESTIMATE.search(plain(terminal.output)))
+        terminal.until(terminal.ended)
+    assert terminal.process.returncode == 0
+    assert tomllib.loads(file.read_text())["pack"]["name"] == "house"
+    settings = load_settings(file)
+    assert (settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == ("lfp", 100.0, 8)
+    assert (settings.sensor.port, settings.sensor.protocol, settings.mqtt) == (path, "jk", None)
+    assert (settings.sensor.voltage_gain, settings.sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
+
+
+def plain(output: str) -> str:
+    """Return the output without control sequences."""
+    return re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", output).replace("\r", "")
+
+
+def test_options_answer_all_questions_without_a_terminal(file, capsys, long_probe):
+    with running_device(jk_bms()) as path:
+        code, out, err = run(
+            capsys, "new", file, "--device", path, *options(), "--no-compare", "--no-install", "--no-estimate"
+        )
+    assert (code, err) == (0, "")
+    assert f"1  {path}: JK-BMS, 8 cells" in out
+    assert f"{file}: written; house: lfp, 8 in series, 26 V, 100 Ah; jk on {path}; no broker" in out
+    written = tomllib.loads(file.read_text())
+    assert written["sensor"] == {"port": path, "protocol": "jk"}
+    pack = {"name": "house", "cell": "lfp", "capacity_ah": 100.0, "series": 8, "parallel": 1}
+    assert written["pack"] == pack
+
+
+def test_the_service_is_installed_with_sudo(file, capsys, long_probe, tmp_path, monkeypatch):
+    sudo = tmp_path / "sudo"
+    sudo.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/arguments\nexit 3\n')
+    sudo.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    with running_device(jk_bms()) as path:
+        code, _, _ = run(capsys, "new", file, "--device", path, *options(), "--yes", "--no-estimate", "--install")
+    assert (tmp_path / "arguments").read_text() == f"{PROGRAM} install {file}\n"
+    assert code == 3  # that of the installation
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--no-compare", *options(cell=None)], "--cell: missing, and there is no terminal to ask"),
+        (["--yes", *options(capacity_ah=None)], "--capacity-ah: missing, and there is no default"),
+        (options(), "--compare: missing"),
+        (["--no-compare", *options(series="4")], "--series 4: the device reports 8 cells in series"),
+        (["--no-compare", *options(broker="ftp://x")], "--broker ftp://x: must be mqtt://host:port"),
+        (["--voltmeter-v", "3.3", *options()], "3.3 V: the device measures 26.40 V, which differs by more than 20%"),
+        (
+            ["--zero", "--ammeter-a", "5", *options()],
+            "--zero: no current flows, but --ammeter-a or --direction states one",
+        ),
+        (["--device", "/dev/none", *options()], "--device /dev/none: was not found; found: /dev/"),
+    ],
+)
+def test_a_missing_or_wrong_option_is_named_and_nothing_is_written(file, capsys, long_probe, arguments, message):
+    with running_device(jk_bms()) as path:
+        device = [] if "--device" in arguments else ["--device", path]
+        code, _, err = run(capsys, "new", file, "--search", path, *device, *arguments)
+    assert code == 2
+    assert message in err
+    assert not file.exists()
+
+
+def test_an_existing_file_is_not_changed(file, capsys):
+    file.write_text("mine\n")
+    code, _, err = run(capsys, "new", file, "--search", "/dev/none")
+    assert code == 2
+    assert f"{file}: exists already and is not changed" in err
+    assert file.read_text() == "mine\n"
+
+
+def test_a_port_without_a_device_is_reported_with_the_reason(file, capsys, tmp_path):
+    code, out, err = run(capsys, "new", file, "--search", tmp_path / "none", "--yes")
+    assert code == 2
+    assert f"-  {tmp_path / 'none'}: cannot be opened" in out
+    assert "--search: no device was found" in err
+
+
+def test_a_multimeter_corrects_gain_and_sign_of_a_bms(file, capsys, long_probe):
+    with running_device(jk_bms(current_a=-5.0)) as path:
+        meter = ["--voltmeter-v", "26.664", "--ammeter-a", "5.5"]
+        code, out, err = run(capsys, "new", file, "--device", path, *options(), *meter, "--yes", "--no-estimate")
+    assert (code, err) == (0, "")
+    assert "voltage: device 26.400 V, multimeter 26.664 V: gain 1.0100" in out
+    assert "the sign of the current is reversed" in out
+    sensor = load_settings(file).sensor
+    assert (sensor.voltage_gain, sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
+    assert sensor.current_sign == "discharge_positive"  # a JK-BMS reports charge as positive
+
+
+def test_the_direction_of_a_load_corrects_the_sign_alone(file, capsys, long_probe):
+    with running_device(jk_bms(current_a=-5.0)) as path:
+        arguments = [*options(), "--direction", "discharging", "--yes", "--no-estimate"]
+        code, out, err = run(capsys, "new", file, "--device", path, *arguments)
+    assert (code, err) == (0, "")
+    assert "current: the sign is reversed" in out
+    assert tomllib.loads(file.read_text())["sensor"]["current_sign"] == "discharge_positive"
+    assert load_settings(file).sensor.current_gain == 1.0
+
+
+def test_the_zero_of_a_bms_is_written_with_its_sign(file, capsys, long_probe):
+    with running_device(jk_bms(current_a=0.3)) as path:
+        code, _, err = run(capsys, "new", file, "--device", path, *options(), "--zero", "--yes", "--no-estimate")
+    assert (code, err) == (0, "")
+    assert load_settings(file).sensor.current_zero_a == pytest.approx(-0.3)
+
+
+@pytest.mark.usefixtures("firmware")
+def test_a_multimeter_corrects_the_gains_of_the_firmware(file, capsys, tmp_path):
+    readings = write_readings(tmp_path / "pack.csv", [(0.0, 5.0, 13.2, 25.0)])
+    with SimavrBoard(readings) as board:
+        before = read_hello(board.path)
+        meter = ["--voltmeter-v", "13.464", "--ammeter-a", "5.5"]
+        code, out, err = run(
+            capsys, "new", file, "--device", board.path, *options(series="4"), *meter, "--yes", "--no-estimate"
+        )
+        after = read_hello(board.path)
+    assert (code, err) == (0, ""), out
+    gains = after.divider_ppm / before.divider_ppm, before.current_uv_per_a / after.current_uv_per_a
+    assert gains == (pytest.approx(1.02, abs=0.01), pytest.approx(1.1, abs=0.02))
+    assert tomllib.loads(file.read_text())["sensor"] == {"port": board.path, "protocol": "binary"}
+
+
+def read_hello(path: str) -> Hello:
+    with BoardClient(path) as client:
+        return client.hello()
+
+
+async def wait_for_node(broker: Broker) -> None:
+    async with Listener(broker) as listener:
+        await listener.wait("jk-bms/sensor/jk-bms_temperature_sensor_1/state")
+
+
+def test_a_publisher_at_the_broker_is_found_with_its_values(broker, file):
+    simulated = [PROGRAM, "simulate", "--mqtt", broker.url, "--cell", "lfp", "--capacity-ah", "100", "--series", "16"]
+    answers = options(series=None, parallel=None, broker=None)
+    with subprocess.Popen(simulated, stdout=subprocess.DEVNULL) as node:
+        try:
+            asyncio.run(wait_for_node(broker))
+            command = [PROGRAM, "new", str(file), "--search", broker.url, *answers, "--yes", "--no-estimate"]
+            found = subprocess.run(command, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+        finally:
+            node.terminate()
+    assert re.search(rf"^1  esphome-jk:jk-bms: .*{broker.url}; 5\d\.\d\d V, ", found.stdout)
+    written = tomllib.loads(file.read_text())
+    assert written["source"] == {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms"}
+    assert written["mqtt"] == {"url": broker.url}
+    assert written["pack"]["series"] == 16
+
+
+@pytest.mark.usefixtures("firmware")
+def test_the_firmware_stores_the_zero_of_its_current(file, capsys, tmp_path):
+    readings = write_readings(tmp_path / "pack.csv", [(0.0, 0.4, 13.2, 25.0)])
+    with SimavrBoard(readings) as board:
+        before = read_hello(board.path)
+        code, out, err = run(
+            capsys, "new", file, "--device", board.path, *options(series="4"), "--zero", "--yes", "--no-estimate"
+        )
+        after = read_hello(board.path)
+    assert (code, err) == (0, "")
+    assert "the board has stored the new zero" in out
+    assert after.current_zero_ppm != before.current_zero_ppm
+    assert "current_zero_a" not in tomllib.loads(file.read_text())["sensor"]

@@ -1,0 +1,113 @@
+"""The setup page in a real Chromium, with a simulated BMS: from the search to the first estimate."""
+
+import re
+from pathlib import Path
+
+import pytest
+from aiohttp import ClientSession
+from playwright.async_api import Page, expect
+
+from bms_estimator.settings.pack import load_settings
+from bms_estimator.settings.page import PageSettings
+from bms_estimator.setup.page.setup_server import SetupServer
+from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.simulation.virtual_adc import Reading
+from tests.command_line import run
+from tests.device_line import running_device
+from tests.page.chromium import DESKTOP, PHONE, chromium, tab
+from tests.patience import LONG_S
+
+TOKEN = "0123456789abcdef"
+
+
+@pytest.fixture(autouse=True)
+def long_timeouts(monkeypatch):
+    """Shorten the wait for a board, and lengthen other timeouts."""
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
+    monkeypatch.setattr("bms_estimator.setup.measurement.FIRST_SAMPLE_S", LONG_S)
+    expect.set_options(timeout=1e3 * LONG_S)
+
+
+def loopback(**options: object) -> PageSettings:
+    return PageSettings.model_validate({"listen": "127.0.0.1:0", **options})
+
+
+async def search_and_choose(page: Page, path: str) -> None:
+    """Search one port, and choose the BMS that is found there."""
+    await page.get_by_label("Where to search").fill(path)
+    await page.get_by_role("button", name="Search", exact=True).click()
+    await expect(page.get_by_role("button", name="Use this device")).to_be_visible()
+    await page.get_by_role("button", name="Use this device").click()
+    await expect(page.get_by_text("26.40 V, 5.00 A, discharging")).to_be_visible()
+
+
+@pytest.mark.parametrize("size", [PHONE, DESKTOP], ids=["phone", "desktop"])
+async def test_page_leads_from_the_search_to_the_first_estimate(tmp_path: Path, size: dict[str, int]) -> None:
+    file = tmp_path / "house.toml"
+    bms = SimulatedBms("jk", lambda _: Reading(5.0, 26.4, 21.0), cells=8)
+    with running_device(bms) as path:
+        async with (
+            SetupServer(loopback(), file) as server,
+            chromium() as browser,
+            tab(browser, server.url, size=size) as opened,
+        ):
+            await search_and_choose(opened.page, path)
+            await compare_voltage(opened.page)
+            await answer_questions(opened.page)
+            await expect(opened.page.locator("[data-q=voltage]")).to_have_text("26.66")
+            await expect(opened.page.locator("[data-q=soc]")).to_have_text(re.compile(r"^\d+\.\d$"))
+            overflow = await opened.page.evaluate("document.documentElement.scrollWidth - innerWidth")
+    assert overflow <= 0, "a part of the page is outside the screen"
+    assert opened.errors == []
+    settings = load_settings(file)
+    assert (settings.pack.name, settings.pack.cell, settings.pack.series) == ("house", "lfp", 8)
+    assert settings.sensor.voltage_gain == pytest.approx(1.01)
+
+
+async def compare_voltage(page: Page) -> None:
+    """Enter an impossible voltage, which is rejected with the reason, and then a possible one."""
+    await page.get_by_label("Voltage at the terminals").fill("2.64")
+    await page.get_by_role("button", name="Compare voltage").click()
+    await expect(page.get_by_role("alert")).to_contain_text("differs by more than 20%")
+    await page.get_by_label("Voltage at the terminals").fill("26.664")
+    await page.get_by_role("button", name="Compare voltage").click()
+    await expect(page.get_by_text("gain 1.0100")).to_be_visible()
+    await page.get_by_role("button", name="Check the sign").click()
+    await expect(page.get_by_text("current: the sign is right")).to_be_visible()
+
+
+async def answer_questions(page: Page) -> None:
+    """Enter a capacity in mAh, which is rejected with the reason, and then the right one."""
+    await page.get_by_role("button", name="Continue").click()
+    await page.get_by_label("Chemistry").select_option("lfp")
+    await page.get_by_label("Capacity of one cell").fill("100000")
+    await page.get_by_role("button", name="Write").click()
+    await expect(page.get_by_role("alert")).to_contain_text("is it in mAh?")
+    await page.get_by_label("Capacity of one cell").fill("100")
+    await page.get_by_role("button", name="Write").click()
+
+
+async def test_a_form_of_another_page_changes_nothing(tmp_path: Path) -> None:
+    async with SetupServer(loopback(), tmp_path / "pack.toml") as server, ClientSession() as client:
+        async with client.post(f"{server.url}search", data={"places": "bluetooth"}) as answer:
+            assert answer.status == 403
+        async with client.get(server.url) as answer:
+            assert "Where to search" in await answer.text()
+
+
+async def test_other_machines_need_the_token(tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text(TOKEN)
+    page = loopback(token_file=token)
+    async with SetupServer(page, tmp_path / "pack.toml") as server, ClientSession() as client:
+        async with client.get(server.url) as answer:
+            assert answer.status == 401
+        async with client.get(server.url, headers={"Authorization": f"Bearer {TOKEN}"}) as answer:
+            assert "Where to search" in await answer.text()
+
+
+def test_a_page_for_other_machines_without_a_token_is_refused(capsys, tmp_path: Path) -> None:
+    code, _, err = run(capsys, "setup", tmp_path / "pack.toml", "--listen", "0.0.0.0:0")
+    assert code == 2
+    assert "is open to other machines: name a token_file" in err

@@ -1,0 +1,47 @@
+"""Search of Modbus devices and brokers."""
+
+import pytest
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.setup import search as search_module
+from bms_estimator.setup.search import search
+from tests.free_port import free_port
+from tests.mosquitto import Broker
+from tests.patience import LONG_S
+
+
+async def test_a_modbus_device_is_found_by_the_registers_of_its_profile(monkeypatch) -> None:
+    modbus = pytest.importorskip("tests.sources.fieldbus.modbus_device", reason="pymodbus is not installed")
+    monkeypatch.setattr(search_module, "MODBUS_S", LONG_S)
+    monkeypatch.setattr(search_module, "MODBUS_PROFILES", {"victron-gx": {}})
+    registers, port = modbus.Registers({259: 5234, 260: 1200, 261: 0x10000 - 123, 262: 215}), free_port()
+    async with modbus.tcp_device(registers, 225, port):
+        (device,) = (await search([f"127.0.0.1:{port}"])).devices
+    assert (device.name, device.values) == (f"victron-gx:127.0.0.1:{port}", "52.34 V, 12.30 A, discharging")
+    assert device.tables == {
+        "source": {"kind": "modbus", "profile": "victron-gx", "host": "127.0.0.1", "tcp_port": port}
+    }
+
+
+async def test_a_broker_without_a_known_publisher_is_reported_and_offered_for_publishing(
+    broker: Broker, monkeypatch
+) -> None:
+    monkeypatch.setattr(search_module, "LISTEN_S", 0.5)
+    result = await search([broker.url])
+    assert result.devices == []
+    assert result.failures == [f"{broker.url}: no message of a known publisher within 0.5 s"]
+    assert result.broker == broker.url
+
+
+async def test_a_missing_broker_is_reported_with_the_reason() -> None:
+    url = f"mqtt://127.0.0.1:{free_port()}"
+    result = await search([url])
+    assert result.broker is None
+    assert result.failures[0].startswith(f"{url}: ")
+
+
+@pytest.mark.parametrize("place", ["ftp://x", "mqtt://user:secret@x", "gx:port"])
+async def test_an_invalid_place_is_rejected_without_its_password(place: str) -> None:
+    with pytest.raises(UserError, match="must be") as caught:
+        await search([place])
+    assert "secret" not in str(caught.value)
