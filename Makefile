@@ -4,6 +4,7 @@ VENV    := .venv
 BIN     := $(VENV)/bin
 PYTHON  ?= python3
 READY   := $(VENV)/.ready
+CORE    := $(VENV)/.core
 COMPARE := .venv-compare
 BLE     := .venv-ble
 AUDIT   := .venv-audit
@@ -20,7 +21,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month observability resolution unseen nats ble chapter5 ablation ablation-weeks learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads lock
+.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month observability resolution unseen nats ble chapter5 ablation ablation-weeks learning fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads cell-schema notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -28,7 +29,11 @@ help: ## this list
 venv: $(READY) ## the environment in .venv, from the hash-locked list
 
 $(READY): requirements.lock pyproject.toml
-	@.ci/venv "$(PYTHON)" "$(VENV)"
+	@.ci/venv "$(PYTHON)" "$(VENV)" requirements.lock
+	@touch $(CORE) $@
+
+$(CORE): requirements-core.lock pyproject.toml
+	@.ci/venv "$(PYTHON)" "$(VENV)" requirements-core.lock
 	@touch $@
 
 apt: ## the Debian packages of the tests: installs missing ones if permitted, otherwise names them
@@ -49,7 +54,7 @@ test-all: prepared ## also the redundant and longer tests
 prepared: apt venv
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant
 
-demo: venv ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
+demo: $(CORE) ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@$(BIN)/bms-estimator demo $(ARGS)
 
 demo-fleet: venv ## a fleet's server, 1,000 simulated packs, two workers of which one is killed, the page: a minute
@@ -133,9 +138,10 @@ page: apt venv ## cost of the live page in a real Chromium at 10 Hz, e.g. make p
 fleet-page: venv ## cost of the page of a fleet of 100,000 packs, e.g. make fleet-page ARGS="--packs 10000": four minutes
 	@$(BIN)/python -m tests.benchmarks.fleet.page $(ARGS)
 
-screenshots: apt venv ## the pictures of the live page and of the page of a fleet in docs
+screenshots: apt venv ## the pictures of the live page, of the page of a fleet and of reports in docs
 	@$(BIN)/python -m tests.page.screenshots
 	@$(BIN)/python -m tests.fleet.page_screenshots
+	@$(BIN)/python -m tests.reports.screenshots
 
 simulate: venv ## the whole service simulated: make simulate SEED=5, or many, e.g. make simulate ARGS="--seeds 1000": minutes
 	@$(BIN)/python -m tests.world $(if $(SEED),--seed $(SEED)) $(ARGS)
@@ -149,16 +155,26 @@ integrations: apt venv ## tests with the real Node-RED, AsyncAPI parser, InfluxD
 	$(BIN)/python -m pytest tests/deploy/test_node_red.py tests/deploy/test_asyncapi.py tests/deploy/test_grafana.py \
 		tests/deploy/test_telegraf.py tests/sinks/exports/test_influx.py tests/sinks/exports/test_prometheus.py $(ARGS)
 
+deb: venv ## the Debian package in build/deb, with the program and the packages that it requires: three minutes
+	@$(BIN)/python deploy/debian/build.py build/deb
+
 docs: venv ## the documentation as a site in build/site, with checked links
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 payloads: venv ## record the published payloads; rejects an incompatible change within a version
 	@$(BIN)/python -m tests.sinks.mqtt.payload_record
 
+cell-schema: venv ## write the JSON schema of `cell convert`
+	@$(BIN)/python -m tests.conversion.published_schema
+
+notebook: venv ## execute the notebook of the documentation, and write its outputs
+	@$(BIN)/python -m tests.library.notebook
+
 kernels: venv
 	$(BIN)/python -c 'from bms_estimator.service.kernel_warm_up import load_kernels; load_kernels()'
 
-lock: ## update requirements.lock and the SBOM of the wheel after a change of dependencies (needs uv)
+lock: ## update requirements.lock, requirements-core.lock and the SBOM of the wheel after a change of dependencies (needs uv)
 	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --universal pyproject.toml -o requirements.lock
-	uv pip compile --quiet --generate-hashes --no-header --universal --constraints requirements.lock pyproject.toml | \
-		uv tool run --quiet --from cyclonedx-bom==$(CYCLONEDX) cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible -o bms_estimator.cdx.json -
+	uv pip compile --quiet --generate-hashes --no-header --universal --constraints requirements.lock pyproject.toml -o requirements-core.lock
+	uv tool run --quiet --from cyclonedx-bom==$(CYCLONEDX) cyclonedx-py requirements --pyproject pyproject.toml --output-reproducible \
+		-o bms_estimator.cdx.json requirements-core.lock

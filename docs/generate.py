@@ -11,12 +11,12 @@ from mkdocs.structure.files import File, Files
 
 from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
 from bms_estimator.cli.main import COMMANDS
-from bms_estimator.cli.settings.settings_template import settings_file
 from bms_estimator.model.payloads import Alarm, Estimate, Health, Info, ParameterReport, Payload
 from bms_estimator.reports.report_items import Table
 from bms_estimator.reports.report_items import name as item_name
 from bms_estimator.reports.thesis_report import build
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.settings_template import settings_file
 
 PAYLOADS: dict[str, type[Payload]] = {
     "state": Estimate,
@@ -38,7 +38,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def settings() -> Iterator[str]:
     """Yield the page of all settings, as ``config init`` writes them."""
-    yield from ("# Settings", "", "`bms-estimator config init pack.toml` writes this file.", "")
+    yield from (
+        "# Settings",
+        "",
+        "`bms-estimator config init pack.toml` writes this file. [`bms-estimator new`](../start/new.md) sets the values of a pack in it.",
+        "",
+    )
     yield from ("```toml", settings_file(Settings), "```")
 
 
@@ -64,7 +69,8 @@ def fields(schema: dict[str, Any]) -> Iterator[str]:
 
 def commands() -> Iterator[str]:
     """Yield the page of all commands with their arguments and options."""
-    yield "# Commands\n\n`bms-estimator COMMAND --help` shows the same.\n"
+    yield "# Commands\n\n`bms-estimator COMMAND -h` shows the same. `bms-estimator --install-completion` lets bash, zsh or fish "
+    yield "complete commands, options, cells, ports and protocols.\n"
     yield from EXIT_CODES
     for prefix, entries in (("bms-estimator", COMMANDS), ("bms-estimator fleet", FLEET_COMMANDS)):
         for name, entry in entries.items():
@@ -77,7 +83,7 @@ EXIT_CODES = """\
 | exit code | meaning |
 |---|---|
 | 0 | done, also after Ctrl-C or SIGTERM of a command that runs until it is ended |
-| 1 | an internal error with a traceback, a full or broken disk, or a closed output pipe |
+| 1 | an internal error with a traceback, a full or broken disk, a closed output pipe, or a fault that `doctor` found |
 | 2 | an error that you can correct; `error:` lines on stderr name it |
 | 130 | interrupted before the end, or before it began |
 

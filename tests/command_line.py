@@ -1,7 +1,12 @@
 """Command line of the project, as a program and in the process of the test."""
 
+import asyncio
+import contextlib
 import sys
+from asyncio.subprocess import DEVNULL, PIPE, Process
+from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -16,3 +21,22 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int | s
         main([str(argument) for argument in arguments])
     out, err = capsys.readouterr()
     return caught.value.code or 0, out, err
+
+
+@contextlib.asynccontextmanager
+async def running_program(
+    *command: object,
+    stdout: int | IO[bytes] = PIPE,
+    stderr: int | IO[bytes] | IO[str] = PIPE,
+    folder: Path | None = None,
+) -> AsyncIterator[Process]:
+    """Start a program without input in ``folder``, and kill it at the end."""
+    process = await asyncio.create_subprocess_exec(
+        *map(str, command), stdin=DEVNULL, stdout=stdout, stderr=stderr, cwd=folder
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()

@@ -38,6 +38,7 @@ LONG_FILES = (
     "tests/fleet/worker/test_worker.py",
     "tests/estimator/anywhere/test_anywhere.py",
     "tests/service/test_process.py",
+    "tests/end_to_end/test_new_pack.py",
     "tests/end_to_end/test_whole_way.py",
     "tests/telemetry/test_alarms.py",
     "tests/estimator/month/test_summary.py",

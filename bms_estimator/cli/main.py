@@ -13,6 +13,10 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.version import __version__
 
 COMMANDS = {
+    "new": LazyCommand(
+        "bms_estimator.cli.settings.new:new", "Find the device of a pack, and write the settings file of the pack."
+    ),
+    "setup": LazyCommand("bms_estimator.cli.settings.setup:setup", "Serve the questions of `new` as a web page."),
     "run": LazyCommand(
         "bms_estimator.cli.live.run:run",
         "Run the live service: estimate from a BMS, monitor or sensor board, and publish.",
@@ -23,7 +27,7 @@ COMMANDS = {
     "edge": LazyCommand("bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet server."),
     "replay": LazyCommand(
         "bms_estimator.cli.captures.replay:replay",
-        "Run the estimator over a capture: recorded raw bytes, CSV or Parquet.",
+        "Run the estimator over a capture: recorded raw bytes, a table or the export of a cycler.",
     ),
     "alarms": LazyCommand(
         "bms_estimator.cli.captures.alarms:alarms", "List the alarms that a capture would have raised."
@@ -46,6 +50,10 @@ COMMANDS = {
     "demo": LazyCommand(
         "bms_estimator.cli.live.demo:demo", "Run an MQTT broker, a simulated board and the live service."
     ),
+    "calibrate": LazyCommand(
+        "bms_estimator.cli.cell.calibrate:calibrate_command",
+        "Write a cell file for your own cell, from captures or beside a pack.",
+    ),
     "ocv": LazyCommand(
         "bms_estimator.cli.cell.ocv:ocv",
         "Write a cell file with the OCV curve from rests, slow discharges or a table.",
@@ -61,12 +69,21 @@ COMMANDS = {
         "bms_estimator.cli.cell.capacity:capacity", "Measure a cell's capacity from rests and the charge between them."
     ),
     "cell": LazyCommand(
-        "bms_estimator.cli.cell.export:app", "Write a cell file from the learned state of a pack's live service."
+        "bms_estimator.cli.cell.commands:app",
+        "Write a cell file from a pack's learned state, or convert a cell file for PyBaMM, JSON or C.",
     ),
     "history": LazyCommand("bms_estimator.cli.live.history:history", "Print a pack's stored history as CSV."),
     "validate": LazyCommand(
         "bms_estimator.cli.captures.validate:validate_command",
         "Compare the voltage of a cell file's model with a capture, open loop.",
+    ),
+    "convert": LazyCommand(
+        "bms_estimator.cli.captures.convert:convert",
+        "Write a capture as CSV, Parquet or Battery Data Format (BDF).",
+    ),
+    "report": LazyCommand(
+        "bms_estimator.cli.captures.report:report",
+        "Write a report with figures and a verdict, from captures or from a pack's history.",
     ),
     "thesis": LazyCommand(
         "bms_estimator.cli.captures.thesis:thesis",
@@ -76,11 +93,23 @@ COMMANDS = {
         "bms_estimator.cli.settings.asyncapi:asyncapi", "Print the MQTT topics and payloads as an AsyncAPI document."
     ),
     "fleet": LazyCommand("bms_estimator.cli.fleet.commands:app", "Estimate many packs: server, workers and queries."),
+    "doctor": LazyCommand(
+        "bms_estimator.cli.settings.doctor:doctor",
+        "Examine settings, device, broker, service and machine; name a remedy for each fault.",
+    ),
+    "install": LazyCommand(
+        "bms_estimator.cli.settings.install:install_command", "Install or upgrade the service on this machine."
+    ),
+    "uninstall": LazyCommand(
+        "bms_estimator.cli.settings.install:uninstall_command", "Remove the service from this machine."
+    ),
     "config": LazyCommand("bms_estimator.cli.settings.config:app", "Write, check or show a pack's settings."),
 }
 
 EXTRAS = {
     "pyarrow": "parquet",
+    "jinja2": "report",
+    "scipy": "calibration",
     "matplotlib": "report",
     "prometheus_client": "prometheus",
     "pymodbus": "modbus",
@@ -91,6 +120,9 @@ EXTRAS = {
     "nats": "fleet",
     "duckdb": "fleet",
     "nkeys": "fleet",
+    "python_calamine": "excel",
+    "fastnda": "cycler",
+    "galvani": "cycler",
 }
 """Extra of ``bms_estimator`` that installs an optional package, by the module name of the package."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
@@ -102,7 +134,12 @@ class _Commands(LazyGroup):
     entries = COMMANDS
 
 
-app = typer.Typer(cls=_Commands, no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["--help", "-h"]},  # subcommands inherit them
+)
 
 
 def _print_version(wanted: bool) -> None:
@@ -126,8 +163,8 @@ def _root(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit.
 
-    Exit codes: 0 success; 1 an internal error (with traceback), a closed stdout, or a full or broken disk; 2 an error
-    that the user can correct; 130 interrupted.
+    Exit codes: 0 success; 1 an internal error (with traceback), a closed stdout, a full or broken disk, or a fault that
+    ``doctor`` found; 2 an error that the user can correct; 130 interrupted.
 
     Args:
         arguments: Arguments without the program's name; None: those of the process.

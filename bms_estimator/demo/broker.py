@@ -34,7 +34,7 @@ class DemoBroker:
 
     def __init__(self, port: int | None = None) -> None:
         self.port = choose_port(port, MQTT_PORT)
-        self._server = find_server("demo")
+        self._server = find_server()
         self._stack = contextlib.AsyncExitStack()
 
     @property

@@ -20,6 +20,8 @@ ATTEMPTS = 20
 """Number of attempts to bind a name whose holder does not listen."""
 ATTEMPT_DELAY_S = 0.01
 """Delay between two attempts to bind a name [s]."""
+SOCKETS = Path("/proc/net/unix")
+"""List of all Unix sockets. The names of abstract sockets begin with @."""
 _CREDENTIALS = struct.Struct("3i")
 """Layout of ``struct ucred``: process, user, group."""
 
@@ -48,6 +50,17 @@ def instance_lock(folder: Path, pack: str) -> Iterator[None]:
         except OSError as error:
             log.warning("cannot ensure that only one process serves this pack", reason=error.strerror)
         yield
+
+
+def is_locked(folder: Path, pack: str) -> bool:
+    """Return True if a process holds the lock of a pack.
+
+    The list of sockets is read instead of connecting, because a connection would stay in the queue of the holder.
+    """
+    name = _name(folder, pack).replace("\0", "@")
+    with contextlib.suppress(OSError):
+        return any(line.endswith(f" {name}") for line in SOCKETS.read_text(encoding="utf-8").splitlines())
+    return False
 
 
 def _bind(lock: socket.socket, folder: Path, pack: str) -> None:

@@ -12,6 +12,7 @@ from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols import devices
 from bms_estimator.protocols.base.device import Device
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.protocols.base.sensor_correction import SensorCorrection
 
 BOARD = "binary"
 """Name of the firmware's protocol. It is not a ``Device``, because its decoder imports numba, which other devices do not need."""
@@ -54,9 +55,19 @@ class Sensor(Protocol):
     def sample_rate_hz(self) -> int:
         """Sample rate that a board of the firmware is set to [Hz]."""
 
+    @property
+    def correction(self) -> SensorCorrection:
+        """Correction of the measured values."""
+
 
 def make_protocol(sensor: Sensor) -> DeviceProtocol:
-    """Make the protocol of a device; its samples have the sign of current that the estimator expects."""
+    """Make the protocol of a device; its samples are corrected, and have the sign of current that the estimator expects."""
+    protocol = _make_uncorrected(sensor)
+    protocol.correction = sensor.correction
+    return protocol
+
+
+def _make_uncorrected(sensor: Sensor) -> DeviceProtocol:
     if sensor.protocol == BOARD:
         from bms_estimator.protocols.firmware.protocol import BoardProtocol  # noqa: PLC0415 - it loads numba
 

@@ -133,7 +133,9 @@ class VirtualBoard:
         clock_us: int = 0,
         seed: int = 0,
     ) -> None:
-        self._mode, self._speed = mode, speed
+        self._mode = mode
+        self.speed = speed
+        """Speed relative to real time; a change applies from the next ``run``."""
         self._readings = self._readings_from(signal) if callable(signal) else iter(signal)
         self._reading = Reading(0.0, 0.0)
         self._converter = VirtualConverter(parts or BoardParts(), noise_lsb, seed)
@@ -187,10 +189,11 @@ class VirtualBoard:
         """Sample and send for ``seconds`` of the board's time, or until the signal ends."""
         self._loop = loop = asyncio.get_running_loop()
         loop.add_reader(self._board_fd, self._receive)
+        self._receive()  # commands that arrived before; a short run may end before the loop calls the reader
         try:
             await self._sample_until(self.time_s + seconds, loop)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(None if math.isinf(self._speed) else _DRAIN_TIMEOUT_S):
+                async with asyncio.timeout(None if math.isinf(self.speed) else _DRAIN_TIMEOUT_S):
                     await self._drain()
         finally:
             self._stop_watching()
@@ -256,19 +259,19 @@ class VirtualBoard:
         self._aux_count = compute_aux_count(rate_hz)
 
     async def _sample_until(self, end_s: float, loop: asyncio.AbstractEventLoop) -> None:
-        start_s = loop.time() - self.time_s / self._speed  # loop time at which the pack's time is 0
+        start_s = loop.time() - self.time_s / self.speed  # loop time at which the pack's time is 0
         while self.time_s < end_s:
             for _ in range(_MAX_SAMPLES_AT_ONCE):
-                due_s = start_s + (self.time_s + self._period_ns * 1e-9) / self._speed
+                due_s = start_s + (self.time_s + self._period_ns * 1e-9) / self.speed
                 if due_s > loop.time() or self.time_s >= end_s:
                     break
                 if not self._take_sample():
                     return
             self._flush()
-            if math.isinf(self._speed) and self._unsent:
+            if math.isinf(self.speed) and self._unsent:
                 await self._drain()  # the host's reads set the pace
             else:
-                await asyncio.sleep(max(due_s - loop.time(), 0.0 if math.isinf(self._speed) else _MIN_SLEEP_S))
+                await asyncio.sleep(max(due_s - loop.time(), 0.0 if math.isinf(self.speed) else _MIN_SLEEP_S))
 
     def _take_sample(self) -> bool:
         """Send one sample. Return False if the signal has ended."""
@@ -282,7 +285,7 @@ class VirtualBoard:
         self._apply_relay_fallback()
         message = self._message(reading)
         self._sequence = (self._sequence + 1) % MODULUS
-        if len(self._unsent) > _MAX_UNSENT_BYTES and not math.isinf(self._speed):
+        if len(self._unsent) > _MAX_UNSENT_BYTES and not math.isinf(self.speed):
             self._overrun = True
             return True
         self._overrun = False

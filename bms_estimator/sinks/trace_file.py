@@ -42,10 +42,11 @@ class CsvSink:
 
     Args:
         path: The file.
+        nan: Text of a value that is not known; an empty text leaves the cell empty.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, nan: str = "nan") -> None:
+        self._path, self._nan = path, nan
         self._files = ExitStack()
         self._file: IO[bytes] | None = None
 
@@ -63,7 +64,7 @@ class CsvSink:
             self._file = self._open()
             self._file.write((",".join(trace.dtype.names or ()) + "\n").encode())
         if trace.size:
-            self._file.write(_csv_rows(trace))
+            self._file.write(_csv_rows(trace, self._nan))
 
     def _open(self) -> IO[bytes]:
         file = self._files.enter_context(_create(self._path))
@@ -129,10 +130,10 @@ def _create(path: Path) -> IO[bytes]:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def _csv_rows(trace: NDArray[np.void]) -> bytes:
+def _csv_rows(trace: NDArray[np.void], nan: str) -> bytes:
     """Return rows as CSV, with enough digits to restore each float exactly."""
     columns = [map(repr, trace[name].tolist()) for name in trace.dtype.names or ()]
-    return ("\n".join(map(",".join, zip(*columns, strict=True))) + "\n").encode()
+    return ("\n".join(map(",".join, zip(*columns, strict=True))) + "\n").replace("nan", nan).encode()
 
 
 def _arrow_batch(trace: NDArray[np.void]) -> Any:

@@ -67,3 +67,26 @@ def test_duplicate_capture_is_rejected(command, make_duplicate, message, capture
     assert f"error: again.csv: {message}" in err
     assert "the capture would count twice" in err
     assert not list(tmp_path.glob("mine*"))
+
+
+def test_missing_folder_is_an_error_before_the_computation(capture, tmp_path, capsys):
+    out = tmp_path / "missing" / "report.html"
+    with pytest.raises(SystemExit) as ended:
+        main(["report", str(capture), "--cell", "ncr18650", "--out", str(out)])
+    assert ended.value.code == 2
+    assert f"there is no folder {out.parent}; create it" in capsys.readouterr().err
+
+
+def test_full_disk_leaves_the_old_file(capture, full_disk, capsys, monkeypatch):
+    out = full_disk / "mine.toml"
+    monkeypatch.setattr("bms_estimator.model.cell_file.cell_text", lambda *_: "x" * 8192)
+    out.touch()
+    (full_disk / "file").unlink()
+    out.write_text("# measured in May\n")
+    (full_disk / "file").write_bytes(b"")
+    with pytest.raises(SystemExit) as ended:
+        main(["ocv", str(capture), "--capacity-ah", "3", "--out", str(out), "--force"])
+    assert ended.value.code == 1
+    assert "cannot be written: No space left on device" in capsys.readouterr().err
+    assert out.read_text() == "# measured in May\n"
+    assert sorted(path.name for path in full_disk.iterdir()) == ["file", "mine.toml"]

@@ -6,10 +6,8 @@ import itertools
 import json
 import signal
 import sys
-from asyncio.subprocess import Process
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
 
 import pytest
 
@@ -19,7 +17,7 @@ from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.health import sample_counters
-from tests.command_line import PROGRAM, run
+from tests.command_line import PROGRAM, run, running_program
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
 from tests.patience import LONG_S
@@ -63,20 +61,6 @@ block_s = 1.0
     return path
 
 
-@contextlib.asynccontextmanager
-async def running_program(*command: object, stderr: IO[bytes]) -> AsyncIterator[Process]:
-    """Start a program and kill it at the end."""
-    process = await asyncio.create_subprocess_exec(
-        *map(str, command), stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL, stderr=stderr
-    )
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
-
-
 async def test_edge_sends_no_block_twice_after_a_kill_and_ends_cleanly_on_sigterm(
     tmp_path: Path, line: Line, engine: NatsCluster
 ) -> None:
@@ -85,12 +69,12 @@ async def test_edge_sends_no_block_twice_after_a_kill_and_ends_cleanly_on_sigter
     board = asyncio.create_task(Board(line).print_lines())
     async with Receiver(engine.url, "pack") as receiver:
         with log_file.open("wb") as log:
-            async with running_program(PROGRAM, "edge", pack, stderr=log) as process:
+            async with running_program(PROGRAM, "edge", pack, stdout=asyncio.subprocess.DEVNULL, stderr=log) as process:
                 await receiver.wait_for_samples(1)
                 process.kill()
             first_log_size = log_file.stat().st_size
             async with running_program(
-                sys.executable, "-X", "importtime", PROGRAM, "edge", pack, stderr=log
+                sys.executable, "-X", "importtime", PROGRAM, "edge", pack, stdout=asyncio.subprocess.DEVNULL, stderr=log
             ) as process:
                 # blocks of the first process may still arrive while the second process imports its modules
                 async with asyncio.timeout(LONG_S):
@@ -147,7 +131,7 @@ def test_edge_without_a_server_url_is_an_error(tmp_path: Path, capsys: pytest.Ca
     ("table", "message"),
     [
         ('url = "http://a"', "edge.url = 'http://a': must be mqtt://host:port"),
-        ("block_s = 0", "edge.block_s = 0: Input should be greater than or equal to 1"),
+        ("block_s = 0", "edge.block_s = 0: must be greater than or equal to 1"),
         ('key_file = "a"', "edge.key_file = a: of no use without edge.cert_file"),
     ],
 )

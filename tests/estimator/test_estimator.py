@@ -1,5 +1,7 @@
 """Results of ``step`` and ``run``, invalid samples, counted charge, and shipped cells."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,23 @@ def test_step_and_run_are_bit_identical_for_any_block_size() -> None:
     for part in np.array_split(samples, 37):
         in_blocks.run(part)
     assert in_one_block.state.tobytes() == stepped.state.tobytes() == in_blocks.state.tobytes()
+
+
+@pytest.mark.parametrize("series", [1, 4])
+def test_soc_and_its_std_are_those_of_the_last_row(series: int) -> None:
+    samples = noisy_load(200)
+    samples["voltage_v"] *= series
+    estimator = Estimator(load_cell("ncr18650").pack(series, 1), initial_soc=0.8)
+    assert math.isnan(estimator.soc)
+    assert math.isnan(estimator.soc_std)
+    last = estimator.run(samples)[-1]
+    assert (estimator.soc, estimator.soc_std) == (last["soc"], last["soc_std"])
+
+
+def test_soc_has_no_std_without_the_identifier() -> None:
+    estimator = Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None)
+    estimator.run(noisy_load(200))
+    assert math.isnan(estimator.soc_std)
 
 
 def test_a_restored_state_resumes_identically() -> None:

@@ -63,14 +63,15 @@ async def test_states_published_during_outages_arrive_in_order(broker: Broker, n
 async def test_live_topics_overtake_a_backlog(broker: Broker, network: Proxy) -> None:
     network.disconnect_network()
     async with Listener(broker) as live, Sink(network.url, max_queued=10_000) as sink:
-        for number in range(2000):
+        # Mosquitto drops messages beyond 1000 that a slow subscriber has not received
+        for number in range(900):
             sink.mqtt.publish(numbered_state(number))
         network.rejects_connections = False
-        await until(lambda: len(live.all(STATE_TOPIC)) == 2000)
+        await until(lambda: len(set(state_numbers(live))) == 900)  # QoS 1 may deliver a state twice
     topics = [topic for topic, _, _ in live.messages]
     for topic in ("availability", "info", "health", "parameters", "home_assistant"):
-        # at least a thousand of the 2000 queued states arrive after it
-        assert STATE_TOPIC in topics[topics.index(f"bms/pack/{topic}") + 1000 :], topic
+        # at least half of the queued states arrive after it
+        assert topics[topics.index(f"bms/pack/{topic}") :].count(STATE_TOPIC) >= 450, topic
 
 
 async def test_queued_states_are_sent_before_offline_at_shutdown(broker: Broker) -> None:

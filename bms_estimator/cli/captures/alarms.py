@@ -2,30 +2,32 @@
 
 import asyncio
 import json
-import logging
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-import structlog
 import typer
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.cli.options.capture_input import capture_file, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     CELL_OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
+    MappedColumns,
     SignOfCurrent,
+    complete_cell,
 )
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
+from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.cli.options.silenced_log import silenced_log
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
@@ -34,7 +36,6 @@ from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.fit_thread import new_slow_fit
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, open_capture
-from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.telemetry.alarms import Change
 
 MAX_BLOCK_S = 1.0
@@ -71,7 +72,9 @@ class AlarmResult:
 
 def alarms(
     capture: Annotated[Path, typer.Argument(help=CAPTURE_HELP, show_default=False)],
-    cell: Annotated[str | None, typer.Option(help=CELL_OR_FUEL_CELL_HELP, show_default=False)] = None,
+    cell: Annotated[
+        str | None, typer.Option(help=CELL_OR_FUEL_CELL_HELP, autocompletion=complete_cell, show_default=False)
+    ] = None,
     capacity_ah: CapacityAh = None,
     pack: Annotated[
         Path | None,
@@ -84,6 +87,7 @@ def alarms(
         ),
     ] = None,
     current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
     as_json: AsJson = False,
 ) -> None:
     """List the alarms that a capture would have raised, with their times.
@@ -94,9 +98,12 @@ def alarms(
     if soc is not None:
         reject_soc_for_fuel_cell(model, "--soc")
         settings = with_pack(settings, initial_soc=soc)
-    with _silenced_log(), standard_input() if str(capture) == "-" else nullcontext(capture) as path:
+    with silenced_log(), capture_file(capture) as path:
         with show_compile_progress():
-            opened = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
+            opened = open_capture(
+                path, settings.sensor if pack else None, current_sign=current_sign, column_map=column_map
+            )
+        print_guesses(path.name, opened)
         source = Replay(opened, max_block_s=MAX_BLOCK_S)
         result = asyncio.run(_evaluate(settings, model, source))
         if source.samples == 0:
@@ -105,17 +112,6 @@ def alarms(
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
         _print(path.name, result)
-
-
-@contextmanager
-def _silenced_log() -> Iterator[None]:
-    """Silence the log, because the command itself prints what the service would log."""
-    previous_config = structlog.get_config()
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
-    try:
-        yield
-    finally:
-        structlog.configure(**previous_config)
 
 
 async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> AlarmResult:
@@ -128,9 +124,11 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
     monitor = AlarmMonitor(settings, model, estimator, source, clock, changes.append)
     runner = new_slow_fit(settings, estimator) or estimator
-    async for received in source:
-        now_s = max(now_s, float(received.samples["time_s"][-1]))
-        monitor.add(received, runner.run(received.samples), now_s)
+    with progress_bar("replaying") as bar:
+        async for received in source:
+            now_s = max(now_s, float(received.samples["time_s"][-1]))
+            monitor.add(received, runner.run(received.samples), now_s)
+            bar.update(source.fraction)
     monitor.evaluate(now_s)
     raised_alarms = _pair_changes(changes)
     latched = {alarm.name for alarm in monitor.report if alarm.latched}

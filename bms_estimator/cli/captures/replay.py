@@ -4,8 +4,8 @@ import asyncio
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager, nullcontext
+from collections.abc import Iterator
+from contextlib import AsyncExitStack, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
@@ -13,22 +13,25 @@ from typing import Annotated
 import typer
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from bms_estimator.cli.captures.replay_summary import ReplayResult, Summary
+from bms_estimator.cli.options.capture_input import capture_file, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     CELL_OR_FUEL_CELL_HELP,
     AsJson,
     CapacityAh,
     Force,
+    MappedColumns,
     SignOfCurrent,
     check_output_file,
+    complete_cell,
 )
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_broker, with_pack
+from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.clock import Clock
@@ -43,7 +46,6 @@ from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.sinks.trace_file import TableSink, table_sink
 from bms_estimator.sources.captures.replay import RawCapture, Replay, open_capture
-from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 from bms_estimator.telemetry.pack_model import FitTimes, pack_model_health
@@ -54,7 +56,9 @@ RARE_FAULT_FRACTION = 0.01
 
 def replay(
     capture: Annotated[Path, typer.Argument(help=CAPTURE_HELP, show_default=False)],
-    cell: Annotated[str | None, typer.Option(help=CELL_OR_FUEL_CELL_HELP, show_default=False)] = None,
+    cell: Annotated[
+        str | None, typer.Option(help=CELL_OR_FUEL_CELL_HELP, autocompletion=complete_cell, show_default=False)
+    ] = None,
     capacity_ah: CapacityAh = None,
     pack: Annotated[Path | None, typer.Option(help="settings file of the pack, pack.toml", show_default=False)] = None,
     soc: Annotated[
@@ -71,6 +75,7 @@ def replay(
     ] = None,
     force: Force = False,
     current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
     as_json: AsJson = False,
     no_pack_model: Annotated[
         bool,
@@ -99,9 +104,12 @@ def replay(
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
     if out is not None:
         check_output_file(out, [capture], force=force)
-    with standard_input() if str(capture) == "-" else nullcontext(capture) as path:
+    with capture_file(capture) as path:
         with show_compile_progress():
-            source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign)
+            source = open_capture(
+                path, settings.sensor if pack else None, current_sign=current_sign, column_map=column_map
+            )
+        print_guesses(path.name, source)
         replay_source = Replay(source, speed=speed)
         table = table_sink(out) if out else None
         result = asyncio.run(_replay(settings, model, replay_source, table, fit_pack=not no_pack_model))
@@ -140,7 +148,7 @@ async def _replay(
     async with AsyncExitStack() as stack:
         publisher = await _open_publisher(stack, settings, model, estimator, pack_model, source)
         stack.enter_context(table or nullcontext())
-        update_progress = stack.enter_context(_progress(source))
+        bar = stack.enter_context(progress_bar("replaying"))
         started_s, impossible = time.perf_counter(), None
         async for received in source:
             trace = runner.run(received.samples)
@@ -152,7 +160,7 @@ async def _replay(
             if publisher:
                 publisher.add(received, trace)
                 await asyncio.sleep(0)  # the MQTT client runs in this event loop
-            update_progress()
+            bar.update(source.fraction)
         wall_s = time.perf_counter() - started_s
         if publisher:
             publisher.publish_last()
@@ -190,16 +198,6 @@ async def _open_publisher(
         delivery=delivery,
         pack_model=lambda: pack_model_health(pack_model, FitTimes(None, None)) if pack_model else None,
     )
-
-
-@contextmanager
-def _progress(source: Replay) -> Iterator[Callable[[], None]]:
-    """Show a progress bar on stderr if it is a terminal. Yield a function to call after each block."""
-    console = Console(stderr=True)
-    columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[samples]:,} samples"), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
-        bar = progress.add_task("replay", total=1.0, samples=0)
-        yield lambda: progress.update(bar, completed=source.capture.fraction, samples=source.samples)
 
 
 def result_table(title: str, result: ReplayResult) -> Table:

@@ -3,34 +3,36 @@
 import textwrap
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     CELL_HELP,
     CapacityAh,
+    MappedColumns,
     SignOfCurrent,
+    complete_battery,
     name_of,
     reject_duplicates,
 )
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import LABORATORY_RESOLUTION_V
+from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import CurrentSign
 from bms_estimator.reports import report_items
 from bms_estimator.reports.experiment import Recorded
-from bms_estimator.reports.html import LONG_CELL, write
+from bms_estimator.reports.thesis_page import LONG_CELL, write
 from bms_estimator.reports.thesis_report import Report, build
-from bms_estimator.sources.captures.replay import load_capture
+from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 MIN_TABLE_WIDTH = 160
 """Minimum width of a printed table [characters]."""
@@ -43,12 +45,16 @@ def thesis(
         list[Path] | None,
         typer.Argument(help=f"captures for chapter 5, each a {CAPTURE_FORMATS}; default: a simulated 6S pack"),
     ] = None,
-    cell: Annotated[str | None, typer.Option(help=f"cell of the captures: {CELL_HELP}", show_default=False)] = None,
+    cell: Annotated[
+        str | None,
+        typer.Option(help=f"cell of the captures: {CELL_HELP}", autocompletion=complete_battery, show_default=False),
+    ] = None,
     capacity_ah: CapacityAh = None,
     resolution_v: Annotated[
         float, typer.Option(parser=decimal(1e-9), help="voltage resolution (LSB) of the captures [V]")
     ] = LABORATORY_RESOLUTION_V,
     current_sign: SignOfCurrent = None,
+    column_map: MappedColumns = None,
     out: Annotated[Path, typer.Option(help="folder for the report")] = Path("thesis-report"),
     table: Annotated[
         str | None, typer.Option(help="recompute only this table: 1 to 13, or Errata", show_default=False)
@@ -62,10 +68,15 @@ def thesis(
     Chapter 5 is computed from the captures, all of one type of cell.
     At least one capture must be a voltage relaxation test, and at least one a constant load or a load with steps.
     """
-    recorded = _load_recorded(captures, cell, capacity_ah, resolution_v, current_sign) if captures else None
+    recorded = _load_recorded(captures, cell, capacity_ah, resolution_v, current_sign, column_map) if captures else None
     started_s = time.perf_counter()
-    with _progress() as show_progress:
-        report = build(recorded, table=table, figure=figure, progress=show_progress)
+    with progress_bar("recomputing the thesis") as bar:
+        report = build(
+            recorded,
+            table=table,
+            figure=figure,
+            progress=lambda title, done, total: bar.update(done / total, f"recomputing {title}"),
+        )
         try:
             path = write(report, out)
         except OSError as error:
@@ -79,24 +90,19 @@ def thesis(
 
 
 def _load_recorded(
-    captures: list[Path], cell: str | None, capacity_ah: float | None, resolution_v: float, current_sign: SignOfCurrent
+    captures: list[Path],
+    cell: str | None,
+    capacity_ah: float | None,
+    resolution_v: float,
+    current_sign: CurrentSign | None,
+    column_map: ColumnMap | None,
 ) -> Recorded:
     if cell is None:
         raise UserError("captures require --cell NAME|CELL.toml, which gives capacity, limits and bounds of the cell")
     reject_duplicates(captures)
-    loaded = [load_capture(path, current_sign=current_sign) for path in captures]
+    loaded = load_captures(captures, current_sign=current_sign, column_map=column_map)
     named_rows = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
     return Recorded(load_cell(cell, capacity_ah), named_rows, resolution_v)
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Show a progress bar on stderr if it is a terminal. Yield a function that takes the name of the next item."""
-    console = Console(stderr=True)
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
-        bar = progress.add_task("", total=None)
-        yield lambda title, done, total: progress.update(bar, description=title, completed=done, total=total)
 
 
 def _print_items(console: Console, report: Report) -> None:

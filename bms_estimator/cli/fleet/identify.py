@@ -6,7 +6,6 @@ import io
 import json
 import math
 import os
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -22,6 +21,7 @@ from bms_estimator.cli.fleet.packs import fetch_registry, reject_unknown
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.cli.options.capture_options import AsJson, Force, check_output_file
 from bms_estimator.cli.options.number_options import whole
+from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
@@ -69,17 +69,18 @@ def identify(
     """
     address = (server, creds, ca)
     names = _names(packs or [], from_file)
-    check_output_file(out / RESULTS_FILE, [], force=force)
+    if out.exists():
+        check_output_file(out / RESULTS_FILE, [], force=force)
     registry = asyncio.run(fetch_registry(address))
     reject_unknown(names, registry)
     span_s = (epoch_s(since, -math.inf), epoch_s(until, math.inf))
     results = list["ReidentificationResult"]()
-    for result in _reidentify(names, registry, span_s, address, processes):
-        results.append(result)
-        if result.cell_file:
-            write_text(out / f"{result.pack}.toml", result.cell_file, make_folder=True)
-        if sys.stderr.isatty():
-            typer.echo(f"{len(results)} of {len(names)}: {result.pack}", err=True)
+    with progress_bar("identifying") as bar:
+        for result in _reidentify(names, registry, span_s, address, processes):
+            results.append(result)
+            if result.cell_file:
+                write_text(out / f"{result.pack}.toml", result.cell_file, make_folder=True)
+            bar.update(len(results) / len(names), f"{len(results)} of {len(names)} packs identified")
     _write_results(out / RESULTS_FILE, results)
     changed_packs = asyncio.run(_upload(results, registry, address)) if put else []
     if as_json:

@@ -13,7 +13,7 @@ from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.nats_config import CLUSTER_PORT, Accounts
 from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.nats_server import serve as run_node
-from bms_estimator.model.config_file import read_toml
+from bms_estimator.model.config_file import error_reason, read_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.settings.fleet import FleetSettings
@@ -113,7 +113,7 @@ def _settings(path: Path | None, **options: str | None) -> FleetSettings:
     try:
         return FleetSettings.model_validate(table | {"server": table["server"] | given})
     except ValidationError as error:
-        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        reason = error_reason(error.errors()[0])
         options_text = ", ".join(f"--{name} {value}" for name, value in given.items())
         raise UserError(f"{options_text}: {reason}") from None
 

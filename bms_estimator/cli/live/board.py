@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.cli.options.port_options import complete_port
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.protocols.firmware.messages import (
@@ -32,7 +33,10 @@ from bms_estimator.sources.serial.port_list import NoPortError, resolve_port
 
 def board(
     port: Annotated[
-        str, typer.Argument(help="serial port of the board; auto: port of the only connected board")
+        str,
+        typer.Argument(
+            help="serial port of the board; auto: port of the only connected board", autocompletion=complete_port
+        ),
     ] = "auto",
     aref_v: Annotated[
         float | None,

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.pack_options import with_sensor
+from bms_estimator.cli.options.port_options import OtherPort
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import startup_signals
 from bms_estimator.process.state_folder import state_folder
@@ -21,7 +22,7 @@ def edge(
     pack: Annotated[Path, typer.Argument(help="settings file of the pack, with a section \\[edge]")] = Path(
         "pack.toml"
     ),
-    port: Annotated[str | None, typer.Option(help="serial port that replaces sensor.port of the settings")] = None,
+    port: OtherPort = None,
 ) -> None:
     """Send a pack's raw samples to a fleet server until SIGINT or SIGTERM.
 

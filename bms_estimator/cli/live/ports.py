@@ -1,6 +1,6 @@
 """``bms-estimator ports``: list of serial ports, and the devices on them."""
 
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from typing import Annotated
 
 import typer
@@ -10,12 +10,16 @@ from rich.table import Table
 from serial.tools import list_ports
 
 from bms_estimator.cli.options.number_options import whole
+from bms_estimator.cli.options.port_options import complete_port
+from bms_estimator.cli.options.status_line import show_status
 from bms_estimator.sources.serial.device_detection import probe as probe_port
 from bms_estimator.sources.serial.port_list import holder, stable_names
 
 
 def ports(
-    paths: Annotated[list[str] | None, typer.Argument(help="paths of serial ports; default: all ports")] = None,
+    paths: Annotated[
+        list[str] | None, typer.Argument(help="paths of serial ports; default: all ports", autocompletion=complete_port)
+    ] = None,
     probe: Annotated[
         bool, typer.Option("--probe", help="open each port and identify its device; this may reset a board")
     ] = False,
@@ -44,12 +48,6 @@ def ports(
     for device, description in sorted(listed.items()):
         name = stable_by_device.get(device, device)
         opened_by = holder(device) or ""
-        with show_probing(device) if probe else nullcontext():
+        with show_status(f"probing {device}: up to 20 s") if probe else nullcontext():
             table.add_row(name, description, opened_by, *([str(probe_port(device, baud))] if probe else []))
     Console().print(table)
-
-
-def show_probing(port: str) -> AbstractContextManager[object]:
-    """Show on stderr that a probe is running, if stderr is a terminal."""
-    console = Console(stderr=True)
-    return console.status(f"probing {port}: up to 20 s") if console.is_terminal else nullcontext()

@@ -1,7 +1,6 @@
 """``bms-estimator record``: capture of a board's raw bytes with their arrival times."""
 
 import asyncio
-import contextlib
 import time
 from collections import deque
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.text import Text
 
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.pack_options import load_pack, with_sensor
+from bms_estimator.cli.options.port_options import OtherPort
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import stop_on_signal
@@ -40,7 +40,7 @@ def record(
             show_default=False,
         ),
     ] = None,
-    port: Annotated[str | None, typer.Option(help="serial port that replaces sensor.port of the settings")] = None,
+    port: OtherPort = None,
     baud: Annotated[
         int | None, typer.Option(parser=whole(1200), help="baud rate that replaces sensor.baud of the settings")
     ] = None,
@@ -84,7 +84,7 @@ async def _record(settings: Settings, recording: CaptureRecorder, seconds: float
         progress = Progress(source, recording)
         await until_first_ends(
             stop.wait(),
-            _wait_for_disk_error(recording),
+            recording.wait_for_end(),
             _read_all(source),
             _wait_for_duration(recording, seconds),
             _show_progress(console, progress, log),
@@ -96,11 +96,6 @@ async def _read_all(source: Source) -> None:
     """Read the source until it ends; its tap, the recorder, receives a copy of all bytes."""
     async for _ in source:
         pass
-
-
-async def _wait_for_disk_error(recording: CaptureRecorder) -> None:
-    with contextlib.suppress(OSError):  # ``record`` reports it as ``recording.fault``
-        await asyncio.wrap_future(recording.ended)
 
 
 async def _wait_for_duration(recording: CaptureRecorder, seconds: float | None) -> None:

@@ -14,6 +14,7 @@ import typer
 
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
+from bms_estimator.cli.options.port_options import OtherPort
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.process.log_setup import configure_logs, flush_logs
@@ -33,7 +34,7 @@ def run(
     packs: Annotated[
         list[Path] | None, typer.Argument(help="settings files, one for each pack", show_default="pack.toml")
     ] = None,
-    port: Annotated[str | None, typer.Option(help="serial port that replaces sensor.port of the settings")] = None,
+    port: OtherPort = None,
     mqtt: Annotated[
         str | None, typer.Option(help="MQTT broker that replaces mqtt.url of the settings, mqtt://host:port")
     ] = None,

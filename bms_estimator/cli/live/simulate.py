@@ -6,11 +6,12 @@ from typing import Annotated, Literal
 
 import typer
 
-from bms_estimator.cli.options.capture_options import CELL_HELP, CapacityAh
+from bms_estimator.cli.options.capture_options import CELL_HELP, CapacityAh, complete_battery
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.pack_options import with_broker
 from bms_estimator.model.cell import Cell, load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.suggestion import suggestion
 from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.tasks import until_first_ends
@@ -29,9 +30,16 @@ DEFAULT_LOAD_C = 3.0
 """Default load current as a multiple of the capacity [1/h], at which the SOC changes visibly."""
 
 
+def _complete_protocol(incomplete: str) -> list[str]:
+    return [name for name in DEVICE_PROTOCOLS if name.startswith(incomplete)]
+
+
 def simulate(
     cell: Annotated[
-        str, typer.Option(help=f"{CELL_HELP}; chen_mora: 275 mAh Li-ion cell of Chen and Rincón-Mora")
+        str,
+        typer.Option(
+            help=f"{CELL_HELP}; chen_mora: 275 mAh Li-ion cell of Chen and Rincón-Mora", autocompletion=complete_battery
+        ),
     ] = "chen_mora",
     capacity_ah: CapacityAh = None,
     series: Annotated[int, typer.Option(parser=whole(1), help="number of cells in series")] = 1,
@@ -56,6 +64,7 @@ def simulate(
         str | None,
         typer.Option(
             help=f"simulate a device with this protocol instead of a board: {', '.join(DEVICE_PROTOCOLS)} (a JK-BMS with newer frames)",
+            autocompletion=_complete_protocol,
             show_default=False,
         ),
     ] = None,
@@ -106,7 +115,9 @@ def simulate(
     elif protocol in BMS_ANSWERS:
         device = _simulated_bms(protocol, pack, model.cell, speed, seed)
     else:
-        raise UserError(f"--protocol {protocol}: must be one of {', '.join(DEVICE_PROTOCOLS)}")
+        raise UserError(
+            f"--protocol {protocol}: must be one of {', '.join(DEVICE_PROTOCOLS)}{suggestion(protocol, DEVICE_PROTOCOLS)}"
+        )
     asyncio.run(_serve(device, seconds))
     typer.echo(f"{device.samples:,} samples in {device.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
 

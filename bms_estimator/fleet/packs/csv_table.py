@@ -8,14 +8,15 @@ import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
 from pydantic import ValidationError
 
 from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, encode_row, known_cells, model_key, model_of
+from bms_estimator.model.config_file import error_reason
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.suggestion import suggestion
 from bms_estimator.settings.pack import DEVICE_NAME
 
 MAX_ERRORS = 20
@@ -137,7 +138,12 @@ class _Reader:
             UserError: A column is unknown, repeated or missing.
         """
         names = [name.strip() for name in header]
-        errors = [f"column {name!r} is unknown; {_suggestion(name)}" for name in names if name not in COLUMNS]
+        all_columns = f"; there are {', '.join(COLUMNS)}"
+        errors = [
+            f"column {name!r} is unknown{suggestion(name, COLUMNS) or all_columns}"
+            for name in names
+            if name not in COLUMNS
+        ]
         errors += [f"column {name} is repeated" for name in COLUMNS if names.count(name) > 1]
         errors += [f"column {name} is missing" for name in ("pack", "cell") if name not in names]
         _raise_errors(self._path, [f"{self._path}: line 1: {error}" for error in errors])
@@ -169,7 +175,7 @@ class _Reader:
             return PackSpec.model_validate(values)
         except ValidationError as error:
             detail = error.errors()[0]
-            message = detail["msg"].removeprefix("Value error, ")
+            message = error_reason(detail)
             if not detail["loc"]:  # a contradiction between columns, which the message names
                 raise _RowError(f"column {message}") from None
             column = str(detail["loc"][0])
@@ -217,11 +223,6 @@ def _separator(text: str) -> str:
     """Return the separator: the more frequent candidate in the first line."""
     first = text.partition("\n")[0]
     return max(",;", key=first.count)
-
-
-def _suggestion(name: str) -> str:
-    close = get_close_matches(name, COLUMNS, n=1)
-    return f"is {close[0]} meant?" if close else f"there are {', '.join(COLUMNS)}"
 
 
 def _raise_errors(path: Path, errors: Sequence[str]) -> None:

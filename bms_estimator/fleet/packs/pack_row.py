@@ -16,7 +16,7 @@ from bms_estimator.model.cell import (
     shipped_fuel_cells,
     with_capacity,
 )
-from bms_estimator.model.config_file import NotNegative, Positive, Strict, parse_toml
+from bms_estimator.model.config_file import NotNegative, Positive, Strict, error_reason, parse_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
 from bms_estimator.model.one_of import OneOf
@@ -98,7 +98,7 @@ def decode_row(data: bytes) -> PackSpec:
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))
-        message = first["msg"].removeprefix("Value error, ")
+        message = error_reason(first)
         raise ValueError(f"{field}: {message}" if field else message) from None
 
 

@@ -216,7 +216,8 @@ def _parts(block: Block) -> Iterator[Block]:
 def _finite_times_s(samples: SampleBlock) -> NDArray[np.float64]:
     """Return the finite timestamps [s]."""
     times: NDArray[np.float64] = samples["time_s"]
-    return times[np.isfinite(times)]
+    finite: NDArray[np.float64] = times[np.isfinite(times)]
+    return finite
 
 
 def _digest(words: NDArray[np.uint64]) -> Digest:

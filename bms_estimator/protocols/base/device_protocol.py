@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.protocols.base.relay import Relay
+from bms_estimator.protocols.base.sensor_correction import EXACT, SensorCorrection
 
 
 @dataclass
@@ -32,6 +33,8 @@ class DeviceProtocol(ABC):
     """Cell voltages of the samples that ``feed`` or ``feed_reads`` returned last [V]."""
     probing: bool = False
     """True while the device is unknown. Then ``next_output`` returns only queries that change nothing in any device."""
+    correction: SensorCorrection = EXACT
+    """Correction of the measured values."""
 
     @property
     @abstractmethod
@@ -63,9 +66,8 @@ class DeviceProtocol(ABC):
         """Maximum time without data while the device works [s]."""
         return 0.0
 
-    @abstractmethod
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
-        """Decode the bytes of one read.
+        """Decode the bytes of one read, and correct the samples.
 
         Args:
             arrival_s: Arrival time, on any clock that never steps back [s].
@@ -74,6 +76,7 @@ class DeviceProtocol(ABC):
         Returns:
             Samples, shape (n,), n may be 0.
         """
+        return self.correction.apply(self._decode(arrival_s, data))
 
     def feed_reads(
         self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
@@ -85,10 +88,20 @@ class DeviceProtocol(ABC):
             ends: End of each read in ``data``.
             data: Concatenated bytes of the reads.
         """
+        return self.correction.apply(self._decode_reads(arrivals_s, ends, data))
+
+    @abstractmethod
+    def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
+        """Decode the bytes of one read to samples as measured."""
+
+    def _decode_reads(
+        self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
+    ) -> SampleBlock:
+        """Decode many reads at once to samples as measured."""
         blocks, cells = [np.empty(0, dtype=SAMPLE)], list[Sequence[float]]()
         begin = 0
         for arrival_s, end in zip(arrivals_s.tolist(), ends.tolist(), strict=True):
-            blocks.append(self.feed(arrival_s, data[begin:end].tobytes()))
+            blocks.append(self._decode(arrival_s, data[begin:end].tobytes()))
             cells += self.cells.tolist() or [()] * blocks[-1].size
             begin = end
         self.cells = cell_block(cells)

@@ -48,7 +48,7 @@ class ReadingProtocol(DeviceProtocol):
         """First fault since the last reading; None without one."""
         return self._fault_text
 
-    def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
+    def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         """Decode the bytes of one read; ``time_s`` is the arrival time since the first sample."""
         self._counts["bytes_received"] += len(data)
         readings = []

@@ -85,7 +85,7 @@ class TextProtocol(DeviceProtocol):
             return None
         return f"prints text, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
-    def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
+    def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         """Decode the bytes of one read; ``time_s`` is the time since the first sample, from ``DeviceClock``."""
         self._received_bytes += len(data)
         *lines, self._unparsed = (self._unparsed + data).split(b"\n")

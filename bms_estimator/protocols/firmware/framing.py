@@ -425,7 +425,8 @@ def decode(
             elif message_type != 0:
                 if message_type == MESSAGE_HELLO:
                     apply_hello(d, s)
-                messages[n_messages, :] = d.packet[:PACKET_BYTES]
+                for j in range(PACKET_BYTES):
+                    messages[n_messages, j] = d.packet[j]
                 messages[n_messages, HELLO_BYTES if message_type == MESSAGE_HELLO else ACK_BYTES :] = 0
                 n_messages += 1
         d.synchronized = 1

@@ -104,14 +104,14 @@ class BoardProtocol(DeviceProtocol):
             self._command.refusal = "the line was lost before the board answered, and another board may be there now"
             self._command.done = True
 
-    def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
+    def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         """Decode the bytes of one read; for ``time_s`` see ``FrameDecoder.feed``."""
         block = self._decoder.feed(arrival_s, data)
         if self._command is not None:
             self._update_command(self._command)
         return block
 
-    def feed_reads(
+    def _decode_reads(
         self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
     ) -> SampleBlock:
         """Decode many reads at once."""

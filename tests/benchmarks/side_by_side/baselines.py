@@ -44,13 +44,13 @@ COLD_C = 0.0
 dependent resistance of the cell file [C]."""
 
 
-@njit
+@njit()
 def _ocv_slope(soc: float, grid: Floats) -> float:
     """Return the slope of the OCV by a central difference [V]."""
     return (ocv(soc + SOC_STEP, grid[0], grid[1]) - ocv(soc - SOC_STEP, grid[0], grid[1])) / (2.0 * SOC_STEP)
 
 
-@njit
+@njit()
 def fixed_ekf(
     time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats
 ) -> tuple[Floats, Floats]:
@@ -89,7 +89,7 @@ def fixed_ekf(
     return soc, std
 
 
-@njit
+@njit()
 def joint_ekf(
     time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats
 ) -> tuple[Floats, Floats]:
@@ -182,7 +182,7 @@ def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]
     return weak + strong, ln_ratio / math.log(arrhenius(1.0, COLD_C))
 
 
-@njit
+@njit()
 def ladder_ekf(
     time_s: Floats,
     current_a: Floats,
@@ -244,7 +244,7 @@ def ladder_ekf(
     return soc, std
 
 
-@njit
+@njit()
 def rls_arx(current_a: Floats, overpotential_v: Floats, forgetting: float) -> Floats:
     """Run recursive least squares with forgetting on the ARX form of a model with two RC pairs.
 

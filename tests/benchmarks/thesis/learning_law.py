@@ -163,7 +163,7 @@ def recompile_with(kernel: Any, **replacements: Any) -> Any:
     original = kernel.py_func
     if unused := replacements.keys() - set(original.__code__.co_names):
         raise KeyError(*unused)
-    return njit(types.FunctionType(original.__code__, original.__globals__ | replacements, original.__name__))
+    return njit()(types.FunctionType(original.__code__, original.__globals__ | replacements, original.__name__))
 
 
 def run_with(**replacements: Any) -> Run:
@@ -173,7 +173,7 @@ def run_with(**replacements: Any) -> Run:
     return run
 
 
-@njit
+@njit()
 def step_without_states(m: Record, q: Record, share: float) -> None:
     """Replace ``apply_parameter_step``: change theta (ln of the parameters) without correcting states and offset."""
     squared_step = 0.0
@@ -183,7 +183,7 @@ def step_without_states(m: Record, q: Record, share: float) -> None:
     learning_law.discount_information(m, q, share * squared_step / (q.reach * q.reach))
 
 
-@njit
+@njit()
 def step_along_gradient(m: Record, q: Record) -> bool:
     """Replace ``solve_parameter_step``: step along the gradient divided by the trace of the memory, instead of Newton's step."""
     trace_of_information = 0.0
@@ -197,7 +197,7 @@ def step_along_gradient(m: Record, q: Record) -> bool:
     return True
 
 
-@njit
+@njit()
 def remember_last_sample(m: Record, q: Record, dt_s: float, e: float) -> None:
     """Replace ``accumulate_information``: use only the present sample, as normalized product of sensitivity psi and error e."""
     psi_squared = 0.0
@@ -207,7 +207,7 @@ def remember_last_sample(m: Record, q: Record, dt_s: float, e: float) -> None:
         m.pull[j] = m.psi[j] * e / (psi_squared + q.told_v * q.told_v)
 
 
-@njit
+@njit()
 def step_along_pull(m: Record, q: Record) -> bool:
     """Replace ``solve_parameter_step`` to suit ``remember_last_sample``.
 
@@ -218,7 +218,7 @@ def step_along_pull(m: Record, q: Record) -> bool:
     return True
 
 
-@njit
+@njit()
 def inject_as_printed(m: Record, q: Record, dt_s: float, e: float) -> None:
     """Replace ``inject_output_error``: u = -N e into both RC pairs, by (3.2) and (3.3) of the thesis with N = N(0) = 1/s."""
     share = 2.0 * integral_of_exponential(-2.0, dt_s)

@@ -11,24 +11,15 @@ import aiohttp
 import aiomqtt
 import pytest
 
-from tests.command_line import PROGRAM
+from tests.command_line import PROGRAM, running_program
 from tests.free_port import free_port
 from tests.mosquitto import Listener
 from tests.patience import LONG_S
 
 
-@contextlib.asynccontextmanager
-async def demo(*arguments):
+def demo(*arguments):
     """Run ``demo`` as a process, which is killed at the end."""
-    process = await asyncio.create_subprocess_exec(
-        PROGRAM, "demo", *map(str, arguments), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
-    )
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
+    return running_program(PROGRAM, "demo", *arguments)
 
 
 async def connect_listener(port):

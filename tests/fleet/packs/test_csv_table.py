@@ -20,6 +20,7 @@ from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings
 from bms_estimator.settings.sensor import SensorSettings
+from bms_estimator.sources.captures.raw_capture import CORRECTIONS
 
 LFP_SPEC = PackSpec(cell="lfp", capacity_ah=100.0, series=16, voltage_resolution_v=0.01)
 ROW = "house,lfp,100,16"
@@ -63,16 +64,16 @@ def test_table_may_have_either_separator_and_line_end_and_a_byte_order_mark(writ
         ("a b,lfp,1,1", "line 2, column pack = 'a b': must be 1 to 64 letters, digits, _ and -"),
         (",lfp,1,1", "line 2, column pack = ''"),
         ("house,,1,1", "line 2, column cell is empty; it must be generic chemistry lfp, nmc"),
-        ("house,../x,1,1", "line 2, column cell = '../x': String should match pattern"),
+        ("house,../x,1,1", "line 2, column cell = '../x': is not of the form that it must have"),
         ("house,x.toml,1,1", "line 2, column cell = 'x.toml': no such file beside the table"),
         (
             "house,lfp,-6.6,1",
-            "line 2, column capacity_ah = '-6.6': Input should be greater than 0 (capacity of the cell",
+            "line 2, column capacity_ah = '-6.6': must be greater than 0 (capacity of the cell",
         ),
         ("house,lfp,1e999,1", "line 2, column capacity_ah = '1e999'"),
         ("house,lfp,nan,1", "line 2, column capacity_ah = 'nan': must be a number"),
         ("house,lfp,1,1.5", "line 2, column series = '1.5'"),
-        ("house,lfp,1,0", "line 2, column series = '0': Input should be greater than or equal to 1"),
+        ("house,lfp,1,0", "line 2, column series = '0': must be greater than or equal to 1"),
         ("house,lfp,1_0,1", "line 2, column capacity_ah = '1_0': must be a number"),
         ('house,lfp,"1,5",1', "line 2, column capacity_ah = '1,5': must be a number, with a point and not a comma"),
         ("house,lfp,1", "line 2, 3 values in 4 columns; give one for each, empty for the default"),
@@ -142,7 +143,7 @@ def test_row_of_the_table_gives_the_settings_of_a_pack():
 
 def test_columns_are_the_settings_of_a_pack_file_that_change_an_estimate():
     """A new setting must become a column, unless the edge or the worker handles it."""
-    handled_by_the_edge = {"port", "serial", "address", "baud", "sample_rate_hz", "current_sign"}
+    handled_by_the_edge = {"port", "serial", "address", "baud", "sample_rate_hz", "current_sign"} | set(CORRECTIONS)
     fixed_by_the_worker = {"enabled", "pack_model"}
     settings = {name for section in (PackSettings, SensorSettings, IdentifierSettings) for name in section.model_fields}
     assert settings - handled_by_the_edge - fixed_by_the_worker == set(COLUMNS) - {"pack"} | {"name"}

