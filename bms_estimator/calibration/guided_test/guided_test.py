@@ -10,7 +10,7 @@ from enum import StrEnum
 
 from bms_estimator.calibration.guided_test.averages import Average, Averager
 from bms_estimator.calibration.guided_test.load_warnings import limit_warning, load_warning
-from bms_estimator.calibration.guided_test.plan import Limits, Plan
+from bms_estimator.calibration.guided_test.plan import KNEE_SOC, Limits, Plan
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 
 FULL_MARGIN_V = 0.02
@@ -158,7 +158,7 @@ class GuidedTest:
     @property
     def expected_discharges(self) -> int:
         """Expected number of discharges, by the rated capacity."""
-        return max(round(1.0 / self._plan.step_soc), self._discharges)
+        return max(round(1.0 / self._plan.step_soc) + 1, self._discharges)
 
     @property
     def _remaining_rest_s(self) -> float:
@@ -176,8 +176,9 @@ class GuidedTest:
     def _discharge_s(self, drawn_ah: float) -> float:
         """Return the time of the remaining discharges and the rests after them [s]."""
         remaining_ah = max(self._limits.capacity_ah - drawn_ah, 0.0)
-        # one rest for each discharge that begins; the tolerance absorbs rounding
+        # one rest for each step that begins, and that of the knee; the tolerance absorbs rounding
         rests = math.ceil(remaining_ah / (self._plan.step_soc * self._limits.capacity_ah) - 1e-6)
+        rests += drawn_ah < KNEE_SOC * self._limits.capacity_ah * (1.0 - 1e-6)
         return 3600.0 * remaining_ah / self._mean_load_a + rests * self._plan.rest_s
 
     def _start_again(self, reason: str) -> None:
@@ -273,7 +274,8 @@ class GuidedTest:
         is_low = now.voltage_v <= self._limits.cutoff_v or now.min_cell_v <= self._limits.min_cell_v
         self._empty_seconds = self._empty_seconds + 1 if is_low else 0
         self._is_empty = self._empty_seconds >= EMPTY_SECONDS
-        if self._is_empty or self._step_as >= self._plan.step_soc * 3600.0 * self._limits.capacity_ah:
+        goal_as = self._plan.discharge_soc(self._discharges) * 3600.0 * self._limits.capacity_ah
+        if self._is_empty or self._step_as >= goal_as:
             self._enter(Phase.REST, now)
 
     def _enter(self, phase: Phase, now: Average) -> None:

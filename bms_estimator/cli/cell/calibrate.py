@@ -97,7 +97,7 @@ def calibrate_command(
     test: Annotated[
         PlanName,
         typer.Option(
-            help="test beside the pack, if no captures are given; it takes 3 h 15 min or 13 h after the charge"
+            help="test beside the pack, if no captures are given; it takes 3 h 21 min or 13.5 h after the charge"
         ),
     ] = PlanName.SHORT,
     restart: Annotated[bool, typer.Option("--restart", help="begin a new test, even if one was interrupted")] = False,

@@ -5,6 +5,11 @@ import pytest
 
 from bms_estimator.calibration.guided_test.guided_test import GuidedTest, Phase
 from bms_estimator.calibration.guided_test.plan import LONG, SHORT, Limits
+from bms_estimator.calibration.ocv.points import Points
+from bms_estimator.calibration.ocv.table_fit import fit_table
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
+from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 
 LIMITS = Limits(
@@ -186,18 +191,36 @@ def test_the_state_depends_only_on_the_samples() -> None:
     )
 
 
+@pytest.mark.parametrize("plan", [SHORT, LONG], ids=lambda plan: plan.name)
+@pytest.mark.parametrize("chemistry", ["lfp", "nca", "nmc", "lco", "lmo", "lto"])
+def test_ocv_near_full_follows_from_the_rests_of_a_plan(plan, chemistry) -> None:
+    pack = Pack(plan)
+    pack.charge()
+    test = pack.run(plan.full_rest_s + 5, 0.0, 4.18)
+    while not test.is_done and test.points[-1].soc > 0.1:
+        pack.run(1, 1.5, 3.8)
+        if test.phase is Phase.REST:
+            pack.run(plan.rest_s + 5, 0.0, 3.9)
+    rests = np.array(sorted({0.0, *(min(point.soc, 1.0) for point in test.points)}))
+    grid = ocv_grid(load_cell(chemistry, 3.0))
+    std_v = np.full(rests.size, 0.001)
+    curve = fit_table(Points(rests, ocv_of_each(rests, *grid), std_v, std_v))
+    near_full = np.linspace(0.9, 1.0, 101)
+    assert np.abs(curve(near_full) - ocv_of_each(near_full, *grid)).max() < 0.025
+
+
 def test_the_remaining_time_follows_the_measured_current() -> None:
     pack = Pack()
     test = pack.until_first_discharge()
-    assert test.remaining_s == pytest.approx(2 * 3600 + 10 * SHORT.rest_s, rel=0.01)
+    assert test.remaining_s == pytest.approx(2 * 3600 + 11 * SHORT.rest_s, rel=0.01)
     pack.run(60, 3.0, 3.8)
-    assert test.remaining_s == pytest.approx(3600 + 10 * SHORT.rest_s, rel=0.03)
+    assert test.remaining_s == pytest.approx(3600 + 11 * SHORT.rest_s, rel=0.03)
     assert "the measured 3.00 A" in test.remaining_basis
 
 
 def test_a_guided_test_lasts_as_long_as_its_help_says() -> None:
-    assert GuidedTest(SHORT, LIMITS).remaining_s / 3600 == pytest.approx(3.25)
-    assert GuidedTest(LONG, LIMITS).remaining_s / 3600 == pytest.approx(13.0)
+    assert GuidedTest(SHORT, LIMITS).remaining_s / 3600 == pytest.approx(3.35)
+    assert GuidedTest(LONG, LIMITS).remaining_s / 3600 == pytest.approx(13.5)
 
 
 def test_noise_of_single_samples_does_not_interrupt_a_rest() -> None:
