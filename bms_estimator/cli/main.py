@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -132,6 +133,13 @@ freed."""
 
 class _Commands(LazyGroup):
     entries = COMMANDS
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command. Ctrl-C or the end of the input at a prompt is an interruption, as anywhere else."""
+        try:
+            return super().invoke(ctx)
+        except typer.Abort:
+            raise typer.Exit(130) from None
 
 
 app = typer.Typer(

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import re
+import signal
 import subprocess
 import tomllib
 from pathlib import Path
@@ -107,6 +108,15 @@ def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
     assert (settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == ("lfp", 100.0, 8)
     assert (settings.sensor.port, settings.sensor.protocol, settings.mqtt) == (path, "jk", None)
     assert (settings.sensor.voltage_gain, settings.sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
+
+
+def test_an_interrupt_at_a_prompt_ends_with_code_130_and_writes_nothing(file):
+    with running_device(jk_bms()) as path, PseudoTerminal("new", str(file), "--search", path, columns=200) as terminal:
+        terminal.until(lambda: "Number of the device" in plain(terminal.output))
+        terminal.process.send_signal(signal.SIGINT)
+        terminal.until(terminal.ended)
+    assert terminal.process.returncode == 130
+    assert not file.exists()
 
 
 def plain(output: str) -> str:
