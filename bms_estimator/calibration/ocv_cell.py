@@ -68,7 +68,7 @@ class OcvCell:
         cell: The cell.
         fit: Fit of the open-circuit voltage.
         sources: Sources of the points, and the capacity.
-        generic: Most similar generic cell, whose resistances were scaled to those of the rests.
+        generic: Most similar generic cell. Its resistances are scaled to the resistances that the rests show.
     """
 
     cell: CellModel

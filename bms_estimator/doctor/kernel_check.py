@@ -16,7 +16,7 @@ MAX_OLD_VERSIONS = 3
 
 
 def check_kernels(subject: Subject | None) -> Iterator[Finding]:
-    """Yield whether kernels are compiled, and whether those of this version can be stored."""
+    """Yield whether kernels are compiled, and whether they can be stored."""
     folder = (subject and subject.unit_cache_folder) or _users_cache_folder()
     if folder is None:
         text = "no folder can be written: every start compiles the kernels, which may take minutes"

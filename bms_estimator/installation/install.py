@@ -35,7 +35,7 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
     Args:
         machine: Machine of the service.
         program: Absolute path of the program on the machine.
-        pack: Files to install; None: keep those of an earlier installation.
+        pack: Files to install; None: keep the files of an earlier installation.
         report: Called after each step.
 
     Returns:

@@ -51,7 +51,7 @@ def element(cell: CellModel, name: str, estimates: Mapping[str, Floats] | None =
         cell: Cell whose curve is drawn.
         name: ``r_s``, ``r_ts``, ``r_tl``, ``c_ts`` or ``c_tl``.
         estimates: Columns of the result of ``estimate``; None: only the cell's curve.
-        ax: Axes; None: those of a new figure.
+        ax: Axes; None: a new figure is created.
     """
     function, scale, label = ELEMENTS[name]
     curve = scale * np.array([function(x, cell.a[:16]) for x in SOC_GRID])
@@ -72,7 +72,7 @@ def rc_product(cell: CellModel, pair: str, estimates: Mapping[str, Floats] | Non
         cell: Cell whose curve is drawn.
         pair: ``ts`` or ``tl``.
         estimates: Columns of the result of ``estimate``; None: only the cell's curve.
-        ax: Axes; None: those of a new figure.
+        ax: Axes; None: a new figure is created.
     """
     ohm, farad, label = PAIRS[pair]
     curve = np.array([ohm(x, cell.a[:16]) * farad(x, cell.a[:16]) for x in SOC_GRID])
@@ -90,7 +90,7 @@ def ocv(cell: CellModel, soc: Floats | None = None, ocv_v: Floats | None = None,
         cell: Cell whose curve is drawn.
         soc: Shape (n,), SOC of the measured points, 0..1.
         ocv_v: Shape (n,), measured open-circuit voltage [V].
-        ax: Axes; None: those of a new figure.
+        ax: Axes; None: a new figure is created.
     """
     ax = ax or new_axes()
     curve_v = ocv_grid(cell)[0]
@@ -112,7 +112,7 @@ def ocv_residuals(cell: CellModel, soc: Floats, residual_v: Floats, *, ax: Any =
         cell: Cell whose curve was subtracted.
         soc: Shape (n,), 0..1.
         residual_v: Shape (n,) [V].
-        ax: Axes; None: those of a new figure.
+        ax: Axes; None: a new figure is created.
     """
     ax = ax or new_axes()
     std_v = ocv_std(cell)

@@ -18,13 +18,13 @@ TIME_UNITS = ((3.0 * 86_400.0, 86_400.0, "days"), (7_200.0, 3_600.0, "h"), (180.
 
 
 def voltage(time_s: Floats, measured_v: Floats, modeled_v: Floats | None = None, *, ax: Any = None) -> Any:
-    """Draw the measured voltage and, if given, that of a model.
+    """Draw the measured voltage and, if given, the modeled voltage.
 
     Args:
         time_s: Shape (n,), increasing [s].
         measured_v: Shape (n,) [V].
         modeled_v: Shape (n,) [V]; None: only the measured voltage is drawn.
-        ax: Axes; None: those of a new figure.
+        ax: Axes; None: a new figure is created.
     """
     ax = ax or new_axes()
     if modeled_v is None:
@@ -43,7 +43,7 @@ def voltage_error(time_s: Floats, error_v: Floats, *, ax: Any = None) -> Any:
     Args:
         time_s: Shape (n,), increasing [s].
         error_v: Shape (n,) [V].
-        ax: Axes; None: those of a new figure.
+        ax: Axes; None: a new figure is created.
     """
     ax = ax or new_axes()
     error_mv = 1e3 * error_v
@@ -70,7 +70,7 @@ def soc(
         soc: Shape (n,), 0..1.
         soc_std: Shape (n,), standard deviation of ``soc``; None: without a band.
         counted: Shape (n,), SOC by coulomb counting; None: not drawn.
-        ax: Axes; None: those of a new figure.
+        ax: Axes; None: a new figure is created.
     """
     ax = ax or new_axes()
     std = np.zeros(soc.size) if soc_std is None else np.nan_to_num(soc_std)
@@ -92,7 +92,7 @@ def current(time_s: Floats, current_a: Floats, *, ax: Any = None) -> Any:
     Args:
         time_s: Shape (n,), increasing [s].
         current_a: Shape (n,) [A].
-        ax: Axes; None: those of a new figure.
+        ax: Axes; None: a new figure is created.
     """
     ax = ax or new_axes()
     ax.plot(*_thin_over_time(time_s, current_a), color=COLORS[2], linewidth=0.8, drawstyle="steps-post")
@@ -106,7 +106,7 @@ def temperature(time_s: Floats, temperature_c: Floats, *, ax: Any = None) -> Any
     Args:
         time_s: Shape (n,), increasing [s].
         temperature_c: Shape (n,) [°C]; NaN where it was not measured.
-        ax: Axes; None: those of a new figure.
+        ax: Axes; None: a new figure is created.
     """
     ax = ax or new_axes()
     ax.plot(*_thin_over_time(time_s, temperature_c), color=COLORS[3], linewidth=1.0)
@@ -120,7 +120,7 @@ def time_unit(time_s: Floats) -> tuple[float, str]:
 
 
 def label_time_axis(ax: Any, time_s: Floats, label: str) -> Any:
-    """Label the axes of a plot over ``time_s``; ``label`` is that of the vertical axis. Return the axes."""
+    """Label the axes of a plot over ``time_s``; ``label`` names the vertical axis. Return the axes."""
     ax.set(xlabel=f"time [{time_unit(time_s)[1]}]", ylabel=label)
     ax.margins(x=0.01)
     return ax

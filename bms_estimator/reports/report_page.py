@@ -38,7 +38,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Section:
-    """Section of a report, such as that of one capture."""
+    """Section of a report, for example on one capture."""
 
     title: str
     sentences: tuple[str, ...]

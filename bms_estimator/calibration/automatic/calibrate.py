@@ -1,6 +1,6 @@
 """Calibration of a cell: capacity, open-circuit voltage with hysteresis, resistances, and a validation.
 
-The steps are those of the commands ``capacity``, ``ocv``, ``identify`` and ``validate``. The model is fitted twice: without
+It takes the same steps as the commands ``capacity``, ``ocv``, ``identify`` and ``validate``. The model is fitted twice: without
 the data that are held back, to validate it, and then to all captures. The second fit is the result.
 """
 
@@ -41,8 +41,8 @@ class FittedModel:
 
     Attributes:
         cell: The cell model.
-        ocv: Fit of the open-circuit voltage; None if it is that of the given cell, because no capture determines it.
-        identification: Fit of the resistances; None if they are those of the most similar generic cell.
+        ocv: Fit of the open-circuit voltage; None if no capture determines it, so that the given cell's OCV is used.
+        identification: Fit of the resistances; None if those of the most similar generic cell are used.
         reason: Reason why the resistances are generic; empty if they were identified.
     """
 
@@ -108,7 +108,7 @@ def calibrate(
         _require_usable_capture(recognized)
     split = hold_back(recognized)
 
-    fits = 1 if split.held_back is None else 2  # their duration is almost that of the whole work
+    fits = 1 if split.held_back is None else 2  # they take almost the whole time
 
     def fit(fitted: Split, step: str, done: int) -> FittedModel:
         def progress(fraction: float) -> None:

@@ -30,7 +30,7 @@ class Split:
     resistances: tuple[RecognizedCapture, ...]
     held_back: RecognizedCapture | None = None
     held_back_from_s: float = 0.0
-    sentence: str = "No data were held back: the errors are those of the fit."
+    sentence: str = "No data were held back: these are the errors on the data of the fit."
 
 
 def use_all(captures: Sequence[RecognizedCapture]) -> Split:
@@ -94,6 +94,6 @@ def _hold_back_last_part(all_data: Split) -> Split:
         held_back_from_s=float(samples["time_s"][end] - samples["time_s"][0]),
         sentence=(
             f"Validated on the last {100.0 * (1.0 - FIT_FRACTION):.0f} % of the charge in {chosen.capture.name}, by resistances "
-            "that were fitted without these data; the OCV is that of the whole capture."
+            "that were fitted without these data; the OCV was fitted to the whole capture."
         ),
     )

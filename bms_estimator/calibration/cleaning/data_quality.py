@@ -27,7 +27,7 @@ class DataQuality:
         gaps: Number of intervals longer than ``MIN_GAP_PERIODS`` times the median period and
             ``MIN_GAP_TO_LONG_PERIOD`` times the 99th percentile.
         longest_gap_s: Longest interval between two samples [s].
-        backward_steps: Number of samples whose time is before that of the previous sample.
+        backward_steps: Number of samples whose time is before the previous sample's time.
         repeated_times: Number of samples with the time of the previous sample.
         not_finite: Number of samples without a finite time, current or voltage.
         temperature_fraction: Fraction of samples with a temperature, 0..1.

@@ -1,6 +1,6 @@
 """State machine of a guided test: samples in, instruction and progress out.
 
-The test has no clock of its own: all durations are those of the samples. After a restart, the samples recorded
+The test has no clock of its own: all durations are differences of sample times. After a restart, the samples recorded
 before lead to the same state.
 """
 
@@ -176,7 +176,7 @@ class GuidedTest:
     def _discharge_s(self, drawn_ah: float) -> float:
         """Return the time of the remaining discharges and the rests after them [s]."""
         remaining_ah = max(self._limits.capacity_ah - drawn_ah, 0.0)
-        # one rest for each step that begins, and that of the knee; the tolerance absorbs rounding
+        # one rest for each step that begins, and one at the knee; the tolerance absorbs rounding
         rests = math.ceil(remaining_ah / (self._plan.step_soc * self._limits.capacity_ah) - 1e-6)
         rests += drawn_ah < KNEE_SOC * self._limits.capacity_ah * (1.0 - 1e-6)
         return 3600.0 * remaining_ah / self._mean_load_a + rests * self._plan.rest_s

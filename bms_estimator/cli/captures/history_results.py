@@ -24,7 +24,7 @@ def pack_history(settings: Settings, model: PackModel, folder: Path | None, sinc
     Args:
         settings: Settings of the pack.
         model: The pack as one object.
-        folder: State folder of the service; None: that of the settings.
+        folder: State folder of the service; None: the folder in the settings.
         since_s: Start time [s since 1970].
 
     Raises:

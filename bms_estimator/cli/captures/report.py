@@ -63,7 +63,9 @@ def report(
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(help="state folder of the service; default: that of the settings of --pack", show_default=False),
+        typer.Option(
+            help="state folder of the service; default: the folder in the settings of --pack", show_default=False
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -111,8 +113,8 @@ def report_on_captures(
         files: Files of the captures.
         opened: The captures, of which nothing has been read.
         pack: Settings file of the pack; None: default settings.
-        cell: Cell; None: that of the pack.
-        capacity_ah: Capacity [Ah]; None: that of the pack or of the cell file.
+        cell: Cell; None: the pack's cell.
+        capacity_ah: Capacity [Ah]; None: the capacity in the settings of the pack or in the cell file.
         soc: SOC at the first sample of each capture, 0..1; None: from the voltage.
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)

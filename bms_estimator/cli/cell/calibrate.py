@@ -77,14 +77,14 @@ def calibrate_command(
             "--capacity-ah",
             "--capacity",
             parser=decimal(1e-6),
-            help="rated capacity of the cell [Ah]; required for a generic cell; default: that of PACK.toml",
+            help="rated capacity of the cell [Ah]; required for a generic cell; default: the capacity in PACK.toml",
             show_default=False,
         ),
     ] = None,
     series: Annotated[
         int | None,
         typer.Option(
-            parser=whole(1), help="number of cells in series in the captures; default: that of PACK.toml, or 1"
+            parser=whole(1), help="number of cells in series in the captures; default: the number in PACK.toml, or 1"
         ),
     ] = None,
     report: Annotated[

@@ -55,7 +55,7 @@ def convert(
 
 
 def _notes(suffix: str, cell: CellModel) -> list[str]:
-    """Return notes on how the written model differs from that of the cell file."""
+    """Return notes on how the written model differs from the model in the cell file."""
     notes = []
     hysteresis_v = cell.ocv.hysteresis_v if isinstance(cell.ocv, TableOcv) else None
     if suffix == ".py" and hysteresis_v and max(hysteresis_v) > 0.0:

@@ -20,7 +20,7 @@ LONG_FILE_BYTES = 5_000_000
 
 @contextmanager
 def capture_file(path: Path) -> Iterator[Path]:
-    """Yield the path of a capture; for ``-`` that of a temporary copy of standard input."""
+    """Yield the path of a capture; for ``-``, a temporary copy of standard input."""
     if str(path) != "-":
         yield path
         return
@@ -30,7 +30,7 @@ def capture_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def capture_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
-    """Yield the paths of captures; for ``-`` that of a temporary copy of standard input."""
+    """Yield the paths of captures; for ``-``, a temporary copy of standard input."""
     with ExitStack() as stack:
         yield [stack.enter_context(capture_file(path)) for path in paths]
 

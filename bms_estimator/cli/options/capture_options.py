@@ -62,7 +62,7 @@ SignOfCurrent = Annotated[
     typer.Option(
         metavar="SIGN",
         help="direction of positive current in the capture: discharge_positive or charge_positive; default: "
-        "that of the format; if it defines none, that which the voltage shows",
+        "the format's direction; if it defines none, the direction that the voltage shows",
     ),
 ]
 TemperatureWithoutSensor = Annotated[

@@ -55,7 +55,7 @@ class CompileListener(event.Listener):
     def __init__(self, show: Callable[[], None]) -> None:
         self._show, self._is_shown, self._interrupted = show, False, False
         self.on_kernel: Callable[[], None] = lambda: None
-        """Function that is called before each kernel is compiled. ``show`` may replace it by that of a bar."""
+        """Function that is called before each kernel is compiled. ``show`` may replace it, for example to draw a bar."""
 
     def on_interrupt(self, *_: object) -> None:
         """Remember SIGINT."""

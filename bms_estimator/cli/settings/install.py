@@ -87,7 +87,7 @@ def uninstall_command(
 
 @contextmanager
 def _errors_of_files() -> Iterator[None]:
-    """Convert an error of a file or folder to UserError, for example that of a read-only file system."""
+    """Convert an error of a file or folder to UserError, for example if the file system is read-only."""
     try:
         yield
     except OSError as error:
@@ -98,7 +98,7 @@ def _machine(root: Path, command: str, arguments: Sequence[str]) -> Machine:
     """Return the machine with a root directory.
 
     Raises:
-        UserError: The user is not root, or the directory is not that of a system.
+        UserError: The user is not root, or the directory contains no system.
     """
     if os.geteuid() != 0:
         options = [] if root == Path("/") else [f"--root={root.resolve()}"]

@@ -254,7 +254,7 @@ def open_capture(
 
 
 def _why_no_file(path: Path) -> str:
-    """Return the reason why a path is not that of a regular file, as text."""
+    """Return the reason why a path is no regular file, as text."""
     if path.is_dir():
         return "is a directory"
     return "is a pipe or a device; give - and redirect it to standard input" if path.exists() else "no such file"
@@ -270,7 +270,7 @@ def load_capture(
 
     Args:
         source: Path of a raw capture or of a table (docs/cell/captures.md), or a table in memory: a DataFrame, a dict of
-            arrays. A table has our columns or those of a cycler.
+            arrays. A table has our columns or a cycler's columns.
         current_sign: Direction of positive current, ``discharge_positive`` or ``charge_positive``; None: that of
             the format; if it defines none, that which the voltage shows, otherwise discharge.
         column_map: Names of a table's columns for ``time``, ``current``, ``voltage`` and, optionally, ``temperature``, and
