@@ -5,6 +5,7 @@ import contextlib
 import shutil
 import socket
 import sys
+from collections.abc import Mapping
 
 import aiomqtt
 import pytest
@@ -43,12 +44,12 @@ async def next_message(client: aiomqtt.Client) -> tuple[str, bytes, bool]:
     return message.topic.value, message.payload, message.retain
 
 
-async def receive_retained(port: int, subscription: str) -> list[str]:
-    """Return the topics of the retained messages that a new client receives.
+async def receive_retained(port: int, subscription: str) -> list[tuple[str, bytes]]:
+    """Return topics and payloads of the retained messages that a new client receives, sorted.
 
     After the subscription the client sends a message to itself. Retained messages come before it.
     """
-    topics = []
+    retained = []
     own_topic = subscription.replace("#", "last").replace("+", "last")
     async with aiomqtt.Client("127.0.0.1", port) as client:
         await client.subscribe(subscription, qos=1)
@@ -56,14 +57,25 @@ async def receive_retained(port: int, subscription: str) -> list[str]:
         while True:
             topic, payload, retain = await next_message(client)
             if not retain and payload == b"end":
-                return sorted(topics)
-            topics.append(topic)
+                return sorted(retained)
+            retained.append((topic, payload))
 
 
-async def publish_all(client: aiomqtt.Client) -> None:
-    """Publish a retained message on each topic of ``RETAINED_TOPICS``."""
+async def wait_for_retained(port: int, expected: Mapping[str, bytes]) -> None:
+    """Wait until the retained messages are the expected ones, by topic.
+
+    nats-server confirms a retained message shortly before new subscriptions receive it.
+    """
+    async with asyncio.timeout(LONG_S):
+        while await receive_retained(port, "#") != sorted(expected.items()):
+            pass
+
+
+async def publish_all(client: aiomqtt.Client, port: int) -> None:
+    """Publish a retained message on each topic of ``RETAINED_TOPICS``, and wait until subscribers receive them."""
     for topic in RETAINED_TOPICS:
         await client.publish(topic, topic, qos=1, retain=True)
+    await wait_for_retained(port, {topic: topic.encode() for topic in RETAINED_TOPICS})
 
 
 @pytest.mark.parametrize(
@@ -78,17 +90,19 @@ async def publish_all(client: aiomqtt.Client) -> None:
 )
 async def test_subscriber_receives_each_matching_retained_message_once(free_port, subscription, expected):
     async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as service:
-        await publish_all(service)
+        await publish_all(service, free_port)
         for other in ("bms/#", "homeassistant/#", "#"):  # overlapping subscriptions of another client
             await service.subscribe(other)
-        assert await receive_retained(free_port, subscription) == sorted(expected)
+        assert [topic for topic, _ in await receive_retained(free_port, subscription)] == sorted(expected)
 
 
 async def test_an_empty_retained_message_removes_the_retained_message_of_its_topic(free_port):
     async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as service:
-        await publish_all(service)
+        await publish_all(service, free_port)
         await service.publish("bms/p/info", b"", qos=1, retain=True)
-        assert "bms/p/info" not in await receive_retained(free_port, "bms/#")
+        await wait_for_retained(
+            free_port, {topic: topic.encode() for topic in RETAINED_TOPICS if topic != "bms/p/info"}
+        )
 
 
 async def test_will_of_a_crashed_client_is_published_and_retained(free_port):
@@ -102,19 +116,19 @@ async def test_will_of_a_crashed_client_is_published_and_retained(free_port):
         process.stdin.close()
         assert await next_message(watcher) == ("bms/p/availability", b"offline", False)
         await process.wait()
-        async with aiomqtt.Client("127.0.0.1", free_port) as late:
-            await late.subscribe("bms/p/availability", qos=1)
-            assert await next_message(late) == ("bms/p/availability", b"offline", True)
+        await wait_for_retained(free_port, {"bms/p/availability": b"offline"})
 
 
 async def test_will_of_a_client_that_disconnects_is_not_published(free_port):
-    async with DemoBroker(free_port):
+    async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as watcher:
+        await watcher.subscribe("bms/p/#", qos=1)
         will = aiomqtt.Will("bms/p/availability", b"offline", qos=1, retain=True)
         async with aiomqtt.Client("127.0.0.1", free_port, will=will) as service:
             await service.publish("bms/p/availability", b"online", qos=1, retain=True)
-        async with aiomqtt.Client("127.0.0.1", free_port) as late:
-            await late.subscribe("bms/p/availability", qos=1)
-            assert await next_message(late) == ("bms/p/availability", b"online", True)
+        await watcher.publish("bms/p/state", b"later", qos=1)
+        assert await next_message(watcher) == ("bms/p/availability", b"online", False)
+        assert await next_message(watcher) == ("bms/p/state", b"later", False)
+        await wait_for_retained(free_port, {"bms/p/availability": b"online"})
 
 
 async def test_a_port_in_use_is_an_error_but_without_a_given_port_a_free_one_is_used(free_port):
@@ -128,7 +142,7 @@ async def test_the_printed_mosquitto_sub_command_shows_all_topics_of_the_packs(f
     if shutil.which("mosquitto_sub") is None:
         pytest.skip("mosquitto_sub is not installed (apt install mosquitto-clients)")
     async with DemoBroker(free_port) as broker, aiomqtt.Client("127.0.0.1", free_port) as service:
-        await publish_all(service)
+        await publish_all(service, free_port)
         command = f"{broker.subscribe_command} -C 3"  # -C: exit after three messages
         process = await asyncio.create_subprocess_shell(command, stdout=asyncio.subprocess.PIPE)
         async with asyncio.timeout(LONG_S):
