@@ -1,7 +1,8 @@
 """Compile kernels once for each signature, with a disk cache that notices every changed source file.
 
 numba checks only the file of the compiled function. It does not notice a change in the files of the functions that the
-kernel calls, or of the constants that it compiles in. Therefore the cache folder carries a hash of all these files.
+kernel calls, or of the constants that it compiles in. Therefore the cache folder carries a hash of all these files. All
+installations of a version share the folder.
 
 Every kernel imports ``njit`` from here: importing it sets the cache folder. If the cache cannot be written or read,
 kernels are compiled at each start. Each cached file ends with a digest, because machine code damaged by a power cut
@@ -16,11 +17,11 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar, cast
+from typing import Any, BinaryIO, Self, TypeVar, cast
 
 import numba
 from numba import types
-from numba.core.caching import Cache, IndexDataCacheFile, _CacheLocator
+from numba.core.caching import Cache, CompileResultCacheImpl, IndexDataCacheFile, _CacheLocator
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
@@ -45,7 +46,7 @@ short enough for a file offset of 63 bits."""
 # Any, because methods of these classes are replaced below
 _Cache: Any = Cache
 _CacheFile: Any = IndexDataCacheFile
-_Locator: Any = _CacheLocator
+_CacheImpl: Any = CompileResultCacheImpl
 _Dispatcher: Any = Dispatcher
 _numba_njit: Any = numba.njit  # its stubs lack no_cfunc_wrapper
 _unliteral: Any = types.unliteral
@@ -103,8 +104,8 @@ def njit(**options: Any) -> Callable[[Function], Function]:
 
 
 def source_digest() -> str:
-    """Return a hash of all files in ``COMPILED_IN``, the name of this version's folder within a cache folder."""
-    digest = hashlib.sha256()
+    """Return a hash of numba's version and all files in ``COMPILED_IN``, the name of a folder within a cache folder."""
+    digest = hashlib.sha256(numba.__version__.encode())
     for source in COMPILED_IN:
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
@@ -143,15 +144,47 @@ def count_kernels() -> int:
 
 
 def count_cached_kernels() -> int:
-    """Return the number of kernels in the cache, also of those that other processes have compiled.
-
-    Kernels of another installation of the same version are not counted: numba names the folder of a source file by
-    the path of the file.
-    """
+    """Return the number of kernels in the cache, also of those that other processes have compiled."""
     if CACHE_FOLDER is None:
         return 0
-    folders = {_Locator.get_suitable_cache_subpath(str(source)) for source in COMPILED_IN}
+    folders = {source.parent.relative_to(_PACKAGE) for source in COMPILED_IN}
     return sum(1 for folder in folders for _ in (CACHE_FOLDER / folder).glob("*.nbi"))
+
+
+class _PackageLocator(_CacheLocator):
+    """Place of a kernel of this package in the cache.
+
+    numba's own locators use the absolute path and the time of the source file, so that each installation would compile
+    the kernels again.
+    """
+
+    def __init__(self, function: Callable[..., Any], source: str) -> None:
+        self._py_file = source  # the name that numba uses in its warnings
+        self._line = function.__code__.co_firstlineno
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], source: str) -> Self | None:
+        """Return the place; None for a function of another package, or if the folder cannot be written."""
+        if not Path(source).is_relative_to(_PACKAGE):
+            return None
+        locator = cls(function, source)
+        try:
+            locator.ensure_cache_path()  # type: ignore[no-untyped-call]
+        except OSError:
+            return None
+        return locator
+
+    def get_cache_path(self) -> str:
+        """Return the folder of the source file within the package, below the cache folder."""
+        return str(Path(numba.config.CACHE_DIR) / Path(self._py_file).parent.relative_to(_PACKAGE))  # type: ignore[attr-defined]
+
+    def get_source_stamp(self) -> str:
+        """Return the same value for all files, because the name of the cache folder contains the hash of the sources."""
+        return ""
+
+    def get_disambiguator(self) -> str:
+        """Return the line of the function, which distinguishes functions of the same name."""
+        return str(self._line)
 
 
 @contextlib.contextmanager
@@ -213,6 +246,7 @@ def _enable_disk_cache(folder: Path | None) -> None:
         _Dispatcher.enable_caching = lambda _: None
         return
     numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+    _CacheImpl._locator_classes.insert(0, _PackageLocator)  # noqa: SLF001 - numba has no public function for it
     # numba's context manager around each access to the cache; numba's own does nothing except on Windows
     _Cache._guard_against_spurious_io_errors = _warn_on_cache_error  # noqa: SLF001
     _CacheFile._dump, _CacheFile._load_data = _dump_with_digest, _load_verified  # noqa: SLF001

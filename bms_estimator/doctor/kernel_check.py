@@ -9,7 +9,7 @@ from bms_estimator.doctor.subject import Subject
 from bms_estimator.numba_cache import cache_folders, source_digest
 
 NAME = "kernel cache"
-STEP_KERNELS = "kernels_*/step.*.nbi"
+STEP_KERNELS = "kernels/step.*.nbi"
 """Pattern of the files of the estimator's step, which is compiled last."""
 MAX_OLD_VERSIONS = 3
 """Maximum number of folders with kernels of earlier versions without a warning. Each may take more than 100 MB."""

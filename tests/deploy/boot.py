@@ -4,7 +4,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import uuid
 from pathlib import Path
 
@@ -18,11 +17,6 @@ COPIED_FILES = ("etc/passwd", "etc/group", "etc/os-release", "etc/nsswitch.conf"
 """Files that the container has from this machine."""
 OVERLAYS = ("/usr", "/var/lib/dpkg")
 """Folders of this machine: its programs and the list of its packages. The container's changes to them end with it."""
-PACKAGE = Path(f"/usr/lib/bms-estimator/lib/python3.{sys.version_info.minor}/site-packages/bms_estimator")
-"""Python package in the Debian package."""
-PACKAGE_COPY = Path("/opt") / PACKAGE.relative_to("/usr/lib")
-"""Python package in the copy of a program from a home folder."""
-
 CLOCK_PROGRAM = """#!/usr/lib/bms-estimator/bin/python3
 import ctypes
 from bms_estimator.process.boot_clock import synchronised
@@ -129,8 +123,8 @@ def make_root(root: Path) -> None:
     state.mkdir()
     # a checkpoint of an earlier version, with the name that the service gives to those of this pack
     shutil.copy(PROJECT / "tests/checkpoint/checkpoint_format_7.npz", state / "pack-5613cbc0.npz")
-    kernel_cache.fill(root / "var/cache/bms-estimator", PACKAGE)
-    kernel_cache.fill(root / "root/cache-of-copy", PACKAGE_COPY, omitted=None)
+    kernel_cache.fill(root / "var/cache/bms-estimator")
+    kernel_cache.fill(root / "root/cache-of-copy", omitted=None)
     shutil.copytree(root / "var/cache/bms-estimator", root / "root/cache")
 
 

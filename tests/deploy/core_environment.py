@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import re
-import shutil
 import subprocess
 import sys
 import sysconfig
@@ -47,9 +46,3 @@ def build_wheel(folder: Path) -> Path:
     subprocess.run(command, cwd=PROJECT, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
     return wheel
-
-
-def copy_times(package: Path, original: Path) -> None:
-    """Give the files of a package the times of the original ones, which compiled kernels in the cache must match."""
-    for file in package.rglob("*.py"):
-        shutil.copystat(original / file.relative_to(package), file)

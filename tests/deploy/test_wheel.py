@@ -7,11 +7,9 @@ from pathlib import Path
 
 import pytest
 
-import bms_estimator
 from tests.deploy.core_environment import (
     PROJECT,
     build_wheel,
-    copy_times,
     core_packages,
     installed_files,
     make_core_environment,
@@ -70,9 +68,8 @@ finally:
 def environment(tmp_path_factory):
     """Return the folder of an environment with the wheel, whose kernels are compiled except one."""
     folder = tmp_path_factory.mktemp("core")
-    package = make_core_environment(folder) / "bms_estimator"
-    copy_times(package, Path(bms_estimator.__file__).parent)
-    fill(folder / "cache", package)
+    make_core_environment(folder)
+    fill(folder / "cache")
     return folder
 
 

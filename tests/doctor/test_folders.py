@@ -61,14 +61,14 @@ def test_a_full_disk_is_a_fault_and_a_small_one_a_warning(full_disk: Path) -> No
 def test_kernels_are_cold_until_the_step_is_compiled(cache: Path) -> None:
     (cold,) = check_kernels(None)
     assert (cold.level, "not compiled yet" in cold.text) == (Level.WARNING, True)
-    write(cache / source_digest() / "kernels_1a2b" / "step.step-1.py311.nbi", 3_000_000)
+    write(cache / source_digest() / "kernels" / "step.step-1.py311.nbi", 3_000_000)
     (warm,) = check_kernels(None)
     assert (warm.level, warm.text) == (Level.OK, f"{cache / source_digest()}: compiled, 3 MB")
 
 
 def test_many_earlier_versions_are_a_warning_with_the_command_that_removes_them(cache: Path) -> None:
     for number in range(4):
-        write(cache / f"old{number}" / "kernels_1a2b" / "step.step-1.py311.nbc", 1)
+        write(cache / f"old{number}" / "kernels" / "step.step-1.py311.nbc", 1)
     _, old = check_kernels(None)
     assert (old.level, "4 earlier versions" in old.text) == (Level.WARNING, True)
     (cache / source_digest()).mkdir()
@@ -85,7 +85,7 @@ def test_without_a_writable_cache_folder_there_is_a_warning(cache: Path, monkeyp
 
 def test_the_cache_of_the_service_is_examined_if_there_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bms_estimator.doctor.subject.CACHE_ROOT", tmp_path)
-    write(tmp_path / "bms-estimator" / source_digest() / "kernels_1a2b" / "step.step-1.py311.nbi", 1)
+    write(tmp_path / "bms-estimator" / source_digest() / "kernels" / "step.step-1.py311.nbi", 1)
     (warm,) = check_kernels(subject(tmp_path, unit=unit_with()))
     assert warm.level is Level.OK
     assert kernel_check.size_of(tmp_path) == 1

@@ -128,6 +128,19 @@ def cached_kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_another_installation_of_the_same_version_loads_the_cached_kernels(cached_kernel: Path, tmp_path: Path) -> None:
+    shutil.copytree(PACKAGE, tmp_path / "bms_estimator", ignore=shutil.ignore_patterns("__pycache__"))
+    script = """
+import bms_estimator, numpy
+from bms_estimator.protocols.firmware.framing import crc16
+print(bms_estimator.__file__, crc16(numpy.zeros(4, "u1"), 0, 4), sum(crc16.stats.cache_misses.values()))
+"""
+    variables = {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(cached_kernel)}
+    command = [sys.executable, "-P", "-c", script]  # -P: the working folder may contain the package, too
+    output = subprocess.check_output(command, env=os.environ | variables, text=True)
+    assert output == f"{tmp_path}/bms_estimator/__init__.py 33984 0\n"
+
+
 def truncate(content: bytes) -> bytes:
     """Return only the first 20 bytes, which end within the header."""
     return content[:20]

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator import numba_cache
 from bms_estimator.cli.options.compile_progress import COMPILE_LABEL, COMPILE_TEXT, show_compile_progress
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.numba_cache import count_cached_kernels, count_kernels, njit
@@ -74,12 +73,3 @@ def test_a_compiled_kernel_counts_as_cached_and_all_kernels_are_counted() -> Non
     load_kernels()
     assert count_kernels() > 100
     assert 0.8 * count_kernels() < count_cached_kernels()
-
-
-def test_kernels_of_another_installation_of_the_same_version_are_not_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(numba_cache, "CACHE_FOLDER", tmp_path)
-    (tmp_path / "kernels_of_another_path").mkdir()
-    (tmp_path / "kernels_of_another_path/step.run-1.py311.nbi").touch()
-    assert count_cached_kernels() == 0
