@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import shutil
-import socket
 import sys
 from collections.abc import Mapping
 
@@ -12,6 +11,7 @@ import pytest
 
 from bms_estimator.demo.broker import DemoBroker
 from bms_estimator.model.errors import UserError
+from tests.free_port import free_port
 from tests.patience import LONG_S
 
 RETAINED_TOPICS = ["bms/p/availability", "bms/p/sensor/availability", "bms/p/info", "homeassistant/device/p/config"]
@@ -31,10 +31,8 @@ asyncio.run(main())
 
 
 @pytest.fixture
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+def port() -> int:
+    return free_port()
 
 
 async def next_message(client: aiomqtt.Client) -> tuple[str, bytes, bool]:
@@ -88,61 +86,59 @@ async def publish_all(client: aiomqtt.Client, port: int) -> None:
         ("homeassistant/status", []),
     ],
 )
-async def test_subscriber_receives_each_matching_retained_message_once(free_port, subscription, expected):
-    async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as service:
-        await publish_all(service, free_port)
+async def test_subscriber_receives_each_matching_retained_message_once(port, subscription, expected):
+    async with DemoBroker(port), aiomqtt.Client("127.0.0.1", port) as service:
+        await publish_all(service, port)
         for other in ("bms/#", "homeassistant/#", "#"):  # overlapping subscriptions of another client
             await service.subscribe(other)
-        assert [topic for topic, _ in await receive_retained(free_port, subscription)] == sorted(expected)
+        assert [topic for topic, _ in await receive_retained(port, subscription)] == sorted(expected)
 
 
-async def test_an_empty_retained_message_removes_the_retained_message_of_its_topic(free_port):
-    async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as service:
-        await publish_all(service, free_port)
+async def test_an_empty_retained_message_removes_the_retained_message_of_its_topic(port):
+    async with DemoBroker(port), aiomqtt.Client("127.0.0.1", port) as service:
+        await publish_all(service, port)
         await service.publish("bms/p/info", b"", qos=1, retain=True)
-        await wait_for_retained(
-            free_port, {topic: topic.encode() for topic in RETAINED_TOPICS if topic != "bms/p/info"}
-        )
+        await wait_for_retained(port, {topic: topic.encode() for topic in RETAINED_TOPICS if topic != "bms/p/info"})
 
 
-async def test_will_of_a_crashed_client_is_published_and_retained(free_port):
-    async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as watcher:
+async def test_will_of_a_crashed_client_is_published_and_retained(port):
+    async with DemoBroker(port), aiomqtt.Client("127.0.0.1", port) as watcher:
         await watcher.subscribe("bms/p/availability", qos=1)
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", CRASHING_CLIENT, str(free_port), stdin=asyncio.subprocess.PIPE
+            sys.executable, "-c", CRASHING_CLIENT, str(port), stdin=asyncio.subprocess.PIPE
         )
         assert await next_message(watcher) == ("bms/p/availability", b"online", False)
         assert process.stdin
         process.stdin.close()
         assert await next_message(watcher) == ("bms/p/availability", b"offline", False)
         await process.wait()
-        await wait_for_retained(free_port, {"bms/p/availability": b"offline"})
+        await wait_for_retained(port, {"bms/p/availability": b"offline"})
 
 
-async def test_will_of_a_client_that_disconnects_is_not_published(free_port):
-    async with DemoBroker(free_port), aiomqtt.Client("127.0.0.1", free_port) as watcher:
+async def test_will_of_a_client_that_disconnects_is_not_published(port):
+    async with DemoBroker(port), aiomqtt.Client("127.0.0.1", port) as watcher:
         await watcher.subscribe("bms/p/#", qos=1)
         will = aiomqtt.Will("bms/p/availability", b"offline", qos=1, retain=True)
-        async with aiomqtt.Client("127.0.0.1", free_port, will=will) as service:
+        async with aiomqtt.Client("127.0.0.1", port, will=will) as service:
             await service.publish("bms/p/availability", b"online", qos=1, retain=True)
         await watcher.publish("bms/p/state", b"later", qos=1)
         assert await next_message(watcher) == ("bms/p/availability", b"online", False)
         assert await next_message(watcher) == ("bms/p/state", b"later", False)
-        await wait_for_retained(free_port, {"bms/p/availability": b"online"})
+        await wait_for_retained(port, {"bms/p/availability": b"online"})
 
 
-async def test_a_port_in_use_is_an_error_but_without_a_given_port_a_free_one_is_used(free_port):
-    async with DemoBroker(free_port):
-        with pytest.raises(UserError, match=f"port {free_port}: taken"):
-            DemoBroker(free_port)
-        assert DemoBroker().port != free_port
+async def test_a_port_in_use_is_an_error_but_without_a_given_port_a_free_one_is_used(port):
+    async with DemoBroker(port):
+        with pytest.raises(UserError, match=f"port {port}: taken"):
+            DemoBroker(port)
+        assert DemoBroker().port != port
 
 
-async def test_the_printed_mosquitto_sub_command_shows_all_topics_of_the_packs(free_port):
+async def test_the_printed_mosquitto_sub_command_shows_all_topics_of_the_packs(port):
     if shutil.which("mosquitto_sub") is None:
         pytest.skip("mosquitto_sub is not installed (apt install mosquitto-clients)")
-    async with DemoBroker(free_port) as broker, aiomqtt.Client("127.0.0.1", free_port) as service:
-        await publish_all(service, free_port)
+    async with DemoBroker(port) as broker, aiomqtt.Client("127.0.0.1", port) as service:
+        await publish_all(service, port)
         command = f"{broker.subscribe_command} -C 3"  # -C: exit after three messages
         process = await asyncio.create_subprocess_shell(command, stdout=asyncio.subprocess.PIPE)
         async with asyncio.timeout(LONG_S):
@@ -151,12 +147,12 @@ async def test_the_printed_mosquitto_sub_command_shows_all_topics_of_the_packs(f
         assert sorted(words[::2]) == sorted(BMS_TOPICS)
 
 
-async def test_messages_received_before_the_shutdown_are_delivered(free_port):
-    async with DemoBroker(free_port):
-        listener = aiomqtt.Client("127.0.0.1", free_port)
+async def test_messages_received_before_the_shutdown_are_delivered(port):
+    async with DemoBroker(port):
+        listener = aiomqtt.Client("127.0.0.1", port)
         await listener.__aenter__()
         await listener.subscribe("bms/#")
-        async with aiomqtt.Client("127.0.0.1", free_port) as client:
+        async with aiomqtt.Client("127.0.0.1", port) as client:
             for number in range(2000):
                 await client.publish("bms/p/state", str(number))
     payloads = list[bytes]()
