@@ -4,6 +4,7 @@ import fcntl
 import os
 import re
 import select
+import signal
 import struct
 import subprocess
 import termios
@@ -38,7 +39,12 @@ class PseudoTerminal:
         # COLUMNS and LINES of the shell that started the tests would override the size of the terminal.
         env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
         self.process = subprocess.Popen(
-            command, stdin=self._slave, stdout=self._slave, stderr=self._slave, env=env | {"TERM": "xterm-256color"}
+            command,
+            stdin=self._slave,
+            stdout=self._slave,
+            stderr=self._slave,
+            env=env | {"TERM": "xterm-256color"},
+            preexec_fn=_accept_interrupts,  # noqa: PLW1509 - it only sets a signal handler
         )
         return self
 
@@ -77,3 +83,8 @@ class PseudoTerminal:
     def is_as_before(self) -> bool:
         """Return True if the program has restored the settings of the terminal."""
         return termios.tcgetattr(self._slave) == self.settings
+
+
+def _accept_interrupts() -> None:
+    """Give SIGINT its default effect. A shell lets programs in the background ignore it, also the tests."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
