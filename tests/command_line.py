@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import sys
 from asyncio.subprocess import DEVNULL, PIPE, Process
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
 from typing import IO
 
@@ -27,12 +27,13 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int | s
 async def running_program(
     *command: object,
     stdout: int | IO[bytes] = PIPE,
-    stderr: int | IO[bytes] | IO[str] = PIPE,
+    stderr: int | IO[bytes] | IO[str] | None = PIPE,
     folder: Path | None = None,
+    env: Mapping[str, str] | None = None,
 ) -> AsyncIterator[Process]:
     """Start a program without input in ``folder``, and kill it at the end."""
     process = await asyncio.create_subprocess_exec(
-        *map(str, command), stdin=DEVNULL, stdout=stdout, stderr=stderr, cwd=folder
+        *map(str, command), stdin=DEVNULL, stdout=stdout, stderr=stderr, cwd=folder, env=env
     )
     try:
         yield process

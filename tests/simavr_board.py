@@ -25,6 +25,8 @@ READINGS_HZ = 50
 """Rate of the readings of the pack model [Hz]. Each reading holds until the next."""
 LINES_AT_ONCE = 50
 """Number of readings that are written to the simulator at a time."""
+PIPE_BYTES = 4096
+"""Size of the pipe to the simulator. Each 4 kB of buffered readings delay the reaction of the pack by about 2.5 s."""
 STOP_S = 5.0
 """Time for the simulator to end after SIGTERM, before it is killed [s]."""
 
@@ -85,7 +87,12 @@ class FirmwareBoard:
         """
         # With a new session, Ctrl-C does not reach the simulator, which this object ends.
         self._process = subprocess.Popen(
-            self._command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+            self._command,
+            bufsize=0,
+            pipesize=PIPE_BYTES,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
         )
         assert self._process.stdout
         self._feed()

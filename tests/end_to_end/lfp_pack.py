@@ -1,9 +1,6 @@
-"""Simulated 4S LFP pack with a charger, a load and a protection circuit, and the board that measures it."""
+"""Simulated 4S LFP pack with a charger, a load and a protection circuit."""
 
-import asyncio
-import contextlib
 import math
-from collections.abc import AsyncIterator
 from enum import Enum
 
 import numpy as np
@@ -12,8 +9,6 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, r_s
 from bms_estimator.model.cell import ELEMENTS, CellModel, load_cell
 from bms_estimator.simulation.virtual_adc import Reading
-from bms_estimator.simulation.virtual_board import VirtualBoard
-from tests.patience import end
 
 SERIES = 4
 RATED_AH = 2.0
@@ -22,15 +17,13 @@ CAPACITY_FACTOR, OHM_FACTOR, OCV_SHIFT_V = 0.92, 1.3, 0.006
 """Differences of the true cell from the generic one: factors, and the shift of the OCV in the middle of SOC [V]."""
 FULL_V = 14.4
 """Voltage at which the charger limits its current [V]."""
-CHARGER_A, CHARGER_END_A = 1.0, 0.08
-"""Maximum current of the charger, and current at which it ends [A]."""
+CHARGER_END_A = 0.08
+"""Current at which the charger ends a charge [A]."""
 HYSTERESIS_V, HYSTERESIS_SOC = 0.008, 0.03
 """OCV of a cell after a charge minus that after a discharge [V], and the charge that changes one into the other, as SOC."""
 PROTECTION_V = 8.8
 """Voltage at which the protection circuit disconnects the load [V]."""
 ROOM_C = 25.0
-SLICE_S = 10.0
-"""Time of the board that is simulated at once [s]."""
 
 
 class Connected(Enum):
@@ -56,13 +49,18 @@ def true_cell() -> CellModel:
 class LfpPack:
     """Pack at rest at time 0. Call the object with times that never decrease.
 
+    Args:
+        soc: SOC at time 0.
+        charger_a: Maximum current of the charger [A].
+
     Attributes:
         connected: What a user has connected.
         load_a: Current of the load [A].
         history: Time [s] and true SOC (0..1) of each call.
     """
 
-    def __init__(self, soc: float) -> None:
+    def __init__(self, soc: float, charger_a: float) -> None:
+        self._charger_a = charger_a
         cell = true_cell().pack(SERIES, 1)
         self._a, self._capacity_as, self._ocv = cell.a, 3600.0 * cell.cell.capacity_ah, ocv_grid(cell)
         self._state, self._time_s, self._current_a = (soc, 0.0, 0.0), 0.0, 0.0
@@ -115,38 +113,8 @@ class LfpPack:
         if self.connected is Connected.CHARGER and not self._has_charger_ended:
             limited_a = (FULL_V - self._rested_v) / r_s(self.soc, self._a)
             self._has_charger_ended = limited_a <= CHARGER_END_A
-            return 0.0 if self._has_charger_ended else -min(limited_a, CHARGER_A)
+            return 0.0 if self._has_charger_ended else -min(limited_a, self._charger_a)
         if self.connected is Connected.LOAD and not self._is_protected:
             self._is_protected = self._rested_v - self.load_a * r_s(self.soc, self._a) < PROTECTION_V
             return 0.0 if self._is_protected else self.load_a
         return 0.0
-
-
-@contextlib.asynccontextmanager
-async def running_board(board: VirtualBoard) -> AsyncIterator[None]:
-    """Run the board in real time."""
-    board.speed = 1.0
-    task = asyncio.create_task(board.run())
-    try:
-        yield
-    finally:
-        await end(task)
-
-
-@contextlib.asynccontextmanager
-async def accelerated_board(board: VirtualBoard, speed: float) -> AsyncIterator[None]:
-    """Run the board faster than real time. It waits for a host that reads late, so that no sample is lost."""
-    board.speed = math.inf  # the host's reads set the pace within a slice
-
-    async def run() -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            due_s = loop.time() + SLICE_S / speed
-            await board.run(SLICE_S)
-            await asyncio.sleep(max(due_s - loop.time(), 0.0))
-
-    task = asyncio.create_task(run())
-    try:
-        yield
-    finally:
-        await end(task)
