@@ -1,4 +1,4 @@
-"""Cell with the open-circuit voltage from rests, low-rate curves and given curves, and with resistances from the rests."""
+"""Cell model from captures: open-circuit voltage from rests and low-rate curves, and first resistances from the rests."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ MIN_VOLTAGE_RATIO = 0.55
 MAX_VOLTAGE_RATIO = 1.06
 """Maximum voltage of a valid sample as a fraction of the OCV at SOC 1: 4.45 V for a cell of 4.2 V, above usual overcharge."""
 MIN_EMPTY_RATIO = 0.25
-"""Minimum plausible ratio of the OCV at SOC 0 to that at SOC 0.5."""
+"""Minimum plausible ratio of the OCV at SOC 0 to the OCV at SOC 0.5."""
 MEASURED_CAPACITY_STD = 0.03
 """Relative standard deviation of a capacity measured by a slow discharge. It covers the gain of the current sensor,
 differences between cells of the type, and ageing over some years."""
@@ -68,7 +68,7 @@ class OcvCell:
         cell: The cell.
         fit: Fit of the open-circuit voltage.
         sources: Sources of the points, and the capacity.
-        generic: Most similar generic cell. Its resistances are scaled to the resistances that the rests show.
+        generic: Most similar generic cell. Its resistances, scaled to the rests, are the resistances of ``cell``.
     """
 
     cell: CellModel
@@ -94,7 +94,7 @@ def determine_ocv(
         curves: Given curves.
         name: Name of the cell.
         form: Form of the open-circuit voltage.
-        capacity_ah: Capacity that SOC is counted against [Ah]; None: capacity by a full slow discharge.
+        capacity_ah: Capacity with which the SOC is counted [Ah]; None: capacity by a full slow discharge.
         initial_soc: SOC 0..1 at the first sample of the captures that start at the highest voltage.
         series_count: Cells in series; None: estimated from the median voltage.
 
@@ -147,7 +147,7 @@ def _cells_in_series(voltage_v: NDArray[np.float64], configured: int | None) -> 
     count = configured or max(round(median_v / TYPICAL_CELL_V), 1)
     if not configured and count > MAX_CELLS:
         raise UserError(
-            f"the median voltage is {median_v:g} V, which would be that of {count} cells in series; if the column is in millivolts, "
+            f"the median voltage is {median_v:g} V, which would be {count} cells in series; if the column is in millivolts, "
             "convert it to volts, otherwise give --series"
         )
     if not MIN_CELL_V <= median_v / count <= MAX_CELL_V:

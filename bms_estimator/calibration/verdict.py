@@ -29,7 +29,7 @@ FAIR_SOC = 0.05
 MIN_WITHIN_BAND = 0.9
 """Minimum fraction of samples whose SOC lies within ±2 std. The fraction is 95 % for a normal distribution."""
 USUAL_MIN_C, USUAL_MAX_C = 0.0, 45.0
-"""Temperature range in which most manufacturers allow charge [°C]. Captures that cover it leave no temperature unknown."""
+"""Temperature range in which most manufacturers allow charge [°C]. Temperatures outside it are not reported as unknown."""
 FULL_SOC = 0.95
 """SOC that counts as full, because a charge with a voltage limit ends below 1."""
 MIN_LOAD_C_RATE = 0.05
@@ -145,7 +145,7 @@ def judge(errors: VoltageErrors, covered: Coverage, soc_errors: SocErrors | None
     """Return the verdict on a model.
 
     Args:
-        errors: Errors of the modeled voltage, best of captures that were not used in the fit.
+        errors: Errors of the modeled voltage, preferably on captures that were not used in the fit.
         covered: Operating ranges of all captures.
         soc_errors: Errors of the estimated SOC; None if no estimator was run.
     """
@@ -173,7 +173,7 @@ def _soc_range(validations: Sequence[Validation]) -> tuple[float, float]:
 
 
 def _range(values: Floats) -> tuple[float, float]:
-    """Return the lowest and the highest of the values that are finite."""
+    """Return the lowest and the highest value; NaN is ignored."""
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
@@ -229,5 +229,5 @@ def _unknown_currents(direction: str, c_rate: float) -> str:
 
 
 def _millivolts(volts: float) -> str:
-    """Return a voltage with two digits, from 0.1 V on without decimals."""
+    """Return a voltage in millivolts with two significant digits, or without decimals from 0.1 V on."""
     return f"{1e3 * volts:.2g} mV" if volts < 0.0995 else f"{1e3 * volts:.0f} mV"  # .2g would round 0.0995 V to 1e+02

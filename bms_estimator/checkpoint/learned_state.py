@@ -17,7 +17,7 @@ def learned_estimator(file: CheckpointFile, settings: Settings, model: PackModel
     Args:
         file: Checkpoint of the pack.
         settings: Settings of the pack.
-        model: The pack as one object.
+        model: Model of the whole pack.
 
     Raises:
         UserError: There is no valid checkpoint, or the service ran without the identifier.

@@ -9,7 +9,7 @@ from bms_estimator.model.arrays import Records, structured_array
 from bms_estimator.model.sample import SampleBlock
 
 EARLIEST_UNIX_TIME_S = 1e9
-"""Time above which a capture's times count as Unix times [s]: September 2001."""
+"""Earliest time that counts as a Unix time [s]: September 2001. Smaller times count from the start of the capture."""
 TIME_DIGITS = 6
 """Number of decimals of the test time [s], because differences of Unix times have rounding errors."""
 SUFFIXES = (".bdf", ".bdf.gz", ".bdf.csv", ".bdf.csv.gz", ".bdf.parquet")
@@ -36,7 +36,7 @@ def bdf_rows(block: SampleBlock, first_s: float, *, with_temperature: bool) -> R
     columns = {
         "Test Time / s": np.round(block["time_s"] - first_s, TIME_DIGITS),
         "Voltage / V": block["voltage_v"],
-        "Current / A": 0.0 - block["current_a"],  # the subtraction gives no negative zeros
+        "Current / A": 0.0 - block["current_a"],  # 0.0 - 0.0 is 0.0, whereas -0.0 would be written as "-0"
     }
     if first_s >= EARLIEST_UNIX_TIME_S:
         columns["Unix Time / s"] = block["time_s"]

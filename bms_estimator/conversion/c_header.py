@@ -5,6 +5,7 @@ import re
 import numpy as np
 
 from bms_estimator.conversion.circuit import OcvTable, ladder_table, ocv_table
+from bms_estimator.conversion.template import fill_template, value_lines
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.rc_ladder import (
@@ -22,52 +23,11 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.version import __version__
 
 FINE_POINTS = 2001
-"""Number of points at which the error of a linear interpolation is computed."""
+"""Number of SOCs at which the error of a linear interpolation is computed."""
 INTERPOLATION_ERROR_V = 2e-4
 """Maximum error of a linear interpolation of the OCV between the nodes of the header, per cell in series [V]."""
 EXTREME_TEMPERATURE_DIFFERENCE_K = 40.0
 """Difference from 25 °C up to which ``INTERPOLATION_ERROR_V`` also holds for the temperature coefficient [K]."""
-LINE_VALUES = 6
-"""Number of values on a line of a table."""
-
-HEADER = """\
-/*
- * {name}{description}
- * Written by bms-estimator {version}. Values describe {series_count} cell(s) in series as one two-terminal object.
- *
- * Current I is positive on discharge. State: SOC, x[0] to x[5], m, h.
- *   d SOC/dt = -I / CELL_CAPACITY_AS
- *   d x[k]/dt = (I - x[k]) / CELL_TAU_S[k]                       current filtered by RC pair k [A]
- *   d m/dt = (SOC - m) / CELL_TAU_S[CELL_TREND]                  filtered SOC
- *   d h/dm = (sign(dm) - h) / CELL_HYSTERESIS_SOC * sign(dm)     hysteresis state: -1 after discharge, 1 after charge
- *   f(B) = exp(B (1/T - 1/298.15))                               T: temperature [K], B: temperature constant [K]
- *   R[k] = f(CELL_WEAK_K) CELL_WEAK_OHM[k](SOC) + f(CELL_STRONG_K) CELL_STRONG_OHM[k](SOC)
- *   V = CELL_OCV_V(SOC) + (T - 298.15) CELL_OCV_V_PER_K(SOC) + h f(CELL_HYSTERESIS_K) CELL_HYSTERESIS_V(SOC)
- *       - I R[0] - x[0] R[1] - ... - x[5] R[6]
- * Tables are linear between their nodes and constant outside. The capacitance of RC pair k is CELL_TAU_S[k] / R[k + 1].
- *
- * AVR: compile with -std=gnu99 -DCELL_MEMORY=__flash, so that the tables stay in flash.
- */
-#ifndef CELL_{guard}_H
-#define CELL_{guard}_H
-
-#ifndef CELL_MEMORY
-#define CELL_MEMORY
-#endif
-
-#define CELL_CAPACITY_AS {capacity_as}
-#define CELL_RC_PAIRS {pairs}
-#define CELL_OCV_NODES {ocv_nodes}
-#define CELL_OHM_NODES {ohm_nodes}
-#define CELL_TREND {trend}
-#define CELL_WEAK_K {weak_k}
-#define CELL_STRONG_K {strong_k}
-#define CELL_HYSTERESIS_K {hysteresis_k}
-#define CELL_HYSTERESIS_SOC {hysteresis_soc}
-
-{tables}
-#endif /* CELL_{guard}_H */
-"""
 
 
 def c_header(cell: CellModel) -> str:
@@ -84,7 +44,8 @@ def c_header(cell: CellModel) -> str:
         _matrix(f"CELL_WEAK_OHM[CELL_RC_PAIRS + 1]{ohm_shape}", ladder.weak_ohm),
         _matrix(f"CELL_STRONG_OHM[CELL_RC_PAIRS + 1]{ohm_shape}", ladder.strong_ohm),
     ]
-    return HEADER.format(
+    return fill_template(
+        "cell.h.txt",
         name=_comment(ratings.name),
         description=f": {_comment(ratings.description)}" if ratings.description else "",
         version=__version__,
@@ -121,7 +82,13 @@ def _thinned(cell: CellModel) -> OcvTable:
 
 
 def _linear_nodes(x: Floats, rows: Floats, tolerance: float) -> list[int]:
-    """Return the indices of nodes between which all rows are linear within ``tolerance``. Each step is as long as possible."""
+    """Return the indices of as few nodes as possible, between which all rows are linear within ``tolerance``.
+
+    Args:
+        x: Shape (n,), increasing abscissa.
+        rows: Shape (curves, n), curves over ``x``.
+        tolerance: Maximum deviation of a curve from the line between two nodes.
+    """
     nodes, last = [0], x.size - 1
     while nodes[-1] < last:
         first, end = nodes[-1], nodes[-1] + 1
@@ -139,18 +106,16 @@ def _linear_error(x: Floats, rows: Floats, first: int, end: int) -> float:
 
 
 def _table(declaration: str, values: Floats) -> str:
-    return f"static const CELL_MEMORY float {declaration} = {{\n{_lines(values, 4)}\n}};\n"
+    return f"static const CELL_MEMORY float {declaration} = {{\n{value_lines(_floats(values), 4)}\n}};\n"
 
 
 def _matrix(declaration: str, rows: Floats) -> str:
-    text = ",\n".join(f"    {{\n{_lines(row, 8)}\n    }}" for row in rows)
+    text = ",\n".join(f"    {{\n{value_lines(_floats(row), 8)}\n    }}" for row in rows)
     return f"static const CELL_MEMORY float {declaration} = {{\n{text}\n}};\n"
 
 
-def _lines(values: Floats, indent: int) -> str:
-    texts = [_float(x) for x in values.tolist()]
-    lines = (", ".join(texts[i : i + LINE_VALUES]) for i in range(0, len(texts), LINE_VALUES))
-    return ",\n".join(" " * indent + line for line in lines)
+def _floats(values: Floats) -> list[str]:
+    return [_float(x) for x in values.tolist()]
 
 
 def _float(value: float) -> str:
@@ -160,5 +125,5 @@ def _float(value: float) -> str:
 
 
 def _comment(text: str) -> str:
-    """Return a text for a C comment: without line breaks, and without the end of a comment, because cell files may be from anyone."""
+    """Return a text without line breaks and ``*/``, because the text of a foreign cell file must not end the C comment."""
     return " ".join(text.replace("*/", "* /").split())

@@ -20,7 +20,7 @@ class OcvTable:
 
     Attributes:
         soc: Shape (n,), increasing from 0 to 1.
-        ocv_v: Shape (n,), OCV at 25 C, the mean of those after charge and after discharge [V].
+        ocv_v: Shape (n,), OCV at 25 C, the mean of the OCVs after charge and after discharge [V].
         per_kelvin_v: Shape (n,), temperature coefficient of the OCV [V/K].
         hysteresis_v: Shape (n,), half of the difference of the OCV after charge and after discharge, at 25 C [V].
     """
@@ -47,7 +47,7 @@ class LadderTable:
 
 
 def ocv_table(cell: CellModel) -> OcvTable:
-    """Return the OCV at the nodes of the cell file; for the form (2.10) at those of ``ocv_grid``."""
+    """Return the OCV at the nodes of the cell file, or at the nodes of ``ocv_grid`` if the cell file has the function (2.10)."""
     ocv = cell.ocv
     if isinstance(ocv, TableOcv):
         soc, ocv_v = np.array(ocv.soc), np.array(ocv.ocv_v)
@@ -59,7 +59,7 @@ def ocv_table(cell: CellModel) -> OcvTable:
 
 
 def ladder_table(cell: CellModel) -> LadderTable:
-    """Return the RC ladder of the cell file, or the one that the live service computes from R_s and both RC pairs."""
+    """Return the RC ladder of the cell file, or the RC ladder that the live service computes from R_s and both RC pairs."""
     if cell.ladder is None:
         ohm, weak = ladder_of_branches(cell).T, weak_share(SOC_GRID)
         soc, weak_ohm, strong_ohm = SOC_GRID, weak * ohm, (1.0 - weak) * ohm

@@ -33,7 +33,7 @@ ACCESS_LIST_REMEDY = "correct the broker's access list, for Mosquitto: deploy/mo
 
 
 def check_broker(subject: Subject) -> Iterator[Finding]:
-    """Yield whether each broker and each fleet server can be reached, and what a broker denies.
+    """Yield whether brokers and fleet server can be reached, and which topics a broker denies.
 
     Raises:
         UserError: A setting of ``[mqtt]`` or ``[edge]`` cannot be used.
@@ -96,7 +96,7 @@ async def _examine_rights(connection: Connection, pack_topic: str) -> AsyncItera
         yield fault(NAME, f"may not read {name}: {reason}", ACCESS_LIST_REMEDY)
     retained = await _retained_messages(connection)
     if retained.get(topic) == b"online":
-        yield _report_of_service(retained.get(f"{pack_topic}/health", b""))
+        yield _denied_topics_of_service(retained.get(f"{pack_topic}/health", b""))
         return
     rejection = await connection.publish(Message(topic, b"offline", 1, retain=False))
     if rejection:
@@ -130,8 +130,8 @@ async def _is_echoed(connection: Connection, topic: str) -> bool:
     return True
 
 
-def _report_of_service(health: bytes) -> Finding:
-    """Return what the health of the running service says about denied topics."""
+def _denied_topics_of_service(health: bytes) -> Finding:
+    """Return the topics that the broker denies to the running service, according to its health message."""
     try:
         topics = json.loads(health)["refused_topics"]
     except (ValueError, KeyError, TypeError):  # its health may not be read

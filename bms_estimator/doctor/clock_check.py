@@ -1,4 +1,4 @@
-"""Check of the wall clock: whether it is synchronized, and whether the service can find that out."""
+"""Check of the wall clock: whether it is synchronized, and whether the service can detect that."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +14,7 @@ REAL_TIME_CLOCK = Path("/dev/rtc0")
 
 
 def check_clock(subject: Subject | None) -> Iterator[Finding]:
-    """Yield whether the clock is synchronized, and whether the service can find that out."""
+    """Yield whether the clock is synchronized, and whether the service can detect that."""
     hardware = "a clock with a battery" if REAL_TIME_CLOCK.exists() else "no clock with a battery"
     if synchronised():
         yield ok(NAME, f"synchronized; {hardware}")

@@ -1,6 +1,6 @@
 """Check of the device: does it send samples, and is it the calibrated board of the pack?
 
-The device is opened as by the service, but only if no service runs and no other process has the port open.
+The device is opened as the service opens it, but only if no service runs and the port is free.
 """
 
 import asyncio
@@ -54,7 +54,7 @@ class FirstSample:
 
 
 def load_decoder(subject: Subject) -> None:
-    """Load the kernel that decodes a board's frames; without a cache it is compiled, which takes longer than a check may."""
+    """Load the kernel that decodes a board's frames. Without a cache it is compiled, which takes longer than a check's timeout."""
     if subject.settings.source is None and not subject.is_running:
         make_protocol(subject.settings.sensor).feed(0.0, b"\0\n")  # ends a frame, or a line of text
 

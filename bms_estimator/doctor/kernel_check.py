@@ -17,7 +17,7 @@ MAX_OLD_VERSIONS = 3
 
 def check_kernels(subject: Subject | None) -> Iterator[Finding]:
     """Yield whether kernels are compiled, and whether they can be stored."""
-    folder = (subject and subject.unit_cache_folder) or _users_cache_folder()
+    folder = (subject and subject.unit_cache_folder) or _own_cache_folder()
     if folder is None:
         text = "no folder can be written: every start compiles the kernels, which may take minutes"
         yield warning(NAME, text, "set a folder that can be written: export NUMBA_CACHE_DIR=FOLDER")
@@ -43,7 +43,7 @@ def size_of(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
-def _users_cache_folder() -> Path | None:
+def _own_cache_folder() -> Path | None:
     """Return the first cache folder that this user can write; None without one."""
     return next((folder for folder in cache_folders() if os.access(folder, os.W_OK | os.X_OK)), None)
 

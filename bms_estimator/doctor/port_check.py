@@ -18,7 +18,7 @@ SERIAL_GROUP = "dialout"
 RULE_FOLDERS = (Path("/etc/udev/rules.d"), Path("/run/udev/rules.d"), Path("/usr/lib/udev/rules.d"))
 """Folders in which udev reads rules."""
 NOBODY = 65534
-"""User id without permissions. The service's user, like it, opens a port only as a member of ``SERIAL_GROUP``."""
+"""User id without permissions. It stands for the service's user, whose only permission is the group ``SERIAL_GROUP``."""
 
 
 def check_port(subject: Subject) -> Iterator[Finding]:
@@ -83,7 +83,7 @@ def _groups_of_service() -> set[int]:
 
 
 def _udev_rule(subject: Subject) -> Finding:
-    """Return whether the udev rule is installed, which names boards by their port and keeps ModemManager away."""
+    """Return whether the udev rule is installed. The rule names boards by their USB port, and excludes them from ModemManager."""
     for folder in RULE_FOLDERS:
         if (folder / places.UDEV_RULE.name).exists():
             return ok("udev rule", f"{folder / places.UDEV_RULE.name}")

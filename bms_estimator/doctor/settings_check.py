@@ -1,4 +1,4 @@
-"""Check of the settings, as by ``config check``."""
+"""Check of the settings, as in ``config check``."""
 
 from collections.abc import Iterator
 

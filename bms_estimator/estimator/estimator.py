@@ -203,7 +203,7 @@ def make_estimator(settings: Settings, cell: PackModel) -> Estimator:
 
     Args:
         settings: Settings of the pack.
-        cell: The pack as one object (``CellModel.pack``).
+        cell: Model of the whole pack.
     """
     return Estimator(
         cell,

@@ -30,7 +30,7 @@ class PackFiles:
 
 
 def install(machine: Machine, program: Path, pack: PackFiles | None, report: Report) -> bool:
-    """Write the files of the service, create its user, and enable it. Keep state and settings of an earlier installation.
+    """Write the files of the service, create its user, and enable it. State and settings of an earlier installation remain.
 
     Args:
         machine: Machine of the service.
@@ -53,7 +53,7 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
     report("user", f"{places.NAME}, in group dialout")
     if pack is not None:
         _write_settings(machine, pack, group, report)
-    _give_settings_to(machine, group)
+    _set_settings_group(machine, group)
     for file in system_files(machine, program):
         machine.write(file.path, file.text.encode())
         report(file.kind, str(file.path))
@@ -120,8 +120,8 @@ def _write_settings(machine: Machine, pack: PackFiles, group: int, report: Repor
         report("settings", str(places.SETTINGS / name))
 
 
-def _give_settings_to(machine: Machine, group: int) -> None:
-    """Let a group read the folder of the settings. An earlier installation may have had a group with another id."""
+def _set_settings_group(machine: Machine, group: int) -> None:
+    """Set the group of all settings. After a new installation the group may have another id."""
     folder = machine.path(places.SETTINGS)
     folder.mkdir(mode=0o755, parents=True, exist_ok=True)
     for path in tree(folder):

@@ -11,7 +11,7 @@ from bms_estimator.model.errors import UserError
 
 @dataclass(frozen=True)
 class Machine:
-    """Root directory of a machine: ``/`` is this machine, any other directory is an image that does not run."""
+    """Machine with a root directory. ``/`` is this machine; any other directory is a system image, which does not run."""
 
     root: Path = Path("/")
 
@@ -42,7 +42,7 @@ class Machine:
         Args:
             program: Name of the program.
             arguments: Its arguments.
-            root_option: Option by which the program takes the root directory of an image.
+            root_option: Option of the program for the root directory of an image.
 
         Raises:
             UserError: The program is missing or fails.

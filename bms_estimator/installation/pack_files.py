@@ -20,8 +20,7 @@ def is_hidden(path: Path) -> bool:
 def named_files(pack: Path, settings: Settings) -> list[Path]:
     """Return the files that a pack's settings name and that must be copied with the pack file.
 
-    They are in the folder of the pack file. A name for which no file exists there may be that of a systemd credential or
-    of a generic cell.
+    The files are in the folder of the pack file. A name without such a file may be a systemd credential or a generic cell.
 
     Args:
         pack: Settings file of the pack.

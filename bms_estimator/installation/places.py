@@ -1,11 +1,11 @@
-"""Names and places of the installed service, as absolute paths on its machine."""
+"""Names and absolute paths of the installed service."""
 
 from pathlib import Path
 
 NAME = "bms-estimator"
 """Name of the program, the service, its user and its group."""
 PACK_FILE = Path("/etc/bms-estimator/pack.toml")
-"""Settings of the pack that the service ``bms-estimator`` serves."""
+"""Settings file of the service ``bms-estimator``."""
 SETTINGS = PACK_FILE.parent
 """Folder of the settings, which the service can read and only root can write."""
 STATE = Path("/var/lib/bms-estimator")

@@ -148,7 +148,7 @@ def _copy_own_package(site_packages: Path) -> None:
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy a file with its modification time, and the compiled file of a Python file, which is valid only for this time."""
+    """Copy a file with its modification time. Also copy the compiled file of a Python file, which is valid only for this time."""
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copy2(source, target)
     if source.suffix == ".py":

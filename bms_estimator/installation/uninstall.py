@@ -32,23 +32,23 @@ def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
         machine.run("systemctl", "disable", "--quiet", *(unit.name for unit in units))
         report("service", "stopped and disabled")
     drop_ins = [places.drop_ins(unit) for unit in all_units]
-    of_user = [*drop_ins, places.SETTINGS, places.STATE]
+    user_data = [*drop_ins, places.SETTINGS, places.STATE]
     for name in (*all_units, *map(places.clock_drop_in, all_units), places.UDEV_RULE, places.CACHE):
         _remove(machine, name, report)
-    for name in of_user if purge else ():
+    for name in user_data if purge else ():
         _remove(machine, name, report)
     for folder in drop_ins:
         _remove_if_empty(machine.path(folder))
     if machine.is_running:
         reload_system()
-    for name in of_user:
+    for name in user_data:
         _give_to_root(machine.path(name))
     _remove_user(machine, report)
     if machine.path(places.PROGRAM_LINK).is_symlink():
         _remove(machine, places.PROGRAM_LINK, report)
     if is_program_copy(machine.path(places.PROGRAM_COPY)):
         _remove(machine, places.PROGRAM_COPY, report)
-    return [name for name in of_user if machine.path(name).exists()]
+    return [name for name in user_data if machine.path(name).exists()]
 
 
 def _remove(machine: Machine, name: Path, report: Report) -> None:
@@ -79,6 +79,6 @@ def _remove_if_empty(folder: Path) -> None:
 
 
 def _give_to_root(folder: Path) -> None:
-    """Make root the owner of what remains: another user may get the ids of the removed one."""
+    """Make root the owner of a remaining folder, because a new user may get the id of the removed user."""
     for path in tree(folder) if folder.exists() else ():
         os.chown(path, 0, 0, follow_symlinks=False)

@@ -368,6 +368,11 @@ def with_capacity(cell: CellModel, capacity_ah: float) -> CellModel:
     )
 
 
+def with_name(cell: CellModel, name: str) -> CellModel:
+    """Return the cell with another name."""
+    return cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name})})
+
+
 def _read_shipped(name: str) -> CellModel:
     """Read a shipped cell file; ``name`` is its path within the folder of this module."""
     with resources.as_file(resources.files("bms_estimator.model") / name) as path:

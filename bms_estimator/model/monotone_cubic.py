@@ -1,6 +1,6 @@
 """Monotone cubic interpolation (PCHIP), bit for bit the same as ``scipy.interpolate.PchipInterpolator``.
 
-The service needs no other function of scipy, which takes 140 MB on disk.
+It replaces scipy in the service, which needs no other function of it. scipy takes 140 MB on disk.
 """
 
 import numpy as np

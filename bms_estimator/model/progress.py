@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 Progress = Callable[[float], None]
-"""Function that a calculation calls with the finished fraction of its work, 0..1, as often as it likes."""
+"""Function that a calculation calls with the finished fraction of its work, 0..1, any number of times."""
 
 
 def no_progress(_: float) -> None:

@@ -42,7 +42,7 @@ STYLE: Any = {
     "figure.constrained_layout.use": True,
     "axes.prop_cycle": f"cycler('color', {list(COLORS)})",
 }
-"""Settings of matplotlib by name. The type of matplotlib's own stubs lists all names."""
+"""Settings of matplotlib by name. The type is Any, because matplotlib's stubs accept only a literal with known names."""
 
 
 def draw_band(ax: Any, x: Floats, low: Floats, high: Floats, *, color: str = COLORS[0], label: str = "") -> None:

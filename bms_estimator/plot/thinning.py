@@ -13,17 +13,16 @@ is missing would be drawn as a ramp."""
 
 
 def thin(x: Floats, *curves: Floats, points: int = MAX_POINTS) -> tuple[Floats, ...]:
-    """Reduce the points of curves so that no extreme is lost and steps stay steps.
+    """Reduce the points of curves. The extremes and the largest steps remain.
 
-    An abscissa that increases is divided into intervals of equal width, because a figure shows them equally wide; the
-    samples of another one into intervals of equal size. The first sample of each interval stays, and so do the samples with
-    the minimum and the maximum of each curve. Both samples of the largest steps stay too. NaN counts as no value.
+    An increasing abscissa is divided into intervals of equal width; otherwise the samples are divided into intervals of equal
+    size. The first sample of each interval remains, and so do the samples with the minimum and the maximum of each curve.
+    Both samples of the largest steps remain, too. NaN is neither a minimum nor a maximum.
 
     Args:
         x: Shape (n,), common abscissa.
         *curves: Each of shape (n,).
-        points: Maximum number of remaining points, apart from the last one, which always stays, and from steps, which have
-            at most half as many points.
+        points: Maximum number of remaining points. The last point, and at most half as many points for steps, are added.
 
     Returns:
         Abscissa and curves, all of the same reduced length.

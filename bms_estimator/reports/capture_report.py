@@ -69,7 +69,7 @@ def capture_report(cell: CellModel, results: Sequence[CaptureResult], written: s
     """Return the report on captures.
 
     Args:
-        cell: Cell, or pack as one object, that the captures were compared with.
+        cell: Model of a cell or of a whole pack that the captures were compared with.
         results: Results of each capture.
         written: Time at which the report is written.
     """

@@ -34,7 +34,7 @@ class AlarmMonitor:
 
     Args:
         settings: The pack's settings.
-        cell: The pack as one object.
+        cell: Model of the whole pack.
         estimator: Estimator; read only.
         source: Supplies counters, and the reason why no samples arrive.
         clock: The clocks.

@@ -52,6 +52,7 @@ def numba_type(value: Any) -> Any:
 def compile_subtrees() -> None:
     """Compile kernels with all kernels that they call, in the order in which the first process needs them."""
     estimator = make_estimator(Settings(), load_cell(CELL))
+    # names as in the kernels: s state, p settings, f state of the filter, fp settings of the filter
     s, p, row = (numba_type(array[0]) for array in (estimator.record, estimator.settings_record, np.zeros(1, TRACE)))
     f, fp = s.typeof("filter"), p.typeof("filter")
     checks, counters, rows = s.typeof("checks"), s.typeof("counters"), s.typeof("history")

@@ -66,7 +66,7 @@ async def run_estimation_loop(
 
     Args:
         settings: The pack's settings.
-        cell: The pack as one object (``CellModel.pack``).
+        cell: Model of the whole pack.
         source: Supplies samples; opened and closed here.
         sinks: Destinations of the snapshots; opened and closed here.
         stop: Event that ends the loop cleanly.

@@ -20,7 +20,7 @@ from bms_estimator.sinks.exports.influx import target
 from bms_estimator.sources.factory import make_line_producer
 
 ONLY_IN_SERVICE = "not checked, because a systemd credential exists only while the service runs"
-"""Warning about a credential file, which is checked only if this process can read it."""
+"""Warning about a credential file that only the running service can read."""
 
 BrokerSettings = TypeVar("BrokerSettings", MqttSettings, EdgeSettings)
 
@@ -30,7 +30,7 @@ def check_settings(settings: Settings, cell: PackModel) -> list[str]:
 
     Args:
         settings: Settings of the pack.
-        cell: The pack as one object (``CellModel.pack``).
+        cell: Model of the whole pack.
 
     Raises:
         UserError: A file that the settings name cannot be used.

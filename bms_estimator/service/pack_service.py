@@ -56,7 +56,7 @@ async def run_pack_service(
 
     Args:
         settings: The pack's settings.
-        cell: The pack as one object (``CellModel.pack``).
+        cell: Model of the whole pack.
         sinks: Further sinks, such as the terminal.
         tap: Receives all bytes of the source with their arrival times.
         stop: Event that ends the service; signals set it, too.

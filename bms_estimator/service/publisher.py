@@ -51,7 +51,7 @@ class Publisher:
 
     Args:
         settings: The pack's settings.
-        cell: The pack as one object.
+        cell: Model of the whole pack.
         estimator: Estimator; read only.
         source: Supplies counters, message and board.
         sinks: Destinations of the snapshots.

@@ -2,12 +2,25 @@
 
 from dataclasses import dataclass
 
+from bms_estimator.model.decimal_text import number
 from bms_estimator.settings.settings_template import GivenSettings
 from bms_estimator.setup.found_device import FoundDevice
 
 
 class InvalidAnswerError(Exception):
-    """An answer cannot be right. The message gives the answer and the reason."""
+    """An answer is malformed or implausible. The message contains the answer and the reason."""
+
+
+def parse_number(text: str) -> float:
+    """Return the number in an answer, with a decimal point or comma.
+
+    Raises:
+        InvalidAnswerError: The text is not a number.
+    """
+    try:
+        return number(text.replace(",", "."))
+    except ValueError:
+        raise InvalidAnswerError(f"{text}: must be a number") from None
 
 
 @dataclass(frozen=True)
@@ -25,10 +38,10 @@ class Answers:
     parallel: int | None = None
     broker: str | None = None
     """URL of the broker to which the service publishes; empty: no broker."""
-    heard_broker: str | None = None
+    found_broker: str | None = None
     """URL of a broker that answered during the search; None: no broker answered."""
     sensor: tuple[tuple[str, object], ...] = ()
-    """Settings of ``[sensor]`` from the comparison with a multimeter, as key and value."""
+    """Settings of ``[sensor]`` from the comparison with a multimeter: key and value of each."""
 
     @property
     def tables(self) -> GivenSettings:

@@ -1,4 +1,4 @@
-"""Comparison of a device with a multimeter, whose result goes to the board or to ``[sensor]``."""
+"""Comparison of a device with a multimeter. The board stores the corrections, or they are settings of ``[sensor]``."""
 
 import asyncio
 
@@ -26,9 +26,11 @@ from bms_estimator.sources.serial.device_detection import BoardClient
 from bms_estimator.sources.serial.port_list import NoPortError
 
 GAIN_DIGITS = 6
-"""Number of digits of a gain after the decimal point, far below the error of a multimeter."""
+"""Number of decimals of a gain. Its rounding error is far below the error of a multimeter."""
 ZERO_DIGITS = 4
-"""Number of digits of the zero of the current after the decimal point [A]."""
+"""Number of decimals of the current zero [A]."""
+OPPOSITE_SIGNS = {"discharge_positive": "charge_positive", "charge_positive": "discharge_positive"}
+"""Opposite of each value of ``sensor.current_sign``."""
 
 
 class Comparison:
@@ -44,12 +46,13 @@ class Comparison:
     def __init__(self, device: FoundDevice) -> None:
         self._device, self._sensor = device, device.settings.sensor
         self._is_board = self._sensor.protocol == BOARD
+        self._resolution_a = self._sensor.current_resolution_a or 0.0
         self._points: list[VoltagePoint] = []
         self._zero_a = 0.0
         self._current: CurrentCorrection | None = None
 
     async def measure(self) -> Measurement:
-        """Return the values of the device without a correction.
+        """Return the present values of the device, without the corrections of this comparison.
 
         Raises:
             UserError: No sample arrives.
@@ -60,7 +63,7 @@ class Comparison:
         """Compare the present voltage [V]; return the result as text.
 
         Raises:
-            InvalidAnswerError: The voltage cannot be right, or contradicts an earlier comparison.
+            InvalidAnswerError: The voltage is implausible, or contradicts an earlier comparison.
             UserError: No sample arrives.
         """
         measured = await self.measure()
@@ -69,8 +72,8 @@ class Comparison:
         self._points = points
         return f"voltage: device {measured.voltage_v:.3f} V, multimeter {multimeter_v:g} V: gain {gain:.4f}"
 
-    async def take_zero(self) -> str:
-        """Take the present current as the zero of the sensor; return the result as text.
+    async def set_zero(self) -> str:
+        """Use the present current as the zero of the sensor; return the result as text.
 
         Raises:
             InvalidAnswerError: A current flows.
@@ -91,10 +94,8 @@ class Comparison:
             InvalidAnswerError: The current is too small, or deviates too far.
             UserError: No sample arrives.
         """
-        measured = await self.measure()
-        device_a = measured.current_a - self._zero_a
-        resolution_a = self._sensor.current_resolution_a or 0.0
-        self._current = current_correction(device_a, multimeter_a, resolution_a=resolution_a)
+        device_a = (await self.measure()).current_a - self._zero_a
+        self._current = current_correction(device_a, multimeter_a, resolution_a=self._resolution_a)
         sign = ", and the sign of the current is reversed" if self._current.is_sign_wrong else ""
         return f"current: device {device_a:.3f} A, multimeter {multimeter_a:g} A: gain {self._current.gain:.4f}{sign}"
 
@@ -102,17 +103,15 @@ class Comparison:
         """Compare the direction of the present current with the true one; return the result as text.
 
         Raises:
-            InvalidAnswerError: The direction has another name, or the current is too small.
+            InvalidAnswerError: The direction is unknown, or the current is too small.
             UserError: No sample arrives.
         """
-        measured = await self.measure()
-        device_a = measured.current_a - self._zero_a
-        resolution_a = self._sensor.current_resolution_a or 0.0
-        self._current = direction_correction(device_a, direction, resolution_a=resolution_a)
+        device_a = (await self.measure()).current_a - self._zero_a
+        self._current = direction_correction(device_a, direction, resolution_a=self._resolution_a)
         return f"current: the sign is {'reversed' if self._current.is_sign_wrong else 'right'}"
 
     async def finish(self) -> tuple[tuple[str, object], ...]:
-        """Store the gains on a board; return the settings of ``[sensor]``, as key and value, that remain.
+        """Store the gains on a board; return the corrections that it does not store, as key and value of settings of ``[sensor]``.
 
         Raises:
             UserError: The board rejects a gain, or does not answer.
@@ -123,9 +122,8 @@ class Comparison:
 
     def _settings(self) -> list[tuple[str, object]]:
         settings: list[tuple[str, object]] = []
-        signs = {"discharge_positive": "charge_positive", "charge_positive": "discharge_positive"}
         if self._current and self._current.is_sign_wrong:
-            settings.append(("current_sign", signs[self._sensor.current_sign]))
+            settings.append(("current_sign", OPPOSITE_SIGNS[self._sensor.current_sign]))
         if self._is_board:
             return settings
         if self._points:
@@ -133,6 +131,7 @@ class Comparison:
         if self._current and self._current.gain != 1.0:
             settings.append(("current_gain", round(self._current.gain, GAIN_DIGITS)))
         if self._zero_a:
+            # the setting has the sign of the device; measured currents are positive on discharge
             sign = 1.0 if self._sensor.current_sign == "discharge_positive" else -1.0
             settings.append(("current_zero_a", round(sign * self._zero_a, ZERO_DIGITS)))
         return settings

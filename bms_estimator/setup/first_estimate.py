@@ -1,4 +1,4 @@
-"""First estimates of a new pack, without saving or publishing anything."""
+"""First estimates of a new pack. Nothing is saved or published."""
 
 import asyncio
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import Estimate, Snapshot
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
-from bms_estimator.setup.measurement import FIRST_SAMPLE_PERIODS, FIRST_SAMPLE_S, open_pack_source
+from bms_estimator.setup.measurement import first_sample_timeout_s, open_pack_source
 
 
 class EstimateSink:
@@ -42,19 +42,19 @@ async def run_estimator(
 
     Args:
         settings: Settings of the pack.
-        cell: The pack as one object (``CellModel.pack``).
+        cell: Model of the whole pack.
         on_estimate: Called with each estimate.
-        seconds: Time after the first estimate until the end [s].
+        seconds: Duration, counted from the first estimate [s].
 
     Raises:
         UserError: No sample arrives.
     """
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
-    timeout_s = FIRST_SAMPLE_S + FIRST_SAMPLE_PERIODS * settings.sensor.sample_period_s
+    timeout_s = first_sample_timeout_s(settings)
     timer = loop.call_later(timeout_s, stop.set)
     count = 0
 
-    def take(received: Estimate) -> None:
+    def on_received(received: Estimate) -> None:
         nonlocal timer, count
         if not count:
             timer.cancel()
@@ -63,7 +63,7 @@ async def run_estimator(
         on_estimate(received)
 
     source = open_pack_source(settings)
-    await run_estimation_loop(settings, cell, source=source, sinks=[EstimateSink(take)], stop=stop)
+    await run_estimation_loop(settings, cell, source=source, sinks=[EstimateSink(on_received)], stop=stop)
     timer.cancel()
     if not count:
         raise UserError(f"no sample within {timeout_s:g} s: {source.silence_reason}")

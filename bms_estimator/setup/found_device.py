@@ -1,12 +1,12 @@
-"""Device that the search has found, and the settings that describe it."""
+"""Device that the search found, and its settings."""
 
 from dataclasses import dataclass
 
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.settings_template import GivenSettings
 
-CHOICE_SEPARATOR = ":"
-"""Separator of a profile and the name of its device in ``FoundDevice.name``."""
+NAME_SEPARATOR = ":"
+"""Separator between profile and address in ``FoundDevice.name``."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class FoundDevice:
 
     @property
     def settings(self) -> Settings:
-        """Settings of a pack with this device, otherwise with default values. Nothing is published."""
+        """Settings of a pack with this device. All other settings have their defaults, with which nothing is published."""
         source = dict(self.tables.get("source", {}))
         if self.broker is not None:
             source["url"] = self.broker

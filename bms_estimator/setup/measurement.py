@@ -16,14 +16,14 @@ from bms_estimator.sources.source import Source
 FIRST_SAMPLE_S = 15.0
 """Timeout of the first sample [s]. A board needs up to 3 s after its port was opened, a Bluetooth BMS up to 15 s."""
 FIRST_SAMPLE_PERIODS = 2.0
-"""Number of sample periods by which the timeout of the first sample is longer."""
+"""Number of sample periods that are added to the timeout of the first sample."""
 AVERAGE_S = 2.0
-"""Time after the first sample over which samples are averaged [s]."""
+"""Duration of the average, from the first sample on [s]."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Mean of the samples of some seconds."""
+    """Means over ``AVERAGE_S``."""
 
     voltage_v: float
     current_a: float
@@ -35,27 +35,37 @@ class Measurement:
 
 
 def open_pack_source(settings: Settings) -> Source:
-    """Return the source of a pack without stored state.
+    """Return the source of a pack. It neither reads nor writes the state folder.
 
     Raises:
-        UserError: A setting cannot be used.
+        UserError: A setting is invalid.
         ModuleNotFoundError: The optional package of the source is missing.
     """
     return open_line_source(settings) or SerialSource(settings.sensor)
 
 
-async def measure(settings: Settings, first_sample_s: float | None = None) -> Measurement:
+def first_sample_timeout_s(settings: Settings, response_s: float | None = None) -> float:
+    """Return the timeout of the first sample [s].
+
+    Args:
+        settings: Settings of the source.
+        response_s: Time within which the device answers [s]; None: ``FIRST_SAMPLE_S``.
+    """
+    return (response_s or FIRST_SAMPLE_S) + FIRST_SAMPLE_PERIODS * settings.sensor.sample_period_s
+
+
+async def measure(settings: Settings, response_s: float | None = None) -> Measurement:
     """Return the present voltage and current.
 
     Args:
         settings: Settings of the source.
-        first_sample_s: Timeout of the first sample [s]; None: ``FIRST_SAMPLE_S``.
+        response_s: Time within which the device answers [s]; None: ``FIRST_SAMPLE_S``.
 
     Raises:
         UserError: No sample arrives, or none is valid.
         ModuleNotFoundError: The optional package of the source is missing.
     """
-    timeout_s = (first_sample_s or FIRST_SAMPLE_S) + FIRST_SAMPLE_PERIODS * settings.sensor.sample_period_s
+    timeout_s = first_sample_timeout_s(settings, response_s)
     blocks = []
     async with open_pack_source(settings) as source:
         received = aiter(source)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from bms_estimator.settings.mqtt_profiles import DISCHARGE, PROFILES, ProfileName
 from bms_estimator.settings.mqtt_source import MqttSource, ValueLocation
-from bms_estimator.setup.found_device import CHOICE_SEPARATOR, FoundDevice, values_text
+from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice, values_text
 from bms_estimator.sources.mqtt.payload_value import InvalidValueError, read_cells, read_value
 
 MAX_PUBLISHERS = 1000
@@ -42,7 +42,7 @@ class PublisherRecognition:
         self._topics: dict[Publisher, str] = {}  # topic of the voltage
 
     def add_message(self, topic: str, payload: bytes) -> None:
-        """Store the values that a message has for any profile."""
+        """Store the values that the profiles with this topic read from the message."""
         recognized = set[tuple[ProfileName, str]]()
         for template in _templates():
             key = (template.profile, template.quantity)
@@ -60,20 +60,20 @@ class PublisherRecognition:
                     self._topics[publisher] = topic
 
     def devices(self, broker: str) -> list[FoundDevice]:
-        """Return the publishers of voltage and current, those with most values first.
+        """Return the publishers of voltage and current, those with the most values first.
 
-        Several profiles may contain one topic. The publisher with most values is returned for each voltage topic; if
-        two have equally many, both are returned.
+        A topic may be part of several profiles. For each voltage topic the publisher with the most values is returned;
+        publishers with equally many values are all returned.
 
         Args:
             broker: URL of the broker that sent the messages.
         """
         complete = {p: values for p, values in self._values.items() if {"voltage", "current"} <= values.keys()}
-        most = dict[str, int]()
+        value_counts = dict[str, int]()  # number of values of the best publisher, by voltage topic
         for publisher, values in complete.items():
             topic = self._topics[publisher]
-            most[topic] = max(most.get(topic, 0), len(values))
-        best = [p for p, values in complete.items() if len(values) == most[self._topics[p]]]
+            value_counts[topic] = max(value_counts.get(topic, 0), len(values))
+        best = [p for p, values in complete.items() if len(values) == value_counts[self._topics[p]]]
         return [_device(p, complete[p], broker) for p in sorted(best, key=lambda p: (-len(complete[p]), p))]
 
 
@@ -111,14 +111,14 @@ def _publisher(profile: ProfileName, groups: Mapping[str, str]) -> Publisher:
 
 
 def _values(template: _Template, publisher: Publisher, topic: str, payload: bytes) -> dict[str, float]:
-    """Return the values of a payload by name; cells are named by their numbers. Without a valid value it is empty."""
+    """Return the valid values of a payload by name: the quantity, or ``cell`` and its number."""
     path = template.location.path.replace("{prefix}", publisher.prefix).replace("{instance}", publisher.instance)
-    cell = template.pattern.fullmatch(topic)
+    match = template.pattern.fullmatch(topic)
     try:
         if template.quantity != "cells":
             return {template.quantity: read_value(payload, template.location, path)}
-        if cell and "cell" in cell.groupdict():
-            return {f"cell {int(cell['cell'])}": read_value(payload, template.location, path)}
+        if match and "cell" in match.groupdict():  # each cell has a topic
+            return {f"cell {int(match['cell'])}": read_value(payload, template.location, path)}
         return {f"cell {number}": v for number, v in read_cells(payload, template.location, path).items()}
     except InvalidValueError:
         return {}
@@ -132,7 +132,7 @@ def _device(publisher: Publisher, values: Mapping[str, float], broker: str) -> F
         if value and value != profile.table.get(key):
             source[key] = value
     sign = 1.0 if profile.current_sign == DISCHARGE else -1.0
-    name = CHOICE_SEPARATOR.join(filter(None, (publisher.profile, source.get("prefix"), source.get("instance"))))
+    name = NAME_SEPARATOR.join(filter(None, (publisher.profile, source.get("prefix"), source.get("instance"))))
     cells = sum(key.startswith("cell ") for key in values)
     return FoundDevice(
         name=name,

@@ -12,16 +12,16 @@ MAX_DEVIATION = 0.2
 MAX_DISAGREEMENT = 0.01
 """Maximum relative deviation of two comparisons from their common gain."""
 MIN_LOAD_STEPS = 20.0
-"""Minimum current of a comparison in steps of the device's resolution, so that its rounding error is at most 2.5 %."""
+"""Minimum current of a comparison relative to the device's resolution, so that the rounding error is at most 2.5 %."""
 MIN_LOAD_A = 0.2
-"""Minimum current of a comparison if the device's resolution is negligible [A]."""
+"""Minimum current of a comparison with a device of negligible resolution [A]."""
 MAX_ZERO_A = 2.0
-"""Maximum zero of a current sensor [A]. A Hall sensor for 200 A may have 1 % of its range."""
+"""Maximum reading of a current sensor without a current [A]. A Hall sensor for 200 A may show 1 % of its range."""
 
 
 @dataclass(frozen=True)
 class VoltagePoint:
-    """Voltage of the pack by the device and by the multimeter at one state of charge [V]."""
+    """Voltage that the device reports, and voltage that the multimeter shows, at one state of charge [V]."""
 
     device_v: float
     multimeter_v: float
@@ -56,11 +56,11 @@ class CurrentCorrection:
 
 
 def current_correction(device_a: float, multimeter_a: float, *, resolution_a: float = 0.0) -> CurrentCorrection:
-    """Return the correction of the current of a load.
+    """Return the correction from a comparison at a load.
 
     Args:
-        device_a: Current by the device after its zero was subtracted, positive on discharge [A].
-        multimeter_a: Current by the multimeter, positive on discharge [A].
+        device_a: Current that the device reports minus its zero, positive on discharge [A].
+        multimeter_a: Current that the multimeter shows, positive on discharge [A].
         resolution_a: Resolution of the device [A].
 
     Raises:
@@ -72,15 +72,15 @@ def current_correction(device_a: float, multimeter_a: float, *, resolution_a: fl
 
 
 def direction_correction(device_a: float, direction: str, *, resolution_a: float = 0.0) -> CurrentCorrection:
-    """Return the correction of the sign of a current, if no multimeter measures it.
+    """Return the correction of the sign, from a load whose direction is known.
 
     Args:
-        device_a: Current by the device, positive on discharge [A].
+        device_a: Current that the device reports, positive on discharge [A].
         direction: ``DISCHARGING`` or ``CHARGING``, the true direction.
         resolution_a: Resolution of the device [A].
 
     Raises:
-        InvalidAnswerError: The direction has another name, or the current is too small.
+        InvalidAnswerError: The direction is unknown, or the current is too small.
     """
     if direction not in (DISCHARGING, CHARGING):
         raise InvalidAnswerError(f"{direction}: must be {DISCHARGING} or {CHARGING}")
@@ -102,7 +102,7 @@ def _require_load(current_a: float, resolution_a: float) -> None:
 
 
 def require_zero(device_a: float) -> float:
-    """Return the current of the device at no load [A], after checking that it may be the zero of the sensor.
+    """Return the current that the device reports without a load [A], if it is a plausible zero.
 
     Raises:
         InvalidAnswerError: The current is above ``MAX_ZERO_A``.
@@ -115,7 +115,7 @@ def require_zero(device_a: float) -> float:
 
 
 def _require_similar(device: float, multimeter: float, unit: str, question: str) -> None:
-    """Reject a comparison whose deviation is no error of a gain.
+    """Reject a deviation that is too large for an error of the gain.
 
     Raises:
         InvalidAnswerError: The deviation is above ``MAX_DEVIATION``.

@@ -1,4 +1,4 @@
-"""New pack: its settings file, the check of the file, first estimates, and the command that installs the service."""
+"""New pack: its settings file, the check of the file, and the command that installs the service."""
 
 import sys
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class NewPack:
 
     settings: Settings
     cell: CellModel
-    """The pack as one object (``CellModel.pack``)."""
+    """Model of the whole pack."""
     warnings: list[str]
     """Likely mistakes in the settings."""
 

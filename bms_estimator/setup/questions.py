@@ -1,4 +1,4 @@
-"""Questions about a new pack. The terminal and the page ask them in this order; each answer is also an option."""
+"""Questions about a new pack, in the order in which the terminal and the page ask them. Each answer is also an option."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -9,10 +9,9 @@ from pydantic import BaseModel, ValidationError
 from bms_estimator.estimator.settings_plausibility import MAX_CAPACITY_AH
 from bms_estimator.model.cell import generic_cells, shipped_cells
 from bms_estimator.model.config_file import error_reason, without_secrets
-from bms_estimator.model.decimal_text import number
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import PackSettings
-from bms_estimator.setup.answers import Answers, InvalidAnswerError
+from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number
 from bms_estimator.setup.series_count import cell_voltages, possible_counts, suggest_count
 
 CHEMISTRIES: Mapping[str, str] = {
@@ -29,9 +28,9 @@ SYNONYMS = {
     for name, description in CHEMISTRIES.items()
     for synonym in description.partition(":")[0].split(", ")
 }
-"""Names of the generic cells by the names of the chemistry in the descriptions."""
+"""Names of the generic cells by the names in their descriptions, in lower case."""
 NO_BROKER = "none"
-"""Answer by which the service publishes nothing over MQTT."""
+"""Answer for a service that publishes nothing over MQTT."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +42,11 @@ class Question:
     text: str
     help: str
     parse: Callable[[str, Answers], object]
-    """Convert the text of an answer; raises InvalidAnswerError."""
+    """Function that converts the text of an answer, or raises InvalidAnswerError."""
     suggest: Callable[[Answers], str]
-    """Return the default answer; empty without one."""
+    """Function that returns the default answer; empty without one."""
     choices: tuple[tuple[str, str], ...] = ()
-    """Usual answers with their descriptions."""
+    """Common answers with their descriptions."""
 
     @property
     def option(self) -> str:
@@ -55,17 +54,17 @@ class Question:
         return f"--{self.name.replace('_', '-')}"
 
     def answer(self, text: str, answers: Answers) -> Answers:
-        """Return the answers with this one.
+        """Return the answers with the parsed text as the answer to this question.
 
         Raises:
-            InvalidAnswerError: The answer cannot be right.
+            InvalidAnswerError: The text is malformed or implausible.
         """
         values: dict[str, Any] = {self.name: self.parse(text.strip(), answers)}
         return replace(answers, **values)
 
 
 def _validated(model: type[BaseModel], key: str, value: object) -> object:
-    """Return a value after checking it against its setting.
+    """Return a value as the setting ``key`` accepts it.
 
     Raises:
         InvalidAnswerError: The setting rejects the value.
@@ -87,14 +86,12 @@ def _parse_cell(text: str, answers: Answers) -> object:
     if name not in (*generic_cells(), *shipped_cells()):
         raise InvalidAnswerError(f"{text}: must be one of {', '.join((*generic_cells(), *shipped_cells()))}")
     if answers.voltage_v is not None and not possible_counts(answers.voltage_v, cell_voltages(name)):
-        raise InvalidAnswerError(
-            f"{text}: {answers.voltage_v:.2f} V is the voltage of no number of such cells in series"
-        )
+        raise InvalidAnswerError(f"{text}: no number of such cells in series has {answers.voltage_v:.2f} V")
     return name
 
 
 def _parse_capacity(text: str, _: Answers) -> object:
-    value = _validated(PackSettings, "capacity_ah", _number(text))
+    value = _validated(PackSettings, "capacity_ah", parse_number(text))
     if isinstance(value, float) and value > MAX_CAPACITY_AH:
         raise InvalidAnswerError(f"{text}: no cell has more than {MAX_CAPACITY_AH:g} Ah; is it in mAh?")
     return value
@@ -132,15 +129,8 @@ def _suggest_series(answers: Answers) -> str:
     return str(suggest_count(answers.voltage_v, cell_voltages(answers.cell)) or "")
 
 
-def _number(text: str) -> float:
-    try:
-        return number(text.replace(",", "."))
-    except ValueError:
-        raise InvalidAnswerError(f"{text}: must be a number") from None
-
-
 def _integer(text: str) -> int:
-    value = _number(text)
+    value = parse_number(text)
     if value != int(value):
         raise InvalidAnswerError(f"{text}: must be a whole number")
     return int(value)
@@ -172,7 +162,7 @@ QUESTIONS = (
         "MQTT broker to publish to",
         f"URL of the MQTT broker to which the service publishes, mqtt://host:port; {NO_BROKER}: no broker",
         _parse_broker,
-        lambda answers: answers.device.broker or answers.heard_broker or NO_BROKER,
+        lambda answers: answers.device.broker or answers.found_broker or NO_BROKER,
     ),
 )
 """Questions in their order."""

@@ -16,7 +16,7 @@ from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.settings.modbus_source import PROFILES as MODBUS_PROFILES
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.setup.found_device import CHOICE_SEPARATOR, FoundDevice
+from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice
 from bms_estimator.setup.measurement import measure
 from bms_estimator.setup.mqtt_recognition import PublisherRecognition
 from bms_estimator.sources.serial.device_detection import DetectedDevice, probe
@@ -25,18 +25,18 @@ from bms_estimator.sources.serial.port_list import board_ports
 LISTEN_S = 12.0
 """Time for which MQTT messages are received [s]. The publishers with default settings send at least every 10 s."""
 MODBUS_S = 3.0
-"""Timeout of the first sample of a Modbus device [s], which answers a request within a second."""
+"""Time within which a Modbus device sends its first sample [s]. It answers a request within a second."""
 MAX_WAITING = 10_000
 """Maximum number of received messages that wait to be read. A broker sends all retained messages at once."""
 BLUETOOTH = "bluetooth"
-"""Name of the place where Bluetooth devices are searched."""
+"""Place that stands for all Bluetooth devices nearby."""
 DEFAULT_BROKER = str(MqttSettings.model_fields["url"].default)
 """URL of the broker that is searched by default."""
 
 
 @dataclass
 class SearchResult:
-    """Devices that were found, and reasons why others were not."""
+    """Devices that were found, and reasons why none was found elsewhere."""
 
     devices: list[FoundDevice] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
@@ -77,7 +77,7 @@ async def _search_place(place: str, result: SearchResult) -> None:
 
 
 async def _search_serial_port(port: str, result: SearchResult) -> None:
-    """Identify the device on a serial port. A device that no protocol recognizes is polled as a known Modbus device."""
+    """Identify the device on a serial port. A silent device is polled with each Modbus profile."""
     found = await asyncio.to_thread(probe, port)
     if isinstance(found, DetectedDevice):
         result.devices.append(serial_device(port, found))
@@ -113,8 +113,9 @@ async def _search_mqtt(url: str, result: SearchResult) -> None:
     try:
         async with BrokerConnector(settings)(brokers(settings)[0], options) as connection:
             result.broker = url
-            for topic, reason in (await connection.subscribe(None, ["#"])).items():
-                result.failures.append(f"{url}: not allowed to read {topic}: {reason}")
+            denied = await connection.subscribe(None, ["#"])
+            if denied:
+                result.failures.append(f"{url}: not allowed to read #: {denied['#']}")
                 return
             try:
                 async with asyncio.timeout(LISTEN_S):
@@ -133,7 +134,7 @@ async def _search_mqtt(url: str, result: SearchResult) -> None:
 
 
 async def _search_modbus_host(place: str, result: SearchResult) -> None:
-    """Poll a Modbus TCP device or gateway, ``host`` or ``host:port``, as each known device."""
+    """Poll a Modbus TCP device or gateway, ``host`` or ``host:port``, with each profile."""
     host, separator, port = place.partition(":")
     if separator and not port.isdecimal():
         raise UserError(f"{place}: must be a host or host:port")
@@ -150,7 +151,7 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
     for profile in profiles:
         source = {"kind": "modbus", "profile": profile, **address}
         device = FoundDevice(
-            f"{profile}{CHOICE_SEPARATOR}{name}", f"Modbus device {profile} at {name}", {"source": source}
+            f"{profile}{NAME_SEPARATOR}{name}", f"Modbus device {profile} at {name}", {"source": source}
         )
         try:
             values = await measure(device.settings, MODBUS_S)
@@ -162,7 +163,7 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
 
 
 async def _search_bluetooth(result: SearchResult) -> None:
-    """Find the Bluetooth BMS that advertise, if the optional package is installed."""
+    """Find BMS by their Bluetooth advertisements, if the optional package is installed."""
     if importlib.util.find_spec("aiobmsble") is None:
         result.failures.append("Bluetooth: not searched: pip install 'bms_estimator[ble]'")
         return

@@ -7,8 +7,9 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.model.cell import load_cell
 
 BELOW_EMPTY_V, ABOVE_FULL_V = 0.5, 0.3
-"""Voltage of a cell below its OCV at SOC 0 and above its OCV at SOC 1 that a load, a charger or a cell of another maker may cause [V]."""
-USUAL_COUNTS = (1, 2, 3, 4, 6, 7, 8, 10, 12, 13, 14, 15, 16, 20, 24)
+"""Margins below the OCV at SOC 0, for a load, and above the OCV at SOC 1, for a charger [V]. Both include differences
+between manufacturers."""
+COMMON_COUNTS = (1, 2, 3, 4, 6, 7, 8, 10, 12, 13, 14, 15, 16, 20, 24)
 """Numbers of cells in series of common packs."""
 
 
@@ -18,7 +19,7 @@ class CellVoltages:
 
     min_v: float
     """Lowest plausible voltage, under load."""
-    usual_v: float
+    mid_v: float
     """OCV at SOC 0.5."""
     max_v: float
     """Highest plausible voltage, while it is charged."""
@@ -39,8 +40,8 @@ def possible_counts(voltage_v: float, cell: CellVoltages) -> range:
 def suggest_count(voltage_v: float, cell: CellVoltages) -> int | None:
     """Return the most plausible number of cells in series; None if no number is possible.
 
-    Common numbers are preferred. Among them the number is returned with which the cells are closest to their usual voltage.
+    Numbers of common packs take precedence. Among them the best brings the cells closest to their OCV at SOC 0.5.
     """
     possible = possible_counts(voltage_v, cell)
-    candidates = [count for count in possible if count in USUAL_COUNTS] or list(possible)
-    return min(candidates, key=lambda count: abs(voltage_v / count - cell.usual_v), default=None)
+    candidates = [count for count in possible if count in COMMON_COUNTS] or list(possible)
+    return min(candidates, key=lambda count: abs(voltage_v / count - cell.mid_v), default=None)

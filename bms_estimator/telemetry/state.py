@@ -103,7 +103,7 @@ def make_info_payload(
 
     Args:
         settings: The pack's settings.
-        pack: The pack as one object.
+        pack: Model of the whole pack.
         board: Properties that the board reported.
         started_s: Wall clock at start [s since 1970].
         temperature_sensor: True if the cell temperature is measured.

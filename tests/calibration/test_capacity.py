@@ -6,7 +6,8 @@ The cell files have errors of the size that they declare.
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.capacity import Capacity, continuous_parts, measure_capacity
+from bms_estimator.calibration.capacity import Capacity, measure_capacity
+from bms_estimator.calibration.capacity_anchors import continuous_parts
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError

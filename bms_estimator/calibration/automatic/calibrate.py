@@ -1,7 +1,7 @@
 """Calibration of a cell: capacity, open-circuit voltage with hysteresis, resistances, and a validation.
 
-It takes the same steps as the commands ``capacity``, ``ocv``, ``identify`` and ``validate``. The model is fitted twice: without
-the data that are held back, to validate it, and then to all captures. The second fit is the result.
+These are the steps of the commands ``capacity``, ``ocv``, ``identify`` and ``validate``. The first fit omits the data that are
+held back, on which it is then validated. The second fit uses all captures, and is the result.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,20 +11,16 @@ import numpy as np
 
 from bms_estimator.calibration.automatic.capacity_estimate import CapacityEstimate, estimate_capacity
 from bms_estimator.calibration.automatic.hold_back import Split, hold_back, use_all
+from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFit
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture, recognize
-from bms_estimator.calibration.cleaning.clean_capture import clean_capture
-from bms_estimator.calibration.elements.identify import Identification, identify
-from bms_estimator.calibration.elements.identify import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.elements.replay_score import MIN_SOC, SETTLING_S
-from bms_estimator.calibration.ocv.sources import ExternalCurve, Recording
-from bms_estimator.calibration.ocv_cell import OcvCell, determine_ocv
+from bms_estimator.calibration.ocv.sources import ExternalCurve
 from bms_estimator.calibration.validate import Validation, validate
 from bms_estimator.calibration.verdict import SocErrors, Verdict, coverage, judge, voltage_errors
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.progress import Progress
 from bms_estimator.model.sample import SAMPLE
 
 Report = Callable[[float, str], None]
@@ -36,28 +32,11 @@ def ignore_report(_fraction: float, _step: str) -> None:
 
 
 @dataclass(frozen=True)
-class FittedModel:
-    """Cell model fitted to captures.
-
-    Attributes:
-        cell: The cell model.
-        ocv: Fit of the open-circuit voltage; None if no capture determines it, so that the given cell's OCV is used.
-        identification: Fit of the resistances; None if those of the most similar generic cell are used.
-        reason: Reason why the resistances are generic; empty if they were identified.
-    """
-
-    cell: CellModel
-    ocv: OcvCell | None
-    identification: Identification | None
-    reason: str
-
-
-@dataclass(frozen=True)
 class Calibration:
     """Result of a calibration.
 
     Attributes:
-        model: Model fitted to all captures. If its replays are worse, the model of the validation.
+        model: Model fitted to all captures; if that fit finds no resistances, the model without the data held back.
         capacity: Capacity that SOC was counted against.
         captures: The captures, and what each determines.
         has_held_back_data: True if the data of the validation were held back from the fit.
@@ -89,9 +68,9 @@ def calibrate(
     """Calibrate a cell by captures of any kind.
 
     Args:
-        captures: Captures of one cell, scaled to one cell. Those that determine the open-circuit voltage start with a full
-            cell.
-        given: Cell with the rated capacity, such as a generic cell. It supplies what the captures do not determine.
+        captures: Captures of one cell, or of a pack scaled to one cell. A capture that determines the open-circuit voltage
+            starts with a full cell.
+        given: Cell with the rated capacity, such as a generic cell. It supplies the values that the captures do not determine.
         name: Name of the new cell.
         curves: Open-circuit voltages over SOC that were measured otherwise.
         temperature_c: Temperature of captures without a sensor [°C]; None: 25 °C.
@@ -107,34 +86,21 @@ def calibrate(
     if not curves:
         _require_usable_capture(recognized)
     split = hold_back(recognized)
-
-    fits = 1 if split.held_back is None else 2  # they take almost the whole time
-
-    def fit(fitted: Split, step: str, done: int) -> FittedModel:
-        def progress(fraction: float) -> None:
-            report((done + fraction) / fits, step)
-
-        progress(0.0)
-        return _fit(fitted, initial_cell, capacity, curves, name, temperature_c, progress)
-
-    validated = fit(split, "model without the data held back", 0)
-    model, notes = validated, []
-    if split.held_back is not None:
-        model = fit(use_all(recognized), "model of all data", 1)
-        if model.identification is None and validated.identification is not None:
-            notes = [f"the model is that without the data held back, because with all data {model.reason}"]
-            model = validated
+    model_fit = ModelFit(initial_cell, capacity, curves, name, temperature_c)
+    validated, model, notes = _fit_both(model_fit, split, use_all(recognized), report)
     report(1.0, "validation")
-    of_captures, failures = _validate_all(recognized, model)
-    validations, soc_errors = of_captures, None
+    validations, failures = _validate_all(recognized, model)
+    covered = coverage(validations, model.cell) if validations else None  # by all captures, not only the data held back
+    soc_errors = None
     if split.held_back is not None:
-        held_back, initial_soc = split.held_back.capture, _initial_soc(split.held_back, model)
-        validations = [validate(held_back, validated.cell, initial_soc=initial_soc, from_s=split.held_back_from_s)]
-        soc_errors = _soc_errors(validations[0], validated.cell)
+        initial_soc = model.initial_soc(split.held_back)
+        validation = validate(
+            split.held_back.capture, validated.cell, initial_soc=initial_soc, from_s=split.held_back_from_s
+        )
+        validations, soc_errors = [validation], _soc_errors(validation, validated.cell)
     if not validations:
         raise UserError("\n".join(failures))
-    # the model covers the operating ranges of all captures, not only of the data held back
-    covered = coverage(of_captures or validations, model.cell)
+    errors = voltage_errors(validations, validated.cell)
     return Calibration(
         model=model,
         capacity=capacity,
@@ -142,7 +108,7 @@ def calibrate(
         has_held_back_data=split.held_back is not None,
         validation_data=split.sentence,
         validations=tuple(validations),
-        verdict=judge(voltage_errors(validations, validated.cell), covered, soc_errors),
+        verdict=judge(errors, covered or coverage(validations, model.cell), soc_errors),
         warnings=(*notes, *failures),
     )
 
@@ -157,48 +123,24 @@ def _require_usable_capture(captures: Sequence[RecognizedCapture]) -> None:
         )
 
 
-def _fit(
-    split: Split,
-    initial_cell: CellModel,
-    capacity: CapacityEstimate,
-    curves: Sequence[ExternalCurve],
-    name: str,
-    temperature_c: float | None,
-    progress: Progress,
-) -> FittedModel:
-    """Fit the open-circuit voltage, and then the resistances."""
-    ocv, cell = None, initial_cell
-    if split.ocv or curves:
-        ocv = determine_ocv(
-            [Recording(each.capture.name, each.capture.rows) for each in split.ocv],
-            curves,
-            name=name,
-            capacity_ah=None if capacity.from_slow_discharge else capacity.capacity_ah,
-            series_count=1,
-        )
-        cell = ocv.cell
-    if not split.resistances:
-        return FittedModel(cell, ocv, None, "no capture has a current above 0.1 C")
-    try:
-        identification = identify(
-            [each.capture for each in split.resistances], cell, temperature_c=temperature_c, progress=progress
-        )
-    except UserError as error:
-        if ocv is None:
-            raise
-        fault = str(error).splitlines()[0].partition(";")[0]  # the rest is a remedy
-        return FittedModel(cell, ocv, None, fault)
-    named = identification.cell.model_copy(update={"cell": identification.cell.cell.model_copy(update={"name": name})})
-    return FittedModel(named, ocv, identification, "")
+def _fit_both(
+    model_fit: ModelFit, split: Split, all_data: Split, report: Report
+) -> tuple[FittedModel, FittedModel, list[str]]:
+    """Return the model without the data held back, the model of all data, and a note if the first replaces the second."""
+    fits = 1 if split.held_back is None else 2  # they take almost the whole time
 
+    def fit(data: Split, step: str, finished_fits: int) -> FittedModel:
+        report(finished_fits / fits, step)
+        return model_fit.fit(data, lambda fraction: report((finished_fits + fraction) / fits, step))
 
-def _initial_soc(recognized: RecognizedCapture, model: FittedModel) -> float:
-    """Return the SOC at the first sample of a capture, from the identification or else from the capture's first rest."""
-    if model.identification is not None:
-        for fit in model.identification.captures:
-            if fit.name == recognized.capture.name:
-                return fit.initial_soc
-    return soc_of_first_rest(clean_capture(recognized.capture.name, recognized.good, model.cell), model.cell)
+    validated = fit(split, "model without the data held back", 0)
+    if split.held_back is None:
+        return validated, validated, []
+    model = fit(all_data, "model of all data", 1)
+    if model.identification is None and validated.identification is not None:
+        note = f"the model was fitted without the data held back, because with all data {model.reason}"
+        return validated, validated, [note]
+    return validated, model, []
 
 
 def _validate_all(captures: Sequence[RecognizedCapture], model: FittedModel) -> tuple[list[Validation], list[str]]:
@@ -206,7 +148,7 @@ def _validate_all(captures: Sequence[RecognizedCapture], model: FittedModel) -> 
     validations, warnings = [], []
     for each in captures:
         try:
-            validations.append(validate(each.capture, model.cell, initial_soc=_initial_soc(each, model)))
+            validations.append(validate(each.capture, model.cell, initial_soc=model.initial_soc(each)))
         except UserError as error:
             warnings.append(str(error))
     return validations, warnings

@@ -1,4 +1,4 @@
-"""Capacity with which the SOC of captures is counted: measured if possible, otherwise the rated one."""
+"""Capacity with which the SOC of captures is counted: the measured capacity, or else the rated capacity."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +14,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 MAX_RESTS_STD = 0.03
-"""Maximum relative standard deviation of a capacity from rests. With the curve of a generic cell it is 5 to 10 %, which is
-no better than a rated capacity, but 2 % between rests of a full and an empty cell. With the curve of the cell itself it is
-1 to 2 %."""
+"""Maximum relative standard deviation of a capacity from rests. The OCV curve of a generic cell gives 5 to 10 %, which is no
+better than a rated capacity, or 2 % between a rest when full and a rest when empty. The cell's own curve gives 1 to 2 %."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class CapacityEstimate:
 
     Attributes:
         capacity_ah: Capacity [Ah].
-        origin: Origin of the value, as the end of a sentence.
+        origin: Origin of the value for messages, such as ``measured by 5 rests``.
         from_slow_discharge: True if a slow discharge from full to empty measured it.
     """
 

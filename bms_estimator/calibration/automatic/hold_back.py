@@ -22,7 +22,7 @@ class Split:
         ocv: Captures that determine the open-circuit voltage.
         resistances: Captures that determine the resistances.
         held_back: Capture of the validation; None if no data are held back.
-        held_back_from_s: Begin of the data that are held back, as the time since the first good sample of ``held_back`` [s].
+        held_back_from_s: Start of the data that are held back [s], counted from the first good sample of ``held_back``.
         sentence: Sentence that names the data that are held back.
     """
 
@@ -60,23 +60,25 @@ def hold_back(captures: Sequence[RecognizedCapture]) -> Split:
     because the open-circuit voltage needs captures that start with a full cell.
 
     Otherwise the last part of the first capture with resistances is held back, but only from the fit of the resistances.
-    Without this part, the open-circuit voltage would be unknown at its SOCs.
+    The fit of the open-circuit voltage needs it, because no other data cover its range of SOC.
     """
     candidates = [each for each in captures if each.gives_resistances and _others_suffice(each, captures)]
     if candidates:
         chosen = min(candidates, key=lambda each: (each.gives_ocv, each.good["voltage_v"][0]))
         others = use_all([each for each in captures if each is not chosen])
-        return replace(others, held_back=chosen, sentence=f"Validated on {chosen.capture.name}, by a fit without it.")
+        return replace(
+            others, held_back=chosen, sentence=f"Validated on {chosen.capture.name}, with a fit that did not use it."
+        )
     all_data = use_all(captures)
     return _hold_back_last_part(all_data) if all_data.resistances else all_data
 
 
 def _others_suffice(chosen: RecognizedCapture, captures: Sequence[RecognizedCapture]) -> bool:
-    """Return True if the other captures determine the resistances near the chosen one's temperature, and the OCV."""
+    """Return True if the other captures determine the resistances at a similar temperature, and the OCV."""
     others = [each for each in captures if each is not chosen]
     has_neighbor = any(
         each.gives_resistances and not abs(each.temperature_c - chosen.temperature_c) >= MIN_SPAN_K for each in others
-    )  # NaN, an unknown temperature, is near to any
+    )  # the negation includes NaN, so that an unknown temperature is similar to every temperature
     return has_neighbor and (any(each.gives_ocv for each in others) or not chosen.gives_ocv)
 
 

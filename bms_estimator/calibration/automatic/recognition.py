@@ -21,7 +21,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 MAX_PULSE_S = 60.0
-"""Maximum duration of a pulse [s]. Those of an HPPC test last 10 to 30 s."""
+"""Maximum duration of a pulse [s]. The pulses of an HPPC test last 10 to 30 s."""
 MAX_CURRENT_DEVIATION = 0.05
 """Maximum relative deviation of a load's current from its median for a constant current."""
 CONSTANT_FRACTION = 0.9
@@ -51,13 +51,13 @@ class RecognizedCapture:
     temperature_c: float
 
     @property
-    def use(self) -> str:
+    def determined(self) -> str:
         """Values that the capture determines, for a table."""
         values = ["OCV"] * self.gives_ocv + ["resistances"] * self.gives_resistances
         return ", ".join(values) or "none"
 
     def with_capture(self, part: Columns) -> "RecognizedCapture":
-        """Return a copy for a part of the capture."""
+        """Return a copy with only a part of the samples."""
         return replace(self, capture=part, good=part.rows)
 
 

@@ -9,8 +9,8 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 
 MIN_GAP_TO_LONG_PERIOD = 1.5
-"""Minimum duration of a gap in multiples of the 99th percentile of the sample period. Many loggers record rests at a longer
-period, which is not a gap."""
+"""Minimum duration of a gap in multiples of the 99th percentile of the sample period. The percentile excludes the longer
+period at which many loggers record rests."""
 ROUNDING_FRACTION = 1e-6
 """Difference of two values that counts as rounding, as a fraction of the largest magnitude."""
 

@@ -21,10 +21,10 @@ from bms_estimator.cli.options.capture_options import (
     CapacityAh,
     MappedColumns,
     SignOfCurrent,
+    SocOfEstimator,
     complete_cell,
 )
 from bms_estimator.cli.options.compile_progress import show_compile_progress
-from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.cli.options.silenced_log import silenced_log
@@ -80,12 +80,7 @@ def alarms(
         Path | None,
         typer.Option(help="settings file of the pack, pack.toml, with the limits of the alarms", show_default=False),
     ] = None,
-    soc: Annotated[
-        float | None,
-        typer.Option(
-            parser=decimal(0.0, 1.0), help="initial SOC, 0..1; default: from the measured voltage, by the OCV curve"
-        ),
-    ] = None,
+    soc: SocOfEstimator = None,
     current_sign: SignOfCurrent = None,
     column_map: MappedColumns = None,
     as_json: AsJson = False,

@@ -27,11 +27,11 @@ from bms_estimator.sources.captures.replay import Capture, RawCapture
 from bms_estimator.telemetry.health import suspicions
 
 BLOCK_SAMPLES = 1 << 16
-"""Number of samples of a block, so that the memory for the trace does not grow with the capture."""
+"""Number of samples in a block. The trace of one block at a time is in memory."""
 ESTIMATE_POINTS = 6000
 """Maximum number of rows of the trace that remain after thinning."""
 KEPT_EXTREMES = ("soc", "soc_std", "r_s_ohm", "r_ts_ohm", "r_tl_ohm", "tau_ts_s", "tau_tl_s")
-"""Columns of the trace whose extremes remain."""
+"""Columns of the trace whose extremes remain after thinning."""
 
 
 def capture_result(
@@ -48,9 +48,9 @@ def capture_result(
     Args:
         file: File of the capture.
         name: Name of the capture in the report.
-        opened: The capture, of which nothing has been read.
+        opened: The capture, at its beginning.
         settings: Settings of the estimator.
-        model: Cell, or pack as one object.
+        model: Model of a cell or of a whole pack.
         initial_soc: SOC at the first sample, 0..1; None: from the voltage.
 
     Raises:
@@ -75,7 +75,7 @@ def capture_result(
 
 
 class _SocErrorSums:
-    """Sums over the blocks of a trace, from which the errors of its SOC follow.
+    """Running sums over the blocks of a trace for the errors of its SOC.
 
     Attributes:
         samples: Number of samples so far.

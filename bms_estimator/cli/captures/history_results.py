@@ -23,7 +23,7 @@ def pack_history(settings: Settings, model: PackModel, folder: Path | None, sinc
 
     Args:
         settings: Settings of the pack.
-        model: The pack as one object.
+        model: Model of the whole pack.
         folder: State folder of the service; None: the folder in the settings.
         since_s: Start time [s since 1970].
 

@@ -25,6 +25,7 @@ from bms_estimator.cli.options.capture_options import (
     Force,
     MappedColumns,
     SignOfCurrent,
+    SocOfEstimator,
     check_output_file,
     complete_cell,
 )
@@ -61,12 +62,7 @@ def replay(
     ] = None,
     capacity_ah: CapacityAh = None,
     pack: Annotated[Path | None, typer.Option(help="settings file of the pack, pack.toml", show_default=False)] = None,
-    soc: Annotated[
-        float | None,
-        typer.Option(
-            parser=decimal(0.0, 1.0), help="initial SOC, 0..1; default: from the measured voltage, by the OCV curve"
-        ),
-    ] = None,
+    soc: SocOfEstimator = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -95,7 +91,7 @@ def replay(
 ) -> None:
     """Run the live service's estimator over a capture.
 
-    For a file of `run --record`, the estimates are bit-identical to those of the recorded run.
+    For a file of `run --record`, the estimates and the estimates of the recorded run are bit-identical.
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:

@@ -111,7 +111,7 @@ def report_on_captures(
 
     Args:
         files: Files of the captures.
-        opened: The captures, of which nothing has been read.
+        opened: The captures, at their beginning.
         pack: Settings file of the pack; None: default settings.
         cell: Cell; None: the pack's cell.
         capacity_ah: Capacity [Ah]; None: the capacity in the settings of the pack or in the cell file.

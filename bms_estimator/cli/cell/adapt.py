@@ -49,7 +49,7 @@ def adapt_command(
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
     Replays of the captures give both cell files a score for SOC error and width of the SOC interval (docs/cell/identify.md).
-    The new file is written only if its score is at most 5 % above that of --cell.
+    The new file is written only if its score is at most 5 % above the score of --cell.
     """
     check_output_file(out, captures, force=force)
     reject_duplicates(captures)

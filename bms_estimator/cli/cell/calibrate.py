@@ -1,8 +1,7 @@
-"""``bms-estimator calibrate``: cell file from captures of any kind, or from tests of a pack that the command guides."""
+"""``bms-estimator calibrate``: cell file from captures of any kind, or from a guided test beside a pack."""
 
 import json
 import sys
-from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -12,9 +11,8 @@ from rich.console import Console
 
 from bms_estimator.calibration.automatic.calibrate import Calibration, calibrate
 from bms_estimator.calibration.guided_test.plan import LONG, SHORT
-from bms_estimator.calibration.ocv.sources import ExternalCurve
 from bms_estimator.cli.cell.calibrate_live import RelayOptions, run_guided_test
-from bms_estimator.cli.cell.calibration_input import load_captures_and_curves
+from bms_estimator.cli.cell.calibration_input import given_cell, load_captures_and_curves, split_inputs
 from bms_estimator.cli.cell.calibration_output import json_result, remarks, result_text
 from bms_estimator.cli.cell.calibration_session import open_session
 from bms_estimator.cli.options.capture_input import capture_files
@@ -31,13 +29,9 @@ from bms_estimator.cli.options.capture_options import (
     reject_duplicates,
 )
 from bms_estimator.cli.options.number_options import decimal, whole
-from bms_estimator.cli.options.pack_options import single_cell_of
 from bms_estimator.cli.options.progress_bar import progress_bar
-from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.cell_file import write_cell
-from bms_estimator.model.columns import Columns
 from bms_estimator.model.config_file import write_text
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.sources.captures.curves import read_curve
@@ -132,42 +126,48 @@ def calibrate_command(
     The model is validated on data that are held back from the fit. The command prints the errors, and what the captures do
     not show.
     """
-    pack, paths = _split_inputs(inputs)
-    for written in (out, report):
-        if written is not None:
-            check_output_file(written, inputs, force=force)
+    pack, paths = split_inputs(inputs)
+    for output in (out, report):
+        if output is not None:
+            check_output_file(output, inputs, force=force)
     reject_duplicates(paths)
-    given, series_count, parallel_count = _given_cell(pack, cell, capacity_ah, series)
-    session = None
+    given = given_cell(pack, cell, capacity_ah, series)
+    session, written = None, list[Path]()
     with capture_files(paths) as files:
-        captures = files
-        if captures:
-            recordings, curves = load_captures_and_curves(captures, current_sign=current_sign, column_map=column_map)
-        elif pack is not None:
+        captures, curves = load_captures_and_curves(files, current_sign=current_sign, column_map=column_map)
+        if pack is not None and not files:
             settings = load_settings(pack)
-            cells = f"{settings.pack.name}, {given.cell.capacity_ah:g} Ah, {series_count}s{parallel_count}p"
-            session = open_session(out, test.value, cells, restart=restart)
-            relay_options = RelayOptions(relay.value if relay else None, relay_command, relay_silent_s)
-            capture = run_guided_test(settings, given.pack(series_count, parallel_count), session, relay_options)
+            session = open_session(out, test.value, f"{settings.pack.name}, {given.size}", restart=restart)
+            options = RelayOptions(relay.value if relay else None, relay_command, relay_silent_s)
+            capture = run_guided_test(settings, given.pack, session, options)
             if capture is None:
                 typer.echo("interrupted; the same command continues", err=True)
                 return
-            recordings, curves, captures = [capture], [], [session.write_capture(capture)]
-        else:
-            raise UserError("give captures, or the settings file of a pack")
-        cell_captures = [_of_one_cell(each, series_count, parallel_count) for each in recordings]
-        calibration = _calibrate(cell_captures, curves, given, name_of(out), temperature_c)
-        for line in calibration.warnings:
-            typer.echo(f"warning: {line}", err=True)
+            captures, written = [capture], [session.write_capture(capture)]
+        with progress_bar("calibrating") as bar:
+            calibration = calibrate(
+                [given.scaled(each) for each in captures],
+                given.cell,
+                name=name_of(out),
+                curves=curves,
+                temperature_c=temperature_c,
+                report=bar.update,
+            )
         write_cell(out, calibration.model.cell, remarks(calibration))
         if session is not None:
             session.end()
-        if as_json:
-            sys.stdout.write(json.dumps(json_result(out, calibration)) + "\n")
-        else:
-            Console().print(result_text(out, calibration))
+        _print_result(out, calibration, as_json=as_json)
         if report is not None:
-            _write_report(report, captures, pack, out, calibration, current_sign, column_map)
+            _write_report(report, [*files, *written], pack, out, calibration, current_sign, column_map)
+
+
+def _print_result(out: Path, calibration: Calibration, *, as_json: bool) -> None:
+    for text in calibration.warnings:
+        typer.echo(f"warning: {text}", err=True)
+    if as_json:
+        sys.stdout.write(json.dumps(json_result(out, calibration)) + "\n")
+    else:
+        Console().print(result_text(out, calibration))
 
 
 def _write_report(
@@ -187,51 +187,3 @@ def _write_report(
     page = report_on_captures(files, opened, pack, str(cell), calibration.model.cell.cell.capacity_ah, None)
     write_text(report, page.html())
     typer.echo(f"{report}: written", err=True)
-
-
-def _calibrate(
-    recordings: list[Columns], curves: list[ExternalCurve], given: CellModel, name: str, temperature_c: float | None
-) -> Calibration:
-    """Calibrate, and show the progress on a terminal."""
-    with progress_bar("calibrating") as bar:
-        return calibrate(
-            recordings,
-            given,
-            name=name,
-            curves=curves,
-            temperature_c=temperature_c,
-            report=bar.update,
-        )
-
-
-def _split_inputs(inputs: list[Path]) -> tuple[Path | None, list[Path]]:
-    """Return the settings file of the pack, if the first argument is one, and the captures."""
-    if inputs[0].suffix == ".toml":
-        return inputs[0], inputs[1:]
-    return None, inputs
-
-
-def _given_cell(
-    pack: Path | None, cell: str | None, capacity_ah: float | None, series: int | None
-) -> tuple[CellModel, int, int]:
-    """Return the cell with the rated capacity, and the numbers of cells in series and in parallel.
-
-    Raises:
-        UserError: Neither a pack nor a cell is given, or a file cannot be read.
-    """
-    if pack is None:
-        if cell is None:
-            raise UserError("give --cell NAME and --capacity AH, or the settings file of a pack before the captures")
-        return load_cell(cell, capacity_ah), series or 1, 1
-    settings = load_settings(pack)
-    capacity_ah = capacity_ah or settings.pack.capacity_ah
-    given = single_cell_of(pack, settings) if cell is None else load_cell(cell, capacity_ah)
-    return given, series or settings.pack.series, settings.pack.parallel
-
-
-def _of_one_cell(capture: Columns, series: int, parallel: int) -> Columns:
-    """Return the capture of a pack scaled to the mean cell."""
-    rows = capture.rows.copy()
-    rows["voltage_v"] /= series
-    rows["current_a"] /= parallel
-    return replace(capture, rows=rows)

@@ -33,7 +33,7 @@ def result_text(out: Path, calibration: Calibration) -> Group:
     table = Table("capture", "recognized as", "°C", "used for", title=f"{out}: written", box=box.SIMPLE_HEAD)
     table.title_justify = "left"
     for each in calibration.captures:
-        table.add_row(each.capture.name.split(".")[0], each.kind, _temperature_text(each), each.use)
+        table.add_row(each.capture.name.split(".")[0], each.kind, _temperature_text(each), each.determined)
     lines = [f"capacity {calibration.model.cell.cell.capacity_ah:.4g} Ah: {calibration.capacity.origin}"]
     lines += [line.rstrip(".") for line in _origin_lines(calibration)]
     use = f'To use it, write cell = "{out}" in [pack] of the settings, without capacity_ah.'

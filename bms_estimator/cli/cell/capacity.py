@@ -11,7 +11,8 @@ from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 
-from bms_estimator.calibration.capacity import Anchor, Capacity, measure_capacity
+from bms_estimator.calibration.capacity import Capacity, measure_capacity
+from bms_estimator.calibration.capacity_anchors import Anchor
 from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
@@ -129,7 +130,7 @@ def _anchor_result(anchor: Anchor, soc_error: float) -> AnchorResult:
         time_s=anchor.time_s,
         rest_s=anchor.rest.duration_s,
         ocv_v=anchor.rest.ocv_v,
-        ocv_std_v=anchor.own_std_v,
+        ocv_std_v=anchor.voltage_std_v,
         soc=anchor.soc,
         soc_std=anchor.soc_std,
         counted_ah=anchor.counted_ah,

@@ -6,11 +6,11 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from bms_estimator.cli.options.capture_options import CELL_HELP, CapacityAh, Force, check_output_file, named_as_file
+from bms_estimator.cli.options.capture_options import CELL_HELP, CapacityAh, Force, check_output_file, name_of
 from bms_estimator.conversion.c_header import c_header
 from bms_estimator.conversion.cell_json import cell_json
 from bms_estimator.conversion.pybamm_parameters import pybamm_module
-from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, TableOcv, load_cell, with_name
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 
@@ -47,7 +47,7 @@ def convert(
     if out.suffix == ".py" and not out.stem.isidentifier():
         raise UserError(f"--out {out}: Python cannot import a module of this name; use letters, digits and underscores")
     check_output_file(out, [Path(cell)], force=force)
-    model = named_as_file(out, load_cell(cell, capacity_ah))
+    model = with_name(load_cell(cell, capacity_ah), name_of(out))
     write_text(out, cell_format.text(model))
     typer.echo(f"{out}: {cell_format.name}, {model.cell.capacity_ah:.4g} Ah")
     for note in _notes(out.suffix, model):

@@ -64,7 +64,7 @@ def identify_command(
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
     Replays of the captures give both cell files a score for SOC error and width of the SOC interval (docs/cell/identify.md).
-    The new file is written only if its score is at most 5 % above that of --cell.
+    The new file is written only if its score is at most 5 % above the score of --cell.
 
     For a fuel cell, give polarization curves (columns current_a, voltage_v) and captures under load
     (docs/theory/fuel-cell.md).

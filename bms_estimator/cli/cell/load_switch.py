@@ -19,13 +19,13 @@ RELEASE_ATTEMPTS = 3
 """Number of attempts to disconnect the load at the end."""
 
 SetLoad = Callable[[bool], Awaitable[None]]
-"""Connects (True) or disconnects the load. Raises UserError if that fails."""
+"""Function that connects (True) or disconnects the load, or raises UserError."""
 
 log = structlog.get_logger(__name__)
 
 
 def board_relay(relay: Callable[[Relay], Awaitable[None]], *, high_is_on: bool, silent_s: int) -> SetLoad:
-    """Return a switch by the relay of the board.
+    """Return a function that switches the load with the relay of the board.
 
     Args:
         relay: Sends a relay command.
@@ -40,7 +40,7 @@ def board_relay(relay: Callable[[Relay], Awaitable[None]], *, high_is_on: bool, 
 
 
 def relay_program(command: str) -> SetLoad:
-    """Return a switch by a program, which is called with the argument ``on`` or ``off``."""
+    """Return a function that switches the load with a program, which is called with the argument ``on`` or ``off``."""
 
     async def set_load(on: bool) -> None:
         arguments = [*shlex.split(command), "on" if on else "off"]
@@ -56,7 +56,7 @@ def relay_program(command: str) -> SetLoad:
 
 
 class LoadSwitch:
-    """Keeps the load in a requested state.
+    """Switch that sends the requested state of the load, and sends it again after a failure.
 
     Args:
         set_load: Connects or disconnects the load.
@@ -66,7 +66,7 @@ class LoadSwitch:
     def __init__(self, set_load: SetLoad, *, repeat: bool) -> None:
         self._set_load, self._repeat = set_load, repeat
         self._on, self._wake = False, asyncio.Event()
-        self._was_on = False
+        self._was_connected = False
         self.error = ""
         """Reason why the last command failed; empty after a success."""
 
@@ -89,12 +89,12 @@ class LoadSwitch:
         """Disconnect the load; raises UserError if that fails after the load was connected."""
         for _ in range(RELEASE_ATTEMPTS):
             await self._send(on=False)
-            if not self.error or not self._was_on:
+            if not self.error or not self._was_connected:
                 return
         raise UserError(f"the load could not be disconnected: {self.error}; disconnect it now")
 
     async def _send(self, on: bool) -> None:
-        self._was_on |= on
+        self._was_connected |= on
         try:
             await self._set_load(on)
             self.error = ""

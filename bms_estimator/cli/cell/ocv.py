@@ -64,12 +64,12 @@ class OcvResult:
     generic: str
     """Most similar generic cell. Its resistances are scaled to the resistances of the captures."""
     usual_hysteresis: bool
-    """True if the hysteresis is that of the generic cell, because no source determines it."""
+    """True if the hysteresis of the generic cell is used, because no source determines it."""
     series_count: int
     points: int
     soc: list[float]
     ocv_v: list[float]
-    """OCV of the points; that of rests is extrapolated to infinite time."""
+    """OCV of the points. The voltages of rests are extrapolated to infinite time."""
     std_v: list[float]
     rms_mv: float
     """RMS of points minus curve."""
@@ -115,7 +115,7 @@ def ocv(
         float,
         typer.Option(
             parser=decimal(0.0, 1.0),
-            help="initial SOC of the captures that start at the highest voltage; that of other captures is read from the OCV curve",
+            help="initial SOC of the captures that start at the highest voltage; other captures start at an SOC that is read from the OCV curve",
         ),
     ] = 1.0,
     series: Annotated[

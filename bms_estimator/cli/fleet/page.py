@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
-from bms_estimator.cli.options.page_options import open_browser, page_settings
+from bms_estimator.cli.options.page_options import Browser, TokenFile, open_browser, page_settings
 from bms_estimator.fleet.page import nats_feed
 from bms_estimator.fleet.page.fleet_page import fleet_page
 from bms_estimator.process.log_setup import configure_logs, flush_logs
@@ -29,16 +29,12 @@ def page(
             help="folder to which `fleet collect` writes, from which the page shows trends", show_default=False
         ),
     ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(help="file with the access token of the page", show_default=False)
-    ] = None,
+    token_file: TokenFile = None,
     host: Annotated[
         list[str] | None,
         typer.Option(help="further host name under which browsers request the page; repeatable", show_default=False),
     ] = None,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
-    ] = True,
+    browser: Browser = True,
 ) -> None:
     """Serve a web page of all packs of a fleet, until SIGINT or SIGTERM."""
     settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.pack_options import with_broker
-from bms_estimator.cli.options.page_options import open_browser, page_settings
+from bms_estimator.cli.options.page_options import Browser, TokenFile, open_browser, page_settings
 from bms_estimator.page.broker_page import dashboard as serve_page
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import stop_on_signal
@@ -32,18 +32,14 @@ def dashboard(
         str | None,
         typer.Option(help=f"host:port of the page; default: page.listen in PACK, otherwise {DEFAULT_LISTEN}"),
     ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(help="file with the access token of the page", show_default=False)
-    ] = None,
+    token_file: TokenFile = None,
     folder: Annotated[
         Path | None,
         typer.Option(
             help="state folder of the services on this machine, from which the page reads the history of their packs"
         ),
     ] = None,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
-    ] = True,
+    browser: Browser = True,
 ) -> None:
     """Serve a live web page of all packs that publish to an MQTT broker, until SIGINT or SIGTERM."""
     settings = load_settings(pack) if pack else Settings()

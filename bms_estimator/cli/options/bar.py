@@ -4,7 +4,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 BAR_WIDTH = 24
-"""Width of the bar [characters], at which a line with a long label fits into 80 columns."""
+"""Width of the bar [characters]. With a long label, the line fits into 80 columns."""
 
 
 def new_bar(console: Console) -> Progress:

@@ -1,4 +1,4 @@
-"""Captures that are given to a command: files or standard input, with a note on stderr about what was guessed."""
+"""Captures as arguments of a command: files or standard input. Guesses about their format are printed on stderr."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager

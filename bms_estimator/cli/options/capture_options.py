@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.model.cell import CellModel, battery_names, cell_names
+from bms_estimator.model.cell import CellModel, battery_names, cell_names, with_name
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
@@ -53,6 +53,12 @@ InitialSoc = Annotated[
     typer.Option(
         parser=decimal(0.0, 1.0),
         help="SOC at the first sample of each capture; default: from the voltage of the capture's first rest",
+    ),
+]
+SocOfEstimator = Annotated[
+    float | None,
+    typer.Option(
+        parser=decimal(0.0, 1.0), help="initial SOC, 0..1; default: from the measured voltage, by the OCV curve"
     ),
 ]
 NewCellFile = Annotated[Path, typer.Option(help="cell file to write", show_default=False)]
@@ -124,11 +130,6 @@ def name_of(path: Path) -> str:
     return path.name.split(".")[0]
 
 
-def named_as_file(out: Path, cell: CellModel) -> CellModel:
-    """Return the cell with the name of a file."""
-    return cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name_of(out)})})
-
-
 def write_cell_named_as_file(out: Path, cell: CellModel, remarks: list[str]) -> None:
     """Write a cell file. Its cell is named after the file, and ``remarks`` become comments at its beginning."""
-    write_cell(out, named_as_file(out, cell), remarks)
+    write_cell(out, with_name(cell, name_of(out)), remarks)

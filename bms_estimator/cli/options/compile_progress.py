@@ -58,7 +58,7 @@ class CompileListener(event.Listener):
         """Function that is called before each kernel is compiled. ``show`` may replace it, for example to draw a bar."""
 
     def on_interrupt(self, *_: object) -> None:
-        """Remember SIGINT."""
+        """Store that SIGINT arrived."""
         self._interrupted = True
 
     def raise_if_interrupted(self) -> None:

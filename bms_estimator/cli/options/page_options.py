@@ -4,13 +4,20 @@ import os
 import sys
 import threading
 import webbrowser
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
+import typer
 from pydantic import ValidationError
 
 from bms_estimator.model.config_file import error_reason
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.page import PageSettings
+
+TokenFile = Annotated[Path | None, typer.Option(help="file with the access token of the page", show_default=False)]
+Browser = Annotated[
+    bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
+]
 
 DESKTOP_VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY")
 """Environment variables of which a desktop session sets at least one."""

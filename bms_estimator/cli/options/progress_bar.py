@@ -29,7 +29,7 @@ class ProgressBar:
             self._bar.update(self._task, completed=fraction, description=label)
 
     def show_compilation(self) -> None:
-        """Show above the bar that kernels compile, which the time left does not include."""
+        """Print above the bar that kernels compile. The time left does not include the compilation."""
         self._bar.console.print(COMPILE_TEXT)
 
 

@@ -6,6 +6,6 @@ from rich.console import Console
 
 
 def show_status(text: str) -> AbstractContextManager[object]:
-    """Show on stderr that something takes time, if stderr is a terminal."""
+    """Show a text with a spinner within the context, if stderr is a terminal."""
     console = Console(stderr=True)
     return console.status(text) if console.is_terminal else nullcontext()

@@ -57,7 +57,7 @@ def show(
 
 
 def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
-    """Return values that follow from the settings and the cell: of pack, observer and alarms, by dotted name."""
+    """Return values of pack, observer and alarms that follow from the settings and the cell, by dotted name."""
     records = estimator_settings(
         cell,
         settings.observer,

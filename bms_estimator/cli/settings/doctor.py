@@ -25,7 +25,7 @@ from bms_estimator.doctor.systemd_unit import unit_of
 from bms_estimator.model.errors import UserError
 
 DEFAULT_PACKS = (Path("pack.toml"), Path("/etc/bms-estimator/pack.toml"))
-"""Settings files that are examined by default, the first that exists."""
+"""Settings files of which the first that exists is examined by default."""
 COLORS = {Level.OK: "green", Level.WARNING: "yellow", Level.FAULT: "red"}
 """Color of each level on a terminal."""
 LEVEL_WIDTH = max(map(len, Level)) + 2
@@ -67,7 +67,7 @@ def doctor(
 
 
 def _examine(path: Path) -> Iterator[Finding]:
-    """Yield the findings on a pack; only those on the machine if the settings cannot be used."""
+    """Yield the findings on a pack and the machine. If the settings are invalid, yield only findings on the machine."""
     subject = load_subject(path)
     if isinstance(subject, Finding):
         yield subject
@@ -86,13 +86,13 @@ def load_subject(path: Path) -> Subject | Finding:
         return fault("settings", str(error), _remedy(path))
     try:
         unit = unit_of(path)
-    except (OSError, subprocess.TimeoutExpired):  # without an answer of systemd, the pack counts as not served by it
+    except (OSError, subprocess.TimeoutExpired):  # systemd does not answer: examine the pack without its unit
         unit = None
     return Subject(path, settings, model, unit)
 
 
 def _remedy(path: Path) -> str:
-    """Return the command for a settings file that cannot be used."""
+    """Return the command that creates, checks or reads a settings file that could not be loaded."""
     if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if the folder cannot be read
         return f"bms-estimator config init {path}"
     command = "bms-estimator config check" if os.access(path, os.R_OK) else "sudo bms-estimator doctor"

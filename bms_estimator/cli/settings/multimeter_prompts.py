@@ -1,4 +1,4 @@
-"""Prompts of the comparison with a multimeter."""
+"""Comparison with a multimeter on the command line: from options, or by prompts."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -9,9 +9,8 @@ import typer
 
 from bms_estimator.cli.options.status_line import show_status
 from bms_estimator.cli.settings.prompts import Prompts
-from bms_estimator.model.decimal_text import number
 from bms_estimator.model.errors import UserError
-from bms_estimator.setup.answers import InvalidAnswerError
+from bms_estimator.setup.answers import InvalidAnswerError, parse_number
 from bms_estimator.setup.comparison import Comparison
 from bms_estimator.setup.found_device import FoundDevice
 
@@ -22,11 +21,11 @@ class MultimeterOptions:
 
     compare: bool | None
     voltmeter_v: float | None
-    """Voltage by the multimeter [V]."""
+    """Voltage that the multimeter shows [V]."""
     zero: bool
-    """True if no current flows."""
+    """True if no current flows now."""
     ammeter_a: float | None
-    """Current by the multimeter [A], positive on discharge."""
+    """Current that the multimeter shows [A], positive on discharge."""
     direction: str | None
     """Direction of the present current: discharging or charging."""
 
@@ -37,7 +36,7 @@ class MultimeterOptions:
 
     @property
     def has_values(self) -> bool:
-        """True if an option answers a part of the comparison. Then the other parts are skipped."""
+        """True if an option is a value of the comparison. The comparison then uses only options, and nothing is asked."""
         return self.voltmeter_v is not None or self.zero or self.has_current
 
 
@@ -68,13 +67,13 @@ def _compare_options(comparison: Comparison, options: MultimeterOptions) -> None
         raise UserError("--zero: no current flows, but --ammeter-a or --direction states one; give only one of them")
     try:
         if options.voltmeter_v is not None:
-            _run(lambda: comparison.compare_voltage(options.voltmeter_v or 0.0))
+            _run(partial(comparison.compare_voltage, options.voltmeter_v))
         if options.zero:
-            _run(comparison.take_zero)
+            _run(comparison.set_zero)
         if options.ammeter_a is not None:
-            _run(lambda: comparison.compare_current(options.ammeter_a or 0.0))
+            _run(partial(comparison.compare_current, options.ammeter_a))
         elif options.direction is not None:
-            _run(lambda: comparison.compare_direction(options.direction or ""))
+            _run(partial(comparison.compare_direction, options.direction))
     except InvalidAnswerError as error:
         raise UserError(f"comparison with the multimeter: {error}") from None
 
@@ -82,12 +81,12 @@ def _compare_options(comparison: Comparison, options: MultimeterOptions) -> None
 def _compare_interactively(comparison: Comparison) -> None:
     typer.echo("Press Enter without a value to skip a step.")
     first_v = "Voltage at the terminals of the pack by the multimeter [V]"
-    if _step(first_v, lambda text: comparison.compare_voltage(_number(text))):
+    if _step(first_v, lambda text: comparison.compare_voltage(parse_number(text))):
         second_v = "Voltage again at another state of charge, after you charged or discharged the pack [V]"
-        _step(second_v, lambda text: comparison.compare_voltage(_number(text)))
-    _step("Switch off all loads and chargers; then enter 0", lambda _: comparison.take_zero())
+        _step(second_v, lambda text: comparison.compare_voltage(parse_number(text)))
+    _step("Switch off all loads and chargers; then enter 0", lambda _: comparison.set_zero())
     load = "Switch on a load; its current by the multimeter [A], negative while the pack is charged"
-    if not _step(load, lambda text: comparison.compare_current(_number(text))):
+    if not _step(load, lambda text: comparison.compare_current(parse_number(text))):
         _step("The pack is now discharging or charging", lambda text: comparison.compare_direction(text.lower()))
 
 
@@ -110,10 +109,3 @@ def _run(compare: Callable[[], Awaitable[str]]) -> None:
     with show_status("measuring"):
         result = asyncio.run(run())
     typer.echo(f"  {result}")
-
-
-def _number(text: str) -> float:
-    try:
-        return number(text.replace(",", "."))
-    except ValueError:
-        raise InvalidAnswerError(f"{text}: must be a number") from None

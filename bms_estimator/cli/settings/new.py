@@ -17,6 +17,7 @@ from bms_estimator.cli.options.status_line import show_status
 from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
 from bms_estimator.cli.settings.prompts import Prompts
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads import Estimate
 from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack_file import require_new
@@ -109,13 +110,12 @@ def new(
     if estimate and measured:
         with show_compile_progress():
             load_kernels()
-        show = lambda each: typer.echo(estimate_text(each))  # noqa: E731
-        asyncio.run(run_estimator(pack.settings, pack.cell, show, seconds=ESTIMATE_S))
+        asyncio.run(run_estimator(pack.settings, pack.cell, _print_estimate, seconds=ESTIMATE_S))
     _offer_install(prompts, file, install)
 
 
 def _default_places() -> list[str]:
-    """Return the places that are searched by default. Print that there is no serial port among them if so."""
+    """Return the places that are searched by default. If none is a serial port, print this."""
     places = default_places()
     if not any(place.startswith("/") for place in places):
         typer.echo("-  no USB serial port is connected; another serial port can be named below")
@@ -134,7 +134,7 @@ def _search(places: Sequence[str]) -> SearchResult:
 
 
 def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -> Answers:
-    """Return the answers with the chosen device. On a terminal, an answer may also be a further place to search.
+    """Return the answers with the chosen device. On a terminal, the user may search another place instead of choosing.
 
     Raises:
         UserError: No device was found, or there is no clear choice and no terminal.
@@ -148,12 +148,12 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
         default = "1" if len(result.devices) == 1 else ""
         chosen = prompts.ask(text, "--device", device, parse, default=default)
         if isinstance(chosen, FoundDevice):
-            return Answers(chosen, heard_broker=result.broker)
+            return Answers(chosen, found_broker=result.broker)
         result = _search([chosen])
 
 
 def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> FoundDevice | str:
-    """Return the device with this name or number; if ``may_search`` is True, any other text is a place to search.
+    """Return the device with this name or number. If ``may_search`` is True, return any other text as a place to search.
 
     Raises:
         InvalidAnswerError: There is no device with this number or name.
@@ -168,7 +168,7 @@ def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> Found
 
 
 def _measure(device: FoundDevice) -> Measurement | None:
-    """Return and print the present values; None if no sample arrives."""
+    """Print and return the present values; None if no sample arrives."""
     try:
         with show_status("measuring"):
             measured = asyncio.run(measure(device.settings))
@@ -177,6 +177,10 @@ def _measure(device: FoundDevice) -> Measurement | None:
         return None
     typer.echo(f"measured: {measured}")
     return measured
+
+
+def _print_estimate(estimate: Estimate) -> None:
+    typer.echo(estimate_text(estimate))
 
 
 def _ask(prompts: Prompts, question: Question, given: str | None, answers: Answers) -> Answers:
@@ -193,7 +197,7 @@ def _ask(prompts: Prompts, question: Question, given: str | None, answers: Answe
 
 
 def _offer_install(prompts: Prompts, file: Path, given: bool | None) -> None:
-    """Install the service, or print the command that does.
+    """Install the service, or print the commands that run and install it.
 
     Raises:
         typer.Exit: The installation failed.

@@ -30,7 +30,7 @@ class Prompts:
     def ask(
         self, text: str, option: str, given: object, parse: Callable[[str], Answer], *, default: str = ""
     ) -> Answer:
-        """Return the answer to a question. An invalid answer is asked again with the reason.
+        """Return the answer to a question. After an invalid answer, print the reason and ask again.
 
         Args:
             text: Text of the prompt.

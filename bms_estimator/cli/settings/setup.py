@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.number_options import whole
-from bms_estimator.cli.options.page_options import open_browser, page_settings
+from bms_estimator.cli.options.page_options import Browser, TokenFile, open_browser, page_settings
 from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.pack_file import require_new
@@ -31,12 +31,8 @@ def setup(
             show_default=False,
         ),
     ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(help="file with the access token of the page", show_default=False)
-    ] = None,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
-    ] = True,
+    token_file: TokenFile = None,
+    browser: Browser = True,
 ) -> None:
     """Serve a web page that asks what `bms-estimator new` asks, until Ctrl-C."""
     require_new(file)

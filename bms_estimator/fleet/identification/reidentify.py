@@ -22,7 +22,7 @@ from bms_estimator.estimator.identified_parameters import identified_cell
 from bms_estimator.fleet.packs.pack_row import PackSpec, cell_of, settings_of
 from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell import CellModel, with_name
 from bms_estimator.model.cell_file import cell_text
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
@@ -244,7 +244,7 @@ class _Pack:
             f"{self._spec.cell} of the pack {self._outcome.pack}, {origins[method]}, from {self._outcome.hours:.1f} h.",
             f"RMS error of the voltage on later samples: {1e3 * before_v:.1f} mV before, {1e3 * after_v:.1f} mV after.",
         ]
-        return cell_text(cell.model_copy(update={"cell": cell.cell.model_copy(update={"name": name})}), remarks)
+        return cell_text(with_name(cell, name), remarks)
 
 
 def _battery(spec: PackSpec, cell_file: str | None) -> CellModel:

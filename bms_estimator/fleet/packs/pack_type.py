@@ -90,7 +90,7 @@ class PackTypes:
 
         Args:
             settings: Settings of the packs.
-            cell: A pack as one object (``CellModel.pack``).
+            cell: Model of a whole pack.
         """
         key = id(settings), id(cell)  # not reused, because the cached tuple keeps both objects alive
         if key not in self._types:
@@ -105,7 +105,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
 
     Args:
         settings: Settings of the packs.
-        cell: A pack as one object (``CellModel.pack``).
+        cell: Model of a whole pack.
         record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
     """
     digest = config_digest(settings, cell)
@@ -125,7 +125,7 @@ def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
 
     Args:
         settings: Settings of the packs.
-        cell: A pack as one object (``CellModel.pack``).
+        cell: Model of a whole pack.
     """
     return _estimator(_EstimatorKey(config_digest(settings, cell), settings, cell))
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 
-from bms_estimator.model.decimal_text import number
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Estimate
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack_file import require_new
-from bms_estimator.setup.answers import Answers, InvalidAnswerError
+from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number
 from bms_estimator.setup.comparison import Comparison
 from bms_estimator.setup.first_estimate import run_estimator
 from bms_estimator.setup.measurement import Measurement
@@ -20,7 +19,7 @@ from bms_estimator.setup.questions import QUESTIONS
 from bms_estimator.setup.search import SearchResult, default_places, search
 
 ESTIMATE_S = 3600.0
-"""Time over which the first estimates are shown [s]. A forgotten page then releases the device."""
+"""Duration of the first estimates [s]. After it, the device is free for other programs, even if the page stays open."""
 
 
 class Step(Enum):
@@ -95,7 +94,7 @@ class SetupSession:
         self.measured = await comparison.measure()
         self._comparison, self.comparisons = comparison, []
         self.answers = Answers(
-            devices[name], self.measured.voltage_v, name=self.file.stem, heard_broker=self.result.broker
+            devices[name], self.measured.voltage_v, name=self.file.stem, found_broker=self.result.broker
         )
         self.step = Step.MULTIMETER
 
@@ -103,23 +102,21 @@ class SetupSession:
         """Compare a quantity with the multimeter: ``voltage``, ``zero``, ``current`` or ``direction``.
 
         Raises:
-            InvalidAnswerError: The value cannot be right.
+            InvalidAnswerError: The value is malformed or implausible.
             UserError: The device does not answer.
         """
         if self._comparison is None:
             return
-        if quantity == "zero":
-            self.comparisons.append(await self._comparison.take_zero())
-            return
-        if quantity == "direction":
-            self.comparisons.append(await self._comparison.compare_direction(text))
-            return
-        try:
-            value = number(text.replace(",", "."))
-        except ValueError:
-            raise InvalidAnswerError(f"{text}: must be a number") from None
-        compare = self._comparison.compare_voltage if quantity == "voltage" else self._comparison.compare_current
-        self.comparisons.append(await compare(value))
+        match quantity:
+            case "voltage":
+                result = await self._comparison.compare_voltage(parse_number(text))
+            case "current":
+                result = await self._comparison.compare_current(parse_number(text))
+            case "direction":
+                result = await self._comparison.compare_direction(text)
+            case _:
+                result = await self._comparison.set_zero()
+        self.comparisons.append(result)
 
     async def finish_comparison(self) -> None:
         """Store the gains on a board, and continue with the questions.

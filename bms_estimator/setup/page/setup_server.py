@@ -4,9 +4,8 @@ import asyncio
 import functools
 import json
 import secrets
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from aiohttp import web
 
@@ -29,7 +28,7 @@ FILES = {
 }
 """Static files by URL path."""
 
-Fields = Any
+Fields = Mapping[str, str]
 """Fields of a form, by name."""
 
 
@@ -75,8 +74,8 @@ class SetupServer(WebServer):
     def _show(self, estimate: Estimate) -> None:
         """Send an estimate to the page."""
         values = {
-            "soc": estimate.soc and 100.0 * estimate.soc,
-            "band": estimate.soc_std and 200.0 * estimate.soc_std,
+            "soc": None if estimate.soc is None else 100.0 * estimate.soc,
+            "band": None if estimate.soc_std is None else 200.0 * estimate.soc_std,  # two standard deviations [%]
             "voltage": estimate.voltage_v,
             "current": estimate.current_a,
         }
@@ -88,13 +87,13 @@ class SetupServer(WebServer):
         )
 
     async def _run_step(self, step: Callable[[Fields], Awaitable[None]], request: web.Request) -> web.StreamResponse:
-        """Run a step with the fields of a form, then show the page again.
+        """Run a step with the fields of a form, and redirect to the page.
 
-        A form without the key of this server comes from another page and is rejected.
+        A form without the key of this server is rejected, because another web site may have sent it.
         """
-        fields = await request.post()
-        if not secrets.compare_digest(str(fields.get(KEY_FIELD, "")).encode(), self._form_key.encode()):
-            raise web.HTTPForbidden(text="this form is of an earlier start of the program; open the page again\n")
+        fields = {name: str(value) for name, value in (await request.post()).items()}
+        if not secrets.compare_digest(fields.get(KEY_FIELD, "").encode(), self._form_key.encode()):
+            raise web.HTTPForbidden(text="this form belongs to an earlier run of the program; reload the page\n")
         async with self._lock:
             self._session.error = ""
             try:
@@ -104,19 +103,19 @@ class SetupServer(WebServer):
         return web.Response(status=303, headers={"Location": "/"})
 
     async def _search(self, fields: Fields) -> None:
-        places = str(fields.get("places", "")).split()
+        places = fields.get("places", "").split()
         if not places:
             raise UserError("name at least one place to search")
         self._session.start_search(places)
 
     async def _choose_device(self, fields: Fields) -> None:
-        await self._session.choose_device(str(fields.get("device", "")))
+        await self._session.choose_device(fields.get("device", ""))
 
     async def _compare(self, quantity: str, fields: Fields) -> None:
-        await self._session.compare(quantity, str(fields.get("value", "")).strip())
+        await self._session.compare(quantity, fields.get("value", "").strip())
 
     async def _continue(self, _: Fields) -> None:
         await self._session.finish_comparison()
 
     async def _create(self, fields: Fields) -> None:
-        self._session.create({name: str(value) for name, value in fields.items()})
+        self._session.create(fields)

@@ -29,7 +29,7 @@ def page(session: SetupSession, form_key: str) -> str:
 
     Args:
         session: State of the setup.
-        form_key: Key that every form sends, so that a foreign page cannot send one.
+        form_key: Key that every form contains, so that no other web site can send a form.
     """
     refresh = f'<meta http-equiv="refresh" content="{REFRESH_S}">' if session.step is Step.SEARCHING else ""
     steps = "".join(
@@ -100,7 +100,7 @@ def _multimeter(session: SetupSession, form_key: str) -> str:
         '<section class="card"><h2>Compare with a multimeter</h2><p class="note">Each comparison may be left out. '
         "A second voltage at another state of charge makes the gain more exact.</p>"
         f"{_form('compare/voltage', form_key, voltage, 'Compare voltage', secondary=True)}"
-        f"{_form('compare/zero', form_key, '<p>Switch off all loads and chargers.</p>', 'Take the zero', secondary=True)}"
+        f"{_form('compare/zero', form_key, '<p>Switch off all loads and chargers.</p>', 'Set the zero', secondary=True)}"
         f"{_form('compare/current', form_key, current, 'Compare current', secondary=True)}"
         f"{_form('compare/direction', form_key, direction, 'Check the sign', secondary=True)}</section>"
     )

@@ -61,8 +61,8 @@ class RawCapture:
 
     Args:
         path: File written by ``CaptureWriter``.
-        sensor: Settings of the decoder; None: those of the capture's header.
-        current_sign: Direction of positive current; None: that of ``sensor``.
+        sensor: Settings of the decoder; None: the settings in the capture's header.
+        current_sign: Direction of positive current; None: the direction of ``sensor``.
 
     Attributes:
         decoder: Decoder that has been fed the bytes read so far.
@@ -270,9 +270,9 @@ def load_capture(
 
     Args:
         source: Path of a raw capture or of a table (docs/cell/captures.md), or a table in memory: a DataFrame, a dict of
-            arrays. A table has our columns or a cycler's columns.
-        current_sign: Direction of positive current, ``discharge_positive`` or ``charge_positive``; None: that of
-            the format; if it defines none, that which the voltage shows, otherwise discharge.
+            arrays. A table has the columns of this project or of a cycler.
+        current_sign: Direction of positive current, ``discharge_positive`` or ``charge_positive``; None: the
+            format's direction; if it defines none, the direction that the voltage shows, otherwise discharge.
         column_map: Names of a table's columns for ``time``, ``current``, ``voltage`` and, optionally, ``temperature``, and
             of a spreadsheet's ``sheet``; None: recognize them.
 

@@ -21,7 +21,7 @@ _DISCHARGE = frozenset(
 _CHARGE = frozenset({"c", "chg", "cha", "charge", "charging", "laden", "ladung"})
 
 MAX_TEXT_CHARACTERS = 40
-"""Maximum length of a cell with text: longer time stamps and states are cut off, also invalid cells in messages."""
+"""Maximum length of a time stamp or state, and of an invalid cell in a message. Longer texts are cut off."""
 
 
 class CellKind(Enum):
@@ -69,8 +69,8 @@ def parse_duration(cell: str) -> float:
 def parse_date_time(cell: str) -> float:
     """Return the Unix time of a date and time [s]; UTC if the text has no time zone.
 
-    Formats are ISO 8601, year first, day first with periods, and month first with slashes or hyphens. The first number
-    of the latter is the day if it is above 12.
+    Formats are ISO 8601, year first, day first with periods, and month first with slashes or hyphens. A first number
+    above 12 is the day.
 
     Raises:
         ValueError: The text is not a date with time.
@@ -98,7 +98,7 @@ def _unix_s(moment: datetime) -> float:
 
 
 def parse_direction(cell: str) -> float:
-    """Return 1 for a word that means discharge, -1 for charge, and 0 for others, such as rest or pause."""
+    """Return 1 for a text with a word for discharge, -1 with a word for charge, and 0 for other texts, such as rest or pause."""
     words = {word.lower() for word in _WORD.findall(cell)}
     return 1.0 if words & _DISCHARGE else -1.0 if words & _CHARGE else 0.0
 
@@ -109,7 +109,7 @@ def uses_decimal_comma(cells: list[str]) -> bool:
 
 
 def time_kind(cell: str) -> CellKind:
-    """Return the kind of a cell in the time column; a number if it is of no kind, so that its parser reports the error."""
+    """Return the kind of a cell in the time column. An unknown kind counts as a number, whose parser reports the error."""
     for kind in (CellKind.NUMBER, CellKind.DURATION, CellKind.DATE_TIME):
         try:
             parser(kind, decimal_comma="," in cell)(cell)

@@ -169,7 +169,7 @@ def _parquet_values(path: Path, column: Column, values: "pa.Array", first_row: i
 
 
 def parse_column(path: object, column: Column, cells: list[str | None], first_row: int = 1) -> NDArray[np.float64]:
-    """Parse a column of text, whose first cell is in ``first_row`` of the table; None becomes NaN.
+    """Parse a column of text; None becomes NaN. ``first_row`` is the row of the first cell, for messages.
 
     Raises:
         UserError: A cell is not valid; the message names its row.

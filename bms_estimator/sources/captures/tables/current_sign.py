@@ -1,4 +1,4 @@
-"""Sign of the current: from an option, a state column, the dialect, the settings or the voltage's response."""
+"""Sign of the current in a table: from an option, a state column, the dialect, the settings or the voltage's response."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from bms_estimator.sources.captures.tables.layout import Layout, Role
 STEP_FRACTION = 0.1
 """Minimum change of the current that counts as a step, as a fraction of its range."""
 MIN_STEPS = 2
-"""Minimum number of steps for a decision. A single one may be a glitch."""
+"""Minimum number of steps for a decision. A single step may be a glitch."""
 AGREEING_FRACTION = 0.8
 """Fraction of the steps to which the voltage must respond in the same direction."""
 MIN_CORRELATION = 0.7

@@ -56,7 +56,7 @@ def read_biologic(path: Path, finder: LayoutFinder) -> ArrayTable:
 
 
 def _call_library(path: Path, read: Callable[[], ColumnTable]) -> ColumnTable:
-    """Return the table that a library reads, without the library's warnings, which name its own internals.
+    """Return the table that a library reads. The library's warnings are suppressed, because they concern its internals.
 
     Raises:
         UserError: The library raised an error. All classes are caught, because neither library documents its errors.

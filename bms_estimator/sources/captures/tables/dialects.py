@@ -89,7 +89,7 @@ GENERIC = Dialect(
     state=("state", "status", "mode", "step type", "zustand"),
     charge_current=("charge current", "ladestrom"),
 )
-"""Usual names in any program; the last dialect that is tried."""
+"""Common names. This dialect is tried last."""
 
 DIALECTS = (
     OWN,

@@ -37,7 +37,7 @@ MAX_SHOWN_CHARACTERS = 40
 """Maximum length of a column name in a message."""
 
 DISCHARGE_CURRENTS = frozenset(fold(name) for name in ("discharge current", "entladestrom"))
-"""Names of currents without the charge current, which has a column of its own."""
+"""Names of a column that contains only the discharge current. The charge current has another column."""
 BLOCK_ROWS = 65_536
 """Maximum number of rows of a block."""
 
@@ -46,7 +46,7 @@ ColumnMap = Mapping[Quantity | Literal["sheet"], str]
 
 
 class Role(Enum):
-    """Meaning of a column: a ``Quantity``, what gives the current its sign, or the status bits of a sample."""
+    """Meaning of a column: a ``Quantity``, the sign of the current (state, charge current), or the status bits of a sample."""
 
     TIME = "time"
     CURRENT = "current"
@@ -129,7 +129,7 @@ class LayoutFinder:
         return None
 
     def no_header(self) -> UserError:
-        """Return the error of a table in which no line is a header; it names the closest line's columns."""
+        """Return the error for a table without a header. It names the columns of the line that is most similar to a header."""
         if self._map:
             return UserError(f"{self._path}: no line names the columns {', '.join(self._map.values())}")
         header, (found, width) = self._closest_header, self._closest_rank
@@ -171,7 +171,7 @@ class LayoutFinder:
     def _sign_columns(
         self, dialect: Dialect, cells: Sequence[str], names: Sequence[ColumnName], current_name: str
     ) -> dict[Role, Column]:
-        """Return the columns that give the current its sign, which the header may lack."""
+        """Return the optional columns that determine the sign of the current."""
         columns = {}
         state = self._find_index(dialect.state, cells, names)
         if state is not None:
@@ -209,7 +209,7 @@ class LayoutFinder:
 
 
 def with_units(layout: Layout, units_row: Sequence[str]) -> Layout | None:
-    """Return the layout with the units in a row below the header; None if the row is not one of units."""
+    """Return the layout with the units in the row below the header; None if the row does not contain units."""
     if len(units_row) <= max(column.index for column in layout.columns.values()):
         return None
     columns = dict(layout.columns)

@@ -28,7 +28,7 @@ MAX_HEADER_ROWS = 100
 DATA_SHEETS = ("channel", "record", "detail")
 """Beginnings of the names of sheets with samples, by Arbin and Neware. Their other sheets have the same columns, but one row
 for each step or cycle."""
-_CONTINUED = re.compile(r"_\d+$")
+_CONTINUATION = re.compile(r"_\d+$")
 """Ending of the name of a sheet that continues another, because a sheet of an .xls file has at most 65,536 rows."""
 
 _Row = list[Any]
@@ -88,11 +88,13 @@ class Spreadsheet:
             raise UserError(f"{self._path}: no sheet {finder.sheet}; there are {', '.join(names)}")
         found = [sheet for sheet in map(self._find_header, names, tables, itertools.repeat(finder)) if sheet]
         if finder.sheet is not None:
-            found = [sheet for sheet in found if _CONTINUED.sub("", sheet.name) == _CONTINUED.sub("", finder.sheet)]
+            found = [
+                sheet for sheet in found if _CONTINUATION.sub("", sheet.name) == _CONTINUATION.sub("", finder.sheet)
+            ]
         sheets = [sheet for sheet in found if sheet.name.lower().startswith(DATA_SHEETS)] or found
         if not sheets:
             raise finder.no_header()
-        if len({_CONTINUED.sub("", sheet.name) for sheet in sheets}) > 1:
+        if len({_CONTINUATION.sub("", sheet.name) for sheet in sheets}) > 1:
             several = ", ".join(sheet.name for sheet in sheets)
             raise UserError(
                 f"{self._path}: several sheets have samples ({several}): choose one by --map sheet={sheets[0].name} "

@@ -30,7 +30,7 @@ from bms_estimator.sources.captures.tables.text_table import TextTable
 SIGN_ROWS = 262_144
 """Minimum number of rows at the beginning of a table from which the sign of the current is determined."""
 STEP_S = 1e-6
-"""Time between two rows of a table that have the same time because the current steps [s]."""
+"""Time that is inserted between two rows with the same time, between which the current steps [s]."""
 PARQUET_MAGIC, OLE_MAGIC = b"PAR1", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 """First bytes of Parquet files and of .xls files."""
 EXCEL_MEMBER, OPEN_DOCUMENT_MEMBER = "[Content_Types].xml", "mimetype"
@@ -65,7 +65,7 @@ class Table:
 
     Attributes:
         implausible: Number of implausible temperatures in the rows read so far.
-        note: Text that says how the table is read; empty for a table with this project's columns.
+        note: Description of dialect, columns and sign; empty for a table with this project's columns.
         warning: Contradiction between the sign of the current and the voltage; empty without one.
     """
 
@@ -139,13 +139,13 @@ def _samples(raw: RawBlock, layout: Layout) -> SampleBlock:
 
 
 def _separate_steps(before: SampleBlock, samples: SampleBlock) -> SampleBlock:
-    """Add ``STEP_S`` to the time of the last of several rows with the same time, if its current differs from the first.
+    """Separate rows that have the same time but different currents: add ``STEP_S`` to the time of the last such row.
 
-    Cyclers write the last row of a step and the first row of the next at the same time. Both are needed, because the
-    charge before the step is that of the first current, and the charge after it that of the last.
+    Cyclers write the last row of a step and the first row of the next step at the same time. Both rows are needed, because
+    each gives the current on its side of the step.
 
     Args:
-        before: Last return value of this function; empty for the first block.
+        before: Return value for the previous block; empty for the first block.
         samples: Block of samples, whose times are changed.
 
     Returns:

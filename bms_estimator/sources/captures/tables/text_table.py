@@ -1,4 +1,4 @@
-"""Reader of delimited text: any preamble, separator and decimal sign, in blocks so that memory does not grow with the file."""
+"""Reader of delimited text with any preamble, separator and decimal sign. It reads blocks, to limit the memory."""
 
 import itertools
 from collections.abc import Iterator, Sequence

@@ -77,7 +77,7 @@ def fold(name: str) -> str:
 
 
 def split_unit(header: str) -> ColumnName:
-    """Return the folded name in a header, and its unit or None. A header such as ``Volts`` is both."""
+    """Return the folded name in a header, and its unit or None. A header such as ``Volts`` is both name and unit."""
     text = header.strip()
     for pattern in (_BRACKETED, _SEPARATED, _LAST_WORD):
         match = pattern.fullmatch(text)
