@@ -17,7 +17,9 @@ COMMANDS = {
     "new": LazyCommand(
         "bms_estimator.cli.settings.new:new", "Find the device of a pack, and write the settings file of the pack."
     ),
-    "setup": LazyCommand("bms_estimator.cli.settings.setup:setup", "Serve the questions of `new` as a web page."),
+    "setup": LazyCommand(
+        "bms_estimator.cli.settings.setup:setup", "Serve a web page with the questions of `bms-estimator new`."
+    ),
     "run": LazyCommand(
         "bms_estimator.cli.live.run:run",
         "Run the live service: estimate from a BMS, monitor or sensor board, and publish.",

@@ -40,5 +40,6 @@ class FoundDevice:
 
 def values_text(voltage_v: float, current_a: float) -> str:
     """Return voltage and current as text; the current is positive on discharge."""
-    direction = "discharging" if current_a > 0.0 else "charging" if current_a < 0.0 else "no current"
-    return f"{voltage_v:.2f} V, {abs(current_a):.2f} A, {direction}" if current_a else f"{voltage_v:.2f} V, {direction}"
+    if not round(current_a, 2):
+        return f"{voltage_v:.2f} V, no current"
+    return f"{voltage_v:.2f} V, {abs(current_a):.2f} A, {'discharging' if current_a > 0.0 else 'charging'}"

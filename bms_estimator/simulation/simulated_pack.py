@@ -56,6 +56,8 @@ class LoadName(StrEnum):
     CONSTANT = "constant"
     PULSE = "pulse"
     RANDOM = "random"
+    RELAY = "relay"
+    """Load that the relay of a board connects, see ``PackWithRelay``."""
 
 
 LOADS: dict[LoadName, Callable[[float, int], Load]] = {
@@ -63,7 +65,7 @@ LOADS: dict[LoadName, Callable[[float, int], Load]] = {
     LoadName.PULSE: pulses,
     LoadName.RANDOM: random_steps,
 }
-"""Function that creates each load from its current [A] and a seed."""
+"""Function that creates a load from its current [A] and a seed."""
 
 
 class SimulatedPack:
@@ -112,3 +114,23 @@ class SimulatedPack:
             seconds, self._load_a = next(self._load)
             self._remaining_s += seconds
         return max(self._load_a, 0.0) if self.soc >= FULL_SOC else self._load_a
+
+
+class PackWithRelay(SimulatedPack):
+    """Simulated pack whose load a relay connects. It is never charged.
+
+    Args:
+        cell: Cell model of the whole pack.
+        load_a: Current of the load [A].
+        soc: SOC at time 0, 0..1, at which the pack is at rest.
+    """
+
+    def __init__(self, cell: CellModel, load_a: float, *, soc: float) -> None:
+        super().__init__(cell, constant(0.0), soc=soc)
+        self._connected_a = load_a
+        self.is_connected: Callable[[], bool] = lambda: False
+        """Function that returns True while the relay connects the load."""
+
+    def _next_current(self, _dt_s: float) -> float:
+        """Return the current of the load while it is connected and the pack is not empty."""
+        return self._connected_a if self.is_connected() and self.soc > 0.0 else 0.0

@@ -82,7 +82,7 @@ def test_a_condition_without_captures_is_unknown(changes, condition):
     assert condition in judge(ERRORS, replace(COVERAGE, **changes)).unknown
 
 
-def test_errors_and_coverage_of_captures_are_those_of_all_their_samples():
+def test_errors_and_coverage_include_all_samples_of_all_captures():
     samples = capture(steps(), noise_v=1e-3)
     samples["temperature_c"] = np.linspace(20.0, 30.0, samples.size)
     validation = validate(Columns(samples, "steps"), TRUTH)

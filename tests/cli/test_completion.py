@@ -16,7 +16,7 @@ COMP_CWORD=$(($# - 1))
 {function} bms-estimator
 printf '%s\\n' "${{COMPREPLY[@]}}"
 """
-"""Script that completes its last argument by the function that is installed, as bash does at a tab."""
+"""Script that completes its last argument with the installed function, as bash does when Tab is pressed."""
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,10 @@ def bash_home(environment: dict[str, str]) -> dict[str, str]:
 
 
 def install(environment: dict[str, str], shell: str) -> None:
-    """Install the completion as a user of ``shell`` does. The second command keeps the shell from replacing itself."""
+    """Install the completion as a user of ``shell`` does.
+
+    ``; true`` prevents the shell from replacing itself by the program, which then could not recognize the shell.
+    """
     path = shutil.which(shell)
     if path is None:
         pytest.skip(f"{shell} is not installed (apt-get install {shell})")

@@ -16,7 +16,7 @@ from tests.conversion.load import INITIAL_SOC, difference_mv, load_profile
 STEP_FOLDER = Path(__file__).parents[2] / "docs" / "cell"
 STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 MAX_MV = 1.0
-"""Maximum difference: single precision, and linear interpolation of the OCV within 0.2 mV."""
+"""Maximum difference. Its causes are single precision, and linear interpolation of the OCV with an error up to 0.2 mV."""
 
 
 def compile_step(compiler: str, folder: Path, cell: CellModel, *options: str) -> Path:

@@ -31,7 +31,7 @@ def make_core_environment(folder: Path) -> Path:
     packages = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
     source = Path(sysconfig.get_path("purelib"))
     for file in {file for package in core_packages() for file in installed_files(package)}:
-        place = packages / file  # a program is in ../../../bin
+        place = packages / file  # scripts have paths such as ../../../bin/name
         place.parent.mkdir(parents=True, exist_ok=True)
         if not place.exists():
             place.symlink_to(source / file)

@@ -66,7 +66,7 @@ finally:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory):
-    """Return the folder of an environment with the wheel, whose kernels are compiled except one."""
+    """Return the folder of an environment with the wheel and with a kernel cache, in which one kernel is missing."""
     folder = tmp_path_factory.mktemp("core")
     make_core_environment(folder)
     fill(folder / "cache")

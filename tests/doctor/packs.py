@@ -37,7 +37,7 @@ CacheDirectory=
 
 
 def subject(folder: Path, *, unit: SystemdUnit | None = None, **sections: Any) -> Subject:
-    """Return a pack ``house`` whose state folder is in ``folder``; ``sections`` are those of its settings file."""
+    """Return a pack ``house`` whose state folder is in ``folder``; ``sections`` are further sections of its settings file."""
     pack = {"name": "house", "cell": "lfp", "capacity_ah": 20.0, "series": 4}
     settings = Settings.model_validate({"pack": pack, "state": {"folder": folder / "state"}} | sections)
     return Subject(folder / "pack.toml", settings, load_cell("lfp", 20.0).pack(4, 1), unit)

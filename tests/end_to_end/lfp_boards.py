@@ -14,9 +14,9 @@ from tests.patience import end
 from tests.simavr_board import FIRMWARE, FirmwareBoard
 
 PARTS = BoardParts(divider=3.23, current_zero=0.503, bandgap_v=1.08)
-"""Parts of the virtual board as built. The label of its divider says 3.2."""
+"""True properties of the virtual board. The user enters the nominal divider, 3.2."""
 SLICE_S = 10.0
-"""Time of the virtual board that is simulated at once [s]."""
+"""Duration that the virtual board simulates before it waits for real time [s]."""
 
 
 class Board(Protocol):

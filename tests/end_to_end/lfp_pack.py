@@ -18,7 +18,7 @@ CAPACITY_FACTOR, OHM_FACTOR, OCV_SHIFT_V = 0.92, 1.3, 0.006
 FULL_V = 14.4
 """Voltage at which the charger limits its current [V]."""
 CHARGER_END_A = 0.08
-"""Current at which the charger ends a charge [A]."""
+"""Current at which the charge ends [A]."""
 HYSTERESIS_V, HYSTERESIS_SOC = 0.008, 0.03
 """OCV of a cell after a charge minus that after a discharge [V], and the charge that changes one into the other, as SOC."""
 PROTECTION_V = 8.8
@@ -47,7 +47,7 @@ def true_cell() -> CellModel:
 
 
 class LfpPack:
-    """Pack at rest at time 0. Call the object with times that never decrease.
+    """Simulated pack, at rest at time 0. Call the object with times that never decrease.
 
     Args:
         soc: SOC at time 0.
@@ -88,7 +88,7 @@ class LfpPack:
     @property
     def voltage_v(self) -> float:
         """Voltage at the terminals [V]."""
-        return self._rested_v - self._current_a * r_s(self.soc, self._a)
+        return self._voltage_behind_r_s - self._current_a * r_s(self.soc, self._a)
 
     def __call__(self, time_s: float) -> Reading:
         """Return the reading at a time [s]."""
@@ -102,7 +102,7 @@ class LfpPack:
         return Reading(self._current_a, self.voltage_v, ROOM_C)
 
     @property
-    def _rested_v(self) -> float:
+    def _voltage_behind_r_s(self) -> float:
         """Voltage without the drop at the series resistance [V]."""
         soc, v_ts, v_tl = self._state
         hysteresis_v = 0.5 * HYSTERESIS_V * SERIES * self._hysteresis
@@ -111,10 +111,10 @@ class LfpPack:
     def _next_current(self) -> float:
         """Return the current, positive on discharge [A]."""
         if self.connected is Connected.CHARGER and not self._has_charger_ended:
-            limited_a = (FULL_V - self._rested_v) / r_s(self.soc, self._a)
+            limited_a = (FULL_V - self._voltage_behind_r_s) / r_s(self.soc, self._a)
             self._has_charger_ended = limited_a <= CHARGER_END_A
             return 0.0 if self._has_charger_ended else -min(limited_a, self._charger_a)
         if self.connected is Connected.LOAD and not self._is_protected:
-            self._is_protected = self._rested_v - self.load_a * r_s(self.soc, self._a) < PROTECTION_V
+            self._is_protected = self._voltage_behind_r_s - self.load_a * r_s(self.soc, self._a) < PROTECTION_V
             return 0.0 if self._is_protected else self.load_a
         return 0.0

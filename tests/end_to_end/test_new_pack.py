@@ -30,8 +30,6 @@ from tests.patience import LONG_S
 
 CALIBRATION_SPEED, RUN_SPEED = 300.0, 500.0
 """Maximum speeds of the virtual board relative to real time, at 1 Hz."""
-LOAD_S = 300.0
-"""Duration of each current of the load in use [s]."""
 
 
 @dataclass(frozen=True)
@@ -43,26 +41,21 @@ class Course:
         start_soc: SOC when the user gets the pack.
         end_soc: SOC at which the user ends the run.
         charger_a: Maximum current of the charger [A].
-        calibration_a: Current of the load while the pack is calibrated [A].
-        loads_a: Currents of the load in use [A].
     """
 
     divider: float
     start_soc: float
     end_soc: float
     charger_a: float
-    calibration_a: float
-    loads_a: tuple[float, ...]
 
 
-COURSES = {
-    "python": Course(3.2, 0.5, 0.05, 1.0, 1.0, (1.0, 0.4, 2.0, 0.0)),
-    "simavr": Course(6.0, 0.97, 0.7, 2.0, 1.0, (1.0, 0.4, 2.0, 0.0)),
-}
-"""Use of the pack by kind of board. With simavr the charge and the use are shorter, because simavr is slower. The current of
-the calibration is that of the plan: at 2 A the load ends at 3 % of SOC, so that the rests do not determine the capacity."""
+COURSES = {"python": Course(3.2, 0.5, 0.05, 1.0), "simavr": Course(6.0, 0.97, 0.7, 2.0)}
+"""Use of the pack by kind of board. With simavr the charge and the use are shorter, because simavr is slower."""
+LOADS_A = (1.0, 0.4, 2.0, 0.0)
+"""Currents of the load in use. Each lasts for ``LOAD_S``."""
+LOAD_S = 300.0
 POLL_S = 0.02
-"""Interval at which the user looks at the pack [s]."""
+"""Interval at which the user checks the pack [s]."""
 
 
 class User:
@@ -113,7 +106,7 @@ class User:
         if "Charge the pack" in instruction:
             self.pack.connect(Connected.CHARGER)
         elif "Discharge the pack at about 1 A" in instruction:
-            self.pack.connect(Connected.LOAD, self.course.calibration_a)
+            self.pack.connect(Connected.LOAD, 1.0)
         elif "Let the pack rest" in instruction or "Done" in instruction:
             self.pack.connect(Connected.NOTHING)
 
@@ -126,13 +119,13 @@ class User:
         start_s = self.pack.history[-1][0]
         while self.pack.soc > self.course.end_soc:
             number = int((self.pack.history[-1][0] - start_s) / LOAD_S)
-            self.pack.connect(Connected.LOAD, self.course.loads_a[number % len(self.course.loads_a)])
+            self.pack.connect(Connected.LOAD, LOADS_A[number % len(LOADS_A)])
             await asyncio.sleep(POLL_S)
         return charge_s
 
 
 async def run_and_use(user: User, board: Board, broker: Broker) -> tuple[list[dict[str, Any]], float]:
-    """Run the service while the pack is used. Return its states, and the time of the pack at their time 0 [s]."""
+    """Run the service while the pack is used. Return the published states, and the pack's time at which ``board_time_s`` is 0 [s]."""
     async with Listener(broker, "bms/#") as listener, user.started("run", "pack.toml") as service:
         await listener.wait("bms/house/availability", lambda payload: payload == b"online")
         async with board.running():  # the service drops samples until the board's hello

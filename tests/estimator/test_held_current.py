@@ -52,7 +52,7 @@ def test_a_fast_load_between_voltage_and_current_is_inside_the_interval(seed: in
     assert np.sqrt(np.mean(error**2)) <= 0.03
 
 
-def test_the_more_the_current_changes_about_a_voltage_the_less_it_corrects() -> None:
+def test_a_voltage_corrects_less_if_the_current_changes_around_it() -> None:
     corrections = []
     for change_a in (0.0, 1.0, 4.0):
         estimator = Estimator(TRUTH, initial_soc=0.6, sampling=SAMPLING)

@@ -28,7 +28,7 @@ RULE = "etc/udev/rules.d/99-bms-estimator.rules"
 
 @pytest.fixture
 def root(tmp_path, monkeypatch) -> Path:
-    """Return an empty root directory. The program of the test is that of the environment."""
+    """Return an empty root directory. The path of the running program is set to one outside home folders."""
     if os.geteuid() != 0:
         pytest.skip("only root can create users in a root directory")
     for name in ("systemd-sysusers", "systemctl", "userdel"):
@@ -196,7 +196,7 @@ def test_link_that_leads_out_of_the_root_directory_is_rejected(root, pack, capsy
 
 
 @pytest.mark.parametrize("name", ["etc/bms-estimator/pack.toml/folder", "usr/local/bin"])
-def test_file_of_another_kind_in_the_place_of_one_of_the_service_is_an_error(root, pack, capsys, name):
+def test_a_file_in_place_of_a_folder_or_a_folder_in_place_of_a_file_is_an_error(root, pack, capsys, name):
     (root / name).parent.mkdir(parents=True)
     (root / name).touch()
     code, _, err = run(capsys, "install", "--root", root, pack)

@@ -17,7 +17,7 @@ def source(monkeypatch) -> ScriptedSource:
     return scripted
 
 
-async def test_samples_without_a_value_are_left_out(source) -> None:
+async def test_samples_without_voltage_or_current_are_ignored(source) -> None:
     source.give((0.0, 1.0, 13.0), (1.0, math.nan, 13.0), (2.0, 1.0, math.nan), (3.0, 3.0, 15.0))
     source.finish()
     assert await measurement.measure(Settings()) == measurement.Measurement(14.0, 2.0)

@@ -22,7 +22,7 @@ def test_the_gain_of_two_comparisons_is_between_them() -> None:
         ([VoltagePoint(13.0, 13.0), VoltagePoint(12.0, 12.5)], "comparisons disagree by"),
     ],
 )
-def test_a_voltage_that_cannot_be_right_is_rejected(points: list[VoltagePoint], reason: str) -> None:
+def test_an_implausible_voltage_is_rejected(points: list[VoltagePoint], reason: str) -> None:
     with pytest.raises(InvalidAnswerError, match=reason):
         voltage_gain(points)
 
@@ -48,7 +48,7 @@ def test_a_current_that_cannot_be_compared_is_rejected(
         current_correction(device_a, multimeter_a, resolution_a=resolution_a)
 
 
-def test_a_load_is_no_zero() -> None:
+def test_a_large_current_is_rejected_as_zero() -> None:
     assert require_zero(-0.3) == -0.3
     with pytest.raises(InvalidAnswerError, match="everything switched off"):
         require_zero(3.0)

@@ -20,8 +20,11 @@ from bms_estimator.conversion.bdf import bdf_rows, is_bdf_name
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.sinks.trace_file import CsvSink, TableSink, table_sink
+from bms_estimator.sinks.trace_file import SINKS, CsvSink, TableSink, table_sink
 from bms_estimator.sources.captures.replay import Capture, open_capture
+
+SUFFIXES_HELP = ".csv, .csv.gz or .parquet; Battery Data Format: .bdf, .bdf.gz, .bdf.csv, .bdf.csv.gz or .bdf.parquet"
+"""Formats by file name suffix."""
 
 
 def convert(
@@ -29,7 +32,7 @@ def convert(
     out: Annotated[
         Path,
         typer.Option(
-            help="file to write: .csv, .csv.gz or .parquet; Battery Data Format: .bdf, .bdf.gz, .bdf.csv or .bdf.parquet",
+            help=f"file to write, its suffix gives the format: {SUFFIXES_HELP}",
             show_default=False,
         ),
     ],
@@ -61,7 +64,11 @@ def convert(
 def _sink(out: Path) -> TableSink:
     """Return the sink of a file name. Missing values are empty in BDF, because most of its readers parse ``nan`` as text."""
     is_bdf_text = is_bdf_name(out.name) and not out.name.lower().endswith(".parquet")
-    return CsvSink(out, nan="") if is_bdf_text else table_sink(out)
+    if is_bdf_text:
+        return CsvSink(out, nan="")
+    if not out.name.lower().endswith(tuple(SINKS)):
+        raise UserError(f"--out {out}: the name must end in {SUFFIXES_HELP}")
+    return table_sink(out)
 
 
 def _blocks(capture: Capture, progress: Progress) -> Iterator[SampleBlock]:

@@ -71,8 +71,8 @@ def report(
 ) -> None:
     """Write a report with figures, tables and a verdict in plain words, as one HTML file.
 
-    From captures: how well a cell's model predicts their voltage, SOC, circuit elements, OCV and data quality.
-    Without captures: the history that the service of --pack has stored.
+    With captures, the report compares them with the model of a cell, and shows SOC, circuit elements and data quality.
+    Without captures, it shows the history that the service of --pack has stored.
     """
     started_s = time.perf_counter()
     check_output_file(out, [*(captures or ()), *([pack] if pack else ())], force=force)

@@ -57,7 +57,7 @@ def calibrate_command(
         list[Path],
         typer.Argument(
             metavar="[PACK.toml] CAPTURE...",
-            help=f"settings file of the pack, and captures of it, each a {CAPTURE_FORMATS}, or an OCV curve (CSV)",
+            help=f"settings file of the pack; captures of the pack, each a {CAPTURE_FORMATS}; or OCV curves (CSV)",
             show_default=False,
         ),
     ],
@@ -91,7 +91,7 @@ def calibrate_command(
     test: Annotated[
         PlanName,
         typer.Option(
-            help="test beside the pack, if no captures are given; it takes 3 h 21 min or 13.5 h after the charge"
+            help="guided test, if no captures are given; after the charge, short takes 3 h 21 min, long 13.5 h"
         ),
     ] = PlanName.SHORT,
     restart: Annotated[bool, typer.Option("--restart", help="begin a new test, even if one was interrupted")] = False,
@@ -117,14 +117,15 @@ def calibrate_command(
 ) -> None:
     """Calibrate a cell: measure its capacity, OCV, hysteresis and resistances, and write a cell file.
 
-    Each capture is used for what it determines: a slow discharge and charge, a relaxation test, HPPC or drive cycle.
-    One capture is enough. Captures that determine the OCV begin with a full cell.
+    The command recognizes slow discharges and charges, relaxation tests, HPPC and drive cycles.
+    One capture is enough. A capture for the OCV must begin with a full cell.
 
-    With PACK.toml alone, the command reads the pack's device and gives instructions: charge, discharge, rest. It recognizes
-    from voltage and current when a step is done, and records all samples. After an interruption, run the same command again.
+    With PACK.toml alone, the command reads the pack's device and gives instructions: charge, discharge, rest.
+    It recognizes the end of each step by voltage and current, and records all samples.
+    After an interruption, run the same command again.
 
-    The model is validated on data that are held back from the fit. The command prints the errors, and what the captures do
-    not show.
+    The model is validated on data that are held back from the fit.
+    The command prints the errors, and the conditions that the captures do not cover.
     """
     pack, paths = split_inputs(inputs)
     for output in (out, report):

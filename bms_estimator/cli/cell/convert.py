@@ -60,8 +60,8 @@ def _notes(suffix: str, cell: CellModel) -> list[str]:
     hysteresis_v = cell.ocv.hysteresis_v if isinstance(cell.ocv, TableOcv) else None
     if suffix == ".py" and hysteresis_v and max(hysteresis_v) > 0.0:
         notes.append(
-            "PyBaMM's Thevenin model has no hysteresis: the OCV is the mean; after charge and discharge it is "
-            f"up to {1e3 * max(hysteresis_v):.3g} mV higher and lower"
+            "PyBaMM's Thevenin model has no hysteresis: the written OCV is the mean of charge and discharge, which "
+            f"differ from it by up to {1e3 * max(hysteresis_v):.3g} mV"
         )
     if suffix == ".h" and cell.ladder is None:
         notes.append(

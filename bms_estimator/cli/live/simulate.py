@@ -21,7 +21,7 @@ from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
-from bms_estimator.simulation.simulated_pack import LOADS, LoadName, SimulatedPack
+from bms_estimator.simulation.simulated_pack import LOADS, LoadName, PackWithRelay, SimulatedPack
 from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 
 DEVICE_PROTOCOLS = (*METERS, *BMS_ANSWERS)
@@ -43,7 +43,9 @@ def simulate(
     ] = "chen_mora",
     capacity_ah: CapacityAh = None,
     series: Annotated[int, typer.Option(parser=whole(1), help="number of cells in series")] = 1,
-    load: Annotated[LoadName, typer.Option(help="load profile")] = LoadName.RANDOM,
+    load: Annotated[
+        LoadName, typer.Option(help="load profile; relay: a constant load that the relay pin of the board connects")
+    ] = LoadName.RANDOM,
     current_a: Annotated[
         float | None,
         typer.Option(
@@ -99,8 +101,18 @@ def simulate(
     """
     model = load_cell(cell, capacity_ah).pack(series, parallel=1)
     load_a = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a
-    pack = SimulatedPack(model, LOADS[load](load_a, seed), soc=soc)
     device: VirtualBoard | SimulatedMeter | SimulatedNode
+    if load is LoadName.RELAY:
+        if mqtt is not None or protocol is not None or text:
+            raise UserError(
+                "--load relay: only a board with binary frames has a relay; omit --mqtt, --protocol and --text"
+            )
+        loaded = PackWithRelay(model, load_a, soc=soc)
+        board = VirtualBoard(loaded, rate_hz=rate_hz, speed=speed, noise_lsb=noise_lsb, seed=seed)
+        loaded.is_connected = lambda: board.relay_high
+        _run(board, loaded, seconds)
+        return
+    pack = SimulatedPack(model, LOADS[load](load_a, seed), soc=soc)
     if mqtt is not None:
         configure_logs()
         # ``with_broker`` sets mqtt; the default only satisfies the type checker
@@ -118,8 +130,7 @@ def simulate(
         raise UserError(
             f"--protocol {protocol}: must be one of {', '.join(DEVICE_PROTOCOLS)}{suggestion(protocol, DEVICE_PROTOCOLS)}"
         )
-    asyncio.run(_serve(device, seconds))
-    typer.echo(f"{device.samples:,} samples in {device.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
+    _run(device, pack, seconds)
 
 
 def _simulated_bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float, seed: int) -> SimulatedBms:
@@ -140,6 +151,11 @@ def _simulated_bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float,
         )
     except ValueError as error:
         raise UserError(f"--series: {error}") from None
+
+
+def _run(device: VirtualBoard | SimulatedMeter | SimulatedNode, pack: SimulatedPack, seconds: float) -> None:
+    asyncio.run(_serve(device, seconds))
+    typer.echo(f"{device.samples:,} samples in {device.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
 
 
 async def _serve(device: VirtualBoard | SimulatedMeter | SimulatedNode, seconds: float) -> None:

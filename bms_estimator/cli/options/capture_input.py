@@ -66,7 +66,7 @@ def read_with_bar(file: Path, capture: Capture) -> SampleBlock:
 @contextmanager
 def long_file_bar(label: str, file: Path) -> Iterator[Progress]:
     """Yield the function that draws the fraction of a file on a bar; for a file that is not long, nothing is drawn."""
-    if file.stat().st_size < LONG_FILE_BYTES:
+    if not file.exists() or file.stat().st_size < LONG_FILE_BYTES:
         yield no_progress
         return
     with progress_bar(f"{label} {file.name}") as bar:

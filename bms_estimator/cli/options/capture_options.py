@@ -19,8 +19,8 @@ AsJson = Annotated[bool, typer.Option("--json", help="print the result as one JS
 CELL_HELP = "generic cell (lfp, nmc, nca, lco, lmo, lto), name of a shipped cell, or path of a cell file"
 CELL_OR_FUEL_CELL_HELP = f"{CELL_HELP}; for a fuel cell: pem_30w or path of a fuel-cell file"
 CAPTURE_FORMATS = (
-    "file of `record` or `run --record`, or a table: CSV, Parquet, spreadsheet or the export of a cycler; "
-    "-: read standard input"
+    "file of `record` or `run --record`, a table (CSV, Parquet, spreadsheet), the export of a cycler, "
+    "or - for standard input"
 )
 """Formats of a capture in help texts."""
 CAPTURE_HELP = f"capture to read: {CAPTURE_FORMATS}"

@@ -49,7 +49,7 @@ def doctor(
 ) -> None:
     """Examine settings, device, broker, service and machine, and name a remedy for each fault.
 
-    Nothing is changed. A device that a service or another process uses is not opened; opening a free port may reset a board.
+    The command changes nothing, and does not open a device that another process uses. Opening a free port may reset a board.
     The exit code is 1 if there is a fault, otherwise 0.
     """
     path = pack or next(filter(os.path.isfile, DEFAULT_PACKS), DEFAULT_PACKS[0])
@@ -94,7 +94,7 @@ def load_subject(path: Path) -> Subject | Finding:
 def _remedy(path: Path) -> str:
     """Return the command that creates, checks or reads a settings file that could not be loaded."""
     if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if the folder cannot be read
-        return f"bms-estimator config init {path}"
+        return f"bms-estimator new {path}"
     command = "bms-estimator config check" if os.access(path, os.R_OK) else "sudo bms-estimator doctor"
     return f"{command} {path}"
 

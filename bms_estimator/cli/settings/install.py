@@ -21,7 +21,7 @@ from bms_estimator.settings.pack import load_settings
 Root = Annotated[
     Path,
     typer.Option(
-        "--root", help="root directory of the machine; another directory than / is an image, which is not started"
+        "--root", help="root directory of the system; with another directory than /, no service is started or stopped"
     ),
 ]
 
@@ -31,7 +31,7 @@ def install_command(
         Path | None,
         typer.Argument(
             metavar="[PACK.toml]",
-            help="settings of the pack, copied to /etc/bms-estimator; without it, installed settings are kept",
+            help="settings file of the pack, copied to /etc/bms-estimator; default: the installed settings",
             show_default=False,
         ),
     ] = None,

@@ -45,7 +45,9 @@ def new(
     ] = None,
     device: Annotated[
         str | None,
-        typer.Option(help="device to use, by its name in the list of found devices; a serial port is searched alone"),
+        typer.Option(
+            help="path of a serial port, which is then the only place that is searched, or name of a found device"
+        ),
     ] = None,
     compare: Annotated[
         bool | None,
@@ -56,7 +58,7 @@ def new(
         typer.Option(parser=decimal(0.0), help="present voltage of the pack by a multimeter [V]", show_default=False),
     ] = None,
     zero: Annotated[
-        bool, typer.Option("--zero", help="no current flows now: take the present current as the zero of the sensor")
+        bool, typer.Option("--zero", help="all loads and chargers are off: take the measured current as zero")
     ] = False,
     ammeter_a: Annotated[
         float | None,
@@ -66,7 +68,7 @@ def new(
     ] = None,
     direction: Annotated[
         str | None,
-        typer.Option(help="direction of the present current, discharging or charging, which checks its sign"),
+        typer.Option(help="direction of the present current, discharging or charging; corrects the sign"),
     ] = None,
     name: Annotated[str | None, typer.Option(help=QUESTIONS[0].help, show_default=False)] = None,
     cell: Annotated[str | None, typer.Option(help=QUESTIONS[1].help, show_default=False)] = None,
@@ -118,7 +120,7 @@ def _default_places() -> list[str]:
     """Return the places that are searched by default. If none is a serial port, print this."""
     places = default_places()
     if not any(place.startswith("/") for place in places):
-        typer.echo("-  no USB serial port is connected; another serial port can be named below")
+        typer.echo("-  no USB serial port is connected; --search PATH searches another serial port")
     return places
 
 
@@ -140,7 +142,7 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
         UserError: No device was found, or there is no clear choice and no terminal.
     """
     if not result.devices and not prompts.is_interactive:
-        raise UserError("--search: no device was found; name another place")
+        raise UserError("--search: no device was found; give its place: --search PLACE")
     text = "Number of the device, or another place to search (serial port, mqtt://host, Modbus host)"
     may_search = prompts.is_interactive and device is None
     while True:

@@ -21,7 +21,9 @@ def setup(
     port: Annotated[
         int | None,
         typer.Option(
-            parser=whole(0, 65535), help="port of the page on this machine; 0: any free port", show_default=False
+            parser=whole(0, 65535),
+            help="port of the page on this machine; 0: any free port; default: 8765",
+            show_default=False,
         ),
     ] = None,
     listen: Annotated[
@@ -34,7 +36,7 @@ def setup(
     token_file: TokenFile = None,
     browser: Browser = True,
 ) -> None:
-    """Serve a web page that asks what `bms-estimator new` asks, until Ctrl-C."""
+    """Serve a web page with the questions of `bms-estimator new`, until Ctrl-C."""
     require_new(file)
     address = listen if port is None else f"127.0.0.1:{port}"
     page = page_settings(PageSettings(), listen=address, token_file=token_file)

@@ -1,4 +1,4 @@
-"""Guided test: recognition of each step from samples, warnings, and the load of a relay."""
+"""Guided test: recognition of each step by the samples, warnings, and control of a load by a relay."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ STEP_S = 0.1 * 3.0 / 1.5 * 3600.0
 
 
 class Pack:
-    """Feeds a test with constant voltage and current, on one clock."""
+    """Source of samples with constant voltage and current, which it feeds to a guided test."""
 
     def __init__(self, plan=SHORT, *, relay=False):
         self.test, self.time_s = GuidedTest(plan, LIMITS, relay=relay), 0.0
@@ -110,7 +110,7 @@ def test_the_lowest_cell_ends_a_discharge() -> None:
 
 
 @pytest.mark.parametrize(("current_a", "temperature_c"), [(7.0, 25.0), (1.5, 61.0)])
-def test_a_relay_disconnects_a_load_beyond_the_limits_for_a_minute(current_a, temperature_c) -> None:
+def test_a_relay_disconnects_the_load_for_a_minute_after_a_limit_was_exceeded(current_a, temperature_c) -> None:
     pack = Pack(relay=True)
     pack.until_first_discharge()
     assert not pack.run(3, current_a, 3.9, temperature_c).load_on
@@ -135,7 +135,7 @@ def test_a_wrong_load_is_reported_in_a_discharge(current_a, voltage_v, message) 
     assert message in warning if message else not warning
 
 
-def test_a_current_begins_a_rest_again() -> None:
+def test_a_current_in_a_rest_restarts_the_rest() -> None:
     pack = Pack()
     pack.until_first_discharge()
     pack.run(STEP_S + 5, 1.5, 3.9)
@@ -152,7 +152,7 @@ def test_a_current_begins_a_rest_again() -> None:
         (600.0, 3, 1.5, "nothing was measured"),
     ],  # 10 minutes at 1.5 A are 8 % of the capacity
 )
-def test_charge_against_the_plan_begins_the_test_again(gap_s, seconds, current_a, reason) -> None:
+def test_an_unplanned_or_unmeasured_charge_restarts_the_test(gap_s, seconds, current_a, reason) -> None:
     pack = Pack()
     pack.until_first_discharge()
     pack.run(60, 1.5, 3.9)

@@ -72,4 +72,12 @@ def test_the_export_of_a_cycler_is_converted_with_a_note_on_what_was_guessed(cap
 def test_an_unknown_suffix_is_an_error_that_lists_the_known_ones(capsys, tmp_path, board):
     code, _, err = run(capsys, "convert", board, "--out", tmp_path / "out.xyz")
     assert code == 2
-    assert err == f"error: {tmp_path / 'out.xyz'}: the name must end in .csv, .csv.gz, .parquet\n"
+    assert err.startswith(
+        f"error: --out {tmp_path / 'out.xyz'}: the name must end in .csv, .csv.gz or .parquet; Battery Data"
+    )
+
+
+def test_a_missing_capture_is_an_error(capsys, tmp_path):
+    code, _, err = run(capsys, "convert", tmp_path / "none.csv", "--out", tmp_path / "out.csv")
+    assert (code, err) == (2, f"error: {tmp_path / 'none.csv'}: no such file\n")
+    assert list(tmp_path.iterdir()) == []

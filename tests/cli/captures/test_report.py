@@ -172,5 +172,5 @@ def test_residuals_are_measured_less_modeled_voltage(tmp_path, capsys, steps_csv
     assert "exists already" in err
 
 
-def test_rated_capacity_is_that_of_the_cell(page):
+def test_page_has_the_rated_capacity_of_the_cell(page):
     assert f"Cell model ncr18650, {TRUTH.cell.capacity_ah:g} Ah" in text_of(page)

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.cli.main import main
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
-from bms_estimator.protocols.firmware.messages import set_rate_command
+from bms_estimator.protocols.firmware.messages import set_rate_command, set_relay_command
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
@@ -86,6 +87,14 @@ def test_frames_of_the_configured_pack_are_sent_until_ctrl_c():
     assert re.fullmatch(r"[\d,]+ samples in \d+\.\d s, SOC \d+\.\d\d%\n", err)
 
 
+def test_the_relay_of_the_board_connects_the_load():
+    with simulate("--load", "relay", "--current-a", "0.5", "--noise-lsb", "0") as (_, path), open_line(path) as line:
+        data = read(line, lambda data: decode(data)[0].size >= 10)
+        assert abs(decode(data)[0]["current_a"]).max() < 0.1
+        os.write(line, set_relay_command(Relay(high=True, high_when_silent=None)))
+        read(line, lambda data: decode(data)[0]["current_a"][-1] == pytest.approx(0.5, abs=0.05), data)
+
+
 def test_text_lines_have_the_format_of_a_sketch():
     with simulate("--text", "--current-a", "0.2", "--load", "constant") as (process, path):
         with open_line(path) as line:
@@ -115,6 +124,7 @@ def test_simulation_ends_after_the_simulated_duration():
         ("--speed", "inf"),
         ("--protocol", "nonsense"),
         ("--protocol", "jbd", "--series", "40"),
+        ("--load", "relay", "--text"),
     ],
 )
 def test_invalid_arguments_are_reported(arguments, capsys):

@@ -75,7 +75,7 @@ def test_without_settings_the_machine_is_examined(
     code, out, _ = run(capsys, "doctor", "--json")
     findings = json.loads(out)["findings"]
     assert code == 1
-    assert findings[0]["remedy"] == f"bms-estimator config init {tmp_path / 'pack.toml'}"
+    assert findings[0]["remedy"] == f"bms-estimator new {tmp_path / 'pack.toml'}"
     assert {finding["check"] for finding in findings} == {"settings", "kernel cache", "clock", "versions"}
 
 

@@ -40,8 +40,8 @@ def file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def long_probe(monkeypatch):
-    """Shorten the wait for a board, and lengthen the wait for answers in other protocols."""
+def long_timeouts(monkeypatch):
+    """Lengthen the timeouts for a JK-BMS. Shorten the wait for a board, because none is connected."""
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.1)
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
     monkeypatch.setattr("bms_estimator.setup.measurement.FIRST_SAMPLE_S", LONG_S)
@@ -124,7 +124,7 @@ def plain(output: str) -> str:
     return re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", output).replace("\r", "")
 
 
-def test_options_answer_all_questions_without_a_terminal(file, capsys, long_probe):
+def test_options_answer_all_questions_without_a_terminal(file, capsys, long_timeouts):
     with running_device(jk_bms()) as path:
         code, out, err = run(
             capsys, "new", file, "--device", path, *options(), "--no-compare", "--no-install", "--no-estimate"
@@ -138,7 +138,7 @@ def test_options_answer_all_questions_without_a_terminal(file, capsys, long_prob
     assert written["pack"] == pack
 
 
-def test_the_service_is_installed_with_sudo(file, capsys, long_probe, tmp_path, monkeypatch):
+def test_the_service_is_installed_with_sudo(file, capsys, long_timeouts, tmp_path, monkeypatch):
     sudo = tmp_path / "sudo"
     sudo.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/arguments\nexit 3\n')
     sudo.chmod(0o755)
@@ -146,7 +146,7 @@ def test_the_service_is_installed_with_sudo(file, capsys, long_probe, tmp_path, 
     with running_device(jk_bms()) as path:
         code, _, _ = run(capsys, "new", file, "--device", path, *options(), "--yes", "--no-estimate", "--install")
     assert (tmp_path / "arguments").read_text() == f"{PROGRAM} install {file}\n"
-    assert code == 3  # that of the installation
+    assert code == 3  # exit code of ``sudo``
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_the_service_is_installed_with_sudo(file, capsys, long_probe, tmp_path, 
         (["--device", "/dev/none", *options()], "--device /dev/none: was not found; found: /dev/"),
     ],
 )
-def test_a_missing_or_wrong_option_is_named_and_nothing_is_written(file, capsys, long_probe, arguments, message):
+def test_a_missing_or_wrong_option_is_named_and_nothing_is_written(file, capsys, long_timeouts, arguments, message):
     with running_device(jk_bms()) as path:
         device = [] if "--device" in arguments else ["--device", path]
         code, _, err = run(capsys, "new", file, "--search", path, *device, *arguments)
@@ -189,7 +189,7 @@ def test_a_port_without_a_device_is_reported_with_the_reason(file, capsys, tmp_p
     assert "--search: no device was found" in err
 
 
-def test_a_multimeter_corrects_gain_and_sign_of_a_bms(file, capsys, long_probe):
+def test_a_multimeter_corrects_gain_and_sign_of_a_bms(file, capsys, long_timeouts):
     with running_device(jk_bms(current_a=-5.0)) as path:
         meter = ["--voltmeter-v", "26.664", "--ammeter-a", "5.5"]
         code, out, err = run(capsys, "new", file, "--device", path, *options(), *meter, "--yes", "--no-estimate")
@@ -201,7 +201,7 @@ def test_a_multimeter_corrects_gain_and_sign_of_a_bms(file, capsys, long_probe):
     assert sensor.current_sign == "discharge_positive"  # a JK-BMS reports charge as positive
 
 
-def test_the_direction_of_a_load_corrects_the_sign_alone(file, capsys, long_probe):
+def test_the_direction_of_a_load_corrects_the_sign_alone(file, capsys, long_timeouts):
     with running_device(jk_bms(current_a=-5.0)) as path:
         arguments = [*options(), "--direction", "discharging", "--yes", "--no-estimate"]
         code, out, err = run(capsys, "new", file, "--device", path, *arguments)
@@ -211,7 +211,7 @@ def test_the_direction_of_a_load_corrects_the_sign_alone(file, capsys, long_prob
     assert load_settings(file).sensor.current_gain == 1.0
 
 
-def test_the_zero_of_a_bms_is_written_with_its_sign(file, capsys, long_probe):
+def test_the_zero_of_a_bms_is_written_with_its_sign(file, capsys, long_timeouts):
     with running_device(jk_bms(current_a=0.3)) as path:
         code, _, err = run(capsys, "new", file, "--device", path, *options(), "--zero", "--yes", "--no-estimate")
     assert (code, err) == (0, "")

@@ -25,16 +25,18 @@ CAPACITY_AH, SERIES = 100.0, 16
 OVERPOTENTIAL_V = {"nmc": 0.22, "lfp": 0.11}
 """Overpotential of a cell at 1C in steady state [V]."""
 FRACTIONS, TAU_S = np.array([0.4, 0.25, 0.35]), np.array([20.0, 900.0])
-"""Fractions of the overpotential of the series resistance and of two RC pairs, and time constants of the pairs [s]."""
+"""Fractions of the overpotential at the series resistance and at two RC pairs, and the time constants of the pairs [s]."""
 LEAD_SOC, LEAD_S = {"nmc": 0.0, "lfp": 0.05}, 600.0
-"""SOC at the surfaces of the particles less the mean SOC at 1C, and its time constant [s]. Charged with C/2 to 3.65 V, LFP cells
-take in another 2 to 3 % at this voltage. In the other cells the RC pairs have this effect."""
+"""Difference between the SOC at the surface of the particles and the mean SOC during a charge at 1C, and its time constant [s].
+
+Charged with C/2 to 3.65 V, LFP cells accept another 2 to 3 % at this voltage. In the other cells the RC pairs have this effect.
+"""
 OVERCHARGE_V = 20.0
 """Slope of the OCV above SOC 1 [V]."""
-FOREVER_S = 80_000
+MAX_CHARGE_S = 80_000
 """Maximum duration of a charge [s]."""
 CHECK_S = 10
-"""Interval between two looks for anchors [s]."""
+"""Interval at which the estimator is checked for a new anchor [s]."""
 Load = Callable[[int], float]
 """Current [C] as a function of the time [s]."""
 
@@ -46,7 +48,7 @@ def no_load(_: int) -> float:
 
 def random_load(std_c: float) -> Load:
     """Return a current around 0 that changes every 20 s."""
-    values = np.random.default_rng(2).normal(0.0, std_c, FOREVER_S // 20 + 1)
+    values = np.random.default_rng(2).normal(0.0, std_c, MAX_CHARGE_S // 20 + 1)
     return lambda t: float(values[t // 20])
 
 
@@ -61,7 +63,7 @@ class Charged:
     Args:
         chemistry: Generic cell.
         soc: Initial SOC.
-        factor: Factor on the resistances and on the lead of the surfaces.
+        factor: Factor on the resistances and on ``LEAD_SOC``.
         celsius: Temperature [C].
 
     Attributes:
@@ -87,7 +89,7 @@ class Charged:
         max_c: float,
         volts: float | None = None,
         *,
-        seconds: int = FOREVER_S,
+        seconds: int = MAX_CHARGE_S,
         tail_c: float = -1.0,
         load: Load = no_load,
         sun: Load | None = None,
@@ -100,10 +102,12 @@ class Charged:
             seconds: Duration unless the charge ends earlier [s].
             tail_c: Current of the charger at which the charge ends; negative: it does not end.
             load: Load in parallel.
-            sun: Maximum current that changes with time.
+            sun: Maximum current of a solar charger as a function of time; replaces ``max_c``.
         """
         for t in range(seconds):
-            held_c = load(t) - (self._settled_v - (volts or self.full_v)) / self._ohm[0]  # holds the voltage
+            held_c = (
+                load(t) - (self._settled_v - (volts or self.full_v)) / self._ohm[0]
+            )  # current that keeps the voltage constant
             charger_c = min(max(held_c, 0.0), sun(t) if sun else max_c)
             if charger_c == held_c < tail_c:
                 break
@@ -111,13 +115,13 @@ class Charged:
         return self
 
     def charge_to(self, part: float, max_c: float) -> Self:
-        """Charge with constant current to a part of ``full_v``."""
+        """Charge with constant current until the voltage is the fraction ``part`` of ``full_v``."""
         while self._settled_v + self._ohm[0] * max_c < part * self.full_v:
             self._step(-max_c)
         return self
 
     def rest(self, seconds: int = 1800) -> Self:
-        """Rest."""
+        """Simulate a rest."""
         for _ in range(seconds):
             self._step(0.0)
         return self
@@ -321,7 +325,7 @@ def high_cell(chemistry: str, part: float, max_c: float) -> Charged:
 
 
 def absorbed(volts: float, max_c: float, seconds: int, load: Load = no_load) -> Charged:
-    """Return an LFP cell after a charge to a voltage, a time at this voltage, and a float."""
+    """Return an LFP cell after constant current, an absorption time at constant voltage, and a float at 3.375 V."""
     cell = Charged("lfp")
     cell.charge_to(volts / cell.full_v, max_c)
     return cell.charge(max_c, volts, seconds=seconds, load=load).charge(max_c, 3.375, seconds=2 * 3600, load=load)

@@ -88,7 +88,7 @@ def messages(topics: Topics, samples: SampleBlock) -> list[Message]:
 def published(
     samples: SampleBlock, name: str, period_s: float, shift_s: float, dead_band: float, max_silent_s: float
 ) -> list[tuple[float, float]]:
-    """Return times and values of one quantity that are sent."""
+    """Return the times and values at which one quantity is sent."""
     chosen = samples[round(shift_s) :: round(period_s)]
     times_s, values = chosen["time_s"].tolist(), chosen[name].tolist()
     if not dead_band:

@@ -1,4 +1,4 @@
-"""The same measurement as the export of each cycler, library and public data set: preamble, columns, units and signs."""
+"""One measurement in the export format of each cycler, library and public data set: preamble, columns, units, signs."""
 
 import gzip
 import zipfile
@@ -42,12 +42,12 @@ class Measurement:
         return np.ones_like(self.step)
 
     def states(self, discharge: str, charge: str, rest: str) -> list[str]:
-        """Return a word for each row."""
+        """Return the name of the state of each row."""
         return [discharge if current > 0 else charge if current < 0 else rest for current in self.current_a]
 
 
 def measure() -> Measurement:
-    """Return the measurement of all exports; its values have few decimals, as a cycler writes them."""
+    """Return the measurement that all exports contain, with rounded values."""
     step = np.repeat(np.arange(4), 21)
     time_s = np.arange(step.size) - step  # the last row of a step and the first of the next have the same time
     current_a = np.array([0.0, 1.5, 0.0, -0.75])[step]
