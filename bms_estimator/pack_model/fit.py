@@ -90,8 +90,7 @@ def fit(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None = Non
     _require_finite(rows)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite raises an error below
-            if previous is not None:
-                rows = rows[rows["segment"] >= previous.first_segment]
+            rows = rows_of_this_pack(rows, previous)
             result = _fit_at_reference(cell, rows, previous)
             if result.is_exchanged:
                 last = rows[rows["segment"] == rows["segment"][-1]]
@@ -101,6 +100,11 @@ def fit(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None = Non
     if not (np.isfinite(result.mean).all() and np.isfinite(result.covariance).all()):
         raise FitError(f"the fit of {rows.size} history rows is not finite")
     return result
+
+
+def rows_of_this_pack(rows: NDArray[np.void], previous: PackFit | None) -> NDArray[np.void]:
+    """Return the rows without those before an exchange of the pack that the previous fit found."""
+    return rows if previous is None else rows[rows["segment"] >= previous.first_segment]
 
 
 def _require_finite(rows: NDArray[np.void]) -> None:
@@ -132,19 +136,22 @@ def _minimize_from_all_starts(
 ) -> PackFit:
     """Return the mixture of the different minima that are reached from all starts."""
     equations = Equations(cell, rows, reference)
+    return mixture(equations, distinct_minima(equations, starts(equations, previous)))
+
+
+def distinct_minima(equations: Equations, from_starts: list[Floats]) -> list[Minimum]:
+    """Return the different minima that are reached from the starts, the best first."""
     minima: list[Minimum] = []
-    for start in starts(equations, previous):
+    for start in from_starts:
         minimum = minimize(equations, start)
         if not any(_is_same(equations, minimum, other) for other in minima):
             minima.append(minimum)
-    return mixture(equations, minima)
+    return sorted(minima, key=lambda minimum: minimum.cost)
 
 
 def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
     """Return the starts of the minimization: those near the previous fit, then those around the filter's SOC."""
-    results: list[Floats] = []
-    if previous is not None:  # two best minima, the best last
-        results += [start_near(equations, previous, curves) for curves in previous.curves[1::-1]]
+    results = [] if previous is None else starts_near(equations, previous)
     for shift, ln_q in STARTS:
         x = equations.prior.mean.copy()
         x[equations.u.soc] = filter_soc(equations, ln_q) + shift
@@ -158,6 +165,11 @@ def filter_soc(equations: Equations, ln_q: float) -> Floats:
     intervals = equations.intervals
     drawn_soc = intervals.drawn_soc[intervals.ends] * math.exp(-ln_q)
     return np.asarray(equations.rows["soc"][intervals.ends] + drawn_soc)
+
+
+def starts_near(equations: Equations, previous: PackFit) -> list[Floats]:
+    """Return the starts at the two best minima of the previous fit, the best last."""
+    return [start_near(equations, previous, curves) for curves in previous.curves[1::-1]]
 
 
 def start_near(equations: Equations, previous: PackFit, curves: Floats) -> Floats:
@@ -199,20 +211,9 @@ def _is_same(equations: Equations, a: Minimum, b: Minimum) -> bool:
 
 
 def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
-    """Return mean and covariance of the mixture of minima, weighted by their cost.
-
-    The weights contain no determinants of covariances, which would favor a larger capacity.
-    """
-    minima = sorted(minima, key=lambda minimum: minimum.cost)
-    weights = np.exp(-0.5 * LIKELIHOOD_EXPONENT * (np.array([m.cost for m in minima]) - minima[0].cost))
-    weights /= weights.sum()
-    moments = [_results(equations, m) for m in minima]
-    means = np.array([mean for mean, _ in moments])
-    mean = weights @ means
-    covariance: Floats = sum(
-        w * (cov + np.outer(part - mean, part - mean))
-        for w, part, (_, cov) in zip(weights, means, moments, strict=True)
-    )
+    """Return mean and covariance of the mixture of minima, of which the best is the first."""
+    weights = mixture_weights(minima)
+    mean, covariance = mixture_moments(weights, [_results(equations, m) for m in minima])
     u, rows = equations.u, equations.rows
     last = rows[-1]
     x = weights @ np.array([m.x for m in minima])
@@ -222,7 +223,7 @@ def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
         segment=float(last["segment"]),
         charge_as=float(last["charge_as"]),
         mean=mean,
-        covariance=0.5 * (covariance + covariance.T),  # symmetric to the last bit
+        covariance=covariance,
         curve_v=NodePosition.of(SOC_GRID, CURVE_NODES).interpolate(x[u.curve]),
         ln_r=shape[:, None] + x[u.ln_r],
         hysteresis=float(max(x[u.hysteresis].sum(), 0.0)),
@@ -233,6 +234,31 @@ def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
         first_segment=float(rows["segment"][0]),
         is_exchanged=is_exchanged(rows, equations.residuals(minima[0].x)),
     )
+
+
+def mixture_weights(minima: list[Minimum]) -> Floats:
+    """Return the weights of minima by their cost.
+
+    They contain no determinants of covariances, which would favor a larger capacity.
+    """
+    weights: Floats = np.exp(-0.5 * LIKELIHOOD_EXPONENT * (np.array([m.cost for m in minima]) - minima[0].cost))
+    return np.asarray(weights / weights.sum())
+
+
+def mixture_moments(weights: Floats, moments: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Return mean and covariance of a mixture.
+
+    Args:
+        weights: Shape (n,), with sum 1.
+        moments: Mean and covariance of each of the n parts.
+    """
+    means = np.array([mean for mean, _ in moments])
+    mean = weights @ means
+    covariance: Floats = sum(
+        w * (cov + np.outer(part - mean, part - mean))
+        for w, part, (_, cov) in zip(weights, means, moments, strict=True)
+    )
+    return mean, 0.5 * (covariance + covariance.T)  # symmetric to the last bit
 
 
 def _results(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:

@@ -12,6 +12,8 @@ from bms_estimator.store.minute import MINUTE_S, Minute
 
 _QUANTITIES = ("voltage", "v"), ("current", "a"), ("temperature", "c")
 _SUMS = "sum(charge_out_ah), sum(charge_in_ah), sum(energy_out_wh), sum(energy_in_wh), sum(seen_s), sum(publications)"
+_DAMAGED = "the service moves a damaged file aside at its next start, and begins a new one"
+"""Remedy for a damaged file."""
 
 
 class PastEvent(NamedTuple):
@@ -73,18 +75,37 @@ class HistoryFile:
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
-        if not self._path.is_file():
-            raise UserError(
-                f"{self._path}: no history there: the service has not run yet, or with another state folder"
-            )
+        self._require_readable()
         try:
             with closing(sqlite3.connect(f"{self._path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
                 (version,) = connection.execute("PRAGMA user_version").fetchone()
                 if version > len(MIGRATIONS):
                     raise UserError(f"{self._path}: written by a later version of bms_estimator; read it with that one")
+                if version == 0:
+                    raise UserError(f"{self._path}: not a history: the file has no tables; {_DAMAGED}")
                 yield connection
-        except sqlite3.Error as error:
+        except (
+            sqlite3.OperationalError
+        ) as error:  # for example locked, or without permission to write the shared memory
             raise UserError(f"{self._path}: history cannot be read: {error}") from error
+        except sqlite3.Error as error:
+            raise UserError(f"{self._path}: history cannot be read: {error}; {_DAMAGED}") from error
+
+    def _require_readable(self) -> None:
+        """Raise a UserError if the file does not exist or cannot be opened."""
+        try:
+            with self._path.open("rb"):
+                return
+        except (FileNotFoundError, NotADirectoryError) as error:
+            raise UserError(
+                f"{self._path}: no history there: the service has not run yet, or with another state folder"
+            ) from error
+        except PermissionError as error:
+            raise UserError(
+                f"{self._path}: no permission to read the history: run the command as the user of the service, or with sudo"
+            ) from error
+        except OSError as error:
+            raise UserError(f"{self._path}: history cannot be read: {error.strerror}") from error
 
 
 def _mean_and_extremes(quantity: str, unit: str) -> str:

@@ -1,10 +1,14 @@
 """Fits of packs that age: during the history, and before its first row."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from bms_estimator.pack_model.aging import CAPACITY, RESISTANCE, Aging, AgingVariance
+from bms_estimator.pack_model.aging_course import aging_course
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.fit import LN_Q, fit
+from bms_estimator.pack_model.fit import LN_Q, LN_R, FitError, PackFit, fit
 from bms_estimator.pack_model.intervals import Intervals
 from tests.pack_model.histories import Truth, cell_curves, measured_rows, with_voltages
 
@@ -12,6 +16,8 @@ DAY_S = 86400.0
 """Length of a day [s]."""
 DAYS = 150
 """Number of days of ``histories.DAY`` in which resistances grow."""
+GROWTH = 0.3
+"""Growth of ln of the resistances in this time."""
 VISITED = slice(16, 33)
 """Points of ``SOC_GRID`` from SOC 0.4 to 0.8."""
 
@@ -33,11 +39,49 @@ def aged_rows(cell: CellCurves, ln_r: float) -> np.ndarray:
     return new[cycle % 12 == 11]
 
 
-def test_resistances_are_those_of_the_present() -> None:
-    ln_r = 0.3
+@pytest.fixture(scope="module")
+def aged() -> tuple[CellCurves, np.ndarray, PackFit]:
+    """Return a cell file, rows of a pack whose resistances grow by a factor of exp(``GROWTH``), and the fit of the rows."""
     cell = measured_cell()
-    fitted = fit(cell, aged_rows(cell, ln_r))
-    np.testing.assert_allclose(fitted.ln_r[VISITED], ln_r, atol=0.04)
+    rows = aged_rows(cell, GROWTH)
+    return cell, rows, fit(cell, rows)
+
+
+def test_resistances_are_those_of_the_present(aged) -> None:
+    _, _, fitted = aged
+    np.testing.assert_allclose(fitted.ln_r[VISITED], GROWTH, atol=0.04)
+
+
+def test_course_contains_the_growth_of_the_resistances_and_a_constant_capacity(aged) -> None:
+    cell, rows, fitted = aged
+    course = aging_course(cell, rows, fitted)
+    ohm = cell.series * cell.resistances(np.array([0.5]), np.ones(1), np.ones(1))[0]
+    for resistance, new_ohm in ((course.series, ohm[0]), (course.total, ohm.sum())):
+        np.testing.assert_allclose(resistance.value[[0, -1]], new_ohm * np.exp([0.0, GROWTH]), rtol=0.04)
+        change, std = resistance.relative_change()
+        assert abs(change - np.expm1(GROWTH)) < 2.0 * std < 0.4
+    np.testing.assert_allclose(course.capacity.value, cell.capacity_as / 3600.0, rtol=0.02)
+    change, std = course.capacity.relative_change()
+    assert abs(change) < 2.0 * std < 0.1
+    assert course.end_s == rows["elapsed_s"][-1] > course.capacity.elapsed_s[-1]
+
+
+def test_present_values_of_the_course_are_those_of_the_fit() -> None:
+    cell, truth = cell_curves(), Truth(ln_q=-0.1, ln_r=(0.2, 0.2, 0.2))
+    rows = with_voltages(cell, measured_rows(cell, days=3), truth)
+    fitted = fit(cell, rows)
+    course = aging_course(cell, rows, fitted)
+    assert course.capacity.value[-1] * 3600.0 / cell.capacity_as == pytest.approx(np.exp(fitted.mean[LN_Q]), rel=0.005)
+    std = np.sqrt(np.diag(fitted.covariance))
+    assert course.capacity.std[-1] / course.capacity.value[-1] == pytest.approx(std[LN_Q], rel=0.1)
+    assert course.series.std[-1] / course.series.value[-1] < 2.0 * std[LN_R][0]
+
+
+def test_course_without_a_minimum_of_the_last_fit_is_an_error() -> None:
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell, days=1), Truth())
+    with pytest.raises(FitError, match="no minimum"):
+        aging_course(cell, rows, replace(fit(cell, rows), curves=()))
 
 
 def test_a_pack_that_aged_before_the_history_may_differ_from_its_cell_file() -> None:

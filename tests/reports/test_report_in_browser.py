@@ -1,9 +1,14 @@
 """Report in a browser: screen, phone and paper."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
+from bms_estimator.reports.history_report import history_report
 from tests.page.chromium import PHONE, chromium, tab
 from tests.reports.screenshots import PAPER, make_report, take_screenshots
+from tests.reports.test_history_report import history_of
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +50,36 @@ async def test_figures_and_tables_are_not_cut_by_a_page_break(report):
     assert set(breaks) == {"avoid"}
     assert hidden == "none"
     assert document.count(b"/Type /Page\n") > 1
+
+
+@pytest.fixture
+def history_page(tmp_path):
+    """Return the page on a history of 30 days with 30 events."""
+    text = (
+        "sensor_fault: samples are lost, unusable or from two publishers: 0.5896, limit 0.1; check sensors and wiring"
+    )
+    events = [(3600.0 * hour, "alarm_raised", text) for hour in range(30)]
+    history = replace(history_of(3600.0 * np.arange(30 * 24)), events=events)
+    path = tmp_path / "history.html"
+    path.write_text(history_report(history, "2026-01-01").html(), encoding="utf-8")
+    return path
+
+
+async def test_events_are_readable_on_a_phone_without_scrolling(history_page):
+    async with chromium() as browser, tab(browser, history_page.as_uri(), size=PHONE) as page_tab:
+        widths = await page_tab.page.evaluate(
+            """() => [...document.querySelectorAll(".text")].map(each => each.getBoundingClientRect().right)"""
+        )
+    assert len(widths) == 2
+    assert max(widths) <= PHONE["width"]
+
+
+async def test_long_tables_continue_on_the_next_page(history_page):
+    async with chromium() as browser, tab(browser, history_page.as_uri(), size=PAPER) as page_tab:
+        await page_tab.page.emulate_media(media="print")
+        breaks = await page_tab.page.evaluate("""() => [...document.querySelectorAll("article.table")].map(each =>
+            [each.querySelectorAll("tbody tr").length, getComputedStyle(each).breakInside])""")
+    assert breaks == [[30, "auto"], [30, "auto"], [5, "avoid"]]
 
 
 async def test_screenshots_of_the_documentation_are_made(report, tmp_path):

@@ -18,6 +18,7 @@ from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.history import History
 from bms_estimator.store.history_reader import HistoryFile, PastEvent
 from bms_estimator.store.minute import Minute
+from tests.doctor.as_user import as_nobody
 from tests.patience import LONG_S
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
@@ -278,3 +279,32 @@ async def test_internal_error_of_the_writing_task_is_raised(path):
     history = await History(BrokenDatabase(path), days=366).__aenter__()
     with pytest.raises(KeyError, match="internal"):
         await publish_forever(history)
+
+
+def error_of_reading(path: Path) -> str:
+    """Return the error of reading a history."""
+    with pytest.raises(UserError) as caught:
+        read_rows(path)
+    return str(caught.value)
+
+
+async def test_history_in_a_folder_without_permission_is_a_user_error(path):
+    await record_history(path, [snapshot_at(0.0)])
+    path.parent.chmod(0o000)
+    error = as_nobody(lambda: error_of_reading(path))
+    path.parent.chmod(0o700)
+    assert error.startswith(f"{path}: no permission to read the history: run the command as the user of the service")
+
+
+async def test_damaged_history_is_a_user_error(path):
+    await record_history(path, [snapshot_at(60.0 * minute) for minute in range(500)])
+    whole = path.read_bytes()
+    for content, reason in (
+        (whole[: len(whole) // 2], "history cannot be read: database disk image is malformed"),
+        (b"\xff" * 600, "history cannot be read: file is not a database"),
+        (b"", "not a history: the file has no tables"),
+    ):
+        path.write_bytes(content)
+        assert error_of_reading(path).startswith(
+            f"{path}: {reason}; the service moves a damaged file aside at its next start"
+        )

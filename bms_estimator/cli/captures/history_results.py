@@ -6,16 +6,26 @@ from pathlib import Path
 import numpy as np
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.history_file import HistoryFile as FitHistoryFile
+from bms_estimator.checkpoint.history_file import RejectedHistoryError
 from bms_estimator.checkpoint.learned_state import learned_estimator
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import present_elements, relative_capacity
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.pack_model.aging_course import aging_course
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.saved import history_of
 from bms_estimator.process.state_folder import state_folder
+from bms_estimator.reports.aging_group import AgingHistory
 from bms_estimator.reports.history_report import PackHistory
 from bms_estimator.reports.report_items import number
 from bms_estimator.settings.pack import Settings
 from bms_estimator.store.history_reader import HistoryFile
 from bms_estimator.store.minute import MINUTE_S, Minute
+
+CAPACITY = "capacity [Ah]"
+"""Name of the learned capacity."""
 
 
 def pack_history(settings: Settings, model: PackModel, folder: Path | None, since_s: float) -> PackHistory:
@@ -44,7 +54,29 @@ def pack_history(settings: Settings, model: PackModel, folder: Path | None, sinc
     except UserError as error:
         not_learned = str(error)
     events = file.events(since_s, until_s)
-    return PackHistory(settings.pack.name, columns["time_s"], columns, events, learned, not_learned)
+    aging = _aging_history(settings, model, path.parent)
+    if aging.course:
+        learned = [row for row in learned if row[0] != CAPACITY]  # the table of the slow fit has the capacity
+    return PackHistory(settings.pack.name, columns["time_s"], columns, events, learned, not_learned, aging)
+
+
+def _aging_history(settings: Settings, model: PackModel, folder: Path) -> AgingHistory:
+    """Return capacity and resistances over the days of the history to which the service fits the pack's model."""
+    if isinstance(model, FuelCellModel):
+        return AgingHistory(None, "Only batteries have a capacity and resistances over days.")
+    file = FitHistoryFile(folder, settings, model)
+    try:
+        arrays = file.load()
+        rows, fit = history_of(arrays) if arrays else (None, None)
+        if rows is None or fit is None:
+            return AgingHistory(
+                None,
+                f"{file.path}: no fit yet; the service first fits capacity and resistances after half an hour of use.",
+            )
+        cell = CellCurves(new_estimator(settings, model).cell_file_settings)
+        return AgingHistory(aging_course(cell, rows.rows, fit))
+    except (RejectedHistoryError, OSError, ValueError) as error:
+        return AgingHistory(None, f"{file.path} cannot be used: {error}.")
 
 
 def _learned_parameters(settings: Settings, model: PackModel, folder: Path) -> list[tuple[str, str, str]]:
@@ -58,7 +90,7 @@ def _learned_parameters(settings: Settings, model: PackModel, folder: Path) -> l
     estimator = learned_estimator(CheckpointFile(folder, settings, model), settings, model)
     record, rated_ah = estimator.record[0], model.cell.capacity_ah
     capacity = relative_capacity(record)
-    rows = [("capacity [Ah]", number(capacity.value * rated_ah), number(capacity.std * rated_ah, 2))]
+    rows = [(CAPACITY, number(capacity.value * rated_ah), number(capacity.std * rated_ah, 2))]
     for name, element in present_elements(record).items():
         symbol, _, unit = name.rpartition("_")
         scale, label = (1e3, "mΩ") if unit == "ohm" else (1.0, "F")

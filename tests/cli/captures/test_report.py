@@ -3,18 +3,24 @@
 import asyncio
 import csv
 import html
+import math
 import re
 
 import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.history_file import HistoryFile as FitHistoryFile
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.pack_model.fit import fit
+from bms_estimator.pack_model.history import History
+from bms_estimator.pack_model.saved import history_arrays
 from bms_estimator.sources.captures.replay import load_capture
 from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.calibration.simulated_load import TRUTH, capture, steps
 from tests.command_line import run
+from tests.pack_model.histories import Truth, cell_curves, measured_rows, with_voltages
 from tests.store.test_history import record_history, snapshot_at
 
 PACK = '[pack]\nname = "shed"\ncell = "nmc"\ncapacity_ah = 30\nseries = 13\n'
@@ -113,7 +119,7 @@ async def test_page_on_a_history_has_days_events_and_gaps(tmp_path, capsys):
     assert re.findall(r'aria-label="([^"]+)">\s*<svg', page) == ["SOC with ±2 std", "Voltage", "Current", "Temperature"]
     text = text_of(page)
     assert re.search(r"2023-11-15 .{5,12} 48\.00 … 48\.00 3\.0 … 3\.0 21 … 21", text)
-    assert "1, the longest 100 min" in text
+    assert "1, the longest 100 minutes" in text
     assert "no checkpoint to read: none found" in text
 
 
@@ -132,15 +138,65 @@ def test_page_on_a_history_has_the_learned_parameters_of_the_checkpoint(tmp_path
     assert float(re.search(r"R_s \[mΩ\] ([\d.]+)", text)[1]) > 86.0
 
 
+def report_on_fitted_history(tmp_path, capsys, content):
+    """Return the page on a pack with two minutes and the given file of history and fit."""
+    (tmp_path / "pack.toml").write_text('[pack]\nname = "shed"\ncell = "nmc"\ncapacity_ah = 3\n')
+    settings, model = load_pack(tmp_path / "pack.toml")
+    file = FitHistoryFile(tmp_path, settings, model)
+    file.save(content)
+    asyncio.run(record_history(tmp_path / "shed.sqlite", [snapshot_at(0.0), snapshot_at(90.0)]))
+    arguments = ("--pack", tmp_path / "pack.toml", "--folder", tmp_path, "--out", tmp_path / "report.html")
+    code, _, err = run(capsys, "report", *arguments)
+    assert (code, err) == (0, "")
+    return file.path, (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_page_on_a_history_has_capacity_and_resistances_over_days(tmp_path, capsys):
+    cell, truth = cell_curves("nmc"), Truth(ln_q=math.log(0.9))  # one of its days takes 9.5 h
+    rows = with_voltages(cell, measured_rows(cell, days=20), truth)
+    _, page = report_on_fitted_history(tmp_path, capsys, history_arrays(History(rows), fit(cell, rows)))
+    figures = re.findall(r'aria-label="([^"]+)">\s*<svg', page)
+    assert figures[-2:] == ["Capacity with ±2 std", "DC resistance with ±2 std"]
+    found = re.search(r"capacity \[Ah\] ([\d.]+) ± ([\d.]+) ([+-][\d.]+) ± ([\d.]+) %", text_of(page))
+    capacity_ah, std_ah, change, change_std = map(float, found.groups())
+    assert capacity_ah == pytest.approx(2.7, abs=2.0 * std_ah)
+    assert abs(change) < 2.0 * change_std
+    assert re.search(r"DC resistance \[mΩ\] [\d.]+ ± [\d.]+ [+-][\d.]+ ± [\d.]+ %", text_of(page))
+
+
+def test_page_on_a_short_history_has_capacity_and_resistances_of_now(tmp_path, capsys):
+    cell = cell_curves("nmc")
+    rows = with_voltages(cell, measured_rows(cell, days=1)[:40], Truth())
+    _, page = report_on_fitted_history(tmp_path, capsys, history_arrays(History(rows), fit(cell, rows)))
+    text = text_of(page)
+    assert "Capacity with" not in page
+    assert re.search(r"capacity \[Ah\] [\d.]+ ± [\d.]+ -", text)
+    assert re.search(r"Slow fit to the last \d+\.\d hours of measurements", text)
+    assert "A change per month needs at least 7 days of history." in text
+
+
+def test_page_names_a_damaged_file_of_the_fit(tmp_path, capsys):
+    path, page = report_on_fitted_history(tmp_path, capsys, {"rows": np.zeros(3)})
+    assert f"{path} cannot be used: its rows have another layout." in text_of(page)
+
+
 def test_user_errors_end_with_code_2(tmp_path, capsys, steps_csv):
     out = tmp_path / "report.html"
     (tmp_path / "pack.toml").write_text(PACK)
+    damaged, old = tmp_path / "damaged", tmp_path / "old"
+    damaged.mkdir()
+    old.mkdir()
+    (damaged / "shed.sqlite").write_bytes(b"\xff" * 600)
+    asyncio.run(record_history(old / "shed.sqlite", [snapshot_at(0.0)]))
     for arguments, message in (
         ((), "give captures with --cell NAME|CELL.toml, or --pack pack.toml"),
         ((steps_csv,), "give either --cell"),
         ((steps_csv, "--cell", "pem_30w"), "is a fuel cell: report needs a battery"),
         ((steps_csv, steps_csv, "--cell", "ncr18650"), "given twice"),
-        (("--pack", tmp_path / "pack.toml", "--folder", tmp_path), "no history there"),
+        (("--pack", tmp_path / "pack.toml", "--folder", tmp_path), "no history there: the service has not run yet"),
+        (("--pack", tmp_path / "pack.toml", "--folder", damaged), "file is not a database"),
+        (("--pack", tmp_path / "pack.toml", "--folder", old, "--days", 1), "no rows in this period"),
+        (("--pack", tmp_path / "house"), "house: cannot be read: No such file or directory"),
     ):
         code, printed, err = run(capsys, "report", *arguments, "--out", out)
         assert (code, printed) == (2, "")
