@@ -12,6 +12,8 @@ from bms_estimator.model.errors import UserError
 
 UDEV_CONTROL = Path("/run/udev/control")
 """Socket of udev, which does not run in containers."""
+OTHER_PACKS = f"{places.NAME}@*.service"
+"""Pattern of the units of other packs."""
 Report = Callable[[str, str], None]
 """Function that shows a finished step: its subject, and what was done."""
 
@@ -72,7 +74,7 @@ def start() -> None:
     Raises:
         UserError: The service does not start.
     """
-    restart_running()
+    run(["systemctl", "try-restart", OTHER_PACKS])
     try:
         run(["systemctl", "restart", places.UNIT.name])
     except UserError:
@@ -83,8 +85,8 @@ def start() -> None:
 
 
 def restart_running() -> None:
-    """Restart the running units of other packs (``bms-estimator@NAME``), so that they run the upgraded program."""
-    run(["systemctl", "try-restart", f"{places.NAME}@*.service"])
+    """Restart the running units, so that they run the upgraded program. Units that do not run are not started."""
+    run(["systemctl", "try-restart", places.UNIT.name, OTHER_PACKS])
 
 
 def reload_system() -> None:

@@ -24,6 +24,8 @@ import sys
 from bms_estimator.cli.main import main
 sys.exit(main())
 """
+ELF_MAGIC = b"\x7fELF"
+"""First bytes of a program for Linux."""
 _REQUIREMENT = re.compile(r"([\w.-]+)\s*(?:\[([^]]*)\])?")
 _EXTRA = re.compile(r"extra\s*==\s*['\"]([\w.-]+)['\"]")
 
@@ -90,21 +92,23 @@ def copy_program(target: Path, *, installed_as: Path, python: Path) -> None:
     new = target.with_name(f".{target.name}.new")
     shutil.rmtree(new, ignore_errors=True)
     site_packages = create_environment(new, installed_as=installed_as, python=python)
-    extras = distribution(DISTRIBUTION).metadata.get_all("Provides-Extra") or []
-    copy_packages(required_packages(extras), site_packages)
+    program = distribution(DISTRIBUTION)
+    extras = program.metadata.get_all("Provides-Extra") or []
+    copy_packages(required_packages(program, extras), site_packages)
     _copy_own_package(site_packages)
     shutil.rmtree(target, ignore_errors=True)
     new.rename(target)
 
 
-def required_packages(extras: Iterable[str]) -> list[Distribution]:
-    """Return the installed packages that this program requires, directly or indirectly, sorted by name.
+def required_packages(program: Distribution, extras: Iterable[str]) -> list[Distribution]:
+    """Return the installed packages that a program requires, directly or indirectly, sorted by name.
 
     Args:
-        extras: Extras of this program whose packages are included, as far as they are installed.
+        program: The program.
+        extras: Extras of the program whose packages are included, as far as they are installed.
     """
     found: dict[str, Distribution] = {}
-    pending = list(_requirements(distribution(DISTRIBUTION), set(extras)))
+    pending = list(_requirements(program, set(extras)))
     seen = set()
     while pending:
         name, extras_of_package = requirement = pending.pop()
@@ -131,12 +135,24 @@ def _requirements(package: Distribution, extras: set[str]) -> Iterator[tuple[str
 
 
 def copy_packages(packages: Iterable[Distribution], site_packages: Path) -> None:
-    """Copy the files of installed packages, with compiled Python files and without scripts."""
+    """Copy the files of installed packages to the same places in another environment.
+
+    Programs such as nats-server and compiled Python files are copied, scripts are not: they name their interpreter.
+    """
     for package in packages:
         for file in package.files or []:
-            if ".." in file.parts or "__pycache__" in file.parts:
+            source = Path(str(file.locate()))
+            if "__pycache__" in file.parts or (".." in file.parts and not _is_program(source)):
                 continue
-            _copy(Path(str(file.locate())), site_packages / file)
+            _copy(source, site_packages / file)
+
+
+def _is_program(path: Path) -> bool:
+    """Return True if a file outside of the folder of packages is a program that runs without an interpreter."""
+    if path.parent.name != "bin" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(ELF_MAGIC)) == ELF_MAGIC
 
 
 def _copy_own_package(site_packages: Path) -> None:

@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 from bms_estimator.installation import places
-from bms_estimator.installation.install import Report, reload_system
+from bms_estimator.installation.install import OTHER_PACKS, Report, reload_system
 from bms_estimator.installation.machine import Machine, run, tree
 from bms_estimator.installation.program_copy import is_program_copy
 
@@ -28,7 +28,7 @@ def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
     units = [unit for unit in all_units if machine.path(unit).exists()]
     if units:
         if machine.is_running:
-            run(["systemctl", "stop", places.UNIT.name, f"{places.NAME}@*.service"])
+            run(["systemctl", "stop", places.UNIT.name, OTHER_PACKS])
         machine.run("systemctl", "disable", "--quiet", *(unit.name for unit in units))
         report("service", "stopped and disabled")
     drop_ins = [places.drop_ins(unit) for unit in all_units]

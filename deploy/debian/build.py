@@ -17,13 +17,13 @@ from pathlib import Path
 
 from bms_estimator.installation import places
 from bms_estimator.installation.program_copy import (
+    DISTRIBUTION,
     PYTHON,
     copy_packages,
     create_environment,
     required_packages,
     system_python,
 )
-from bms_estimator.version import __version__
 
 PROJECT = Path(__file__).parents[2]
 EXTRAS = ("calibration", "can", "modbus", "prometheus", "report")
@@ -46,22 +46,23 @@ def build(output: Path, compression: str) -> Path:
     site_packages = create_environment(
         root / ENVIRONMENT.relative_to("/"), installed_as=ENVIRONMENT, python=system_python()
     )
-    packages = required_packages(EXTRAS)
+    with zipfile.ZipFile(build_wheel(output)) as wheel:
+        wheel.extractall(site_packages)
+    program = Distribution.at(next(site_packages.glob(f"{DISTRIBUTION}-*.dist-info")))
+    packages = required_packages(program, EXTRAS)
     require_locked(packages)
     copy_packages(packages, site_packages)
     for folder in list(site_packages.rglob("__pycache__")):  # postinst compiles the files on the machine
         shutil.rmtree(folder)
-    with zipfile.ZipFile(build_wheel(output)) as wheel:
-        wheel.extractall(site_packages)
     link = root / "usr/bin/bms-estimator"
     link.parent.mkdir()
     link.symlink_to(f"..{ENVIRONMENT.as_posix().removeprefix('/usr')}/bin/bms-estimator")
-    write_documents(root / "usr/share/doc/bms-estimator")
-    write_control(root / "DEBIAN", size_kib(root))
+    write_documents(root / "usr/share/doc/bms-estimator", program.version)
+    write_control(root / "DEBIAN", program.version, size_kib(root))
     subprocess.run(["chmod", "-R", "u=rwX,go=rX", root], check=True)
     for library in site_packages.rglob("*.so*"):
         library.chmod(0o644)
-    package = output / f"bms-estimator_{__version__}_{architecture()}.deb"
+    package = output / f"bms-estimator_{program.version}_{architecture()}.deb"
     subprocess.run(["dpkg-deb", "--root-owner-group", f"-Z{compression}", "--build", root, package], check=True)
     return package
 
@@ -97,26 +98,26 @@ def size_kib(root: Path) -> int:
     return sum(path.lstat().st_size for path in root.rglob("*")) // 1024
 
 
-def write_documents(folder: Path) -> None:
+def write_documents(folder: Path, version: str) -> None:
     """Write copyright and changelog."""
     folder.mkdir(parents=True)
     packages = "the licenses of the bundled packages are in /usr/lib/bms-estimator/lib/*/site-packages/*.dist-info"
     license_text = (PROJECT / "LICENSE").read_text(encoding="utf-8")
     (folder / "copyright").write_text(f"bms_estimator; {packages}\n\n{license_text}", encoding="utf-8")
-    entry = f"bms-estimator ({__version__}) unstable; urgency=medium\n\n  * See CHANGELOG.md of the project.\n\n"
+    entry = f"bms-estimator ({version}) unstable; urgency=medium\n\n  * See CHANGELOG.md of the project.\n\n"
     entry += f" -- {MAINTAINER}  {formatdate()}\n"
     compressed = subprocess.run(["gzip", "-9n"], input=entry.encode(), capture_output=True, check=True).stdout
     (folder / "changelog.gz").write_bytes(compressed)
 
 
-def write_control(folder: Path, installed_kib: int) -> None:
+def write_control(folder: Path, version: str, installed_kib: int) -> None:
     """Write the package's description and its maintainer scripts."""
     folder.mkdir()
     minor = sys.version_info.minor
     (folder / "control").write_text(
         f"""\
 Package: bms-estimator
-Version: {__version__}
+Version: {version}
 Architecture: {architecture()}
 Maintainer: {MAINTAINER}
 Installed-Size: {installed_kib}

@@ -5,14 +5,15 @@ import re
 import shutil
 import subprocess
 import uuid
+from importlib.metadata import distribution
 from pathlib import Path
 
 from tests.deploy import kernel_cache
 
 PROJECT = Path(__file__).parents[2]
 ROOT_LINKS = {"bin": "usr/bin", "sbin": "usr/sbin", "lib": "usr/lib", "lib64": "usr/lib64"}
-OWN_FOLDERS = ("etc/systemd/system", "etc/udev/rules.d", "root/bin", "root/house", "var/lib/dpkg")
-MOUNT_POINTS = ("usr", "run", "tmp", "proc", "sys", "dev", "home", "opt/package")
+OWN_FOLDERS = ("etc/systemd/system", "etc/udev/rules.d", "root/bin", "root/house", "root/pip", "var/lib/dpkg")
+MOUNT_POINTS = ("usr", "run", "tmp", "proc", "sys", "dev", "home", "opt/packages")
 COPIED_FILES = ("etc/passwd", "etc/group", "etc/os-release", "etc/nsswitch.conf", "etc/debian_version")
 """Files that the container has from this machine."""
 OVERLAYS = ("/usr", "/var/lib/dpkg")
@@ -69,8 +70,8 @@ ExecStart=/root/container-script
 
 REPLACED_PROGRAMS = {
     "sudo": 'exec "$@"',
-    # this machine's packages have no archive in the container
-    "apt": 'case $1 in install) exec dpkg -i /opt/package/*.deb ;; remove) exec dpkg -r "$2" ;; purge) exec dpkg -P "$2" ;; esac',
+    # this machine's packages have no archive in the container; the container's script links the folder of the package
+    "apt": 'case $1 in install) exec dpkg -i /root/package/*.deb ;; remove) exec dpkg -r "$2" ;; purge) exec dpkg -P "$2" ;; esac',
 }
 """Programs of the documentation page that the container replaces."""
 
@@ -109,6 +110,7 @@ def make_root(root: Path) -> None:
         ("purge", "Uninstall", 1),
     ):
         (root / "root" / name).write_text(commands_of_page(section, block).lstrip("\n"))
+    shutil.copytree(Path(str(distribution("pip").locate_file("pip"))), root / "root/pip/pip")
     (root / "root/bms.conf").write_text(BROKER_CONFIG)
     acl = PROJECT / "deploy/mosquitto"
     packs = [(acl / "pack.acl").read_text().replace("PACK", name) for name in ("pack", "second")]
@@ -134,12 +136,13 @@ def write_program(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
-def boot(root: Path, package: Path, systemd_nspawn: str, timeout_s: float) -> str:
+def boot(root: Path, packages: Path, systemd_nspawn: str, timeout_s: float) -> str:
     """Boot the container until its script powers it off.
 
     Args:
         root: Root folder of ``make_root``.
-        package: Debian package of the program.
+        packages: Folder with two builds of the program, each with a Debian package and a wheel: ``current``, and ``next``
+            of a higher version.
         systemd_nspawn: Path of this program.
         timeout_s: Maximum duration [s].
 
@@ -151,7 +154,7 @@ def boot(root: Path, package: Path, systemd_nspawn: str, timeout_s: float) -> st
     """
     command = [systemd_nspawn, "--quiet", "--register=no", "--keep-unit", "--private-network", f"--directory={root}"]
     command += ["--capability=CAP_SYS_TIME"]  # otherwise the container itself forbids adjtimex
-    command += [f"--bind-ro={package.parent}:/opt/package", *(f"--overlay={folder}::{folder}" for folder in OVERLAYS)]
+    command += [f"--bind-ro={packages}:/opt/packages", *(f"--overlay={folder}::{folder}" for folder in OVERLAYS)]
     command += ["--boot", "systemd.unit=container-script.service", "systemd.mask=systemd-networkd.service"]
     environment = {"PATH": os.environ["PATH"], "SYSTEMD_SECCOMP": os.environ.get("SYSTEMD_SECCOMP", "1")}
     try:

@@ -12,12 +12,48 @@ main_pid() { systemctl show "${1:-bms-estimator}" -P MainPID; }
 run_page() { PATH="/root/bin:$PATH" bash -ex "$1"; }
 lines() { journalctl --no-pager -o cat -u "${1:-bms-estimator}"; }
 traces() { # files of the service outside the program's package
-    find /etc /usr/local /opt /var/lib /var/cache -xdev -path /var/lib/dpkg -prune -o -path /opt/package -prune -o -name "*bms-estimator*" -printf "%u %p\n"
+    find /etc /usr/local /opt /var/lib /var/cache -xdev -path /var/lib/dpkg -prune -o -path /opt/packages -prune -o -name "*bms-estimator*" -printf "%u %p\n"
     id bms-estimator 2>&1 | tr -d "\047‘’"
+}
+# next message of topic $1; with -R those that the broker has stored are skipped
+receive() { timeout 60 mosquitto_sub -v -C 1 -u dashboard -P two -t "bms/pack/$1" $2; }
+snapshot() { # what an upgrade keeps or continues
+    sha256sum /etc/bms-estimator/*
+    systemctl is-enabled bms-estimator bms-estimator@second
+    find /var/lib/bms-estimator -type f | sort
+    bms-estimator history /etc/bms-estimator/pack.toml --folder /var/lib/bms-estimator --events
+    receive health -R
+    receive state -R
+    receive info
+    bms-estimator --version
+}
+# upgrades a running service of edited settings by the commands $2 in place of an edited unit
+upgrade() {
+    echo "# edited" | tee -a /etc/bms-estimator/pack.toml >>/etc/systemd/system/bms-estimator.service
+    until_true 'receive state -R'
+    part "$1_before"
+    snapshot
+    part "$1"
+    mosquitto_sub -u dashboard -P two -t bms/pack/state >/run/states &
+    subscriber=$!
+    first=$(main_pid) second=$(main_pid bms-estimator@second)
+    eval "$2"
+    echo "exit code $?"
+    until_true "systemctl is-active bms-estimator && [ \$(main_pid) != $first ]"
+    until_true "systemctl is-active bms-estimator@second && [ \$(main_pid bms-estimator@second) != $second ]"
+    until_true 'receive info | grep -q "\"version\": *\"$(bms-estimator --version | cut -d " " -f 2)\""'
+    show
+    grep -c "# edited" /etc/bms-estimator/pack.toml /etc/systemd/system/bms-estimator.service
+    lines | grep restored | tail -n 1
+    part "$1_after"
+    snapshot
+    kill $subscriber
+    sed -E 's/.*"publish_time":"([^"]+)".*"soc":([^,]+),.*/published \1 \2/' /run/states
 }
 cache=/var/cache/bms-estimator
 
 part install
+ln -s /opt/packages/current /root/package
 mosquitto_passwd -b /root/bms.passwd pack "$(cat /root/house/mqtt-password)"
 mosquitto_passwd -b /root/bms.passwd second "$(cat /root/house/mqtt-password)"
 mosquitto_passwd -b /root/bms.passwd dashboard two
@@ -83,22 +119,17 @@ show
 systemctl stop bms-estimator
 umount /var/lib/bms-estimator
 
-part upgrade
 systemctl start bms-estimator
-before=$(main_pid)
-echo "# edited" >>/etc/bms-estimator/pack.toml
-run_page /root/install-package
-until_true "systemctl is-active bms-estimator && [ \$(systemctl show bms-estimator -P MainPID) != $before ]"
-tail -n 1 /etc/bms-estimator/pack.toml
-show
-lines | grep restored | tail -n 1
+systemctl enable --quiet --now bms-estimator@second
+cp -a /usr/lib/bms-estimator /root/program
+ln -sfn /opt/packages/next /root/package
+upgrade deb "run_page /root/install-package"
 
 part journal
 lines
 lines bms-estimator@second
 
 part remove
-cp -a /usr/lib/bms-estimator /root/program
 run_page /root/remove
 traces
 
@@ -112,5 +143,12 @@ cp -a /root/cache-of-copy /var/cache/bms-estimator
 /root/program/bin/python3 /root/program/bin/bms-estimator install /root/house/pack.toml
 show
 systemctl show bms-estimator -p ExecStart
+cp /root/second.toml /etc/bms-estimator/
+systemctl enable --quiet --now bms-estimator@second
+systemctl disable --quiet bms-estimator
+upgrade pip "PYTHONPATH=/root/pip /root/program/bin/python3 -m pip install --no-index --upgrade /opt/packages/next/*.whl &&
+    /root/program/bin/bms-estimator install"
+
+part uninstall
 bms-estimator uninstall --purge
 traces

