@@ -23,6 +23,10 @@ from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 
+MAX_FULL_DEVIATION_V = 0.45
+"""Maximum difference between the highest voltages of captures of one cell [V]. Full cells have 2.7 V (LTO), 3.6 V (LFP) or 4.2 V
+(with cobalt, nickel or manganese). An LFP cell shows between 3.34 V (at rest) and 3.65 V (at the end of a charge)."""
+
 Report = Callable[[float, str], None]
 """Function that receives the finished fraction of the work, 0..1, and the name of the present step."""
 
@@ -83,6 +87,7 @@ def calibrate(
     capacity = estimate_capacity(captures, given)
     initial_cell = with_capacity(given, capacity.capacity_ah)
     recognized = tuple(recognize(capture, initial_cell) for capture in captures)
+    _require_equal_full_voltages(recognized)
     if not curves:
         _require_usable_capture(recognized)
     split = hold_back(recognized)
@@ -111,6 +116,24 @@ def calibrate(
         verdict=judge(errors, covered or coverage(validations, model.cell), soc_errors),
         warnings=(*notes, *failures),
     )
+
+
+def _require_equal_full_voltages(captures: Sequence[RecognizedCapture]) -> None:
+    """Raise UserError if the highest voltages of captures show that the cells have different chemistries.
+
+    Captures that determine the OCV contain the full cell. The other ones need not, but do not exceed its voltage either.
+    """
+    ranges_v = {each.capture.name: np.percentile(each.good["voltage_v"], [1.0, 99.0]) for each in captures}
+    from_full = [each.capture.name for each in captures if each.gives_ocv]
+    if not from_full:
+        return
+    low, high = min(from_full, key=lambda name: ranges_v[name][1]), max(ranges_v, key=lambda name: ranges_v[name][1])
+    if ranges_v[high][1] - ranges_v[low][1] > MAX_FULL_DEVIATION_V:
+        lines = [f"\n{name}: {ranges_v[name][0]:.2f} to {ranges_v[name][1]:.2f} V per cell" for name in (low, high)]
+        raise UserError(
+            "the captures are not of one cell, because their voltages at full differ; calibrate each cell by itself"
+            + "".join(lines)
+        )
 
 
 def _require_usable_capture(captures: Sequence[RecognizedCapture]) -> None:

@@ -10,7 +10,7 @@ from enum import StrEnum
 
 from bms_estimator.calibration.guided_test.averages import Average, Averager
 from bms_estimator.calibration.guided_test.load_warnings import limit_warning, load_warning
-from bms_estimator.calibration.guided_test.plan import KNEE_SOC, Limits, Plan
+from bms_estimator.calibration.guided_test.plan import Limits, Plan
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 
 FULL_MARGIN_V = 0.02
@@ -65,6 +65,8 @@ class GuidedTest:
     Attributes:
         phase: Present phase.
         points: Voltages at the ends of the rests.
+        drawn_ah: Charge drawn since the pack was full [Ah].
+        discharge_number: Number of the present or last discharge, from 1; 0 before the first.
         begin_s: Time at which the rest of the full pack began [s]; NaN before. The capture for the calibration begins here.
         restart_reason: Reason why the test began again; empty if it did not, and as soon as the pack is full again.
         warning: Deviation from the instruction, and its remedy; empty if there is no deviation.
@@ -122,63 +124,46 @@ class GuidedTest:
     @property
     def progress(self) -> float:
         """Fraction of the time after the charge that has passed, 0..1."""
-        if self.phase is Phase.DONE:
-            return 1.0
-        total_s = self._plan.full_rest_s + self._discharge_s(0.0)
-        return max(0.0, min(1.0 - self.remaining_s / total_s, 1.0)) if self.phase is not Phase.CHARGE else 0.0
+        return max(0.0, 1.0 - self.remaining_s / self._total_s)
 
     @property
     def remaining_s(self) -> float:
         """Estimated time until the end, without the charge [s]."""
-        if self.phase is Phase.DONE:
-            return 0.0
         if self.phase is Phase.CHARGE:
-            return self._plan.full_rest_s + self._discharge_s(0.0)
-        if self._is_empty:
-            return self._remaining_rest_s
-        return (self._remaining_rest_s if self.phase is not Phase.DISCHARGE else 0.0) + self._discharge_s(self.drawn_ah)
+            return self._total_s
+        rest_s = self._remaining_rest_s if self.phase in (Phase.FULL_REST, Phase.REST) else 0.0
+        return rest_s if self._is_empty else rest_s + self._discharges_s(self.drawn_ah)
 
     @property
     def remaining_basis(self) -> str:
         """Basis of the remaining time, such as the rated capacity and the measured current."""
-        current = f"the measured {self._mean_load_a:.2f} A" if self._load_s else f"a load of {self.load_a:.2g} A"
+        current = f"the measured {self._mean_load_a:.2f} A" if self._load_h else f"a load of {self.load_a:.2g} A"
         without = ", without the charge" if self.phase is Phase.CHARGE else ""
         return f"from the rated {self._limits.capacity_ah:g} Ah and {current}{without}"
 
     @property
-    def drawn_ah(self) -> float:
-        """Charge drawn since the pack was full [Ah]."""
-        return self._drawn_as / 3600.0
-
-    @property
-    def discharge_number(self) -> int:
-        """Number of the present or last discharge, from 1; 0 before the first."""
-        return self._discharges
-
-    @property
     def expected_discharges(self) -> int:
         """Expected number of discharges, by the rated capacity."""
-        return max(round(1.0 / self._plan.step_soc) + 1, self._discharges)
+        return max(round(1.0 / self._plan.step_soc) + 1, self.discharge_number)
+
+    @property
+    def _total_s(self) -> float:
+        return self._plan.full_rest_s + self._discharges_s(0.0)
 
     @property
     def _remaining_rest_s(self) -> float:
-        return max(self._rest_goal_s - self._rested_s, 0.0)
-
-    @property
-    def _rest_goal_s(self) -> float:
-        return self._plan.full_rest_s if self.phase is Phase.FULL_REST else self._plan.rest_s
+        goal_s = self._plan.full_rest_s if self.phase is Phase.FULL_REST else self._plan.rest_s
+        return max(goal_s - self._rested_s, 0.0)
 
     @property
     def _mean_load_a(self) -> float:
         """Mean current of the discharges [A]."""
-        return self._load_as / self._load_s if self._load_s else self.load_a
+        return self._load_ah / self._load_h if self._load_h else self.load_a
 
-    def _discharge_s(self, drawn_ah: float) -> float:
+    def _discharges_s(self, drawn_ah: float) -> float:
         """Return the time of the remaining discharges and the rests after them [s]."""
         remaining_ah = max(self._limits.capacity_ah - drawn_ah, 0.0)
-        # one rest for each step that begins, and one at the knee; the tolerance absorbs rounding
-        rests = math.ceil(remaining_ah / (self._plan.step_soc * self._limits.capacity_ah) - 1e-6)
-        rests += drawn_ah < KNEE_SOC * self._limits.capacity_ah * (1.0 - 1e-6)
+        rests = self._plan.remaining_rests(drawn_ah / self._limits.capacity_ah)
         return 3600.0 * remaining_ah / self._mean_load_a + rests * self._plan.rest_s
 
     def _start_again(self, reason: str) -> None:
@@ -187,19 +172,25 @@ class GuidedTest:
         self.points: list[OcvPoint] = []
         self.begin_s = math.nan
         self._reached_full = self._was_charged = self._is_empty = False
-        self._discharges = self._empty_seconds = 0
-        # charges in ampere-seconds: since full, in this discharge, charged against the plan, in all discharges
-        self._drawn_as = self._step_as = self._returned_as = self._load_as = self._load_s = 0.0
+        self.discharge_number = self._empty_seconds = 0
+        self.drawn_ah = 0.0
+        self._step_ah = 0.0  # charge drawn in this discharge
+        self._returned_ah = 0.0  # charge that was charged against the plan
+        self._load_ah = self._load_h = 0.0  # charge and duration of all discharges
         self._rested_s = self._confirm_s = self._interrupted_s = 0.0
+
+    @property
+    def _max_unplanned_ah(self) -> float:
+        return MAX_UNPLANNED_CHARGE * self._limits.capacity_ah
 
     def _advance(self, now: Average) -> None:
         """Advance the test by a mean; begin again if too much charge may have flowed in a gap before it."""
         step_s = 0.0 if self.latest is None else now.time_s - self.latest.time_s
         last_a = 0.0 if self.latest is None else self.latest.current_a
         self.latest = now
-        lost_as = abs(last_a) * step_s if step_s > MAX_GAP_S else 0.0
-        if lost_as > MAX_UNPLANNED_CHARGE * 3600.0 * self._limits.capacity_ah and self.phase is not Phase.CHARGE:
-            self._start_again(f"Up to {lost_as / 3600.0:.2f} Ah flowed while nothing was measured; begin again.")
+        lost_ah = abs(last_a) * step_s / 3600.0 if step_s > MAX_GAP_S else 0.0
+        if lost_ah > self._max_unplanned_ah and self.phase is not Phase.CHARGE:
+            self._start_again(f"Up to {lost_ah:.2f} Ah flowed while nothing was measured; begin again.")
             return
         self.warning = ""
         if self.phase is not Phase.CHARGE:
@@ -215,13 +206,12 @@ class GuidedTest:
 
     def _count(self, now: Average, step_s: float) -> None:
         """Count the charge since the pack was full; begin again if it is charged, or discharged too early."""
-        max_as = MAX_UNPLANNED_CHARGE * 3600.0 * self._limits.capacity_ah
-        self._drawn_as += now.current_a * step_s
+        self.drawn_ah += now.current_a * step_s / 3600.0
         if self.phase in (Phase.DISCHARGE, Phase.REST):
-            self._returned_as += max(-now.current_a - self._limits.rest_a, 0.0) * step_s
-        if self._returned_as > max_as:
+            self._returned_ah += max(-now.current_a - self._limits.rest_a, 0.0) * step_s / 3600.0
+        if self._returned_ah > self._max_unplanned_ah:
             self._start_again("The pack was charged during the test; begin again.")
-        elif self.phase is Phase.FULL_REST and self._drawn_as > max_as:
+        elif self.phase is Phase.FULL_REST and self.drawn_ah > self._max_unplanned_ah:
             self._start_again("The pack was discharged before the rest of the full pack ended; begin again.")
 
     def _advance_charge(self, now: Average, step_s: float) -> None:
@@ -255,11 +245,11 @@ class GuidedTest:
             if self._interrupted_s > INTERRUPTION_S:
                 self._rested_s = 0.0
                 if self.phase is Phase.FULL_REST and now.current_a < 0.0:  # a full pack that is charged stays full
-                    self.begin_s, self._drawn_as = now.time_s, 0.0
+                    self.begin_s, self.drawn_ah = now.time_s, 0.0
             return
         self._interrupted_s = 0.0
         self._rested_s += step_s
-        if self._rested_s < self._rest_goal_s:
+        if self._remaining_rest_s > 0.0:
             return
         self.points.append(OcvPoint(1.0 - self.drawn_ah / self._limits.capacity_ah, now.voltage_v))
         self._enter(Phase.DONE if self._is_empty else Phase.DISCHARGE, now)
@@ -267,23 +257,21 @@ class GuidedTest:
     def _advance_discharge(self, now: Average, step_s: float) -> None:
         """Wait until the charge of a step is drawn, or the pack is empty."""
         if now.current_a > self._limits.rest_a:
-            self._step_as += now.current_a * step_s
-            self._load_as += now.current_a * step_s
-            self._load_s += step_s
+            self._step_ah += now.current_a * step_s / 3600.0
+            self._load_ah += now.current_a * step_s / 3600.0
+            self._load_h += step_s / 3600.0
         self.warning = load_warning(now, self._limits)
         is_low = now.voltage_v <= self._limits.cutoff_v or now.min_cell_v <= self._limits.min_cell_v
         self._empty_seconds = self._empty_seconds + 1 if is_low else 0
         self._is_empty = self._empty_seconds >= EMPTY_SECONDS
-        goal_as = self._plan.discharge_soc(self._discharges) * 3600.0 * self._limits.capacity_ah
-        if self._is_empty or self._step_as >= goal_as:
+        goal_ah = self._plan.discharge_soc(self.discharge_number) * self._limits.capacity_ah
+        if self._is_empty or self._step_ah >= goal_ah:
             self._enter(Phase.REST, now)
 
     def _enter(self, phase: Phase, now: Average) -> None:
         self.phase = phase
-        self._rested_s = self._interrupted_s = self._step_as = 0.0
+        self._rested_s = self._interrupted_s = self._step_ah = 0.0
+        self._empty_seconds = 0
         if phase is Phase.FULL_REST:
-            self.begin_s, self._drawn_as, self._returned_as = now.time_s, 0.0, 0.0
-            self.restart_reason = ""
-        if phase is Phase.DISCHARGE:
-            self._discharges += 1
-            self._empty_seconds = 0
+            self.begin_s, self.drawn_ah, self.restart_reason = now.time_s, 0.0, ""
+        self.discharge_number += phase is Phase.DISCHARGE

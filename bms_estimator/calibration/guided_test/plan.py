@@ -1,5 +1,6 @@
 """Plans of the guided tests, and the limits of a pack that they respect."""
 
+import math
 from dataclasses import dataclass
 
 REST_C_RATE = 0.03
@@ -33,6 +34,12 @@ class Plan:
     def discharge_soc(self, number: int) -> float:
         """Return the SOC to draw in a discharge, whose ``number`` counts from 1."""
         return {1: KNEE_SOC, 2: self.step_soc - KNEE_SOC}.get(number, self.step_soc)
+
+    def remaining_rests(self, drawn_soc: float) -> int:
+        """Return the number of rests after further discharges, when ``drawn_soc`` (0..1) has been drawn since full."""
+        # one rest for each step that begins, and that of the knee; the tolerance absorbs rounding
+        steps = math.ceil(max(1.0 - drawn_soc, 0.0) / self.step_soc - 1e-6)
+        return steps + (drawn_soc < KNEE_SOC * (1.0 - 1e-6))
 
 
 SHORT = Plan("short", load_c_rate=0.5, step_soc=0.1, rest_s=360.0, full_rest_s=900.0)

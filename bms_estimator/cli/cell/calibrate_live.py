@@ -12,18 +12,17 @@ from rich.text import Text
 
 from bms_estimator.calibration.guided_test.averages import means_of_windows
 from bms_estimator.calibration.guided_test.guided_test import GuidedTest
-from bms_estimator.calibration.guided_test.plan import PLANS, Limits
+from bms_estimator.calibration.guided_test.plan import PLANS
 from bms_estimator.cli.cell.calibration_screen import build_screen, instruction_text, measured_text, remaining_text
-from bms_estimator.cli.cell.calibration_session import Session, join_recordings, shift_samples, start_time
+from bms_estimator.cli.cell.calibration_session import Session, join_recordings, start_time
 from bms_estimator.cli.cell.load_switch import LoadSwitch, board_relay, relay_program
-from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.cli.cell.pack_limits import pack_limits
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.tasks import end, until_first_ends
-from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
@@ -36,12 +35,6 @@ REDRAW_S = 0.5
 """Interval between two updates of the screen [s]."""
 STALE_S = 5.0
 """Age of the last samples at which a relay disconnects the load [s]."""
-CUTOFF_MARGIN_V = 0.02
-"""Distance of the default cut-off above the alarm for low voltage, per cell [V]."""
-DEFAULT_TAIL_C_RATE = 0.05
-"""Charge current at which a charge ends by default, as a C-rate [1/h]."""
-DEFAULT_MAX_TEMPERATURE_C = 60.0
-"""Maximum temperature of a pack without an alarm for high temperature [°C]. Most cells may be discharged up to it."""
 
 
 @dataclass(frozen=True)
@@ -57,33 +50,6 @@ class RelayOptions:
     level: str | None
     command: str | None
     silent_s: int
-
-
-def pack_limits(settings: Settings, pack: CellModel) -> Limits:
-    """Return the limits of a pack, none of them beyond its alarms.
-
-    Args:
-        settings: Settings of the pack.
-        pack: Model of the whole pack.
-    """
-    cells, charge = pack.cell.series_count, settings.pack.charge_limits
-    alarms = {alarm.name: alarm.limit for alarm in monitored_alarms(settings, pack)}
-    grid_v = ocv_grid(pack)[0]
-    margin_v = CUTOFF_MARGIN_V * cells
-    lowest_v = alarms["pack_under_voltage"] + margin_v if "pack_under_voltage" in alarms else float(grid_v[0])
-    full_v = min(charge.full_voltage_v or float(grid_v[-1]), alarms.get("pack_over_voltage", math.inf))
-    cutoff_v = max(charge.cutoff_voltage_v or 0.0, lowest_v)
-    return Limits(
-        capacity_ah=pack.cell.capacity_ah,
-        series_count=cells,
-        full_v=full_v,
-        tail_a=charge.tail_current_a or DEFAULT_TAIL_C_RATE * pack.cell.capacity_ah,
-        cutoff_v=cutoff_v,
-        min_cell_v=alarms.get("cell_under_voltage", cutoff_v / cells - CUTOFF_MARGIN_V) + CUTOFF_MARGIN_V,
-        max_cell_v=alarms.get("cell_over_voltage", full_v / cells + CUTOFF_MARGIN_V),
-        max_discharge_a=min(alarms.get("discharge_over_current", math.inf), pack.cell.current_max_a),
-        max_temperature_c=alarms.get("over_temperature", DEFAULT_MAX_TEMPERATURE_C),
-    )
 
 
 def run_guided_test(settings: Settings, pack: CellModel, session: Session, relay: RelayOptions) -> Columns | None:
@@ -174,7 +140,7 @@ class _LiveTest:
                 await until_first_ends(
                     stop.wait(),
                     self._done.wait(),
-                    _wait_for_end(reading),
+                    asyncio.wait([reading]),  # waits without cancelling the task
                     self._recording.wait_for_end(),
                     self._drive_switch(),
                     self._show(console, source, log),
@@ -209,9 +175,8 @@ class _LiveTest:
         async for received in source:
             samples = received.samples.copy()
             if math.isnan(shift_s):
-                first_s = float(samples["time_s"][0])
-                shift_s = start_time(self._end_s, self._last_arrival_s, time.time()) - first_s
-            shift_samples(samples, float(samples["time_s"][0]) + shift_s)
+                shift_s = start_time(self._end_s, self._last_arrival_s, time.time()) - float(samples["time_s"][0])
+            samples["time_s"] += shift_s
             self._test.feed(samples, received.cells_v)
             self._block_s = time.monotonic()
             self._connected.set()
@@ -249,8 +214,3 @@ class _LiveTest:
                     line = f"{text} [{measured_text(self._test)}; {remaining_text(self._test)}]"
                     console.print(line, markup=False, soft_wrap=True)
                 await asyncio.sleep(REDRAW_S)
-
-
-async def _wait_for_end(task: asyncio.Task[None]) -> None:
-    """Wait until a task ends, without cancelling it."""
-    await asyncio.wait([task])

@@ -125,7 +125,7 @@ def join_recordings(paths: list[Path], sensor: SensorSettings) -> tuple[SampleBl
         if not blocks or not arrivals_s:
             continue
         part = np.concatenate(blocks)
-        shift_samples(part, start_time(end_s, last_arrival_s, float(arrivals_s[0][0])))
+        part["time_s"] += start_time(end_s, last_arrival_s, float(arrivals_s[0][0])) - part["time_s"][0]
         parts.append(part)
         end_s, last_arrival_s = float(part["time_s"][-1]), float(arrivals_s[-1][-1])
     return np.concatenate(parts), last_arrival_s
@@ -146,8 +146,3 @@ def start_time(end_s: float, last_arrival_s: float, first_arrival_s: float) -> f
         first_arrival_s: Arrival of the first sample of the recording [s since 1970].
     """
     return 0.0 if math.isnan(last_arrival_s) else end_s + max(first_arrival_s - last_arrival_s, 1e-3)
-
-
-def shift_samples(samples: SampleBlock, start_s: float) -> None:
-    """Shift the times of samples, in place, so that the first is at ``start_s`` [s]."""
-    samples["time_s"] += start_s - samples["time_s"][0]

@@ -85,3 +85,11 @@ def test_captures_that_determine_nothing_are_listed_with_their_kind() -> None:
     rest = Columns(capture(np.zeros(7200), soc=0.5), "shelf")
     with pytest.raises(UserError, match=r"no capture determines the OCV or resistances(.|\n)*shelf: rest"):
         calibrate([rest], GIVEN, name="mine")
+
+
+def test_captures_of_different_chemistries_are_named_with_their_voltages() -> None:
+    lfp = relaxation()
+    lfp["voltage_v"] *= 3.4 / 4.2
+    message = r"not of one cell.*\nlfp: 2\.\d\d to 3\.\d\d V per cell\nrelaxation: \d\.\d\d to 4\.\d\d V per cell$"
+    with pytest.raises(UserError, match=message):
+        calibrate([CAPTURES["relaxation"], Columns(lfp, "lfp")], GIVEN, name="mine")

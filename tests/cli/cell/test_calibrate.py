@@ -1,25 +1,33 @@
 """``calibrate``: cell file from captures, and beside a simulated board, also after the program was killed."""
 
 import asyncio
+import contextlib
 import gzip
 import io
+import itertools
 import json
+import math
 import sys
 
+import numpy as np
 import pytest
 
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, r_s
+from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, ocv_of_each, r_s
 from bms_estimator.model.cell import load_cell
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.sources.captures.raw_capture import CaptureWriter, read_capture, read_header
 from tests.command_line import PROGRAM, run, running_program
 from tests.patience import LONG_S, end
 
-SPEED = 200.0
-"""Speed of the board. At 1 Hz it sends 200 frames a second. The relay acts later by this factor times the delay of a busy
-machine."""
-LOAD_A = 5.0
+LOAD_A = 3.0
+SLICE_S = 10.0
+"""Time that the board simulates before it waits until the program has recorded it [s]."""
+STALL_S = 0.25
+"""Time without a new record after which the board goes on [s]: the program does not run yet, or has not opened the port."""
+KILL_DELAY_S = 100.0
+"""Time from the beginning of a discharge or rest to the kill [s]."""
 PACK = """
 [pack]
 name = "mine"
@@ -38,20 +46,80 @@ def _text_of(path):
 
 
 class PackWithRelay:
-    """Full cell whose load a relay connects."""
+    """Full cell whose load a relay connects, and the board that measures it.
 
-    def __init__(self):
-        self._cell = load_cell("ncr18650")
+    The board waits for the program after each slice, so that the relay acts within a few slices on a busy machine, too.
+    """
+
+    def __init__(self, folder):
+        self.cell = load_cell("ncr18650")
         self._state, self._time_s, self._current_a = (1.0, 0.0, 0.0), 0.0, 0.0
-        self.board = VirtualBoard(self, rate_hz=1, speed=SPEED)
+        self._folder = folder
+        self.discharges, self._switched_s = 0, 0.0
+        self.board = VirtualBoard(self, rate_hz=1, speed=math.inf)
 
     def __call__(self, time_s):
-        capacity_as = 3600.0 * self._cell.cell.capacity_ah
-        self._state = cell_step(self._state, self._current_a, time_s - self._time_s, capacity_as, self._cell.a)
+        capacity_as = 3600.0 * self.cell.cell.capacity_ah
+        self._state = cell_step(self._state, self._current_a, time_s - self._time_s, capacity_as, self.cell.a)
+        if self.is_loaded != self.board.relay_high:
+            self._switched_s = time_s
+            self.discharges += self.board.relay_high
         self._time_s, self._current_a = time_s, LOAD_A if self.board.relay_high else 0.0
         soc, v_ts, v_tl = self._state
-        voltage_v = ocv(soc, *ocv_grid(self._cell)) - v_ts - v_tl - self._current_a * r_s(soc, self._cell.a)
+        voltage_v = ocv(soc, *ocv_grid(self.cell)) - v_ts - v_tl - self._current_a * r_s(soc, self.cell.a)
         return Reading(self._current_a, float(voltage_v), 25.0)
+
+    def charge(self):
+        """Make the cell full and settled."""
+        self._state = 1.0, 0.0, 0.0
+
+    @property
+    def is_loaded(self):
+        return self._current_a > 0.0
+
+    def is_within(self, phase, number):
+        """Return True from ``KILL_DELAY_S`` after the beginning of a discharge, or of the rest after it."""
+        is_phase = self.is_loaded == (phase == "discharge") and self.discharges == number
+        return is_phase and self._time_s - self._switched_s >= KILL_DELAY_S
+
+    async def advance(self, until=lambda: False):
+        """Advance until a condition holds. The samples before the last slice are then in the program's recording.
+
+        This never returns if no program reads the line any more.
+        """
+        while not until():
+            recorded = self._recorded_bytes()
+            await self.board.run(SLICE_S)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(STALL_S):
+                    while self._recorded_bytes() == recorded:  # noqa: ASYNC110 - a file has no event
+                        await asyncio.sleep(0.001)
+
+    @contextlib.asynccontextmanager
+    async def advancing(self):
+        """Advance in the background, also after the end of the program."""
+        task = asyncio.create_task(self.advance())
+        try:
+            yield
+        finally:
+            await end(task)
+
+    def _recorded_bytes(self):
+        return sum(path.stat().st_size for path in self._folder.glob("*.bms"))
+
+
+def move_to_the_past(recording, seconds):
+    """Write the arrival times of a recording anew, as if its program had been killed ``seconds`` earlier."""
+    header, batches = read_header(recording), list(read_capture(recording))
+    recording.unlink()
+    with CaptureWriter(recording, header) as writer:
+        for arrival_s, data in itertools.chain.from_iterable(batches):
+            writer.write(arrival_s - seconds, data)
+
+
+def ocv_at(cell, drawn_ah):
+    """Return the OCV after charges were drawn from a full cell [V]."""
+    return ocv_of_each(1.0 - drawn_ah / cell.cell.capacity_ah, *ocv_grid(cell))
 
 
 def calibration(folder, *options):
@@ -60,61 +128,56 @@ def calibration(folder, *options):
     return running_program(PROGRAM, *command, folder=folder)
 
 
-async def read_until(process, text):
-    """Read stderr until a line contains ``text``; return the lines."""
-    lines = []
-    async with asyncio.timeout(LONG_S):
-        while not lines or text not in lines[-1]:
-            lines.append((await process.stderr.readline()).decode())
-            assert lines[-1], f"{text!r} is missing in:\n{''.join(lines)}"
-    return lines
-
-
 @pytest.fixture
-async def pack(tmp_path):
-    """Run the board of a full pack, whose settings file is in ``tmp_path``."""
-    simulated = PackWithRelay()
+def pack(tmp_path):
+    """Return a full pack, whose settings file is in ``tmp_path``."""
+    simulated = PackWithRelay(tmp_path)
     with simulated.board as board:
         (tmp_path / "pack.toml").write_text(PACK.format(port=board.path))
-        running = asyncio.create_task(board.run())
         yield simulated
-        await end(running)
 
 
-@pytest.mark.thorough
-async def test_a_killed_calibration_continues_and_writes_the_cell_file(pack, tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("phase", "hours", "begins_again"), [("rest", 1.0, False), ("discharge", 0.0, False), ("discharge", 1.0, True)]
+)
+async def test_after_a_kill_the_test_continues_unless_charge_may_be_missing(
+    pack, tmp_path, phase, hours, begins_again
+) -> None:
     async with calibration(tmp_path) as process:
-        await read_until(process, "[rest 2 of")
+        await pack.advance(until=lambda: pack.is_within(phase, 3))
         process.kill()
-    assert (tmp_path / "cell.calibration.json").exists()
-    async with calibration(tmp_path, "--json") as process:
-        lines = await read_until(process, "[discharge 3 of")
+    assert json.loads((tmp_path / "cell.calibration.json").read_text())["recordings"] == ["cell-1.bms"]
+    move_to_the_past(tmp_path / "cell-1.bms", 3600.0 * hours)
+    pack.board.reset()  # as by the next opening of the port; the relay disconnects the load
+    if begins_again:
+        pack.charge()
+    async with calibration(tmp_path, "--json") as process, pack.advancing():
         out, err = await asyncio.wait_for(process.communicate(), LONG_S)
     assert process.returncode == 0, err.decode()
-    assert "Charge the pack" not in "".join(lines)  # it did not begin again
     result = json.loads(out)
     assert (result["resistances_identified"], result["held_back"]) == (True, True)
-    assert load_cell(tmp_path / "cell.toml").cell.capacity_ah == pytest.approx(3.0, rel=0.05)
     assert {path.name for path in tmp_path.glob("cell-*")} == {"cell-1.bms", "cell-2.bms", "cell-test.csv.gz"}
     assert not (tmp_path / "cell.calibration.json").exists()
     assert not pack.board.relay_high
+    capture_begin_s = float(_text_of(tmp_path / "cell-test.csv.gz").splitlines()[1].partition(",")[0])
+    assert (capture_begin_s > 3600.0) == begins_again
+    drawn_ah = np.linspace(0.0, 2.6, 100)
+    assert ocv_at(load_cell(tmp_path / "cell.toml"), drawn_ah) == pytest.approx(ocv_at(pack.cell, drawn_ah), abs=0.03)
 
 
 async def test_a_signal_disconnects_the_load(pack, tmp_path) -> None:
     async with calibration(tmp_path) as process:
-        await read_until(process, "[discharge ")
-        async with asyncio.timeout(LONG_S):
-            while not pack.board.relay_high:  # noqa: ASYNC110 - the board has no event for its relay
-                await asyncio.sleep(0.01)
+        await pack.advance(until=lambda: pack.is_loaded)
         process.terminate()
-        _, err = await asyncio.wait_for(process.communicate(), LONG_S)
+        async with pack.advancing():
+            _, err = await asyncio.wait_for(process.communicate(), LONG_S)
     assert (process.returncode, pack.board.relay_high) == (0, False)
     assert "the same command continues" in err.decode()
 
 
 async def test_a_port_that_another_program_reads_is_an_error(pack, tmp_path) -> None:
-    async with calibration(tmp_path) as first:
-        await read_until(first, "[discharge ")
+    async with calibration(tmp_path):
+        await pack.advance(until=lambda: pack.is_loaded)
         async with calibration(tmp_path, "--out", "other.toml") as second:
             _, err = await asyncio.wait_for(second.communicate(), LONG_S)
     assert second.returncode == 2
