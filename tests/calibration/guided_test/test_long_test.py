@@ -48,7 +48,7 @@ def follow_instructions(test, pack):
 
 
 def test_the_long_test_measures_the_ocv_in_rests_down_to_the_cut_off() -> None:
-    pack, test = LfpPack(0.9), GuidedTest(LONG, LIMITS)
+    pack, test = LfpPack(0.9, charger_a=1.0), GuidedTest(LONG, LIMITS)
     samples = follow_instructions(test, pack)
     capture = samples[samples["time_s"] >= test.begin_s]
     rests = relaxation_test(capture, CAPACITY_FACTOR * RATED_AH, name="long", series_count=SERIES).rests
