@@ -361,10 +361,10 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
     return cell if capacity_ah is None else with_capacity(cell, capacity_ah)
 
 
-def with_capacity(cell: CellModel, capacity_ah: float) -> CellModel:
-    """Return the cell with another capacity [Ah], whose std is unknown, and unchanged resistances."""
+def with_capacity(cell: CellModel, capacity_ah: float, relative_std: float | None = None) -> CellModel:
+    """Return the cell with another capacity [Ah], its relative std (None: unknown), and unchanged resistances."""
     return cell.model_copy(
-        update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah, "capacity_std": None})}
+        update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah, "capacity_std": relative_std})}
     )
 
 

@@ -195,7 +195,9 @@ async def test_a_new_pack_is_calibrated_and_its_soc_is_within_the_band(
     assert {levels[name] for name in ("settings", "port", "device", "board", "broker")} == {"ok"}
     assert calibration["resistances_identified"]
     assert calibration["capacity_ah"] == pytest.approx(CAPACITY_FACTOR * RATED_AH, rel=0.02)
-    assert load_cell(tmp_path / "cell.toml").cell.capacity_ah == pytest.approx(calibration["capacity_ah"])
+    calibrated = load_cell(tmp_path / "cell.toml").cell
+    assert calibrated.capacity_ah == pytest.approx(calibration["capacity_ah"])
+    assert calibrated.capacity_std == pytest.approx(0.02, abs=0.02)
     assert tomllib.loads(user.file.read_text())["pack"]["cell"] == "cell.toml"
     check_soc(states, first_s, pack)
     assert "The pack's SOC at the end is" in report

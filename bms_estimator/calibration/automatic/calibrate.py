@@ -85,7 +85,7 @@ def calibrate(
     """
     report(0.0, "capacity")
     capacity = estimate_capacity(captures, given)
-    initial_cell = with_capacity(given, capacity.capacity_ah)
+    initial_cell = with_capacity(given, capacity.capacity_ah, capacity.relative_std)
     recognized = tuple(recognize(capture, initial_cell) for capture in captures)
     _require_equal_full_voltages(recognized)
     if not curves:

@@ -1,4 +1,4 @@
-"""Capacity with which the SOC of captures is counted: the measured capacity, or else the rated capacity."""
+"""Capacity with which the SOC of captures is counted, from a slow discharge, rests and the rated capacity."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,9 +13,10 @@ from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-MAX_RESTS_STD = 0.03
-"""Maximum relative standard deviation of a capacity from rests. The OCV curve of a generic cell gives 5 to 10 %, which is no
-better than a rated capacity, or 2 % between a rest when full and a rest when empty. The cell's own curve gives 1 to 2 %."""
+MAX_RESTS_STD = 0.06
+"""Maximum relative standard deviation of a capacity from rests. It lies between 2 and 6 % for a rest when full and a rest when
+empty with the OCV of a generic cell, and above 7 % without these rests. A rated capacity is exact to some percent for a new
+cell, and 10 to 20 % too large for an aged one."""
 
 
 @dataclass(frozen=True)
@@ -24,24 +25,22 @@ class CapacityEstimate:
 
     Attributes:
         capacity_ah: Capacity [Ah].
-        origin: Origin of the value for messages, such as ``measured by 5 rests``.
+        origin: Origin of the value for messages, such as ``drawn in test.csv``.
+        relative_std: Standard deviation relative to the capacity; None if it is unknown.
         from_slow_discharge: True if a slow discharge from full to empty measured it.
     """
 
     capacity_ah: float
     origin: str
+    relative_std: float | None = None
     from_slow_discharge: bool = False
 
 
 def estimate_capacity(captures: Sequence[Columns], rated: CellModel) -> CapacityEstimate:
     """Return the capacity of a cell.
 
-    It comes from the first of these sources that is available:
-
-    1. the charge of a slow discharge from full to empty
-    2. the SOC differences between rests, if the std of the result is small
-    3. the largest charge that a capture draws, if it exceeds the rated capacity
-    4. the rated capacity
+    A slow discharge from full to empty measures it. Otherwise the SOC differences between rests give it if their std
+    is small, and otherwise the rated capacity. If a capture draws a larger charge, this charge is the capacity.
 
     Args:
         captures: Captures of one cell.
@@ -55,23 +54,25 @@ def estimate_capacity(captures: Sequence[Columns], rated: CellModel) -> Capacity
     slow_ah = measured_capacity_ah(branches)
     if np.isfinite(slow_ah):
         return CapacityEstimate(slow_ah, "measured by a slow discharge from full to empty", from_slow_discharge=True)
+    estimate = _rated_or_rests(captures, rated)
     name, drawn_ah = max(((name, _largest_swing_ah(samples)) for name, samples in good.items()), key=lambda x: x[1])
+    if drawn_ah > estimate.capacity_ah:
+        return CapacityEstimate(drawn_ah, f"drawn in {name}, more than the expected {estimate.capacity_ah:.4g} Ah")
+    return estimate
+
+
+def _rated_or_rests(captures: Sequence[Columns], rated: CellModel) -> CapacityEstimate:
+    """Return the capacity by rests if it is exact enough, otherwise the rated capacity."""
     rated_ah = rated.cell.capacity_ah
     try:
-        measured = measure_capacity(captures, rated)
+        rests = measure_capacity(captures, rated)
     except UserError:  # too few rests, or a curve that is too inexact
-        measured = None
-    if (
-        measured is not None
-        and measured.std_ah < MAX_RESTS_STD * measured.capacity_ah
-        and measured.capacity_ah > drawn_ah
-    ):
-        return CapacityEstimate(
-            measured.capacity_ah, f"measured by {len(measured.anchors)} rests, ± {measured.std_ah:.2g} Ah"
-        )
-    if drawn_ah > rated_ah:
-        return CapacityEstimate(drawn_ah, f"drawn in {name}, more than the rated {rated_ah:g} Ah")
-    return CapacityEstimate(rated_ah, "rated; no capture measures it")
+        return CapacityEstimate(rated_ah, "rated; no capture measures it")
+    relative_std = rests.std_ah / rests.capacity_ah
+    if relative_std > MAX_RESTS_STD:
+        return CapacityEstimate(rated_ah, f"rated; rests would measure it to {100.0 * relative_std:.0f} % only")
+    origin = f"measured by {len(rests.anchors)} rests, ± {rests.std_ah:.2g} Ah"
+    return CapacityEstimate(rests.capacity_ah, origin, relative_std)
 
 
 def _largest_swing_ah(good: SampleBlock) -> float:

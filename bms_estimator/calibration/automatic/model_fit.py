@@ -11,7 +11,7 @@ from bms_estimator.calibration.elements.identify import Identification, identify
 from bms_estimator.calibration.elements.identify import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.ocv.sources import ExternalCurve, Recording
 from bms_estimator.calibration.ocv_cell import OcvCell, determine_ocv
-from bms_estimator.model.cell import CellModel, with_name
+from bms_estimator.model.cell import CellModel, with_capacity, with_name
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
 
@@ -70,7 +70,12 @@ class ModelFit:
             UserError: A capture cannot be used, or neither OCV nor resistances are determined.
         """
         ocv = self._fit_ocv(data.ocv)
-        cell = ocv.cell if ocv else self.initial_cell
+        cell = self.initial_cell
+        if ocv is not None:
+            is_slow = self.capacity.from_slow_discharge
+            cell = (
+                ocv.cell if is_slow else with_capacity(ocv.cell, ocv.cell.cell.capacity_ah, self.capacity.relative_std)
+            )
         if not data.resistances:
             return FittedModel(cell, ocv, None, "no capture has a current above 0.1 C")
         captures = [each.capture for each in data.resistances]

@@ -8,7 +8,7 @@ from bms_estimator.calibration.automatic.capacity_estimate import estimate_capac
 from bms_estimator.calibration.automatic.hold_back import hold_back
 from bms_estimator.calibration.automatic.recognition import recognize
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell import load_cell, with_capacity
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps
@@ -42,7 +42,7 @@ def test_a_charge_above_the_rated_capacity_is_the_capacity() -> None:
     small = load_cell("nca", 2.5)
     estimate = estimate_capacity([CAPTURES["relaxation"]], small)
     assert estimate.capacity_ah == pytest.approx(0.97 * TRUTH.cell.capacity_ah, rel=0.01)  # it ends at SOC 0.03
-    assert "relaxation, more than the rated 2.5 Ah" in estimate.origin
+    assert "relaxation, more than the expected 2.5 Ah" in estimate.origin
 
 
 def test_rests_measure_the_capacity_by_an_ocv_of_the_cell() -> None:
@@ -50,6 +50,20 @@ def test_rests_measure_the_capacity_by_an_ocv_of_the_cell() -> None:
     estimate = estimate_capacity([CAPTURES[name] for name in ("relaxation", "pulses", "drive")], wrong)
     assert "rests" in estimate.origin
     assert estimate.capacity_ah == pytest.approx(TRUTH.cell.capacity_ah, rel=0.04)
+
+
+@pytest.mark.parametrize("chemistry", ["lfp", "nmc", "nca", "lco", "lmo"])
+def test_rests_from_full_to_empty_measure_the_capacity_of_an_aged_pack(chemistry) -> None:
+    rated = load_cell(chemistry, 3.0)
+    rest_a = np.zeros(360)
+    knee_a = np.r_[np.zeros(900), np.full(216, 1.2), rest_a]  # discharges 3 % of 2.4 Ah
+    steps_a = np.tile(np.r_[np.full(736, 1.2), rest_a], 9)  # down to 5 %
+    aged = capture(np.r_[knee_a, steps_a], cell=with_capacity(rated, 2.4), soc=1.0)
+    estimate = estimate_capacity([Columns(aged, "test")], rated)
+    assert estimate.capacity_ah == pytest.approx(2.4, rel=0.03)
+    assert estimate.relative_std is not None
+    assert abs(estimate.capacity_ah / 2.4 - 1.0) < 2.0 * estimate.relative_std
+    assert "rests" in estimate.origin
 
 
 def test_a_capture_without_ocv_is_held_back_first() -> None:
