@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from bms_estimator.calibration.guided_test.averages import Average, Averager
-from bms_estimator.calibration.guided_test.load_warnings import limit_warning, load_warning
+from bms_estimator.calibration.guided_test.load_warnings import empty_warning, limit_warning, load_warning
 from bms_estimator.calibration.guided_test.plan import Limits, Plan
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 
@@ -203,6 +203,8 @@ class GuidedTest:
             self._advance_rest(now, step_s)
         if warning := limit_warning(now, self._limits):
             self.warning, self._blocked_until_s = warning, now.time_s + BLOCK_S
+        elif self.phase is not Phase.DISCHARGE:  # a discharge ends by itself at the cut-off
+            self.warning = empty_warning(now, self._limits) or self.warning
 
     def _count(self, now: Average, step_s: float) -> None:
         """Count the charge since the pack was full; begin again if it is charged, or discharged too early."""

@@ -28,6 +28,11 @@ def limit_warning(now: Average, limits: Limits) -> str:
         now.max_cell_v > limits.max_cell_v or now.voltage_v > limits.max_cell_v * limits.series_count
     ):
         return "The voltage is above the limit of the cells: end the charge now."
+    return ""
+
+
+def empty_warning(now: Average, limits: Limits) -> str:
+    """Return a warning about a load of an empty pack; empty without one."""
     if now.current_a > limits.rest_a and now.voltage_v <= limits.cutoff_v:
         return f"The pack is empty ({now.voltage_v:.2f} V): remove the load now."
     return ""

@@ -99,6 +99,15 @@ def test_the_load_of_a_relay_is_on_only_in_discharges() -> None:
     assert not pack.run(3, 1.5, 2.79).load_on
 
 
+def test_a_relay_that_disconnects_an_empty_pack_at_once_ends_the_test() -> None:
+    pack = Pack(relay=True)
+    test = pack.until_first_discharge()
+    for _ in range(10):
+        pack.run(1, *((1.5, 2.79) if test.load_on else (0.0, 3.1)))
+    assert test.phase is Phase.REST
+    assert pack.run(SHORT.rest_s + 5, 0.0, 3.2).is_done
+
+
 def test_the_lowest_cell_ends_a_discharge() -> None:
     pack = Pack()
     pack.until_first_discharge()
