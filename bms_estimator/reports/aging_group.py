@@ -6,16 +6,16 @@ from typing import Any
 
 from bms_estimator.pack_model.aging_course import RESISTANCE_SOC, AgingCourse, Course
 from bms_estimator.plot.style import COLORS, draw_band
-from bms_estimator.reports.report_items import DAY_S, duration_text, number
+from bms_estimator.reports.formats import DAY_S, duration_text, number
 from bms_estimator.reports.report_page import Group, Plot
 from bms_estimator.reports.svg_plot import small_plot
 
 MONTH_S = 30.0 * DAY_S
-"""Length of the month of a change per month [s]."""
+"""Length of a month in "change per month" [s]."""
 MIN_CHANGE_S = 7.0 * DAY_S
 """Minimum duration of a history for a change per month [s]. A change in less time is smaller than its std."""
-OHM = 1e3
-"""Resistances are shown in milliohms."""
+MILLIOHM = 1e3
+"""Milliohms in an ohm."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class AgingHistory:
 
     Attributes:
         course: Values by day; None if there is no fit.
-        missing: Sentence on what is missing; empty with a course.
+        missing: Sentence with the reason why there is no fit; empty if there is one.
     """
 
     course: AgingCourse | None
@@ -32,7 +32,7 @@ class AgingHistory:
 
 
 def aging_group(aging: AgingHistory) -> Group:
-    """Return figures and table of capacity and resistances over days, or a sentence on what is missing."""
+    """Return figures and table of capacity and resistances over days, or the reason why they are missing."""
     title = "Capacity and resistances over days"
     course = aging.course
     if course is None:
@@ -48,7 +48,7 @@ def aging_group(aging: AgingHistory) -> Group:
             Plot(name, small_plot(partial(_draw, course.end_s, *part), salt=f"aging-{name}"))
             for name, part in (
                 ("Capacity with ±2 std", (course.capacity, 1.0, "capacity [Ah]", COLORS[0])),
-                ("DC resistance with ±2 std", (course.total, OHM, "DC resistance [mΩ]", COLORS[1])),
+                ("DC resistance with ±2 std", (course.total, MILLIOHM, "DC resistance [mΩ]", COLORS[1])),
             )
         )
         sentences.append(
@@ -65,8 +65,8 @@ def aging_group(aging: AgingHistory) -> Group:
 def _rows(course: AgingCourse) -> tuple[tuple[str, ...], ...]:
     quantities = (
         ("capacity [Ah]", course.capacity, 1.0),
-        ("R_s [mΩ]", course.series, OHM),
-        ("DC resistance [mΩ]", course.total, OHM),
+        ("R_s [mΩ]", course.series, MILLIOHM),
+        ("DC resistance [mΩ]", course.total, MILLIOHM),
     )
     return tuple(
         (

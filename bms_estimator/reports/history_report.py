@@ -14,7 +14,7 @@ from bms_estimator.plot.style import COLORS, FAINT, draw_band
 from bms_estimator.plot.thinning import MAX_POINTS, thin
 from bms_estimator.reports.aging_group import AgingHistory, aging_group
 from bms_estimator.reports.day_table import day_table
-from bms_estimator.reports.report_items import DAY_S, MINUTE_S, duration_text, number
+from bms_estimator.reports.formats import DAY_S, MINUTE_S, duration_text, number
 from bms_estimator.reports.report_page import Group, Plot, ReportPage, Section
 from bms_estimator.reports.svg_plot import small_plot
 
@@ -45,7 +45,7 @@ class PackHistory:
         columns: Columns of ``store.minute.Minute`` by name, each of shape (n,); NaN where a value is missing.
         events: Time [s since 1970], name and text of each event, oldest first.
         learned: Name, value and std of each learned parameter in the last checkpoint; empty without a checkpoint.
-        not_learned: Reason for which ``learned`` is empty; empty if it is not.
+        not_learned: Reason why there are no learned parameters; empty if there are some.
         aging: Capacity and resistances over the days of the fitted history.
     """
 

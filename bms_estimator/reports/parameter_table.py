@@ -9,7 +9,7 @@ from bms_estimator.estimator.stability_conditions import failed_conditions
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.plot.cell_curves import ELEMENTS, SocCurve, element_over_soc, stability_limits
-from bms_estimator.reports.report_items import number
+from bms_estimator.reports.formats import number
 from bms_estimator.reports.report_page import Group
 
 TABULATED_SOC = (0.2, 0.5, 0.8)

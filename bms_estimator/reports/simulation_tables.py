@@ -10,7 +10,8 @@ from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports import printed_values
-from bms_estimator.reports.report_items import Reproduction, Table, number, percent
+from bms_estimator.reports.formats import number, percent
+from bms_estimator.reports.report_items import Reproduction, Table
 from bms_estimator.reports.simulation import (
     CURRENT_A,
     FINAL_SOC,

@@ -18,8 +18,8 @@ from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.saved import history_of
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.reports.aging_group import AgingHistory
+from bms_estimator.reports.formats import number
 from bms_estimator.reports.history_report import PackHistory
-from bms_estimator.reports.report_items import number
 from bms_estimator.settings.pack import Settings
 from bms_estimator.store.history_reader import HistoryFile
 from bms_estimator.store.minute import MINUTE_S, Minute
