@@ -4,9 +4,9 @@
 
 z_k is the SOC of anchor k, Ah_k the charge counted until its time t_k, Q the capacity, and z_c the SOC at the beginning
 of the continuous part c of a capture. The equation is linear in 1/Q, offset/Q and each part's z_c. All anchors are
-solved jointly by generalized least squares. Plett (2011) weighs the errors of both axes; here the offset of the current
-is an unknown with a prior. Errors of the OCV curve are correlated between anchors at similar SOCs, so that they cancel
-in a capacity between two anchors at the same SOC.
+solved jointly by generalized least squares. The covariance contains the errors of SOC and charge, as in Plett (2011). The
+offset of the current is an unknown with a prior. Errors of the OCV curve are correlated between anchors at similar SOCs,
+so that repeated rests at one SOC do not reduce them.
 """
 
 import itertools
@@ -32,7 +32,7 @@ MAX_DISTANCE_TO_CURVE_STDS = 3.0
 """Maximum distance of a rest's voltage from the voltage range of the OCV curve, in standard deviations. A larger distance
 indicates another cell."""
 MAX_REDUCED_CHI_SQUARED = 9.0
-"""Maximum weighted squared residual of the anchors per degree of freedom."""
+"""Maximum weighted squared residual of the anchors per degree of freedom: residuals of three times their expected errors."""
 VOLTAGE_STEP_V = 1e-3
 """Assumed resolution of a capture's voltage [V]."""
 MAX_SHOWN_REASONS = 8
@@ -133,7 +133,7 @@ def _check_span(anchors: Sequence[Anchor], rejected: Sequence[str], capacity_ah:
     reasons = "".join(f"\n  {line}" for line in rejected[:MAX_SHOWN_REASONS])
     if not anchors:
         raise UserError(
-            "no capacity: no two rests give an SOC with the charge between them counted; rest the cell for half an hour "
+            "no capacity: no two rests give an SOC without a gap between them; rest the cell for half an hour "
             f"near full and again near empty, or give a whole slow discharge to `ocv`{':' if reasons else ''}{reasons}"
         )
     parts = [[anchor for anchor in anchors if anchor.part == part] for part in {anchor.part for anchor in anchors}]
@@ -162,6 +162,7 @@ def _solve(anchors: Sequence[Anchor], rejected: Sequence[str], settings: np.void
     model_rows = _model_rows(anchors)
     precision = np.linalg.inv(_covariance(anchors, settings))
     prior = np.zeros((model_rows.shape[1], model_rows.shape[1]))
+    # inverse variance of offset/Q, the second unknown
     prior[1, 1] = (capacity_ah / max(float(settings["offset_c"]) * capacity_ah, MIN_OFFSET_STD_A)) ** 2
     covariance = np.linalg.inv(model_rows.T @ precision @ model_rows + prior)
     unknowns = covariance @ model_rows.T @ precision @ soc

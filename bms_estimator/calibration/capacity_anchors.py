@@ -92,16 +92,17 @@ class AnchorSearch:
     settings: np.void
     anchors: list[Anchor] = field(default_factory=list)
     rejected: list[str] = field(default_factory=list)
-    _parts: int = 0
+    _part: int = 0  # number of the present part
 
     def add_capture(self, capture: Columns) -> None:
         """Search the continuous parts of a capture."""
         good = remove_glitches(capture.rows, capture.name)
         for first, end in continuous_parts(good, self.settings["capacity_as"] / 3600.0):
             self._add_part(capture.name, good[first:end])
-            self._parts += 1
+            self._part += 1
 
     def _add_part(self, name: str, good: SampleBlock) -> None:
+        """Add the rests of a continuous part."""
         capacity_ah = self.settings["capacity_as"] / 3600.0
         step_ah = good["current_a"][:-1] * np.diff(good["time_s"]) / 3600.0
         counted_ah, throughput_ah = np.r_[0.0, np.cumsum(step_ah)], np.r_[0.0, np.cumsum(np.abs(step_ah))]
@@ -109,7 +110,8 @@ class AnchorSearch:
         resting = resting_samples(good, capacity_ah)
         rests, reasons = find_rests(good, soc, resting, int(self.settings["series"]))
         self.rejected += [f"{name}: {line}" for line in reasons]
-        # the part may begin with either hysteresis state, 1 after a charge or -1 after a discharge
+        # The hysteresis state h at the beginning of the part is unknown: 1 after a charge, -1 after a discharge. Its std
+        # HYST_STD decays by half the difference between both courses.
         hysteresis_soc = float(self.settings["hysteresis_soc"])
         after_charge, after_discharge = (
             hysteresis(good["time_s"], soc, hysteresis_soc, first) for first in (1.0, -1.0)
@@ -121,7 +123,7 @@ class AnchorSearch:
             std = math.hypot(HYSTERESIS_STD, 0.5 * HYST_STD * (after_charge[end] - after_discharge[end]))
             anchor = Anchor(
                 name,
-                self._parts,
+                self._part,
                 rest.start_s + rest.duration_s,
                 rest,
                 *_soc_of_rest(rest, self.settings, mean, std),

@@ -11,7 +11,7 @@ import numpy as np
 
 from bms_estimator.calibration.automatic.capacity_estimate import CapacityEstimate, estimate_capacity
 from bms_estimator.calibration.automatic.hold_back import Split, hold_back, use_all
-from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFit
+from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFitter
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture, recognize
 from bms_estimator.calibration.elements.replay_score import MIN_SOC, SETTLING_S
 from bms_estimator.calibration.ocv.sources import ExternalCurve
@@ -24,8 +24,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 
 MAX_FULL_DEVIATION_V = 0.45
-"""Maximum difference between the highest voltages of captures of one cell [V]. Full cells have 2.7 V (LTO), 3.6 V (LFP) or 4.2 V
-(with cobalt, nickel or manganese). An LFP cell shows between 3.34 V (at rest) and 3.65 V (at the end of a charge)."""
+"""Maximum difference between the highest voltages of captures of one cell [V]. It allows the 0.31 V between a full LFP cell at rest
+(3.34 V) and at the end of a charge (3.65 V), but not the difference between chemistries: full cells have 2.7 V (LTO), 3.6 V (LFP)
+or 4.2 V (with cobalt, nickel or manganese)."""
 
 Report = Callable[[float, str], None]
 """Function that receives the finished fraction of the work, 0..1, and the name of the present step."""
@@ -91,8 +92,8 @@ def calibrate(
     if not curves:
         _require_usable_capture(recognized)
     split = hold_back(recognized)
-    model_fit = ModelFit(initial_cell, capacity, curves, name, temperature_c)
-    validated, model, notes = _fit_both(model_fit, split, use_all(recognized), report)
+    fitter = ModelFitter(initial_cell, capacity, curves, name, temperature_c)
+    validated_model, model, notes = _fit_both(fitter, split, use_all(recognized), report)
     report(1.0, "validation")
     validations, failures = _validate_all(recognized, model)
     covered = coverage(validations, model.cell) if validations else None  # by all captures, not only the data held back
@@ -100,12 +101,12 @@ def calibrate(
     if split.held_back is not None:
         initial_soc = model.initial_soc(split.held_back)
         validation = validate(
-            split.held_back.capture, validated.cell, initial_soc=initial_soc, from_s=split.held_back_from_s
+            split.held_back.capture, validated_model.cell, initial_soc=initial_soc, from_s=split.held_back_from_s
         )
-        validations, soc_errors = [validation], _soc_errors(validation, validated.cell)
+        validations, soc_errors = [validation], _soc_errors(validation, validated_model.cell)
     if not validations:
         raise UserError("\n".join(failures))
-    errors = voltage_errors(validations, validated.cell)
+    errors = voltage_errors(validations, validated_model.cell)
     return Calibration(
         model=model,
         capacity=capacity,
@@ -147,23 +148,23 @@ def _require_usable_capture(captures: Sequence[RecognizedCapture]) -> None:
 
 
 def _fit_both(
-    model_fit: ModelFit, split: Split, all_data: Split, report: Report
+    fitter: ModelFitter, split: Split, all_data: Split, report: Report
 ) -> tuple[FittedModel, FittedModel, list[str]]:
     """Return the model without the data held back, the model of all data, and a note if the first replaces the second."""
     fits = 1 if split.held_back is None else 2  # they take almost the whole time
 
     def fit(data: Split, step: str, finished_fits: int) -> FittedModel:
         report(finished_fits / fits, step)
-        return model_fit.fit(data, lambda fraction: report((finished_fits + fraction) / fits, step))
+        return fitter.fit(data, lambda fraction: report((finished_fits + fraction) / fits, step))
 
-    validated = fit(split, "model without the data held back", 0)
+    validated_model = fit(split, "model without the data held back", 0)
     if split.held_back is None:
-        return validated, validated, []
+        return validated_model, validated_model, []
     model = fit(all_data, "model of all data", 1)
-    if model.identification is None and validated.identification is not None:
+    if model.identification is None and validated_model.identification is not None:
         note = f"the model was fitted without the data held back, because with all data {model.reason}"
-        return validated, validated, [note]
-    return validated, model, []
+        return validated_model, validated_model, [note]
+    return validated_model, model, []
 
 
 def _validate_all(captures: Sequence[RecognizedCapture], model: FittedModel) -> tuple[list[Validation], list[str]]:

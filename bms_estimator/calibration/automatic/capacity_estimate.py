@@ -1,4 +1,4 @@
-"""Capacity with which the SOC of captures is counted, from a slow discharge, rests and the rated capacity."""
+"""Capacity with which the SOC of captures is counted: from a slow discharge, from rests, or the rated capacity."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
 MAX_RESTS_STD = 0.06
-"""Maximum relative standard deviation of a capacity from rests. It lies between 2 and 6 % for a rest when full and a rest when
-empty with the OCV of a generic cell, and above 7 % without these rests. A rated capacity is exact to some percent for a new
-cell, and 10 to 20 % too large for an aged one."""
+"""Maximum relative standard deviation of a capacity from rests. With the OCV of a generic cell, the std is 2 to 6 % if the rests
+include one when full and one when empty, and otherwise above 7 %. A rated capacity is exact to some percent for a new cell, and
+10 to 20 % too large for an aged one."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,9 @@ class CapacityEstimate:
 def estimate_capacity(captures: Sequence[Columns], rated: CellModel) -> CapacityEstimate:
     """Return the capacity of a cell.
 
-    A slow discharge from full to empty measures it. Otherwise the SOC differences between rests give it if their std
-    is small, and otherwise the rated capacity. If a capture draws a larger charge, this charge is the capacity.
+    The first choice is the charge of a slow discharge from full to empty. The second is the capacity by the SOC differences
+    between rests, if its std is small. The third is the rated capacity. If a capture draws more charge than the second or
+    third choice, this charge is the capacity.
 
     Args:
         captures: Captures of one cell.
@@ -55,7 +56,9 @@ def estimate_capacity(captures: Sequence[Columns], rated: CellModel) -> Capacity
     if np.isfinite(slow_ah):
         return CapacityEstimate(slow_ah, "measured by a slow discharge from full to empty", from_slow_discharge=True)
     estimate = _rated_or_rests(captures, rated)
-    name, drawn_ah = max(((name, _largest_swing_ah(samples)) for name, samples in good.items()), key=lambda x: x[1])
+    name, drawn_ah = max(
+        ((name, _largest_swing_ah(samples)) for name, samples in good.items()), key=lambda swing: swing[1]
+    )
     if drawn_ah > estimate.capacity_ah:
         return CapacityEstimate(drawn_ah, f"drawn in {name}, more than the expected {estimate.capacity_ah:.4g} Ah")
     return estimate

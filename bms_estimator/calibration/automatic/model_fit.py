@@ -42,8 +42,8 @@ class FittedModel:
 
 
 @dataclass(frozen=True)
-class ModelFit:
-    """Data of a fit that do not depend on the data that are held back.
+class ModelFitter:
+    """Fitter of cell models. It has the inputs that are equal in the fit without the data held back and in the fit of all data.
 
     Attributes:
         initial_cell: Given cell with the capacity. It supplies what the captures do not determine.
@@ -70,12 +70,9 @@ class ModelFit:
             UserError: A capture cannot be used, or neither OCV nor resistances are determined.
         """
         ocv = self._fit_ocv(data.ocv)
-        cell = self.initial_cell
-        if ocv is not None:
-            is_slow = self.capacity.from_slow_discharge
-            cell = (
-                ocv.cell if is_slow else with_capacity(ocv.cell, ocv.cell.cell.capacity_ah, self.capacity.relative_std)
-            )
+        cell = self.initial_cell if ocv is None else ocv.cell
+        if ocv is not None and not self.capacity.from_slow_discharge:  # whose std the fit of the OCV sets
+            cell = with_capacity(cell, cell.cell.capacity_ah, self.capacity.relative_std)
         if not data.resistances:
             return FittedModel(cell, ocv, None, "no capture has a current above 0.1 C")
         captures = [each.capture for each in data.resistances]

@@ -19,7 +19,7 @@ RESTED_FULL_MARGIN_V = 0.03
 """Tolerance below the full voltage for a full pack at rest, per cell [V]. Full charges end up to 30 mV apart."""
 CONFIRM_S = 60.0
 """Minimum duration of a rest after which a pack counts as full, or a charge as ended too early [s]."""
-EMPTY_SECONDS = 2
+EMPTY_MEANS = 2
 """Number of successive means at or below the cut-off after which the pack counts as empty."""
 MAX_GAP_S = 60.0
 """Maximum time between two means [s]. The charge in a longer gap is unknown."""
@@ -28,7 +28,7 @@ MAX_UNPLANNED_CHARGE = 0.01
 BLOCK_S = 60.0
 """Time for which a relay disconnects the load after a limit was exceeded [s]."""
 INTERRUPTION_S = 3.0
-"""Duration of a current after which it interrupts a rest [s]."""
+"""Duration of a current in a rest after which the rest begins again [s]."""
 
 
 class Phase(StrEnum):
@@ -172,12 +172,15 @@ class GuidedTest:
         self.points: list[OcvPoint] = []
         self.begin_s = math.nan
         self._reached_full = self._was_charged = self._is_empty = False
-        self.discharge_number = self._empty_seconds = 0
+        self.discharge_number = 0
+        self._low_means = 0  # successive means at or below the cut-off
         self.drawn_ah = 0.0
         self._step_ah = 0.0  # charge drawn in this discharge
-        self._returned_ah = 0.0  # charge that was charged against the plan
+        self._returned_ah = 0.0  # charge into the pack during discharges and rests
         self._load_ah = self._load_h = 0.0  # charge and duration of all discharges
-        self._rested_s = self._confirm_s = self._interrupted_s = 0.0
+        self._idle_s = 0.0  # time without a current before the rest of the full pack
+        self._rested_s = 0.0  # time without a current in this rest
+        self._interrupted_s = 0.0  # duration of the present current in this rest
 
     @property
     def _max_unplanned_ah(self) -> float:
@@ -207,7 +210,7 @@ class GuidedTest:
             self.warning = empty_warning(now, self._limits) or self.warning
 
     def _count(self, now: Average, step_s: float) -> None:
-        """Count the charge since the pack was full; begin again if it is charged, or discharged too early."""
+        """Count the charge drawn since the pack was full. Begin again if the pack is charged, or discharged too early."""
         self.drawn_ah += now.current_a * step_s / 3600.0
         if self.phase in (Phase.DISCHARGE, Phase.REST):
             self._returned_ah += max(-now.current_a - self._limits.rest_a, 0.0) * step_s / 3600.0
@@ -226,8 +229,8 @@ class GuidedTest:
             self._enter(Phase.FULL_REST, now)
             return
         is_resting = abs(now.current_a) <= self._limits.rest_a
-        self._confirm_s = self._confirm_s + step_s if is_resting else 0.0
-        if is_resting and self._confirm_s >= CONFIRM_S:
+        self._idle_s = self._idle_s + step_s if is_resting else 0.0
+        if self._idle_s >= CONFIRM_S:
             if now.voltage_v >= full_v - RESTED_FULL_MARGIN_V * cells:
                 self._enter(Phase.FULL_REST, now)
             elif self._was_charged:
@@ -243,7 +246,7 @@ class GuidedTest:
         if abs(now.current_a) > self._limits.rest_a:
             self._interrupted_s += step_s
             verb = "discharged" if now.current_a > 0.0 else "charged"
-            self.warning = f"The pack is {verb} at {abs(now.current_a):.2f} A: disconnect it, the rest begins again."
+            self.warning = f"The pack is {verb} at {abs(now.current_a):.2f} A: disconnect it; the rest begins again."
             if self._interrupted_s > INTERRUPTION_S:
                 self._rested_s = 0.0
                 if self.phase is Phase.FULL_REST and now.current_a < 0.0:  # a full pack that is charged stays full
@@ -264,8 +267,8 @@ class GuidedTest:
             self._load_h += step_s / 3600.0
         self.warning = load_warning(now, self._limits)
         is_low = now.voltage_v <= self._limits.cutoff_v or now.min_cell_v <= self._limits.min_cell_v
-        self._empty_seconds = self._empty_seconds + 1 if is_low else 0
-        self._is_empty = self._empty_seconds >= EMPTY_SECONDS
+        self._low_means = self._low_means + 1 if is_low else 0
+        self._is_empty = self._low_means >= EMPTY_MEANS
         goal_ah = self._plan.discharge_soc(self.discharge_number) * self._limits.capacity_ah
         if self._is_empty or self._step_ah >= goal_ah:
             self._enter(Phase.REST, now)
@@ -273,7 +276,7 @@ class GuidedTest:
     def _enter(self, phase: Phase, now: Average) -> None:
         self.phase = phase
         self._rested_s = self._interrupted_s = self._step_ah = 0.0
-        self._empty_seconds = 0
+        self._low_means = 0
         if phase is Phase.FULL_REST:
             self.begin_s, self.drawn_ah, self.restart_reason = now.time_s, 0.0, ""
         self.discharge_number += phase is Phase.DISCHARGE

@@ -19,7 +19,7 @@ def load_warning(now: Average, limits: Limits) -> str:
 
 
 def limit_warning(now: Average, limits: Limits) -> str:
-    """Return a warning about a limit of the pack that is exceeded; empty if none is."""
+    """Return a warning about a limit of the pack that is exceeded; empty if no limit is."""
     if now.current_a > limits.max_discharge_a:
         return f"The load draws {now.current_a:.2f} A, more than {limits.max_discharge_a:.2f} A: reduce it now."
     if now.temperature_c > limits.max_temperature_c:
@@ -32,7 +32,7 @@ def limit_warning(now: Average, limits: Limits) -> str:
 
 
 def empty_warning(now: Average, limits: Limits) -> str:
-    """Return a warning about a load of an empty pack; empty without one."""
+    """Return a warning about a load that discharges an empty pack; empty without one."""
     if now.current_a > limits.rest_a and now.voltage_v <= limits.cutoff_v:
         return f"The pack is empty ({now.voltage_v:.2f} V): remove the load now."
     return ""

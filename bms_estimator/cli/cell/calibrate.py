@@ -133,7 +133,7 @@ def calibrate_command(
             check_output_file(output, inputs, force=force)
     reject_duplicates(paths)
     given = given_cell(pack, cell, capacity_ah, series)
-    session, written = None, list[Path]()
+    session, recorded = None, list[Path]()
     with capture_files(paths) as files:
         captures, curves = load_captures_and_curves(files, current_sign=current_sign, column_map=column_map)
         if pack is not None and not files:
@@ -142,9 +142,9 @@ def calibrate_command(
             options = RelayOptions(relay.value if relay else None, relay_command, relay_silent_s)
             capture = run_guided_test(settings, given.pack, session, options)
             if capture is None:
-                typer.echo("interrupted; the same command continues", err=True)
+                typer.echo("interrupted; the same command continues the test", err=True)
                 return
-            captures, written = [capture], [session.write_capture(capture)]
+            captures, recorded = [capture], [session.write_capture(capture)]
         with progress_bar("calibrating") as bar:
             calibration = calibrate(
                 [given.scaled(each) for each in captures],
@@ -159,7 +159,7 @@ def calibrate_command(
             session.end()
         _print_result(out, calibration, as_json=as_json)
         if report is not None:
-            _write_report(report, [*files, *written], pack, out, calibration, current_sign, column_map)
+            _write_report(report, [*files, *recorded], pack, out, calibration, current_sign, column_map)
 
 
 def _print_result(out: Path, calibration: Calibration, *, as_json: bool) -> None:

@@ -92,13 +92,13 @@ def _check_port(settings: Settings) -> None:
     try:
         open_port(resolve_port(settings.sensor.port), settings.sensor.baud).close()
     except PortBusyError as error:
-        raise UserError(f"{error}; end that program first, because a serial port serves only one") from None
+        raise UserError(f"{error}; end that program first, because a serial port serves only one program") from None
     except NoPortError:
         return
 
 
 class _LiveTest:
-    """A test that samples of a source advance.
+    """Guided test that runs on the live samples of a source.
 
     Args:
         settings: Settings of the pack.

@@ -70,7 +70,7 @@ def json_result(out: Path, calibration: Calibration) -> dict[str, Any]:
 def _origin_lines(calibration: Calibration) -> list[str]:
     """Return sentences on the origin of the OCV curve and of the resistances."""
     model = calibration.model
-    ocv = "the given cell's, corrected by the fit" if model.ocv is None else "measured"
+    ocv = "from the given cell, corrected by the fit" if model.ocv is None else "measured"
     if model.ocv is not None and model.ocv.sources.usual_hysteresis:
         ocv += f", with the hysteresis of the generic {model.ocv.generic.cell.name}"
     if model.identification is not None:

@@ -112,9 +112,8 @@ def open_session(out: Path, plan: str, pack: str, *, restart: bool) -> Session:
 def join_recordings(paths: list[Path], sensor: SensorSettings) -> tuple[SampleBlock, float]:
     """Return the samples of successive recordings on one clock, and the arrival time of the last [s since 1970].
 
-    Recordings that a power failure ended before the first sync are left out. Each recording begins at time 0. The time
-    between two recordings is that between the arrivals of their samples.
-    The arrival time is NaN without samples.
+    Recordings that a power failure ended before the first sync are left out. Each recording begins at time 0. The gap
+    between two recordings follows from the arrival times of their samples. The arrival time is NaN without samples.
     """
     parts, end_s, last_arrival_s = [np.zeros(0, dtype=SAMPLE)], 0.0, math.nan
     for path in paths:
