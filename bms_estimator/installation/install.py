@@ -32,7 +32,7 @@ class PackFiles:
 
 
 def install(machine: Machine, program: Path, pack: PackFiles | None, report: Report) -> bool:
-    """Write the files of the service, create its user, and enable it. State and settings of an earlier installation remain.
+    """Write the files of the service, create its user, and enable the service. State and settings of an earlier installation remain.
 
     Args:
         machine: Machine of the service.

@@ -1,7 +1,4 @@
-"""Simulated pack under an endless load, with the cell model of Chen and Mora, (2.1) to (2.4) of the thesis.
-
-An empty pack is charged; a full one is not charged further.
-"""
+"""Simulated pack under an endless load, with the cell model of Chen and Mora, (2.1) to (2.4) of the thesis."""
 
 import math
 import random
@@ -71,6 +68,8 @@ LOADS: dict[LoadName, Callable[[float, int], Load]] = {
 class SimulatedPack:
     """Simulated pack. Call the object with times that never decrease.
 
+    An empty pack is charged; a full one is not charged further.
+
     Args:
         cell: Cell model of the whole pack.
         load: Load profile.
@@ -117,7 +116,7 @@ class SimulatedPack:
 
 
 class PackWithRelay(SimulatedPack):
-    """Simulated pack whose load a relay connects. It is never charged.
+    """Simulated pack whose load is connected by a relay. It is never charged.
 
     Args:
         cell: Cell model of the whole pack.

@@ -60,7 +60,7 @@ def build(output: Path, compression: str) -> Path:
     write_documents(root / "usr/share/doc/bms-estimator", program.version)
     write_control(root / "DEBIAN", program.version, size_kib(root))
     subprocess.run(["chmod", "-R", "u=rwX,go=rX", root], check=True)
-    for library in site_packages.rglob("*.so*"):
+    for library in site_packages.rglob("*.so*"):  # libraries of a Debian package are not executable
         library.chmod(0o644)
     package = output / f"bms-estimator_{program.version}_{architecture()}.deb"
     subprocess.run(["dpkg-deb", "--root-owner-group", f"-Z{compression}", "--build", root, package], check=True)
@@ -141,6 +141,8 @@ Description: real-time estimator for Li-ion battery packs
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Build the Debian package.")
     parser.add_argument("output", type=Path, help="new folder for the package and its parts")
-    parser.add_argument("--compression", default="xz", help="of the package, as for dpkg-deb -Z; default: xz")
+    parser.add_argument(
+        "--compression", default="xz", help="compression of the package, as for dpkg-deb -Z; default: xz"
+    )
     arguments = parser.parse_args()
     sys.stdout.write(f"{build(arguments.output, arguments.compression)}\n")

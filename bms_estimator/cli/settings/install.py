@@ -157,7 +157,7 @@ def _report(subject: str, text: str) -> None:
 
 
 def _show_next(*lines: tuple[str, str]) -> None:
-    """Print commands, each with what it does."""
+    """Print commands, each with its effect."""
     width = max(len(command) for command, _ in lines)
     for command, text in lines:
         typer.echo(f"  {command:<{width}}  {text}")
