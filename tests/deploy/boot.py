@@ -70,7 +70,7 @@ ExecStart=/root/container-script
 
 REPLACED_PROGRAMS = {
     "sudo": 'exec "$@"',
-    # this machine's packages have no archive in the container; the container's script links the folder of the package
+    # the container has no archive of packages; its script sets the link /root/package to the folder of a build
     "apt": 'case $1 in install) exec dpkg -i /root/package/*.deb ;; remove) exec dpkg -r "$2" ;; purge) exec dpkg -P "$2" ;; esac',
 }
 """Programs of the documentation page that the container replaces."""

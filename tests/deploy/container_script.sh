@@ -15,9 +15,9 @@ traces() { # files of the service outside the program's package
     find /etc /usr/local /opt /var/lib /var/cache -xdev -path /var/lib/dpkg -prune -o -path /opt/packages -prune -o -name "*bms-estimator*" -printf "%u %p\n"
     id bms-estimator 2>&1 | tr -d "\047‘’"
 }
-# next message of topic $1; with -R those that the broker has stored are skipped
+# next message of topic $1; with -R messages that the broker has stored are skipped
 receive() { timeout 60 mosquitto_sub -v -C 1 -u dashboard -P two -t "bms/pack/$1" $2; }
-snapshot() { # what an upgrade keeps or continues
+snapshot() { # data that an upgrade keeps or continues
     sha256sum /etc/bms-estimator/*
     systemctl is-enabled bms-estimator bms-estimator@second
     find /var/lib/bms-estimator -type f | sort
@@ -27,7 +27,7 @@ snapshot() { # what an upgrade keeps or continues
     receive info
     bms-estimator --version
 }
-# upgrades a running service of edited settings by the commands $2 in place of an edited unit
+# edits settings and unit, and upgrades the running services by the commands $2; $1 is the name of the part
 upgrade() {
     echo "# edited" | tee -a /etc/bms-estimator/pack.toml >>/etc/systemd/system/bms-estimator.service
     until_true 'receive state -R'

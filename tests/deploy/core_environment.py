@@ -1,14 +1,20 @@
 """Environment with the wheel and the packages of requirements-core.lock, and nothing else of the tests' environment."""
 
 import importlib.metadata
+import os
 import re
 import subprocess
 import sys
 import sysconfig
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
+from tests.patience import LONG_S
+
 PROJECT = Path(__file__).parents[2]
+VARIABLES = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+"""Environment variables of a program that must not import the checkout."""
 
 
 def core_packages() -> set[str]:
@@ -46,3 +52,16 @@ def build_wheel(folder: Path) -> Path:
     subprocess.run(command, cwd=PROJECT, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
     return wheel
+
+
+def run_program(command: Sequence[str | Path], folder: Path, kernel_cache: Path) -> subprocess.CompletedProcess[str]:
+    """Run a program of another environment in ``folder``, without access to the checkout."""
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env=VARIABLES | {"NUMBA_CACHE_DIR": str(kernel_cache)},
+        capture_output=True,
+        text=True,
+        timeout=LONG_S,
+        check=False,
+    )

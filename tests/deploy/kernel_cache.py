@@ -1,4 +1,4 @@
-"""Kernel cache for a service with its own cache folder, from the tests' compiled kernels."""
+"""Copy of the tests' compiled kernels for a program with another cache folder."""
 
 import shutil
 from pathlib import Path

@@ -1,6 +1,5 @@
 """The wheel with its dependencies alone: what it needs on disk, and the commands of a user who has only installed it."""
 
-import os
 import subprocess
 import zipfile
 from pathlib import Path
@@ -13,9 +12,9 @@ from tests.deploy.core_environment import (
     core_packages,
     installed_files,
     make_core_environment,
+    run_program,
 )
 from tests.deploy.kernel_cache import fill
-from tests.patience import LONG_S
 
 CORE_PACKAGES = {
     "aiohappyeyeballs",
@@ -75,16 +74,8 @@ def environment(tmp_path_factory):
 
 def run(environment: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the command line in ``folder``."""
-    variables = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    return subprocess.run(
-        [environment / "bin" / "python", "-P", "-c", RUN_AND_LIST_FILES, *arguments],
-        cwd=folder,
-        env=variables | {"NUMBA_CACHE_DIR": str(environment / "cache")},
-        capture_output=True,
-        text=True,
-        timeout=LONG_S,
-        check=False,
-    )
+    command = [environment / "bin" / "python", "-P", "-c", RUN_AND_LIST_FILES, *arguments]
+    return run_program(command, folder, environment / "cache")
 
 
 def test_the_service_needs_these_packages_and_no_others():

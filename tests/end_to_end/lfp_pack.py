@@ -20,7 +20,7 @@ FULL_V = 14.4
 CHARGER_END_A = 0.08
 """Current at which the charge ends [A]."""
 HYSTERESIS_V, HYSTERESIS_SOC = 0.008, 0.03
-"""OCV of a cell after a charge minus that after a discharge [V], and the charge that changes one into the other, as SOC."""
+"""Difference between the OCVs of a cell after a charge and after a discharge [V], and the SOC over which one changes to the other."""
 PROTECTION_V = 8.8
 """Voltage at which the protection circuit disconnects the load [V]."""
 ROOM_C = 25.0
@@ -54,7 +54,7 @@ class LfpPack:
         charger_a: Maximum current of the charger [A].
 
     Attributes:
-        connected: What a user has connected.
+        connected: Device that a user has connected.
         load_a: Current of the load [A].
         history: Time [s] and true SOC (0..1) of each call.
     """

@@ -33,7 +33,7 @@ CALIBRATION_SPEED, RUN_SPEED = 300.0, 500.0
 
 
 @dataclass(frozen=True)
-class Course:
+class Usage:
     """Use of a pack in a test.
 
     Attributes:
@@ -49,7 +49,7 @@ class Course:
     charger_a: float
 
 
-COURSES = {"python": Course(3.2, 0.5, 0.05, 1.0), "simavr": Course(6.0, 0.97, 0.7, 2.0)}
+USAGES = {"python": Usage(3.2, 0.5, 0.05, 1.0), "simavr": Usage(6.0, 0.97, 0.7, 2.0)}
 """Use of the pack by kind of board. With simavr the charge and the use are shorter, because simavr is slower."""
 LOADS_A = (1.0, 0.4, 2.0, 0.0)
 """Currents of the load in use. Each lasts for ``LOAD_S``."""
@@ -64,11 +64,11 @@ class User:
     Args:
         folder: Folder with the settings file.
         pack: The user's pack.
-        course: Use of the pack.
+        usage: Use of the pack.
     """
 
-    def __init__(self, folder: Path, pack: LfpPack, course: Course) -> None:
-        self.folder, self.pack, self.course = folder, pack, course
+    def __init__(self, folder: Path, pack: LfpPack, usage: Usage) -> None:
+        self.folder, self.pack, self.usage = folder, pack, usage
         self.file = folder / "pack.toml"
 
     async def type(self, *arguments: object) -> str:
@@ -117,7 +117,7 @@ class User:
         while not self.pack.is_charged:  # noqa: ASYNC110 - the simulated charger has no event
             await asyncio.sleep(POLL_S)
         start_s = self.pack.history[-1][0]
-        while self.pack.soc > self.course.end_soc:
+        while self.pack.soc > self.usage.end_soc:
             number = int((self.pack.history[-1][0] - start_s) / LOAD_S)
             self.pack.connect(Connected.LOAD, LOADS_A[number % len(LOADS_A)])
             await asyncio.sleep(POLL_S)
@@ -134,14 +134,14 @@ async def run_and_use(user: User, board: Board, broker: Broker) -> tuple[list[di
             charge_s = await user.use_pack()
             end_s = user.pack.history[-1][0]
             states = [json.loads(payload) for payload in listener.all("bms/house/state")]
-            first_s = charge_s - begin_of_charge_s(states, user.course.charger_a)
+            board_start_s = charge_s - begin_of_charge_s(states, user.usage.charger_a)
             await listener.wait_json(
-                "bms/house/state", lambda state: state["board_time_s"] > end_s - first_s - 0.5 * LOAD_S
+                "bms/house/state", lambda state: state["board_time_s"] > end_s - board_start_s - 0.5 * LOAD_S
             )
         service.send_signal(signal.SIGTERM)
         await asyncio.wait_for(service.communicate(), LONG_S)
         assert service.returncode == 0
-        return [json.loads(payload) for payload in listener.all("bms/house/state")], first_s
+        return [json.loads(payload) for payload in listener.all("bms/house/state")], board_start_s
 
 
 def begin_of_charge_s(states: list[dict[str, Any]], charger_a: float) -> float:
@@ -169,12 +169,12 @@ def board_kind(request: pytest.FixtureRequest) -> str:
 async def test_a_new_pack_is_calibrated_and_its_soc_is_within_the_band(
     board_kind: str, tmp_path: Path, broker: Broker
 ) -> None:
-    course = COURSES[board_kind]
-    pack = LfpPack(course.start_soc, course.charger_a)
-    user = User(tmp_path, pack, course)
+    usage = USAGES[board_kind]
+    pack = LfpPack(usage.start_soc, usage.charger_a)
+    user = User(tmp_path, pack, usage)
     async with open_board(board_kind, pack) as board:
         async with board.running():
-            await user.type("board", board.path, "--aref-v", "5.0", "--divider", course.divider)
+            await user.type("board", board.path, "--aref-v", "5.0", "--divider", usage.divider)
             await user.type(
                 *("new", "--device", board.path, "--voltmeter-v", f"{pack.voltage_v:.2f}", "--zero"),
                 *("--name", "house", "--cell", "lfp", "--capacity-ah", RATED_AH, "--series", SERIES),
@@ -187,7 +187,7 @@ async def test_a_new_pack_is_calibrated_and_its_soc_is_within_the_band(
             calibration = await user.calibrate()
         user.edit_settings('cell = "lfp"', 'cell = "cell.toml"')
         user.edit_settings(f"capacity_ah = {RATED_AH}", "#capacity_ah =")
-        states, first_s = await run_and_use(user, board, broker)
+        states, board_start_s = await run_and_use(user, board, broker)
     report = await user.type("report", "--pack", "pack.toml")
 
     levels = {finding["check"]: finding["level"] for finding in findings["findings"]}
@@ -199,15 +199,15 @@ async def test_a_new_pack_is_calibrated_and_its_soc_is_within_the_band(
     assert calibrated.capacity_ah == pytest.approx(calibration["capacity_ah"])
     assert calibrated.capacity_std == pytest.approx(0.02, abs=0.02)
     assert tomllib.loads(user.file.read_text())["pack"]["cell"] == "cell.toml"
-    check_soc(states, first_s, pack)
+    check_soc(states, board_start_s, pack)
     assert "The pack's SOC at the end is" in report
     assert "</html>" in (tmp_path / "report.html").read_text()
 
 
-def check_soc(states: list[dict[str, Any]], first_s: float, pack: LfpPack) -> None:
+def check_soc(states: list[dict[str, Any]], board_start_s: float, pack: LfpPack) -> None:
     """Compare the published SOC with the true one."""
     time_s, true_soc = np.array(pack.history).T
-    at_s = np.array([state["board_time_s"] for state in states]) + first_s
+    at_s = np.array([state["board_time_s"] for state in states]) + board_start_s
     error = np.array([state["soc"] for state in states]) - np.interp(at_s, time_s, true_soc)
     error_in_std = np.abs(error) / np.array([state["soc_std"] for state in states])
     assert len(states) > 50

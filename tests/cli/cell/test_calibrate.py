@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, ocv_of_each, r_s
+from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
 from bms_estimator.model.cell import load_cell
-from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.simulation.simulated_pack import PackWithRelay
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, read_capture, read_header
 from tests.command_line import PROGRAM, run, running_program
@@ -23,9 +23,9 @@ from tests.patience import LONG_S, end
 
 LOAD_A = 3.0
 SLICE_S = 10.0
-"""Time that the board simulates before it waits until the program has recorded it [s]."""
+"""Time that the board simulates before it waits until the program has recorded its samples [s]."""
 STALL_S = 0.25
-"""Time without a new record after which the board goes on [s]: the program does not run yet, or has not opened the port."""
+"""Time after which the board stops waiting [s], because the program does not run yet, or has not opened the port."""
 KILL_DELAY_S = 100.0
 """Time from the beginning of a discharge or rest to the kill [s]."""
 PACK = """
@@ -45,42 +45,35 @@ def _text_of(path):
     return gzip.decompress(path.read_bytes()).decode()
 
 
-class PackWithRelay:
-    """Full cell whose load a relay connects, and the board that measures it.
+class MeasuredPack:
+    """Full cell with a load, and the board that measures it and connects the load.
 
     The board waits for the program after each slice, so that the relay acts within a few slices on a busy machine, too.
     """
 
     def __init__(self, folder):
         self.cell = load_cell("ncr18650")
-        self._state, self._time_s, self._current_a = (1.0, 0.0, 0.0), 0.0, 0.0
         self._folder = folder
-        self.discharges, self._switched_s = 0, 0.0
+        self.is_loaded, self.discharges, self._switched_s = False, 0, 0.0
         self.board = VirtualBoard(self, rate_hz=1, speed=math.inf)
+        self.charge()
 
     def __call__(self, time_s):
-        capacity_as = 3600.0 * self.cell.cell.capacity_ah
-        self._state = cell_step(self._state, self._current_a, time_s - self._time_s, capacity_as, self.cell.a)
+        reading = self._pack(time_s)
         if self.is_loaded != self.board.relay_high:
-            self._switched_s = time_s
-            self.discharges += self.board.relay_high
-        self._time_s, self._current_a = time_s, LOAD_A if self.board.relay_high else 0.0
-        soc, v_ts, v_tl = self._state
-        voltage_v = ocv(soc, *ocv_grid(self.cell)) - v_ts - v_tl - self._current_a * r_s(soc, self.cell.a)
-        return Reading(self._current_a, float(voltage_v), 25.0)
+            self.is_loaded, self._switched_s = self.board.relay_high, time_s
+            self.discharges += self.is_loaded
+        return reading
 
     def charge(self):
         """Make the cell full and settled."""
-        self._state = 1.0, 0.0, 0.0
-
-    @property
-    def is_loaded(self):
-        return self._current_a > 0.0
+        self._pack = PackWithRelay(self.cell, LOAD_A, soc=1.0)
+        self._pack.is_connected = lambda: self.board.relay_high
 
     def is_within(self, phase, number):
         """Return True from ``KILL_DELAY_S`` after the beginning of a discharge, or of the rest after it."""
         is_phase = self.is_loaded == (phase == "discharge") and self.discharges == number
-        return is_phase and self._time_s - self._switched_s >= KILL_DELAY_S
+        return is_phase and self._pack.time_s - self._switched_s >= KILL_DELAY_S
 
     async def advance(self, until=lambda: False):
         """Advance until a condition holds. The samples before the last slice are then in the program's recording.
@@ -109,7 +102,7 @@ class PackWithRelay:
 
 
 def move_to_the_past(recording, seconds):
-    """Write the arrival times of a recording anew, as if its program had been killed ``seconds`` earlier."""
+    """Change the arrival times of a recording, as if its program had been killed ``seconds`` earlier."""
     header, batches = read_header(recording), list(read_capture(recording))
     recording.unlink()
     with CaptureWriter(recording, header) as writer:
@@ -131,7 +124,7 @@ def calibration(folder, *options):
 @pytest.fixture
 def pack(tmp_path):
     """Return a full pack, whose settings file is in ``tmp_path``."""
-    simulated = PackWithRelay(tmp_path)
+    simulated = MeasuredPack(tmp_path)
     with simulated.board as board:
         (tmp_path / "pack.toml").write_text(PACK.format(port=board.path))
         yield simulated
