@@ -139,7 +139,7 @@ def _check_span(anchors: Sequence[Anchor], rejected: Sequence[str], capacity_ah:
     parts = [[anchor for anchor in anchors if anchor.part == part] for part in {anchor.part for anchor in anchors}]
     soc_span = max(np.ptp([anchor.soc for anchor in part]) for part in parts)
     counted_span = max(np.ptp([anchor.counted_ah for anchor in part]) for part in parts) / capacity_ah
-    if soc_span < MIN_SOC_SPAN <= 0.5 * counted_span:
+    if soc_span < MIN_SOC_SPAN <= 0.5 * counted_span:  # enough charge: the voltages or the current must be wrong
         raise UserError(
             f"no capacity: the voltages of the rests are at most {soc_span:.2f} of SOC apart, the charge between them is "
             f"{counted_span:.2f} of the declared capacity: check the curve of the cell file, and that the current is in ampere"

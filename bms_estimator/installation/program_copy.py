@@ -107,7 +107,7 @@ def required_packages(program: Distribution, extras: Iterable[str]) -> list[Dist
         program: The program.
         extras: Extras of the program whose packages are included, as far as they are installed.
     """
-    found: dict[str, Distribution] = {}
+    packages: dict[str, Distribution] = {}
     pending = list(_requirements(program, set(extras)))
     seen = set()
     while pending:
@@ -119,9 +119,9 @@ def required_packages(program: Distribution, extras: Iterable[str]) -> list[Dist
             package = distribution(name)
         except PackageNotFoundError:  # required on another platform, or by an extra that is not installed
             continue
-        found[package.name] = package
+        packages[package.name] = package
         pending += _requirements(package, set(extras_of_package))
-    return [found[name] for name in sorted(found)]
+    return [packages[name] for name in sorted(packages)]
 
 
 def _requirements(package: Distribution, extras: set[str]) -> Iterator[tuple[str, frozenset[str]]]:

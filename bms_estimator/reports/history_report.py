@@ -201,7 +201,7 @@ def _learned(history: PackHistory) -> Group:
         "Learned parameters",
         columns=("parameter", "value", "std"),
         rows=tuple(history.learned),
-        remark="From the last checkpoint of the service. Circuit elements are those of the pack at its SOC then.",
+        remark="From the last checkpoint of the service. Circuit elements are values at the SOC of that time.",
     )
 
 
