@@ -71,6 +71,11 @@ def test_small_charges_and_currents_have_more_decimals():
     assert groups_of(large)["Days"].rows[0][7] == "4.0"
 
 
+def test_table_of_days_has_the_last_two_months():
+    rows = groups_of(history_of(86_400.0 * np.arange(70)))["Days"].rows
+    assert (len(rows), rows[0][0], rows[-1][0]) == (62, "1970-01-09", "1970-03-11")
+
+
 def test_missing_fit_is_a_sentence():
     group = groups_of(history_of([0.0, 60.0]))["Capacity and resistances over days"]
     assert (group.figures, group.rows, group.remark) == ((), (), "No fit.")

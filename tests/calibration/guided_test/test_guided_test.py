@@ -108,6 +108,26 @@ def test_a_relay_that_disconnects_an_empty_pack_at_once_ends_the_test() -> None:
     assert pack.run(SHORT.rest_s + 5, 0.0, 3.2).is_done
 
 
+def test_a_single_low_mean_does_not_end_a_discharge() -> None:
+    pack = Pack()
+    pack.until_first_discharge()
+    low = pack.run(1, 1.5, 2.79)
+    assert (low.phase, low.warning) == (Phase.DISCHARGE, "")
+    assert pack.run(5, 1.5, 3.9).phase is Phase.DISCHARGE
+
+
+def test_a_load_that_stays_connected_to_an_empty_pack_is_reported() -> None:
+    pack = Pack()
+    pack.until_first_discharge()
+    test = pack.run(5, 1.5, 2.79)
+    assert test.phase is Phase.REST
+    assert test.warning == "The pack is empty (2.79 V): remove the load now."
+
+
+def test_a_charge_above_the_limit_of_the_cells_is_reported() -> None:
+    assert "above the limit of the cells: end the charge now" in Pack().run(3, -1.5, 4.3).warning
+
+
 def test_the_lowest_cell_ends_a_discharge() -> None:
     pack = Pack()
     pack.until_first_discharge()
@@ -171,6 +191,14 @@ def test_an_unplanned_or_unmeasured_charge_restarts_the_test(gap_s, seconds, cur
     assert reason in test.restart_reason
     assert test.points == []
     assert pack.charge().restart_reason == ""
+
+
+def test_a_discharge_before_the_end_of_the_first_rest_restarts_the_test() -> None:
+    pack = Pack()
+    assert pack.charge().phase is Phase.FULL_REST
+    test = pack.run(100, 1.5, 4.0)  # 1.4 % of the capacity
+    assert test.phase is Phase.CHARGE
+    assert "discharged before the rest of the full pack ended" in test.restart_reason
 
 
 def test_a_gap_in_a_rest_does_not_interrupt_the_test() -> None:
