@@ -75,7 +75,7 @@ def _rated_or_rests(captures: Sequence[Columns], rated: CellModel) -> CapacityEs
     if relative_std > MAX_RESTS_STD:
         return CapacityEstimate(rated_ah, f"rated; rests would measure it to {100.0 * relative_std:.0f} % only")
     origin = f"measured by {len(rests.anchors)} rests, ± {rests.std_ah:.2g} Ah"
-    return CapacityEstimate(rests.capacity_ah, origin, relative_std)
+    return CapacityEstimate(rests.capacity_ah, origin, round(relative_std, 4))
 
 
 def _largest_swing_ah(good: SampleBlock) -> float:
