@@ -206,11 +206,7 @@ def _unknown_conditions(covered: Coverage) -> list[str]:
     if covered.temperature_c is None:
         unknown.append("the effect of temperature, which was not measured")
     else:
-        low_c, high_c = covered.temperature_c
-        if low_c > USUAL_MIN_C:
-            unknown.append(f"below {low_c:.0f} °C")
-        if high_c < USUAL_MAX_C:
-            unknown.append(f"above {high_c:.0f} °C")
+        unknown += _unknown_temperatures(*covered.temperature_c)
     low, high = covered.soc
     if low > LOW_SOC:
         unknown.append(f"SOC below {100 * low:.0f} %")
@@ -221,6 +217,14 @@ def _unknown_conditions(covered: Coverage) -> list[str]:
     if covered.long_rests == 0:
         unknown.append(f"relaxation, because there is no rest of {LONG_REST_S / 60.0:.0f} minutes")
     return unknown
+
+
+def _unknown_temperatures(low_c: float, high_c: float) -> list[str]:
+    """Return the usual temperatures that the captures, between two temperatures [°C], do not cover."""
+    below, above = low_c > USUAL_MIN_C, high_c < USUAL_MAX_C
+    if below and above and round(low_c) == round(high_c):
+        return [f"temperatures other than {low_c:.0f} °C"]
+    return [*([f"below {low_c:.0f} °C"] if below else []), *([f"above {high_c:.0f} °C"] if above else [])]
 
 
 def _unknown_currents(direction: str, c_rate: float) -> str:

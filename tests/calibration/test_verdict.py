@@ -70,6 +70,7 @@ def test_a_band_that_is_too_narrow_is_reported():
     [
         ({"temperature_c": None}, "the effect of temperature, which was not measured"),
         ({"temperature_c": (-5.0, 31.0)}, "above 31 °C"),
+        ({"temperature_c": (24.8, 25.3)}, "temperatures other than 25 °C"),
         ({"soc": (0.2, 1.0)}, "SOC below 20 %"),
         ({"soc": (0.0, 0.8)}, "SOC above 80 %"),
         ({"charge_c_rate": 0.5}, "charge above 0.5 C"),

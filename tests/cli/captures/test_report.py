@@ -67,7 +67,8 @@ def test_page_on_a_capture_has_verdict_figures_and_tables(page):
     assert re.search(r"The model predicts the voltage within [\d.]+ mV \(RMS per cell.*?: good\.", text)
     assert "The estimated SOC differs from coulomb counting by" in text
     assert (
-        "Not known, because the captures do not show it: below 25 °C; above 25 °C; discharge above 1 C; charge." in text
+        "Not known, because the captures do not show it: temperatures other than 25 °C; discharge above 1 C; charge."
+        in text
     )
     figures = re.findall(r'aria-label="([^"]+)">\s*<svg', page)
     assert figures == [
