@@ -154,8 +154,7 @@ def count_cached_kernels() -> int:
 class _PackageLocator(_CacheLocator):
     """Place of a kernel of this package in the cache.
 
-    numba's own locators use the absolute path and the time of the source file, so that each installation would compile
-    the kernels again.
+    numba's own locators use the absolute path of the source file, so that each installation would compile the kernels again.
     """
 
     def __init__(self, function: Callable[..., Any], source: str) -> None:
