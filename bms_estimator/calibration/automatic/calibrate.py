@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.calibration.automatic.capacity_estimate import CapacityEstimate, estimate_capacity
+from bms_estimator.calibration.automatic.given_values import capacity_warnings, chemistry_warnings
 from bms_estimator.calibration.automatic.hold_back import Split, hold_back, use_all
 from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFitter
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture, recognize
@@ -48,7 +49,8 @@ class Calibration:
         validation_data: Sentence that names the data of the validation.
         validations: Validation on the data that were held back; without such data, validations on all captures.
         verdict: Verdict on the model.
-        warnings: Reasons why data are not in the model, or why captures could not be validated.
+        warnings: Given values that the captures contradict, and reasons why data are not in the model, or why captures could not
+            be validated.
     """
 
     model: FittedModel
@@ -107,6 +109,10 @@ def calibrate(
     if not validations:
         raise UserError("\n".join(failures))
     errors = voltage_errors(validations, validated_model.cell)
+    contradictions = [
+        *chemistry_warnings(given, capacity, model.ocv),
+        *capacity_warnings(given, capacity, recognized, errors.low_soc_rms_v),
+    ]
     return Calibration(
         model=model,
         capacity=capacity,
@@ -115,7 +121,7 @@ def calibrate(
         validation_data=split.sentence,
         validations=tuple(validations),
         verdict=judge(errors, covered or coverage(validations, model.cell), soc_errors),
-        warnings=(*notes, *failures),
+        warnings=(*contradictions, *notes, *failures),
     )
 
 

@@ -35,6 +35,11 @@ class CapacityEstimate:
     relative_std: float | None = None
     from_slow_discharge: bool = False
 
+    @property
+    def is_measured(self) -> bool:
+        """True if a slow discharge or rests measured it."""
+        return self.from_slow_discharge or self.relative_std is not None
+
 
 def estimate_capacity(captures: Sequence[Columns], rated: CellModel) -> CapacityEstimate:
     """Return the capacity of a cell.
@@ -57,7 +62,7 @@ def estimate_capacity(captures: Sequence[Columns], rated: CellModel) -> Capacity
         return CapacityEstimate(slow_ah, "measured by a slow discharge from full to empty", from_slow_discharge=True)
     estimate = _rated_or_rests(captures, rated)
     name, drawn_ah = max(
-        ((name, _largest_swing_ah(samples)) for name, samples in good.items()), key=lambda swing: swing[1]
+        ((name, largest_swing_ah(samples)) for name, samples in good.items()), key=lambda swing: swing[1]
     )
     if drawn_ah > estimate.capacity_ah:
         return CapacityEstimate(drawn_ah, f"drawn in {name}, more than the expected {estimate.capacity_ah:.4g} Ah")
@@ -78,7 +83,7 @@ def _rated_or_rests(captures: Sequence[Columns], rated: CellModel) -> CapacityEs
     return CapacityEstimate(rests.capacity_ah, origin, round(relative_std, 4))
 
 
-def _largest_swing_ah(good: SampleBlock) -> float:
+def largest_swing_ah(good: SampleBlock) -> float:
     """Return the largest difference of the counted charge within a capture [Ah]."""
     counted_ah = np.cumsum(good["current_a"][:-1] * np.diff(good["time_s"])) / 3600.0
     return float(np.ptp(np.r_[0.0, counted_ah]))

@@ -24,14 +24,21 @@ def nearest_generic_cell(soc: Floats, ocv_v: Floats, capacity_ah: float, series_
         capacity_ah: Capacity of the returned cell [Ah].
         series_count: Cells in series.
     """
-    inside = (soc > COMPARED_SOC[0]) & (soc < COMPARED_SOC[1])
-
-    def mean_squared_v2(cell: CellModel) -> float:
-        curve_v = np.interp(soc[inside], *curve(cell, "ocv_v"))
-        return float(np.mean((curve_v - ocv_v[inside]) ** 2))
-
     cells = [load_cell(name, capacity_ah).pack(series_count, 1) for name in generic_cells()]
-    return min(cells, key=mean_squared_v2)
+    return min(cells, key=lambda cell: ocv_rms_difference_v(cell, soc, ocv_v))
+
+
+def ocv_rms_difference_v(cell: CellModel, soc: Floats, ocv_v: Floats) -> float:
+    """Return the RMS difference between a generic cell's OCV and a curve at ``COMPARED_SOC`` [V].
+
+    Args:
+        cell: The generic cell.
+        soc: Shape (n,), increasing.
+        ocv_v: Open-circuit voltage there [V].
+    """
+    inside = (soc > COMPARED_SOC[0]) & (soc < COMPARED_SOC[1])
+    curve_v = np.interp(soc[inside], *curve(cell, "ocv_v"))
+    return float(np.sqrt(np.mean((curve_v - ocv_v[inside]) ** 2)))
 
 
 def curve(cell: CellModel, column: str) -> tuple[Floats, Floats]:

@@ -102,6 +102,8 @@ class GuidedTest:
             return f"Charge the pack to full ({self._limits.full_v:.2f} V), and wait until the charger ends."
         if self.phase is Phase.DONE:
             return "Done: remove the load, and charge the pack."
+        if self.phase is Phase.REST and self._relay:
+            return "The pack rests: nothing to do."
         if self.phase is not Phase.DISCHARGE:
             return f"Let the pack rest: disconnect {'the charger' if self._relay else 'charger and load'}."
         if self._relay:

@@ -15,6 +15,7 @@ from bms_estimator.cli.cell.calibrate_live import RelayOptions, run_guided_test
 from bms_estimator.cli.cell.calibration_input import given_cell, load_captures_and_curves, split_inputs
 from bms_estimator.cli.cell.calibration_output import json_result, remarks, result_text
 from bms_estimator.cli.cell.calibration_session import open_session
+from bms_estimator.cli.cell.load_switch import relay_program
 from bms_estimator.cli.options.capture_input import capture_files
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
@@ -138,12 +139,13 @@ def calibrate_command(
         captures, curves = load_captures_and_curves(files, current_sign=current_sign, column_map=column_map)
         if pack is not None and not files:
             settings = load_settings(pack)
+            program = relay_program(relay_command) if relay_command else None
+            options = RelayOptions(relay.value if relay else None, program, relay_silent_s)
             session = open_session(out, test.value, f"{settings.pack.name}, {given.size}", restart=restart)
-            options = RelayOptions(relay.value if relay else None, relay_command, relay_silent_s)
             capture = run_guided_test(settings, given.pack, session, options)
             if capture is None:
                 typer.echo("interrupted; the same command continues the test", err=True)
-                return
+                raise typer.Exit(130)
             captures, recorded = [capture], [session.write_capture(capture)]
         with progress_bar("calibrating") as bar:
             calibration = calibrate(

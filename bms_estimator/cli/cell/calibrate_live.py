@@ -15,7 +15,7 @@ from bms_estimator.calibration.guided_test.guided_test import GuidedTest
 from bms_estimator.calibration.guided_test.plan import PLANS
 from bms_estimator.cli.cell.calibration_screen import build_screen, instruction_text, measured_text, remaining_text
 from bms_estimator.cli.cell.calibration_session import Session, join_recordings, start_time
-from bms_estimator.cli.cell.load_switch import LoadSwitch, board_relay, relay_program
+from bms_estimator.cli.cell.load_switch import LoadSwitch, SetLoad, board_relay
 from bms_estimator.cli.cell.pack_limits import pack_limits
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
@@ -43,12 +43,12 @@ class RelayOptions:
 
     Attributes:
         level: Level of the board's relay pin that connects the load, ``high`` or ``low``; None: the board has no relay.
-        command: Program that is called with ``on`` or ``off``; None: no program.
+        program: Function that switches the load with a program; None: no program.
         silent_s: Time without a command after which the board disconnects the load by itself [s].
     """
 
     level: str | None
-    command: str | None
+    program: SetLoad | None
     silent_s: int
 
 
@@ -61,7 +61,7 @@ def run_guided_test(settings: Settings, pack: CellModel, session: Session, relay
     Raises:
         UserError: The source, the relay or the recording cannot be used.
     """
-    has_relay = bool(relay.level or relay.command)
+    has_relay = bool(relay.level or relay.program)
     test = GuidedTest(PLANS[session.plan], pack_limits(settings, pack), relay=has_relay)
     samples, last_arrival_s = join_recordings(session.paths, settings.sensor)
     test.feed(samples)
@@ -160,8 +160,8 @@ class _LiveTest:
         Raises:
             UserError: The device has no relay.
         """
-        if self._relay.command:
-            return LoadSwitch(relay_program(self._relay.command), repeat=False)
+        if self._relay.program:
+            return LoadSwitch(self._relay.program, repeat=False)
         if not self._relay.level:
             return None
         if source.relay is None or self._settings.sensor.protocol != "binary":

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import shlex
+import shutil
 from collections.abc import Awaitable, Callable
 
 import structlog
@@ -40,10 +41,20 @@ def board_relay(relay: Callable[[Relay], Awaitable[None]], *, high_is_on: bool, 
 
 
 def relay_program(command: str) -> SetLoad:
-    """Return a function that switches the load with a program, which is called with the argument ``on`` or ``off``."""
+    """Return a function that switches the load with a program, which is called with the argument ``on`` or ``off``.
+
+    Raises:
+        UserError: The program does not exist, or may not be run.
+    """
+    try:
+        program = shlex.split(command)
+    except ValueError as error:
+        raise UserError(f"--relay-command {command}: {error}") from None
+    if not program or shutil.which(program[0]) is None:
+        raise UserError(f"--relay-command {command}: no such program here, or it may not be run")
 
     async def set_load(on: bool) -> None:
-        arguments = [*shlex.split(command), "on" if on else "off"]
+        arguments = [*program, "on" if on else "off"]
         try:
             code = await run_program(arguments, b"", program_environment((), {}), PROGRAM_TIMEOUT_S)
         except StartError as error:

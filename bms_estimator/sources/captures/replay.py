@@ -244,10 +244,12 @@ def open_capture(
         column_map: Columns of a table by quantity; None: recognize them by their names.
 
     Raises:
-        UserError: The file does not exist, or is neither a table nor a raw capture.
+        UserError: The file does not exist, is empty, or is neither a table nor a raw capture.
     """
     if not path.is_file():
         raise UserError(f"{path}: {_why_no_file(path)}")
+    if path.stat().st_size == 0:
+        raise UserError(f"{path}: is empty")
     if is_capture(path):
         return RawCapture(path, sensor, current_sign)
     return open_table(path, Sign(current_sign, sensor.current_sign if sensor else None), column_map)

@@ -11,6 +11,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.model.cell import load_cell, with_capacity
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps
 from tests.calibration.simulated_relaxation import relaxation
 
@@ -52,14 +53,18 @@ def test_rests_measure_the_capacity_by_an_ocv_of_the_cell() -> None:
     assert estimate.capacity_ah == pytest.approx(TRUTH.cell.capacity_ah, rel=0.04)
 
 
+def full_discharge(cell):
+    """Return a capture of a cell of 2.4 Ah from full to SOC 0.05, with rests."""
+    rest_a = np.zeros(360)
+    knee_a = np.r_[np.zeros(900), np.full(216, 1.2), rest_a]  # discharges 3 %
+    steps_a = np.tile(np.r_[np.full(736, 1.2), rest_a], 9)
+    return Columns(capture(np.r_[knee_a, steps_a], cell=with_capacity(cell, 2.4), soc=1.0), "test")
+
+
 @pytest.mark.parametrize("chemistry", ["lfp", "nmc", "nca", "lco", "lmo"])
 def test_rests_from_full_to_empty_measure_the_capacity_of_an_aged_pack(chemistry) -> None:
     rated = load_cell(chemistry, 3.0)
-    rest_a = np.zeros(360)
-    knee_a = np.r_[np.zeros(900), np.full(216, 1.2), rest_a]  # discharges 3 % of 2.4 Ah
-    steps_a = np.tile(np.r_[np.full(736, 1.2), rest_a], 9)  # down to 5 %
-    aged = capture(np.r_[knee_a, steps_a], cell=with_capacity(rated, 2.4), soc=1.0)
-    estimate = estimate_capacity([Columns(aged, "test")], rated)
+    estimate = estimate_capacity([full_discharge(rated)], rated)
     assert estimate.capacity_ah == pytest.approx(2.4, rel=0.03)
     assert estimate.relative_std is not None
     assert abs(estimate.capacity_ah / 2.4 - 1.0) < 2.0 * estimate.relative_std
@@ -107,3 +112,21 @@ def test_captures_of_different_chemistries_are_named_with_their_voltages() -> No
     message = r"not of one cell.*\nlfp: 2\.\d\d to 3\.\d\d V per cell\nrelaxation: \d\.\d\d to 4\.\d\d V per cell$"
     with pytest.raises(UserError, match=message):
         calibrate([CAPTURES["relaxation"], Columns(lfp, "lfp")], GIVEN, name="mine")
+
+
+@pytest.mark.parametrize(("chemistry", "given", "is_warned"), [("lfp", "nmc", True), ("nmc", "lmo", False)])
+def test_a_given_chemistry_that_the_measured_ocv_contradicts_is_warned_about(chemistry, given, is_warned) -> None:
+    test = full_discharge(load_cell(chemistry, 2.4))
+    calibration = calibrate([test], load_cell(given, 2.7), name="mine")
+    assert not calibration.capacity.is_measured
+    warning = f"the measured OCV is that of {chemistry} rather than {given}: check --cell, or cell in [pack]"
+    assert (warning in calibration.warnings) == is_warned
+    assert any("the measured OCV is that" in each for each in calibration.warnings) == is_warned
+
+
+@pytest.mark.parametrize(("rated_ah", "is_warned"), [(33.0, True), (30.0, False)])
+def test_a_rated_capacity_that_a_whole_discharge_contradicts_is_warned_about(data, rated_ah, is_warned) -> None:
+    leaf = load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
+    warnings = calibrate([leaf], load_cell("lmo", rated_ah), name="mine").warnings
+    expected = f"{leaf.name} draws 30.47 Ah from full; if it ended when the cell was empty, give --capacity 30.47"
+    assert warnings == ((expected,) if is_warned else ())

@@ -360,7 +360,11 @@ def convert_time_to_hours(samples):
         (hold_voltage(capture(steps()), 2000), TRUTH, ["the voltage changes by 0.000 mV per ampere"]),
         (convert_time_to_hours(capture(steps())[:9000]), TRUTH, ["it lasts 2.5 s", "check that time_s is in seconds"]),
         (insert_gap(capture(steps())), TRUTH, ["a gap of 3601 s", "A: the charge drawn in it is unknown"]),
-        (capture(steps()), load_cell("thunder_power_6s"), ["lie within the cell's limits", "check the cell file"]),
+        (
+            capture(steps()),
+            load_cell("thunder_power_6s"),
+            ["lie within the cell's limits", "calibrate: --series; report: --pack PACK.toml"],
+        ),
     ],
     ids=[
         "rest",

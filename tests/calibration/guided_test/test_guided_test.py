@@ -96,7 +96,9 @@ def test_the_load_of_a_relay_is_on_only_in_discharges() -> None:
     pack = Pack(relay=True)
     assert not pack.charge().load_on
     assert pack.run(SHORT.full_rest_s + 5, 0.0, 4.18).load_on
-    assert not pack.run(3, 1.5, 2.79).load_on
+    test = pack.run(3, 1.5, 2.79)
+    assert not test.load_on
+    assert test.instruction == "The pack rests: nothing to do."
 
 
 def test_a_relay_that_disconnects_an_empty_pack_at_once_ends_the_test() -> None:

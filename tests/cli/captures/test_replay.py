@@ -338,7 +338,8 @@ def test_closed_stdin_is_reported(monkeypatch, capsys):
 def test_error_on_stdin_shows_no_path(monkeypatch, capsys):
     for data, message in [
         (b"time_s,current_a,voltage_v\n0,none,3.7\n", "stdin: line 2: current_a = 'none': must be a number"),
-        (b"", "stdin: not a capture: no line names the columns; needed: time_s,current_a,voltage_v"),
+        (b"", "stdin: is empty\n"),
+        (b"\n", "stdin: not a capture: no line names the columns; needed: time_s,current_a,voltage_v"),
         (b"\x1f\x8b\x08 no gzip", "stdin: gzip data damaged or cut short"),
     ]:
         code, out, err = replay_stdin(monkeypatch, capsys, data)

@@ -7,6 +7,7 @@ import io
 import itertools
 import json
 import math
+import signal
 import sys
 
 import numpy as np
@@ -158,13 +159,14 @@ async def test_after_a_kill_the_test_continues_unless_charge_may_be_missing(
     assert ocv_at(load_cell(tmp_path / "cell.toml"), drawn_ah) == pytest.approx(ocv_at(pack.cell, drawn_ah), abs=0.03)
 
 
-async def test_a_signal_disconnects_the_load(pack, tmp_path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+async def test_a_signal_disconnects_the_load_and_ends_with_code_130(pack, tmp_path, number) -> None:
     async with calibration(tmp_path) as process:
         await pack.advance(until=lambda: pack.is_loaded)
-        process.terminate()
+        process.send_signal(number)
         async with pack.advancing():
             _, err = await asyncio.wait_for(process.communicate(), LONG_S)
-    assert (process.returncode, pack.board.relay_high) == (0, False)
+    assert (process.returncode, pack.board.relay_high) == (130, False)
     assert "the same command continues" in err.decode()
 
 
@@ -219,6 +221,10 @@ def test_a_capture_of_a_pack_from_standard_input_is_scaled_to_one_cell(capsys, m
         (("{capture}",), "give --cell NAME and --capacity AH"),
         (("{capture}", "--cell", "lmo"), "give its capacity"),
         (("{pack}", "--out", "{pack}", "--force"), "is also an input"),
+        (
+            ("{pack}", "--relay-command", "/no/such", "--out", "{missing}"),
+            "--relay-command /no/such: no such program here",
+        ),
         (("{missing}", "--cell", "lmo", "--capacity", "30"), "no such file"),
     ],
 )

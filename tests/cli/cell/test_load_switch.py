@@ -32,6 +32,14 @@ async def test_the_program_is_called_with_each_change_and_at_the_end(tmp_path) -
     assert calls.read_text() == "off\non\noff\n"
 
 
+@pytest.mark.parametrize("command", ["/no/such", "{folder}", "{file}", "'unfinished", " "])
+def test_a_program_that_cannot_be_run_is_an_error(tmp_path, command) -> None:
+    file = tmp_path / "text"
+    file.write_text("#!/bin/sh\n")
+    with pytest.raises(UserError, match="--relay-command"):
+        relay_program(command.format(folder=tmp_path, file=file))
+
+
 async def test_a_load_that_cannot_be_disconnected_is_an_error(tmp_path) -> None:
     switch = LoadSwitch(relay_program(program(tmp_path, '[ "$1" = on ]')), repeat=False)
     await switch.release()  # it was never connected

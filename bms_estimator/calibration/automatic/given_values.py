@@ -1,0 +1,59 @@
+"""Warnings about given values that the captures contradict: the chemistry and the rated capacity."""
+
+from collections.abc import Sequence
+
+from bms_estimator.calibration.automatic.capacity_estimate import CapacityEstimate, largest_swing_ah
+from bms_estimator.calibration.automatic.recognition import RecognizedCapture
+from bms_estimator.calibration.elements.generic_prior import ocv_rms_difference_v
+from bms_estimator.calibration.ocv.table_fit import NODES
+from bms_estimator.calibration.ocv_cell import OcvCell
+from bms_estimator.model.cell import CellModel, generic_cells, load_cell
+
+MIN_CHEMISTRY_DIFFERENCE_V = 0.25
+"""Minimum excess of the given cell's RMS difference from the measured OCV over that of the nearest generic cell [V]. The excess
+is at most 0.19 V among LCO, LMO, NCA and NMC. If only one of the two cells is LFP or LTO, it is at least 0.34 V with a rated
+capacity up to 12 % too large."""
+MIN_LOW_SOC_RMS_V = 0.1
+"""Minimum RMS error at low SOC that suggests a wrong capacity, per cell [V]. With the capacity drawn,
+a Leaf cell has 31 mV and an NCR18650 cell 71 mV. With a capacity that is 8 % too large, the Leaf cell has 228 mV."""
+MIN_DRAWN_FRACTION = 0.8
+"""Minimum fraction of the rated capacity that a capture draws if its end may be an empty cell. Cells usually count
+as worn out at 80 % of their rated capacity."""
+
+
+def chemistry_warnings(given: CellModel, capacity: CapacityEstimate, ocv: OcvCell | None) -> list[str]:
+    """Return a warning if the measured OCV is that of another chemistry than the given generic cell's.
+
+    There is no warning if the capacity was measured, because the given cell then determines neither capacity nor OCV.
+    """
+    if ocv is None or capacity.is_measured or given.cell.name not in generic_cells():
+        return []
+    generic = load_cell(given.cell.name, given.cell.capacity_ah)
+    given_v, nearest_v = (ocv_rms_difference_v(cell, NODES, ocv.fit(NODES)) for cell in (generic, ocv.generic))
+    if given_v - nearest_v < MIN_CHEMISTRY_DIFFERENCE_V:
+        return []
+    nearest = ocv.generic.cell.name
+    return [f"the measured OCV is that of {nearest} rather than {generic.cell.name}: check --cell, or cell in [pack]"]
+
+
+def capacity_warnings(
+    given: CellModel, capacity: CapacityEstimate, captures: Sequence[RecognizedCapture], low_soc_rms_v: float
+) -> list[str]:
+    """Return a warning if the rated capacity is used, and the charge drawn from full may be the capacity instead.
+
+    Args:
+        given: Cell with the rated capacity.
+        capacity: Capacity that SOC was counted against.
+        captures: The captures; those that determine the OCV begin with a full cell.
+        low_soc_rms_v: RMS error of the model at low SOC, per cell [V]; NaN without samples.
+    """
+    rated_ah = given.cell.capacity_ah
+    drawn = [(largest_swing_ah(each.good), each.capture.name) for each in captures if each.gives_ocv]
+    if not drawn or capacity.capacity_ah != rated_ah or not low_soc_rms_v > MIN_LOW_SOC_RMS_V:
+        return []
+    drawn_ah, name = max(drawn)
+    if drawn_ah < MIN_DRAWN_FRACTION * rated_ah:
+        return []
+    return [
+        f"{name} draws {drawn_ah:.4g} Ah from full; if it ended when the cell was empty, give --capacity {drawn_ah:.4g}"
+    ]
