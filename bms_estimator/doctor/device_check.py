@@ -7,11 +7,13 @@ import asyncio
 import contextlib
 import math
 import os
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from bms_estimator.doctor.finding import Finding, fault, ok, warning
 from bms_estimator.doctor.subject import Subject
+from bms_estimator.installation.root_command import root_command
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.sources.factory import open_line_source
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
@@ -133,7 +135,7 @@ def check_board(subject: Subject, board: Mapping[str, str]) -> Iterator[Finding]
     except PermissionError:
         yield warning("board", f"{file.path}: cannot be read by this user; not compared", subject.command_as_root)
         return
-    accept = f"sudo {file.accept_command} {subject.path}"
+    accept = shlex.join(root_command("board", "--folder", file.path.parent, "--accept", subject.path))
     if known.get("serial") and known["serial"] != board.get("serial"):
         yield fault("board", f"board {board.get('serial')} is connected, but the pack's is {known['serial']}", accept)
     elif changes := [name for name in CALIBRATION_FIELDS if known.get(name) and known[name] != board.get(name)]:

@@ -1,18 +1,20 @@
-"""Check of the cache of compiled kernels: complete, writable, and free of earlier versions."""
+"""Check of the cache of compiled kernels: complete, writable, and free of other versions."""
 
 import os
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
 from bms_estimator.doctor.finding import Finding, ok, warning
 from bms_estimator.doctor.subject import Subject
+from bms_estimator.installation.root_command import root_command
 from bms_estimator.numba_cache import cache_folders, source_digest
 
 NAME = "kernel cache"
 STEP_KERNELS = "kernels/step.*.nbi"
 """Pattern of the files of the estimator's step, which is compiled last."""
-MAX_OLD_VERSIONS = 3
-"""Maximum number of folders with kernels of earlier versions without a warning. Each may take more than 100 MB."""
+MAX_OTHER_VERSIONS = 3
+"""Maximum number of folders with kernels of other versions without a warning. Each may take more than 100 MB."""
 
 
 def check_kernels(subject: Subject | None) -> Iterator[Finding]:
@@ -32,10 +34,11 @@ def check_kernels(subject: Subject | None) -> Iterator[Finding]:
     else:
         text = f"{version_folder}: not compiled yet: the first start may take minutes"
         yield warning(NAME, text, "start the service, or run any replay, once")
-    old_versions = [each for each in folder.iterdir() if each.is_dir() and each != version_folder]
-    if len(old_versions) > MAX_OLD_VERSIONS:
-        remedy = f"find {folder} -mindepth 1 -maxdepth 1 ! -name {version_folder.name} -exec rm -r {{}} +"
-        yield warning(NAME, f"{folder}: kernels of {len(old_versions)} earlier versions take space", remedy)
+    other_versions = [each for each in folder.iterdir() if each.is_dir() and each != version_folder]
+    if len(other_versions) > MAX_OTHER_VERSIONS:
+        command = f"find {folder} -mindepth 1 -maxdepth 1 ! -name {version_folder.name} -exec rm -r {{}} +"
+        remedy = f"{command}  # other installed versions then compile theirs again"
+        yield warning(NAME, f"{folder}: kernels of {len(other_versions)} other versions take space", remedy)
 
 
 def size_of(folder: Path) -> int:
@@ -49,4 +52,4 @@ def _own_cache_folder() -> Path | None:
 
 
 def _command_as_root(subject: Subject | None) -> str:
-    return subject.command_as_root if subject else "sudo bms-estimator doctor"
+    return subject.command_as_root if subject else shlex.join(root_command("doctor"))

@@ -61,7 +61,7 @@ def _permission(subject: Subject, port: str) -> Finding:
     owner = f"{_user_name(status.st_uid)}:{_group_name(status.st_gid)} {stat.filemode(status.st_mode)}"
     if is_root() and subject.unit:
         user, groups = NOBODY, _groups_of_service()
-        name, remedy = "the service's user", f"sudo bms-estimator install {subject.path}"
+        name, remedy = "the service's user", subject.install_command
     else:
         user, groups = os.geteuid(), {os.getegid(), *os.getgroups()}
         name = _user_name(user)
@@ -70,7 +70,7 @@ def _permission(subject: Subject, port: str) -> Finding:
     if may_open(status, user, groups):
         return ok(NAME, f"{port}: {name} may open it ({owner})")
     if status.st_gid == ROOT_USER or not status.st_mode & stat.S_IWGRP:
-        remedy = f"let the group open it: sudo bms-estimator install {subject.path}"
+        remedy = f"let the group open it: {subject.install_command}"
     return fault(NAME, f"{port}: {name} may not open it ({owner})", remedy)
 
 
@@ -88,7 +88,7 @@ def _udev_rule(subject: Subject) -> Finding:
         if (folder / places.UDEV_RULE.name).exists():
             return ok("udev rule", f"{folder / places.UDEV_RULE.name}")
     text = "not installed: a board may get another name after a reboot, and ModemManager may write to it"
-    return warning("udev rule", text, f"sudo bms-estimator install {subject.path}")
+    return warning("udev rule", text, subject.install_command)
 
 
 def _user_name(user: int) -> str:

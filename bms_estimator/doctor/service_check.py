@@ -19,9 +19,7 @@ def check_service(subject: Subject) -> Iterator[Finding]:
             yield ok(NAME, "runs, but not by systemd")
         else:
             text = f"does not run, and no systemd unit runs {subject.path}"
-            yield warning(
-                NAME, text, f"sudo bms-estimator install {subject.path}; or: bms-estimator run {subject.path}"
-            )
+            yield warning(NAME, text, f"{subject.install_command}; or: bms-estimator run {subject.path}")
         return
     yield describe_unit(unit)
     if not unit.is_enabled:

@@ -1,10 +1,12 @@
 """Pack that is examined, its service and its folders."""
 
 import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 from bms_estimator.doctor.systemd_unit import SystemdUnit
+from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.process.instance_lock import is_locked
 from bms_estimator.process.state_folder import state_folder_path
@@ -57,7 +59,12 @@ class Subject:
     @property
     def command_as_root(self) -> str:
         """Command that examines the pack as root, who can read the folders of the systemd unit."""
-        return f"sudo bms-estimator doctor {self.path}"
+        return shlex.join(root_command("doctor", self.path))
+
+    @property
+    def install_command(self) -> str:
+        """Command that installs the service of the pack."""
+        return shlex.join(root_command("install", self.path))
 
 
 def is_root() -> bool:

@@ -19,6 +19,15 @@ MEASURED: dict[str, Any] = {"color": COLORS[0], "alpha": 0.45, "linewidth": 2.4}
 MODEL: dict[str, Any] = {"color": COLORS[1], "linestyle": "--", "linewidth": 1.1}
 """Style of a model's values."""
 
+MIN_VOLTAGE_SPAN_V = 0.01
+"""Minimum span of an axis of voltages [V]. On a smaller axis the resolution of a sensor would look like a signal."""
+MIN_CURRENT_SPAN_A = 0.01
+"""Minimum span of an axis of currents [A]."""
+MIN_TEMPERATURE_SPAN_K = 1.0
+"""Minimum span of an axis of temperatures [K]."""
+MIN_SOC_SPAN_PERCENT = 1.0
+"""Minimum span of an axis of SOC [%]."""
+
 STYLE: Any = {
     "svg.fonttype": "path",
     "font.family": "sans-serif",
@@ -32,6 +41,7 @@ STYLE: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    "axes.formatter.useoffset": False,
     "grid.color": "#e6eaef",
     "grid.linewidth": 0.7,
     "xtick.color": INK,
@@ -48,6 +58,13 @@ STYLE: Any = {
 def draw_band(ax: Any, x: Floats, low: Floats, high: Floats, *, color: str = COLORS[0], label: str = "") -> None:
     """Draw the band between two curves, with an entry in the legend if it has a label."""
     ax.fill_between(x, low, high, color=color, alpha=BAND_ALPHA, lw=0.0, label=label or None)
+
+
+def widen(ax: Any, min_span: float) -> None:
+    """Widen the vertical axis to a minimum span, in the unit of the axis. Call it after the curves are drawn."""
+    low, high = ax.get_ylim()
+    if (missing := min_span - (high - low)) > 0.0:
+        ax.set_ylim(low - missing / 2.0, high + missing / 2.0)
 
 
 def new_axes() -> Any:

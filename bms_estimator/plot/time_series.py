@@ -5,7 +5,20 @@ from typing import Any
 import numpy as np
 
 from bms_estimator.model.arrays import Floats
-from bms_estimator.plot.style import BAND_LABEL, COLORS, FAINT, MEASURED, MODEL, draw_band, new_axes
+from bms_estimator.plot.style import (
+    BAND_LABEL,
+    COLORS,
+    FAINT,
+    MEASURED,
+    MIN_CURRENT_SPAN_A,
+    MIN_SOC_SPAN_PERCENT,
+    MIN_TEMPERATURE_SPAN_K,
+    MIN_VOLTAGE_SPAN_V,
+    MODEL,
+    draw_band,
+    new_axes,
+    widen,
+)
 from bms_estimator.plot.thinning import thin
 
 LINEAR_MV = 20.0
@@ -13,6 +26,8 @@ LINEAR_MV = 20.0
 MAX_LINEAR_MV = 100.0
 """Largest error of a plot with a linear axis [mV]. On a linear axis, larger errors, such as those near empty, would hide all
 others."""
+MIN_ERROR_SPAN_MV = 1.0
+"""Minimum span of an axis of errors [mV]."""
 TIME_UNITS = ((3.0 * 86_400.0, 86_400.0, "days"), (7_200.0, 3_600.0, "h"), (180.0, 60.0, "min"), (0.0, 1.0, "s"))
 """Minimum duration [s], length [s] and name of each unit of the time axis."""
 
@@ -34,7 +49,7 @@ def voltage(time_s: Floats, measured_v: Floats, modeled_v: Floats | None = None,
         ax.plot(time, measured, label="measured", **MEASURED)
         ax.plot(time, modeled, label="model", **MODEL)
         _legend_above(ax)
-    return label_time_axis(ax, time_s, "voltage [V]")
+    return label_axes(ax, time_s, "voltage [V]", MIN_VOLTAGE_SPAN_V)
 
 
 def voltage_error(time_s: Floats, error_v: Floats, *, ax: Any = None) -> Any:
@@ -49,7 +64,7 @@ def voltage_error(time_s: Floats, error_v: Floats, *, ax: Any = None) -> Any:
     error_mv = 1e3 * error_v
     ax.plot(*_thin_over_time(time_s, error_mv), color=COLORS[1], linewidth=0.8)
     ax.axhline(0.0, color=FAINT, linewidth=0.8)
-    label_time_axis(ax, time_s, "measured minus model [mV]")
+    label_axes(ax, time_s, "measured minus model [mV]", MIN_ERROR_SPAN_MV)
     if float(np.abs(error_mv).max(initial=0.0)) > MAX_LINEAR_MV:
         ax.set_yscale("symlog", linthresh=LINEAR_MV)
         ax.axhspan(
@@ -83,7 +98,7 @@ def soc(
     for curve in counted_curve:
         ax.plot(time, curve, label="coulomb counting", **MODEL)
     _legend_above(ax)
-    return label_time_axis(ax, time_s, "SOC [%]")
+    return label_axes(ax, time_s, "SOC [%]", MIN_SOC_SPAN_PERCENT)
 
 
 def current(time_s: Floats, current_a: Floats, *, ax: Any = None) -> Any:
@@ -97,7 +112,7 @@ def current(time_s: Floats, current_a: Floats, *, ax: Any = None) -> Any:
     ax = ax or new_axes()
     ax.plot(*_thin_over_time(time_s, current_a), color=COLORS[2], linewidth=0.8, drawstyle="steps-post")
     ax.axhline(0.0, color=FAINT, linewidth=0.8)
-    return label_time_axis(ax, time_s, "current [A], discharge > 0")
+    return label_axes(ax, time_s, "current [A], discharge > 0", MIN_CURRENT_SPAN_A)
 
 
 def temperature(time_s: Floats, temperature_c: Floats, *, ax: Any = None) -> Any:
@@ -110,7 +125,7 @@ def temperature(time_s: Floats, temperature_c: Floats, *, ax: Any = None) -> Any
     """
     ax = ax or new_axes()
     ax.plot(*_thin_over_time(time_s, temperature_c), color=COLORS[3], linewidth=1.0)
-    return label_time_axis(ax, time_s, "temperature [°C]")
+    return label_axes(ax, time_s, "temperature [°C]", MIN_TEMPERATURE_SPAN_K)
 
 
 def time_unit(time_s: Floats) -> tuple[float, str]:
@@ -119,10 +134,11 @@ def time_unit(time_s: Floats) -> tuple[float, str]:
     return next((length_s, name) for minimum_s, length_s, name in TIME_UNITS if duration_s >= minimum_s)
 
 
-def label_time_axis(ax: Any, time_s: Floats, label: str) -> Any:
-    """Label the axes of a plot over ``time_s``; ``label`` names the vertical axis. Return the axes."""
+def label_axes(ax: Any, time_s: Floats, label: str, min_span: float) -> Any:
+    """Label the axes of a plot over ``time_s``; ``label`` names the vertical axis of at least ``min_span``. Return the axes."""
     ax.set(xlabel=f"time [{time_unit(time_s)[1]}]", ylabel=label)
     ax.margins(x=0.01)
+    widen(ax, min_span)
     return ax
 
 

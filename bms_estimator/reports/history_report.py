@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from bms_estimator.model.arrays import Floats
-from bms_estimator.plot.style import COLORS, FAINT, draw_band
+from bms_estimator.plot.style import (
+    COLORS,
+    FAINT,
+    MIN_CURRENT_SPAN_A,
+    MIN_SOC_SPAN_PERCENT,
+    MIN_TEMPERATURE_SPAN_K,
+    MIN_VOLTAGE_SPAN_V,
+    draw_band,
+    widen,
+)
 from bms_estimator.plot.thinning import MAX_POINTS, thin
 from bms_estimator.reports.aging_group import AgingHistory, aging_group
 from bms_estimator.reports.day_table import day_table
@@ -26,6 +35,8 @@ MAX_MARKED_ROWS = 30
 """Maximum number of rows at which each row has a marker. A row between two gaps has no line, and would be invisible."""
 MIN_ROWS = 2
 """Minimum number of rows with a value for a figure."""
+MIN_TICKS = 3
+"""Minimum number of labels on the time axis. With more, matplotlib finds no interval for 3 to 5 hours, and for 3 to 5 days."""
 MAX_TICKS = 7
 """Maximum number of labels on the time axis. More would overlap."""
 TICK_MINUTES = [1, 2, 5, 10, 15, 30]
@@ -47,6 +58,7 @@ class PackHistory:
         learned: Name, value and std of each learned parameter in the last checkpoint; empty without a checkpoint.
         not_learned: Reason why there are no learned parameters; empty if there are some.
         aging: Capacity and resistances over the days of the fitted history.
+        warnings: Doubts about the history, one text each.
     """
 
     pack: str
@@ -56,6 +68,7 @@ class PackHistory:
     learned: Sequence[tuple[str, str, str]]
     not_learned: str
     aging: AgingHistory
+    warnings: Sequence[str] = ()
 
 
 def history_report(history: PackHistory, written: str) -> ReportPage:
@@ -75,7 +88,7 @@ def history_report(history: PackHistory, written: str) -> ReportPage:
         subtitle=f"{begin} to {end}",
         grade="",
         sentences=tuple(_sentences(history)),
-        sections=(Section("History", sentences=(), warnings=(), groups=tuple(groups)),),
+        sections=(Section("History", sentences=(), warnings=tuple(history.warnings), groups=tuple(groups)),),
         written=written,
     )
 
@@ -122,11 +135,13 @@ def _draw_soc(history: PackHistory, ax: Any) -> None:
     time, middle, low, high = _with_gaps(history.time_s, soc, (soc - std).clip(0.0), (soc + std).clip(max=100.0))
     draw_band(ax, time, low, high)
     ax.plot(time, middle, color=COLORS[0], marker=_marker(history))
-    _label_axes(ax, "SOC [%]")
+    _label_axes(ax, "SOC [%]", MIN_SOC_SPAN_PERCENT)
 
 
-def _draw_range(quantity: str, unit: str, label: str, color: str) -> Callable[[PackHistory, Any], None]:
-    """Return the function that draws the mean of a quantity with the band of its extremes."""
+def _draw_range(
+    quantity: str, unit: str, label: str, min_span: float, color: str
+) -> Callable[[PackHistory, Any], None]:
+    """Return the function that draws the mean of a quantity with the band of its extremes, on an axis of at least ``min_span``."""
 
     def draw(history: PackHistory, ax: Any) -> None:
         mean, low, high = (history.columns[f"{quantity}_{part}{unit}"] for part in ("", "min_", "max_"))
@@ -135,7 +150,7 @@ def _draw_range(quantity: str, unit: str, label: str, color: str) -> Callable[[P
         ax.plot(time, mean, color=color, linewidth=0.9, marker=_marker(history))
         if quantity == "current":
             ax.axhline(0.0, color=FAINT, linewidth=0.8)
-        _label_axes(ax, label)
+        _label_axes(ax, label, min_span)
 
     return draw
 
@@ -151,18 +166,23 @@ _FIGURES = (
         "the estimator has published no SOC; it needs a measured voltage and current",
         _draw_soc,
     ),
-    ("Voltage", "voltage_v", "no voltage was measured", _draw_range("voltage", "v", "voltage [V]", COLORS[0])),
+    (
+        "Voltage",
+        "voltage_v",
+        "no voltage was measured",
+        _draw_range("voltage", "v", "voltage [V]", MIN_VOLTAGE_SPAN_V, COLORS[0]),
+    ),
     (
         "Current",
         "current_a",
         "no current was measured",
-        _draw_range("current", "a", "current [A], discharge > 0", COLORS[2]),
+        _draw_range("current", "a", "current [A], discharge > 0", MIN_CURRENT_SPAN_A, COLORS[2]),
     ),
     (
         "Temperature",
         "temperature_c",
         "it was not measured; it needs a source with a temperature sensor",
-        _draw_range("temperature", "c", "temperature [°C]", COLORS[3]),
+        _draw_range("temperature", "c", "temperature [°C]", MIN_TEMPERATURE_SPAN_K, COLORS[3]),
     ),
 )
 """Title of each figure, column that must have values, reason for a missing figure, and function that draws the figure."""
@@ -181,17 +201,24 @@ def _with_gaps(time_s: Floats, *curves: Floats) -> tuple[Floats, ...]:
     return (joined_s / DAY_S, *joined)
 
 
-def _label_axes(ax: Any, label: str) -> None:
-    """Label the axes of a plot over days since 1970 with dates and times; ``label`` is that of the vertical axis."""
+def _label_axes(ax: Any, label: str, min_span: float) -> None:
+    """Label the axes of a plot over days since 1970 with dates and times.
+
+    Args:
+        ax: The axes.
+        label: Label of the vertical axis.
+        min_span: Minimum span of the vertical axis.
+    """
     from matplotlib import dates as matplotlib_dates  # noqa: PLC0415 - optional
 
     dates: Any = matplotlib_dates  # its functions have no types
-    locator = dates.AutoDateLocator(maxticks=MAX_TICKS)
+    locator = dates.AutoDateLocator(minticks=MIN_TICKS, maxticks=MAX_TICKS)
     locator.intervald[dates.MINUTELY] = TICK_MINUTES
     ax.xaxis.set_major_locator(locator)
     ax.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
     ax.set(xlabel="time (UTC)", ylabel=label)
     ax.margins(x=0.01)
+    widen(ax, min_span)
 
 
 def _learned(history: PackHistory) -> Group:

@@ -1,6 +1,5 @@
-"""New pack: its settings file, the check of the file, and the command that installs the service."""
+"""New pack: its settings file, and the check of the file."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,9 +38,3 @@ def create_pack(file: Path, answers: Answers) -> NewPack:
     pack = settings.pack
     cell = load_cell(pack.cell, pack.capacity_ah).pack(pack.series, pack.parallel)
     return NewPack(settings, cell, check_settings(settings, cell))
-
-
-def install_command(file: Path) -> list[str]:
-    """Return the command that installs the service of a pack."""
-    program = Path(sys.executable).with_name("bms-estimator")
-    return ["sudo", str(program), "install", str(file)]

@@ -60,6 +60,7 @@ def test_a_silent_device_is_a_fault(tmp_path: Path, line: Line, monkeypatch: pyt
 
 def test_a_missing_port_is_reported_only_by_the_check_of_the_port(tmp_path: Path) -> None:
     assert list(check_device(subject(tmp_path, sensor={"port": "/dev/absent"}))) == []
+    assert list(check_device(subject(tmp_path, sensor={"port": "/dev"}))) == []
 
 
 def test_the_port_of_a_running_service_is_not_opened(tmp_path: Path, line: Line) -> None:
@@ -96,4 +97,4 @@ def test_an_unreadable_stored_board_is_a_warning(tmp_path: Path) -> None:
     pack.state_folder.chmod(0o000)
     _, unread = as_nobody(lambda: list(check_board(pack, BOARD)))
     pack.state_folder.chmod(0o700)
-    assert (unread.level, unread.remedy) == (Level.WARNING, f"sudo bms-estimator doctor {pack.path}")
+    assert (unread.level, unread.remedy) == (Level.WARNING, pack.command_as_root)

@@ -55,9 +55,13 @@ def test_a_port_of_another_user_is_a_fault_with_the_command_that_adds_the_user_t
     assert finding.level is Level.OK
 
 
-def test_a_missing_port_is_a_fault(tmp_path: Path) -> None:
-    (finding,) = check_port(subject(tmp_path, sensor={"port": "/dev/absent"}))
-    assert (finding.level, finding.text) == (Level.FAULT, "/dev/absent: it does not exist")
+@pytest.mark.parametrize(
+    ("port", "text"),
+    [("/dev/absent", "/dev/absent: it does not exist"), ("/dev/..", "/dev/..: it is not a serial port")],
+)
+def test_a_missing_port_and_a_folder_are_faults(tmp_path: Path, port: str, text: str) -> None:
+    (finding,) = check_port(subject(tmp_path, sensor={"port": port}))
+    assert (finding.level, finding.text) == (Level.FAULT, text)
     assert "bms-estimator ports" in finding.remedy
 
 

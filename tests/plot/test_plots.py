@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from bms_estimator import plot
 from bms_estimator.model.cell import load_cell
+from bms_estimator.plot.style import new_axes
 
 TIME_S = np.arange(0.0, 10_800.0)
 CELL = load_cell("nmc", 3.0)
@@ -53,6 +54,26 @@ def test_the_band_of_the_soc_stays_within_0_to_100_percent(ax):
 def test_a_temperature_that_was_not_measured_is_not_drawn(ax):
     plot.temperature(TIME_S, np.full(TIME_S.size, np.nan), ax=ax)
     assert np.isnan(ax.get_lines()[0].get_ydata()).all()
+
+
+@pytest.mark.parametrize(
+    ("draw", "value", "noise", "span"),
+    [
+        (plot.voltage, 3.3, 1e-4, 0.01),
+        (plot.voltage_error, 0.0, 1e-5, 1.0),
+        (plot.current, 0.0, 1e-4, 0.01),
+        (plot.temperature, 24.99, 0.01, 1.0),
+        (plot.soc, 0.9, 1e-5, 1.0),
+    ],
+)
+def test_a_constant_value_is_a_line_on_an_axis_of_a_minimum_span_without_offset(draw, value, noise, span):
+    ax = new_axes()
+    draw(TIME_S, value + noise * (TIME_S % 2), ax=ax)
+    ax.figure.draw_without_rendering()
+    plt.close(ax.figure)
+    low, high = ax.get_ylim()
+    assert high - low >= span * (1.0 - 1e-9)
+    assert ax.yaxis.get_offset_text().get_text() == ""
 
 
 def test_estimates_of_an_element_are_averaged_over_soc(ax):

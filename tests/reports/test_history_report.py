@@ -81,6 +81,21 @@ def test_missing_fit_is_a_sentence():
     assert (group.figures, group.rows, group.remark) == ((), (), "No fit.")
 
 
+@pytest.mark.parametrize("minutes", [2, 3, 180, 264, 1440, 5000, 576_000, 2_000_000])
+@pytest.mark.filterwarnings("error")
+def test_time_axis_of_a_history_that_is_nearly_all_gap_has_two_to_seven_labels(minutes):
+    svg = groups_of(history_of(60.0 * np.array([0, 1, minutes - 1])))["Over time"].figures[0].svg
+    labels = re.findall(r"<!-- (.+?) -->", svg)
+    assert 2 <= labels.index("time (UTC)") <= 7
+
+
+def test_nearly_constant_temperature_has_an_axis_of_1_degree():
+    history = history_of([0.0, 60.0], temperature_c=24.99, temperature_min_c=24.99, temperature_max_c=25.0)
+    assert {"<!-- 24.6 -->", "<!-- 25.4 -->"} <= set(
+        re.findall(r"<!-- 2\d\.\d -->", groups_of(history)["Over time"].figures[-1].svg)
+    )
+
+
 def test_time_axis_has_dates_and_times():
     svg = groups_of(history_of(60.0 * np.arange(8)))["Over time"].figures[0].svg
     assert re.findall(r"<!-- (\d\d:\d\d) -->", svg) == ["00:00", "00:02", "00:04", "00:06"]

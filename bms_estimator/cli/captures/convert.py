@@ -19,7 +19,7 @@ from bms_estimator.cli.options.capture_options import (
 from bms_estimator.conversion.bdf import bdf_rows, is_bdf_name
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sinks.trace_file import SINKS, CsvSink, TableSink, table_sink
 from bms_estimator.sources.captures.replay import Capture, open_capture
 
@@ -51,9 +51,8 @@ def convert(
         def reopen() -> Capture:
             return open_capture(path, current_sign=current_sign, column_map=column_map)
 
-        source = reopen()
-        print_guesses(path.name, source)
-        for block in _bdf_blocks(reopen, progress) if is_bdf_name(out.name) else _blocks(source, progress):
+        print_guesses(path.name, reopen())
+        for block in (_bdf_blocks if is_bdf_name(out.name) else _own_blocks)(reopen, progress):
             sink.write(block)
             rows += block.size
     if rows == 0:
@@ -76,6 +75,29 @@ def _blocks(capture: Capture, progress: Progress) -> Iterator[SampleBlock]:
     for block in capture:
         yield block
         progress(capture.fraction)
+
+
+def _own_blocks(reopen: Callable[[], Capture], progress: Progress) -> Iterator[NDArray[np.void]]:
+    """Yield the samples of a capture without columns that have no value, which a first pass finds.
+
+    Args:
+        reopen: Function that opens the capture for one pass.
+        progress: Receives the fraction of the file that has been converted.
+    """
+    columns = _columns_with_values(reopen())
+    for block in _blocks(reopen(), progress):
+        yield block[columns]
+
+
+def _columns_with_values(capture: Capture) -> list[str]:
+    """Return the columns of a capture's samples. A file with a status needs all, because captures with fewer have none."""
+    *columns, temperature, _ = SAMPLE.names or ()
+    has_temperature = False
+    for block in capture:
+        if block["status"].any():
+            return [*(SAMPLE.names or ())]
+        has_temperature |= bool(np.isfinite(block["temperature_c"]).any())
+    return [*columns, temperature] if has_temperature else columns
 
 
 def _bdf_blocks(reopen: Callable[[], Capture], progress: Progress) -> Iterator[NDArray[np.void]]:

@@ -11,6 +11,7 @@ from bms_estimator.checkpoint.history_file import RejectedHistoryError
 from bms_estimator.checkpoint.learned_state import learned_estimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import present_elements, relative_capacity
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.pack_model.aging_course import aging_course
@@ -26,6 +27,8 @@ from bms_estimator.store.minute import MINUTE_S, Minute
 
 CAPACITY = "capacity [Ah]"
 """Name of the learned capacity."""
+MIN_VOLTAGE_RATIO = 0.6
+"""Minimum voltage of a pack, relative to its nominal voltage. A full pack with half as many cells has less."""
 
 
 def pack_history(settings: Settings, model: PackModel, folder: Path | None, since_s: float) -> PackHistory:
@@ -57,7 +60,24 @@ def pack_history(settings: Settings, model: PackModel, folder: Path | None, sinc
     aging = _aging_history(settings, model, path.parent)
     if aging.course:
         learned = [row for row in learned if row[0] != CAPACITY]  # the table of the slow fit has the capacity
-    return PackHistory(settings.pack.name, columns["time_s"], columns, events, learned, not_learned, aging)
+    warnings = _implausible_voltages(model, columns["voltage_v"], path)
+    return PackHistory(settings.pack.name, columns["time_s"], columns, events, learned, not_learned, aging, warnings)
+
+
+def _implausible_voltages(model: PackModel, voltage_v: Floats, path: Path) -> list[str]:
+    """Return a warning if a history has voltages that the pack cannot have, as from another pack of its name."""
+    cell = model.cell
+    low_v = 0.0 if isinstance(model, FuelCellModel) else MIN_VOLTAGE_RATIO * cell.nominal_voltage_v
+    outside_v = voltage_v[(voltage_v < low_v) | (voltage_v > cell.voltage_max_v)]
+    if outside_v.size == 0:
+        return []
+    text = (
+        f"{outside_v.size:,} of {voltage_v.size:,} minutes have voltages from {outside_v.min():.2f} to {outside_v.max():.2f} V, "
+        f"outside {low_v:.2f} to {cell.voltage_max_v:.2f} V, the range of {cell.series_count} cells in series. The sensor was "
+        f"wrong, or {path} also has the history of an earlier pack of this name; to begin a new history, stop the service and "
+        "rename the file."
+    )
+    return [text]
 
 
 def _aging_history(settings: Settings, model: PackModel, folder: Path) -> AgingHistory:

@@ -27,7 +27,9 @@ from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoar
 DEVICE_PROTOCOLS = (*METERS, *BMS_ANSWERS)
 """Protocols of the simulated devices that are not boards: battery monitors and BMS."""
 DEFAULT_LOAD_C = 3.0
-"""Default load current as a multiple of the capacity [1/h], at which the SOC changes visibly."""
+"""Default load current of a board as a multiple of the capacity [1/h], at which the SOC changes visibly."""
+DEVICE_LOAD_C = 1.0
+"""Default load current of a battery monitor or BMS as a multiple of the capacity [1/h]. Their packs are large."""
 
 
 def _complete_protocol(incomplete: str) -> list[str]:
@@ -50,7 +52,7 @@ def simulate(
         float | None,
         typer.Option(
             parser=decimal(),
-            help="current of the load [A], positive on discharge; default: the 3C current",
+            help="current of the load [A], positive on discharge; default: 3C for a board, 1C for other devices",
             show_default=False,
         ),
     ] = None,
@@ -100,7 +102,8 @@ def simulate(
     --mqtt simulates an ESPHome node with a JK-BMS instead, for the setting `source.profile = "esphome-jk"`.
     """
     model = load_cell(cell, capacity_ah).pack(series, parallel=1)
-    load_a = DEFAULT_LOAD_C * model.cell.capacity_ah if current_a is None else current_a
+    load_c = DEFAULT_LOAD_C if protocol is None and mqtt is None else DEVICE_LOAD_C
+    load_a = load_c * model.cell.capacity_ah if current_a is None else current_a
     device: VirtualBoard | SimulatedMeter | SimulatedNode
     if load is LoadName.RELAY:
         if mqtt is not None or protocol is not None or text:

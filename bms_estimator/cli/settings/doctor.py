@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from bms_estimator.doctor.examine import examine
 from bms_estimator.doctor.finding import Finding, Level, fault
 from bms_estimator.doctor.subject import Subject
 from bms_estimator.doctor.systemd_unit import unit_of
+from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.errors import UserError
 
 DEFAULT_PACKS = (Path("pack.toml"), Path("/etc/bms-estimator/pack.toml"))
@@ -95,8 +97,9 @@ def _remedy(path: Path) -> str:
     """Return the command that creates, checks or reads a settings file that could not be loaded."""
     if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if the folder cannot be read
         return f"bms-estimator new {path}"
-    command = "bms-estimator config check" if os.access(path, os.R_OK) else "sudo bms-estimator doctor"
-    return f"{command} {path}"
+    return (
+        f"bms-estimator config check {path}" if os.access(path, os.R_OK) else shlex.join(root_command("doctor", path))
+    )
 
 
 def _print(finding: Finding) -> None:

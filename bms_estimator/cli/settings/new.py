@@ -16,6 +16,7 @@ from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.status_line import show_status
 from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
 from bms_estimator.cli.settings.prompts import Prompts
+from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads import Estimate
 from bms_estimator.process.log_setup import configure_logs
@@ -25,7 +26,7 @@ from bms_estimator.setup.answers import Answers, InvalidAnswerError
 from bms_estimator.setup.first_estimate import estimate_text, run_estimator
 from bms_estimator.setup.found_device import FoundDevice
 from bms_estimator.setup.measurement import Measurement, measure
-from bms_estimator.setup.new_pack import create_pack, install_command
+from bms_estimator.setup.new_pack import create_pack
 from bms_estimator.setup.questions import QUESTIONS, Question
 from bms_estimator.setup.search import SearchResult, default_places, search
 
@@ -204,7 +205,7 @@ def _offer_install(prompts: Prompts, file: Path, given: bool | None) -> None:
     Raises:
         typer.Exit: The installation failed.
     """
-    command = install_command(file)
+    command = root_command("install", file)
     if prompts.confirm(
         "Install the service, which runs at each start of this machine?", "--install", given, default=False
     ):

@@ -4,8 +4,8 @@ import shlex
 from collections.abc import Iterable
 from html import escape
 
+from bms_estimator.installation.root_command import root_command
 from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
-from bms_estimator.setup.new_pack import install_command
 from bms_estimator.setup.page.session import SetupSession, Step
 from bms_estimator.setup.questions import QUESTIONS, Question
 
@@ -115,7 +115,7 @@ def _done(session: SetupSession, _: str) -> str:
     if session.pack is None:
         return ""
     warnings = f"<ul class='bad'>{_items(session.pack.warnings)}</ul>" if session.pack.warnings else ""
-    command = escape(shlex.join(install_command(session.file)))
+    command = escape(shlex.join(root_command("install", session.file)))
     return (
         '<section class="card"><h2>State of charge</h2><p class="huge"><b data-q="soc">&nbsp;</b><small>%</small></p>'
         '<p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p>'

@@ -64,11 +64,13 @@ def resolve_port(port: str) -> str:
     """Return the device path of ``port``, which may be ``auto``.
 
     Raises:
-        NoPortError: The port does not exist, or ``auto`` finds no board or more than one.
+        NoPortError: The port does not exist or is a file or folder, or ``auto`` finds no board or more than one.
     """
     if port != "auto":
         if not os.path.exists(port):  # noqa: PTH110 - Path.exists raises if the name is too long
             raise NoPortError(f"{port}: it does not exist")
+        if not Path(port).is_char_device():
+            raise NoPortError(f"{port}: it is not a serial port")
         return port
     candidates = board_ports()
     if len(candidates) == 1:

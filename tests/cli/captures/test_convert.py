@@ -24,6 +24,16 @@ def test_our_columns_restore_the_samples_exactly(capsys, tmp_path, board, name):
     assert all(np.array_equal(after[column], before[column], equal_nan=True) for column in before)
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["time_s,current_a,voltage_v\n0.0,1.0,3.6\n", "time_s,current_a,voltage_v,temperature_c\n0.0,1.0,3.6,25.0\n"],
+)
+def test_columns_without_values_are_omitted(capsys, tmp_path, text):
+    (tmp_path / "in.csv").write_text(text)
+    assert run(capsys, "convert", tmp_path / "in.csv", "--out", tmp_path / "out.csv")[0] == 0
+    assert (tmp_path / "out.csv").read_text() == text
+
+
 @pytest.mark.parametrize("name", ["out.bdf", "out.bdf.gz", "out.bdf.csv", "out.bdf.csv.gz", "out.bdf.parquet"])
 def test_battery_data_format_restores_the_samples_from_time_zero(capsys, tmp_path, board, name):
     out = tmp_path / name

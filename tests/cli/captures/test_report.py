@@ -124,6 +124,20 @@ async def test_page_on_a_history_has_days_events_and_gaps(tmp_path, capsys):
     assert "no checkpoint to read: none found" in text
 
 
+@pytest.mark.parametrize(
+    ("earlier_v", "warning"), [(13.3, "outside 15.60 to 32.00 V, the range of 8 cells in series"), (26.4, "")]
+)
+async def test_page_warns_of_the_history_of_an_earlier_pack_of_the_same_name(tmp_path, capsys, earlier_v, warning):
+    (tmp_path / "pack.toml").write_text('[pack]\nname = "shed"\ncell = "lfp"\ncapacity_ah = 100\nseries = 8\n')
+    rows = [snapshot_at(60.0 * minute, 2.0, earlier_v if minute < 3 else 26.5) for minute in range(8)]
+    await record_history(tmp_path / "shed.sqlite", rows)
+    arguments = ("--pack", tmp_path / "pack.toml", "--folder", tmp_path, "--out", tmp_path / "report.html")
+    assert run(capsys, "report", *arguments)[0] == 0
+    text = text_of((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert warning in text
+    assert (f"{tmp_path / 'shed.sqlite'} also has the history of an earlier pack" in text) == bool(warning)
+
+
 def test_page_on_a_history_has_the_learned_parameters_of_the_checkpoint(tmp_path, capsys, steps_csv):
     (tmp_path / "pack.toml").write_text('[pack]\nname = "shed"\ncell = "ncr18650"\n')
     settings, model = load_pack(tmp_path / "pack.toml")

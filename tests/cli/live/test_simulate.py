@@ -112,6 +112,13 @@ def test_simulation_ends_after_the_simulated_duration():
     assert re.fullmatch(r"40[01] samples in 4\.0 s, SOC 90\.00%\n", err)
 
 
+def test_default_load_of_a_battery_monitor_is_1c():
+    arguments = ("--cell", "lfp", "--capacity-ah", "100", "--load", "constant", "--seconds", "36", "--speed", "100")
+    with simulate("--protocol", "vedirect", *arguments) as (process, _):
+        _, err = process.communicate(timeout=LONG_S)
+    assert float(re.search(r"SOC ([\d.]+)%", err)[1]) == pytest.approx(89.0, abs=0.1)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -1,6 +1,7 @@
 """``doctor``: output, exit code and remedies of a whole examination."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -94,4 +95,4 @@ def test_settings_that_only_root_can_read_need_sudo(tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)  # user nobody may not search the parents of this folder
     finding = as_nobody(lambda: load_subject(Path("pack.toml")))
     assert isinstance(finding, Finding)
-    assert finding.remedy == "sudo bms-estimator doctor pack.toml"
+    assert finding.remedy == f"sudo {Path(sys.executable).parent}/bms-estimator doctor pack.toml"
