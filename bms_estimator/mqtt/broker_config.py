@@ -30,7 +30,12 @@ def brokers(settings: BrokerSettings) -> list[Broker]:
         UserError: A URL cannot be used, or a certificate or key is configured that no connection would use.
     """
     section = settings.section
-    addresses = [_broker(section, url) for url in settings.urls]
+    addresses = []
+    for url in settings.urls:
+        try:
+            addresses.append(parse_url(url))
+        except ValueError as error:
+            raise UserError(f"{section}.url = {url}: {error}") from None
     if settings.cert_file and not any(broker.tls for broker in addresses):
         raise UserError(
             f"{section}.cert_file = {settings.cert_file}: of no use without TLS: {section}.url must be mqtts://..."
@@ -99,15 +104,17 @@ def check(settings: BrokerSettings) -> list[str]:
     ]
 
 
-def _broker(section: str, address: str) -> Broker:
-    try:
-        url = urlsplit(address)
-        host, port = url.hostname, url.port or PORTS[url.scheme]
-        (host or "").encode("idna")  # the resolver encodes the name this way and would fail later
-    except ValueError as error:  # includes UnicodeError
-        raise UserError(f"{section}.url = {address}: {error}") from None
+def parse_url(address: str) -> Broker:
+    """Return the address in a URL of the form that the setting ``url`` accepts.
+
+    Raises:
+        ValueError: The host or the port is invalid.
+    """
+    url = urlsplit(address)
+    host, port = url.hostname, url.port or PORTS[url.scheme]
     if not host:
-        raise UserError(f"{section}.url = {address}: must be mqtt://host:port")
+        raise ValueError("must be mqtt://host:port")
+    host.encode("idna")  # the resolver encodes the name this way and would fail later
     return Broker(address, host, port, tls=url.scheme == "mqtts")
 
 

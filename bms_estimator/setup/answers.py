@@ -11,16 +11,17 @@ class InvalidAnswerError(Exception):
     """An answer is malformed or implausible. The message contains the answer and the reason."""
 
 
-def parse_number(text: str) -> float:
-    """Return the number in an answer, with a decimal point or comma.
+def parse_number(text: str, unit: str = "") -> float:
+    """Return the number in an answer, with a decimal point or comma, and with or without its unit.
 
     Raises:
         InvalidAnswerError: The text is not a number.
     """
+    digits = text[: -len(unit)] if unit and text.lower().endswith(unit.lower()) else text
     try:
-        return number(text.replace(",", "."))
+        return number(digits.replace(",", "."))
     except ValueError:
-        raise InvalidAnswerError(f"{text}: must be a number") from None
+        raise InvalidAnswerError(f"{text}: must be a number, such as {f'12 {unit}'.strip()}") from None
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,9 @@ from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.setup.measurement import first_sample_timeout_s, open_pack_source
 
+MAX_RESTING_C = 0.1
+"""Current relative to the capacity [1/h]. Above it, the overvoltage makes the first estimate inexact."""
+
 
 class EstimateSink:
     """Sink that passes each estimate to a function.
@@ -76,3 +79,15 @@ def estimate_text(estimate: Estimate) -> str:
         return values
     band = "" if estimate.soc_std is None else f" ± {2.0 * estimate.soc_std:.1%} (2 standard deviations)"
     return f"SOC {estimate.soc:.1%}{band}, {values}"
+
+
+def load_note(current_a: float, capacity_ah: float) -> str:
+    """Return a note about the first estimate under a large current; empty if the current is small.
+
+    Args:
+        current_a: Present current [A].
+        capacity_ah: Capacity of the pack [Ah].
+    """
+    if abs(current_a) <= MAX_RESTING_C * capacity_ah:
+        return ""
+    return "A first estimate under load is inexact, and may lie outside its band; it becomes better at rest."

@@ -1,12 +1,15 @@
-"""New pack: its settings file, and the check of the file."""
+"""New pack: its settings file, and the command that runs its estimator."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.config_file import parse_toml
 from bms_estimator.service.pack_check import check_settings, summarize
-from bms_estimator.settings.pack import Settings, load_settings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.pack_file import create_pack_file
+from bms_estimator.settings.settings_template import settings_file
 from bms_estimator.setup.answers import Answers
 
 
@@ -27,14 +30,20 @@ class NewPack:
 
 
 def create_pack(file: Path, answers: Answers) -> NewPack:
-    """Write the settings file of a pack, and check it.
+    """Check the settings of a pack, and write its settings file. Invalid settings are not written.
 
     Raises:
-        UserError: The file exists, cannot be written, or has an invalid setting.
+        UserError: A setting is invalid, or the file exists or cannot be written.
         ModuleNotFoundError: The optional package of the source is missing.
     """
-    create_pack_file(file, answers.tables)
-    settings = load_settings(file)
+    settings = parse_toml(settings_file(Settings, answers.tables), Settings, str(file))
     pack = settings.pack
     cell = load_cell(pack.cell, pack.capacity_ah).pack(pack.series, pack.parallel)
-    return NewPack(settings, cell, check_settings(settings, cell))
+    warnings = check_settings(settings, cell)
+    create_pack_file(file, answers.tables)
+    return NewPack(settings, cell, warnings)
+
+
+def run_command(file: Path) -> str:
+    """Return the command that runs the estimator of a pack in the foreground."""
+    return shlex.join(["bms-estimator", "run", str(file)])

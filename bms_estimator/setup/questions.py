@@ -1,5 +1,6 @@
 """Questions about a new pack, in the order in which the terminal and the page ask them. Each answer is also an option."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,8 +10,9 @@ from pydantic import BaseModel, ValidationError
 from bms_estimator.estimator.settings_plausibility import MAX_CAPACITY_AH
 from bms_estimator.model.cell import generic_cells, shipped_cells
 from bms_estimator.model.config_file import error_reason, without_secrets
+from bms_estimator.mqtt.broker_config import parse_url
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.settings.pack import PackSettings
+from bms_estimator.settings.pack import DEVICE_NAME, PackSettings
 from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number
 from bms_estimator.setup.series_count import cell_voltages, possible_counts, suggest_count
 
@@ -78,7 +80,9 @@ def _validated(model: type[BaseModel], key: str, value: object) -> object:
 
 
 def _parse_name(text: str, _: Answers) -> object:
-    return _validated(PackSettings, "name", text)
+    if not re.fullmatch(DEVICE_NAME, text):
+        raise InvalidAnswerError(f"{text}: must be 1 to 64 of the characters A-Z, a-z, 0-9, _ and -")
+    return text
 
 
 def _parse_cell(text: str, answers: Answers) -> object:
@@ -91,7 +95,7 @@ def _parse_cell(text: str, answers: Answers) -> object:
 
 
 def _parse_capacity(text: str, _: Answers) -> object:
-    value = _validated(PackSettings, "capacity_ah", parse_number(text))
+    value = _validated(PackSettings, "capacity_ah", parse_number(text, "Ah"))
     if isinstance(value, float) and value > MAX_CAPACITY_AH:
         raise InvalidAnswerError(f"{text}: no cell has more than {MAX_CAPACITY_AH:g} Ah; is it in mAh?")
     return value
@@ -118,7 +122,14 @@ def _parse_parallel(text: str, _: Answers) -> object:
 
 
 def _parse_broker(text: str, _: Answers) -> object:
-    return "" if text == NO_BROKER else _validated(MqttSettings, "url", text)
+    if text == NO_BROKER:
+        return ""
+    url = _validated(MqttSettings, "url", text)
+    try:
+        parse_url(text)
+    except ValueError as error:
+        raise InvalidAnswerError(f"{text}: {error}") from None
+    return url
 
 
 def _suggest_series(answers: Answers) -> str:

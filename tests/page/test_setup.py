@@ -57,6 +57,8 @@ async def test_page_leads_from_the_search_to_the_first_estimate(tmp_path: Path, 
             await answer_questions(opened.page)
             await expect(opened.page.locator("[data-q=voltage]")).to_have_text("26.66")
             await expect(opened.page.locator("[data-q=soc]")).to_have_text(re.compile(r"^\d+\.\d$"))
+            await expect(opened.page.get_by_text("A first estimate under load is inexact")).to_be_visible()
+            await expect(opened.page.get_by_text(f"bms-estimator run {file}")).to_be_visible()
             overflow = await opened.page.evaluate("document.documentElement.scrollWidth - innerWidth")
     assert overflow <= 0, "a part of the page is outside the screen"
     assert opened.errors == []
@@ -78,13 +80,15 @@ async def compare_voltage(page: Page) -> None:
 
 
 async def answer_questions(page: Page) -> None:
-    """Enter a capacity in mAh, which is rejected with the reason, and then the right one."""
+    """Enter a capacity in mAh and an invalid port, which are rejected with the reasons, and then the right ones."""
     await page.get_by_role("button", name="Continue").click()
     await page.get_by_label("Chemistry").select_option("lfp")
     await page.get_by_label("Capacity of one cell").fill("100000")
+    await page.get_by_label("MQTT broker").fill("mqtt://localhost:99999")
     await page.get_by_role("button", name="Write").click()
-    await expect(page.get_by_role("alert")).to_contain_text("is it in mAh?")
-    await page.get_by_label("Capacity of one cell").fill("100")
+    await expect(page.get_by_role("alert")).to_contain_text(["is it in mAh?", "Port out of range"])
+    await page.get_by_label("Capacity of one cell").fill("40 Ah")
+    await page.get_by_label("MQTT broker").fill("none")
     await page.get_by_role("button", name="Write").click()
 
 

@@ -81,13 +81,19 @@ def _compare_options(comparison: Comparison, options: MultimeterOptions) -> None
 def _compare_interactively(comparison: Comparison) -> None:
     typer.echo("Press Enter without a value to skip a step.")
     first_v = "Voltage at the terminals of the pack by the multimeter [V]"
-    if _step(first_v, lambda text: comparison.compare_voltage(parse_number(text))):
+    if _step(first_v, lambda text: comparison.compare_voltage(parse_number(text, "V"))):
         second_v = "Voltage again at another state of charge, after you charged or discharged the pack [V]"
-        _step(second_v, lambda text: comparison.compare_voltage(parse_number(text)))
-    _step("Switch off all loads and chargers; then enter 0", lambda _: comparison.set_zero())
+        _step(second_v, lambda text: comparison.compare_voltage(parse_number(text, "V")))
+    _step("Switch off all loads and chargers; then enter 0", partial(_set_zero, comparison))
     load = "Switch on a load; its current by the multimeter [A], negative while the pack is charged"
-    if not _step(load, lambda text: comparison.compare_current(parse_number(text))):
+    if not _step(load, lambda text: comparison.compare_current(parse_number(text, "A"))):
         _step("The pack is now discharging or charging", lambda text: comparison.compare_direction(text.lower()))
+
+
+def _set_zero(comparison: Comparison, text: str) -> Awaitable[str]:
+    if text != "0":
+        raise InvalidAnswerError(f"{text}: must be 0; press Enter without a value to skip this step")
+    return comparison.set_zero()
 
 
 def _step(text: str, compare: Callable[[str], Awaitable[str]]) -> bool:

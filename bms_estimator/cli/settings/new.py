@@ -1,9 +1,11 @@
 """``bms-estimator new``: wizard that finds the device of a pack and writes its settings file."""
 
 import asyncio
+import shlex
 import subprocess
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,10 +25,10 @@ from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack_file import require_new
 from bms_estimator.setup.answers import Answers, InvalidAnswerError
-from bms_estimator.setup.first_estimate import estimate_text, run_estimator
+from bms_estimator.setup.first_estimate import estimate_text, load_note, run_estimator
 from bms_estimator.setup.found_device import FoundDevice
 from bms_estimator.setup.measurement import Measurement, measure
-from bms_estimator.setup.new_pack import create_pack
+from bms_estimator.setup.new_pack import create_pack, run_command
 from bms_estimator.setup.questions import QUESTIONS, Question
 from bms_estimator.setup.search import SearchResult, default_places, search
 
@@ -95,26 +97,43 @@ def new(
     """
     require_new(file)
     configure_logs(deque[str](maxlen=1))  # the wizard reports faults itself
-    prompts = Prompts(yes=yes)
-    result = _search(search_at or ([device] if device and device.startswith("/") else _default_places()))
-    answers = _choose_device(prompts, result, device)
-    measured = _measure(answers.device)
-    options = MultimeterOptions(compare, voltmeter_v, zero, ammeter_a, direction)
-    sensor = compare_with_multimeter(prompts, answers.device, options) if measured else ()
-    voltage_v = measured.voltage_v if measured else None
-    answers = replace(answers, voltage_v=voltage_v, name=file.stem, sensor=sensor)
-    given = (name, cell, capacity_ah, series, parallel, broker)
-    for question, option in zip(QUESTIONS, given, strict=True):
-        answers = _ask(prompts, question, option, answers)
-    pack = create_pack(file, answers)
-    for warning in pack.warnings:
-        typer.echo(f"warning: {warning}", err=True)
-    typer.echo(f"{file}: written; {pack.summary}")
-    if estimate and measured:
-        with show_compile_progress():
-            load_kernels()
-        asyncio.run(run_estimator(pack.settings, pack.cell, _print_estimate, seconds=ESTIMATE_S))
-    _offer_install(prompts, file, install)
+    with _reported_interruption(file):
+        prompts = Prompts(yes=yes)
+        result = _search(search_at or ([device] if device and device.startswith("/") else _default_places()))
+        answers = _choose_device(prompts, result, device)
+        measured = _measure(answers.device)
+        options = MultimeterOptions(compare, voltmeter_v, zero, ammeter_a, direction)
+        sensor = compare_with_multimeter(prompts, answers.device, options) if measured else ()
+        voltage_v = measured.voltage_v if measured else None
+        answers = replace(answers, voltage_v=voltage_v, name=file.stem, sensor=sensor)
+        given = (name, cell, capacity_ah, series, parallel, broker)
+        for question, option in zip(QUESTIONS, given, strict=True):
+            answers = _ask(prompts, question, option, answers)
+        pack = create_pack(file, answers)
+        for warning in pack.warnings:
+            typer.echo(f"warning: {warning}", err=True)
+        typer.echo(f"{file}: written; {pack.summary}")
+        if estimate and measured:
+            with show_compile_progress():
+                load_kernels()
+            asyncio.run(run_estimator(pack.settings, pack.cell, _print_estimate, seconds=ESTIMATE_S))
+            if note := load_note(measured.current_a, pack.cell.cell.capacity_ah):
+                typer.echo(note)
+        _offer_install(prompts, file, install)
+
+
+@contextmanager
+def _reported_interruption(file: Path) -> Iterator[None]:
+    """Report Ctrl-C or the end of the input within the context, and whether the file is written.
+
+    Raises:
+        typer.Exit: The user interrupted the command.
+    """
+    try:
+        yield
+    except (typer.Abort, KeyboardInterrupt):
+        typer.echo(f"\nInterrupted; {f'{file} is' if file.exists() else 'nothing was'} written.", err=True)
+        raise typer.Exit(130) from None
 
 
 def _default_places() -> list[str]:
@@ -125,10 +144,12 @@ def _default_places() -> list[str]:
     return places
 
 
-def _search(places: Sequence[str]) -> SearchResult:
-    """Search the places, and print what was found."""
+def _search(places: Sequence[str], earlier: Sequence[FoundDevice] = ()) -> SearchResult:
+    """Search the places, and print what was found, after the devices that were found earlier."""
     with show_status(f"searching {', '.join(places)}: up to 20 s"):
         result = asyncio.run(search(places))
+    names = [device.name for device in earlier]
+    result.devices = [*earlier, *(device for device in result.devices if device.name not in names)]
     for number, device in enumerate(result.devices, start=1):
         typer.echo(f"{number}  {device.name}: {device}")
     for failure in result.failures:
@@ -142,7 +163,7 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
     Raises:
         UserError: No device was found, or there is no clear choice and no terminal.
     """
-    if not result.devices and not prompts.is_interactive:
+    if not result.devices and device is None and not prompts.is_interactive:
         raise UserError("--search: no device was found; give its place: --search PLACE")
     text = "Number of the device, or another place to search (serial port, mqtt://host, Modbus host)"
     may_search = prompts.is_interactive and device is None
@@ -152,19 +173,27 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
         chosen = prompts.ask(text, "--device", device, parse, default=default)
         if isinstance(chosen, FoundDevice):
             return Answers(chosen, found_broker=result.broker)
-        result = _search([chosen])
+        try:
+            later = _search([chosen], result.devices)
+        except UserError as error:
+            typer.echo(f"  {error}")
+        else:
+            result = replace(later, broker=later.broker or result.broker)
 
 
 def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> FoundDevice | str:
     """Return the device with this name or number. If ``may_search`` is True, return any other text as a place to search.
 
     Raises:
-        InvalidAnswerError: There is no device with this number or name.
+        InvalidAnswerError: There is no device with this number or name. The reason is that of the search, if it has one.
     """
     for number, device in enumerate(result.devices, start=1):
         if text in (str(number), device.name):
             return device
     if text.isdigit() or not may_search:
+        for failure in result.failures:
+            if failure.startswith(f"{text}: "):
+                raise InvalidAnswerError(failure)
         names = ", ".join(device.name for device in result.devices) or "no device"
         raise InvalidAnswerError(f"{text}: was not found; found: {names}")
     return text
@@ -213,4 +242,4 @@ def _offer_install(prompts: Prompts, file: Path, given: bool | None) -> None:
         if code:
             raise typer.Exit(code)
         return
-    typer.echo(f"run it here: bms-estimator run {file}\ninstall the service: {' '.join(command)}")
+    typer.echo(f"run it here: {run_command(file)}\ninstall the service: {shlex.join(command)}")

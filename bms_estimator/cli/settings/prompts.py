@@ -43,7 +43,7 @@ class Prompts:
             UserError: The option is invalid, or missing without a terminal.
         """
         if given is None and self.is_interactive:
-            return self._prompt(text, parse, default)
+            return self._prompt(f"{text} [{default}]" if default else text, parse, default)
         if given is None and not (self._yes and default):
             reason = "there is no default" if self._yes else "there is no terminal to ask"
             raise UserError(f"{option}: missing, and {reason}")
@@ -61,7 +61,8 @@ class Prompts:
         if given is not None:
             return given
         if self.is_interactive:
-            return typer.confirm(text, default=default)
+            choices, answer = ("Y/n", "y") if default else ("y/N", "n")
+            return self._prompt(f"{text} [{choices}]", _parse_yes_or_no, answer)
         if self._yes:
             return default
         raise UserError(f"{option}: missing, and there is no terminal to ask")
@@ -69,7 +70,7 @@ class Prompts:
     @staticmethod
     def _prompt(text: str, parse: Callable[[str], Answer], default: str) -> Answer:
         while True:
-            text_given = typer.prompt(text, default=default, show_default=bool(default))
+            text_given = typer.prompt(text, default=default, show_default=False)
             if not text_given:
                 typer.echo("  an answer is required, because there is no default")
                 continue
@@ -77,3 +78,15 @@ class Prompts:
                 return parse(text_given)
             except InvalidAnswerError as error:
                 typer.echo(f"  {error}")
+
+
+def _parse_yes_or_no(text: str) -> bool:
+    """Return True for yes.
+
+    Raises:
+        InvalidAnswerError: The text is neither yes nor no.
+    """
+    answer = text.strip().lower()
+    if answer not in ("y", "yes", "n", "no"):
+        raise InvalidAnswerError(f"{text}: must be y or n")
+    return answer.startswith("y")

@@ -109,9 +109,9 @@ class SetupSession:
             return
         match quantity:
             case "voltage":
-                result = await self._comparison.compare_voltage(parse_number(text))
+                result = await self._comparison.compare_voltage(parse_number(text, "V"))
             case "current":
-                result = await self._comparison.compare_current(parse_number(text))
+                result = await self._comparison.compare_current(parse_number(text, "A"))
             case "direction":
                 result = await self._comparison.compare_direction(text)
             case _:
@@ -135,7 +135,7 @@ class SetupSession:
         An empty text is replaced by the default. If an answer is invalid, its reason is stored and nothing is written.
 
         Raises:
-            UserError: The file exists, or cannot be written.
+            UserError: A setting is invalid, or the file exists or cannot be written.
         """
         if self.answers is None:
             return

@@ -5,7 +5,9 @@ from collections.abc import Iterable
 from html import escape
 
 from bms_estimator.installation.root_command import root_command
+from bms_estimator.setup.first_estimate import load_note
 from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
+from bms_estimator.setup.new_pack import run_command
 from bms_estimator.setup.page.session import SetupSession, Step
 from bms_estimator.setup.questions import QUESTIONS, Question
 
@@ -115,14 +117,19 @@ def _done(session: SetupSession, _: str) -> str:
     if session.pack is None:
         return ""
     warnings = f"<ul class='bad'>{_items(session.pack.warnings)}</ul>" if session.pack.warnings else ""
-    command = escape(shlex.join(root_command("install", session.file)))
+    install, run = escape(shlex.join(root_command("install", session.file))), escape(run_command(session.file))
+    current_a = session.measured.current_a if session.measured else 0.0
+    note = load_note(current_a, session.pack.cell.cell.capacity_ah)
+    note = f'<p class="note">{note}</p>' if note else ""
     return (
         '<section class="card"><h2>State of charge</h2><p class="huge"><b data-q="soc">&nbsp;</b><small>%</small></p>'
         '<p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p>'
         '<p id="wait" role="status">Waiting for the first estimate. The first start compiles the kernels, which takes a '
-        'minute or two.</p><p>measured <b data-q="voltage"></b> V, <b data-q="current"></b> A</p></section>'
+        'minute or two.</p><p>measured <b data-q="voltage"></b> V, <b data-q="current"></b> A</p>'
+        f"{note}</section>"
         f'<section class="card"><h2>{escape(str(session.file))} is written</h2><p>{escape(session.pack.summary)}</p>'
-        f"{warnings}<p>End this program, then install the service:</p><pre>{command}</pre></section>"
+        f"{warnings}<p>End this program, then run the estimator here:</p><pre>{run}</pre>"
+        f"<p>or install the service:</p><pre>{install}</pre></section>"
     )
 
 

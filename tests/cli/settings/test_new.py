@@ -63,30 +63,33 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
     return [
         ("Number of the device", "7", "7: was not found"),
         ("Number of the device", "/dev/none", "-  /dev/none: cannot be opened: No such file or directory\n"),
-        ("Number of the device", "", "an answer is required"),
-        ("Number of the device", path, f"1  {path}: JK-BMS"),
+        ("Number of the device", "mqtt://localhost:99999", "Port out of range"),
         ("Number of the device", "", "measured: 26.40 V, 5.00 A, discharging"),
+        ("Compare the device with a multimeter", "maybe", "maybe: must be y or n"),
         ("Compare the device with a multimeter", "y", "Press Enter without a value to skip a step"),
         ("Voltage at the terminals", "2.6", "which differs by more than 20%"),
-        ("Voltage at the terminals", "26,664", "voltage: device 26.400 V, multimeter 26.664 V: gain 1.0100"),
+        ("Voltage at the terminals", "26,664 V", "voltage: device 26.400 V, multimeter 26.664 V: gain 1.0100"),
         ("Voltage again", "", "Switch off all loads"),
+        ("Switch off all loads", "x", "x: must be 0"),
         ("Switch off all loads", "0", "is everything switched off?"),
         ("Switch off all loads", "", "Switch on a load"),
         ("Switch on a load", "0.1", "switch on a larger load"),
         ("Switch on a load", "5.5", "gain 1.1000"),
-        ("Name of the pack", "my pack", "my pack: is not of the form"),
+        ("Name of the pack", "my pack", "my pack: must be 1 to 64 of the characters A-Z, a-z, 0-9, _ and -"),
         ("Name of the pack", "house", "lfp  LFP, LiFePO4"),
+        ("Chemistry of the cells", "", "an answer is required"),
         ("Chemistry of the cells", "lead", "lead: must be one of"),
         ("Chemistry of the cells", "LiFePO4", "Capacity of one cell"),
         ("Capacity of one cell", "100000", "is it in mAh?"),
         ("Capacity of one cell", "-100", "-100.0: must be greater than 0"),
-        ("Capacity of one cell", "much", "much: must be a number"),
-        ("Capacity of one cell", "100", "Cells in series"),
+        ("Capacity of one cell", "much", "much: must be a number, such as 12 Ah"),
+        ("Capacity of one cell", "40 Ah", "Cells in series"),
         ("Cells in series", "4", "4: the device reports 8 cells in series"),
         ("Cells in series", "", "Cells in parallel"),
         ("Cells in parallel", "1.5", "1.5: must be a whole number"),
         ("Cells in parallel", "", "MQTT broker"),
         ("MQTT broker", "localhost", "localhost: must be mqtt://host:port"),
+        ("MQTT broker", "mqtt://localhost:99999", "mqtt://localhost:99999: Port out of range 0-65535"),
         ("MQTT broker", "none", "pack.toml: written; house: lfp, 8 in series"),
         ("Install the service", "n", "bms-estimator install"),
     ]
@@ -101,11 +104,12 @@ def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
             terminal.until(lambda reply=reply: reply in plain(terminal.output))
             if reply.startswith("pack.toml"):
                 terminal.until(lambda: ESTIMATE.search(plain(terminal.output)))
+                terminal.until(lambda: "estimate under load is inexact" in plain(terminal.output))
         terminal.until(terminal.ended)
     assert terminal.process.returncode == 0
     assert tomllib.loads(file.read_text())["pack"]["name"] == "house"
     settings = load_settings(file)
-    assert (settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == ("lfp", 100.0, 8)
+    assert (settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == ("lfp", 40.0, 8)
     assert (settings.sensor.port, settings.sensor.protocol, settings.mqtt) == (path, "jk", None)
     assert (settings.sensor.voltage_gain, settings.sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
 
@@ -114,6 +118,7 @@ def test_an_interrupt_at_a_prompt_ends_with_code_130_and_writes_nothing(file):
     with running_device(jk_bms()) as path, PseudoTerminal("new", str(file), "--search", path, columns=200) as terminal:
         terminal.until(lambda: "Number of the device" in plain(terminal.output))
         terminal.process.send_signal(signal.SIGINT)
+        terminal.until(lambda: "\nInterrupted; nothing was written.\r\n" in terminal.output)
         terminal.until(terminal.ended)
     assert terminal.process.returncode == 130
     assert not file.exists()
@@ -187,6 +192,12 @@ def test_a_port_without_a_device_is_reported_with_the_reason(file, capsys, tmp_p
     assert code == 2
     assert f"-  {tmp_path / 'none'}: cannot be opened" in out
     assert "--search: no device was found" in err
+
+
+def test_a_named_port_without_a_device_is_reported_with_its_option(file, capsys, tmp_path):
+    code, _, err = run(capsys, "new", file, "--device", tmp_path / "none", "--yes")
+    assert code == 2
+    assert err.startswith(f"error: --device {tmp_path / 'none'}: cannot be opened")
 
 
 def test_a_multimeter_corrects_gain_and_sign_of_a_bms(file, capsys, long_timeouts):
