@@ -133,4 +133,4 @@ def test_file_that_is_no_port_is_reported(capsys, tmp_path):
     path.write_text("")
     code, out, err = run_board(capsys, str(path))
     assert (code, out) == (2, "")
-    assert err.startswith(f"error: {path}: cannot be opened: ")
+    assert err.startswith(f"error: {path}: it is not a serial port")

@@ -113,10 +113,12 @@ def test_simulation_ends_after_the_simulated_duration():
 
 
 def test_default_load_of_a_battery_monitor_is_1c():
-    arguments = ("--cell", "lfp", "--capacity-ah", "100", "--load", "constant", "--seconds", "36", "--speed", "100")
-    with simulate("--protocol", "vedirect", *arguments) as (process, _):
-        _, err = process.communicate(timeout=LONG_S)
-    assert float(re.search(r"SOC ([\d.]+)%", err)[1]) == pytest.approx(89.0, abs=0.1)
+    arguments = ("--cell", "lfp", "--capacity-ah", "100", "--load", "constant")
+    with simulate("--protocol", "vedirect", *arguments) as (_, path), open_line(path) as line:
+        data = read(line, lambda data: re.search(rb"\r\nI\t-?\d+\r\n", data) is not None)
+    assert float(re.search(rb"\r\nI\t(-?\d+)\r\n", data)[1]) == pytest.approx(
+        -100e3, rel=0.01
+    )  # mA, negative on discharge
 
 
 @pytest.mark.parametrize(
