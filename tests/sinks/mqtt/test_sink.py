@@ -103,6 +103,9 @@ async def test_restarted_broker_is_served_and_drops_are_counted(tmp_path: Path) 
             broker.start()
             try:
                 async with Listener(broker) as live:
+                    await live.wait(
+                        "bms/pack/availability", lambda payload: payload == b"online"
+                    )  # the sink is connected
                     sink.mqtt.publish(snapshot(delivery=sink.delivery))
                     for topic in (*RETAINED_TOPICS, "state"):
                         await live.wait(f"bms/pack/{topic}")
