@@ -71,7 +71,7 @@ def _permission(subject: Subject, port: str) -> Finding:
         return ok(NAME, f"{port}: {name} may open it ({owner})")
     if status.st_gid == ROOT_USER or not status.st_mode & stat.S_IWGRP:
         remedy = f"let the group open it: {subject.install_command}"
-    return fault(NAME, f"{port}: {name} may not open it ({owner})", remedy)
+    return fault(NAME, f"{port}: cannot be opened by {name} ({owner})", remedy)
 
 
 def _groups_of_service() -> set[int]:

@@ -148,7 +148,7 @@ def _over_time(result: CaptureResult, salt: str) -> Group:
     return Group(
         "Over time",
         tuple(Plot(title, small_plot(draw, salt=f"{salt}-{title}")) for title, draw in figures.items()),
-        remark="The model's voltage is simulated from the current alone (open loop). The SOC is that of the service's "
+        remark="The model's voltage is simulated from the current alone (open loop). The SOC comes from the service's "
         "estimator, which also uses the voltage.",
     )
 

@@ -52,14 +52,14 @@ class SensorSettings(Strict):
         description="address of the BMS on a shared RS485 line; default: the first address that responds",
     )
     baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
-        default=500_000, description="baud rate of the serial port; default: that of the protocol"
+        default=500_000, description="baud rate of the serial port; default: depends on the protocol"
     )
     sample_rate_hz: Annotated[int, Field(ge=1, le=1000)] = Field(
         default=100, description="sample rate that is requested from a board with the protocol binary"
     )
     current_sign: Literal["discharge_positive", "charge_positive"] = Field(
         default="discharge_positive",
-        description="direction of positive current in the values of the device, or in the columns of a table; default: that of the protocol",
+        description="direction of positive current in the values of the device, or in the columns of a table; default: depends on the protocol",
     )
     voltage_resolution_v: Positive = Field(
         default=25.0 / 1024,  # 10-bit converter behind a common divider module for 0 to 25 V

@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 def as_nobody(function: Callable[[], T]) -> T:
-    """Run a function in a child process of user nobody, and return its result. Without root, it runs as this user."""
+    """Run a function in a child process of the user ``nobody``, and return its result. Without root, it runs as this user."""
     reader, writer = os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the child uses none of the parent's threads

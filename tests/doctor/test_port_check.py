@@ -49,7 +49,7 @@ def test_a_port_of_another_user_is_a_fault_with_the_command_that_adds_the_user_t
         os.chown(line.path, 0, GROUP)
         (finding,) = as_nobody(lambda: list(check_port(pack)))
         assert finding.level is Level.FAULT
-        assert "nobody may not open it (root:" in finding.text
+        assert "cannot be opened by nobody (root:" in finding.text
         assert "sudo usermod -aG dialout nobody" in finding.remedy
     (finding,) = check_port(pack)
     assert finding.level is Level.OK

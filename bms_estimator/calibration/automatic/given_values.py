@@ -10,9 +10,9 @@ from bms_estimator.calibration.ocv_cell import OcvCell
 from bms_estimator.model.cell import CellModel, generic_cells, load_cell
 
 MIN_CHEMISTRY_DIFFERENCE_V = 0.25
-"""Minimum excess of the given cell's RMS difference from the measured OCV over that of the nearest generic cell [V]. The excess
-is at most 0.19 V among LCO, LMO, NCA and NMC. If only one of the two cells is LFP or LTO, it is at least 0.34 V with a rated
-capacity up to 12 % too large."""
+"""Minimum difference of two RMS voltages that causes a warning [V]. The voltages are the RMS differences from the measured OCV of
+the given cell and of the nearest generic cell. The difference is at most 0.19 V among LCO, LMO, NCA and NMC. If only one of the
+two cells is LFP or LTO, it is at least 0.34 V with a rated capacity up to 12 % too large."""
 MIN_LOW_SOC_RMS_V = 0.1
 """Minimum RMS error at low SOC that suggests a wrong capacity, per cell [V]. With the capacity drawn,
 a Leaf cell has 31 mV and an NCR18650 cell 71 mV. With a capacity that is 8 % too large, the Leaf cell has 228 mV."""
@@ -22,7 +22,7 @@ as worn out at 80 % of their rated capacity."""
 
 
 def chemistry_warnings(given: CellModel, capacity: CapacityEstimate, ocv: OcvCell | None) -> list[str]:
-    """Return a warning if the measured OCV is that of another chemistry than the given generic cell's.
+    """Return a warning if the measured OCV belongs to another chemistry than the given generic cell.
 
     There is no warning if the capacity was measured, because the given cell then determines neither capacity nor OCV.
     """
@@ -33,7 +33,7 @@ def chemistry_warnings(given: CellModel, capacity: CapacityEstimate, ocv: OcvCel
     if given_v - nearest_v < MIN_CHEMISTRY_DIFFERENCE_V:
         return []
     nearest = ocv.generic.cell.name
-    return [f"the measured OCV is that of {nearest} rather than {generic.cell.name}: check --cell, or cell in [pack]"]
+    return [f"the measured OCV fits {nearest} better than {generic.cell.name}: check --cell, or cell in [pack]"]
 
 
 def capacity_warnings(

@@ -94,7 +94,7 @@ def fit_chen_mora(points: Points) -> ChenMoraFit:
 def _with_exponent(points: Points, exponent: float, upper: Floats) -> tuple[float, Floats]:
     """Fit (2.10) with a given a17; return the squared residual and a16..a21.
 
-    Only a16 and a18 are bounded. The best solution with each of them free or at a bound is that of the bounded problem.
+    Only a16 and a18 have bounds. The fit tries each of them free and at its bounds, and keeps the best valid solution.
     """
     soc = points.soc
     basis = np.column_stack([-np.exp(-exponent * soc), np.ones_like(soc), soc, -(soc**2), soc**3])

@@ -76,7 +76,7 @@ def _origin_lines(calibration: Calibration) -> list[str]:
     if model.identification is not None:
         return [f"OCV: {ocv}.", "Resistances: identified."]
     generic = model.ocv.generic.cell.name if model.ocv else model.cell.cell.name
-    return [f"OCV: {ocv}.", f"Resistances: those of the generic {generic}, because {model.reason}."]
+    return [f"OCV: {ocv}.", f"Resistances: from the generic {generic}, because {model.reason}."]
 
 
 def _temperature_text(each: RecognizedCapture) -> str:

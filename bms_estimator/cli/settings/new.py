@@ -185,7 +185,7 @@ def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> Found
     """Return the device with this name or number. If ``may_search`` is True, return any other text as a place to search.
 
     Raises:
-        InvalidAnswerError: There is no device with this number or name. The reason is that of the search, if it has one.
+        InvalidAnswerError: There is no device with this number or name. If the search failed there, the message gives its reason.
     """
     for number, device in enumerate(result.devices, start=1):
         if text in (str(number), device.name):

@@ -59,10 +59,10 @@ class PackSpec(IdentifierValues, PackValues, _CellName):
         default=None, description="limit below which the device reports a current of 0"
     )
     voltage_gain_std: GainStd | None = Field(
-        default=None, description="relative standard deviation of the voltage's gain; default: that of the protocol"
+        default=None, description="relative standard deviation of the voltage's gain; default: depends on the protocol"
     )
     current_gain_std: GainStd | None = Field(
-        default=None, description="relative standard deviation of the current's gain; default: that of the protocol"
+        default=None, description="relative standard deviation of the current's gain; default: depends on the protocol"
     )
     period_s: Positive | None = Field(default=None, description="interval between two samples; default: 1 s")
 

@@ -119,9 +119,9 @@ def test_a_given_chemistry_that_the_measured_ocv_contradicts_is_warned_about(che
     test = full_discharge(load_cell(chemistry, 2.4))
     calibration = calibrate([test], load_cell(given, 2.7), name="mine")
     assert not calibration.capacity.is_measured
-    warning = f"the measured OCV is that of {chemistry} rather than {given}: check --cell, or cell in [pack]"
+    warning = f"the measured OCV fits {chemistry} better than {given}: check --cell, or cell in [pack]"
     assert (warning in calibration.warnings) == is_warned
-    assert any("the measured OCV is that" in each for each in calibration.warnings) == is_warned
+    assert any("the measured OCV fits" in each for each in calibration.warnings) == is_warned
 
 
 @pytest.mark.parametrize(("rated_ah", "is_warned"), [(33.0, True), (30.0, False)])

@@ -92,7 +92,7 @@ def test_settings_that_only_root_can_read_need_sudo(tmp_path: Path, monkeypatch:
     file = tmp_path / "pack.toml"
     tmp_path.chmod(0o755)
     file.touch(mode=0o000)
-    monkeypatch.chdir(tmp_path)  # user nobody may not search the parents of this folder
+    monkeypatch.chdir(tmp_path)  # the user nobody has no access to the parents of this folder
     finding = as_nobody(lambda: load_subject(Path("pack.toml")))
     assert isinstance(finding, Finding)
     assert finding.remedy == f"sudo {Path(sys.executable).parent}/bms-estimator doctor pack.toml"
