@@ -1,0 +1,73 @@
+"""Forecast of a pack: present values and curves."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.arrays import Floats
+
+FORECAST = np.dtype(
+    [
+        ("time_to_cutoff_s", "f8"),  # median time until the terminal voltage reaches the cut-off voltage [s]
+        ("time_to_cutoff_p05_s", "f8"),  # 5 % quantile of that time [s]
+        ("time_to_cutoff_p95_s", "f8"),  # 95 % quantile of that time [s]
+        ("cutoff_within_2min", "f8"),  # probability of the cut-off within 120 s, 0..1
+        ("cutoff_within_5min", "f8"),  # probability of the cut-off within 300 s, 0..1
+        ("cutoff_within_15min", "f8"),  # probability of the cut-off within 900 s, 0..1
+        ("time_to_full_s", "f8"),  # time until the charger ends the present charge [s]
+        ("usable_capacity_ah", "f8"),  # charge to the cut-off at the present load and temperature [Ah]
+        ("available_discharge_power_10s_w", "f8"),  # constant power that the pack supplies for 10 s [W]
+        ("available_discharge_power_60s_w", "f8"),  # constant power that the pack supplies for 60 s [W]
+        ("available_charge_power_10s_w", "f8"),  # constant power that the pack accepts for 10 s [W]
+        ("available_charge_power_60s_w", "f8"),  # constant power that the pack accepts for 60 s [W]
+    ],
+    align=True,
+)
+"""Present values of a forecast; NaN if unknown. The names are those of the published fields."""
+
+ForecastRows = NDArray[np.void]
+"""Shape (n,), dtype ``FORECAST``."""
+
+
+@dataclass(frozen=True)
+class ForecastCurve:
+    """Quantiles over the time ahead, each of shape (n,).
+
+    Attributes:
+        elapsed_s: Time from the forecast [s], increasing.
+        soc_p05, soc_p50, soc_p95: Quantiles of the SOC, 0..1.
+        voltage_p05_v, voltage_p50_v, voltage_p95_v: Quantiles of the terminal voltage [V].
+        survival: Probability that the cut-off comes later, 0..1.
+    """
+
+    elapsed_s: Floats
+    soc_p05: Floats
+    soc_p50: Floats
+    soc_p95: Floats
+    voltage_p05_v: Floats
+    voltage_p50_v: Floats
+    voltage_p95_v: Floats
+    survival: Floats
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Forecast at one sample.
+
+    Attributes:
+        time_s: Time stamp of the sample [s].
+        values: Shape (1,), dtype ``FORECAST``.
+        reason: Reason why there is no time to the cut-off; None if there is one.
+        curve: Curves; None without a time to the cut-off.
+    """
+
+    time_s: float
+    values: ForecastRows
+    reason: str | None
+    curve: ForecastCurve | None
+
+
+def unknown_values() -> ForecastRows:
+    """Return values that are all unknown, shape (1,), dtype ``FORECAST``."""
+    return np.array([(np.nan,) * len(FORECAST.names or ())], FORECAST)

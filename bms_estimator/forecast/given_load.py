@@ -1,0 +1,20 @@
+"""Load that the user gives for a forecast."""
+
+from dataclasses import dataclass
+
+from bms_estimator.model.arrays import Floats
+
+
+@dataclass(frozen=True)
+class GivenLoad:
+    """Load over the time ahead, constant between its points. It repeats after its end.
+
+    Attributes:
+        duration_s: Duration of each part [s], shape (n,), above 0.
+        current_a: Current of each part [A], positive on discharge, shape (n,); NaN where ``power_w`` is given.
+        power_w: Power of each part [W], positive on discharge, shape (n,); NaN where ``current_a`` is given.
+    """
+
+    duration_s: Floats
+    current_a: Floats
+    power_w: Floats

@@ -1,0 +1,1 @@
+"""Kernels of the forecast: the cell model run forward under drawn loads."""
