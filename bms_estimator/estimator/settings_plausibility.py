@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bms_estimator.estimator.anchor_settings import MAX_EMPTY_SOC, MIN_FULL_SOC, soc_at_cutoff, soc_at_full
+from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
@@ -20,6 +21,9 @@ SMALL_CELL_AH = 5.5
 """Maximum capacity of a 18650 or 21700 cell [Ah]."""
 MAX_SINGLE_ROW = 8
 """Number of cells in series above which cells of up to ``SMALL_CELL_AH`` are rarely used without cells in parallel."""
+MAX_LOAD_CUTOFF_SOC = 0.5
+"""SOC of the OCV curve at the cut-off voltage of the load above which the voltage is implausible. Inverters of LFP packs switch
+off at up to 3.2 V per cell, at which the OCV curve of the generic cell has 0.11."""
 CONVERTER_STEPS = 1024
 """Number of steps of the firmware's voltage converter."""
 
@@ -30,6 +34,9 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
     Args:
         settings: Settings of the pack.
         cell: The pack as one two-terminal object (``CellModel.pack``).
+
+    Raises:
+        UserError: The cut-off voltage of the load is not below the voltage of the full pack.
     """
     if isinstance(cell, FuelCellModel):
         lines = [_voltage_out_of_range(settings, _no_load_v(cell), "at no load"), *_ignored(settings, cell)]
@@ -41,6 +48,7 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
             _missing_parallel,
             _full_voltage_off_curve,
             _cutoff_voltage_off_curve,
+            _implausible_load_cutoff,
         )
         full_v = float(ocv_grid(cell)[0][-1])
         lines = [*(check(settings, cell) for check in checks), _voltage_out_of_range(settings, full_v, "when full")]
@@ -117,6 +125,19 @@ def _cutoff_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None
     return (
         f"pack.cutoff_voltage_v = {limits.cutoff_voltage_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there and SOC 0 "
         f"at {ocv_v[0]:.2f} V, so that the end of a discharge does not correct the SOC; is it the voltage of the whole pack?"
+    )
+
+
+def _implausible_load_cutoff(settings: Settings, cell: CellModel) -> str | None:
+    cutoff_v, ocv_v = load_cutoff_v(settings, cell), ocv_grid(cell)[0]
+    if settings.pack.cutoff_v is None:
+        return None
+    soc = float(np.interp(cutoff_v, ocv_v, np.linspace(0.0, 1.0, ocv_v.size)))
+    if soc <= MAX_LOAD_CUTOFF_SOC and cutoff_v >= cell.cell.voltage_min_v:
+        return None
+    return (
+        f"pack.cutoff_v = {cutoff_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there, and samples below "
+        f"{cell.cell.voltage_min_v:.4g} V are dropped as invalid (voltage_min_v); is it the voltage of the whole pack?"
     )
 
 

@@ -92,6 +92,11 @@ class PackValues(Strict):
 class PackSettings(PackValues, _PackNames):
     """Name and initial SOC of the pack; type, capacity and number of its cells."""
 
+    cutoff_v: Positive | None = Field(
+        default=None,
+        description="voltage at the terminals of the pack at which the load is switched off, which ends the forecast; default: cutoff_voltage_v, otherwise the limit of the alarm pack_under_voltage, otherwise OCV of the cell file at SOC 0",
+    )
+
 
 class PublishSettings(Strict):
     """Rate of the published estimates."""

@@ -7,6 +7,7 @@ import tomlkit
 import typer
 
 from bms_estimator.cli.options.pack_options import load_pack
+from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import CellModel, load_cell
@@ -81,6 +82,7 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         # values to which the observer adapts a7..a9 of C_ts and a10..a12 of C_tl
         a = {i: cell.bounds(i).limit for i in range(7, 13)}
         values["pack.capacity_ah"] = cell.cell.capacity_ah
+        values["pack.cutoff_v"] = load_cutoff_v(settings, cell)
         # SOC below which C_ts is negative, (2.11) of the thesis
         values["observer.delta_1"] = delta(exponent=a[8], offset=a[9], amplitude=a[7])
         # SOC below which C_tl is negative, (2.12) of the thesis

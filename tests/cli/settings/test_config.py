@@ -207,6 +207,8 @@ def cell_file(tmp_path):
             "series = 2\ncutoff_voltage_v = 6.8",
             "pack.cutoff_voltage_v = 6.8: the OCV of",
         ),
+        ({}, "series = 2\ncutoff_v = 7.6", "pack.cutoff_v = 7.6: the OCV of"),
+        ({}, "series = 2\ncutoff_v = 3.3", "pack.cutoff_v = 3.3: the OCV of"),
     ],
 )
 def test_check_warns_about_implausible_settings(cell, settings, message, cell_file, pack, capsys):
