@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 
 from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
 from bms_estimator.cli.main import COMMANDS
-from bms_estimator.model.payloads import Alarm, Estimate, Health, Info, ParameterReport, Payload
+from bms_estimator.model.payloads import Alarm, Estimate, ForecastReport, Health, Info, ParameterReport, Payload
 from bms_estimator.reports.report_items import Table
 from bms_estimator.reports.report_items import name as item_name
 from bms_estimator.reports.thesis_report import build
@@ -21,6 +21,7 @@ from bms_estimator.settings.settings_template import settings_file
 PAYLOADS: dict[str, type[Payload]] = {
     "state": Estimate,
     "parameters": ParameterReport,
+    "forecast": ForecastReport,
     "health": Health,
     "info": Info,
     "alarm": Alarm,

@@ -21,7 +21,7 @@ FRESH_PERIODS = 3
 """Number of periods without an accepted sample after which values are stale. The period is the longer one of publish and
 sample period."""
 
-PAYLOAD_VERSION = 1
+PAYLOAD_VERSION = 2
 """Version of all payloads; ``sinks/mqtt/topics.py`` defines when it increases."""
 
 
@@ -105,15 +105,46 @@ class Estimate(Payload):
     remaining_capacity_ah: Annotated[
         float | None, Quantity(Entity("Remaining capacity", "Ah", 2, 0.02, is_primary=True), packs="batteries")
     ] = Field(description="remaining charge to SOC 0 [Ah]")
-    usable_capacity_ah: Annotated[float | None, Quantity(raw_entity("Usable capacity", "Ah", 2), packs="batteries")] = (
-        Field(description="remaining charge to max(delta_1, delta_2) [Ah]")
-    )
     remaining_energy_wh: Annotated[
         float | None,
         Quantity(Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", is_primary=True), packs="batteries"),
     ] = Field(description="remaining energy at the terminals to SOC 0 at current_a [Wh]")
-    time_to_empty_s: float | None = Field(description="time to SOC 0 at current_a [s]; null unless discharging")
-    time_to_full_s: float | None = Field(description="time to SOC 1 at current_a [s]; null unless charging")
+    time_to_cutoff_s: float | None = Field(
+        description="median time until the load is switched off at the cut-off voltage [s], under a load like the one seen; "
+        "below 600 s use the quantiles and probabilities; null with a forecast_reason"
+    )
+    time_to_cutoff_p05_s: float | None = Field(description="5 % quantile of this time [s]")
+    time_to_cutoff_p95_s: float | None = Field(description="95 % quantile of this time [s]")
+    cutoff_within_2min: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
+        description="probability that the load is switched off within 2 min of the forecast, 0..1"
+    )
+    cutoff_within_5min: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
+        description="probability that the load is switched off within 5 min of the forecast, 0..1"
+    )
+    cutoff_within_15min: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
+        description="probability that the load is switched off within 15 min of the forecast, 0..1"
+    )
+    time_to_full_s: float | None = Field(description="time until the charger ends the charge [s]; null unless charging")
+    usable_capacity_ah: Annotated[
+        float | None, Quantity(Entity("Usable capacity", "Ah", 2, 0.02, is_primary=True), packs="batteries")
+    ] = Field(description="remaining charge to the cut-off voltage at the present load and temperature [Ah]")
+    available_discharge_power_10s_w: Annotated[
+        float | None,
+        Quantity(Entity("Available discharge power, 10 s", "W", 0, 5.0, "power", is_primary=True), packs="batteries"),
+    ] = Field(description="constant power that the pack supplies for 10 s [W]")
+    available_discharge_power_60s_w: Annotated[
+        float | None, Quantity(raw_entity("Available discharge power, 60 s", "W", 0, "power"), packs="batteries")
+    ] = Field(description="constant power that the pack supplies for 60 s [W]")
+    available_charge_power_10s_w: Annotated[
+        float | None,
+        Quantity(Entity("Available charge power, 10 s", "W", 0, 5.0, "power", is_primary=True), packs="batteries"),
+    ] = Field(description="constant power that the pack accepts for 10 s [W]")
+    available_charge_power_60s_w: Annotated[
+        float | None, Quantity(raw_entity("Available charge power, 60 s", "W", 0, "power"), packs="batteries")
+    ] = Field(description="constant power that the pack accepts for 60 s [W]")
+    forecast_reason: str | None = Field(
+        description="reason why time_to_cutoff_s and its quantiles are null; null if they have values"
+    )
     charge_out_ah: Annotated[
         float, Quantity(total_entity("Charge out", "Ah", 2)._replace(enabled=False), prometheus="counter")
     ] = Field(description=f"discharged {_COUNTED} [Ah]")
@@ -417,6 +448,23 @@ class Alarm(Payload):
     unwatched_reason: str | None = Field(default=None, description="reason why it is not watched; null while it is")
 
 
+class ForecastReport(Payload):
+    """Topic ``forecast``: course of SOC and voltage until the cut-off. Each list has one value for each ``elapsed_s``."""
+
+    time: str = Field(description="arrival time of the sample from which the forecast begins, ISO 8601, UTC")
+    publish_time: str = Field(description="time at which this message was created, ISO 8601, UTC")
+    reason: str | None = Field(description="reason why the lists are empty; null if there is a forecast")
+    cutoff_v: float = Field(description="voltage at which the load is switched off [V]")
+    elapsed_s: list[float | None] = Field(description="time from ``time`` [s], increasing")
+    soc_p05: list[float | None] = Field(description="5 % quantile of the SOC, 0..1")
+    soc_p50: list[float | None] = Field(description="median of the SOC, 0..1")
+    soc_p95: list[float | None] = Field(description="95 % quantile of the SOC, 0..1")
+    voltage_p05_v: list[float | None] = Field(description="5 % quantile of the terminal voltage [V]")
+    voltage_p50_v: list[float | None] = Field(description="median of the terminal voltage [V]")
+    voltage_p95_v: list[float | None] = Field(description="95 % quantile of the terminal voltage [V]")
+    survival: list[float | None] = Field(description="probability that the load is still on at this time, 0..1")
+
+
 class Snapshot(NamedTuple):
     """Payloads of one publication."""
 
@@ -427,3 +475,5 @@ class Snapshot(NamedTuple):
     info: Info
     alarms: tuple[Alarm, ...] = ()
     """All alarms, raised or not."""
+    forecast: ForecastReport | None = None
+    """Curves of the last forecast; None before the first sample and without a forecaster."""

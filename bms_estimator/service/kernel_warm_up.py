@@ -12,6 +12,7 @@ from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import neutral_fit
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.kernel_subtrees import CELL, second_process
+from bms_estimator.service.pack_forecaster import load_forecast_kernels
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload
@@ -50,4 +51,5 @@ def _call_kernels() -> None:
     SlowFit(estimator).adopt(neutral_fit())
     return_to_cell_file(estimator)
     remaining_charge(estimator, 0.0)
+    load_forecast_kernels()
     _ = FrameDecoder().clock_ppm

@@ -13,17 +13,18 @@ from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.forecast.forecaster import Runner
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import RecordingHealth
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import CheckpointWriter
 from bms_estimator.service.fit_thread import FitThread, new_slow_fit
+from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.request_handlers import RequestHandlers
 from bms_estimator.service.restored_pack import restore_pack
@@ -94,6 +95,7 @@ async def run_estimation_loop(
     pack_model = new_slow_fit(settings, estimator, submit=fit_thread.submit, on_failure=fit_thread.log_failure)
     counters, outcome = restore_pack(estimator, pack_model, checkpoint, history, clock)
     restored_s = since_boot()
+    forecaster = new_forecaster(settings, cell, estimator, pack_model)
     totals = LifetimeTotals(estimator, counters.total)
     publisher = Publisher(
         settings,
@@ -112,6 +114,7 @@ async def run_estimation_loop(
         hooks=lambda: hooks.health,
         pack_model=lambda: pack_model_health(pack_model, fit_thread.times) if pack_model else None,
         on_alarm=hooks.on_alarm_change,
+        forecaster=forecaster,
     )
     _restore_alarms(publisher, counters.alarms)
     hooks.restore_active(publisher.alarm_monitor.report)
@@ -139,7 +142,7 @@ async def run_estimation_loop(
         await stack.enter_async_context(hooks)
         notifier.ready(name)
         tasks = [
-            _estimate(source, estimator, pack_model or estimator, totals, publisher, edge, restored_s),
+            _estimate(source, estimator, forecaster or pack_model or estimator, totals, publisher, edge, restored_s),
             _keep_alive(publisher, notifier, name, clock),
             _measure_lag(publisher),
         ]
@@ -162,7 +165,7 @@ async def run_estimation_loop(
 async def _estimate(
     source: Source,
     estimator: Estimator,
-    runner: Estimator | SlowFit,
+    runner: Runner,
     totals: LifetimeTotals,
     publisher: Publisher,
     edge: BlockSender | None,
@@ -173,7 +176,7 @@ async def _estimate(
     Args:
         source: Supplies the blocks.
         estimator: Estimator.
-        runner: The estimator, or the slow fit that runs it.
+        runner: The estimator, or the forecaster or slow fit that runs it.
         totals: Totals over restarts.
         publisher: Publisher.
         edge: Sender that receives all samples; None: no sender.

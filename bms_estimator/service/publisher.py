@@ -7,6 +7,7 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
@@ -14,6 +15,7 @@ from bms_estimator.model.payloads import (
     FRESH_PERIODS,
     EdgeHealth,
     Estimate,
+    ForecastReport,
     Health,
     HookHealth,
     Info,
@@ -30,6 +32,7 @@ from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source, SourceHealth
 from bms_estimator.telemetry.alarms import Change
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
 from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
@@ -42,6 +45,8 @@ log = structlog.get_logger(__name__)
 
 SLOW_S = 1.0
 """Minimum interval between two payloads of parameters, health or info, at any publish rate [s]."""
+FORECAST_S = 60.0
+"""Minimum interval between two payloads of the forecast's curves [s]."""
 SOURCE_HUNG_S = 20.0
 """Time after which a source whose task has not run counts as hung [s]. A missing port is retried at least every 10 s."""
 
@@ -66,6 +71,7 @@ class Publisher:
         hooks: Returns successes and failures of alarm hooks; None without hooks.
         pack_model: Returns the state of the slow fit; None without one.
         on_alarm: Called with each alarm that is raised or cleared.
+        forecaster: Supplies the forecasts; None: there are none.
 
     Attributes:
         alarm_monitor: Alarm monitor.
@@ -96,6 +102,7 @@ class Publisher:
         hooks: Callable[[], HookHealth | None] = lambda: None,
         pack_model: Callable[[], PackModelHealth | None] = lambda: None,
         on_alarm: Callable[[Change], object] = lambda _: None,
+        forecaster: Forecaster | None = None,
     ) -> None:
         self._settings, self._cell, self._estimator = settings, cell, estimator
         self._source, self._sinks, self._clock = source, sinks, clock
@@ -105,6 +112,11 @@ class Publisher:
         self._board: Mapping[str, str] = {}
         self._source_health, self._recording, self._edge, self._latency = source_health, recording, edge, Latency()
         self._hooks, self._pack_model = hooks, pack_model
+        self._forecaster, self._forecast_s = forecaster, -math.inf  # time of the last payload of the curves
+        is_battery = isinstance(cell, CellModel)
+        self._no_forecast = no_forecast(
+            "the identifier is off" if is_battery else "a fuel cell has no charge to forecast"
+        )
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None
         self.saved_flow: ChargeEnergy | None = None
@@ -185,7 +197,7 @@ class Publisher:
 
     def publish_last(self) -> None:
         """Publish a last snapshot with all payloads recomputed."""
-        self._slow_s = -math.inf
+        self._slow_s = self._forecast_s = -math.inf
         self.publish()
 
     @property
@@ -220,9 +232,11 @@ class Publisher:
 
     def _next_snapshot(self, now_s: float) -> Snapshot:
         """Return a snapshot with the estimate of this window. Other payloads are recomputed only when they are due."""
-        _, parameters, health, info, _ = self.snapshot
+        _, parameters, health, info, _, forecast = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
         estimate = self._estimate(summary, wall_s) if summary else None
+        if summary and now_s - self._forecast_s >= FORECAST_S:
+            self._forecast_s, forecast = now_s, self._forecast(summary, wall_s)
         message = self._sensor_message(now_s)
         slow_due = now_s - self._slow_s >= SLOW_S
         if slow_due:
@@ -231,14 +245,19 @@ class Publisher:
         if slow_due or health.sensor_online != (message is None):
             health = self._health(now_s, message)
             self._log_input_faults(health)
-        return Snapshot(estimate, parameters, health, info, self.alarm_monitor.report)
+        return Snapshot(estimate, parameters, health, info, self.alarm_monitor.report, forecast)
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         remaining = remaining_charge(self._estimator, window.current_a)
         # only saved values, so that the next run continues from there
         self._flow = self._flow.at_least(self.saved_flow or self._totals.flow)
         capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
-        return make_state_payload(window, remaining, self._source.counters, wall_s, self._flow, capacity_ah)
+        forecast = self._forecaster.latest if self._forecaster else self._no_forecast
+        return make_state_payload(window, remaining, forecast, self._source.counters, wall_s, self._flow, capacity_ah)
+
+    def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:
+        forecaster = self._forecaster
+        return make_forecast_payload(forecaster.latest, forecaster.cutoff_v, window, wall_s) if forecaster else None
 
     def _health(self, now_s: float, message: str | None) -> Health:
         lag_s, self._lag_s = self._lag_s, 0.0

@@ -1,6 +1,6 @@
 """CSV and Parquet files with the estimates of each sample. They are written in blocks, so that memory does not grow.
 
-The columns are the trace's fields. Every value can be restored exactly.
+The columns are the trace's fields and those of the forecast. Every value can be restored exactly.
 """
 
 import gzip
@@ -121,6 +121,15 @@ def table_sink(path: Path) -> TableSink:
         if path.name.lower().endswith(suffix):
             return sink(path)
     raise UserError(f"{path}: the name must end in {', '.join(SINKS)}")
+
+
+def join_columns(*blocks: NDArray[np.void]) -> NDArray[np.void]:
+    """Return one structured array with the columns of all ``blocks``, which have equal lengths and different columns."""
+    columns = {name: block[name] for block in blocks for name in block.dtype.names or ()}
+    joined = np.empty(blocks[0].size, [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        joined[name] = column
+    return joined
 
 
 def _create(path: Path) -> IO[bytes]:

@@ -1,4 +1,4 @@
-"""Remaining charge, energy and time at the present state and load."""
+"""Remaining charge and energy at the present state and load."""
 
 import math
 from dataclasses import dataclass
@@ -10,31 +10,22 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import present_resistance, relative_capacity
 from bms_estimator.kernels.cell_model import chen_mora
 
-MAX_TIME_H = 1000.0
-"""Maximum published time to empty or full [h]. A current that would take longer counts as zero."""
-
 
 @dataclass(frozen=True)
 class RemainingCharge:
-    """Remaining charge, energy and time; NaN if unknown.
+    """Remaining charge and energy; NaN if unknown.
 
     Attributes:
         capacity_ah: Charge down to SOC 0 [Ah].
-        usable_ah: Charge down to max(delta1, delta2), the SOC below which a capacitance of the model is negative [Ah].
         energy_wh: Energy at the terminals down to SOC 0 at the present current [Wh].
-        time_to_empty_s: Time to SOC 0 at the present current [s].
-        time_to_full_s: Time to SOC 1 at the present current [s].
     """
 
     capacity_ah: float = math.nan
-    usable_ah: float = math.nan
     energy_wh: float = math.nan
-    time_to_empty_s: float = math.nan
-    time_to_full_s: float = math.nan
 
 
 def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
-    """Return the remaining charge, energy and time.
+    """Return the remaining charge and energy.
 
     Args:
         estimator: Estimator; read only.
@@ -48,17 +39,9 @@ def remaining_charge(estimator: Estimator, current_a: float) -> RemainingCharge:
     if estimator.identifying:
         capacity_ah *= relative_capacity(estimator.record[0]).value
     charge_ah = soc * capacity_ah
-    usable_ah = max(soc - max(state["delta_1"], state["delta_2"]), 0.0) * capacity_ah
     open_circuit_wh = _mean_ocv(settings["ocv_v"], soc) * charge_ah
     lost_wh = load_a * _total_resistance(estimator, soc) * charge_ah
-    to_empty_s = _duration_s(charge_ah, load_a, capacity_ah)
-    to_full_s = _duration_s(capacity_ah - charge_ah, -current_a, capacity_ah)
-    return RemainingCharge(charge_ah, usable_ah, max(open_circuit_wh - lost_wh, 0.0), to_empty_s, to_full_s)
-
-
-def _duration_s(charge_ah: float, current_a: float, capacity_ah: float) -> float:
-    """Return the time in which the current moves ``charge_ah`` [s]; NaN if the current is negligible for ``capacity_ah``."""
-    return 3600.0 * charge_ah / current_a if current_a * MAX_TIME_H > capacity_ah else math.nan
+    return RemainingCharge(charge_ah, max(open_circuit_wh - lost_wh, 0.0))
 
 
 def _mean_ocv(ocv_v: NDArray[np.float64], soc: float) -> float:

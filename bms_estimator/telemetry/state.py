@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.forecast.forecast import Forecast
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
@@ -14,6 +15,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import PAYLOAD_VERSION, Estimate, Info
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.forecast import forecast_fields
 from bms_estimator.telemetry.publish_window import WindowSummary
 from bms_estimator.telemetry.remaining_charge import RemainingCharge
 from bms_estimator.version import __version__
@@ -33,6 +35,7 @@ def finite(value: float) -> float | None:
 def make_state_payload(
     window: WindowSummary,
     remaining: RemainingCharge,
+    forecast: Forecast,
     counters: Mapping[str, int],
     now_s: float,
     flow: ChargeEnergy,
@@ -43,6 +46,7 @@ def make_state_payload(
     Args:
         window: Summary since the last publication.
         remaining: Remaining charge and energy.
+        forecast: The last forecast.
         counters: Counters of the source.
         now_s: Wall clock [s since 1970].
         flow: Charge and energy at the terminals.
@@ -64,10 +68,8 @@ def make_state_payload(
         **{name: last[name] for name in COPIED},
         soc_percent=None if soc is None else 100.0 * soc,
         remaining_capacity_ah=finite(remaining.capacity_ah),
-        usable_capacity_ah=finite(remaining.usable_ah),
         remaining_energy_wh=finite(remaining.energy_wh),
-        time_to_empty_s=finite(remaining.time_to_empty_s),
-        time_to_full_s=finite(remaining.time_to_full_s),
+        **forecast_fields(forecast, float(window.last["time_s"])),
         **flow._asdict(),
         equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
         # the learning law does not change delta1 and delta2, and only this law has an adaptation gain

@@ -58,7 +58,7 @@ folder = "{tmp_path / "state"}"
         with contextlib.suppress(asyncio.CancelledError):
             await running
     state = json.loads(listener.all("bms/pack/state")[-1])
-    for name in ("soc", "soc_percent", "remaining_capacity_ah", "delta_1", "time_to_empty_s"):
+    for name in ("soc", "soc_percent", "remaining_capacity_ah", "delta_1", "time_to_cutoff_s"):
         assert state[name] is None
     assert 8.0 < state["voltage_v"] < 13.0
     assert state["lock"]

@@ -10,6 +10,7 @@ from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.forecast import no_forecast
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
@@ -310,7 +311,9 @@ def test_the_learning_law_publishes_gamma_k_and_the_improved_law_publishes_n_of_
         window.add(estimator.run(ten_hours[:600]), 0.0)
         summary = window.take()
         assert summary is not None
-        states[law] = make_state_payload(summary, remaining_charge(estimator, 0.0), {}, 0.0, ChargeEnergy(), 3.0)
+        states[law] = make_state_payload(
+            summary, remaining_charge(estimator, 0.0), no_forecast("none"), {}, 0.0, ChargeEnergy(), 3.0
+        )
         k = float(estimator.state["k"][0])
         assert states[law].adaptive_gain_k == k
     learning, improved = states["learning"], states["improved"]

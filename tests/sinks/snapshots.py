@@ -3,6 +3,7 @@
 import numpy as np
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.forecast.forecast import Forecast, ForecastCurve, unknown_values
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
 from bms_estimator.model.payloads import Alarm, LoopHealth, Snapshot
@@ -10,6 +11,7 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
 from bms_estimator.telemetry.health import make_health_payload
 from bms_estimator.telemetry.lifetime_totals import new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
@@ -19,6 +21,25 @@ from bms_estimator.telemetry.state import make_info_payload, make_state_payload
 
 NOW = 1_700_000_000.0
 """Wall clock of the snapshots [s since 1970]."""
+
+CUTOFF_V = 2.7
+"""Cut-off voltage of the forecast [V]."""
+
+
+def forecast_at(median_s: float) -> Forecast:
+    """Return a forecast at the time 0.1 s with a linear course of SOC and voltage, whose median time to the cut-off is given."""
+    values, part = unknown_values(), np.linspace(0.0, 1.0, 61)
+    values["time_to_cutoff_s"], values["time_to_cutoff_p05_s"] = median_s, 0.75 * median_s
+    values["time_to_cutoff_p95_s"], values["cutoff_within_15min"] = 1.5 * median_s, 0.01
+    values["cutoff_within_2min"], values["cutoff_within_5min"] = 0.0, 0.002
+    soc, voltage_v = 0.5 * (1.0 - part), 3.8 - 1.1 * part**3
+    survival = np.interp(part, [0.0, 0.5, 1.0], [1.0, 1.0, 0.0])
+    bands = 0.9 * soc, soc, 1.1 * soc, voltage_v - 0.3 * part, voltage_v, voltage_v + 0.2 * part
+    return Forecast(0.1, values, None, ForecastCurve(1.5 * median_s * part, *bands, survival))
+
+
+FORECAST = forecast_at(6600.0)
+"""Forecast of the snapshots of a cell."""
 
 IDLE_LOOP = LoopHealth(
     latency_p50_s=None,
@@ -63,7 +84,13 @@ def _make_snapshot(
     assert summary
     return Snapshot(
         make_state_payload(
-            summary, remaining_charge(estimator, 0.0), {"crc_errors": 3}, NOW, ChargeEnergy(), _capacity_ah(cell)
+            summary,
+            remaining_charge(estimator, 0.0),
+            FORECAST if isinstance(cell, CellModel) else no_forecast("a fuel cell"),
+            {"crc_errors": 3},
+            NOW,
+            ChargeEnergy(),
+            _capacity_ah(cell),
         ),
         make_parameters_payload(estimator, NOW),
         make_health_payload(
@@ -84,6 +111,7 @@ def _make_snapshot(
             recording=None,
         ),
         make_info_payload(Settings(), cell, {"firmware": "1.0", "serial": "A1"}, NOW, temperature_sensor=False),
+        forecast=make_forecast_payload(FORECAST, CUTOFF_V, summary, NOW) if isinstance(cell, CellModel) else None,
     )
 
 

@@ -46,38 +46,15 @@ def pulses(current_a: float, hours: float) -> np.ndarray:
     return block
 
 
-def test_remaining_charge_energy_and_time_to_empty_under_a_load() -> None:
+def test_remaining_charge_and_energy_under_a_load() -> None:
     left = remaining_charge(estimator_at(0.5), C_5_A)
     assert left.capacity_ah == pytest.approx(0.5 * CAPACITY_AH)
-    assert left.time_to_empty_s == pytest.approx(0.5 * CAPACITY_AH / C_5_A * 3600.0)
     energy_wh = CAPACITY_AH * quad(chen_mora.emf, 0.0, 0.5, args=(CELL.a,))[0]
     assert remaining_charge(estimator_at(0.5), 0.0).energy_wh == pytest.approx(energy_wh, rel=1e-4)
     a = estimator_at(0.5).state[0]["a"]
     total_ohm = chen_mora.r_s(0.5, a) + chen_mora.r_ts(0.5, a) + chen_mora.r_tl(0.5, a)
     lost_wh = remaining_charge(estimator_at(0.5), 0.0).energy_wh - left.energy_wh
     assert lost_wh == pytest.approx(C_5_A * total_ohm * 0.5 * CAPACITY_AH)
-
-
-def test_usable_charge_ends_at_the_larger_of_delta1_and_delta2() -> None:
-    """Below these SOCs the capacitances C_ts and C_tl of the model are negative."""
-    estimator = estimator_at(0.5)
-    state = estimator.state[0]
-    usable_ah = remaining_charge(estimator, 0.0).usable_ah
-    assert usable_ah == pytest.approx((0.5 - max(state["delta_1"], state["delta_2"])) * CAPACITY_AH)
-    assert remaining_charge(estimator_at(0.001), 0.0).usable_ah == 0.0
-
-
-@pytest.mark.parametrize("current_a", [0.0, -1.0, 1e-5])
-def test_time_to_empty_is_nan_unless_the_pack_is_discharged(current_a: float) -> None:
-    assert math.isnan(remaining_charge(estimator_at(0.5), current_a).time_to_empty_s)
-
-
-def test_time_to_full_is_nan_unless_the_pack_is_charged() -> None:
-    assert remaining_charge(estimator_at(0.4), -C_5_A).time_to_full_s == pytest.approx(
-        0.6 * CAPACITY_AH / C_5_A * 3600.0
-    )
-    assert remaining_charge(estimator_at(1.0), -C_5_A).time_to_full_s == 0.0
-    assert all(math.isnan(remaining_charge(estimator_at(0.5), a).time_to_full_s) for a in (0.0, 1.0, -1e-5))
 
 
 def test_no_values_are_published_before_the_first_sample() -> None:

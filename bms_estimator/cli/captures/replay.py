@@ -35,19 +35,22 @@ from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.service.fit_thread import new_slow_fit
+from bms_estimator.service.pack_forecaster import load_forecast_kernels, new_forecaster
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
-from bms_estimator.sinks.trace_file import TableSink, table_sink
+from bms_estimator.sinks.trace_file import TableSink, join_columns, table_sink
 from bms_estimator.sources.captures.replay import RawCapture, Replay, open_capture
 from bms_estimator.store.outbox import Outbox
+from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 from bms_estimator.telemetry.pack_model import FitTimes, pack_model_health
 
@@ -67,6 +70,14 @@ def replay(
         Path | None,
         typer.Option(
             help="file to which the estimates of each sample are written: .csv, .csv.gz or .parquet", show_default=False
+        ),
+    ] = None,
+    cutoff_v: Annotated[
+        float | None,
+        typer.Option(
+            parser=decimal(1e-3),
+            help="voltage at which the load is switched off, which ends the forecast [V]; default: cutoff_v of the pack",
+            show_default=False,
         ),
     ] = None,
     force: Force = False,
@@ -97,6 +108,9 @@ def replay(
     if soc is not None:
         reject_soc_for_fuel_cell(model, "--soc")
         settings = with_pack(settings, initial_soc=soc)
+    if cutoff_v is not None:
+        reject_soc_for_fuel_cell(model, "--cutoff-v")
+        settings = with_pack(settings, cutoff_v=cutoff_v)
     settings = with_broker(settings, mqtt) if mqtt else settings.model_copy(update={"mqtt": None})
     if out is not None:
         check_output_file(out, [capture], force=force)
@@ -134,15 +148,17 @@ async def _replay(
     """Run the estimator over a source, and pass the estimates to table, summary and broker."""
     with show_compile_progress():
         estimator, summary = new_estimator(settings, model), Summary()
+        load_forecast_kernels()
     errors: dict[str, str] = {}  # the last text of each kind
     pack_model = None
     if fit_pack:
         pack_model = new_slow_fit(
             settings, estimator, on_failure=lambda error: errors.update({type(error).__name__: str(error)})
         )
-    runner = pack_model or estimator
+    forecaster = new_forecaster(settings, model, estimator, pack_model)
+    runner = forecaster or pack_model or estimator
     async with AsyncExitStack() as stack:
-        publisher = await _open_publisher(stack, settings, model, estimator, pack_model, source)
+        publisher = await _open_publisher(stack, settings, model, estimator, pack_model, forecaster, source)
         stack.enter_context(table or nullcontext())
         bar = stack.enter_context(progress_bar("replaying"))
         started_s, impossible = time.perf_counter(), None
@@ -152,7 +168,7 @@ async def _replay(
             if trace.size < received.samples.size:  # samples were dropped
                 impossible = out_of_range_reason(received.samples, estimator.settings[0]) or impossible
             if table:
-                table.write(trace)
+                table.write(join_columns(trace, forecaster.rows) if forecaster else trace)
             if publisher:
                 publisher.add(received, trace)
                 await asyncio.sleep(0)  # the MQTT client runs in this event loop
@@ -162,7 +178,7 @@ async def _replay(
             publisher.publish_last()
     for kind, text in errors.items():
         typer.echo(f"warning: a fit of the pack's model failed: {kind}: {text}", err=True)
-    result = summary.result(estimator, pack_model, source.samples, wall_s)
+    result = summary.result(estimator, pack_model, forecaster, source.samples, wall_s)
     return replace(result, impossible=impossible, temperatures_dropped=source.counters.get("implausible", 0))
 
 
@@ -172,6 +188,7 @@ async def _open_publisher(
     model: PackModel,
     estimator: Estimator,
     pack_model: SlowFit | None,
+    forecaster: Forecaster | None,
     source: Replay,
 ) -> Publisher | None:
     """Return the publisher; None without a broker."""
@@ -193,6 +210,7 @@ async def _open_publisher(
         clock=Clock(),
         delivery=delivery,
         pack_model=lambda: pack_model_health(pack_model, FitTimes(None, None)) if pack_model else None,
+        forecaster=forecaster,
     )
 
 
@@ -231,8 +249,17 @@ def _soc_rows(result: ReplayResult) -> dict[str, str]:
         "SOC": f"{_number_text(result.soc_initial, '.2%')} to {_number_text(result.soc_final, '.2%')}",
         "SOC, std at the end": _number_text(result.soc_std_final, ".2%"),
         **({} if result.capacity_ah is None else {"capacity": _capacity_text(result)}),
+        **_forecast_row(result),
         **_temperature_row(result),
     }
+
+
+def _forecast_row(result: ReplayResult) -> dict[str, str]:
+    f = result.forecast
+    if not f:
+        return {}
+    text = cutoff_text(*(f[name] for name in CUTOFF_FIELDS))
+    return {"to cut-off, 5 to 95 %": text or f"unknown: {result.forecast_reason}"}
 
 
 def _capacity_text(result: ReplayResult) -> str:

@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
+from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
@@ -70,6 +72,10 @@ class ReplayResult:
     """Number of adopted fits of the pack's model."""
     failed_fits: int
     """Number of fits that ended with an error."""
+    forecast: dict[str, float | None]
+    """Values of the last forecast; empty without a forecaster."""
+    forecast_reason: str | None
+    """Reason why the last forecast has no time to the cut-off; None if it has one, or without a forecaster."""
     samples_per_s: float | None
     """Number of processed samples per second, including dropped samples."""
     wall_s: float
@@ -105,13 +111,19 @@ class Summary:
         self._soc_difference_sum += float(soc_difference @ soc_difference)
 
     def result(
-        self, estimator: Estimator, pack_model: SlowFit | None, sample_count: int, wall_s: float
+        self,
+        estimator: Estimator,
+        pack_model: SlowFit | None,
+        forecaster: Forecaster | None,
+        sample_count: int,
+        wall_s: float,
     ) -> ReplayResult:
         """Return the result of the replay, without ``impossible`` and ``temperatures_dropped``, which the caller sets.
 
         Args:
             estimator: Estimator after the last sample.
             pack_model: Slow fit of the estimator; None without one.
+            forecaster: Forecaster after the last sample; None without one.
             sample_count: Number of samples in the capture, including dropped samples.
             wall_s: Duration of the replay [s].
         """
@@ -148,6 +160,7 @@ class Summary:
             capacity_std_ah=capacity.std * declared_ah if capacity else None,
             fits=pack_model.fits if pack_model else 0,
             failed_fits=pack_model.failed if pack_model else 0,
+            **_last_forecast(forecaster),
             samples_per_s=sample_count / wall_s if wall_s > 0.0 else None,
             wall_s=wall_s,
         )
@@ -162,6 +175,15 @@ def _learned_parameters(estimator: Estimator) -> dict[str, LearnedParameter]:
         return {}
     parameters = fuel_cell_parameters(estimator, now_s=0.0)  # the time is not part of the result
     return {name: LearnedParameter(p.value, p.std, p.valid) for name, p in parameters.items()}
+
+
+def _last_forecast(forecaster: Forecaster | None) -> dict[str, Any]:
+    """Return the fields of ``ReplayResult`` with the last forecast."""
+    if forecaster is None:
+        return {"forecast": {}, "forecast_reason": None}
+    latest = forecaster.latest
+    values = {name: finite(latest.values[0][name]) for name in latest.values.dtype.names or ()}
+    return {"forecast": values, "forecast_reason": latest.reason}
 
 
 def _finite_field(row: np.void | None, name: str) -> float | None:

@@ -20,6 +20,7 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads import Payload
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.forecast import no_forecast
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
@@ -30,6 +31,8 @@ MAX_WALL_S = 2.0**34
 MAX_PART_SAMPLES = 4096
 """Maximum number of samples that are estimated at a time. It limits the buffer of estimates of 200 bytes each, which
 exists for each type of pack in each partition."""
+NO_FORECAST = no_forecast("a fleet worker makes no forecasts")
+"""Forecast in the payloads of a worker."""
 
 Publications = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
 """Payloads of the topics ``state`` and ``parameters``, and message ids and rows of finished hours."""
@@ -145,7 +148,7 @@ class BlockProcessor:
         # ``blocks`` does not count the present block yet
         counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
         remaining = remaining_charge(pack_type.estimator, window.current_a)
-        return _json(make_state_payload(window, remaining, counters, now_s, totals, pack_type.capacity_ah))
+        return _json(make_state_payload(window, remaining, NO_FORECAST, counters, now_s, totals, pack_type.capacity_ah))
 
     def _parameters_payload(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
         """Return the payload of topic ``parameters``. Its ages refer to the arrival time of the samples."""

@@ -11,7 +11,12 @@ ESTIMATE = field_entities(Estimate, "all")
 """Entities of every pack."""
 CHARGE_STATE = field_entities(Estimate, "batteries") | {
     "soc_std_percent": Entity("State of charge, standard deviation", "%", decimals=1, step=0.2, is_primary=True),
-    "time_to_empty_h": Entity("Time to empty", "h", decimals=2, step=0.05, device_class="duration", is_primary=True),
+    "time_to_cutoff_h": Entity("Time to cut-off", "h", decimals=2, step=0.05, device_class="duration", is_primary=True),
+    "time_to_cutoff_p05_h": raw_entity("Time to cut-off, 5 % quantile", "h", 2, "duration"),
+    "time_to_cutoff_p95_h": raw_entity("Time to cut-off, 95 % quantile", "h", 2, "duration"),
+    "cutoff_within_15min_percent": Entity(
+        "Probability of cut-off within 15 min", "%", decimals=0, step=5.0, is_primary=True
+    ),
     "time_to_full_h": Entity("Time to full", "h", decimals=2, step=0.05, device_class="duration", is_primary=True),
     "soh_percent": Entity("State of health", "%", decimals=1, step=0.2),
     "soh_std_percent": Entity("State of health, standard deviation", "%", decimals=1, step=0.2),

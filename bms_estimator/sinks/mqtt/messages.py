@@ -107,12 +107,14 @@ class MessageBuilder:
         Returns:
             The messages, and the state that the broker has after them.
         """
-        _, parameters, health, info, alarms = snapshot
+        _, parameters, health, info, alarms, forecast = snapshot
         before, messages = sent.snapshot, []
         has_sample = bool(parameters.elements)
         # parameters and health have a publish time, so that each new object is published
         if has_sample and (before is None or before.parameters is not parameters):
             messages.append(self._live("parameters", parameters.json_bytes))
+        if forecast is not None and (before is None or before.forecast is not forecast):
+            messages.append(self._live("forecast", forecast.json_bytes))
         if before is None or before.health.sensor_online != health.sensor_online:
             messages.append(self._sensor(health))
         if before is None or before.health is not health:

@@ -8,7 +8,16 @@ An addition does not increase it: readers ignore unknown fields.
 from typing import Any, NamedTuple
 
 from bms_estimator.model.events import Event
-from bms_estimator.model.payloads import PAYLOAD_VERSION, Alarm, Estimate, Health, Info, ParameterReport, Payload
+from bms_estimator.model.payloads import (
+    PAYLOAD_VERSION,
+    Alarm,
+    Estimate,
+    ForecastReport,
+    Health,
+    Info,
+    ParameterReport,
+    Payload,
+)
 
 
 class Topic(NamedTuple):
@@ -25,6 +34,7 @@ TOPICS = {
     "state": Topic(Estimate, 1, retain=False, when="each publish period with samples; late after an outage"),
     "event": Topic(Event, 1, retain=False, when="when it happens; late after an outage"),
     "parameters": Topic(ParameterReport, 0, retain=False, when="each second, from the first sample on"),
+    "forecast": Topic(ForecastReport, 0, retain=False, when="once a minute, from the first sample on"),
     "health": Topic(Health, 1, retain=True, when="each second, and when the sensor comes or goes"),
     "info": Topic(Info, 1, retain=True, when="on change"),
     "alarm": Topic(Alarm, 1, retain=True, when="on change"),

@@ -8,10 +8,12 @@ from rich.table import Table
 from rich.text import Text
 
 from bms_estimator.sinks.terminal.json_fields import JsonFields
-from bms_estimator.sinks.terminal.view_state import PackView, ViewState, clock_text, soc_text
+from bms_estimator.sinks.terminal.view_state import PackView, ViewState, clock_text, cutoff_band_text, soc_text
 
 MIN_TABLE_CELLS = 80
 """Minimum width of the table [cells]. A narrower terminal crops the right columns."""
+MIN_WIDE_TABLE_CELLS = 96
+"""Minimum width of the table with the remaining charge [cells]."""
 OTHER_LINES = 9
 """Lines of the screen without packs and messages: headings, broker outage, numbers of omitted lines, log and hint."""
 LOG_LINES = 2
@@ -53,7 +55,9 @@ def _pack_table(view: ViewState, packs: Sequence[PackView], width: int) -> Table
     if view.true_soc is not None:
         table.add_column("True\nSOC %", no_wrap=True, style="magenta")
     table.add_column(f"State at\n{clock_text(view.now_s)}", no_wrap=True)
-    for heading in ("Voltage\nV", "Current\nA", "Power\nW", "Remaining\nAh", "Stability\nmargin"):
+    is_wide = width >= MIN_WIDE_TABLE_CELLS
+    remaining = ("Remaining\nAh",) if is_wide else ()
+    for heading in ("Voltage\nV", "Current\nA", "Power\nW", *remaining, "To cut-off\nh, 90 %", "Stability\nmargin"):
         table.add_column(heading, justify="right", no_wrap=True)
     for pack in packs:
         state, status = pack.fields("state"), "no broker" if view.outage else pack.status(view.now_s)[0]
@@ -65,7 +69,8 @@ def _pack_table(view: ViewState, packs: Sequence[PackView], width: int) -> Table
             state.number_text("voltage_v", ".3f"),
             state.number_text("current_a", "+.3f"),
             state.number_text("power_w", "+.2f"),
-            state.number_text("remaining_capacity_ah", ".3f"),
+            *([state.number_text("remaining_capacity_ah", ".3f")] if is_wide else []),
+            cutoff_band_text(state),
             "NO LOCK" if state and not state.flag("lock") else state.number_text("stability_margin", ".4f"),
             style="" if status == "live" else "dim",
         )

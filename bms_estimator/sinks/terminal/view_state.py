@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.sinks.terminal.json_fields import JsonFields
+from bms_estimator.telemetry.cutoff_text import clock_duration
 
 MAX_SILENT_S = 10.0
 """Maximum time between two messages of a running service [s]. A service that is silent for longer counts as gone."""
@@ -74,6 +75,12 @@ def soc_text(state: JsonFields) -> str:
     """Return the SOC of a topic ``state`` with its band, ``89.50 ± 1.20`` [%]; without the band if that is unknown."""
     soc, std = state.number_text("soc_percent", ".2f"), state.number("soc_std")
     return soc if std is None else f"{soc} ± {100.0 * BAND_STDS * std:.2f}"
+
+
+def cutoff_band_text(state: JsonFields) -> str:
+    """Return the 90 % band of the time to the cut-off of a topic ``state``, ``1:20-2:31`` [h]; ``-`` if it is unknown."""
+    p05_s, p95_s = state.number("time_to_cutoff_p05_s"), state.number("time_to_cutoff_p95_s")
+    return "-" if p05_s is None or p95_s is None else f"{clock_duration(p05_s)}-{clock_duration(p95_s)}"
 
 
 def clock_text(epoch_s: float) -> str:

@@ -12,6 +12,7 @@ from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.forecast import no_forecast
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_charge import remaining_charge
@@ -96,7 +97,9 @@ def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) ->
         assert summary is not None
         remaining = remaining_charge(estimator, summary.current_a)
         return (
-            make_state_payload(summary, remaining, {}, wall_s, pack_type.meter.update_totals(), 3.0)
+            make_state_payload(
+                summary, remaining, no_forecast("none"), {}, wall_s, pack_type.meter.update_totals(), 3.0
+            )
             .model_dump_json()
             .encode()
         )

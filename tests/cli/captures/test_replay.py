@@ -16,6 +16,7 @@ from pyarrow import BufferOutputStream, parquet
 from pyarrow.csv import read_csv
 
 from bms_estimator import estimate, load_capture, load_cell
+from bms_estimator.forecast.forecast import FORECAST
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 from tests.command_line import run
 
@@ -115,6 +116,39 @@ def test_estimates_sample_by_sample_agree_with_the_summary(name, capture, tmp_pa
     assert columns["soc_std"][-1] == result["soc_std_final"]
     assert columns["k"][-1] == result["k_final"]
     assert math.sqrt(np.mean(columns["innovation_v"] ** 2)) == pytest.approx(result["innovation_rms_v"])
+
+
+def test_the_table_and_the_summary_have_the_last_forecast(capture, tmp_path, capsys):
+    out = tmp_path / "out.csv"
+    code, text, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--json")
+    assert (code, err) == (0, "")
+    columns, result = columns_of_csv(out), json.loads(text)
+    assert tuple(result["forecast"]) == FORECAST.names
+    assert (result["forecast"]["time_to_cutoff_s"] is None) == bool(result["forecast_reason"])
+    for name, value in result["forecast"].items():
+        last = columns[name][-1]
+        assert math.isnan(last) if value is None else last == value, name
+
+
+def test_a_higher_cut_off_voltage_is_reached_earlier(tmp_path, capsys):
+    capture = tmp_path / "load.csv"
+    rows = "".join(f"{time},1.0,{3.9 - 1e-4 * time}\n" for time in range(SAMPLES))
+    capture.write_text(f"time_s,current_a,voltage_v\n{rows}")
+    times_s = []
+    for cutoff_v in ("2.7", "3.5"):
+        code, out, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--cutoff-v", cutoff_v, "--json")
+        assert (code, err) == (0, "")
+        times_s.append(json.loads(out)["forecast"]["time_to_cutoff_s"])
+    assert times_s[1] < times_s[0]
+
+
+def test_an_unusable_cut_off_voltage_is_reported(capture, capsys):
+    code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--cutoff-v", "4.3")
+    assert code == 2
+    assert "pack.cutoff_v = 4.3: must be below 4.16 V, the voltage of the full pack" in err
+    code, _, err = run(capsys, "replay", capture, "--cell", "pem_30w", "--cutoff-v", "8")
+    assert code == 2
+    assert "--cutoff-v: " in err
 
 
 def test_csv_and_parquet_are_equal_bit_for_bit(capture, tmp_path, capsys):
@@ -273,8 +307,9 @@ def test_replay_equals_estimate_bit_for_bit(data, tmp_path, capsys):
     capture, out = data / "leaf" / "cc_1c.csv.gz", tmp_path / "out.csv"
     assert run(capsys, "replay", capture, "--cell", "leaf", "--soc", 0.2, "--no-pack-model", "--out", out)[0] == 0
     trace = estimate(load_capture(capture), load_cell("leaf"), initial_soc=0.2)
-    for name, values in columns_of_csv(out).items():
-        assert np.array_equal(values, trace[name], equal_nan=True), name
+    columns = columns_of_csv(out)
+    for name in trace.names:
+        assert np.array_equal(columns[name], trace[name], equal_nan=True), name
 
 
 def as_gzip(path):

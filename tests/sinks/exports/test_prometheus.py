@@ -34,7 +34,7 @@ PROMTOOL = shutil.which("promtool")
 def snapshot_with_all_values() -> Snapshot:
     """Return a snapshot with cells, energy and an alarm."""
     assert CELL_SNAPSHOT.estimate
-    values = {"cells_v": [3.25, None, 3.5], "energy_out_kwh": 1.5, "time_to_empty_s": 60.0, "temperature_c": 21.5}
+    values = {"cells_v": [3.25, None, 3.5], "energy_out_kwh": 1.5, "time_to_cutoff_s": 60.0, "temperature_c": 21.5}
     return CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=values), alarms=(SOC_LOW_ALARM,))
 
 

@@ -62,7 +62,7 @@ def noisy_cell(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, S
                 soc_percent=100.0 * soc + float(rng.normal(0.0, 0.05)),
                 remaining_capacity_ah=CAPACITY_AH * soc,
                 remaining_energy_wh=CAPACITY_AH * soc * 3.6,
-                time_to_empty_s=3600.0 * CAPACITY_AH * soc / current_a if current_a > 0.0 else None,
+                time_to_cutoff_s=3600.0 * CAPACITY_AH * soc / 1.5 + 60.0 * float(rng.normal()),
                 innovation_v=float(rng.normal(0.0, 0.003)),
                 frames_lost=i // 50,
             ),
@@ -71,7 +71,7 @@ def noisy_cell(seconds: float, period_s: float = 1.0) -> Iterator[tuple[float, S
 
 CELL_COUNT = 4
 """Number of cells with a voltage in ``all_values_changing``."""
-SOURCE_FIELDS = ("soc_std", "time_to_empty_s", "time_to_full_s", "cell_lowest", "cell_lowest_v")
+SOURCE_FIELDS = ("soc_std", "time_to_cutoff_s", "cutoff_within_15min", "time_to_full_s", "cell_lowest", "cell_lowest_v")
 """Fields of the estimate from which entities with other names are computed."""
 
 
@@ -216,7 +216,7 @@ def test_observer_values_are_disabled_by_default() -> None:
     }
     assert not ENABLED_BY_DEFAULT & observer_values
     assert observer_values < set(COMPONENTS)
-    assert {"voltage_v", "current_a", "soc_percent", "time_to_empty_h", "r_s_ohm"} <= ENABLED_BY_DEFAULT
+    assert {"voltage_v", "current_a", "soc_percent", "time_to_cutoff_h", "r_s_ohm"} <= ENABLED_BY_DEFAULT
 
 
 def test_discovery_describes_every_entity_with_both_availabilities() -> None:

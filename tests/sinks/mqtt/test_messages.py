@@ -27,6 +27,7 @@ def test_broker_that_has_received_nothing_gets_all_live_messages():
     messages, published = MESSAGES.live_messages(PublishedState(), CELL_SNAPSHOT, NOW)
     assert topics(messages) == [
         "parameters",
+        "forecast",
         "sensor/availability",
         "health",
         "info",
@@ -38,7 +39,7 @@ def test_broker_that_has_received_nothing_gets_all_live_messages():
 
 def test_retained_messages_have_qos_1_and_live_ones_qos_0():
     messages, _ = MESSAGES.live_messages(PublishedState(), CELL_SNAPSHOT, NOW)
-    live_topics = {"parameters", "home_assistant"}
+    live_topics = {"parameters", "forecast", "home_assistant"}
     for message, topic in zip(messages, topics(messages), strict=True):
         assert (message.qos, message.retain) == ((0, False) if topic in live_topics else (1, True))
     assert all((m.qos, m.retain) == (1, True) for m in (*MESSAGES.birth_messages(), *MESSAGES.offline_messages()))
@@ -68,8 +69,15 @@ def test_unchanged_messages_are_not_repeated():
 
 def test_new_health_is_published():
     _, published = MESSAGES.live_messages(PublishedState(), CELL_SNAPSHOT, NOW)
-    messages, _ = MESSAGES.live_messages(published, snapshot(), NOW + 1.0)
+    messages, _ = MESSAGES.live_messages(published, snapshot()._replace(forecast=CELL_SNAPSHOT.forecast), NOW + 1.0)
     assert topics(messages) == ["parameters", "health"]
+
+
+def test_a_forecast_is_published_once():
+    _, published = MESSAGES.live_messages(PublishedState(), CELL_SNAPSHOT, NOW)
+    assert MESSAGES.live_messages(published, CELL_SNAPSHOT, NOW + 1.0)[0] == []
+    messages, _ = MESSAGES.live_messages(published, CELL_SNAPSHOT._replace(forecast=snapshot().forecast), NOW + 2.0)
+    assert topics(messages) == ["forecast"]
 
 
 def test_discovery_is_published_again_for_another_board_but_not_for_another_sample_rate():

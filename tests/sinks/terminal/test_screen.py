@@ -78,7 +78,7 @@ def test_80_by_24_cells_show_a_pack_with_three_alarms_and_the_log_and_the_hint()
 
 def test_unknown_values_are_dashes() -> None:
     assert "pack - live 13.000" in text_of(pack_view(snapshot=STACK_SNAPSHOT))
-    assert "pack - live - - - - -" in text_of(pack_view(snapshot=SNAPSHOT_WITHOUT_SAMPLES))
+    assert "pack - live - - - - - -" in text_of(pack_view(snapshot=SNAPSHOT_WITHOUT_SAMPLES))
 
 
 def test_stale_values_have_a_reason_and_a_time() -> None:
