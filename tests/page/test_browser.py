@@ -22,17 +22,18 @@ from bms_estimator.mqtt.topic_cache import MAX_DEVICES
 from bms_estimator.page.broker_page import dashboard
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.page import PageSettings
+from bms_estimator.telemetry.forecast import forecast_fields, no_forecast
 from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, start_program
-from tests.sinks.snapshots import CELL_SNAPSHOT, STACK_SNAPSHOT
+from tests.sinks.snapshots import CELL_SNAPSHOT, FORECAST, STACK_SNAPSHOT, forecast_at
 from tests.store.test_history import record_history, snapshot_at
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 
-MINUS = "\N{MINUS SIGN}"
+MINUS, DASH = "\N{MINUS SIGN}", "\N{EN DASH}"
 PACK_SECTION = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
 CELLS_V = (3.311, 3.325, 3.318, 3.322)
 CELLAR_TOPIC = "bms/cellar"
@@ -48,7 +49,7 @@ STATE_VALUES = {  # as published in ``state``
     "innovation_v": -0.0543,
     "remaining_energy_wh": 2345.6,
     "remaining_capacity_ah": 45.678,
-    "time_to_empty_s": None,
+    "time_to_cutoff_s": None,
     "time_to_full_s": 11_520.0,
     "energy_out_kwh": 12.3456,
     "energy_in_kwh": 123.456,
@@ -182,9 +183,51 @@ async def test_page_shows_the_published_values_with_units(browser: Browser, prog
         assert page_tab.errors == []
 
 
+async def test_the_forecast_is_shown_as_curves_and_with_its_band(browser: Browser, programs: RunningPrograms) -> None:
+    assert CELL_SNAPSHOT.forecast
+    shown = {
+        "time_left_label": "To cut-off",
+        "time_left": "1 h 50 min",
+        "time_left_band": f"90 % band 1 h 23 min {DASH} 2 h 45 min",
+    }
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        power = {"available_discharge_power_10s_w": 450.4, "available_discharge_power_60s_w": 420.0}
+        await publish_state(programs.live, **forecast_fields(FORECAST, FORECAST.time_s) | power)
+        await publish(programs.live, "forecast", CELL_SNAPSHOT.forecast.json_bytes, retain=False)
+        await page_tab.until_text("time_left", shown["time_left"])
+        assert {name: await page_tab.text(name) for name in shown} == shown
+        await page_tab.until_text("cutoff_within", "0 %, 0 %, 1 %")
+        assert await page_tab.text("discharge_power") == "450 W, 420 W"
+        for chart in ("Voltage, forecast: from 2.700 to 3.800 V", "State of charge, forecast: from 0.000 to 50.000 %"):
+            await page_tab.page.get_by_role("img", name=chart).wait_for()
+        await page_tab.page.get_by_role("img", name="Load still on, probability, forecast: from 0").wait_for()
+        assert page_tab.errors == []
+
+
+async def test_below_ten_minutes_the_page_shows_the_band_and_no_single_time(
+    browser: Browser, programs: RunningPrograms
+) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        fields = forecast_fields(forecast_at(480.0), 0.1) | {"cutoff_within_5min": 0.34}
+        await publish_state(programs.live, **fields)
+        await page_tab.until_text("time_left", f"6{DASH}12 min")
+        assert await page_tab.text("time_left_band") == "90 % band; 34 % within 5 min"
+        assert "8 min" not in await page_tab.page.inner_text(".hero")
+
+
+async def test_the_reason_for_a_missing_forecast_is_shown(browser: Browser, programs: RunningPrograms) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        await publish_state(programs.live, **forecast_fields(no_forecast("the pack is charged"), 0.0))
+        await page_tab.page.get_by_text("No time to the cut-off: the pack is charged.").wait_for()
+        assert not await page_tab.page.locator("#forecast").is_visible()
+        assert await page_tab.text("time_left") == ""
+
+
 async def test_unknown_values_are_hidden(browser: Browser, programs: RunningPrograms) -> None:
     async with dashboard_of(browser, programs, "cellar") as page_tab:
-        state = await publish_state(programs.live, soc_std=None, temperature_c=None, innovation_v=None, voltage_v=3.21)
+        state = await publish_state(
+            programs.live, soc_std=None, temperature_c=None, innovation_v=None, voltage_v=3.21, time_to_cutoff_s=None
+        )
         await page_tab.until_text("voltage_v", "3.210 V")
         for name in ("soc_std", "temperature_c", "innovation_v", "time_left", "celllow"):
             assert await page_tab.text(name) == "", name
@@ -215,7 +258,6 @@ async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_noth
             for name, published, factor in (("soc", "soc", 100.0), ("soc_std", "soc_std", 200.0)):
                 text = await page_tab.text(name)
                 await programs.live.wait_json("bms/attic/state", lambda s: f"{factor * s[published]:.1f}" == text)  # noqa: B023
-            assert re.fullmatch(r"\d+ h \d\d min", await page_tab.text("time_left"))
             assert await page_tab.text("celllow") == "3.311 V · cell 1"
             assert "in series" in await page_tab.page.inner_text("#what")
             await page_tab.until(

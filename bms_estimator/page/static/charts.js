@@ -74,9 +74,9 @@ class Sized {
 	}
 }
 
-/** Chart over time. Data: times, edges of the band, value, and optionally a second value. */
+/** Chart over time. Data: times, edges of the band, value, and optionally a second value. Charts with equal `sync` share the cursor. */
 export class Curve extends Sized {
-	constructor(parent, { title, unit, color: name, height, minSpan, low, high, second }) {
+	constructor(parent, { title, unit, color: name, height, minSpan, low, high, first = "measured", second, sync = "time" }) {
 		super();
 		Object.assign(this, { title, unit });
 		this.box = document.createElement("figure");
@@ -86,7 +86,7 @@ export class Curve extends Sized {
 		caption.children[0].textContent = title;
 		caption.children[1].textContent = unit;
 		if (second) {
-			for (const [line, label] of [[name, "measured"], [second.color, second.label]]) {
+			for (const [line, label] of [[name, first], [second.color, second.label]]) {
 				const key = document.createElement("i");
 				key.className = line.slice(2);
 				key.textContent = label;
@@ -101,7 +101,7 @@ export class Curve extends Sized {
 			width: 300, height, legend: { show: false }, padding: [8, 26, 0, 0],
 			series: [{}, edge, edge, { ...thin, stroke: color(name), width: 1.6 }, ...(second ? [{ ...thin, stroke: color(second.color), width: 1.6, dash: second.dash }] : [])],
 			bands: [{ series: [1, 2], fill: faint(name) }],
-			cursor: { drag: { x: false, y: false }, points: { show: false }, sync: { key: "time" } },
+			cursor: { drag: { x: false, y: false }, points: { show: false }, sync: { key: sync } },
 			hooks: { setCursor: [(u) => this.showValues(u.cursor.idx)] },
 			scales: { x: { time: false }, y: { range: rangeOver(minSpan, low, high) } },
 			axes: [{ ...axis, values: timeLabels, size: 24, space: 90, incrs: STEPS_S }, { ...axis, size: 52, space: 26, values: axisLabels }],

@@ -45,6 +45,12 @@ export function duration(seconds) {
 	return `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")} min`;
 }
 
+/** Two durations as a range: 3–15 min, 1 h 20 min – 2 h 31 min. */
+export function durations(from, to) {
+	if (!isKnown(from) || !isKnown(to)) return "";
+	return to < 3600 ? `${Math.round(from / 60)}–${Math.round(to / 60)} min` : `${duration(from)} – ${duration(to)}`;
+}
+
 const pad = (x) => String(x).padStart(2, "0");
 /** HH:MM:SS of this browser's clock. */
 export const clock = (date) => `${pad(date.getHours())}:${pad(date.getMinutes())}:${pad(date.getSeconds())}`;

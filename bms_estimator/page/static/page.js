@@ -8,6 +8,7 @@ const SPANS = { live: 300, hour: 3600, day: 86400, month: 30 * 86400 }; // [s]
 const ROWS = 3600; // of recent states
 const COLUMNS = ["voltage_v", "voltage_estimate_v", "current_a", "soc", "soc_std", "innovation_v"];
 const MAX_EVENTS = 50;
+const MIN_POINT_S = 600; // shortest time to the cut-off that is shown as one number [s]
 
 const $ = (id) => document.getElementById(id);
 const number = (x) => typeof x === "number";
@@ -115,6 +116,7 @@ function draw() {
 	if (now - ui.curves >= CURVES_MS) {
 		ui.curves = now;
 		drawCurves(pack);
+		drawForecast(pack);
 		drawElement(pack);
 	}
 	if (now - ui.described >= DESCRIBE_MS) {
@@ -177,17 +179,28 @@ function alarmRow(a) {
 
 const SHOWN = {
 	voltage_v: f.volts, voltage_estimate_v: f.volts, current_a: f.amperes, power_w: f.watts, temperature_c: f.celsius,
-	innovation_v: f.millivolts, remaining_energy_wh: f.wattHours, remaining_capacity_ah: f.ampereHours,
+	innovation_v: f.millivolts, usable_capacity_ah: f.ampereHours, remaining_energy_wh: f.wattHours, remaining_capacity_ah: f.ampereHours,
 	energy_out_kwh: (x) => f.wattHours(1e3 * x), energy_in_kwh: (x) => f.wattHours(1e3 * x), soc: f.percent, stability_margin: f.percent,
 };
 
+/** Time to the cut-off, or while charging to full, with its 90 % band. Below ten minutes a single load peak decides, so only the band is shown. */
+function timeLeft(s) {
+	const { time_to_cutoff_s: median, time_to_cutoff_p05_s: early, time_to_cutoff_p95_s: late } = s;
+	if (!number(median)) return ["To full", f.duration(s.time_to_full_s), ""];
+	const band = f.durations(early, late);
+	if (median >= MIN_POINT_S) return ["To cut-off", f.duration(median), `90 % band ${band}`];
+	return ["To cut-off", band, `90 % band; ${f.percent(s.cutoff_within_5min, 0)} % within 5 min`];
+}
+
 function drawState(s) {
-	const time = s.time_to_empty_s ?? s.time_to_full_s;
+	const time = s.time_to_cutoff_s ?? s.time_to_full_s, [label, left, band] = timeLeft(s);
 	for (const [name, show] of Object.entries(SHOWN)) put(name, show(s[name]));
 	for (const part of parts) hide(part, !number(part.dataset.of === "time_left" ? time : s[part.dataset.of]));
 	put("soc_std", f.percent(number(s.soc_std) ? 2 * s.soc_std : null));
-	put("time_left", f.duration(time));
-	put("time_left_label", number(s.time_to_empty_s) ? "To empty" : "To full");
+	put("time_left", left);
+	put("time_left_label", label);
+	put("time_left_band", band);
+	drawForecastValues(s);
 	put("way", s.current_a > 0 ? "discharging" : s.current_a < 0 ? "charging" : "at rest");
 	put("lock", `${s.lock ? "in lock" : "no lock"}, ${s.converged ? "converged" : "converging"}`);
 	if (number(s.soc)) drawScale(s);
@@ -338,6 +351,38 @@ function drawCurves(pack) {
 	}
 }
 
+let forecast = null;
+
+/** Curves of the forecast: SOC and voltage with their 90 % bands, and the probability that the load is still on. */
+function drawForecast({ topics: { forecast: report, state } }) {
+	const known = number(state?.time_to_cutoff_s), hasCurves = known && !!report?.elapsed_s?.length;
+	hide($("forecastcard"), !known && !state?.forecast_reason);
+	text($("noforecast"), !known ? `No time to the cut-off: ${state?.forecast_reason}.` : hasCurves ? "" : "The curves follow within a minute.");
+	hide($("noforecast"), hasCurves);
+	hide($("forecast"), !hasCurves);
+	put("forecast_note", hasCurves ? `of ${f.clock(new Date(report.time))}, under a load like the one seen; shaded: 90 %` : "");
+	if (!hasCurves) return;
+	if (!forecast) {
+		const make = (title, unit, color, minSpan, more) => new Curve($("forecast"), { title, unit, color, minSpan, height: 132, sync: "forecast", ...more });
+		forecast = {
+			v: make("Voltage", "V", "--volt", 0.02, { first: "median", second: { color: "--bad", label: "cut-off", dash: [5, 3] } }),
+			soc: make("State of charge", "%", "--soc", 2, { low: 0, high: 100 }),
+			on: make("Load still on, probability", "%", "--amp", 200, { low: 0, high: 100 }),
+		};
+	}
+	const start = Date.parse(report.time) / 1e3, time = report.elapsed_s.map((s) => start + s), no = nulls(time);
+	const fan = (name, unit, factor) => ["p95", "p05", "p50"].map((q) => scaled(report[`${name}_${q}${unit}`] ?? [], factor));
+	const columns = { v: [...fan("voltage", "_v", 1), time.map(() => report.cutoff_v)], soc: fan("soc", "", 100), on: [no, no, scaled(report.survival ?? [], 100)] };
+	for (const [name, chart] of Object.entries(forecast)) chart.draw([time, ...columns[name]], time[0], time.at(-1));
+}
+
+function drawForecastValues(s) {
+	const both = (name) => `${f.watts(s[`${name}_10s_w`])}, ${f.watts(s[`${name}_60s_w`])}`;
+	put("cutoff_within", [2, 5, 15].map((minutes) => `${f.percent(s[`cutoff_within_${minutes}min`], 0)} %`).join(", "));
+	put("discharge_power", both("available_discharge_power"));
+	put("charge_power", both("available_charge_power"));
+}
+
 const nulls = (time) => new Array(time.length).fill(null);
 /** Upper edge, lower edge and value of the SOC [%]. */
 function socColumns(soc, std) {
@@ -375,6 +420,7 @@ async function loadHistory(pack, span) {
 }
 
 function describe(pack) {
+	for (const chart of Object.values(forecast ?? {})) chart.describe("forecast");
 	for (const chart of Object.values(curves ?? {})) chart.describe(ui.span === "live" ? "last five minutes" : `last ${ui.span}`);
 	const p = pack.topics.parameters?.elements?.[ui.element], [name, factor, unit] = ELEMENTS[ui.element] ?? [];
 	if (!p || !name) return;
@@ -459,7 +505,7 @@ $("spans").onchange = (event) => { ui.span = event.target.value; redrawAll(); };
 $("element").onchange = (event) => { ui.element = event.target.value; redrawAll(); };
 onresize = redrawAll;
 matchMedia("(prefers-color-scheme: dark)").onchange = () => {
-	for (const chart of [...Object.values(curves ?? {}), overSoc]) chart?.plot.redraw(false, true);
+	for (const chart of [...Object.values(curves ?? {}), ...Object.values(forecast ?? {}), overSoc]) chart?.plot.redraw(false, true);
 };
 setInterval(drawSoon, 1000);
 stream = listen(take, drawSoon);
