@@ -31,6 +31,7 @@ from tests.sinks.home_assistant.test_discovery import (
     noisy_cell,
     row_times,
 )
+from tests.sinks.snapshots import CELL_SNAPSHOT
 
 SOC_ENTITY, SET_SOC_ENTITY, SOC_LOW_ENTITY = (
     "sensor.bms_pack_soc_percent",
@@ -83,7 +84,6 @@ def test_states_equal_the_measured_values(home: HomeAssistant, packs: Packs) -> 
     measured = {"voltage_v": 13.19, "current_a": 2.0, "power_w": 26.4, "temperature_c": 21.5, "cell_lowest_v": 3.28}
     assert {name: number_state(states, f"sensor.bms_pack_{name}") for name in measured} == measured
     assert states["sensor.bms_pack_current_a"]["attributes"]["positive"] == "discharge"
-    assert number_state(states, "sensor.bms_pack_time_to_empty_h") > 1.0
     assert number_state(states, "sensor.bms_pack_soc_std_percent") > 0.0
     assert states["sensor.bms_pack_time_to_full_h"]["state"] == "unknown"
     assert number_state(states, "sensor.bms_pack_energy_out_kwh") >= 0.0
@@ -191,6 +191,17 @@ def publish_fast(broker: Broker, device: str, stream: Iterator[tuple[float, Snap
     home.until(is_available)
     asyncio.run(publish(values))
     home.until(lambda states: number_state(states, voltage) == last_values["voltage_v"])
+
+
+def test_a_forecast_has_the_time_to_the_cut_off_in_hours_and_the_probability(
+    home: HomeAssistant, broker: Broker
+) -> None:
+    publish_fast(broker, "forecast", iter([(0.0, CELL_SNAPSHOT)]), home)
+    shown = {"time_to_cutoff_h": 1.83, "cutoff_within_15min_percent": 1.0}
+    states = home.until(lambda states: number_state(states, "sensor.bms_forecast_time_to_cutoff_h") == 1.83)
+    assert {name: number_state(states, f"sensor.bms_forecast_{name}") for name in shown} == shown
+    registry = {entry["entity_id"]: entry for entry in home.websocket_command("config/entity_registry/list")}
+    assert registry["sensor.bms_forecast_time_to_cutoff_p05_h"]["disabled_by"] == "integration"
 
 
 def test_entity_of_a_withdrawn_command_is_removed(home: HomeAssistant, broker: Broker) -> None:

@@ -19,16 +19,18 @@ from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity, relative_series_resistance
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.events import events
-from bms_estimator.model.payloads import PackModelHealth
+from bms_estimator.model.payloads import PackModelHealth, Snapshot
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sources.source import ReceivedSamples
+from bms_estimator.telemetry.state import finite
 from tests.collector import Collector
 from tests.estimator.anywhere.use import days
 from tests.estimator.simulated_cell import TRUTH, measured, wrong_cell
@@ -128,11 +130,25 @@ async def test_service_and_replay_agree_to_the_last_bit(
     live = await run_service(part, tmp_path)  # the first start with a state folder
     replayed = new_estimator(SETTINGS, CELL)
     slow_fit = SlowFit(replayed)
-    slow_fit.run(part)
+    forecaster = new_forecaster(SETTINGS, CELL, replayed, slow_fit)
+    assert forecaster
+    trace = forecaster.run(part)
     assert slow_fit.fits >= 3
     assert (live.model.fits, live.model.late, live.model.failed) == (slow_fit.fits, 0, 0)
     assert live.estimator.settings_record.tobytes() == replayed.settings_record.tobytes()
     same_fields(live.estimator, replayed)
+    same_forecasts(live.sink.snapshots, trace, forecaster.rows)
+
+
+def same_forecasts(snapshots: list[Snapshot], trace: np.ndarray, rows: np.ndarray) -> None:
+    """Check that the published probabilities and quantities are those of the replay at the same sample, to the last bit."""
+    names = [name for name in rows.dtype.names if not name.startswith("time_to_")]  # times count down after a forecast
+    row_by_time = dict(zip(trace["time_s"].tolist(), rows, strict=True))
+    estimates = [snapshot.estimate for snapshot in snapshots if snapshot.estimate]
+    published = [[getattr(each, name) for name in names] for each in estimates]
+    replayed = [[finite(row_by_time[each.board_time_s][name]) for name in names] for each in estimates]
+    assert any(value is not None for values in published for value in values)
+    assert published == replayed
 
 
 def same_fields(a: Estimator, b: Estimator, without: tuple[str, ...] = ()) -> None:

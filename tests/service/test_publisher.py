@@ -1,6 +1,7 @@
 """Publisher: its log lines, and the times of its publications."""
 
 import numpy as np
+import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.estimator import Estimator
@@ -8,6 +9,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
+from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples
@@ -68,3 +70,32 @@ def test_an_estimate_that_is_due_is_published_before_the_alarm_of_the_same_sampl
         (each.estimate and each.estimate.voltage_v, any(alarm.active for alarm in each.alarms))
         for each in sink.snapshots
     ] == [(3.8, False), (4.05, False), (None, True)]
+
+
+def test_the_curves_of_a_forecast_are_published_once_a_minute() -> None:
+    now_s, cell, sink = 0.0, load_cell("chen_mora"), Collector()
+    settings, estimator = Settings.model_validate({"publish": {"rate_hz": 0.1}}), Estimator(cell, initial_soc=0.5)
+    forecaster = new_forecaster(settings, cell, estimator, None)
+    assert forecaster
+    clock = Clock(monotonic=lambda: now_s)
+    publisher = Publisher(
+        settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock, forecaster=forecaster
+    )
+    for now_s in np.arange(0.0, 181.0, 10.0):
+        block = np.array([(now_s, 0.1, 3.8, 25.0, 0)], dtype=SAMPLE)
+        publisher.add(ReceivedSamples(block, NO_CELLS), forecaster.run(block))
+    reports = [each.forecast for each in sink.snapshots if each.forecast]
+    assert len({id(report) for report in reports}) == 4  # at 0, 60, 120 and 180 s
+    assert reports[0].cutoff_v == pytest.approx(2.7)  # default limit of the alarm pack_under_voltage
+
+
+def test_a_pack_without_the_identifier_has_no_forecast_and_a_reason() -> None:
+    cell, sink = load_cell("chen_mora"), Collector()
+    settings, estimator = Settings(), Estimator(cell, identifier=None, initial_soc=0.5)
+    assert new_forecaster(settings, cell, estimator, None) is None
+    publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=Clock())
+    block = np.array([(0.0, 0.1, 3.8, 25.0, 0)], dtype=SAMPLE)
+    publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
+    [snapshot] = sink.snapshots
+    assert snapshot.estimate
+    assert (snapshot.estimate.forecast_reason, snapshot.forecast) == ("the identifier is off", None)
