@@ -259,7 +259,7 @@ def _forecast_row(result: ReplayResult) -> dict[str, str]:
     if not f:
         return {}
     text = cutoff_text(*(f[name] for name in CUTOFF_FIELDS))
-    return {"to cut-off, 5 to 95 %": text or f"unknown: {result.forecast_reason}"}
+    return {"time to cut-off": text or f"unknown: {result.forecast_reason}"}
 
 
 def _capacity_text(result: ReplayResult) -> str:
