@@ -1,4 +1,4 @@
-"""Estimator with a forecast at fixed intervals of the samples' clock."""
+"""Estimator with a forecast at intervals of the samples' clock."""
 
 import math
 from typing import Protocol
@@ -7,14 +7,28 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastCurve, ForecastRows, unknown_values
+from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import LoadHistory
+from bms_estimator.forecast.projection import Projection, project_given_load, project_seen_load, time_quantiles
+from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
 from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.arrays import Records
+from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.sample import SampleBlock
 
-INTERVAL_S = 10.0
-"""Interval between two forecasts, on the clock of the samples [s]."""
+MIN_INTERVAL_S = 10.0
+"""Minimum interval between two forecasts, on the clock of the samples [s]."""
+MAX_INTERVAL_S = 60.0
+"""Maximum interval between two forecasts [s]."""
+INTERVAL_OF_TIME_LEFT = 1.0 / 60.0
+"""Interval between two forecasts as a fraction of the time to the cut-off, within its limits."""
+MIN_LOAD_S = 300
+"""Minimum length of the load that was seen, for a forecast [s]."""
+MAX_REST_S = 900
+"""Duration of a rest after which the load that was seen says nothing about the next one [s]."""
+_HASH_FACTOR = 0x9E3779B97F4A7C15
+_INTEGERS = 2**64
 
 
 class Runner(Protocol):
@@ -27,6 +41,9 @@ class Runner(Protocol):
 class Forecaster:
     """Runs the estimator on blocks of samples, and makes a forecast at intervals.
 
+    The times of the forecasts and their random numbers depend on the samples alone, so that any division of the samples into
+    blocks gives the same forecasts to the last bit.
+
     Args:
         estimator: Estimator of the pack.
         runner: The estimator, or the slow fit that runs it.
@@ -38,33 +55,44 @@ class Forecaster:
     """
 
     def __init__(self, estimator: Estimator, runner: Runner, *, cutoff_v: float) -> None:
-        self.estimator, self.cutoff_v, self.load = estimator, cutoff_v, LoadHistory()
-        self.latest = Forecast(math.nan, unknown_values(), "no sample", None)
+        self.estimator, self.cutoff_v = estimator, cutoff_v
+        filter_settings = estimator.cell_file_settings
+        self.load = LoadHistory(float(filter_settings["capacity_as"]), float(filter_settings["unmeasured_s"]))
+        self.latest = Forecast(math.nan, unknown_values(), "no sample has been processed yet", None)
         self._runner, self._due_s = runner, -math.inf
-        self._rows: ForecastRows = np.zeros(0, FORECAST)
+        self._rows: list[tuple[ForecastRows, int]] = []
 
     def run(self, block: SampleBlock) -> TraceBlock:
-        """Process a block of samples. Return one row of dtype ``TRACE`` for each accepted sample."""
-        traces, rows, start = [np.zeros(0, TRACE)], [np.zeros(0, FORECAST)], 0
+        """Process a block of samples.
+
+        Returns:
+            One row of dtype ``TRACE`` for each accepted sample. The array is valid until the next call.
+        """
+        self._rows, traces, start = [], [], 0
         while start < block.size:
-            due = np.flatnonzero(block["time_s"][start:] >= self._due_s)
-            end = start + int(due[0]) + 1 if due.size else block.size
-            trace = self._runner.run(block[start:end]).copy()
+            due = self._first_due(block["time_s"][start:])
+            end = block.size if due is None else start + due + 1
+            trace = self._runner.run(block[start:end])
             self.load.add(trace)
-            rows.append(np.repeat(self.latest.values, trace.size))
-            if due.size:
-                self._due_s = float(block["time_s"][end - 1]) + INTERVAL_S
-                self.latest = self.forecast()
-                rows[-1][-1:] = self.latest.values
+            if start > 0 or end < block.size:
+                trace = trace.copy()
             traces.append(trace)
+            before = trace.size if due is None else max(trace.size - 1, 0)
+            self._rows.append((self.latest.values, before))
+            if due is not None:
+                self.latest = self.forecast()
+                self._due_s = float(block["time_s"][end - 1]) + _interval_s(self.latest)
+                self._rows.append((self.latest.values, trace.size - before))
             start = end
-        self._rows = np.concatenate(rows)
-        return np.concatenate(traces)
+        if len(traces) == 1:
+            return traces[0]
+        return np.concatenate(traces) if traces else np.zeros(0, TRACE)
 
     @property
     def rows(self) -> ForecastRows:
         """Values valid at each row of the trace that ``run`` returned last, dtype ``FORECAST``."""
-        return self._rows
+        parts = [np.repeat(values, count) for values, count in self._rows]
+        return np.concatenate(parts) if parts else np.zeros(0, FORECAST)
 
     def forecast(self, load: GivenLoad | None = None) -> Forecast:
         """Return a forecast from the present state.
@@ -73,16 +101,87 @@ class Forecaster:
             load: Load to expect; None: a load like the one that was seen.
         """
         values, time_s = unknown_values(), float(self.estimator.state["time_s"][0])
-        mean_a = float(self.load.mean_a[-600:].mean()) if load is None and self.load.mean_a.size else 1.0
-        if mean_a <= 0.0:
-            return Forecast(time_s, values, "the pack is not discharged", None)
-        median_s = self.estimator.soc * float(self.estimator.settings[0]["capacity_as"]) / mean_a
-        values["time_to_cutoff_s"], values["time_to_cutoff_p05_s"] = median_s, 0.7 * median_s
-        values["time_to_cutoff_p95_s"] = 1.4 * median_s
-        for name in ("cutoff_within_2min", "cutoff_within_5min", "cutoff_within_15min"):
-            values[name] = 0.1
-        elapsed_s = np.linspace(0.0, 2.0 * median_s, 61)
-        fall = np.clip(1.0 - elapsed_s / median_s, 0.0, 1.0)
-        soc, volts = self.estimator.soc * fall, 3.0 + fall
-        curve = ForecastCurve(elapsed_s, 0.8 * soc, soc, 1.1 * soc, volts - 0.1, volts, volts + 0.1, fall)
-        return Forecast(time_s, values, None, curve)
+        reason = self._missing_state()
+        if reason is None and load is None:
+            reason = self._missing_load()
+        if reason is not None:
+            return Forecast(time_s, values, reason, None)
+        pack = self._pack()
+        projection = self._project(pack, load)
+        if projection is None:
+            return Forecast(time_s, values, "the load does not discharge the pack on average", None)
+        _write_time_to_cutoff(values, projection)
+        return Forecast(time_s, values, None, projection.curve)
+
+    def _first_due(self, time_s: np.ndarray) -> int | None:
+        """Return the index of the first sample at which a forecast is due; None without such a sample.
+
+        A clock that was set back must not delay the next forecast.
+        """
+        earliest_s = self._due_s - MAX_INTERVAL_S
+        due = np.isfinite(time_s) & ((time_s >= self._due_s) | (time_s < earliest_s))
+        first = int(due.argmax()) if due.size else 0
+        return first if due.size and due[first] else None
+
+    def _missing_state(self) -> str | None:
+        """Return the reason why no load can be projected; None if it can."""
+        if isinstance(self.estimator.cell, FuelCellModel):
+            return "a fuel cell has no state of charge"
+        if not self.estimator.identifying:
+            return "the identifier is switched off"
+        if not self.estimator.record[0]["filter"]["started"]:
+            return "no sample has been processed yet"
+        return None
+
+    def _missing_load(self) -> str | None:
+        """Return the reason why the load that was seen says nothing about the next one; None if it does."""
+        if self.load.is_charging:
+            return "the pack is being charged"
+        if self.load.rest_s >= MAX_REST_S:
+            return f"the pack has been at rest for {MAX_REST_S // 60} min"
+        if self.load.seconds < MIN_LOAD_S:
+            return f"less than {MIN_LOAD_S} s of load have been seen since the last charge"
+        return None
+
+    def _pack(self) -> Records:
+        """Return the pack as it is now, shape (1,), dtype ``PROJECTED_PACK``."""
+        pack = np.zeros(1, PROJECTED_PACK)
+        project_pack(
+            pack[0], self.estimator.record[0]["filter"], self.estimator.settings_record[0]["filter"], self.cutoff_v
+        )
+        return pack
+
+    def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:
+        """Run the pack forward. Return None if the load does not discharge it."""
+        if load is not None:
+            projection = project_given_load(pack, load, self._seed())
+            return projection if np.isfinite(projection.time_s).all() else None
+        mean_a, max_a = self.load.mean_and_max()
+        if mean_a.mean() <= pack["offset_a"][0]:
+            return None
+        return project_seen_load(pack, mean_a, max_a, self._seed())
+
+    def _seed(self) -> int:
+        """Return the seed of the random numbers, by time and number of the last sample."""
+        state = self.estimator.state
+        time_bits = int(state["time_s"].view(np.uint64)[0])
+        return (time_bits * _HASH_FACTOR + int(state["samples"][0])) % _INTEGERS
+
+
+def _interval_s(forecast: Forecast) -> float:
+    """Return the time until the next forecast [s]. It is shorter near the cut-off."""
+    time_left_s = float(forecast.values["time_to_cutoff_s"][0])
+    if math.isnan(time_left_s):
+        return MAX_INTERVAL_S
+    return min(max(INTERVAL_OF_TIME_LEFT * time_left_s, MIN_INTERVAL_S), MAX_INTERVAL_S)
+
+
+def _write_time_to_cutoff(values: ForecastRows, projection: Projection) -> None:
+    """Write quantiles and probabilities of the time to the cut-off, and the median charge."""
+    time_s = projection.time_s
+    for name, seconds in (("2min", 120.0), ("5min", 300.0), ("15min", 900.0)):
+        values[f"cutoff_within_{name}"] = np.mean(time_s <= seconds)
+    names = "time_to_cutoff_p05_s", "time_to_cutoff_s", "time_to_cutoff_p95_s"
+    for name, quantile_s in zip(names, time_quantiles(time_s), strict=True):
+        values[name] = quantile_s
+    values["usable_capacity_ah"] = np.median(projection.charge_as) / 3600.0

@@ -3,25 +3,62 @@
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.model.arrays import Floats
+from bms_estimator.kernels.cell_model.current_interpolation import UNMEASURED_S
+from bms_estimator.kernels.forecast.load_seconds import LOAD, MAX_LOAD_S, add_rows, copy_seconds
+from bms_estimator.kernels.kalman_filter.current_offset import REST_C
+from bms_estimator.kernels.kalman_filter.ekf import CHARGE_C
+from bms_estimator.model.arrays import Floats, Records
 
-MAX_LOAD_S = 20_000
-"""Maximum length of the stored load [s]."""
+__all__ = ["MAX_LOAD_S", "LoadHistory"]
 
 
 class LoadHistory:
-    """Mean and largest current of each second since the last long charge.
+    """Mean and largest current of each second since the last long charge, in a buffer of constant size.
+
+    Args:
+        capacity_as: Capacity of the pack [A s].
+        unmeasured_s: Longest step over which the current counts as measured [s].
 
     Attributes:
-        mean_a: Mean current of each second [A], oldest first, positive on discharge.
-        max_a: Largest current of each second [A].
+        record: Shape (1,), dtype ``LOAD``: the complete state, which can be copied, saved and restored.
     """
 
-    def __init__(self) -> None:
-        self.mean_a: Floats = np.zeros(0)
-        self.max_a: Floats = np.zeros(0)
+    def __init__(self, capacity_as: float, unmeasured_s: float = UNMEASURED_S) -> None:
+        self.record: Records = np.zeros(1, LOAD)
+        self._one_c_a, self._unmeasured_s = capacity_as / 3600.0, unmeasured_s
 
     def add(self, trace: TraceBlock) -> None:
         """Add rows of dtype ``TRACE``."""
-        self.mean_a = np.append(self.mean_a, trace["current_a"])[-MAX_LOAD_S:]
-        self.max_a = np.append(self.max_a, trace["current_a"])[-MAX_LOAD_S:]
+        add_rows(self.record[0], trace, self._unmeasured_s, self._one_c_a)
+
+    @property
+    def seconds(self) -> int:
+        """Number of stored seconds."""
+        return int(self.record["count"][0])
+
+    @property
+    def rest_s(self) -> int:
+        """Duration of the present rest [s]."""
+        return int(self.record["rest_s"][0])
+
+    @property
+    def is_charging(self) -> bool:
+        """True in a long charge. Regeneration is shorter."""
+        row = self.record[0]
+        return bool(row["filtered_a"] < -CHARGE_C * self._one_c_a and row["last_a"] < -REST_C * self._one_c_a)
+
+    @property
+    def mean_a(self) -> Floats:
+        """Mean current of each second [A], oldest first, positive on discharge."""
+        return self.mean_and_max()[0]
+
+    @property
+    def max_a(self) -> Floats:
+        """Largest current of each second [A]."""
+        return self.mean_and_max()[1]
+
+    def mean_and_max(self) -> tuple[Floats, Floats]:
+        """Return mean and largest current of each second [A], oldest first."""
+        mean_a, max_a = np.empty(self.seconds), np.empty(self.seconds)
+        copy_seconds(self.record[0], mean_a, max_a)
+        return mean_a, max_a

@@ -1,0 +1,167 @@
+"""Distribution of the time to the cut-off: the pack run forward under many drawn or given loads."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bms_estimator.forecast.forecast import ForecastCurve
+from bms_estimator.forecast.given_load import GivenLoad
+from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
+from bms_estimator.kernels.forecast.draws import DRAW, draw_packs
+from bms_estimator.kernels.forecast.future_load import LOAD_PART, follow_given_load, set_decays
+from bms_estimator.kernels.forecast.seen_load import follow_seen_load, record_curves
+from bms_estimator.model.arrays import Floats, Records
+
+DRAWS = 1000
+"""Number of draws."""
+CURVE_DRAWS = 200
+"""Number of draws from which the curves are computed."""
+CURVE_POINTS = 60
+"""Maximum number of points of a curve."""
+BLOCK_S = 10
+"""Minimum length of a block of the load [s]."""
+MAX_STEPS = 720
+"""Maximum number of blocks that a draw passes. For a longer horizon the blocks are longer, so that the cost is bounded."""
+MIN_BLOCKS = 10
+"""Minimum number of blocks in the load that was seen, which limits their length."""
+HORIZON_RATIO = 1.5
+"""Horizon of the draws, in multiples of the time in which the mean load draws the whole charge. Draws that outlive it are
+extrapolated by the mean load."""
+CURVE_END = 1.05
+"""Length of the curves in multiples of the 95 % quantile of the time to the cut-off."""
+QUANTILES = 0.05, 0.5, 0.95
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Outcomes of the draws.
+
+    Attributes:
+        time_s: Time to the cut-off of each draw [s]; infinite if the load never discharges the pack.
+        charge_as: Charge until then [A s].
+        curve: Curves of SOC and voltage.
+    """
+
+    time_s: Floats
+    charge_as: Floats
+    curve: ForecastCurve
+
+
+def project_seen_load(pack: Records, mean_a: Floats, max_a: Floats, seed: int) -> Projection:
+    """Run the pack forward under loads drawn from the load that was seen.
+
+    Args:
+        pack: Shape (1,), dtype ``PROJECTED_PACK``.
+        mean_a: Mean current of each second [A], with a mean above the offset of the sensor.
+        max_a: Largest current of each second [A].
+        seed: Seed of the random numbers, 0 to 2**64 - 1.
+    """
+    m = pack[0]
+    load_a = float(mean_a.mean() - m["offset_a"])
+    horizon_s = HORIZON_RATIO * _full_time_s(pack, load_a)
+    block_s = min(max(BLOCK_S, math.ceil(horizon_s / MAX_STEPS)), max(mean_a.size // MIN_BLOCKS, 1))
+    steps = min(math.ceil(horizon_s / block_s), MAX_STEPS)
+    blocks = np.zeros(mean_a.size // block_s, LOAD_BLOCK)
+    used = blocks.size * block_s
+    tabulate_blocks(m, mean_a[-used:], max_a[-used:], block_s, blocks)
+    draws = _draws(m, seed)
+    follow_seen_load(m, blocks, float(block_s), steps, draws)
+    time_s, charge_as = _extrapolated(draws, load_a)
+    curve_steps = min(math.ceil(CURVE_END * time_quantiles(time_s)[-1] / block_s), steps)
+    stride = math.ceil(curve_steps / CURVE_POINTS)
+    soc, voltage_v = np.empty((2, CURVE_DRAWS, math.ceil(curve_steps / stride)))
+    record_curves(m, blocks, float(block_s), curve_steps, draws[:CURVE_DRAWS], stride, soc, voltage_v)
+    elapsed_s: Floats = block_s * (np.arange(soc.shape[1], dtype=np.float64) * stride + 0.5)
+    return Projection(time_s, charge_as, _curve(elapsed_s, soc, voltage_v, time_s))
+
+
+def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:
+    """Run the pack forward under a given load.
+
+    Args:
+        pack: Shape (1,), dtype ``PROJECTED_PACK``.
+        load: Load to expect.
+        seed: Seed of the random numbers, 0 to 2**64 - 1.
+    """
+    m = pack[0]
+    load_a = _mean_current(pack, load)
+    horizon_s = HORIZON_RATIO * _full_time_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
+    parts = _parts(load, max(horizon_s / MAX_STEPS, 1.0))
+    draws = _draws(m, seed)
+    no_points = np.empty((DRAWS, 0))
+    follow_given_load(m, parts, horizon_s, draws, math.inf, no_points, no_points)
+    time_s, charge_as = _extrapolated(draws, load_a)
+    end_s = min(CURVE_END * time_quantiles(time_s)[-1], horizon_s)
+    soc, voltage_v = np.empty((2, CURVE_DRAWS, CURVE_POINTS))
+    step_s = max(end_s, 1.0) / (CURVE_POINTS - 1)
+    follow_given_load(m, parts, end_s, draws[:CURVE_DRAWS], step_s, soc, voltage_v)
+    return Projection(
+        time_s, charge_as, _curve(step_s * np.arange(CURVE_POINTS, dtype=np.float64), soc, voltage_v, time_s)
+    )
+
+
+def time_quantiles(time_s: Floats) -> tuple[float, float, float]:
+    """Return the 5 %, 50 % and 95 % quantiles of times, which may be infinite [s]."""
+    low_s, median_s, high_s = np.quantile(time_s, QUANTILES, method="inverted_cdf").tolist()
+    return low_s, median_s, high_s
+
+
+def _full_time_s(pack: Records, load_a: float) -> float:
+    """Return the time in which the mean load draws the whole remaining charge [s]."""
+    return max(float(pack["soc"][0]), 0.02) * float(pack["capacity_as"][0]) / load_a
+
+
+def _mean_current(pack: Records, load: GivenLoad) -> float:
+    """Return the mean current of a given load [A], at the present voltage without load."""
+    soc_points = pack["voltage_v"].shape[1] - 1
+    present_v = float(pack["voltage_v"][0, round(min(max(float(pack["soc"][0]), 0.0), 1.0) * soc_points)])
+    current_a = np.where(np.isnan(load.current_a), load.power_w / present_v, load.current_a)
+    return float(np.average(current_a, weights=load.duration_s))
+
+
+def _parts(load: GivenLoad, max_part_s: float) -> Records:
+    """Return the parts of a load, divided into parts of at most ``max_part_s``."""
+    pieces = np.ceil(load.duration_s / max_part_s).astype(int)
+    parts = np.zeros(int(pieces.sum()), LOAD_PART)
+    parts["duration_s"] = np.repeat(load.duration_s / pieces, pieces)
+    parts["current_a"], parts["power_w"] = np.repeat(load.current_a, pieces), np.repeat(load.power_w, pieces)
+    set_decays(parts)
+    return parts
+
+
+def _draws(m: np.void, seed: int) -> Records:
+    """Return draws of the pack, shape (DRAWS,), dtype ``DRAW``."""
+    draws = np.zeros(DRAWS, DRAW)
+    draw_packs(m, np.uint64(seed), draws)
+    return draws
+
+
+def _extrapolated(draws: Records, load_a: float) -> tuple[Floats, Floats]:
+    """Return time [s] and charge [A s] to the cut-off of each draw.
+
+    Draws that outlived the horizon continue at the mean load down to the median SOC at which the others ended.
+    """
+    ended, end_soc, time_s = draws["ended"] == 1, draws["soc"].copy(), draws["time_s"].copy()
+    if not ended.all():
+        last_soc = float(np.median(end_soc[ended])) if ended.any() else 0.0
+        end_soc[~ended] = np.minimum(end_soc[~ended], last_soc)
+        left_as = (draws["soc"] - end_soc) * draws["capacity_as"]
+        time_s[~ended] += (left_as / (draws["load"] * load_a))[~ended] if load_a > 0.0 else math.inf
+    return time_s, (draws["begin_soc"] - end_soc) * draws["capacity_as"]
+
+
+def _curve(elapsed_s: Floats, soc: Floats, voltage_v: Floats, time_s: Floats) -> ForecastCurve:
+    """Return the quantiles of the draws' curves, shapes (draws, points), and the fraction of draws without cut-off."""
+    survival = 1.0 - np.searchsorted(np.sort(time_s), elapsed_s, side="right") / time_s.size
+    socs, voltages_v = np.clip(np.quantile(soc, QUANTILES, axis=0), 0.0, 1.0), np.quantile(voltage_v, QUANTILES, axis=0)
+    return ForecastCurve(
+        elapsed_s,
+        soc_p05=socs[0],
+        soc_p50=socs[1],
+        soc_p95=socs[2],
+        voltage_p05_v=voltages_v[0],
+        voltage_p50_v=voltages_v[1],
+        voltage_p95_v=voltages_v[2],
+        survival=survival,
+    )

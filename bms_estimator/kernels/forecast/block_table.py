@@ -1,0 +1,69 @@
+"""Table of the largest voltage drop in each block of the load that was seen, over the SOC.
+
+The RC network is linear. A draw that passes a block with other currents in its RC pairs than in the past adds the difference,
+which decays exactly.
+"""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, TAUS
+from bms_estimator.model.arrays import Floats, Record, Records
+from bms_estimator.numba_cache import njit
+
+PEAK_SHARE = 0.35
+"""Share of the RC pair of 1 s that has settled at the largest current of a second."""
+
+LOAD_BLOCK = np.dtype(
+    [
+        ("mean_a", "f8"),  # mean current [A]
+        ("drop_v", "f8", GRID),  # largest voltage drop over SOC 0..1 [V]
+        ("peak_s", "f8"),  # time of the largest drop from the beginning [s]
+        ("peak_decay", "f8", BRANCHES),  # decay of the RC pairs until then
+        ("begin_a", "f8", BRANCHES),  # filtered currents at the beginning [A]
+        ("end_a", "f8", BRANCHES),  # filtered currents at the end [A]
+        ("mean_x_a", "f8", BRANCHES),  # mean filtered currents [A]
+    ],
+    align=True,
+)
+"""Block of the load that was seen."""
+
+
+@njit(cache=True)
+def tabulate_blocks(m: Record, mean_a: Floats, max_a: Floats, block_s: int, blocks: Records) -> None:
+    """Write one row for each block of ``block_s`` seconds.
+
+    Args:
+        m: Record of PROJECTED_PACK.
+        mean_a: Mean current of each second [A], shape (block_s * blocks.size,).
+        max_a: Largest current of each second [A].
+        block_s: Length of a block [s].
+        blocks: Shape (n,), dtype LOAD_BLOCK; written.
+    """
+    x, decay, drop = np.empty(BRANCHES), np.exp(-1.0 / TAUS), np.empty(GRID)
+    at_soc = round(min(max(m.soc, 0.0), 1.0) * (GRID - 1))
+    x[:] = mean_a.mean() - m.offset_a
+    for n in range(blocks.shape[0]):
+        row = blocks[n]
+        row.mean_a, row.peak_s, row.mean_x_a[:], row.begin_a[:] = 0.0, 0.0, 0.0, x
+        row.drop_v[:] = -math.inf
+        for j in range(n * block_s, (n + 1) * block_s):
+            current_a, peak_a = mean_a[j] - m.offset_a, max_a[j] - m.offset_a
+            row.mean_a += current_a / block_s
+            drop[:] = 0.0
+            for k in range(BRANCHES):
+                x[k] = current_a + (x[k] - current_a) * decay[k]
+                row.mean_x_a[k] += x[k] / block_s
+                x_a = x[k] + (PEAK_SHARE * (peak_a - current_a) if k == 0 else 0.0)
+                for i in range(GRID):
+                    drop[i] += m.ohm[1 + k, i] * x_a
+            for i in range(GRID):
+                drop[i] += m.ohm[0, i] * peak_a
+            if drop[at_soc] > row.drop_v[at_soc]:
+                row.peak_s = j - n * block_s + 1.0
+            for i in range(GRID):
+                row.drop_v[i] = max(row.drop_v[i], drop[i])
+        row.end_a[:] = x
+        for k in range(BRANCHES):
+            row.peak_decay[k] = math.exp(-row.peak_s / TAUS[k])

@@ -1,0 +1,118 @@
+"""Spread of the draws: what each draw assumes of pack and load.
+
+``d`` is a record of DRAW, ``m`` of PROJECTED_PACK.
+"""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
+from bms_estimator.kernels.forecast.projected_pack import voltage_without_load
+from bms_estimator.kernels.forecast.random_numbers import generator_of_draw, normal
+from bms_estimator.model.arrays import Record, Records
+from bms_estimator.numba_cache import njit
+
+LOAD_STD = 0.1
+"""Std of ln of the future over the drawn load."""
+RESISTANCE_MEAN = 1.05
+"""Mean factor on the voltage drop."""
+RESISTANCE_STD = 0.05
+"""Std of the factor on the voltage drop."""
+GROWTH_MEAN = 1.0
+"""Mean relative growth of the resistances from SOC ``GROWTH_SOC`` to 0, beyond that of the cell file. Cell files are measured
+with rests, in which the concentration recovers."""
+GROWTH_STD = 0.1
+"""Std of the growth."""
+GROWTH_SOC = 0.4
+"""SOC below which the resistances grow."""
+
+DRAW = np.dtype(
+    [
+        ("begin_soc", "f8"),  # SOC of the weakest cell at the beginning
+        ("capacity_as", "f8"),  # of the weakest cell [A s]
+        ("load", "f8"),  # factor on the load
+        ("voltage_v", "f8"),  # error of the voltage [V]
+        ("resistance", "f8"),  # factor on the voltage drop at the present SOC
+        ("growth", "f8"),  # growth of the voltage drop from SOC ``GROWTH_SOC`` to 0
+        ("grown", "f8"),  # part of the growth that the present resistances contain
+        ("first_generator", "u8"),  # state of the generator of random numbers after these
+        ("generator", "u8"),  # present state of the generator
+        ("block", "i8"),  # index of the present block of the load
+        ("run", "i8"),  # number of blocks until the next jump to another one
+        ("difference_a", "f8", BRANCHES),  # currents of the RC pairs, less those of the present block in the past [A]
+        ("slower", "i8"),  # index of the first RC pair that has such a difference
+        ("ended", "i8"),  # 1: the cut-off came within the horizon
+        ("time_s", "f8"),  # time until the cut-off or the horizon [s]
+        ("soc", "f8"),  # SOC at that time
+    ],
+    align=True,
+)
+"""Assumptions, present load and outcome of one draw."""
+
+
+@njit(cache=True)
+def draw_packs(m: Record, seed: np.uint64, draws: Records) -> None:
+    """Draw pack and load factor of each draw.
+
+    Args:
+        m: Record of PROJECTED_PACK.
+        seed: Seed of the random numbers.
+        draws: Shape (n,), dtype DRAW; written.
+    """
+    for n in range(draws.shape[0]):
+        draw_pack(draws[n], m, generator_of_draw(seed, n))
+
+
+@njit(cache=True)
+def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
+    """Draw pack and load factor of one draw from its generator."""
+    generator, of_soc = normal(generator)
+    generator, of_capacity = normal(generator)
+    generator, of_load = normal(generator)
+    generator, of_voltage = normal(generator)
+    generator, of_resistance = normal(generator)
+    generator, of_growth = normal(generator)
+    generator, of_weakest = normal(generator)
+    weakest = m.weakest_std * max(of_weakest, 0.0)  # the weakest cell is never better than the mean
+    d.begin_soc = m.soc + m.soc_std * of_soc
+    d.begin_soc -= weakest * max(1.0 - d.begin_soc, 0.0)
+    d.capacity_as = m.capacity_as * math.exp(m.capacity_std * of_capacity) / (1.0 + weakest)
+    d.load = math.exp(LOAD_STD * of_load)
+    d.voltage_v = m.voltage_std_v * of_voltage
+    d.resistance = RESISTANCE_MEAN + RESISTANCE_STD * of_resistance
+    d.growth = GROWTH_MEAN + GROWTH_STD * of_growth
+    d.grown = lowness(m.soc)
+    d.first_generator = generator
+
+
+@njit(cache=True)
+def lowness(soc: float) -> float:
+    """Return 0 above ``GROWTH_SOC``, rising to 1 at SOC 0."""
+    return min(max(1.0 - soc / GROWTH_SOC, 0.0), 1.0)
+
+
+@njit(cache=True)
+def drop_factor(d: Record, soc: float) -> float:
+    """Return the factor on the model's voltage drop at ``soc``."""
+    return d.resistance + d.growth * max(lowness(soc) - d.grown, 0.0)
+
+
+@njit(cache=True)
+def loaded_voltage(d: Record, m: Record, soc: float, bias_v: float, drop_v: float) -> float:
+    """Return the terminal voltage at ``soc`` [V].
+
+    Args:
+        d: Record of DRAW.
+        m: Record of PROJECTED_PACK.
+        soc: SOC of the weakest cell.
+        bias_v: Errors of the model that the filter has estimated [V], by ``remaining_bias``.
+        drop_v: Voltage drop of the model [V].
+    """
+    return voltage_without_load(m, soc) + bias_v + d.voltage_v - drop_factor(d, soc) * drop_v
+
+
+@njit(cache=True)
+def remaining_bias(m: Record, elapsed_s: float) -> float:
+    """Return the errors of the model that remain after ``elapsed_s`` of those that the filter has estimated [V]."""
+    return m.b_slow_v * math.exp(-elapsed_s / m.slow_s) + m.b_fast_v * math.exp(-elapsed_s / m.fast_s)

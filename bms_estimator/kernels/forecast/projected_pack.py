@@ -1,0 +1,123 @@
+"""Pack as it is now, with the curves of its voltage over the SOC, from which each draw starts.
+
+``m`` is a record of PROJECTED_PACK, ``s`` of EKF_STATE, ``p`` of EKF_SETTINGS. Voltages and resistances are of the whole pack.
+"""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, REFERENCE_C, RESISTANCES, arrhenius, on_grid
+from bms_estimator.kernels.kalman_filter.ocv_correction import ocv_correction
+from bms_estimator.kernels.kalman_filter.records import (
+    B_FAST,
+    B_SLOW,
+    CURVE,
+    HYST,
+    LN_Q,
+    LN_R,
+    LN_R0,
+    OFFSET,
+    SOC,
+    X,
+)
+from bms_estimator.model.arrays import Record
+from bms_estimator.numba_cache import njit
+
+SOC_STD_SHARE = 0.5
+"""Share of the filter's std of the SOC that the draws use. The other half is not independent of the biases."""
+MIN_SOC_STD = 0.02
+"""Std of the SOC that is added to that of the filter."""
+CAPACITY_STD_SHARE = 0.5
+"""Share of the filter's std of the capacity that the draws use."""
+VOLTAGE_STD_V = 0.02
+"""Std of the error of one cell's model at 25 C that lasts until the cut-off [V]."""
+VOLTAGE_STD_J = 22e3
+"""Activation energy of ``VOLTAGE_STD_V`` squared [J/mol]."""
+
+PROJECTED_PACK = np.dtype(
+    [
+        ("soc", "f8"),
+        ("capacity_as", "f8"),  # by the filter [A s]
+        ("offset_a", "f8"),  # measured less true current [A]
+        ("x_a", "f8", BRANCHES),  # filtered currents of the RC pairs [A]
+        ("b_slow_v", "f8"),  # error of the model that persists for hours [V]
+        ("b_fast_v", "f8"),  # error of the model that persists for a minute [V]
+        ("slow_s", "f8"),  # time constant of ``b_slow_v`` [s]
+        ("fast_s", "f8"),  # time constant of ``b_fast_v`` [s]
+        ("cutoff_v", "f8"),
+        ("soc_std", "f8"),
+        ("weakest_std", "f8"),  # std of the weakest cell's SOC below the mean, per unit of SOC discharged
+        ("capacity_std", "f8"),  # std of ln capacity
+        ("voltage_std_v", "f8"),
+        ("voltage_v", "f8", OCV_POINTS),  # voltage without load over SOC 0..1, after a discharge to that SOC [V]
+        ("end_slope_v", "f8"),  # slope with which the voltage continues below SOC 0 [V]
+        ("ohm", "f8", (RESISTANCES, GRID)),  # resistances over SOC 0..1 [ohm]
+    ],
+    align=True,
+)
+"""Present state of a pack, its curves, and the spread of the draws."""
+
+
+@njit(cache=True)
+def project_pack(m: Record, s: Record, p: Record, cutoff_v: float) -> None:
+    """Write the pack by the likeliest hypothesis of the filter to ``m``."""
+    x, cov = s.mean[s.best], s.covariance[s.best]
+    m.soc, m.cutoff_v, m.offset_a = x[SOC], cutoff_v, x[OFFSET]
+    m.capacity_as = p.capacity_as * math.exp(x[LN_Q])
+    for k in range(BRANCHES):
+        m.x_a[k] = s.x_a[k] + x[X + k]
+    m.b_slow_v, m.b_fast_v, m.slow_s, m.fast_s = x[B_SLOW], x[B_FAST], p.slow_s, p.fast_s
+    m.soc_std = math.hypot(SOC_STD_SHARE * s.soc_std, MIN_SOC_STD)
+    m.weakest_std = p.cell_spread if p.series > 1.0 else 0.0
+    m.capacity_std = CAPACITY_STD_SHARE * math.sqrt(cov[LN_Q, LN_Q])
+    m.voltage_std_v = VOLTAGE_STD_V * p.series * math.sqrt(arrhenius(VOLTAGE_STD_J, s.temperature_c))
+    project_voltage(m, s, p)
+    project_resistances(m, s, p)
+
+
+@njit(cache=True)
+def project_voltage(m: Record, s: Record, p: Record) -> None:
+    """Write the voltage without load over the SOC. The hysteresis approaches -1 during the discharge to each SOC."""
+    x = s.mean[s.best]
+    for j in range(OCV_POINTS):
+        soc = j / (OCV_POINTS - 1)
+        discharged = max(m.soc - soc, 0.0)
+        hysteresis = -1.0 + (x[HYST] + 1.0) * math.exp(-discharged / p.hysteresis_soc)
+        m.voltage_v[j] = (
+            p.ocv_v[j]
+            + s.hysteresis * on_grid(soc, p.hysteresis_v) * hysteresis
+            + math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v) * x[CURVE]
+            + ocv_correction(p, x, soc)
+            + (s.temperature_c - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
+        )
+    m.end_slope_v = p.ocv_slope_v[0]
+
+
+@njit(cache=True)
+def project_resistances(m: Record, s: Record, p: Record) -> None:
+    """Write the resistances over the SOC, with the filter's factors."""
+    x = s.mean[s.best]
+    for k in range(RESISTANCES):
+        factor = math.exp(x[LN_R0 if k == 0 else LN_R])
+        for n in range(GRID):
+            m.ohm[k, n] = factor * (s.weak * p.weak_ohm[n, k] + s.strong * p.strong_ohm[n, k])
+
+
+@njit(cache=True)
+def voltage_without_load(m: Record, soc: float) -> float:
+    """Return the voltage without load at ``soc``, linear between its points [V]."""
+    if soc <= 0.0:
+        return m.voltage_v[0] + soc * m.end_slope_v
+    position = min(soc, 1.0) * (OCV_POINTS - 1)
+    i = min(int(position), OCV_POINTS - 2)
+    return m.voltage_v[i] + (position - i) * (m.voltage_v[i + 1] - m.voltage_v[i])
+
+
+@njit(cache=True)
+def grid_position(soc: float) -> tuple[int, float]:
+    """Return the node of the resistances below ``soc``, and the fraction of the distance to the next one."""
+    position = min(max(soc, 0.0), 1.0) * (GRID - 1)
+    i = min(int(position), GRID - 2)
+    return i, position - i

@@ -1,0 +1,172 @@
+"""Draws under a load like the one that was seen: stationary bootstrap of its blocks (Politis and Romano 1994).
+
+Each draw passes the blocks in their order, from a random one on, and continues from another random block after ``RUN_S`` on
+average.
+"""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
+from bms_estimator.kernels.forecast.draws import loaded_voltage, remaining_bias
+from bms_estimator.kernels.forecast.projected_pack import grid_position
+from bms_estimator.kernels.forecast.random_numbers import uniform
+from bms_estimator.model.arrays import Floats, Record, Records
+from bms_estimator.numba_cache import njit
+
+RUN_S = 300.0
+"""Mean time for which a draw passes the load in its order [s]."""
+
+NEGLIGIBLE_C = 1e-3
+"""Difference of an RC pair's current that is left out, as a C-rate."""
+
+
+@njit(cache=True)
+def follow_seen_load(m: Record, blocks: Records, block_s: float, steps: int, draws: Records) -> None:
+    """Follow each draw until the cut-off, or through ``steps`` blocks.
+
+    Args:
+        m: Record of PROJECTED_PACK.
+        blocks: Shape (n,), dtype LOAD_BLOCK.
+        block_s: Length of a block [s].
+        steps: Maximum number of blocks of a draw.
+        draws: Shape (draws,), dtype DRAW, by ``draw_packs``; the outcomes are written.
+    """
+    decay, bias_v, nowhere = np.exp(-block_s / TAUS), biases(m, block_s, steps), np.empty(0)
+    for n in range(draws.shape[0]):
+        follow_draw(m, blocks, block_s, steps, draws[n], decay, bias_v, 0, nowhere, nowhere)
+
+
+@njit(cache=True)
+def record_curves(
+    m: Record,
+    blocks: Records,
+    block_s: float,
+    steps: int,
+    draws: Records,
+    stride: int,
+    soc: Floats,
+    voltage_v: Floats,
+) -> None:
+    """Follow draws as ``follow_seen_load`` does, and write SOC and mean voltage at every ``stride``-th block.
+
+    After its cut-off a draw keeps its SOC and the cut-off voltage. ``soc`` and ``voltage_v`` have the shape
+    (draws, points). The outcomes of the draws are overwritten.
+    """
+    decay, bias_v = np.exp(-block_s / TAUS), biases(m, block_s, steps)
+    for n in range(draws.shape[0]):
+        follow_draw(m, blocks, block_s, steps, draws[n], decay, bias_v, stride, soc[n], voltage_v[n])
+
+
+@njit(cache=True)
+def biases(m: Record, block_s: float, steps: int) -> Floats:
+    """Return ``remaining_bias`` in the middle of each block [V]."""
+    bias_v = np.empty(steps)
+    for n in range(steps):
+        bias_v[n] = remaining_bias(m, (n + 0.5) * block_s)
+    return bias_v
+
+
+@njit(cache=True)
+def follow_draw(
+    m: Record,
+    blocks: Records,
+    block_s: float,
+    steps: int,
+    d: Record,
+    decay: Floats,
+    bias_v: Floats,
+    stride: int,
+    soc_points: Floats,
+    voltage_points_v: Floats,
+) -> None:
+    """Follow one draw until the cut-off or through ``steps`` blocks. With ``stride`` above 0, write its curve."""
+    begin_load(m, blocks, block_s, d)
+    soc, d.ended, step = d.begin_soc, 0, 0
+    while step < steps:
+        row = blocks[d.block]
+        moved = d.load * row.mean_a * block_s / d.capacity_as
+        middle = min(soc - 0.5 * moved, 1.0)
+        i, t = grid_position(middle)
+        difference_v = difference_drop(m, d, row, i, t)
+        drop_v = d.load * (row.drop_v[i] + t * (row.drop_v[i + 1] - row.drop_v[i])) + difference_v
+        if loaded_voltage(d, m, middle, bias_v[step], drop_v) <= m.cutoff_v:
+            d.ended = 1
+            break
+        if stride > 0 and step % stride == 0:
+            mean_drop_v = d.load * mean_drop(m, row, i, t) + difference_v
+            soc_points[step // stride] = middle
+            voltage_points_v[step // stride] = loaded_voltage(d, m, middle, bias_v[step], mean_drop_v)
+        soc = min(soc - moved, 1.0)
+        step += 1
+        advance_load(blocks, block_s, decay, d)
+    d.time_s, d.soc = step * block_s, soc
+    if d.ended:
+        row = blocks[d.block]
+        d.time_s += row.peak_s
+        d.soc -= d.load * row.mean_a * row.peak_s / d.capacity_as
+    if stride > 0:
+        for point in range((step + stride - 1) // stride, soc_points.size):
+            soc_points[point], voltage_points_v[point] = d.soc, m.cutoff_v
+
+
+@njit(cache=True)
+def begin_load(m: Record, blocks: Records, block_s: float, d: Record) -> None:
+    """Set the first block of a draw."""
+    d.generator, d.slower = d.first_generator, 0
+    jump(blocks, block_s, d)
+    for k in range(BRANCHES):
+        d.difference_a[k] = m.x_a[k] - d.load * blocks[d.block].begin_a[k]
+
+
+@njit(cache=True)
+def advance_load(blocks: Records, block_s: float, decay: Floats, d: Record) -> None:
+    """Set the next block of a draw, and the differences of the RC pairs at its beginning."""
+    negligible_a = NEGLIGIBLE_C * d.capacity_as / 3600.0
+    for k in range(d.slower, BRANCHES):
+        d.difference_a[k] *= decay[k]
+    while d.slower < BRANCHES and abs(d.difference_a[d.slower]) < negligible_a:
+        d.difference_a[d.slower] = 0.0
+        d.slower += 1
+    last = d.block
+    d.block = last + 1 if last + 1 < blocks.shape[0] else 0
+    d.run -= 1
+    if d.run == 0:
+        jump(blocks, block_s, d)
+    if d.block != last + 1:
+        d.slower = 0
+        for k in range(BRANCHES):
+            d.difference_a[k] += d.load * (blocks[last].end_a[k] - blocks[d.block].begin_a[k])
+
+
+@njit(cache=True)
+def jump(blocks: Records, block_s: float, d: Record) -> None:
+    """Draw the next block at random, and the number of blocks until the jump after it (geometric distribution)."""
+    d.generator, u = uniform(d.generator)
+    d.block = int(u * blocks.shape[0])
+    d.generator, u = uniform(d.generator)
+    probability = min(block_s / RUN_S, 1.0)
+    d.run = 1 if probability >= 1.0 else 1 + int(math.log(u) / math.log1p(-probability))
+
+
+@njit(cache=True)
+def difference_drop(m: Record, d: Record, row: Record, i: int, t: float) -> float:
+    """Return the drop by the differences of the RC pairs at the peak of a block [V].
+
+    ``i`` and ``t`` are a position in the SOC grid.
+    """
+    drop_v = 0.0
+    for k in range(d.slower, BRANCHES):
+        r_ohm = m.ohm[1 + k, i] + t * (m.ohm[1 + k, i + 1] - m.ohm[1 + k, i])
+        drop_v += r_ohm * d.difference_a[k] * row.peak_decay[k]
+    return drop_v
+
+
+@njit(cache=True)
+def mean_drop(m: Record, row: Record, i: int, t: float) -> float:
+    """Return the mean drop of a block, as it was in the past, at a position in the SOC grid [V]."""
+    drop_v = (m.ohm[0, i] + t * (m.ohm[0, i + 1] - m.ohm[0, i])) * row.mean_a
+    for k in range(BRANCHES):
+        drop_v += (m.ohm[1 + k, i] + t * (m.ohm[1 + k, i + 1] - m.ohm[1 + k, i])) * row.mean_x_a[k]
+    return drop_v

@@ -1,0 +1,103 @@
+"""Outcomes of the forecast and of the other methods at each moment of a capture."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.model.cell import CellModel
+from tests.benchmarks.forecast import baselines
+from tests.benchmarks.forecast.captures import OWN, Case
+from tests.benchmarks.forecast.moments import Moment, moments
+from tests.benchmarks.forecast.scores import Outcome
+from tests.benchmarks.forecast.simulations import Simulation, simulate_discharge
+from tests.benchmarks.forecast.truth import Discharge, read_discharge
+from tests.benchmarks.recipes import cell_file
+
+FORECAST, COUNT, HALF_HOUR, POWER = "forecast", "charge / mean current", "half an hour repeated", "constant power"
+PERFECT, GIVEN = "perfect model", "true load given"
+"""Names of the methods."""
+MAX_LEFT_S = 7200.0
+"""Time to the cut-off, by the capture or by the forecast, up to which the slow methods run [s]."""
+EVERY = 2
+"""Number of moments for each moment at which the slow methods run, except in the last ``LEADS_S``."""
+LEADS_S = (3600.0, 1800.0, 1200.0, 600.0, 300.0, 120.0)
+"""Times before the cut-off at which the forecasts are judged [s]."""
+TEMPERATURE_TOLERANCE_K = 3.0
+"""Distance from the temperatures of a cell file within which the file knows the temperature [K]."""
+
+
+def outcomes(case: Case | Simulation, folder: Path, *, has_baselines: bool = True) -> Iterator[Outcome]:
+    """Yield the outcomes of a case; none if its capture is not a discharge.
+
+    Args:
+        case: Capture and cell file.
+        folder: Folder in which cell files are computed.
+        has_baselines: True: the other methods run, too, if the cell file is of the first kind, ``OWN``.
+    """
+    if isinstance(case, Simulation):
+        discharge, cell = simulate_discharge(case)
+        yield from outcomes_of_discharge(case.case, discharge, cell, has_baselines=False)
+        return
+    discharge = read_discharge(case)
+    if discharge is not None:
+        cell = cell_file(case.recipe, folder)
+        yield from outcomes_of_discharge(case, discharge, cell, has_baselines=has_baselines and case.file == OWN)
+
+
+def outcomes_of_discharge(
+    case: Case, discharge: Discharge, cell: CellModel, *, has_baselines: bool
+) -> Iterator[Outcome]:
+    """Yield the outcomes of a discharge with a cell file."""
+    for n, moment in enumerate(moments(discharge, cell)):
+        said = baselines.quantiles_of(moment.forecast)
+        if np.isnan(said.p50_s):
+            continue  # the forecast has a reason to say nothing
+        ours = Outcome(
+            FORECAST,
+            case.name,
+            case.file,
+            case.load,
+            case.is_phosphate,
+            discharge.temperature_c if np.isfinite(discharge.temperature_c) else REFERENCE_C,
+            knows_temperature(cell, discharge.temperature_c),
+            baselines.mean_current(discharge.samples) / case.recipe.capacity_ah,
+            moment.left_s,
+            moment.left_s,
+            said,
+        )
+        yield ours
+        if has_baselines:
+            yield from of_fast_baselines(ours, moment)
+            is_due = n % EVERY == 0 or any(abs(moment.left_s - s) < 1.0 for s in LEADS_S)
+            if is_due and min(moment.left_s, said.p50_s) < MAX_LEFT_S:
+                yield from of_slow_baselines(ours, moment, discharge)
+
+
+def of_fast_baselines(ours: Outcome, moment: Moment) -> Iterator[Outcome]:
+    """Yield the outcomes of the methods that need little time."""
+    for method, forecast in ((COUNT, baselines.charge_over_mean_current), (POWER, baselines.constant_power)):
+        said = forecast(moment)
+        if np.isfinite(said.p50_s):
+            yield replace(ours, method=method, said=said)
+
+
+def of_slow_baselines(ours: Outcome, moment: Moment, discharge: Discharge) -> Iterator[Outcome]:
+    """Yield the outcomes of the methods that run the model forward second by second."""
+    repeated = baselines.half_hour_repeated(moment)
+    if np.isfinite(repeated.p50_s):
+        yield replace(ours, method=HALF_HOUR, said=repeated)
+    given = baselines.true_load_given(moment, discharge.samples)
+    if np.isfinite(given.p50_s):
+        yield replace(ours, method=GIVEN, said=given)
+        yield replace(ours, method=PERFECT, truth_s=max(baselines.drawn_truth(moment, given), 1.0))
+
+
+def knows_temperature(cell: CellModel, temperature_c: float) -> bool:
+    """Return True if the captures of the cell file had this temperature [C]. A file without temperatures is of 25 C."""
+    if np.isnan(temperature_c):
+        return True  # without a sensor the estimator assumes 25 C
+    low_c, high_c = (REFERENCE_C, REFERENCE_C) if cell.ladder is None else cell.ladder.temperature_c
+    return low_c - TEMPERATURE_TOLERANCE_K <= temperature_c <= high_c + TEMPERATURE_TOLERANCE_K

@@ -1,0 +1,153 @@
+"""Forecast of the time to the cut-off, from samples of a simulated cell."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.forecast.forecast import FORECAST
+from bms_estimator.forecast.forecaster import MAX_INTERVAL_S, Forecaster
+from bms_estimator.forecast.given_load import GivenLoad
+from bms_estimator.pack_model.learning import SlowFit
+from tests.estimator.simulated_cell import TRUTH
+from tests.forecast.simulated_load import CUTOFF_V, changing_load, constant_load, cutoff_s, forecaster
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Return samples of the cell from SOC 0.9 to below the cut-off voltage."""
+    return changing_load(11_000)
+
+
+def values_of(forecast, *names):
+    return [float(forecast.values[name][0]) for name in names]
+
+
+BAND = "time_to_cutoff_p05_s", "time_to_cutoff_s", "time_to_cutoff_p95_s"
+
+
+def test_any_division_into_blocks_gives_the_same_forecasts_to_the_last_bit(drive):
+    drive = drive[:4000]
+    whole = forecaster()
+    trace = whole.run(drive).copy()
+    rows = whole.rows
+    for size in (1, 7, 1000):
+        parts, traces, part_rows = forecaster(), [], []
+        for start in range(0, drive.size, size):
+            traces.append(parts.run(drive[start : start + size]).copy())
+            part_rows.append(parts.rows)
+        assert np.concatenate(traces).tobytes() == trace.tobytes()
+        assert np.concatenate(part_rows).tobytes() == rows.tobytes()
+        assert parts.latest.curve.voltage_p50_v.tobytes() == whole.latest.curve.voltage_p50_v.tobytes()
+
+
+def test_the_slow_fit_as_runner_gives_a_row_for_each_trace_row(drive):
+    estimator = Estimator(TRUTH, initial_soc=0.9)
+    forecasts = Forecaster(estimator, SlowFit(estimator), cutoff_v=CUTOFF_V)
+    trace = forecasts.run(drive[:4000])
+    assert forecasts.rows.size == trace.size == 4000
+    assert forecasts.rows.dtype == FORECAST
+    assert np.isnan(forecasts.rows["time_to_cutoff_s"][:300]).all()
+    assert np.isfinite(forecasts.rows["time_to_cutoff_s"][300 + int(MAX_INTERVAL_S) :]).all()
+
+
+def test_the_band_contains_the_true_time_under_a_load_like_the_one_seen(drive):
+    end_s, forecasts = cutoff_s(drive), forecaster()
+    forecasts.run(drive[drive["time_s"] < end_s - 900.0])
+    trues_s = end_s - forecasts.latest.time_s
+    p05_s, median_s, p95_s = values_of(forecasts.latest, *BAND)
+    assert p05_s < trues_s < p95_s
+    assert median_s == pytest.approx(trues_s, rel=0.35)
+    assert values_of(forecasts.latest, "cutoff_within_2min")[0] < 0.1
+    assert 0.1 < values_of(forecasts.latest, "cutoff_within_15min")[0] < 0.9
+
+
+def test_the_curves_begin_at_the_present_state_and_end_at_the_cutoff(drive):
+    forecasts = forecaster()
+    forecasts.run(drive[:5000])
+    curve = forecasts.latest.curve
+    assert 30 <= curve.elapsed_s.size <= 60
+    assert (np.diff(curve.elapsed_s) > 0.0).all()
+    assert curve.soc_p50[0] == pytest.approx(forecasts.estimator.soc, abs=0.02)
+    assert (curve.soc_p05 <= curve.soc_p50).all()
+    assert (curve.soc_p50 <= curve.soc_p95).all()
+    assert (curve.voltage_p05_v <= curve.voltage_p95_v).all()
+    assert curve.survival[0] == 1.0
+    assert curve.survival[-1] <= 0.05
+    assert curve.voltage_p50_v[-1] == CUTOFF_V
+    p95_s = values_of(forecasts.latest, "time_to_cutoff_p95_s")[0]
+    assert p95_s <= curve.elapsed_s[-1] * 1.05
+
+
+def test_a_given_constant_current_gives_the_true_time_within_15_percent():
+    block = constant_load(1.5, 8000)
+    end_s, forecasts = cutoff_s(block), forecaster()
+    forecasts.run(block[:2000])
+    now_s = forecasts.latest.time_s
+    given = forecasts.forecast(GivenLoad(np.array([60.0]), np.array([1.5]), np.array([np.nan])))
+    assert values_of(given, "time_to_cutoff_s")[0] == pytest.approx(end_s - now_s, rel=0.15)
+    p05_s, _, p95_s = values_of(given, *BAND)
+    seen_p05_s, _, seen_p95_s = values_of(forecasts.latest, *BAND)
+    assert p95_s - p05_s < 0.7 * (seen_p95_s - seen_p05_s)
+
+
+def test_a_given_power_lasts_as_long_as_its_mean_current():
+    forecasts = forecaster()
+    forecasts.run(constant_load(1.5, 2000))
+    nan = np.array([np.nan])
+    power = forecasts.forecast(GivenLoad(np.array([60.0]), nan, np.array([5.0])))
+    time_s, charge_ah = values_of(power, "time_to_cutoff_s", "usable_capacity_ah")
+    mean_a = 3600.0 * charge_ah / time_s
+    current = forecasts.forecast(GivenLoad(np.array([60.0]), np.array([mean_a]), nan))
+    assert time_s == pytest.approx(values_of(current, "time_to_cutoff_s")[0], rel=0.05)
+    assert 3.2 < 5.0 / mean_a < 3.8
+
+
+def test_a_power_that_the_pack_cannot_supply_reaches_the_cutoff_at_once():
+    forecasts = forecaster()
+    forecasts.run(constant_load(1.5, 400))
+    given = forecasts.forecast(GivenLoad(np.array([60.0]), np.array([np.nan]), np.array([500.0])))
+    assert values_of(given, *BAND) == [0.0, 0.0, 0.0]
+
+
+def test_a_given_load_needs_no_load_seen_but_must_discharge():
+    forecasts = forecaster()
+    forecasts.run(constant_load(0.0, 100))
+    part = np.array([60.0, 60.0])
+    discharge = forecasts.forecast(GivenLoad(part, np.array([2.0, -0.5]), np.full(2, np.nan)))
+    assert discharge.reason is None
+    charge = forecasts.forecast(GivenLoad(part, np.array([0.5, -2.0]), np.full(2, np.nan)))
+    assert charge.reason == "the load does not discharge the pack on average"
+    assert np.isnan(charge.values["time_to_cutoff_s"][0])
+
+
+def test_a_low_load_lasts_for_its_mean_current():
+    forecasts = forecaster()
+    forecasts.run(constant_load(0.05, 1000))
+    median_s = values_of(forecasts.latest, "time_to_cutoff_s")[0]
+    assert median_s == pytest.approx(0.9 * TRUTH.cell.capacity_ah / 0.05 * 3600.0, rel=0.1)
+
+
+def test_the_reason_says_why_there_is_no_forecast():
+    forecasts = forecaster()
+    assert forecasts.latest.reason == "no sample has been processed yet"
+    block = np.concatenate([constant_load(a, n) for a, n in ((1.0, 200), (1.0, 400), (0.0, 1000), (-1.0, 600))])
+    block["time_s"] = np.arange(block.size)
+    ends = 200, 600, 1600, 2200
+    reasons = []
+    for start, end in zip((0, *ends), ends, strict=False):
+        forecasts.run(block[start:end])
+        reasons.append(forecasts.forecast().reason)
+    assert reasons == [
+        "less than 300 s of load have been seen since the last charge",
+        None,
+        "the pack has been at rest for 15 min",
+        "the pack is being charged",
+    ]
+
+
+def test_a_clock_that_is_set_back_does_not_delay_the_next_forecast():
+    forecasts, block = forecaster(), constant_load(1.0, 1000)
+    block["time_s"] += np.where(np.arange(block.size) < 500, 1e6, 0.0)
+    forecasts.run(block)
+    assert forecasts.latest.time_s > 900.0
+    assert forecasts.latest.time_s < 1000.0
