@@ -88,6 +88,12 @@ class Forecaster:
             return traces[0]
         return np.concatenate(traces) if traces else np.zeros(0, TRACE)
 
+    def run_without_forecast(self, block: SampleBlock) -> TraceBlock:
+        """Process a block of samples and store their load. This is faster if only a later forecast is needed."""
+        trace = self._runner.run(block)
+        self.load.add(trace)
+        return trace
+
     @property
     def rows(self) -> ForecastRows:
         """Values valid at each row of the trace that ``run`` returned last, dtype ``FORECAST``."""

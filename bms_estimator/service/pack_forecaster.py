@@ -13,7 +13,7 @@ from bms_estimator.service.kernel_subtrees import CELL
 from bms_estimator.settings.pack import Settings
 
 WARM_UP_S = 330
-"""Duration of the load after which a forecast exists, with a margin [s]."""
+"""Duration of the load after which a forecast can be made, with a margin [s]."""
 
 
 def new_forecaster(
@@ -42,4 +42,6 @@ def load_forecast_kernels() -> None:
     samples = np.zeros(WARM_UP_S, SAMPLE)
     samples["time_s"], samples["temperature_c"] = np.arange(WARM_UP_S), 25.0
     samples["voltage_v"], samples["current_a"] = cell.cell.nominal_voltage_v, 0.1 * cell.cell.capacity_ah
-    Forecaster(estimator, estimator, cutoff_v=cell.cell.voltage_min_v).run(samples)
+    forecaster = Forecaster(estimator, estimator, cutoff_v=cell.cell.voltage_min_v)
+    forecaster.run(samples)
+    forecaster.forecast()

@@ -115,7 +115,7 @@ class Publisher:
         self._forecaster, self._forecast_s = forecaster, -math.inf  # time of the last payload of the curves
         is_battery = isinstance(cell, CellModel)
         self._no_forecast = no_forecast(
-            "the identifier is off" if is_battery else "a fuel cell has no charge to forecast"
+            "the identifier is switched off" if is_battery else "a fuel cell has no state of charge"
         )
         self.checkpoint, self.log_lines_lost = checkpoint, 0
         self.disk_free_mib: float | None = None

@@ -98,4 +98,4 @@ def test_a_pack_without_the_identifier_has_no_forecast_and_a_reason() -> None:
     publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
     [snapshot] = sink.snapshots
     assert snapshot.estimate
-    assert (snapshot.estimate.forecast_reason, snapshot.forecast) == ("the identifier is off", None)
+    assert (snapshot.estimate.forecast_reason, snapshot.forecast) == ("the identifier is switched off", None)

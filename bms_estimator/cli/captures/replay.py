@@ -156,14 +156,16 @@ async def _replay(
             settings, estimator, on_failure=lambda error: errors.update({type(error).__name__: str(error)})
         )
     forecaster = new_forecaster(settings, model, estimator, pack_model)
-    runner = forecaster or pack_model or estimator
+    run = (pack_model or estimator).run
+    if forecaster:  # forecasts at intervals take longer than the estimates, and the summary needs only the last one
+        run = forecaster.run if table or settings.mqtt else forecaster.run_without_forecast
     async with AsyncExitStack() as stack:
         publisher = await _open_publisher(stack, settings, model, estimator, pack_model, forecaster, source)
         stack.enter_context(table or nullcontext())
         bar = stack.enter_context(progress_bar("replaying"))
         started_s, impossible = time.perf_counter(), None
         async for received in source:
-            trace = runner.run(received.samples)
+            trace = run(received.samples)
             summary.add(trace)
             if trace.size < received.samples.size:  # samples were dropped
                 impossible = out_of_range_reason(received.samples, estimator.settings[0]) or impossible

@@ -73,9 +73,9 @@ class ReplayResult:
     failed_fits: int
     """Number of fits that ended with an error."""
     forecast: dict[str, float | None]
-    """Values of the last forecast; empty without a forecaster."""
+    """Values of a forecast from the last sample; empty without a forecaster."""
     forecast_reason: str | None
-    """Reason why the last forecast has no time to the cut-off; None if it has one, or without a forecaster."""
+    """Reason why this forecast has no time to the cut-off; None if it has one, or without a forecaster."""
     samples_per_s: float | None
     """Number of processed samples per second, including dropped samples."""
     wall_s: float
@@ -178,12 +178,12 @@ def _learned_parameters(estimator: Estimator) -> dict[str, LearnedParameter]:
 
 
 def _last_forecast(forecaster: Forecaster | None) -> dict[str, Any]:
-    """Return the fields of ``ReplayResult`` with the last forecast."""
+    """Return the fields of ``ReplayResult`` with a forecast from the last sample."""
     if forecaster is None:
         return {"forecast": {}, "forecast_reason": None}
-    latest = forecaster.latest
-    values = {name: finite(latest.values[0][name]) for name in latest.values.dtype.names or ()}
-    return {"forecast": values, "forecast_reason": latest.reason}
+    forecast = forecaster.forecast()
+    values = {name: finite(forecast.values[0][name]) for name in forecast.values.dtype.names or ()}
+    return {"forecast": values, "forecast_reason": forecast.reason}
 
 
 def _finite_field(row: np.void | None, name: str) -> float | None:

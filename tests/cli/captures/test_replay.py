@@ -118,25 +118,48 @@ def test_estimates_sample_by_sample_agree_with_the_summary(name, capture, tmp_pa
     assert math.sqrt(np.mean(columns["innovation_v"] ** 2)) == pytest.approx(result["innovation_rms_v"])
 
 
-def test_the_table_and_the_summary_have_the_last_forecast(capture, tmp_path, capsys):
+@pytest.fixture
+def discharge(tmp_path):
+    """Write a capture of ten minutes with a constant load of 1 A."""
+    path = tmp_path / "load.csv"
+    rows = "".join(f"{time},1.0,{3.9 - 1e-4 * time}\n" for time in range(SAMPLES))
+    path.write_text(f"time_s,current_a,voltage_v\n{rows}")
+    return path
+
+
+def test_the_table_and_the_summary_have_forecasts(discharge, tmp_path, capsys):
     out = tmp_path / "out.csv"
-    code, text, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--json")
+    code, text, err = run(capsys, "replay", discharge, "--cell", "ncr18650", "--out", out, "--json")
     assert (code, err) == (0, "")
     columns, result = columns_of_csv(out), json.loads(text)
     assert tuple(result["forecast"]) == FORECAST.names
-    assert (result["forecast"]["time_to_cutoff_s"] is None) == bool(result["forecast_reason"])
-    for name, value in result["forecast"].items():
-        last = columns[name][-1]
-        assert math.isnan(last) if value is None else last == value, name
+    assert result["forecast_reason"] is None
+    times_s = columns["time_to_cutoff_s"]
+    assert np.isnan(times_s[:300]).all()  # too little load was seen
+    assert times_s[-1] == pytest.approx(result["forecast"]["time_to_cutoff_s"], rel=0.2)
+    assert (columns["time_to_cutoff_p05_s"] <= times_s)[-1]
+    code, text, _ = run(capsys, "replay", discharge, "--cell", "ncr18650", "--json")
+    assert code == 0
+    assert json.loads(text)["forecast"] == result["forecast"]
 
 
-def test_a_higher_cut_off_voltage_is_reached_earlier(tmp_path, capsys):
-    capture = tmp_path / "load.csv"
-    rows = "".join(f"{time},1.0,{3.9 - 1e-4 * time}\n" for time in range(SAMPLES))
-    capture.write_text(f"time_s,current_a,voltage_v\n{rows}")
+def test_the_reason_for_a_missing_forecast_is_reported(tmp_path, capsys):
+    capture = tmp_path / "short.csv"
+    capture.write_text("time_s,current_a,voltage_v\n" + "".join(f"{time},1.0,3.8\n" for time in range(100)))
+    code, out, _ = run(capsys, "replay", capture, "--cell", "ncr18650", "--json")
+    assert code == 0
+    result = json.loads(out)
+    assert result["forecast"]["time_to_cutoff_s"] is None
+    assert "of load have been seen" in result["forecast_reason"]
+    assert "time to cut-off unknown: less than" in " ".join(
+        run(capsys, "replay", capture, "--cell", "ncr18650")[1].split()
+    )
+
+
+def test_a_higher_cut_off_voltage_is_reached_earlier(discharge, capsys):
     times_s = []
     for cutoff_v in ("2.7", "3.5"):
-        code, out, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--cutoff-v", cutoff_v, "--json")
+        code, out, err = run(capsys, "replay", discharge, "--cell", "ncr18650", "--cutoff-v", cutoff_v, "--json")
         assert (code, err) == (0, "")
         times_s.append(json.loads(out)["forecast"]["time_to_cutoff_s"])
     assert times_s[1] < times_s[0]
