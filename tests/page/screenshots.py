@@ -33,8 +33,10 @@ from tests.sinks.snapshots import CELL_SNAPSHOT
 from tests.store.test_history import record_history
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
-LEARN_S = 60.0
-"""Time before the first screenshot in which the estimator identifies the pack [s]."""
+LEARN_S = 30.0
+"""Time before the screenshot with alarms in which the estimator identifies the pack [s]."""
+FORECAST_TIMEOUT_S = 600.0
+"""Timeout of the first curves of a forecast, which need 300 s of load [s]."""
 TOP_PX = 500
 """Height of the upper part of the page, with alarms or the note about stale values [px]."""
 END_SOC = 0.66
@@ -103,7 +105,7 @@ async def open_page(browser: Browser, service: Service, **options: Any) -> Async
 async def shoot_all(service: Service, browser: Browser) -> None:
     """Write all screenshots. The service is killed for one of them, and restarted with alarms."""
     async with open_page(browser, service) as page_tab:
-        await asyncio.sleep(LEARN_S)
+        await page_tab.page.locator("#forecast .curve").last.wait_for(timeout=1e3 * FORECAST_TIMEOUT_S)
         await shoot(page_tab, "desktop")
         await shoot(page_tab, "cells", ".cells")
         await page_tab.page.get_by_text("Day", exact=True).click()
@@ -119,7 +121,7 @@ async def shoot_all(service: Service, browser: Browser) -> None:
     await service.start(ALARMS)
     async with open_page(browser, service) as page_tab:
         await page_tab.page.locator(".alarm").nth(1).wait_for()
-        await asyncio.sleep(LEARN_S / 2)
+        await asyncio.sleep(LEARN_S)
         await shoot(page_tab, "alarm", top=True)
 
 

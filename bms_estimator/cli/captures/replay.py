@@ -148,7 +148,8 @@ async def _replay(
     """Run the estimator over a source, and pass the estimates to table, summary and broker."""
     with show_compile_progress():
         estimator, summary = new_estimator(settings, model), Summary()
-        load_forecast_kernels()
+        if estimator.identifying:
+            load_forecast_kernels()
     errors: dict[str, str] = {}  # the last text of each kind
     pack_model = None
     if fit_pack:
