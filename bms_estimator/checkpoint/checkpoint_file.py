@@ -20,7 +20,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.history_file import SUFFIX
+from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX
 from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity, without_observer
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads import Totals
@@ -236,7 +236,8 @@ class CheckpointFile:
         others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
         for path in others[MAX_FILES - 1 :]:
             path.unlink(missing_ok=True)
-            path.with_suffix(SUFFIX).unlink(missing_ok=True)
+            for suffix in (SUFFIX, LOAD_SUFFIX):
+                path.with_suffix(suffix).unlink(missing_ok=True)
 
 
 class _RejectedError(Exception):

@@ -1,4 +1,4 @@
-"""File of a pack's history and its last fit, beside the checkpoint of the same pack."""
+"""Files of arrays beside the checkpoint of the same pack: the history with its last fit, and the load that was seen."""
 
 import io
 from collections.abc import Mapping
@@ -18,7 +18,9 @@ FORMAT = 1
 MAX_FILE_BYTES = 4 << 20
 """Maximum size of a file [bytes]. A full history of 5000 rows has about 1 MB before compression."""
 SUFFIX = ".history.npz"
-"""End of the file's name."""
+"""End of the name of the file with the history."""
+LOAD_SUFFIX = ".load.npz"
+"""End of the name of the file with the load."""
 
 
 class RejectedHistoryError(Exception):
@@ -26,18 +28,20 @@ class RejectedHistoryError(Exception):
 
 
 class HistoryFile:
-    """One pack's history, ``<pack.name>-<identity>.history.npz``.
+    """One pack's history, ``<pack.name>-<identity>.history.npz``, or another file of arrays.
 
     Args:
         folder: Folder of the file.
         settings: The pack's settings.
         cell: Model of battery or fuel cell, with the values of the whole pack.
+        suffix: End of the file's name.
     """
 
-    def __init__(self, folder: Path, settings: Settings, cell: PackModel) -> None:
+    def __init__(self, folder: Path, settings: Settings, cell: PackModel, suffix: str = SUFFIX) -> None:
+        self._suffix = suffix
         self._name, self._identity = settings.pack.name, pack_identity(settings, cell)
         self._is_later = False
-        self.path = folder / f"{self._name}-{self._identity[:8]}{SUFFIX}"
+        self.path = folder / f"{self._name}-{self._identity[:8]}{suffix}"
 
     def save(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Write the file atomically.
@@ -77,7 +81,7 @@ class HistoryFile:
 
     def quarantine(self) -> str:
         """Rename a rejected file, so that the next save does not overwrite it. Return a description for the user."""
-        kept = self.path.with_name(f"{self._name}.{'later' if self._is_later else 'refused'}{SUFFIX}")
+        kept = self.path.with_name(f"{self._name}.{'later' if self._is_later else 'refused'}{self._suffix}")
         try:
             self.path.replace(kept)
         except OSError as error:

@@ -1,6 +1,6 @@
 """Estimator with the learned state of a pack's checkpoint."""
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.checkpoint_file import CheckpointContent, CheckpointFile
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
@@ -22,12 +22,36 @@ def learned_estimator(file: CheckpointFile, settings: Settings, model: PackModel
     Raises:
         UserError: There is no valid checkpoint, or the service ran without the identifier.
     """
+    return estimator_of(load_valid(file, settings), file, settings, model)
+
+
+def load_valid(file: CheckpointFile, settings: Settings) -> CheckpointContent:
+    """Return the content of a checkpoint. The file remains unchanged.
+
+    Raises:
+        UserError: There is no valid checkpoint.
+    """
     content = file.load()
     if content.reason:
         raise UserError(
             f"{file.path}: no checkpoint to read: {content.reason}; the pack's service saves a checkpoint every "
             f"{settings.state.checkpoint_s:g} s"
         )
+    return content
+
+
+def estimator_of(content: CheckpointContent, file: CheckpointFile, settings: Settings, model: PackModel) -> Estimator:
+    """Return an estimator with the state and the fit of a checkpoint's content, as it was when it was saved.
+
+    Args:
+        content: Content of ``file``.
+        file: Checkpoint of the pack, for the errors.
+        settings: Settings of the pack.
+        model: Model of the whole pack.
+
+    Raises:
+        UserError: The state is invalid, or the service ran without the identifier.
+    """
     estimator = new_estimator(settings, model)
     try:
         fit = fit_of_curves(content.curves)

@@ -32,6 +32,10 @@ COMMANDS = {
         "bms_estimator.cli.captures.replay:replay",
         "Run the estimator over a capture: recorded raw bytes, a table or the export of a cycler.",
     ),
+    "forecast": LazyCommand(
+        "bms_estimator.cli.live.forecast:forecast",
+        "Forecast the time to cut-off of a pack under an expected load.",
+    ),
     "alarms": LazyCommand(
         "bms_estimator.cli.captures.alarms:alarms", "List the alarms that a capture would have raised."
     ),

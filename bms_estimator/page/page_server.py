@@ -1,8 +1,9 @@
-"""Server of the live page of packs: event stream and history."""
+"""Server of the live page of packs: event stream, history, and forecasts under a load that the user gives."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from aiohttp import web
 
@@ -11,6 +12,7 @@ from bms_estimator.page.history_query import SPANS, HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.settings.page import PageSettings
+from bms_estimator.sinks.mqtt.requests import MAX_READ_BYTES
 
 HISTORY_TIMEOUT_S = 10.0
 """Timeout of a history query [s]. A disk that needs longer counts as hung."""
@@ -23,12 +25,16 @@ FILES = {
     "/style.css": File(STATIC / "style.css", "text/css"),
     "/page.js": File(STATIC / "page.js", "text/javascript"),
     "/live.js": File(STATIC / "live.js", "text/javascript"),
+    "/what_if.js": File(STATIC / "what_if.js", "text/javascript"),
     "/format.js": File(STATIC / "format.js", "text/javascript"),
     "/charts.js": File(STATIC / "charts.js", "text/javascript"),
     "/uplot.js": File(STATIC / "uplot.js", "text/javascript"),
     "/icon.svg": File(STATIC / "icon.svg", "image/svg+xml"),
 }
 """Static files by URL path."""
+
+Forecast = Callable[[bytes], Awaitable[bytes | None]]
+"""Function that answers the payload of a request ``forecast``; None: too many requests."""
 
 
 class PageServer(WebServer):
@@ -38,6 +44,7 @@ class PageServer(WebServer):
         settings: Address and access of the page.
         hub: Present state of the packs.
         history: History of the packs.
+        forecasts: Functions that answer requests for a forecast, by pack. The caller may add and remove packs.
         on_listening: Called with the address of the page once the server listens.
         retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
@@ -50,14 +57,22 @@ class PageServer(WebServer):
         settings: PageSettings,
         hub: PackTopics,
         history: HistoryQuery,
+        forecasts: Mapping[str, Forecast] = MappingProxyType({}),
         *,
         on_listening: Callable[[str], object] = str,
         retry: bool = True,
     ) -> None:
         super().__init__(
-            settings, FILES, hub, {"/history": self._answer_history}, on_listening=on_listening, retry=retry
+            settings,
+            FILES,
+            hub,
+            {"/history": self._answer_history},
+            forms={"/forecast": self._answer_forecast},
+            max_form_bytes=MAX_READ_BYTES,
+            on_listening=on_listening,
+            retry=retry,
         )
-        self._history = history
+        self._history, self._forecasts = history, forecasts
         self._query_slots = asyncio.Semaphore(MAX_HISTORY_QUERIES)
 
     async def _answer_history(self, request: web.Request) -> web.StreamResponse:
@@ -72,4 +87,16 @@ class PageServer(WebServer):
             raise web.HTTPNotFound(text=f"{error}\n") from None
         except TimeoutError:
             raise web.HTTPServiceUnavailable(text="the disk does not answer\n") from None
+        return web.Response(body=body, content_type="application/json", headers={"Cache-Control": "no-store"})
+
+    async def _answer_forecast(self, request: web.Request) -> web.StreamResponse:
+        """Answer a request ``forecast`` in JSON. A form of a foreign page cannot have this content type."""
+        if request.content_type != "application/json":
+            raise web.HTTPUnsupportedMediaType(text="the content type must be application/json\n")
+        forecast = self._forecasts.get(request.query.get("pack", ""))
+        if forecast is None:
+            raise web.HTTPNotFound(text="forecasts are made where the service of the pack runs\n")
+        body = await forecast(await request.read())
+        if body is None:
+            raise web.HTTPTooManyRequests(text="too many requests; wait some seconds\n")
         return web.Response(body=body, content_type="application/json", headers={"Cache-Control": "no-store"})

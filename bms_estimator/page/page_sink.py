@@ -12,7 +12,7 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.topic_cache import parse_payload
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
-from bms_estimator.page.page_server import PageServer
+from bms_estimator.page.page_server import Forecast, PageServer
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 
@@ -25,10 +25,19 @@ class PageSink:
         settings: Settings of the page.
         pack: Name of the pack.
         history: File of its history; None: no history.
+        forecast: Function that answers requests for a forecast; None: there are none.
     """
 
-    def __init__(self, pages: "Pages", settings: PageSettings, pack: str, history: Path | None = None) -> None:
+    def __init__(
+        self,
+        pages: "Pages",
+        settings: PageSettings,
+        pack: str,
+        history: Path | None = None,
+        forecast: Forecast | None = None,
+    ) -> None:
         self._pages, self._settings, self._pack, self._history = pages, settings, pack, history
+        self._forecast = forecast
         self._messages = MessageBuilder("", pack)
         self._previous: Snapshot | None = None
         self._sent = PublishedState()
@@ -38,7 +47,7 @@ class PageSink:
     async def __aenter__(self) -> Self:
         """Start to serve the page."""
         self._hub = await self._stack.enter_async_context(
-            self._pages.serving(self._settings, self._pack, self._history)
+            self._pages.serving(self._settings, self._pack, self._history, self._forecast)
         )
         self._put(self._messages.birth_messages())
         return self
@@ -74,7 +83,9 @@ class Pages:
         self._by_address: dict[str, _Page] = {}
 
     @contextlib.asynccontextmanager
-    async def serving(self, settings: PageSettings, pack: str, history: Path | None) -> AsyncIterator[PackTopics]:
+    async def serving(
+        self, settings: PageSettings, pack: str, history: Path | None, forecast: Forecast | None
+    ) -> AsyncIterator[PackTopics]:
         """Show a pack. The first pack starts the server of its address, the last one ends it.
 
         Raises:
@@ -89,10 +100,13 @@ class Pages:
                 raise UserError(f"page: packs that share listen = {settings.listen} must share token_file and hosts")
             if history:
                 page.history_query.add(pack, history)
+            if forecast:
+                page.forecasts[pack] = forecast
             await page.start()
             yield page.hub
         finally:
             page.packs -= 1
+            page.forecasts.pop(pack, None)
             if not page.packs:
                 del self._by_address[settings.listen]
                 await page.stop()
@@ -103,8 +117,8 @@ class _Page:
 
     def __init__(self, settings: PageSettings, on_listening: Callable[[str], object]) -> None:
         self.settings, self.packs = settings, 0
-        self.hub, self.history_query = PackTopics(), HistoryQuery()
-        self._server = PageServer(settings, self.hub, self.history_query, on_listening=on_listening)
+        self.hub, self.history_query, self.forecasts = PackTopics(), HistoryQuery(), dict[str, Forecast]()
+        self._server = PageServer(settings, self.hub, self.history_query, self.forecasts, on_listening=on_listening)
         self._start_task: asyncio.Task[PageServer] | None = None
 
     async def start(self) -> None:

@@ -72,6 +72,7 @@ class WebServer:
         latest: Content of the event stream ``/events``.
         handlers: Handlers of queries, by path.
         forms: Handlers of submitted forms, by path.
+        max_form_bytes: Maximum size of a submitted form [bytes].
         on_listening: Called with the address once the server listens.
         retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
@@ -87,6 +88,7 @@ class WebServer:
         handlers: Mapping[str, Handler],
         *,
         forms: Mapping[str, Handler] = MappingProxyType({}),
+        max_form_bytes: int = 1024,
         on_listening: Callable[[str], object] = str,
         retry: bool = True,
     ) -> None:
@@ -95,7 +97,7 @@ class WebServer:
         self._configured_address, self._listening = settings.address, settings.address
         self._files = {path: _load_file(file) for path, file in files.items()}
         self._handlers = {**dict.fromkeys(files, self._file), "/events": self._stream_events, **handlers}
-        self._forms = forms
+        self._forms, self._max_form_bytes = forms, max_form_bytes
         self._streams: dict[Reader, _Stream] = {}
         self._runner: web.AppRunner | None = None
         self._listener: Listener | None = None
@@ -114,7 +116,7 @@ class WebServer:
         Raises:
             UserError: The address cannot be listened on, and ``retry`` is False.
         """
-        app = web.Application(middlewares=[self._exempt_connection], client_max_size=1024)
+        app = web.Application(middlewares=[self._exempt_connection], client_max_size=self._max_form_bytes)
         app.on_response_prepare.append(_protect)
         for path, handler in self._handlers.items():
             app.router.add_get(path, handler)

@@ -4,6 +4,7 @@ import asyncio
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import structlog
@@ -11,6 +12,8 @@ import structlog
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.estimator import Estimator
+from bms_estimator.forecast.load_history import LoadHistory
+from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.publisher import Publisher
@@ -24,10 +27,19 @@ CHECK_S = 1.0
 """Interval of the check for a change of SOC or alarms [s]."""
 DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
+LOAD_SAVE_S = 300.0
+"""Interval between two saves of the load that was seen [s]. A crash loses at most the load of this time."""
 FINAL_SAVE_S = 5.0
 """Timeout of the save at shutdown [s]; systemd waits 90 s before it kills a service."""
 
 log = structlog.get_logger(__name__)
+
+
+class SeenLoad(NamedTuple):
+    """Load that was seen, and its file."""
+
+    load: LoadHistory
+    file: HistoryFile
 
 
 class CheckpointWriter:
@@ -42,6 +54,7 @@ class CheckpointWriter:
         interval_s: Maximum interval between two saves [s].
         pack_model: Slow fit, whose history is saved when its ``revision`` changes; None: no history.
         history: File of the history; None: no history.
+        seen_load: Load that was seen, which is saved every ``LOAD_SAVE_S``; None: it is not saved.
     """
 
     def __init__(
@@ -55,8 +68,10 @@ class CheckpointWriter:
         interval_s: float,
         pack_model: SlowFit | None = None,
         history: HistoryFile | None = None,
+        seen_load: SeenLoad | None = None,
     ) -> None:
-        self._interval_s = interval_s
+        self._interval_s, self._seen_load = interval_s, seen_load
+        self._samples_of_saved_load = 0
         self._pack_model, self._history = pack_model, history
         self._saved_revision = pack_model.revision if pack_model else 0
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
@@ -73,13 +88,16 @@ class CheckpointWriter:
         counters = self._counters(clean=False)
         await self._write(lambda: self._checkpoint.update_counters(counters))
         loop = asyncio.get_running_loop()
-        tried_s, failed = -math.inf, False
+        tried_s, failed, load_tried_s = -math.inf, False, loop.time()
         while True:
             await asyncio.sleep(min(CHECK_S, self._interval_s))
             if loop.time() >= tried_s + self._interval_s or (self._needs_save and not failed):
                 history_saved = await self._save_history()
                 failed = not (await self._save() and history_saved)
                 tried_s = loop.time()
+            if loop.time() >= load_tried_s + LOAD_SAVE_S:
+                await self._save_load()
+                load_tried_s = loop.time()
 
     async def save_final(self, *, clean: bool) -> None:
         """Save at the end of a run; give up after ``FINAL_SAVE_S``.
@@ -91,6 +109,7 @@ class CheckpointWriter:
             async with asyncio.timeout(FINAL_SAVE_S):
                 await self._save(clean=clean)
                 await self._save_history(is_last=True)
+                await self._save_load()
         except TimeoutError:
             log.warning("the disk hangs: the last checkpoint is not written", file=str(self._checkpoint.path))
 
@@ -148,6 +167,16 @@ class CheckpointWriter:
             self._saved_revision = revision
             return True
         return False
+
+    async def _save_load(self) -> None:
+        """Save the load that was seen, if there are new samples."""
+        samples = self._progress[0]
+        if self._seen_load is None or samples == self._samples_of_saved_load:
+            return
+        load, file = self._seen_load
+        arrays = load_arrays(load)
+        if await self._write(lambda: file.save(arrays), file.path):
+            self._samples_of_saved_load = samples
 
     @property
     def _curves_changed(self) -> bool:

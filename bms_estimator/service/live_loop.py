@@ -10,6 +10,7 @@ import structlog
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.history_file import HistoryFile
+from bms_estimator.checkpoint.load_file import restore_seen_load
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
@@ -22,7 +23,7 @@ from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.service.alarm_hooks import AlarmHooks
-from bms_estimator.service.checkpoint_writer import CheckpointWriter
+from bms_estimator.service.checkpoint_writer import CheckpointWriter, SeenLoad
 from bms_estimator.service.fit_thread import FitThread, new_slow_fit
 from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.service.publisher import Publisher
@@ -61,6 +62,7 @@ async def run_estimation_loop(
     hooks: AlarmHooks | None = None,
     edge: BlockSender | None = None,
     history: HistoryFile | None = None,
+    load_file: HistoryFile | None = None,
     fit_executor: Executor | None = None,
 ) -> Estimator:
     """Estimate until the source ends or ``stop`` is set.
@@ -82,6 +84,7 @@ async def run_estimation_loop(
         hooks: Alarm hooks; opened and closed here.
         edge: Sender that also receives all samples. Its owner opens and closes it. None: no sender.
         history: File of the history and the last fit; None: they are not saved.
+        load_file: File of the load that was seen; None: it is not saved.
         fit_executor: Runs the fits of the pack's model; None: a thread of their own.
 
     Returns:
@@ -96,6 +99,9 @@ async def run_estimation_loop(
     counters, outcome = restore_pack(estimator, pack_model, checkpoint, history, clock)
     restored_s = since_boot()
     forecaster = new_forecaster(settings, cell, estimator, pack_model)
+    seen_load = SeenLoad(forecaster.load, load_file) if forecaster and load_file else None
+    if seen_load:
+        restore_seen_load(seen_load.file, seen_load.load)
     totals = LifetimeTotals(estimator, counters.total)
     publisher = Publisher(
         settings,
@@ -119,7 +125,7 @@ async def run_estimation_loop(
     _restore_alarms(publisher, counters.alarms)
     hooks.restore_active(publisher.alarm_monitor.report)
     if requests is not None:
-        RequestHandlers(estimator, publisher, current_zero, pack_model).register(requests)
+        RequestHandlers(estimator, publisher, current_zero, pack_model, forecaster).register(requests)
     interval_s = settings.state.checkpoint_s
     writer = (
         CheckpointWriter(
@@ -131,6 +137,7 @@ async def run_estimation_loop(
             interval_s=interval_s,
             pack_model=pack_model,
             history=history,
+            seen_load=seen_load,
         )
         if checkpoint
         else None

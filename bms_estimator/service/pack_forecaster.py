@@ -5,6 +5,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import SAMPLE
@@ -45,3 +46,4 @@ def load_forecast_kernels() -> None:
     forecaster = Forecaster(estimator, estimator, cutoff_v=cell.cell.voltage_min_v)
     forecaster.run(samples)
     forecaster.forecast()
+    forecaster.trip_curve(constant_trip("power_w", 1.0, 60.0).load)

@@ -9,7 +9,7 @@ from pathlib import Path
 import structlog
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import HistoryFile
+from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_plausibility import implausible_settings
@@ -101,9 +101,18 @@ async def run_pack_service(
     hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, publish_raw, select_relay(settings, source.relay))
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None
-        all_sinks.append(PageSink(pages or Pages(), settings.page, settings.pack.name, history))
+        all_sinks.append(
+            PageSink(
+                pages or Pages(),
+                settings.page,
+                settings.pack.name,
+                history,
+                partial(requests.handle, "forecast"),
+            )
+        )
     checkpoint = CheckpointFile(folder, settings, cell) if folder else None
     pack_history = HistoryFile(folder, settings, cell) if folder else None
+    load_file = HistoryFile(folder, settings, cell, LOAD_SUFFIX) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
             stack.enter_context(instance_lock(folder, settings.pack.name))
@@ -128,6 +137,7 @@ async def run_pack_service(
             hooks=hooks,
             edge=edge,
             history=pack_history,
+            load_file=load_file,
         )
 
 

@@ -1,4 +1,4 @@
-"""Handlers of the requests that change a running service."""
+"""Handlers of the requests to a running service."""
 
 import reprlib
 from collections.abc import Awaitable, Callable, Mapping
@@ -7,8 +7,10 @@ from typing import Any
 import structlog
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.errors import UserError
 from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.service.forecast_request import forecast_data, requested_trip
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
@@ -24,6 +26,7 @@ class RequestHandlers:
         publisher: Publisher of the pack.
         zero_board: Makes the board store the present current as zero; None: the source has no such command.
         pack_model: Slow fit of the pack's model; None: none.
+        forecaster: Forecaster of the pack; None: there are no forecasts for it.
     """
 
     def __init__(
@@ -32,13 +35,21 @@ class RequestHandlers:
         publisher: Publisher,
         zero_board: Callable[[], Awaitable[None]] | None,
         pack_model: SlowFit | None = None,
+        forecaster: Forecaster | None = None,
     ) -> None:
         self._estimator, self._publisher, self._zero_board = estimator, publisher, zero_board
-        self._pack_model = pack_model
+        self._pack_model, self._forecaster = pack_model, forecaster
 
     def register(self, requests: RequestDispatcher) -> None:
         """Register all handlers."""
-        for handler in (self.set_soc, self.current_zero, self.publish_rate, self.acknowledge_alarm, self.forget_pack):
+        for handler in (
+            self.set_soc,
+            self.current_zero,
+            self.publish_rate,
+            self.acknowledge_alarm,
+            self.forget_pack,
+            self.forecast,
+        ):
             requests.register(handler.__name__, handler)
 
     async def set_soc(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -112,3 +123,14 @@ class RequestHandlers:
         self._pack_model.forget()
         log.info("history and model of the pack discarded on request", rows=rows)
         return {"rows": rows}
+
+    async def forecast(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return a forecast from the present state, under the load of the request or a load like the one that was seen.
+
+        Raises:
+            UserError: An argument is invalid, or there are no forecasts for this pack.
+        """
+        if self._forecaster is None:
+            raise UserError("there are no forecasts for a fuel cell, or with identifier.enabled = false")
+        trip = requested_trip(arguments)
+        return forecast_data(self._forecaster, trip)

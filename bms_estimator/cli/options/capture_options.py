@@ -93,18 +93,24 @@ MappedColumns = Annotated[
 ]
 
 
-def check_output_file(out: Path, inputs: Sequence[Path], *, force: bool) -> None:
+def check_output_file(out: Path, inputs: Sequence[Path], *, force: bool, option: str = "--out") -> None:
     """Reject an output file that exists, unless ``force`` is set, that is also an input, or whose folder does not exist.
+
+    Args:
+        out: The output file.
+        inputs: Input files of the command.
+        force: Replace an existing file.
+        option: Option that names the file, for the errors.
 
     Raises:
         UserError: ``out`` is one of ``inputs``, has no folder, or exists and ``force`` is not set.
     """
     if any(out.exists() and path.exists() and out.samefile(path) for path in inputs):
-        raise UserError(f"--out {out}: is also an input; name another file")
+        raise UserError(f"{option} {out}: is also an input; name another file")
     if out.is_file() and not force:
-        raise UserError(f"--out {out}: exists already; --force replaces it")
+        raise UserError(f"{option} {out}: exists already; --force replaces it")
     if not out.parent.is_dir():
-        raise UserError(f"--out {out}: cannot be written: there is no folder {out.parent}; create it")
+        raise UserError(f"{option} {out}: cannot be written: there is no folder {out.parent}; create it")
 
 
 def reject_duplicates(captures: Sequence[Path]) -> None:

@@ -20,12 +20,18 @@ from bms_estimator.settings.mqtt import Command
 
 COMMANDS = get_args(Command)
 """Names of all commands."""
+READS = ("forecast",)
+"""Names of the requests that change nothing, and therefore need no permission."""
 FORMER_READS = ("state", "parameters", "health")
 """Former requests, whose payloads are now published on topics of these names."""
 MAX_PAYLOAD_BYTES = 4096
 """Maximum size of a request's payload [bytes]."""
+MAX_READ_BYTES = 1 << 17
+"""Maximum size of the payload of a request of ``READS`` [bytes]. An MQTT message is limited to 16 kB by the connection."""
 REQUESTS_PER_MIN = 6.0
 """Rate limit of all clients' requests together, granted or not [1/min]. This number of requests may arrive at once."""
+READS_PER_MIN = 30.0
+"""Rate limit of all clients' requests of ``READS`` together [1/min]. This number of requests may arrive at once."""
 LOG_S = 60.0
 """Minimum interval between two log lines for each counter of rejection [s]; all rejections are counted."""
 MAX_SHOWN = 40
@@ -54,11 +60,14 @@ class RequestDispatcher:
     ) -> None:
         self._counts, self._allowed, self._monotonic = delivery.requests, commands, monotonic
         self._handlers: dict[str, Handler] = {}
-        self._command_limiter, self._former_limiter = (RateLimiter(REQUESTS_PER_MIN, monotonic) for _ in range(2))
+        rates = ((COMMANDS, REQUESTS_PER_MIN), (READS, READS_PER_MIN), (FORMER_READS, REQUESTS_PER_MIN))
+        self._limiters: dict[str, RateLimiter] = {}
+        for names, per_minute in rates:
+            self._limiters |= dict.fromkeys(names, RateLimiter(per_minute, monotonic))  # shared by all names of a kind
         self._logged_s: dict[str, float] = {}
 
     def register(self, name: str, handler: Handler) -> None:
-        """Register the handler of a request of ``COMMANDS``."""
+        """Register the handler of a request of ``COMMANDS`` or ``READS``."""
         self._handlers[name] = handler
 
     @property
@@ -77,15 +86,15 @@ class RequestDispatcher:
         Returns:
             The response; None for an unknown name and beyond the rate limit.
         """
-        if name not in COMMANDS + FORMER_READS:
+        if name not in self._limiters:
             self.count_refusal("unknown", name[:MAX_SHOWN])
             return None
-        if not (self._command_limiter if name in COMMANDS else self._former_limiter).take():
+        if not self._limiters[name].take():
             self.count_refusal("too_many", name)
             return None
         transaction = None
         try:
-            arguments = _arguments(payload)
+            arguments = _arguments(payload, MAX_READ_BYTES if name in READS else MAX_PAYLOAD_BYTES)
             transaction = _transaction(arguments)
             response = _response("ok", await self._handler(name, prefix)(arguments), None, transaction)
         except UserError as error:
@@ -119,7 +128,7 @@ class RequestDispatcher:
         """
         if name in FORMER_READS:
             raise UserError(f"no such request: subscribe to {prefix}{name}")
-        if name not in self._allowed:
+        if name not in READS and name not in self._allowed:
             raise UserError(f"{name}: not allowed; mqtt.commands in the pack file lists the allowed commands")
         if name not in self._handlers:
             raise UserError(f"{name}: cannot be asked here")
@@ -166,14 +175,14 @@ def _response(status: str, data: Mapping[str, Any] | None, error: str | None, tr
     return json.dumps(response, allow_nan=False, separators=(",", ":")).encode()
 
 
-def _arguments(payload: bytes) -> Mapping[str, Any]:
-    """Parse a request's payload: a JSON object of finite numbers, or empty.
+def _arguments(payload: bytes, max_bytes: int) -> Mapping[str, Any]:
+    """Parse a request's payload of at most ``max_bytes``: a JSON object of finite numbers, or empty.
 
     Raises:
         UserError: The payload is something else, or too long.
     """
-    if len(payload) > MAX_PAYLOAD_BYTES:
-        raise UserError(f"a request's payload must not be longer than {MAX_PAYLOAD_BYTES} bytes")
+    if len(payload) > max_bytes:
+        raise UserError(f"a request's payload must not be longer than {max_bytes} bytes")
     if not payload:
         return {}
     try:

@@ -1,0 +1,55 @@
+"""Load that was seen, as arrays for a file."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.forecast.load_history import MAX_LOAD_S, LoadHistory
+
+MAX_CURRENT_A = 1e6
+"""Maximum plausible absolute current [A]."""
+
+
+def load_arrays(load: LoadHistory) -> dict[str, NDArray[Any]]:
+    """Return the load as arrays by name, which ``restore_load`` accepts."""
+    row = load.record[0]
+    mean_a, max_a = load.mean_and_max()
+    return {
+        "mean_a": mean_a.astype(np.float32),
+        "max_a": max_a.astype(np.float32),
+        "filtered_a": np.array(row["filtered_a"]),
+        "last_a": np.array(row["last_a"]),
+        "rest_s": np.array(row["rest_s"]),
+    }
+
+
+def restore_load(load: LoadHistory, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Restore a load.
+
+    Args:
+        load: Empty load; unchanged if the arrays are invalid.
+        arrays: Arrays of ``load_arrays``.
+
+    Raises:
+        ValueError: An array is missing, or has another shape or implausible values.
+    """
+    missing = [name for name in load_arrays(load) if name not in arrays]
+    if missing:
+        raise ValueError(f"{', '.join(missing)}: missing")
+    mean_a, max_a, scalars = arrays["mean_a"], arrays["max_a"], [arrays[n] for n in ("filtered_a", "last_a", "rest_s")]
+    if mean_a.ndim != 1 or mean_a.shape != max_a.shape or mean_a.size > MAX_LOAD_S or any(v.ndim for v in scalars):
+        raise ValueError(
+            f"arrays of shapes {mean_a.shape} and {max_a.shape}: must be equal, with at most {MAX_LOAD_S} elements"
+        )
+    for values in (mean_a, max_a, *scalars):
+        if values.dtype.kind not in "fi" or not (np.abs(values) <= MAX_CURRENT_A).all():
+            raise ValueError("a value is not finite, or too large")
+    if (mean_a > max_a).any() or arrays["rest_s"] < 0:
+        raise ValueError("a mean is above the largest current, or the duration of the rest is negative")
+    row = load.record[0]
+    for name in ("filtered_a", "last_a", "rest_s"):
+        row[name] = arrays[name]
+    row["count"], row["next"] = mean_a.size, mean_a.size % MAX_LOAD_S
+    row["mean_a"][: mean_a.size], row["max_a"][: mean_a.size] = mean_a, max_a

@@ -1,0 +1,96 @@
+"""Trip: a load that the user gives, until its end."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from bms_estimator.forecast.given_load import GivenLoad
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.errors import UserError
+
+LoadQuantity = Literal["current_a", "power_w"]
+"""Quantity of a load: current [A] or power [W], positive on discharge."""
+
+MAX_LOAD = 1e6
+"""Maximum absolute current [A] or power [W] of a load."""
+MAX_TRIP_S = 7.0 * 86_400.0
+"""Maximum duration of a trip [s]."""
+MAX_POINTS = 1_000_000
+"""Maximum number of points of a profile."""
+CONSTANT_PART_S = 3600.0
+"""Duration of the only part of a constant load without an end, which repeats [s]."""
+
+
+@dataclass(frozen=True)
+class Trip:
+    """Load that the user gives, until its end.
+
+    Attributes:
+        load: The load.
+        has_end: True if the trip ends with the last part of the load; False if the load continues without an end.
+    """
+
+    load: GivenLoad
+    has_end: bool
+
+
+def constant_trip(quantity: LoadQuantity, value: float, duration_s: float | None = None) -> Trip:
+    """Return a trip with a constant load.
+
+    Args:
+        quantity: Quantity of the load.
+        value: Current [A] or power [W], positive on discharge.
+        duration_s: Duration [s]; None: the load has no end.
+
+    Raises:
+        UserError: The load is not a number, or too large; the duration is not positive, or too long.
+    """
+    values = np.array([value])
+    _check_values(quantity, values, "")
+    if duration_s is not None and not 0.0 < duration_s <= MAX_TRIP_S:
+        raise UserError(f"duration_s = {duration_s:g}: must be above 0 and at most {MAX_TRIP_S:g} (seven days)")
+    return Trip(
+        _given_load(quantity, np.array([duration_s or CONSTANT_PART_S]), values), has_end=duration_s is not None
+    )
+
+
+def profile_trip(quantity: LoadQuantity, time_s: Floats, values: Floats) -> Trip:
+    """Return a trip whose load is a profile. The load is constant from each point to the next; the last point is the end.
+
+    Args:
+        quantity: Quantity of the load.
+        time_s: Time of each point [s], shape (n,), increasing.
+        values: Current [A] or power [W] from each point on, positive on discharge, shape (n,). The last one is ignored.
+
+    Raises:
+        UserError: There are too few or too many points, the times do not increase, the trip is too long, or a value is not a
+            number or too large.
+    """
+    if not 2 <= time_s.size <= MAX_POINTS:
+        raise UserError(f"{time_s.size} points: must be 2 to {MAX_POINTS:,}, of which the last is the end of the trip")
+    duration_s = np.diff(time_s)
+    wrong = np.flatnonzero(~(duration_s > 0.0))
+    if wrong.size:
+        before_s, after_s = time_s[wrong[0] : wrong[0] + 2]
+        raise UserError(f"point {wrong[0] + 2}: time_s = {after_s:g} after {before_s:g}: must increase")
+    if not time_s[-1] - time_s[0] <= MAX_TRIP_S:
+        raise UserError(f"lasts {time_s[-1] - time_s[0]:g} s: must be at most {MAX_TRIP_S:g} s (seven days)")
+    _check_values(quantity, values[:-1], "point {}: ")
+    return Trip(_given_load(quantity, duration_s, values[:-1]), has_end=True)
+
+
+def _check_values(quantity: LoadQuantity, values: Floats, place: str) -> None:
+    """Reject values that are not numbers, or too large. ``place`` names the point of a value in the error."""
+    wrong = np.flatnonzero(~(np.abs(values) <= MAX_LOAD))
+    if wrong.size:
+        raise UserError(
+            f"{place.format(wrong[0] + 1)}{quantity} = {values[wrong[0]]:g}: must be a number from {-MAX_LOAD:g} to {MAX_LOAD:g}"
+        )
+
+
+def _given_load(quantity: LoadQuantity, duration_s: Floats, values: Floats) -> GivenLoad:
+    unknown = np.full(values.size, np.nan)
+    if quantity == "current_a":
+        return GivenLoad(duration_s, current_a=values.astype(float), power_w=unknown)
+    return GivenLoad(duration_s, current_a=unknown, power_w=values.astype(float))
