@@ -101,7 +101,7 @@ async def run_estimation_loop(
     forecaster = new_forecaster(settings, cell, estimator, pack_model)
     seen_load = SeenLoad(forecaster.load, load_file) if forecaster and load_file else None
     if seen_load:
-        restore_seen_load(seen_load.file, seen_load.load)
+        _restore_load(seen_load)
     totals = LifetimeTotals(estimator, counters.total)
     publisher = Publisher(
         settings,
@@ -226,6 +226,15 @@ async def _measure_lag(publisher: Publisher) -> None:
         due_s = loop.time() + LAG_STEP_S
         await asyncio.sleep(LAG_STEP_S)
         publisher.add_lag(loop.time() - due_s)
+
+
+def _restore_load(seen: SeenLoad) -> None:
+    """Restore the load that an earlier run saw; a damaged file is logged, and the next save replaces it."""
+    file, reason = str(seen.file.path), restore_seen_load(seen.file, seen.load)
+    if reason:
+        log.warning("the load that was seen is damaged and was not restored", file=file, reason=reason)
+    else:
+        log.info("load", file=file, seconds=seen.load.seconds)
 
 
 def _restore_alarms(publisher: Publisher, saved: str) -> None:

@@ -204,7 +204,9 @@ def _saved_state(settings: Settings, model: PackModel) -> _Start:
     forecaster = new_forecaster(settings, model, estimator_of(content, file, settings, model), None)
     if forecaster is None:
         raise _no_forecaster(model)
-    restore_seen_load(HistoryFile(folder, settings, model, LOAD_SUFFIX), forecaster.load)
+    load_file = HistoryFile(folder, settings, model, LOAD_SUFFIX)
+    if reason := restore_seen_load(load_file, forecaster.load):
+        typer.echo(f"warning: {load_file.path}: the load that was seen is unknown: {reason}", err=True)
     return _Start(settings.pack.name, forecaster, content.unseen_s)
 
 

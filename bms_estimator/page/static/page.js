@@ -1,6 +1,7 @@
 // The live page, drawn at most four times a second, its curves twice.
 import * as f from "./format.js";
 import { attribute, changed, hide, listen, node, text } from "./live.js";
+import { showWhatIf } from "./what_if.js";
 import { Curve, OverSoc, Ring, nullGaps, scaled } from "./charts.js";
 
 const DRAW_MS = 250, CURVES_MS = 500, DESCRIBE_MS = 10_000, HISTORY_MS = 60_000, AHEAD_MS = 86_400_000;
@@ -107,6 +108,7 @@ function draw() {
 	if (!pack) return;
 	const state = pack.topics.state ?? {};
 	drawHead(pack);
+	showWhatIf(link || !number(state.soc) ? null : pack.name); // a dashboard, which has a link to a broker, makes no forecasts
 	drawAlarms(pack);
 	drawState(state);
 	drawCells(state);

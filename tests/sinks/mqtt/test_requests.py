@@ -16,6 +16,9 @@ from bms_estimator.sinks.mqtt.requests import (
     FORMER_READS,
     LOG_S,
     MAX_PAYLOAD_BYTES,
+    MAX_READ_BYTES,
+    READS,
+    READS_PER_MIN,
     REQUESTS_PER_MIN,
     RequestDispatcher,
 )
@@ -34,7 +37,7 @@ class RecordingDispatcher:
     def __init__(self, *allowed_commands: Any) -> None:
         self.delivery, self.now_s, self.granted = DeliveryStats(), 0.0, list[str]()
         self.requests = RequestDispatcher(self.delivery, allowed_commands, monotonic=lambda: self.now_s)
-        for name in COMMANDS:
+        for name in COMMANDS + READS:
             self.requests.register(name, self._handler(name))
 
     def _handler(self, name: str) -> Any:
@@ -111,6 +114,20 @@ async def test_payload_above_4096_bytes_is_rejected() -> None:
     padded = b'{"x": 1}' + b" " * MAX_PAYLOAD_BYTES
     assert (await dispatcher("publish_rate", padded[:MAX_PAYLOAD_BYTES]))["status"] == "ok"
     assert "4096 bytes" in (await dispatcher("publish_rate", padded))["error"]
+
+
+async def test_read_needs_no_permission_and_may_be_longer_than_a_command() -> None:
+    dispatcher = RecordingDispatcher()
+    padded = b'{"x": 1}' + b" " * MAX_READ_BYTES
+    assert (await dispatcher("forecast", padded[:MAX_READ_BYTES]))["status"] == "ok"
+    assert f"{MAX_READ_BYTES} bytes" in (await dispatcher("forecast", padded))["error"]
+
+
+async def test_reads_and_commands_have_separate_rate_limits() -> None:
+    dispatcher = RecordingDispatcher("publish_rate")
+    reads = [await dispatcher("forecast") for _ in range(int(READS_PER_MIN) + 1)]
+    assert [response is None for response in reads] == [False] * int(READS_PER_MIN) + [True]
+    assert (await dispatcher("publish_rate"))["status"] == "ok"
 
 
 async def test_command_is_granted_only_if_the_settings_allow_it() -> None:

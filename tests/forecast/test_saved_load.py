@@ -1,0 +1,64 @@
+"""Load that was seen, saved and restored."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.forecast.load_history import MAX_LOAD_S, LoadHistory
+from bms_estimator.forecast.saved_load import load_arrays, restore_load
+from bms_estimator.kernels.trace import TRACE
+
+CAPACITY_AS = 3.0 * 3600.0
+
+
+def seen_load(seconds: int, first_s: float = 0.0) -> LoadHistory:
+    load = LoadHistory(CAPACITY_AS)
+    load.add(drive(seconds, first_s))
+    return load
+
+
+def drive(seconds: int, first_s: float = 0.0) -> Any:
+    """Return rows of a discharge with changing current."""
+    rows = np.zeros(seconds, TRACE)
+    rows["time_s"] = first_s + np.arange(seconds)
+    rows["current_a"] = 1.0 + np.sin(0.1 * rows["time_s"])
+    return rows
+
+
+@pytest.mark.parametrize("seconds", [2, 700, MAX_LOAD_S + 500])
+def test_restored_load_continues_like_the_saved_one(seconds: int) -> None:
+    load, restored = seen_load(seconds), LoadHistory(CAPACITY_AS)
+    restore_load(restored, load_arrays(load))
+    assert restored.seconds == load.seconds
+    more = drive(600, 1e6)  # after a gap
+    for each in (load, restored):
+        each.add(more)
+    for one, other in zip(load.mean_and_max(), restored.mean_and_max(), strict=True):
+        assert one.tobytes() == other.tobytes()
+    assert (restored.is_charging, restored.rest_s) == (load.is_charging, load.rest_s)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda arrays: arrays.pop("max_a"),
+        lambda arrays: arrays.update(mean_a=np.full(3, np.nan), max_a=np.full(3, np.nan)),
+        lambda arrays: arrays.update(mean_a=np.full(3, 1e9), max_a=np.full(3, 1e9)),
+        lambda arrays: arrays.update(mean_a=np.ones(MAX_LOAD_S + 1), max_a=np.ones(MAX_LOAD_S + 1)),
+        lambda arrays: arrays.update(mean_a=np.ones(4)),
+        lambda arrays: arrays.update(mean_a=np.ones((2, 2)), max_a=np.ones((2, 2))),
+        lambda arrays: arrays.update(mean_a=2.0 * arrays["max_a"]),
+        lambda arrays: arrays.update(rest_s=np.array(-1)),
+        lambda arrays: arrays.update(rest_s=np.zeros(2)),
+        lambda arrays: arrays.update(filtered_a=np.array("x")),
+    ],
+)
+def test_damaged_arrays_are_rejected_and_change_nothing(damage: Callable[[dict[str, Any]], object]) -> None:
+    arrays, load = load_arrays(seen_load(400)), LoadHistory(CAPACITY_AS)
+    damage(arrays)
+    empty = load.record.tobytes()
+    with pytest.raises(ValueError, match=r"missing|must be equal|not finite|above the largest"):
+        restore_load(load, arrays)
+    assert load.record.tobytes() == empty
