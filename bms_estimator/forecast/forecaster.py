@@ -7,10 +7,16 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastRows, unknown_values
+from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastCurve, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import LoadHistory
-from bms_estimator.forecast.projection import Projection, project_given_load, project_seen_load, time_quantiles
+from bms_estimator.forecast.projection import (
+    Projection,
+    project_given_load,
+    project_seen_load,
+    project_trip,
+    time_quantiles,
+)
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Records
@@ -118,6 +124,10 @@ class Forecaster:
             return Forecast(time_s, values, "the load does not discharge the pack on average", None)
         _write_time_to_cutoff(values, projection)
         return Forecast(time_s, values, None, projection.curve)
+
+    def trip_curve(self, load: GivenLoad) -> ForecastCurve | None:
+        """Return the curves from the present state until the end of a given load; None without a state."""
+        return None if self._missing_state() else project_trip(self._pack(), load, self._seed())
 
     def _first_due(self, time_s: np.ndarray) -> int | None:
         """Return the index of the first sample at which a forecast is due; None without such a sample.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bms_estimator.forecast.condensed_load import condense
 from bms_estimator.forecast.forecast import ForecastCurve
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
@@ -30,6 +31,16 @@ HORIZON_RATIO = 1.5
 extrapolated by the mean load."""
 CURVE_END = 1.05
 """Length of the curves in multiples of the 95 % quantile of the time to the cut-off."""
+END_TOLERANCE = 1e-9
+"""Part of a trip by which its end is earlier, so that rounding does not begin the load again."""
+MIN_BLOCK_S = 1.0
+"""Resolution of a given load [s]: mean and peak of each block remain."""
+MAX_BLOCKS = 10_000
+"""Maximum number of blocks of a given load within a horizon."""
+MAX_TOTAL_STEPS = 1_000_000
+"""Maximum number of steps of all draws under a given load, unless there are only ``MIN_DRAWS``."""
+MIN_DRAWS = 100
+"""Minimum number of draws under a given load with many parts."""
 QUANTILES = 0.05, 0.5, 0.95
 
 
@@ -87,13 +98,13 @@ def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:
     m = pack[0]
     load_a = _mean_current(pack, load)
     horizon_s = HORIZON_RATIO * _full_time_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
-    parts = _parts(load, max(horizon_s / MAX_STEPS, 1.0))
-    draws = _draws(m, seed)
-    no_points = np.empty((DRAWS, 0))
+    parts = _parts(load, horizon_s)
+    draws = _draws(m, seed)[: _draw_count(parts, horizon_s)]
+    no_points = np.empty((draws.size, 0))
     follow_given_load(m, parts, horizon_s, draws, math.inf, no_points, no_points)
     time_s, charge_as = _extrapolated(draws, load_a)
     end_s = min(CURVE_END * time_quantiles(time_s)[-1], horizon_s)
-    soc, voltage_v = np.empty((2, CURVE_DRAWS, CURVE_POINTS))
+    soc, voltage_v = np.empty((2, min(CURVE_DRAWS, draws.size), CURVE_POINTS))
     step_s = max(end_s, 1.0) / (CURVE_POINTS - 1)
     follow_given_load(m, parts, end_s, draws[:CURVE_DRAWS], step_s, soc, voltage_v)
     return Projection(
@@ -105,6 +116,24 @@ def time_quantiles(time_s: Floats) -> tuple[float, float, float]:
     """Return the 5 %, 50 % and 95 % quantiles of times, which may be infinite [s]."""
     low_s, median_s, high_s = np.quantile(time_s, QUANTILES, method="inverted_cdf").tolist()
     return low_s, median_s, high_s
+
+
+def project_trip(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
+    """Return the curves until the end of a load, at which the last point lies.
+
+    Args:
+        pack: Shape (1,), dtype ``PROJECTED_PACK``.
+        load: Load to expect.
+        seed: Seed of the random numbers, 0 to 2**64 - 1.
+    """
+    end_s = float(load.duration_s.sum())
+    horizon_s = (1.0 - END_TOLERANCE) * end_s
+    parts = _parts(load, end_s)
+    draws = _draws(pack[0], seed)[: _draw_count(parts, end_s)]
+    step_s, (soc, voltage_v) = horizon_s / (CURVE_POINTS - 1), np.empty((2, draws.size, CURVE_POINTS))
+    follow_given_load(pack[0], parts, horizon_s, draws, step_s, soc, voltage_v)
+    time_s = np.where(draws["ended"] == 1, draws["time_s"], math.inf)
+    return _curve(step_s * np.arange(CURVE_POINTS), soc, voltage_v, time_s)
 
 
 def _full_time_s(pack: Records, load_a: float) -> float:
@@ -120,8 +149,16 @@ def _mean_current(pack: Records, load: GivenLoad) -> float:
     return float(np.average(current_a, weights=load.duration_s))
 
 
-def _parts(load: GivenLoad, max_part_s: float) -> Records:
-    """Return the parts of a load, divided into parts of at most ``max_part_s``."""
+def _draw_count(parts: Records, horizon_s: float) -> int:
+    """Return the number of draws for a horizon, which limits the cost of a load with many parts."""
+    steps = math.ceil(horizon_s / float(parts["duration_s"].mean()))
+    return min(max(MAX_TOTAL_STEPS // steps, MIN_DRAWS), DRAWS)
+
+
+def _parts(load: GivenLoad, horizon_s: float) -> Records:
+    """Return the parts of a load for a horizon: long parts are divided, and parts shorter than a second are joined."""
+    load = condense(load, max(horizon_s / MAX_BLOCKS, MIN_BLOCK_S))
+    max_part_s = max(horizon_s / MAX_STEPS, MIN_BLOCK_S)
     pieces = np.ceil(load.duration_s / max_part_s).astype(int)
     parts = np.zeros(int(pieces.sum()), LOAD_PART)
     parts["duration_s"] = np.repeat(load.duration_s / pieces, pieces)
