@@ -7,6 +7,7 @@ import structlog
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.forecast.forecast import ForecastRows
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.input_faults import InputFault
@@ -16,7 +17,7 @@ from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarm_inputs import Inputs
-from bms_estimator.telemetry.alarms import AlarmEvaluator, Change, SampleCounts
+from bms_estimator.telemetry.alarms import NO_FORECAST, AlarmEvaluator, Change, SampleCounts
 from bms_estimator.telemetry.health import sample_counters, suspicions
 
 UNUSABLE_KINDS = "not_finite", "range", "saturated"
@@ -72,18 +73,21 @@ class AlarmMonitor:
         self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
 
-    def add(self, received: ReceivedSamples, trace: TraceBlock, now_s: float) -> bool:
+    def add(
+        self, received: ReceivedSamples, trace: TraceBlock, now_s: float, forecasts: ForecastRows = NO_FORECAST
+    ) -> bool:
         """Add received samples and their estimates; evaluate the alarms if this is due.
 
         Args:
             received: Samples and cell voltages.
             trace: Estimates of the accepted samples.
             now_s: Monotonic clock [s].
+            forecasts: Forecast at each row of ``trace``.
 
         Returns:
             True if an alarm has changed.
         """
-        self.alarms.add(received.samples, trace, received.cells_v)
+        self.alarms.add(received.samples, trace, received.cells_v, forecasts)
         self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
         is_due = now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS
         return is_due and self.evaluate(now_s)

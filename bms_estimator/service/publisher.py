@@ -30,7 +30,7 @@ from bms_estimator.service.latency import Latency
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source, SourceHealth
-from bms_estimator.telemetry.alarms import Change
+from bms_estimator.telemetry.alarms import NO_FORECAST, Change
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
 from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
@@ -161,7 +161,8 @@ class Publisher:
         is_due = now_s >= self._due_s
         if is_due and self.latest:  # before the alarms, so that their evaluation does not delay the estimate
             self._publish_snapshot(now_s)
-        alarm_changed = self.alarm_monitor.add(received, trace, now_s)
+        forecasts = self._forecaster.rows if self._forecaster else NO_FORECAST
+        alarm_changed = self.alarm_monitor.add(received, trace, now_s, forecasts)
         if is_due and not self.latest:  # the first snapshot lists the alarms that the first samples permit
             self.publish()
         elif alarm_changed:

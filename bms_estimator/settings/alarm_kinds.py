@@ -67,6 +67,9 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
         is_upper_limit=False,
         device_class="battery",
     ),
+    "collapse_risk": AlarmKind(
+        "the voltage may fall to the cut-off within minutes", "reduce the load, and charge", ("voltage", "current")
+    ),
     "stability_margin_low": AlarmKind(
         "the SOC is close to the value below which the model is unstable",
         "charge",

@@ -12,6 +12,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, AlarmKind
 from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
+from bms_estimator.settings.collapse_limit import collapse_limit
 from bms_estimator.settings.pack import Settings
 
 MIN_SILENT_LIMIT_S = 10.0
@@ -63,6 +64,8 @@ CLEAR_DECIMALS = 9
 MAX_DISCHARGE_C = 5.0
 """Default limit of the discharge current as a C-rate [1/h]. ``current_max_a`` of a generic cell file would be too high a
 default: it only rejects invalid samples, and lies far above the continuous current of most cells."""
+COLLAPSE_CLEAR_FRACTION = 0.5
+"""Clear level of ``collapse_risk`` as a fraction of its limit."""
 CURRENT_CLEAR_FRACTION = 0.95
 """Default clear level of a current as a fraction of its limit."""
 
@@ -167,6 +170,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "under_temperature": _Default(-20.0, -15.0),
         "charging_below_freezing": _Default(0.0, 2.0),
         "soc_low": _Default(0.1, 0.15),
+        "collapse_risk": _collapse_default(settings, cell),
         "stability_margin_low": _Default(0.05, 0.08),
         "cell_imbalance": _Default(0.05, 0.03),
         "sensor_fault": _Default(0.1, 0.02),
@@ -176,6 +180,14 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0),
     }
     return all_packs | (_battery_defaults(cell) if isinstance(cell, CellModel) else _stack_defaults(cell))
+
+
+def _collapse_default(settings: Settings, cell: PackModel) -> _Default:
+    """Return the limit for the accepted rate of false alarms. Without a forecast the alarm is not monitored."""
+    if not isinstance(cell, CellModel) or not settings.identifier.enabled:
+        return _Default(None, None)
+    limit = collapse_limit(settings.alarms.collapse_risk.false_alarms_per_month)
+    return _Default(limit, COLLAPSE_CLEAR_FRACTION * limit)
 
 
 def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:

@@ -18,6 +18,7 @@ AlarmName = Literal[
     "under_temperature",
     "charging_below_freezing",
     "soc_low",
+    "collapse_risk",
     "stability_margin_low",
     "cell_imbalance",
     "sensor_fault",
@@ -69,6 +70,15 @@ class FractionRule(AlarmRule):
 
     limit: Fraction | None = None
     clear: Fraction | None = None
+
+
+class CollapseRule(AlarmRule):
+    """Alarm on the risk of the cut-off within minutes; its limit follows from the accepted rate of false alarms."""
+
+    false_alarms_per_month: Positive = Field(
+        default=1.0,
+        description="accepted number of false alarms in a month of 60 h of use; a larger number warns earlier and of more cut-offs",
+    )
 
 
 class LinkRule(AlarmRule):
@@ -145,6 +155,10 @@ class AlarmSettings(Strict):
     under_temperature: TemperatureRule = TemperatureRule()
     charging_below_freezing: TemperatureRule = TemperatureRule(severity="critical", clear_delay_s=10.0, latch=True)
     soc_low: FractionRule = FractionRule()
+    collapse_risk: CollapseRule = Field(
+        default=CollapseRule(),
+        description="risk that the voltage falls to the cut-off within minutes, by the forecast",
+    )
     stability_margin_low: FractionRule = FractionRule()
     cell_imbalance: VoltageRule = VoltageRule(delay_s=60.0)
     sensor_fault: FractionRule = Field(

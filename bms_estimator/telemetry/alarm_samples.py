@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.forecast.forecast import FORECAST, ForecastRows
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
@@ -68,36 +69,40 @@ class SampleIntervals:
 
 
 class SampleBuffer:
-    """Samples that the alarms have not evaluated yet, with their trace and the extremes of their cell voltages.
+    """Samples that the alarms have not evaluated yet, with their trace, forecasts and the extremes of their cell voltages.
 
     Attributes:
         size: Number of samples.
     """
 
     def __init__(self) -> None:
-        self._samples, self._traces, self._extremes = _Rows(SAMPLE), _Rows(TRACE), _Rows(np.float64, (3,))
+        self._samples, self._traces, self._forecasts = _Rows(SAMPLE), _Rows(TRACE), _Rows(FORECAST)
+        self._extremes = _Rows(np.float64, (3,))
 
     @property
     def size(self) -> int:
         """Number of samples."""
         return self._samples.size
 
-    def add(self, block: SampleBlock, trace: TraceBlock, cells: CellBlock) -> None:
+    def add(self, block: SampleBlock, trace: TraceBlock, cells: CellBlock, forecasts: ForecastRows) -> None:
         """Append a block."""
         self._samples.add(block, block.size)
         self._traces.add(trace, trace.size)
+        self._forecasts.add(forecasts, trace.size)
         self._extremes.add(_cell_extremes(cells) if len(cells) == block.size else _NO_EXTREMES, block.size)
 
-    def take(self) -> tuple[SampleBlock, TraceBlock, Floats]:
+    def take(self) -> tuple[SampleBlock, TraceBlock, ForecastRows, Floats]:
         """Remove and return all rows.
 
         Returns:
-            Samples with a finite time stamp; trace; and for each of these samples the minimum and maximum cell voltage [V]
+            Samples with a finite time stamp; trace; forecast at each row of the trace; and for each of these samples the minimum and maximum cell voltage [V]
             and the number of cell voltages, shape (n, 3).
         """
-        samples, trace, extremes_v = self._samples.take(), self._traces.take(), self._extremes.take()
-        has_time = np.isfinite(samples["time_s"])
-        return (samples, trace, extremes_v) if has_time.all() else (samples[has_time], trace, extremes_v[has_time])
+        samples, trace, forecasts = self._samples.take(), self._traces.take(), self._forecasts.take()
+        extremes_v, has_time = self._extremes.take(), np.isfinite(samples["time_s"])
+        if not has_time.all():
+            samples, extremes_v = samples[has_time], extremes_v[has_time]
+        return samples, trace, forecasts, extremes_v
 
 
 class _Rows:

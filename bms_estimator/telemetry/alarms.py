@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.forecast.forecast import ForecastRows, unknown_values
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import InputFault
@@ -24,6 +25,7 @@ from bms_estimator.telemetry.alarm_inputs import LOSS_TEXTS, Inputs, count_value
 from bms_estimator.telemetry.alarm_samples import SampleBuffer, SampleIntervals
 from bms_estimator.telemetry.alarm_state import AlarmState, AlarmTransition, RaisedAlarm
 from bms_estimator.telemetry.alarm_text import alarm_text
+from bms_estimator.telemetry.collapse_risk import collapse_risks, collapse_text
 
 SENSOR_SUSPECTS = (
     InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
@@ -39,6 +41,9 @@ SILENCE = "silence"
 """Key of the reason why no samples arrived, in the saved state."""
 BAD_FRACTION_INTERVAL_S = 1.0
 """Minimum interval over which the fraction of lost and unusable samples is computed [s]."""
+
+NO_FORECAST = unknown_values()
+"""Forecast at all samples of a pack without a forecaster."""
 
 
 class SampleCounts(NamedTuple):
@@ -136,9 +141,11 @@ class AlarmEvaluator:
         """Number of samples that wait for ``evaluate``."""
         return self._buffer.size
 
-    def add(self, block: SampleBlock, trace: TraceBlock, cells: CellBlock) -> None:
-        """Buffer a block of samples, its estimates and its cell voltages for ``evaluate``."""
-        self._buffer.add(block, trace, cells)
+    def add(
+        self, block: SampleBlock, trace: TraceBlock, cells: CellBlock, forecasts: ForecastRows = NO_FORECAST
+    ) -> None:
+        """Buffer a block of samples, its estimates, its cell voltages and the forecast at each estimate for ``evaluate``."""
+        self._buffer.add(block, trace, cells, forecasts)
 
     def evaluate(self, arrival_s: float, counts: SampleCounts, suspects: InputFault, suspicions: Sequence[str]) -> None:
         """Evaluate all buffered samples.
@@ -152,7 +159,7 @@ class AlarmEvaluator:
         if not self.rows:
             return
         self._has_samples = True
-        samples, trace, extremes_v = self._buffer.take()
+        samples, trace, forecasts, extremes_v = self._buffer.take()
         self._update_reasons("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
         self._update_reasons("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
         if samples.size:
@@ -160,7 +167,7 @@ class AlarmEvaluator:
             self._evaluate_samples(samples, extremes_v, wall_offset_s)
             self._evaluate_bad_fraction(float(samples["time_s"][-1]), counts, suspects, wall_offset_s)
         if trace.size:
-            self._evaluate_estimates(trace, suspects, arrival_s - float(trace["time_s"][-1]))
+            self._evaluate_estimates(trace, forecasts, suspects, arrival_s - float(trace["time_s"][-1]))
         self._save_state()
 
     def on_silence(self, silent_s: float, now_s: float, reason: str) -> None:
@@ -354,11 +361,14 @@ class AlarmEvaluator:
             bad_fraction = math.inf  # above every limit
         self._evaluate_values("sensor_fault", np.array([at_s]), observed_s, np.array([bad_fraction]), wall_offset_s)
 
-    def _evaluate_estimates(self, trace: TraceBlock, suspects: InputFault, wall_offset_s: float) -> None:
+    def _evaluate_estimates(
+        self, trace: TraceBlock, forecasts: ForecastRows, suspects: InputFault, wall_offset_s: float
+    ) -> None:
         """Evaluate the alarms on estimates.
 
         Args:
             trace: Shape (n,), dtype TRACE.
+            forecasts: Forecast at each row of the trace, shape (n,), dtype FORECAST.
             suspects: Input faults that the filter suspects now.
             wall_offset_s: Wall clock minus the samples' clock [s].
         """
@@ -376,14 +386,32 @@ class AlarmEvaluator:
         }
         for name, series in values.items():
             self._evaluate_values(name, times_s, observed_s, series, wall_offset_s)
+        is_charging = trace["current_a"] <= -self._charging_a
+        risks = collapse_risks(forecasts, is_charging)
+        self._evaluate_values("collapse_risk", times_s, observed_s, risks, wall_offset_s, forecasts)
 
     def _evaluate_values(
-        self, name: AlarmName, times_s: Floats, steps_s: Floats, values: Floats, wall_offset_s: float
+        self,
+        name: AlarmName,
+        times_s: Floats,
+        steps_s: Floats,
+        values: Floats,
+        wall_offset_s: float,
+        forecasts: ForecastRows | None = None,
     ) -> None:
-        """Evaluate one alarm, if it is defined. The arguments are those of ``AlarmState.update``."""
+        """Evaluate one alarm, if it is defined.
+
+        ``forecasts`` are the forecasts at ``times_s``, for the text of the alarm. The other arguments are those of
+        ``AlarmState.update``.
+        """
         state = self._states.get(name)
-        if state is not None:
-            self._record(state, state.update(times_s, steps_s, values, wall_offset_s))
+        if state is None:
+            return
+        for transition in state.update(times_s, steps_s, values, wall_offset_s):
+            if transition.raised is not None and forecasts is not None:
+                at = int(np.flatnonzero(times_s == transition.at_s)[-1])
+                self._reasons[name] = Reasons(InputFault(0), (collapse_text(forecasts[at]),))
+            self._record(state, [transition])
 
     def _record(self, state: AlarmState, transitions: Iterable[AlarmTransition]) -> None:
         """Record transitions for ``changes``, and raised alarms for ``report``."""

@@ -7,21 +7,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads import Snapshot
+from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header
 from bms_estimator.sources.captures.replay import Replay, open_capture
 from bms_estimator.telemetry.alarms import Change
 from tests.collector import Collector
+from tests.estimator.anywhere.cases import OXIDE
+from tests.estimator.anywhere.truth import curve_of, simulate
 
 WALL_S = 1_700_000_000.0
 """Wall clock at the start of a capture [s since 1970]."""
 PACK = load_cell("nmc", 10.0).pack(2, 1)
 """Pack of two cells in series. Its alarms have limits of 5.4 and 8.5 V, 10 A of charge and 50 A of discharge."""
+
+KNEE_S = 700
+"""Duration of the discharge of ``knee_lines`` [s]."""
 
 
 class Line(NamedTuple):
@@ -77,6 +85,16 @@ def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
     return path
 
 
+def knee_lines(charge_s: int = 900) -> list[Line]:
+    """Return a simulated discharge of ``PACK`` at 1 C from SOC 0.25 down the knee, and a charge of ``charge_s`` [s] at C/2."""
+    one_c, cells = PACK.cell.capacity_ah, PACK.cell.series_count
+    current_a = np.r_[np.full(KNEE_S, one_c), np.full(charge_s, -0.5 * one_c)]
+    scale = OXIDE.capacity_ah / one_c
+    curves = curve_of("nmc"), OXIDE.per_kelvin_v, OXIDE.hysteresis_v, scale * OXIDE.ohm
+    voltage_v, _ = simulate(1.0, current_a, np.full(current_a.size, 25.0), 0.25, -1.0, one_c, *curves)
+    return [Line(1, round(cells * v, 3), i) for v, i in zip(voltage_v.tolist(), current_a.tolist(), strict=True)]
+
+
 def settings(alarms: dict[str, Any] | None = None, **sections: Any) -> Settings:
     """Return settings of a board that prints text, with these alarms and other sections."""
     tables = {"sensor": {"protocol": "text"}, "pack": {"initial_soc": 0.5}, "alarms": alarms or {}}
@@ -105,14 +123,23 @@ async def replayed(
     now_s, result, sink = 0.0, ReplayResult(), Collector()
     source = Replay(open_capture(path, settings_.sensor), max_block_s=math.inf if at_once else 0.05)
     estimator = new_estimator(settings_, cell)
+    forecaster = new_forecaster(settings_, cell, estimator, None)
+    runner = forecaster or estimator
     clock = Clock(wall=lambda: begin_s + now_s, monotonic=lambda: now_s)
     publisher = Publisher(
-        settings_, cell, estimator, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append
+        settings_,
+        cell,
+        estimator,
+        source=source,
+        sinks=[sink],
+        clock=clock,
+        on_alarm=result.changes.append,
+        forecaster=forecaster,
     )
     publisher.alarm_monitor.restore(saved_state)
     async for received in source:
         now_s = float(received.samples["time_s"][-1])
-        publisher.add(received, estimator.run(received.samples))
+        publisher.add(received, runner.run(received.samples))
     publisher.publish_last()
     result.snapshots, result.saved_state = sink.snapshots, publisher.alarm_monitor.alarms.saved_state
     return result

@@ -22,7 +22,7 @@ from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarm_state import AlarmState
 from bms_estimator.telemetry.alarms import AlarmEvaluator, SampleCounts
-from tests.telemetry.alarm_captures import PACK, WALL_S, Line, ReplayResult, record, replayed, settings
+from tests.telemetry.alarm_captures import PACK, WALL_S, Line, ReplayResult, knee_lines, record, replayed, settings
 
 NAN = math.nan
 GOOD_CELLS = (3.70, 3.70)
@@ -57,6 +57,7 @@ CAPTURES: dict[str, tuple[list[Line], dict[str, Any], list[tuple[float, bool]]]]
         WITHOUT_IDENTIFIER | {"pack": {"initial_soc": 0.2}},
         [(190.0, True), (0.0, False)],
     ),
+    "collapse_risk": (knee_lines(), {"pack": {}}, [(0.0, True), (0.0, False)]),
     "stability_margin_low": (
         [Line(400, current_a=20.0), Line(500, current_a=-18.0)],
         WITHOUT_IDENTIFIER | {"pack": {"initial_soc": 0.2}},

@@ -34,9 +34,10 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.fit_thread import new_slow_fit
+from bms_estimator.service.pack_forecaster import load_forecast_kernels, new_forecaster
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, open_capture
-from bms_estimator.telemetry.alarms import Change
+from bms_estimator.telemetry.alarms import NO_FORECAST, Change
 
 MAX_BLOCK_S = 1.0
 """Maximum duration of a block [s]. Alarms are evaluated after each block, by the capture's clock."""
@@ -61,13 +62,13 @@ class RaisedAlarm:
 
 @dataclass
 class AlarmResult:
-    """Alarms of a capture: raised, not raised, and not monitored because of missing quantities."""
+    """Alarms of a capture: raised, not raised, and not monitored because of missing values."""
 
     raised: list[RaisedAlarm]
     quiet: Sequence[str]
     """Monitored alarms that were not raised."""
     unmeasured: Sequence[str]
-    """Alarms whose quantity the capture lacks."""
+    """Alarms without a value, because the capture lacks a quantity, or the load for a forecast."""
 
 
 def alarms(
@@ -114,15 +115,19 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     now_s, changes = 0.0, list[Change]()
     with show_compile_progress():
         estimator = new_estimator(settings, model)
+        load_forecast_kernels()
     without_hooks = settings.alarms.model_copy(update={"hook": ()})
     settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
     monitor = AlarmMonitor(settings, model, estimator, source, clock, changes.append)
-    runner = new_slow_fit(settings, estimator) or estimator
+    slow_fit = new_slow_fit(settings, estimator)
+    forecaster = new_forecaster(settings, model, estimator, slow_fit)
+    runner = forecaster or slow_fit or estimator
     with progress_bar("replaying") as bar:
         async for received in source:
             now_s = max(now_s, float(received.samples["time_s"][-1]))
-            monitor.add(received, runner.run(received.samples), now_s)
+            trace = runner.run(received.samples)
+            monitor.add(received, trace, now_s, forecaster.rows if forecaster else NO_FORECAST)
             bar.update(source.fraction)
     monitor.evaluate(now_s)
     raised_alarms = _pair_changes(changes)
@@ -175,4 +180,4 @@ def _print(title: str, result: AlarmResult) -> None:
     else:
         console.print(f"{title}: no alarm")
     console.print(f"not raised: {', '.join(result.quiet) or '-'}")
-    console.print(f"not monitored, because the capture lacks the quantity: {', '.join(result.unmeasured) or '-'}")
+    console.print(f"not monitored, because the capture lacks the quantity or the load for a forecast: {', '.join(result.unmeasured) or '-'}")

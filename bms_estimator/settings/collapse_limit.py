@@ -1,0 +1,23 @@
+"""Limit of the alarm ``collapse_risk`` by the accepted rate of false alarms."""
+
+import math
+
+import numpy as np
+
+USE_H_PER_MONTH = 60.0
+"""Hours of use in a month: two hours a day."""
+FALSE_ALARMS = ((0.5, 0.9), (1.0, 0.7), (3.0, 0.5), (10.0, 0.2))
+"""Pairs of the number of false alarms in 100 h of use and the limit, by ``make collapse`` (docs/theory/collapse.md)."""
+
+
+def collapse_limit(false_alarms_per_month: float) -> float:
+    """Return the risk at which the alarm is raised, 0..1.
+
+    The limit is interpolated over the logarithm of the rate. Outside the measured curve it is that of the curve's end.
+
+    Args:
+        false_alarms_per_month: Accepted number of false alarms in ``USE_H_PER_MONTH``, above 0.
+    """
+    rates, limits = zip(*FALSE_ALARMS, strict=True)
+    in_100_h = 100.0 / USE_H_PER_MONTH * false_alarms_per_month
+    return float(np.interp(math.log(in_100_h), np.log(rates), limits))

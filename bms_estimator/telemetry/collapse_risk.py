@@ -1,0 +1,28 @@
+"""Risk that the voltage falls to the cut-off within minutes, by the forecast."""
+
+import numpy as np
+
+from bms_estimator.forecast.forecast import ForecastRows
+from bms_estimator.model.arrays import Floats
+
+
+def collapse_risks(forecasts: ForecastRows, is_charging: np.ndarray) -> Floats:
+    """Return the value of the alarm ``collapse_risk`` at each forecast, shape (n,), 0..1.
+
+    It is the probability of the cut-off within 5 min. It is 0 in a charge, in which there is no forecast, and otherwise NaN
+    without a forecast.
+
+    Args:
+        forecasts: Forecasts, shape (n,), dtype FORECAST.
+        is_charging: True at samples with a charge current, shape (n,).
+    """
+    probability: Floats = forecasts["cutoff_within_5min"]
+    return np.where(np.isnan(probability) & is_charging, 0.0, probability)
+
+
+def collapse_text(forecast: np.void) -> str:
+    """Return the probability of the cut-off and the band of the time left, one sentence, for a record FORECAST."""
+    percent = 100.0 * float(forecast["cutoff_within_5min"])
+    early_min, late_min = (float(forecast[f"time_to_cutoff_{name}_s"]) / 60.0 for name in ("p05", "p95"))
+    band = f"the voltage reaches it in {early_min:.0f} to {late_min:.0f} min (90 %)"
+    return f"when raised: cut-off within 5 min with a probability of {percent:.0f} %; {band}"
