@@ -7,6 +7,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.forecast.capability import PowerLimits, cell_power_limits, write_capability
 from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastCurve, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import LoadHistory
@@ -54,14 +55,18 @@ class Forecaster:
         estimator: Estimator of the pack.
         runner: The estimator, or the slow fit that runs it.
         cutoff_v: Terminal voltage at which the load is switched off [V].
+        limits: Limits of the available power; None: those of the cell file.
 
     Attributes:
         load: Load that was seen.
         latest: The last forecast.
     """
 
-    def __init__(self, estimator: Estimator, runner: Runner, *, cutoff_v: float) -> None:
+    def __init__(
+        self, estimator: Estimator, runner: Runner, *, cutoff_v: float, limits: PowerLimits | None = None
+    ) -> None:
         self.estimator, self.cutoff_v = estimator, cutoff_v
+        self._limits = limits or cell_power_limits(estimator.cell)
         filter_settings = estimator.cell_file_settings
         self.load = LoadHistory(float(filter_settings["capacity_as"]), float(filter_settings["unmeasured_s"]))
         self.latest = Forecast(math.nan, unknown_values(), "no sample has been processed yet", None)
@@ -113,6 +118,7 @@ class Forecaster:
             load: Load to expect; None: a load like the one that was seen.
         """
         values, time_s = unknown_values(), float(self.estimator.state["time_s"][0])
+        write_capability(values, self.estimator, self.cutoff_v, self._limits, float(self.load.max_a.max(initial=0.0)))
         reason = self._missing_state()
         if reason is None and load is None:
             reason = self._missing_load()
@@ -123,6 +129,8 @@ class Forecaster:
         if projection is None:
             return Forecast(time_s, values, "the load does not discharge the pack on average", None)
         _write_time_to_cutoff(values, projection)
+        if load is not None:
+            values["usable_capacity_ah"] = np.median(projection.charge_as) / 3600.0
         return Forecast(time_s, values, None, projection.curve)
 
     def trip_curve(self, load: GivenLoad) -> ForecastCurve | None:
@@ -193,11 +201,10 @@ def _interval_s(forecast: Forecast) -> float:
 
 
 def _write_time_to_cutoff(values: ForecastRows, projection: Projection) -> None:
-    """Write quantiles and probabilities of the time to the cut-off, and the median charge."""
+    """Write quantiles and probabilities of the time to the cut-off."""
     time_s = projection.time_s
     for name, seconds in (("2min", 120.0), ("5min", 300.0), ("15min", 900.0)):
         values[f"cutoff_within_{name}"] = np.mean(time_s <= seconds)
     names = "time_to_cutoff_p05_s", "time_to_cutoff_s", "time_to_cutoff_p95_s"
     for name, quantile_s in zip(names, time_quantiles(time_s), strict=True):
         values[name] = quantile_s
-    values["usable_capacity_ah"] = np.median(projection.charge_as) / 3600.0

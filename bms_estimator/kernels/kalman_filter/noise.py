@@ -112,7 +112,13 @@ def skew_variance(s: Record, p: Record) -> float:
 
 @njit(cache=True)
 def bias_variance(s: Record, p: Record, q: int) -> float:
-    """Return the steady-state variance of B_SLOW + B_FAST of hypothesis ``q`` [V^2].
+    """Return the steady-state variance of B_SLOW + B_FAST of hypothesis ``q`` under the load of the last ten minutes [V^2]."""
+    return load_bias_variance(s, p, q, s.rms_a2)
+
+
+@njit(cache=True)
+def load_bias_variance(s: Record, p: Record, q: int, load_a2: float) -> float:
+    """Return the variance of the model's error of hypothesis ``q`` under a load with the mean square ``load_a2`` [V^2].
 
     The file's resistances have a relative error and a shift along SOC. The error grows with LN_R above ``USUAL_LN_R``.
 
@@ -130,7 +136,7 @@ def bias_variance(s: Record, p: Record, q: int) -> float:
     grown_ohm = max(ohm - p.middle_ohm, 0.0)
     min_load_a = MIN_LOAD_C * p.capacity_as / 3600.0
     error_ohm2 = (p.bias_relative * ohm) ** 2 + (p.bias_grown * grown_ohm) ** 2 + (0.5 * shift_ohm) ** 2
-    error_v2 = scale * scale * error_ohm2 * max(s.rms_a2, min_load_a * min_load_a) + early_v * early_v
+    error_v2 = scale * scale * error_ohm2 * max(load_a2, min_load_a * min_load_a) + early_v * early_v
     return extrapolation_factor(p, s.temperature_c) ** 2 * error_v2
 
 

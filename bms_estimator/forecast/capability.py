@@ -1,0 +1,102 @@
+"""Present capability of a pack: available power, usable capacity, and time to full.
+
+These values need no load ahead, so that they exist at rest and in a charge, too.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.forecast.forecast import ForecastRows
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES
+from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
+from bms_estimator.kernels.forecast.discharge import mean_load, usable_charge
+from bms_estimator.kernels.forecast.power import available_power, new_scratch
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.settings.alarm_limits import monitored_alarms
+from bms_estimator.settings.pack import Settings
+
+QUANTILE_STDS = 1.645
+"""Distance of the 5 % quantile of a normal distribution from its mean, in standard deviations."""
+DURATIONS_S = 10.0, 60.0
+"""Durations of the available power [s]."""
+
+
+@dataclass(frozen=True)
+class PowerLimits:
+    """Limits of current and temperature of the available power.
+
+    Attributes:
+        discharge_a: Largest discharge current [A], above 0.
+        charge_a: Largest charge current [A], above 0.
+        charge_min_c: Temperature below which the pack must not be charged [C].
+    """
+
+    discharge_a: float
+    charge_a: float
+    charge_min_c: float = 0.0
+
+
+def cell_power_limits(cell: PackModel) -> PowerLimits:
+    """Return the limits of the cell file: ``current_max_a`` in both directions.
+
+    Args:
+        cell: Model of the whole pack.
+    """
+    return PowerLimits(cell.cell.current_max_a, cell.cell.current_max_a)
+
+
+def power_limits(settings: Settings, cell: CellModel) -> PowerLimits:
+    """Return the limits of the pack's alarms, which are at most those of the cell file.
+
+    A switched-off alarm of a current gives the limit of the cell file, and that of the temperature none.
+
+    Args:
+        settings: Settings of the pack.
+        cell: Model of the whole pack.
+    """
+    alarms = {alarm.name: alarm.limit for alarm in monitored_alarms(settings, cell)}
+    max_a = cell.cell.current_max_a
+    return PowerLimits(
+        min(alarms.get("discharge_over_current", max_a), max_a),
+        min(alarms.get("charge_over_current", max_a), max_a),
+        alarms.get("charging_below_freezing", -np.inf),
+    )
+
+
+def write_capability(
+    values: ForecastRows, estimator: Estimator, cutoff_v: float, limits: PowerLimits, largest_a: float
+) -> None:
+    """Write available power, usable capacity and time to full to ``values``.
+
+    Without samples, without the identifier and for a fuel cell the values do not change.
+
+    Args:
+        values: Shape (1,), dtype ``FORECAST``; written.
+        estimator: Estimator of the pack; read only.
+        cutoff_v: Terminal voltage at which the load is switched off [V].
+        limits: Limits of current and temperature.
+        largest_a: Largest current of the load since the last long charge [A].
+    """
+    state, settings = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
+    if not state["started"]:
+        return
+    anchors = estimator.settings_record[0]["anchors"]
+    full_v, tail_a = float(anchors["charger_v"]), float(anchors["tail_a"])
+    charge_a = limits.charge_a if state["temperature_c"] >= limits.charge_min_c else 0.0
+    scratch = new_scratch()
+    for duration_s in DURATIONS_S:
+        for name, limit_v, max_a in (("discharge", cutoff_v, limits.discharge_a), ("charge", full_v, -charge_a)):
+            values[f"available_{name}_power_{duration_s:.0f}s_w"] = available_power(
+                state, settings, duration_s, limit_v, max_a, QUANTILE_STDS, scratch
+            )
+    mean_a = mean_load(state, settings)
+    charge_as = usable_charge(state, settings, mean_a, max(mean_a, largest_a), cutoff_v, scratch)[0]
+    values["usable_capacity_ah"] = charge_as / 3600.0
+    present_a = charge_current(state, settings)
+    if present_a < 0.0:
+        values["time_to_full_s"] = time_to_full(
+            state, settings, present_a, full_v, tail_a, np.empty(RESISTANCES + BRANCHES)
+        )

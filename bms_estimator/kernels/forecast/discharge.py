@@ -1,0 +1,107 @@
+"""Charge and energy down to the cut-off voltage under a load like the present one.
+
+The mean current of the load discharges the pack and polarizes the RC pairs. The cut-off comes at a peak of the load, which
+adds a drop over R_0 and over a part of R_1. The filter has learned the resistances at higher SOCs, and they are larger than in
+the cell file towards empty.
+
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Currents are positive on discharge.
+"""
+
+import math
+
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
+from bms_estimator.kernels.forecast.constant_current import (
+    branch_current,
+    hypothesis_capacity,
+    open_circuit_voltage,
+    scaled_resistances,
+)
+from bms_estimator.kernels.kalman_filter.records import SOC
+from bms_estimator.model.arrays import Floats, Record
+from bms_estimator.numba_cache import njit
+
+MIN_LOAD_C = 0.05
+"""Minimum mean current of the load, as a C-rate. At rest and while charging, the load has this mean."""
+PEAK_SHARE_R_1 = 0.35
+"""Fraction of R_1 (1 s) that a peak polarizes."""
+RESISTANCE_FACTOR = 1.05
+"""Factor on all resistances until the end of a discharge."""
+GROWTH = 0.5
+"""Additional increase of all resistances from ``GROWTH_SOC`` to SOC 0, relative to those of the cell file. Few captures of a
+calibration contain loads near empty."""
+GROWTH_SOC = 0.4
+"""SOC below which the resistances increase by ``GROWTH``."""
+SOC_STEP = 0.005
+"""Step of the SOC towards empty. The crossing of the cut-off voltage is interpolated within a step."""
+
+
+@njit(cache=True)
+def mean_load(s: Record, p: Record) -> float:
+    """Return the mean current of the last ten minutes [A], at least that of ``MIN_LOAD_C``."""
+    return max(s.mean_a, MIN_LOAD_C * p.capacity_as / 3600.0)
+
+
+@njit(cache=True)
+def usable_charge(
+    s: Record, p: Record, mean_a: float, peak_a: float, cutoff_v: float, ohm: Floats
+) -> tuple[float, float]:
+    """Return charge [A s] and energy at the terminals [J] until the voltage reaches the cut-off or the SOC reaches 0.
+
+    Both are weighted means over the hypotheses.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        mean_a: Mean current [A], above 0.
+        peak_a: Peak current [A], at least ``mean_a``.
+        cutoff_v: Voltage that ends the discharge [V].
+        ohm: Scratch space of shape (RESISTANCES,).
+    """
+    total = charge_as = energy_j = 0.0
+    for q in range(s.count):
+        weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
+        soc, mean_v = _discharge(s, p, q, mean_a, peak_a, cutoff_v, ohm)
+        moved_as = (s.mean[q, SOC] - soc) * hypothesis_capacity(s, p, q)
+        total += weight
+        charge_as += weight * moved_as
+        energy_j += weight * moved_as * mean_v
+    return charge_as / total, energy_j / total
+
+
+@njit(cache=True)
+def _discharge(
+    s: Record, p: Record, q: int, mean_a: float, peak_a: float, cutoff_v: float, ohm: Floats
+) -> tuple[float, float]:
+    """Return the SOC at the end of the discharge, and the mean voltage until then [V]."""
+    first_soc = soc = s.mean[q, SOC]
+    voltage_v, peak_drop_v = _voltage(s, p, q, mean_a, peak_a, soc, ohm)
+    sum_v = 0.0
+    while soc > 0.0 and voltage_v - peak_drop_v > cutoff_v:
+        step = min(SOC_STEP, soc)
+        next_v, next_drop_v = _voltage(s, p, q, mean_a, peak_a, soc - step, ohm)
+        fall_v = voltage_v - peak_drop_v - (next_v - next_drop_v)
+        above_v = voltage_v - peak_drop_v - cutoff_v
+        share = above_v / fall_v if fall_v > above_v else 1.0  # of the step before the cut-off
+        sum_v += share * step * (voltage_v + 0.5 * share * (next_v - voltage_v))
+        soc -= share * step
+        if share < 1.0:
+            break
+        voltage_v, peak_drop_v = next_v, next_drop_v
+    moved = first_soc - soc
+    return soc, sum_v / moved if moved > 0.0 else 0.0
+
+
+@njit(cache=True)
+def _voltage(
+    s: Record, p: Record, q: int, mean_a: float, peak_a: float, soc: float, ohm: Floats
+) -> tuple[float, float]:
+    """Return the voltage at ``soc`` under the mean current, and the additional drop at a peak [V]."""
+    elapsed_s = (s.mean[q, SOC] - soc) * hypothesis_capacity(s, p, q) / mean_a
+    scaled_resistances(s, p, q, soc, ohm)
+    growth = GROWTH * (max(GROWTH_SOC - soc, 0.0) - max(GROWTH_SOC - s.mean[q, SOC], 0.0)) / GROWTH_SOC
+    drop_v = ohm[0] * mean_a
+    for k in range(BRANCHES):
+        drop_v += ohm[1 + k] * branch_current(s, q, k, mean_a, elapsed_s)
+    peak_drop_v = (ohm[0] + PEAK_SHARE_R_1 * ohm[1]) * (peak_a - mean_a)
+    factor = RESISTANCE_FACTOR + growth
+    return open_circuit_voltage(s, p, q, soc, elapsed_s) - factor * drop_v, factor * peak_drop_v

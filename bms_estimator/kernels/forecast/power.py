@@ -1,0 +1,172 @@
+"""Available power: constant power that the pack supplies or accepts until its voltage reaches a limit.
+
+The largest constant current is sought for which the voltage stays inside the limit with a stated probability. The voltage has
+the mean and the variance of the filter's mixture of hypotheses, propagated to the end of the current. The power is that
+current times the lowest voltage meanwhile. A constant power of this size never draws a larger current, so that its voltage
+stays inside the limit, too.
+
+``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Currents are positive on discharge.
+"""
+
+import math
+
+import numpy as np
+
+from bms_estimator.kernels.cell_model.chen_mora import ocv
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES, TAUS, on_grid
+from bms_estimator.kernels.forecast.constant_current import branch_current, hypothesis_capacity, voltage_after
+from bms_estimator.kernels.kalman_filter.noise import load_bias_variance
+from bms_estimator.kernels.kalman_filter.ocv_correction import node_error_scale, node_position
+from bms_estimator.kernels.kalman_filter.records import (
+    B_FAST,
+    B_SLOW,
+    CURVE,
+    HYST,
+    LN_Q,
+    LN_R,
+    LN_R0,
+    NODE,
+    SOC,
+    STATES,
+    X,
+)
+from bms_estimator.model.arrays import Floats, Record
+from bms_estimator.numba_cache import njit
+
+CHECKED = (0.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)
+"""Fractions of the duration at which the voltage is checked. It is not always lowest or highest at the end: after a larger load,
+the RC pairs recover while the SOC still falls."""
+BISECTIONS = 24
+"""Number of bisections. The error of the current is below 1e-7 of the current limit."""
+MIN_REACH_SOC = 1e-3
+"""Minimum SOC width of the OCV's secant."""
+
+
+@njit(cache=True)
+def available_power(
+    s: Record, p: Record, duration_s: float, limit_v: float, max_a: float, stds: float, scratch: Floats
+) -> float:
+    """Return the constant power that the pack supplies or accepts for ``duration_s`` [W], at least 0.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        duration_s: Duration of the power [s].
+        limit_v: Voltage that must not be crossed: the lower limit on discharge, the upper one on charge [V].
+        max_a: Largest current [A]; positive: discharge, negative: charge.
+        stds: Distance of the voltage's quantile from its mean, in standard deviations; 0: median.
+        scratch: Scratch space of shape (RESISTANCES + STATES,).
+    """
+    direction = math.copysign(1.0, max_a)
+    if (
+        max_a == 0.0
+        or closest_voltage(s, p, 0.0, duration_s, direction, stds, scratch) * direction <= limit_v * direction
+    ):
+        return 0.0
+    current_a = max_a
+    if closest_voltage(s, p, max_a, duration_s, direction, stds, scratch) * direction < limit_v * direction:
+        low_a, high_a = 0.0, max_a
+        for _ in range(BISECTIONS):
+            middle_a = 0.5 * (low_a + high_a)
+            if closest_voltage(s, p, middle_a, duration_s, direction, stds, scratch) * direction >= limit_v * direction:
+                low_a = middle_a
+            else:
+                high_a = middle_a
+        current_a = low_a
+    if direction > 0.0:
+        return current_a * closest_voltage(s, p, current_a, duration_s, direction, stds, scratch)
+    return -current_a * voltage_quantile(s, p, current_a, 0.0, 0.0, scratch)  # the voltage is lowest at the beginning
+
+
+@njit(cache=True)
+def closest_voltage(
+    s: Record, p: Record, current_a: float, duration_s: float, direction: float, stds: float, scratch: Floats
+) -> float:
+    """Return the quantile of the voltage at the checked time at which it is closest to the limit [V].
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        current_a: Constant current [A].
+        duration_s: Duration of the current [s].
+        direction: 1: the limit is below the voltage; -1: it is above.
+        stds: Distance of the quantile from the mean towards the limit, in standard deviations.
+        scratch: Scratch space of shape (RESISTANCES + STATES,).
+    """
+    closest_v = math.inf * direction
+    for fraction in CHECKED:
+        voltage_v = voltage_quantile(s, p, current_a, fraction * duration_s, -direction * stds, scratch)
+        if voltage_v * direction < closest_v * direction:
+            closest_v = voltage_v
+    return closest_v
+
+
+@njit(cache=True)
+def voltage_quantile(s: Record, p: Record, current_a: float, elapsed_s: float, stds: float, scratch: Floats) -> float:
+    """Return mean plus ``stds`` standard deviations of the voltage after ``elapsed_s`` of the constant current [V].
+
+    Mean and variance are those of the mixture of hypotheses.
+    """
+    total = mean_v = square_v2 = 0.0
+    reference_v = voltage_after(s, p, s.best, current_a, elapsed_s, scratch[:RESISTANCES])  # limits the rounding error
+    for q in range(s.count):
+        weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
+        deviation_v = voltage_after(s, p, q, current_a, elapsed_s, scratch[:RESISTANCES]) - reference_v
+        variance_v2 = voltage_variance(s, p, q, current_a, elapsed_s, stds, scratch) if stds != 0.0 else 0.0
+        total += weight
+        mean_v += weight * deviation_v
+        square_v2 += weight * (variance_v2 + deviation_v * deviation_v)
+    mean_v, square_v2 = mean_v / total, square_v2 / total
+    return reference_v + mean_v + stds * math.sqrt(max(square_v2 - mean_v * mean_v, 0.0))
+
+
+@njit(cache=True)
+def voltage_variance(
+    s: Record, p: Record, q: int, current_a: float, elapsed_s: float, stds: float, scratch: Floats
+) -> float:
+    """Return the variance of the voltage after ``elapsed_s`` of the constant current [V^2].
+
+    It is H P H' of the filter's covariance, and the errors of the model that the current adds.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        q: Index of the hypothesis.
+        current_a: Constant current [A].
+        elapsed_s: Time from now [s].
+        stds: Width of the OCV's secant in standard deviations of the SOC, towards full (positive) or empty (negative).
+        scratch: Shape (RESISTANCES + STATES,); contains the resistances at the end of the current (``voltage_after``).
+    """
+    x, cov, ohm, h = s.mean[q], s.covariance[q], scratch[:RESISTANCES], scratch[RESISTANCES:]
+    moved_soc = current_a * elapsed_s / hypothesis_capacity(s, p, q)
+    soc = x[SOC] - moved_soc
+    h[:] = 0.0
+    reach_soc = math.copysign(max(abs(stds) * math.sqrt(cov[SOC, SOC]), MIN_REACH_SOC), stds)
+    e_o_v = ocv(soc, p.ocv_v, p.ocv_slope_v)
+    h[SOC] = (ocv(soc + reach_soc, p.ocv_v, p.ocv_slope_v) - e_o_v) / reach_soc
+    h[LN_Q] = h[SOC] * moved_soc
+    h[LN_R0] = -ohm[0] * current_a
+    for k in range(BRANCHES):
+        h[X + k] = -ohm[1 + k] * math.exp(-elapsed_s / TAUS[k])
+        h[LN_R] -= ohm[1 + k] * branch_current(s, q, k, current_a, elapsed_s)
+    h[B_SLOW], h[B_FAST] = math.exp(-elapsed_s / p.slow_s), math.exp(-elapsed_s / p.fast_s)
+    h[HYST] = s.hysteresis * on_grid(soc, p.hysteresis_v)
+    h[CURVE] = math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v)
+    i, t = node_position(soc)
+    node_v = node_error_scale(p, soc, t)
+    h[NODE + i], h[NODE + i + 1] = (1.0 - t) * node_v, t * node_v
+    variance_v2 = 0.0
+    for j in range(STATES):
+        if h[j] != 0.0:
+            for k in range(STATES):
+                variance_v2 += h[j] * cov[j, k] * h[k]
+    usual_v2 = load_bias_variance(s, p, q, s.rms_a2)
+    pulse_v2 = load_bias_variance(s, p, q, max(current_a * current_a, s.rms_a2))
+    renewed = 1.0 - 0.5 * (h[B_SLOW] * h[B_SLOW] + h[B_FAST] * h[B_FAST])
+    return variance_v2 + (pulse_v2 - usual_v2) + renewed * usual_v2
+
+
+@njit(cache=True)
+def new_scratch() -> Floats:
+    """Return scratch space for ``available_power``."""
+    return np.empty(RESISTANCES + STATES)
