@@ -1,0 +1,309 @@
+"""Simulated bank: cells in series, each with its own capacity, SOC, resistance, temperature and internal short."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from bms_estimator.estimator.filter_settings import filter_settings
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.accumulators.history import HYSTERESIS_SOC
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    BRANCHES,
+    HYSTERESIS_J,
+    RESISTANCES,
+    STRONG_J,
+    TAUS,
+    WEAK_J,
+    arrhenius,
+    on_grid,
+    resistances,
+)
+from bms_estimator.model.arrays import Floats, Record
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.numba_cache import njit
+from bms_estimator.settings.observer import IdentifierSettings
+
+COLLAPSE_V = 50.0
+"""Slope of the OCV of a cell below SOC 0 [V per unit SOC]. The voltage of an over-discharged cell falls to 0 within a few
+percent of its capacity. Assumed."""
+TAPER_C = 0.05
+"""Current at which the charger ends the charge, as a C-rate of the mean capacity."""
+FAST_FRACTION = 0.6
+"""Fraction of the hysteresis with the shorter charge constant of ``HYSTERESIS_SOC``."""
+STATE = np.dtype(
+    [
+        ("soc", "f8"),
+        ("x_a", "f8", BRANCHES),  # current filtered by the RC pairs [A]
+        ("hysteresis", "f8", 2),  # fast and slow part, -1..1
+    ]
+)
+"""State of one cell."""
+
+
+@dataclass(frozen=True)
+class BankCells:
+    """Properties of the cells of a bank, each an array of shape (cells,)."""
+
+    capacity_ah: Floats
+    """True capacity [Ah]."""
+    soc: Floats
+    """SOC at time 0, at rest."""
+    ohm_factor: Floats
+    """Resistances relative to those of the cell file."""
+    leak_ohm: Floats
+    """Resistance of an internal short across the cell [ohm]; infinite: none."""
+    warmer_k: Floats
+    """Temperature of the cell above that of the bank [K]."""
+
+    @classmethod
+    def equal(cls, cells: int, capacity_ah: float, soc: float = 1.0) -> Self:
+        """Return equal cells with the resistances of the cell file."""
+        ones = np.ones(cells)
+        return cls(capacity_ah * ones, soc * ones, ones, np.inf * ones, 0.0 * ones)
+
+    @classmethod
+    def drawn(
+        cls,
+        rng: np.random.Generator,
+        cells: int,
+        capacity_ah: float,
+        soc: float = 1.0,
+        *,
+        capacity_std: float = 0.015,
+        soc_std: float = 0.01,
+        ohm_std: float = 0.05,
+    ) -> Self:
+        """Return cells with normally distributed capacities, SOCs and resistances.
+
+        Args:
+            rng: Random generator.
+            cells: Number of cells.
+            capacity_ah: Mean capacity [Ah].
+            soc: Mean SOC.
+            capacity_std: Relative std of the capacities.
+            soc_std: Std of the SOCs.
+            ohm_std: Relative std of the resistances.
+        """
+        return cls(
+            capacity_ah * np.exp(capacity_std * rng.standard_normal(cells)),
+            np.clip(soc + soc_std * rng.standard_normal(cells), 0.0, 1.0),
+            np.exp(ohm_std * rng.standard_normal(cells)),
+            np.full(cells, np.inf),
+            np.zeros(cells),
+        )
+
+    def with_weak_cell(self, cell: int, *, capacity_ratio: float = 1.0, soc_below: float = 0.0) -> Self:
+        """Return the cells with one weak cell.
+
+        Args:
+            cell: Number of the weak cell, from 0.
+            capacity_ratio: Factor on its capacity.
+            soc_below: Amount by which its SOC at time 0 is lower.
+        """
+        capacity_ah, soc = self.capacity_ah.copy(), self.soc.copy()
+        capacity_ah[cell] *= capacity_ratio
+        soc[cell] -= soc_below
+        return replace(self, capacity_ah=capacity_ah, soc=soc)
+
+
+@dataclass(frozen=True)
+class BankHistory:
+    """True values of a simulated bank at each of n times."""
+
+    time_s: Floats
+    """Time since the simulation began [s], shape (n,)."""
+    current_a: Floats
+    """Current that flowed [A], positive on discharge, shape (n,)."""
+    cell_v: Floats
+    """Voltage of each cell [V], shape (n, cells)."""
+    cell_soc: Floats
+    """SOC of each cell, negative after over-discharge, shape (n, cells)."""
+    temperature_c: Floats
+    """Temperature of the bank [degC], shape (n,)."""
+
+    @property
+    def voltage_v(self) -> Floats:
+        """Voltage of the bank [V], shape (n,)."""
+        return np.asarray(self.cell_v.sum(axis=1))
+
+    def samples(self, rng: np.random.Generator, noise_v: float = 0.0, resolution_v: float = 1e-3) -> SampleBlock:
+        """Return measured samples of the bank, dtype ``SAMPLE``.
+
+        Args:
+            rng: Random generator.
+            noise_v: Std of a voltage sample [V].
+            resolution_v: Resolution of a voltage sample [V].
+        """
+        block = np.zeros(self.time_s.size, SAMPLE)
+        noisy_v = self.voltage_v + noise_v * rng.standard_normal(self.time_s.size)
+        block["time_s"], block["current_a"], block["temperature_c"] = self.time_s, self.current_a, self.temperature_c
+        block["voltage_v"] = np.round(noisy_v / resolution_v) * resolution_v
+        return block
+
+
+class SimulatedBank:
+    """Bank that is simulated part by part. The cells have the RC ladder, OCV and hysteresis of a cell file.
+
+    Args:
+        cell: Cell model of one cell.
+        cells: Properties of the cells.
+        full_v: Voltage of the bank that the charger does not exceed [V]. It ends the charge at ``TAPER_C``.
+        cutoff_v: Voltage of the bank below which the load is disconnected until the next charge [V].
+
+    Attributes:
+        cells: Properties of the cells; may be replaced between two runs, for example to simulate aging. Their ``soc`` has no
+            effect after the start.
+        time_s: End of the last run [s].
+    """
+
+    def __init__(self, cell: CellModel, cells: BankCells, *, full_v: float = np.inf, cutoff_v: float = -np.inf) -> None:
+        grid = ocv_grid(cell)
+        self._settings = filter_settings(cell, grid, IdentifierSettings(), 1e-3, None)[0]
+        self.cells, self.time_s = cells, 0.0
+        self._limits_v = np.array([cutoff_v, full_v])
+        self._state = np.zeros(cells.soc.size, STATE)
+        self._state["soc"] = cells.soc
+        self._stopped = np.zeros(1)
+
+    @property
+    def soc(self) -> Floats:
+        """SOC of each cell."""
+        return self._state["soc"].copy()
+
+    def run(self, current_a: Floats, step_s: float = 1.0, temperature_c: float | Floats = 25.0) -> BankHistory:
+        """Simulate requested currents, each of which flows for ``step_s`` [s].
+
+        Args:
+            current_a: Requested current [A], positive on discharge, shape (n,).
+            step_s: Interval between two times [s].
+            temperature_c: Temperature of the bank [degC], one value or one for each current.
+        """
+        n, c = current_a.size, self.cells
+        flowed_a, bank_c = np.array(current_a, np.float64), np.full(n, temperature_c, np.float64)
+        cell_v, cell_soc = np.empty((n, c.soc.size)), np.empty((n, c.soc.size))
+        properties = np.array([3600.0 * c.capacity_ah, c.ohm_factor, c.leak_ohm, c.warmer_k])
+        simulate(
+            self._settings,
+            self._state,
+            properties,
+            self._limits_v,
+            self._stopped,
+            step_s,
+            bank_c,
+            flowed_a,
+            cell_v,
+            cell_soc,
+        )
+        time_s = self.time_s + step_s * np.arange(n)
+        self.time_s += step_s * n
+        return BankHistory(time_s, flowed_a, cell_v, cell_soc, bank_c)
+
+
+@njit(cache=True)
+def simulate(
+    p: Record,
+    state: Record,
+    properties: Floats,
+    limits_v: Floats,
+    stopped: Floats,
+    step_s: float,
+    bank_c: Floats,
+    current_a: Floats,
+    cell_v: Floats,
+    cell_soc: Floats,
+) -> None:
+    """Simulate a bank.
+
+    Args:
+        p: Record of dtype EKF_SETTINGS of one cell.
+        state: Shape (cells,), dtype ``STATE``; updated.
+        properties: Capacity [A s], factor on the resistances, resistance of the internal short [ohm] and temperature above
+            that of the bank [K], shape (4, cells).
+        limits_v: Cut-off voltage and charger voltage of the bank [V].
+        stopped: Sign of the current that a limit has stopped, shape (1,); updated.
+        step_s: Interval between two times [s].
+        bank_c: Temperature of the bank [degC], shape (n,).
+        current_a: Requested current, replaced by the current that flowed [A], shape (n,).
+        cell_v: Voltage of each cell [V], shape (n, cells); written.
+        cell_soc: SOC of each cell, shape (n, cells); written.
+    """
+    cells, ohm, capacity_as = state.size, np.zeros(RESISTANCES), properties[0]
+    for n in range(current_a.size):
+        i = current_a[n]
+        if i * stopped[0] > 0.0:
+            i = 0.0
+        elif i != 0.0:
+            stopped[0] = 0.0
+        series_ohm = 0.0
+        for c in range(cells):
+            cell_v[n, c] = cell_voltage(p, state[c], i, properties[1, c], bank_c[n] + properties[3, c], ohm)
+            cell_soc[n, c] = state[c].soc
+            series_ohm += properties[1, c] * ohm[0]
+        bank_v = cell_v[n].sum()
+        if i < 0.0 and bank_v > limits_v[1]:  # constant voltage
+            held_a = min(i + (bank_v - limits_v[1]) / series_ohm, 0.0)
+            cell_v[n] -= (held_a - i) * series_ohm / cells
+            i = held_a
+            stopped[0] = -1.0 if i > -TAPER_C * capacity_as.mean() / 3600.0 else 0.0
+        elif i > 0.0 and bank_v < limits_v[0]:
+            stopped[0] = 1.0
+        current_a[n] = i
+        for c in range(cells):
+            advance(state[c], i, i + cell_v[n, c] / properties[2, c], step_s, capacity_as[c])
+
+
+@njit(cache=True)
+def cell_voltage(p: Record, s: Record, current_a: float, ohm_factor: float, celsius: float, ohm: Floats) -> float:
+    """Return the voltage of one cell [V].
+
+    Args:
+        p: Record of dtype EKF_SETTINGS of one cell.
+        s: Record of dtype ``STATE``.
+        current_a: Current [A], positive on discharge.
+        ohm_factor: Factor on the resistances.
+        celsius: Temperature of the cell [degC].
+        ohm: Resistances by the cell file [ohm], shape (RESISTANCES,); written.
+    """
+    resistances(s.soc, p.weak_ohm, p.strong_ohm, arrhenius(WEAK_J, celsius), arrhenius(STRONG_J, celsius), ohm)
+    drop_v = current_a * ohm[0]
+    for k in range(BRANCHES):
+        drop_v += ohm[1 + k] * s.x_a[k]
+    return open_circuit(p, s, celsius) - ohm_factor * drop_v
+
+
+@njit(cache=True)
+def open_circuit(p: Record, s: Record, celsius: float) -> float:
+    """Return the open-circuit voltage with hysteresis of one cell [V].
+
+    ``p`` is a record of dtype EKF_SETTINGS, ``s`` one of dtype ``STATE``.
+    """
+    position = min(max(s.soc, 0.0), 1.0) * (p.ocv_v.size - 1)
+    j = min(int(position), p.ocv_v.size - 2)
+    ocv_v = p.ocv_v[j] + (position - j) * (p.ocv_v[j + 1] - p.ocv_v[j])
+    ocv_v += (s.soc - 1.0) * p.ocv_slope_v[-1] if s.soc > 1.0 else 0.0
+    h = FAST_FRACTION * s.hysteresis[0] + (1.0 - FAST_FRACTION) * s.hysteresis[1]
+    ocv_v += h * arrhenius(HYSTERESIS_J, celsius) * on_grid(s.soc, p.hysteresis_v)
+    ocv_v += (celsius - 25.0) * on_grid(s.soc, p.per_kelvin_v)
+    return max(float(ocv_v + COLLAPSE_V * min(s.soc, 0.0)), 0.0)
+
+
+@njit(cache=True)
+def advance(s: Record, current_a: float, drawn_a: float, step_s: float, capacity_as: float) -> None:
+    """Advance the state of one cell.
+
+    Args:
+        s: Record of dtype ``STATE``; updated.
+        current_a: Current of the bank [A], positive on discharge.
+        drawn_a: Current of the cell, which includes that of its internal short [A].
+        step_s: Duration [s].
+        capacity_as: Capacity of the cell [A s].
+    """
+    for k in range(BRANCHES):
+        s.x_a[k] = current_a + (s.x_a[k] - current_a) * np.exp(-step_s / TAUS[k])
+    drawn_soc = drawn_a * step_s / capacity_as
+    s.soc -= drawn_soc
+    for k in range(2):
+        share = 1.0 - np.exp(-abs(drawn_soc) / HYSTERESIS_SOC[k])
+        s.hysteresis[k] -= share * (s.hysteresis[k] + np.sign(drawn_soc))
