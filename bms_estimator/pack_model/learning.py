@@ -15,6 +15,7 @@ from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD
 from bms_estimator.kernels.kalman_filter.input_checks import store_last_good_state
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.pack_model.bank_monitor import BankMonitor
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.curve_change import keep_series_resistance, present_ohm, return_to_cell_file
 from bms_estimator.pack_model.fit import SOC as FIT_SOC
@@ -81,6 +82,7 @@ class SlowFit:
 
     Attributes:
         history: Rows of this and earlier runs.
+        bank: Monitor of the weakest cell; None for a single cell.
         saved_fit: The latest fit, adopted or not, which is saved with the history; None: no fit yet.
         fit: The adopted fit, whose curves the filter uses; None: the filter uses the curves of the cell file.
         fits: Number of adopted fits.
@@ -102,6 +104,7 @@ class SlowFit:
     ) -> None:
         self.estimator, self.history = estimator, History()
         self.cell = CellCurves(estimator.cell_file_settings)
+        self.bank = BankMonitor(self.cell) if self.cell.series > 1.0 else None
         self.fit: PackFit | None = None
         self.fits = self.late = self.failed = self.changes = self.revision = self.unsaved_rows = 0
         self.last_change: FitChange | None = None
@@ -167,6 +170,8 @@ class SlowFit:
         """Discard history and fit, and restart the estimator with the curves of the cell file, as for a new pack."""
         self._pending, self.fit, self.saved_fit, self.last_change = None, None, None, None
         self.history, self._is_late, self._new_rows, self.unsaved_rows = History(), False, 0, 0
+        if self.bank:
+            self.bank.reset()
         return_to_cell_file(self.estimator)
         self.estimator.restart()
         self._h["enabled"], self._h["event_s"] = 1, self._interval()
@@ -195,6 +200,8 @@ class SlowFit:
             self.history.append(h["rows"][:count].copy(), self.cell.capacity_as)
             self._new_rows += count
             self.unsaved_rows += count
+            if self.bank and self.saved_fit is not None:
+                self.bank.add(self.history.rows, count, self.saved_fit)
             h["count"] = 0
             h["rows"] = np.zeros(1, HISTORY_ROW)  # unused rows would depend on the division of the samples into blocks
 

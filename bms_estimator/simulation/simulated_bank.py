@@ -196,7 +196,7 @@ class SimulatedBank:
             cell_v,
             cell_soc,
         )
-        time_s = self.time_s + step_s * np.arange(n)
+        time_s = self.time_s + step_s * np.arange(n, dtype=np.float64)
         self.time_s += step_s * n
         return BankHistory(time_s, flowed_a, cell_v, cell_soc, bank_c)
 
@@ -270,7 +270,7 @@ def cell_voltage(p: Record, s: Record, current_a: float, ohm_factor: float, cels
     drop_v = current_a * ohm[0]
     for k in range(BRANCHES):
         drop_v += ohm[1 + k] * s.x_a[k]
-    return open_circuit(p, s, celsius) - ohm_factor * drop_v
+    return float(open_circuit(p, s, celsius) - ohm_factor * drop_v)
 
 
 @njit(cache=True)
@@ -286,7 +286,7 @@ def open_circuit(p: Record, s: Record, celsius: float) -> float:
     h = FAST_FRACTION * s.hysteresis[0] + (1.0 - FAST_FRACTION) * s.hysteresis[1]
     ocv_v += h * arrhenius(HYSTERESIS_J, celsius) * on_grid(s.soc, p.hysteresis_v)
     ocv_v += (celsius - 25.0) * on_grid(s.soc, p.per_kelvin_v)
-    return max(float(ocv_v + COLLAPSE_V * min(s.soc, 0.0)), 0.0)
+    return float(max(ocv_v + COLLAPSE_V * min(s.soc, 0.0), 0.0))
 
 
 @njit(cache=True)

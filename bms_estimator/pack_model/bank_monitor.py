@@ -1,0 +1,147 @@
+"""Monitor that compares each discharge of a bank with its reference discharges, row by row."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.fit import PackFit
+from bms_estimator.pack_model.open_circuit import drawn_soc, row_soc
+from bms_estimator.pack_model.weakest_cell import ReferenceCurve, WeakestCell, compare
+
+CHARGED_SOC = 0.05
+"""Charge that ends a discharge, as a fraction of the capacity. Regeneration is smaller."""
+
+
+@dataclass(frozen=True)
+class Discharge:
+    """Present discharge, and the model with which its rows are compared."""
+
+    start_s: float
+    """Time of its first row [s]."""
+    fit: PackFit
+    """Fit from before the discharge. A later fit would absorb the weak cell."""
+    reference: ReferenceCurve | None
+    """Reference; None: too few rows."""
+    start_soc: float
+    """SOC at its first row."""
+    start_as: float
+    """Counter of the charge at its first row [A s]."""
+
+    def soc(self, cell: CellCurves, rows: NDArray[np.void]) -> Floats:
+        """Return the SOC of rows of the discharge by the counted charge."""
+        return np.asarray(self.start_soc - drawn_soc(cell, self.fit, rows["charge_as"] - self.start_as))
+
+
+class BankMonitor:
+    """Monitor of the weakest cell of one bank.
+
+    A result is replaced by that of a later discharge once this discharge finds a weak cell, or has gone as deep as the result
+    without one. Discharges with a weak cell do not become part of the reference.
+
+    Args:
+        cell: Curves of the cell file.
+
+    Attributes:
+        weakest: Present result; None before the first comparison.
+    """
+
+    def __init__(self, cell: CellCurves) -> None:
+        self._cell = cell
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all results, as for a new bank."""
+        self.weakest: WeakestCell | None = None
+        self._decided_s, self._decided_soc = (
+            -np.inf,
+            np.inf,
+        )  # discharge of ``weakest``, and SOC that a later one must reach
+        self._weak_s: list[tuple[float, float]] = []  # times of discharges with a weak cell
+        self._discharge: Discharge | None = None
+
+    def add(self, rows: NDArray[np.void], new: int, fit: PackFit) -> None:
+        """Evaluate the last ``new`` rows of a history, one by one.
+
+        Args:
+            rows: Shape (n,), dtype HISTORY_ROW, in order of time.
+            new: Number of new rows.
+            fit: Latest fit of the history.
+        """
+        if fit.is_exchanged and self._discharge is not None and self._discharge.fit.first_segment < fit.first_segment:
+            self.reset()
+        rows = rows[rows["segment"] >= fit.first_segment]
+        for end in range(max(rows.size - new, 0) + 1, rows.size + 1):
+            if is_discharge(rows[end - 1 : end]).all():
+                self._evaluate(rows[:end], fit)
+
+    def _evaluate(self, rows: NDArray[np.void], fit: PackFit) -> None:
+        """Compare the discharge that the last row belongs to."""
+        start = discharge_start(rows, CHARGED_SOC * self._cell.capacity_as)
+        if self._discharge is None or self._discharge.start_s != rows["elapsed_s"][start]:
+            self._discharge = self._begin(rows, start, fit)
+        discharge, measured = self._discharge, rows[start:][is_discharge(rows[start:])]
+        if discharge.reference is None:
+            return
+        soc = discharge.soc(self._cell, measured)
+        result = compare(self._cell, discharge.fit, discharge.reference, measured, soc)
+        if result is not None:
+            self._decide(result, discharge.start_s, float(rows["elapsed_s"][-1]))
+
+    def _begin(self, rows: NDArray[np.void], start: int, fit: PackFit) -> Discharge:
+        """Return the discharge that begins with the row ``start``. While a cell is weak, the fit does not change."""
+        is_weak = self.weakest is not None and self.weakest.is_weak
+        used = self._discharge.fit if is_weak and self._discharge is not None else fit
+        first = rows[start : start + 1]
+        return Discharge(
+            start_s=float(first["elapsed_s"][0]),
+            fit=used,
+            reference=ReferenceCurve.of(self._cell, used, self._reference_rows(rows[:start])),
+            start_soc=float(row_soc(self._cell, fit, first)[0]),
+            start_as=float(first["charge_as"][0]),
+        )
+
+    def _reference_rows(self, rows: NDArray[np.void]) -> NDArray[np.void]:
+        """Return the rows of discharges without a weak cell."""
+        is_reference = is_discharge(rows)
+        for start_s, end_s in self._weak_s:
+            is_reference &= (rows["elapsed_s"] < start_s) | (rows["elapsed_s"] > end_s)
+        return rows[is_reference]
+
+    def _decide(self, result: WeakestCell, start_s: float, now_s: float) -> None:
+        """Replace the present result if the discharge that began at ``start_s`` decides."""
+        was_weak, is_same = self.weakest is not None and self.weakest.is_weak, start_s == self._decided_s
+        decides = is_same or result.is_weak or result.soc <= self._decided_soc
+        if was_weak and (result.is_weak or not decides):
+            self._weak_s[-1] = self._weak_s[-1][0], now_s
+        elif result.is_weak:
+            self._weak_s.append((start_s, now_s))
+        if not decides:
+            return
+        if not (is_same and was_weak and result.is_weak):  # the SOC at which a discharge first finds the weak cell
+            self._decided_soc = result.soc
+        self.weakest, self._decided_s = result, start_s
+
+
+def is_discharge(rows: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Return True for each row of a discharge with a voltage."""
+    return np.asarray((rows["direction"] > 0.0) & (rows["duration_s"] > 0.0))
+
+
+def discharge_start(rows: NDArray[np.void], charged_as: float) -> int:
+    """Return the first row of the discharge that the last row belongs to: the row with the lowest charge counter.
+
+    Args:
+        rows: Shape (n,), dtype HISTORY_ROW, in order of time.
+        charged_as: Charge that ends a discharge [A s].
+    """
+    segment, charge_as = rows["segment"], rows["charge_as"]  # the counter increases on discharge
+    start = rows.size - 1
+    for j in range(rows.size - 1, -1, -1):
+        if segment[j] != segment[-1] or charge_as[j] > charge_as[start] + charged_as:
+            break
+        if charge_as[j] <= charge_as[start]:
+            start = j
+    return start

@@ -1,0 +1,109 @@
+"""Open-circuit voltage E_o of history rows: measured voltages, corrected for load, hysteresis and temperature by a fit."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
+from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition, arrhenius
+from bms_estimator.pack_model.fit import LN_Q, OFFSET, SOC, PackFit
+from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS
+
+HALF_ROW_SOC = 0.01
+"""Half width of the secant that gives the slope of the OCV: the secant covers the SOC range of a row."""
+COLLAPSE_V = 20.0
+"""Slope of the OCV of a cell below SOC 0 [V per unit SOC]. Assumed: over-discharged cells fall to 0 V within a few percent to
+20 % of their capacity."""
+
+
+@dataclass(frozen=True)
+class OpenCircuit:
+    """Open-circuit voltages of n rows. Voltages are of the mean cell."""
+
+    soc: Floats
+    """SOC of the mean cell."""
+    error_v: Floats
+    """E_o minus the fitted OCV at ``soc`` [V]."""
+    drop_v: Floats
+    """Overpotential by which the voltage was corrected, positive on discharge [V]."""
+    temperature_c: Floats
+    """Temperature [degC]."""
+    overpotential: "Overpotential"
+    """Overpotential of the rows at any SOC."""
+
+    @classmethod
+    def of(cls, cell: CellCurves, fit: PackFit, rows: NDArray[np.void], soc: Floats) -> "OpenCircuit":
+        """Return the open-circuit voltages of rows with a voltage.
+
+        Args:
+            cell: Curves of the cell file.
+            fit: Fit of the history that contains the rows or ends before them.
+            rows: Shape (n,), dtype HISTORY_ROW.
+            soc: SOC of the rows, shape (n,).
+        """
+        temperature_c = rows["temperature_c"]
+        drops = Overpotential(cell, fit, rows)
+        drop_v = drops.at(soc[:, None])[:, 0]
+        hysteresis_v = (
+            fit.hysteresis * arrhenius(HYSTERESIS_J, temperature_c) * np.interp(soc, SOC_GRID, cell.hysteresis_v)
+        )
+        by_temperature_v = (temperature_c - REFERENCE_C) * np.interp(soc, SOC_GRID, cell.per_kelvin_v)
+        e_o_v = rows["voltage_v"] / cell.series + drop_v - hysteresis_v * rows["hysteresis"].mean(axis=1)
+        return cls(soc, e_o_v - by_temperature_v - fitted_ocv(cell, fit, soc), drop_v, temperature_c, drops)
+
+
+class Overpotential:
+    """Overpotential of a cell under the currents of n rows, at any SOC, by the fitted resistances.
+
+    Args:
+        cell: Curves of the cell file.
+        fit: Fit of the history.
+        rows: Shape (n,), dtype HISTORY_ROW.
+    """
+
+    def __init__(self, cell: CellCurves, fit: PackFit, rows: NDArray[np.void]) -> None:
+        one, scale = np.ones(SOC_GRID.size), np.exp(fit.ln_r)[:, RESISTANCE_GROUPS]
+        weak_ohm = scale * cell.resistances(SOC_GRID, one, 0.0 * one)
+        strong_ohm = scale * cell.resistances(SOC_GRID, 0.0 * one, one)
+        current_a = np.column_stack([rows["current_a"], rows["x_a"]]) - fit.mean[OFFSET] * cell.one_c_a
+        weak, strong = arrhenius(WEAK_J, rows["temperature_c"]), arrhenius(STRONG_J, rows["temperature_c"])
+        self._grid_v = weak[:, None] * (current_a @ weak_ohm.T) + strong[:, None] * (current_a @ strong_ohm.T)
+
+    def at(self, soc: Floats) -> Floats:
+        """Return the overpotential of row j at ``soc[j]``, positive on discharge, shape of ``soc``: (n, m) [V]."""
+        position, row = NodePosition.of(soc, SOC_GRID.size), np.arange(soc.shape[0])[:, None]
+        low, high = position.weights
+        return np.asarray(low * self._grid_v[row, position.below] + high * self._grid_v[row, position.below + 1])
+
+
+def row_soc(cell: CellCurves, fit: PackFit, rows: NDArray[np.void]) -> Floats:
+    """Return the SOC of rows: that of the fit, and after its last row the SOC by the counted charge.
+
+    After a gap since the fit it is the SOC of the filter.
+    """
+    since_fit = drawn_soc(cell, fit, rows["charge_as"] - fit.charge_as)
+    counted = np.where(rows["segment"] == fit.segment, fit.mean[SOC] - since_fit, rows["soc"])
+    if fit.row_elapsed_s.size == 0:
+        return np.asarray(counted)
+    fitted = np.interp(rows["elapsed_s"], fit.row_elapsed_s, fit.row_soc)
+    return np.asarray(np.where(rows["elapsed_s"] <= fit.elapsed_s, fitted, counted))
+
+
+def drawn_soc(cell: CellCurves, fit: PackFit, charge_as: Floats) -> Floats:
+    """Return a charge [A s] as a fraction of the fitted capacity."""
+    return np.asarray(charge_as / (cell.capacity_as * math.exp(fit.mean[LN_Q])))
+
+
+def fitted_ocv(cell: CellCurves, fit: PackFit, soc: Floats) -> Floats:
+    """Return the fitted OCV of the mean cell [V], which collapses below SOC 0 and is never negative."""
+    ocv_v = cell.ocv(np.maximum(soc, 0.0)) + np.interp(soc, SOC_GRID, fit.curve_v) + COLLAPSE_V * np.minimum(soc, 0.0)
+    return np.asarray(np.maximum(ocv_v, 0.0))
+
+
+def fitted_slope(cell: CellCurves, fit: PackFit, soc: Floats) -> Floats:
+    """Return the slope of the fitted OCV as a secant over the SOC range of a row [V per unit SOC]."""
+    above_v, below_v = (fitted_ocv(cell, fit, soc + shift) for shift in (HALF_ROW_SOC, -HALF_ROW_SOC))
+    return np.asarray((above_v - below_v) / (2.0 * HALF_ROW_SOC))

@@ -1,0 +1,205 @@
+"""Weakest cell of a bank in series, from the voltage of the bank alone (section 7.2 of the thesis).
+
+A discharge is compared with earlier discharges of the same bank, its reference. If one of N cells has become weaker, the
+open-circuit voltage of the mean cell deviates from the reference by
+
+    (E(z - d) - V(z - d) - E(z) + V(z)) / N,    d(z) = shift + shrink (1 - z)
+
+where E is the fitted OCV, V the overpotential under the present load, z the SOC of the other cells and d the SOC by which
+the weak cell lies below them. ``shift`` is a
+lower SOC when the others are full, and 1 / (1 + shrink) is the capacity relative to theirs. The sum of the voltages does
+not depend on the position of the weak cell, so that it cannot tell which cell it is.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from bms_estimator.kernels.kalman_filter.records import Noise
+from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
+from bms_estimator.pack_model.fit import LIKELIHOOD_EXPONENT, PackFit
+from bms_estimator.pack_model.open_circuit import OpenCircuit, fitted_ocv, fitted_slope, row_soc
+
+DETECTED_STD = 5.0
+"""Deviation from the reference from which on a cell counts as weak [std]. docs/pack/bank.md has its false alarms."""
+BINS = 50
+"""Number of SOC bins of the reference."""
+BIN_SOC = (np.arange(BINS) + 0.5) / BINS
+"""SOC in the middle of each bin."""
+MIN_REFERENCE_ROWS = 50
+"""Minimum number of rows of the reference: one or two complete discharges."""
+MIN_ROWS = 4
+"""Minimum number of rows of a discharge for a comparison."""
+PRIOR_ROWS = 4.0
+"""Weight of the prior variance of a bin, in rows."""
+REPEAT_STD_V, REPEAT_STD_SOC = 1.5e-3, 0.002
+"""Prior std by which E_o of the mean cell differs from discharge to discharge: of the voltage [V] and along SOC. Assumed."""
+INDEPENDENT_FRACTION = 0.3
+"""Fraction of this variance that is independent from row to row. The rest is correlated over ``CORRELATED_SOC``."""
+CORRELATED_SOC = 0.15
+"""Correlation length of the difference between two discharges [SOC]."""
+COMMON_SOC_STD, COMMON_CAPACITY_STD = 0.02, 0.01
+"""Std of the change of SOC and capacity that all cells share, since the reference: error of the SOC, and aging."""
+COMMON_DROP_STD, COMMON_ENTROPY_STD_V, COMMON_VOLTAGE_STD_V = 0.05, 1e-4, 1e-3
+"""Std of the common relative change of the overpotential, of the temperature coefficient [V/K], and of the voltage [V]."""
+SHIFTS, SHRINKS = np.linspace(0.0, 0.4, 21), np.linspace(0.0, 0.6, 25)
+"""Tested values of ``shift`` and ``shrink``."""
+SHIFT_STD, SHRINK_STD = 0.03, Noise.cell_spread
+"""Std of the prior of ``shift`` (assumed) and ``shrink``. Without a comparison, the prior of ``shrink`` gives the spread that
+the published ``soc_std`` contains."""
+MIN_BELOW_STD = 0.01
+"""Minimum std of the weak cell's SOC below the others."""
+
+SHIFT, SHRINK = (values.ravel() for values in np.meshgrid(SHIFTS, SHRINKS, indexing="ij"))
+"""``shift`` and ``shrink`` of each hypothesis."""
+LN_PRIOR = -0.5 * ((SHIFT / SHIFT_STD) ** 2 + (SHRINK / SHRINK_STD) ** 2)
+"""ln of the prior density of each hypothesis, up to a constant."""
+
+
+@dataclass(frozen=True)
+class WeakestCell:
+    """Estimate of the weakest cell from one discharge."""
+
+    soc: float
+    """SOC of the other cells at the last row."""
+    filter_soc: float
+    """SOC of the bank by the filter at the last row."""
+    deviation_std: float
+    """Deviation from the reference in the direction of one weak cell: square root of twice the log-likelihood ratio [std]."""
+    mean: Floats
+    """Mean of ``shift`` and ``shrink``."""
+    covariance: Floats
+    """Covariance of ``shift`` and ``shrink``."""
+
+    @property
+    def is_weak(self) -> bool:
+        """True if the deviation is larger than healthy banks have."""
+        return self.deviation_std >= DETECTED_STD
+
+    @property
+    def capacity_ratio(self) -> float:
+        """Capacity of the weakest cell relative to the others."""
+        return float(1.0 / (1.0 + self.mean[1]))
+
+    @property
+    def empty_soc(self) -> float:
+        """SOC of the other cells at which the weakest cell is empty."""
+        return float((self.mean[0] + self.mean[1]) / (1.0 + self.mean[1]))
+
+    def others_soc(self, filter_soc: float) -> float:
+        """Return the SOC of the other cells when the filter's SOC of the bank is ``filter_soc``."""
+        return min(self.soc + filter_soc - self.filter_soc, 1.0)
+
+    def weakest_soc(self, filter_soc: float) -> tuple[float, float]:
+        """Return mean and std of the weakest cell's SOC when the filter's SOC of the bank is ``filter_soc``.
+
+        The std is that of the difference from the other cells. The SOC of an over-discharged cell is 0.
+        """
+        soc = self.others_soc(filter_soc)
+        weights = np.array([1.0, 1.0 - soc])
+        variance = max(float(weights @ self.covariance @ weights), 0.0)
+        return max(soc - float(weights @ self.mean), 0.0), math.hypot(math.sqrt(variance), MIN_BELOW_STD)
+
+
+@dataclass(frozen=True)
+class ReferenceCurve:
+    """Mean difference of E_o from the fitted OCV in the reference discharges, and its std, for each SOC bin."""
+
+    error_v: Floats
+    """Mean of ``OpenCircuit.error_v``, shape (BINS,) [V]."""
+    std_v: Floats
+    """Std by which another discharge of the same bank differs from ``error_v``, shape (BINS,) [V]."""
+    temperature_c: float
+    """Mean temperature [degC]."""
+
+    @classmethod
+    def of(cls, cell: CellCurves, fit: PackFit, rows: NDArray[np.void]) -> "ReferenceCurve | None":
+        """Return the curve of reference rows of discharges; None if there are too few.
+
+        Args:
+            cell: Curves of the cell file.
+            fit: Fit of the history.
+            rows: Shape (n,), dtype HISTORY_ROW.
+        """
+        if rows.size < MIN_REFERENCE_ROWS:
+            return None
+        measured = OpenCircuit.of(cell, fit, rows, row_soc(cell, fit, rows))
+        at = np.clip((measured.soc * BINS).astype(np.intp), 0, BINS - 1)
+        count = np.bincount(at, minlength=BINS)
+        mean_v = np.bincount(at, measured.error_v, BINS) / np.maximum(count, 1)
+        squares_v2 = np.bincount(at, (measured.error_v - mean_v[at]) ** 2, BINS)
+        prior_v2 = REPEAT_STD_V**2 + (REPEAT_STD_SOC * fitted_slope(cell, fit, BIN_SOC)) ** 2
+        variance_v2 = (squares_v2 + PRIOR_ROWS * prior_v2) / (count + PRIOR_ROWS)
+        is_known = count > 1
+        # a bin without reference has the error of the cell file's OCV
+        unknown_v2 = np.where(is_known, 0.0, np.interp(BIN_SOC, SOC_GRID, cell.ocv_std_v) ** 2)
+        return cls(
+            error_v=np.interp(BIN_SOC, BIN_SOC[is_known], mean_v[is_known]) if is_known.any() else np.zeros(BINS),
+            std_v=np.sqrt(variance_v2 * (1.0 + 1.0 / np.maximum(count, 1)) + unknown_v2),
+            temperature_c=float(measured.temperature_c.mean()),
+        )
+
+
+def compare(
+    cell: CellCurves, fit: PackFit, reference: ReferenceCurve, rows: NDArray[np.void], soc: Floats
+) -> WeakestCell | None:
+    """Return the weakest cell by the rows of one discharge; None if there are too few rows.
+
+    The likelihood of each hypothesis contains changes that all cells share: SOC, capacity, resistances, temperature
+    coefficient and voltage.
+
+    Args:
+        cell: Curves of the cell file.
+        fit: Fit of the history.
+        reference: Reference of the bank.
+        rows: Shape (n,), dtype HISTORY_ROW: rows of the discharge with a voltage.
+        soc: SOC of the rows, if no cell were weak, shape (n,).
+    """
+    if rows.size < MIN_ROWS:
+        return None
+    measured, z = OpenCircuit.of(cell, fit, rows, soc), soc
+    deviation_v = measured.error_v - np.interp(z, BIN_SOC, reference.error_v)
+    whitening = np.linalg.cholesky(_covariance(cell, fit, reference, measured))
+    y = solve_triangular(whitening, deviation_v, lower=True)
+    templates = solve_triangular(whitening, weak_cell_deviation(cell, fit, measured), lower=True)
+    ln_likelihood = templates.T @ y - 0.5 * (templates**2).sum(axis=0)
+    ln_weight = LN_PRIOR + LIKELIHOOD_EXPONENT * ln_likelihood
+    weight = np.exp(ln_weight - ln_weight.max())
+    values = np.stack([SHIFT, SHRINK])
+    return WeakestCell(
+        soc=float(z[-1]),
+        filter_soc=float(rows["soc"][-1]),
+        deviation_std=math.sqrt(max(2.0 * float(ln_likelihood.max()), 0.0)),
+        mean=np.average(values, axis=1, weights=weight),
+        covariance=np.cov(values, aweights=weight, ddof=0).astype(np.float64),
+    )
+
+
+def weak_cell_deviation(cell: CellCurves, fit: PackFit, measured: OpenCircuit) -> Floats:
+    """Return the deviation of E_o of the mean cell in each row by each hypothesis, shape (n, hypotheses) [V]."""
+    soc = measured.soc[:, None]
+    weak_soc = soc - SHIFT - SHRINK * (1.0 - soc)
+    weak_v = fitted_ocv(cell, fit, weak_soc) - measured.overpotential.at(weak_soc)
+    return np.asarray((weak_v - fitted_ocv(cell, fit, soc) + measured.drop_v[:, None]) / cell.series)
+
+
+def _covariance(cell: CellCurves, fit: PackFit, reference: ReferenceCurve, measured: OpenCircuit) -> Floats:
+    """Return the covariance of the deviations of a healthy bank, shape (n, n) [V^2]."""
+    z = measured.soc
+    std_v, slope_v = np.interp(z, BIN_SOC, reference.std_v), fitted_slope(cell, fit, z)
+    common = np.column_stack(
+        [
+            COMMON_SOC_STD * slope_v,
+            COMMON_CAPACITY_STD * slope_v * (1.0 - z),
+            COMMON_DROP_STD * measured.drop_v,
+            COMMON_ENTROPY_STD_V * (measured.temperature_c - reference.temperature_c),
+            np.full(z.size, COMMON_VOLTAGE_STD_V),
+        ]
+    )
+    correlation = (1.0 - INDEPENDENT_FRACTION) * np.exp(-np.abs(z[:, None] - z) / CORRELATED_SOC)
+    correlation[np.diag_indices(z.size)] = 1.0
+    return np.asarray(np.outer(std_v, std_v) * correlation + common @ common.T)
