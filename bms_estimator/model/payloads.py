@@ -145,6 +145,23 @@ class Estimate(Payload):
     forecast_reason: str | None = Field(
         description="reason why time_to_cutoff_s and its quantiles are null; null if they have values"
     )
+    weakest_cell_soc: Annotated[
+        float | None, Quantity(Entity("Weakest cell, SOC", None, 3, 0.01), packs="batteries", prometheus="ratio")
+    ] = Field(
+        default=None,
+        description="SOC of the weakest cell in series by the bank's voltage, 0..1; null for a single cell, and before a "
+        "discharge was compared with earlier ones. The voltage of the bank does not show which cell it is",
+    )
+    weakest_cell_soc_std: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
+        default=None, description="standard deviation of weakest_cell_soc"
+    )
+    weakest_cell_capacity: Annotated[
+        float | None,
+        Quantity(Entity("Weakest cell, capacity", None, 2, 0.01), packs="batteries", prometheus="ratio"),
+    ] = Field(default=None, description="capacity of the weakest cell relative to the other cells")
+    usable_capacity_to_weakest_ah: Annotated[
+        float | None, Quantity(raw_entity("Usable capacity to the weakest cell", "Ah", 2), packs="batteries")
+    ] = Field(default=None, description="remaining charge until the weakest cell is empty [Ah]")
     charge_out_ah: Annotated[
         float, Quantity(total_entity("Charge out", "Ah", 2)._replace(enabled=False), prometheus="counter")
     ] = Field(description=f"discharged {_COUNTED} [Ah]")

@@ -10,6 +10,7 @@ from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.open_circuit import drawn_soc, row_soc
 from bms_estimator.pack_model.weakest_cell import ReferenceCurve, WeakestCell, compare
+from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_STD, WEAK_CELL_STD
 
 CHARGED_SOC = 0.05
 """Charge that ends a discharge, as a fraction of the capacity. Regeneration is smaller."""
@@ -46,6 +47,7 @@ class BankMonitor:
 
     Attributes:
         weakest: Present result; None before the first comparison.
+        is_weak: True after a discharge that found a weak cell, until one as deep does not.
     """
 
     def __init__(self, cell: CellCurves) -> None:
@@ -55,6 +57,7 @@ class BankMonitor:
     def reset(self) -> None:
         """Forget all results, as for a new bank."""
         self.weakest: WeakestCell | None = None
+        self.is_weak = False
         self._decided_s, self._decided_soc = (
             -np.inf,
             np.inf,
@@ -92,8 +95,7 @@ class BankMonitor:
 
     def _begin(self, rows: NDArray[np.void], start: int, fit: PackFit) -> Discharge:
         """Return the discharge that begins with the row ``start``. While a cell is weak, the fit does not change."""
-        is_weak = self.weakest is not None and self.weakest.is_weak
-        used = self._discharge.fit if is_weak and self._discharge is not None else fit
+        used = self._discharge.fit if self.is_weak and self._discharge is not None else fit
         first = rows[start : start + 1]
         return Discharge(
             start_s=float(first["elapsed_s"][0]),
@@ -112,17 +114,18 @@ class BankMonitor:
 
     def _decide(self, result: WeakestCell, start_s: float, now_s: float) -> None:
         """Replace the present result if the discharge that began at ``start_s`` decides."""
-        was_weak, is_same = self.weakest is not None and self.weakest.is_weak, start_s == self._decided_s
-        decides = is_same or result.is_weak or result.soc <= self._decided_soc
-        if was_weak and (result.is_weak or not decides):
+        was_weak, is_same = self.is_weak, start_s == self._decided_s
+        is_weak = result.deviation_std >= (WEAK_CELL_CLEAR_STD if was_weak else WEAK_CELL_STD)
+        decides = is_same or is_weak or result.soc <= self._decided_soc
+        if was_weak and (is_weak or not decides):
             self._weak_s[-1] = self._weak_s[-1][0], now_s
-        elif result.is_weak:
+        elif is_weak:
             self._weak_s.append((start_s, now_s))
         if not decides:
             return
-        if not (is_same and was_weak and result.is_weak):  # the SOC at which a discharge first finds the weak cell
+        if not (is_same and was_weak and is_weak):  # the SOC at which a discharge first finds the weak cell
             self._decided_soc = result.soc
-        self.weakest, self._decided_s = result, start_s
+        self.weakest, self.is_weak, self._decided_s = result, is_weak, start_s
 
 
 def is_discharge(rows: NDArray[np.void]) -> NDArray[np.bool_]:

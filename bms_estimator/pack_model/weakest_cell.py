@@ -24,8 +24,6 @@ from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.fit import LIKELIHOOD_EXPONENT, PackFit
 from bms_estimator.pack_model.open_circuit import OpenCircuit, fitted_ocv, fitted_slope, row_soc
 
-DETECTED_STD = 5.0
-"""Deviation from the reference from which on a cell counts as weak [std]. docs/pack/bank.md has its false alarms."""
 BINS = 50
 """Number of SOC bins of the reference."""
 BIN_SOC = (np.arange(BINS) + 0.5) / BINS
@@ -74,11 +72,6 @@ class WeakestCell:
     """Mean of ``shift`` and ``shrink``."""
     covariance: Floats
     """Covariance of ``shift`` and ``shrink``."""
-
-    @property
-    def is_weak(self) -> bool:
-        """True if the deviation is larger than healthy banks have."""
-        return self.deviation_std >= DETECTED_STD
 
     @property
     def capacity_ratio(self) -> float:

@@ -19,6 +19,7 @@ from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarms import NO_FORECAST, AlarmEvaluator, Change, SampleCounts
 from bms_estimator.telemetry.health import sample_counters, suspicions
+from bms_estimator.telemetry.weakest_cell import WeakestCellValues
 
 UNUSABLE_KINDS = "not_finite", "range", "saturated"
 """Kinds of dropped samples that indicate a sensor fault."""
@@ -41,6 +42,7 @@ class AlarmMonitor:
         clock: The clocks.
         on_alarm: Called with each change of an alarm, as soon as it occurs.
         hooks: Successes and failures of alarm hooks; None without hooks.
+        weakest_cell: Returns the values of the weakest cell.
 
     Attributes:
         alarms: The monitored alarms and their states.
@@ -60,8 +62,9 @@ class AlarmMonitor:
         clock: Clock,
         on_alarm: Callable[[Change], object],
         hooks: Callable[[], HookHealth | None] = lambda: None,
+        weakest_cell: Callable[[], WeakestCellValues] = WeakestCellValues,
     ) -> None:
-        self._hooks = hooks
+        self._hooks, self._weakest_cell = hooks, weakest_cell
         self._estimator, self._source, self._clock, self._on_alarm = estimator, source, clock, on_alarm
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
@@ -106,6 +109,7 @@ class AlarmMonitor:
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
         self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts)
+        self.alarms.evaluate_weak_cell(self._weakest_cell().deviation_std, self._arrival_s)
         self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.silence_reason or "")
         if (hooks := self._hooks()) is not None:
             self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall())

@@ -35,6 +35,7 @@ from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import Source, SourceHealth
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 from bms_estimator.telemetry.pack_model import pack_model_health
+from bms_estimator.telemetry.weakest_cell import weakest_cell_values
 
 LAG_STEP_S = 0.1
 """Interval at which the loop's lag is measured [s]. Any longer blocking of the loop is noticed."""
@@ -119,6 +120,7 @@ async def run_estimation_loop(
         edge=edge.health if edge else lambda: None,
         hooks=lambda: hooks.health,
         pack_model=lambda: pack_model_health(pack_model, fit_thread.times) if pack_model else None,
+        weakest_cell=lambda: weakest_cell_values(pack_model),
         on_alarm=hooks.on_alarm_change,
         forecaster=forecaster,
     )

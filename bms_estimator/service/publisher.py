@@ -40,6 +40,7 @@ from bms_estimator.telemetry.publish_window import Window, WindowSummary
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 from bms_estimator.telemetry.rest_detector import RestDetector
 from bms_estimator.telemetry.state import make_info_payload, make_state_payload
+from bms_estimator.telemetry.weakest_cell import WeakestCellValues
 
 log = structlog.get_logger(__name__)
 
@@ -70,6 +71,7 @@ class Publisher:
         edge: Returns the state of the fleet edge; None without one.
         hooks: Returns successes and failures of alarm hooks; None without hooks.
         pack_model: Returns the state of the slow fit; None without one.
+        weakest_cell: Returns the values of the weakest cell.
         on_alarm: Called with each alarm that is raised or cleared.
         forecaster: Supplies the forecasts; None: there are none.
 
@@ -101,6 +103,7 @@ class Publisher:
         edge: Callable[[], EdgeHealth | None] = lambda: None,
         hooks: Callable[[], HookHealth | None] = lambda: None,
         pack_model: Callable[[], PackModelHealth | None] = lambda: None,
+        weakest_cell: Callable[[], WeakestCellValues] = WeakestCellValues,
         on_alarm: Callable[[Change], object] = lambda _: None,
         forecaster: Forecaster | None = None,
     ) -> None:
@@ -111,7 +114,7 @@ class Publisher:
         self._rest = RestDetector(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
         self._source_health, self._recording, self._edge, self._latency = source_health, recording, edge, Latency()
-        self._hooks, self._pack_model = hooks, pack_model
+        self._hooks, self._pack_model, self._weakest_cell = hooks, pack_model, weakest_cell
         self._forecaster, self._forecast_s = forecaster, -math.inf  # time of the last payload of the curves
         is_battery = isinstance(cell, CellModel)
         self._no_forecast = no_forecast(
@@ -123,7 +126,7 @@ class Publisher:
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
-        self.alarm_monitor = AlarmMonitor(settings, cell, estimator, source, clock, on_alarm, hooks)
+        self.alarm_monitor = AlarmMonitor(settings, cell, estimator, source, clock, on_alarm, hooks, weakest_cell)
         self._logged_faults = 0  # bits of ``InputFault``
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
@@ -254,7 +257,16 @@ class Publisher:
         self._flow = self._flow.at_least(self.saved_flow or self._totals.flow)
         capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
         forecast = self._forecaster.latest if self._forecaster else self._no_forecast
-        return make_state_payload(window, remaining, forecast, self._source.counters, wall_s, self._flow, capacity_ah)
+        return make_state_payload(
+            window,
+            remaining,
+            forecast,
+            self._source.counters,
+            wall_s,
+            self._flow,
+            capacity_ah,
+            self._weakest_cell(),
+        )
 
     def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:
         forecaster = self._forecaster

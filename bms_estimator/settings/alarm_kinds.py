@@ -79,6 +79,11 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
     "cell_imbalance": AlarmKind(
         "the cells' voltages differ", "let the cells balance, and look for a weak cell", ("cells",), "V"
     ),
+    "weak_cell": AlarmKind(
+        "one cell of the bank is weaker than the others, and is empty first",
+        "measure each cell, because the bank's voltage does not show which one it is; until then charge earlier",
+        ("voltage", "current"),
+    ),
     "sensor_fault": AlarmKind(
         "samples are lost, unusable or from two publishers",
         "check sensors and wiring; the counters in topic health name the fault",

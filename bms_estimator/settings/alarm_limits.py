@@ -66,6 +66,9 @@ MAX_DISCHARGE_C = 5.0
 default: it only rejects invalid samples, and lies far above the continuous current of most cells."""
 COLLAPSE_CLEAR_FRACTION = 0.5
 """Clear level of ``collapse_risk`` as a fraction of its limit."""
+WEAK_CELL_STD, WEAK_CELL_CLEAR_STD = 5.0, 3.0
+"""Default limit and clear level of ``weak_cell``: deviation of a discharge from the bank's reference [std]. docs/pack/bank.md
+has its false alarms."""
 CURRENT_CLEAR_FRACTION = 0.95
 """Default clear level of a current as a fraction of its limit."""
 
@@ -173,6 +176,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "collapse_risk": _collapse_default(settings, cell),
         "stability_margin_low": _Default(0.05, 0.08),
         "cell_imbalance": _Default(0.05, 0.03),
+        "weak_cell": _Default(WEAK_CELL_STD if n > 1 else None, WEAK_CELL_CLEAR_STD),
         "sensor_fault": _Default(0.1, 0.02),
         "model_mismatch": _Default(0.05 * n, 0.03 * n),
         "link_lost": _Default(_default_silent_limit_s(settings), None),
@@ -218,5 +222,6 @@ def _stack_defaults(cell: PackModel) -> dict[AlarmName, _Default]:
         "discharge_over_current": _Default(c.current_max_a, CURRENT_CLEAR_FRACTION * c.current_max_a),
         "charge_over_current": unmonitored,
         "charging_below_freezing": unmonitored,
+        "weak_cell": unmonitored,
         "over_temperature": _Default(90.0, 85.0),
     }

@@ -21,6 +21,7 @@ AlarmName = Literal[
     "collapse_risk",
     "stability_margin_low",
     "cell_imbalance",
+    "weak_cell",
     "sensor_fault",
     "model_mismatch",
     "link_lost",
@@ -79,6 +80,13 @@ class CollapseRule(AlarmRule):
         default=1.0,
         description="accepted number of false alarms in a month of 60 h of use; a larger number warns earlier and of more cut-offs",
     )
+
+
+class DeviationRule(AlarmRule):
+    """Alarm on a deviation in standard deviations."""
+
+    limit: Positive | None = None
+    clear: NotNegative | None = None
 
 
 class LinkRule(AlarmRule):
@@ -161,6 +169,10 @@ class AlarmSettings(Strict):
     )
     stability_margin_low: FractionRule = FractionRule()
     cell_imbalance: VoltageRule = VoltageRule(delay_s=60.0)
+    weak_cell: DeviationRule = Field(
+        default=DeviationRule(delay_s=0.0, clear_delay_s=0.0),
+        description="limit: deviation of a discharge from earlier ones in the direction of one weak cell, in standard deviations",
+    )
     sensor_fault: FractionRule = Field(
         default=FractionRule(clear_delay_s=30.0), description="limit: fraction of samples that are lost or unusable"
     )

@@ -172,6 +172,10 @@ class SimulatedBank:
         """SOC of each cell."""
         return self._state["soc"].copy()
 
+    def discharge_cell(self, cell: int, soc: float) -> None:
+        """Lower the SOC of one cell by ``soc``, as by an internal short in the past."""
+        self._state["soc"][cell] -= soc
+
     def run(self, current_a: Floats, step_s: float = 1.0, temperature_c: float | Floats = 25.0) -> BankHistory:
         """Simulate requested currents, each of which flows for ``step_s`` [s].
 

@@ -122,9 +122,8 @@ class AlarmEvaluator:
         self._has_samples = False  # since the start of this run
         self._unwatched_reasons: dict[AlarmName, str] = {}
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
-        self._loss_intervals = SampleIntervals(
-            math.inf
-        )  # no interval is a gap, because losses are counted in gaps, too
+        # no interval is a gap, because losses are counted in gaps, too, and a weak cell remains weak
+        self._loss_intervals, self._weak_cell_intervals = SampleIntervals(math.inf), SampleIntervals(math.inf)
         self._buffer = SampleBuffer()
         self._counts: SampleCounts | None = None
         self._counted_s = -math.inf
@@ -208,6 +207,19 @@ class AlarmEvaluator:
         value = np.array([math.inf if failing else 0.0])  # this alarm publishes no value
         self._evaluate_values("hook_failed", np.array([self._at_s]), np.array([passed_s]), value, now_s - self._at_s)
         self._save_state()
+
+    def evaluate_weak_cell(self, deviation_std: float, arrival_s: float) -> None:
+        """Evaluate the alarm ``weak_cell`` at the last sample.
+
+        Args:
+            deviation_std: Deviation of the last discharge from the bank's reference [std]; NaN if unknown.
+            arrival_s: Arrival of the last sample on the wall clock [s since 1970].
+        """
+        if not math.isnan(deviation_std):
+            time_s = np.array([self._at_s])
+            _, observed_s = self._weak_cell_intervals.measure(time_s)
+            self._evaluate_values("weak_cell", time_s, observed_s, np.array([deviation_std]), arrival_s - self._at_s)
+            self._save_state()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Acknowledge an alarm, or all alarms. Return their names. Alarms whose cause is gone end now.

@@ -38,6 +38,7 @@ from bms_estimator.service.pack_forecaster import load_forecast_kernels, new_for
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, open_capture
 from bms_estimator.telemetry.alarms import NO_FORECAST, Change
+from bms_estimator.telemetry.weakest_cell import weakest_cell_values
 
 MAX_BLOCK_S = 1.0
 """Maximum duration of a block [s]. Alarms are evaluated after each block, by the capture's clock."""
@@ -119,10 +120,18 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     without_hooks = settings.alarms.model_copy(update={"hook": ()})
     settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
-    monitor = AlarmMonitor(settings, model, estimator, source, clock, changes.append)
     slow_fit = new_slow_fit(settings, estimator)
     forecaster = new_forecaster(settings, model, estimator, slow_fit)
     runner = forecaster or slow_fit or estimator
+    monitor = AlarmMonitor(
+        settings,
+        model,
+        estimator,
+        source,
+        clock,
+        changes.append,
+        weakest_cell=lambda: weakest_cell_values(slow_fit),
+    )
     with progress_bar("replaying") as bar:
         async for received in source:
             now_s = max(now_s, float(received.samples["time_s"][-1]))

@@ -53,6 +53,7 @@ from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 from bms_estimator.telemetry.pack_model import FitTimes, pack_model_health
+from bms_estimator.telemetry.weakest_cell import weakest_cell_values
 
 RARE_FAULT_FRACTION = 0.01
 """Maximum fraction of samples with a fault for which no likely cause is reported."""
@@ -213,6 +214,7 @@ async def _open_publisher(
         clock=Clock(),
         delivery=delivery,
         pack_model=lambda: pack_model_health(pack_model, FitTimes(None, None)) if pack_model else None,
+        weakest_cell=lambda: weakest_cell_values(pack_model),
         forecaster=forecaster,
     )
 
