@@ -18,12 +18,9 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.weakest_cell import WeakestCell
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
-from bms_estimator.simulation.simulated_bank import BankCells, BankHistory, SimulatedBank
+from bms_estimator.simulation.simulated_bank import BankCells
+from tests.pack_model.bank_cycles import CELL, ONE_C, cycle, new_bank
 
-CELL = load_cell("ncr18650")
-"""True cell."""
-ONE_C = CELL.cell.capacity_ah
-"""Current of 1 C [A]."""
 SERIES = 3, 6, 12
 """Numbers of cells in series."""
 STEP_S = 3.0
@@ -58,18 +55,6 @@ class Comparison:
     """True SOC of the weakest cell."""
 
 
-def cycle(bank: SimulatedBank, rng: np.random.Generator) -> Iterator[tuple[bool, BankHistory]]:
-    """Yield a discharge of random steps to SOC 0..0.3, a rest, a full charge and a rest; True: discharge."""
-    room_c = rng.uniform(10.0, 32.0)
-    steps = int(3600 * rng.uniform(1.5, 4.0) / 30.0)
-    load = rng.gamma(1.5, 1.0, steps)
-    load[rng.random(steps) < 0.15] *= -0.2  # regeneration
-    load *= rng.uniform(0.7, 1.0) * ONE_C * 3600.0 / (load.sum() * 30.0)
-    yield True, bank.run(np.repeat(load, int(30.0 / STEP_S)), STEP_S, room_c)
-    for current_a, hours in ((0.0, rng.uniform(0.3, 2.0)), (-0.4 * ONE_C, 4.0), (0.0, rng.uniform(0.3, 2.0))):
-        yield False, bank.run(np.full(int(3600 * hours / STEP_S), current_a), STEP_S, room_c)
-
-
 def comparisons(
     series: int, seed: int, cycles: int, capacity_ratio: float = 1.0, soc_below: float = 0.0
 ) -> Iterator[Comparison]:
@@ -77,7 +62,7 @@ def comparisons(
     rng = np.random.default_rng(seed)
     cells = BankCells.drawn(rng, series, ONE_C)
     cells.warmer_k[:] = np.linspace(0.0, rng.uniform(0.0, MAX_GRADIENT_K), series)
-    bank = SimulatedBank(CELL, cells, full_v=4.2 * series, cutoff_v=2.8 * series)
+    bank = new_bank(cells)
     file = load_cell("nca", FILE_CAPACITY_RATIO * ONE_C).pack(series, 1)
     slow_fit = SlowFit(Estimator(file, voltage_resolution_v=RESOLUTION_V), interval_s=FIT_S)
     assert slow_fit.bank is not None
@@ -86,7 +71,7 @@ def comparisons(
         if number == HEALTHY_CYCLES:
             bank.cells = cells.with_weak_cell(0, capacity_ratio=capacity_ratio)
             bank.discharge_cell(0, soc_below)
-        for is_discharge, history in cycle(bank, rng):
+        for is_discharge, history in cycle(bank, rng, STEP_S):
             samples = history.samples(rng, NOISE_V * np.sqrt(series), RESOLUTION_V)
             drawn = np.cumsum(history.current_a) * STEP_S / 3600.0 / ONE_C
             for begin in range(0, samples.size, BLOCK):
