@@ -189,4 +189,6 @@ def _print(title: str, result: AlarmResult) -> None:
     else:
         console.print(f"{title}: no alarm")
     console.print(f"not raised: {', '.join(result.quiet) or '-'}")
-    console.print(f"not monitored, because the capture lacks the quantity or the load for a forecast: {', '.join(result.unmeasured) or '-'}")
+    console.print(
+        f"not monitored, because the capture lacks the quantity or the load for a forecast: {', '.join(result.unmeasured) or '-'}"
+    )
