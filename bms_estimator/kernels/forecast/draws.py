@@ -13,17 +13,6 @@ from bms_estimator.kernels.forecast.random_numbers import generator_of_draw, nor
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 
-LOAD_STD = 0.1
-"""Std of ln of the future over the drawn load."""
-RESISTANCE_MEAN = 1.05
-"""Mean factor on the voltage drop."""
-RESISTANCE_STD = 0.05
-"""Std of the factor on the voltage drop."""
-GROWTH_MEAN = 1.0
-"""Mean relative growth of the resistances from SOC ``GROWTH_SOC`` to 0, beyond that of the cell file. Cell files are measured
-with rests, in which the concentration recovers."""
-GROWTH_STD = 0.1
-"""Std of the growth."""
 GROWTH_SOC = 0.4
 """SOC below which the resistances grow."""
 
@@ -78,10 +67,10 @@ def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
     d.begin_soc = m.soc + m.soc_std * of_soc
     d.begin_soc -= weakest * max(1.0 - d.begin_soc, 0.0)
     d.capacity_as = m.capacity_as * math.exp(m.capacity_std * of_capacity) / (1.0 + weakest)
-    d.load = math.exp(LOAD_STD * of_load)
+    d.load = math.exp(m.load_std * of_load)
     d.voltage_v = m.voltage_std_v * of_voltage
-    d.resistance = RESISTANCE_MEAN + RESISTANCE_STD * of_resistance
-    d.growth = GROWTH_MEAN + GROWTH_STD * of_growth
+    d.resistance = m.resistance_mean + m.resistance_std * of_resistance
+    d.growth = m.growth_mean + m.growth_std * of_growth
     d.grown = lowness(m.soc)
     d.first_generator = generator
 

@@ -35,6 +35,17 @@ VOLTAGE_STD_V = 0.02
 """Std of the error of one cell's model at 25 C that lasts until the cut-off [V]."""
 VOLTAGE_STD_J = 22e3
 """Activation energy of ``VOLTAGE_STD_V`` squared [J/mol]."""
+LOAD_STD = 0.1
+"""Std of ln of the future over the drawn load."""
+RESISTANCE_MEAN = 1.05
+"""Mean factor on the voltage drop."""
+RESISTANCE_STD = 0.05
+"""Std of the factor on the voltage drop."""
+GROWTH_MEAN = 1.0
+"""Mean relative growth of the resistances towards SOC 0, beyond that of the cell file. Cell files are measured
+with rests, in which the concentration recovers."""
+GROWTH_STD = 0.1
+"""Std of the growth."""
 
 PROJECTED_PACK = np.dtype(
     [
@@ -51,6 +62,11 @@ PROJECTED_PACK = np.dtype(
         ("weakest_std", "f8"),  # std of the weakest cell's SOC below the mean, per unit of SOC discharged
         ("capacity_std", "f8"),  # std of ln capacity
         ("voltage_std_v", "f8"),
+        ("load_std", "f8"),  # std of ln of the future over the drawn load
+        ("resistance_mean", "f8"),  # mean factor on the voltage drop
+        ("resistance_std", "f8"),
+        ("growth_mean", "f8"),  # mean relative growth of the voltage drop towards empty
+        ("growth_std", "f8"),
         ("voltage_v", "f8", OCV_POINTS),  # voltage without load over SOC 0..1, after a discharge to that SOC [V]
         ("end_slope_v", "f8"),  # slope with which the voltage continues below SOC 0 [V]
         ("ohm", "f8", (RESISTANCES, GRID)),  # resistances over SOC 0..1 [ohm]
@@ -73,6 +89,8 @@ def project_pack(m: Record, s: Record, p: Record, cutoff_v: float) -> None:
     m.weakest_std = p.cell_spread if p.series > 1.0 else 0.0
     m.capacity_std = CAPACITY_STD_SHARE * math.sqrt(cov[LN_Q, LN_Q])
     m.voltage_std_v = VOLTAGE_STD_V * p.series * math.sqrt(arrhenius(VOLTAGE_STD_J, s.temperature_c))
+    m.load_std, m.resistance_mean, m.resistance_std = LOAD_STD, RESISTANCE_MEAN, RESISTANCE_STD
+    m.growth_mean, m.growth_std = GROWTH_MEAN, GROWTH_STD
     project_voltage(m, s, p)
     project_resistances(m, s, p)
 
