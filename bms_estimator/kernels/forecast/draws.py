@@ -22,9 +22,7 @@ DRAW = np.dtype(
         ("capacity_as", "f8"),  # of the weakest cell [A s]
         ("load", "f8"),  # factor on the load
         ("voltage_v", "f8"),  # error of the voltage [V]
-        ("resistance", "f8"),  # factor on the voltage drop at the present SOC
-        ("growth", "f8"),  # growth of the voltage drop from SOC ``GROWTH_SOC`` to 0
-        ("grown", "f8"),  # part of the growth that the present resistances contain
+        ("resistance", "f8"),  # factor on the voltage drop
         ("first_generator", "u8"),  # state of the generator of random numbers after these
         ("generator", "u8"),  # present state of the generator
         ("block", "i8"),  # index of the present block of the load
@@ -61,17 +59,14 @@ def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
     generator, of_load = normal(generator)
     generator, of_voltage = normal(generator)
     generator, of_resistance = normal(generator)
-    generator, of_growth = normal(generator)
     generator, of_weakest = normal(generator)
     weakest = m.weakest_std * max(of_weakest, 0.0)  # the weakest cell is never better than the mean
-    d.begin_soc = m.soc + m.soc_std * of_soc
+    d.begin_soc = m.soc - m.early_soc + m.soc_std * of_soc
     d.begin_soc -= weakest * max(1.0 - d.begin_soc, 0.0)
     d.capacity_as = m.capacity_as * math.exp(m.capacity_std * of_capacity) / (1.0 + weakest)
     d.load = math.exp(m.load_std * of_load)
     d.voltage_v = m.voltage_std_v * of_voltage
     d.resistance = m.resistance_mean + m.resistance_std * of_resistance
-    d.growth = m.growth_mean + m.growth_std * of_growth
-    d.grown = lowness(m.soc)
     d.first_generator = generator
 
 
@@ -82,26 +77,12 @@ def lowness(soc: float) -> float:
 
 
 @njit(cache=True)
-def drop_factor(d: Record, soc: float) -> float:
-    """Return the factor on the model's voltage drop at ``soc``."""
-    return d.resistance + d.growth * max(lowness(soc) - d.grown, 0.0)
+def drop_factor(d: Record, m: Record, soc: float) -> float:
+    """Return the factor on the model's voltage drop at ``soc``. The present resistances contain the growth until now."""
+    return d.resistance + m.growth * max(lowness(soc) - lowness(m.soc), 0.0)
 
 
 @njit(cache=True)
-def loaded_voltage(d: Record, m: Record, soc: float, bias_v: float, drop_v: float) -> float:
-    """Return the terminal voltage at ``soc`` [V].
-
-    Args:
-        d: Record of DRAW.
-        m: Record of PROJECTED_PACK.
-        soc: SOC of the weakest cell.
-        bias_v: Errors of the model that the filter has estimated [V], by ``remaining_bias``.
-        drop_v: Voltage drop of the model [V].
-    """
-    return voltage_without_load(m, soc) + bias_v + d.voltage_v - drop_factor(d, soc) * drop_v
-
-
-@njit(cache=True)
-def remaining_bias(m: Record, elapsed_s: float) -> float:
-    """Return the errors of the model that remain after ``elapsed_s`` of those that the filter has estimated [V]."""
-    return m.b_slow_v * math.exp(-elapsed_s / m.slow_s) + m.b_fast_v * math.exp(-elapsed_s / m.fast_s)
+def loaded_voltage(d: Record, m: Record, soc: float, drop_v: float) -> float:
+    """Return the terminal voltage at ``soc`` for the model's voltage drop ``drop_v`` [V]."""
+    return voltage_without_load(m, soc) + m.bias_v + d.voltage_v - drop_factor(d, m, soc) * drop_v

@@ -28,7 +28,7 @@ from bms_estimator.numba_cache import njit
 SOC_STD_SHARE = 0.5
 """Share of the filter's std of the SOC that the draws use. The other half is not independent of the biases."""
 MIN_SOC_STD = 0.02
-"""Std of the SOC that is added to that of the filter."""
+"""Std of the SOC that is added to the filter's [SOC]."""
 CAPACITY_STD_SHARE = 0.5
 """Share of the filter's std of the capacity that the draws use."""
 VOLTAGE_STD_V = 0.02
@@ -41,22 +41,23 @@ RESISTANCE_MEAN = 1.05
 """Mean factor on the voltage drop."""
 RESISTANCE_STD = 0.05
 """Std of the factor on the voltage drop."""
-GROWTH_MEAN = 1.0
-"""Mean relative growth of the resistances towards SOC 0, beyond that of the cell file. Cell files are measured
-with rests, in which the concentration recovers."""
-GROWTH_STD = 0.1
-"""Std of the growth."""
+GROWTH = 0.75
+"""Relative growth of the voltage drop towards SOC 0, beyond that of the cell file, at 25 C. Cell files are measured with rests,
+in which concentrations recover. The growth increases with the Arrhenius factor of ``WEAK_J`` in the cold."""
+EARLY_SOC = 0.005
+"""SOC by which a loaded cell is empty before its OCV curve ends, at 25 C. It increases in the cold as ``GROWTH`` does."""
+EARLY_PLATEAU_SOC = 0.015
+"""The same for a cell whose OCV has a plateau, at all temperatures. Its SOC is corrected only at the knees, and the errors of
+both knees add up."""
 
 PROJECTED_PACK = np.dtype(
     [
-        ("soc", "f8"),
+        ("soc", "f8"),  # by the filter
+        ("early_soc", "f8"),  # SOC at which the loaded pack is empty
         ("capacity_as", "f8"),  # by the filter [A s]
         ("offset_a", "f8"),  # measured less true current [A]
         ("x_a", "f8", BRANCHES),  # filtered currents of the RC pairs [A]
-        ("b_slow_v", "f8"),  # error of the model that persists for hours [V]
-        ("b_fast_v", "f8"),  # error of the model that persists for a minute [V]
-        ("slow_s", "f8"),  # time constant of ``b_slow_v`` [s]
-        ("fast_s", "f8"),  # time constant of ``b_fast_v`` [s]
+        ("bias_v", "f8"),  # present error of the model; near empty it is mainly a shift of the knee, which persists [V]
         ("cutoff_v", "f8"),
         ("soc_std", "f8"),
         ("weakest_std", "f8"),  # std of the weakest cell's SOC below the mean, per unit of SOC discharged
@@ -65,8 +66,7 @@ PROJECTED_PACK = np.dtype(
         ("load_std", "f8"),  # std of ln of the future over the drawn load
         ("resistance_mean", "f8"),  # mean factor on the voltage drop
         ("resistance_std", "f8"),
-        ("growth_mean", "f8"),  # mean relative growth of the voltage drop towards empty
-        ("growth_std", "f8"),
+        ("growth", "f8"),  # relative growth of the voltage drop towards empty
         ("voltage_v", "f8", OCV_POINTS),  # voltage without load over SOC 0..1, after a discharge to that SOC [V]
         ("end_slope_v", "f8"),  # slope with which the voltage continues below SOC 0 [V]
         ("ohm", "f8", (RESISTANCES, GRID)),  # resistances over SOC 0..1 [ohm]
@@ -84,13 +84,15 @@ def project_pack(m: Record, s: Record, p: Record, cutoff_v: float) -> None:
     m.capacity_as = p.capacity_as * math.exp(x[LN_Q])
     for k in range(BRANCHES):
         m.x_a[k] = s.x_a[k] + x[X + k]
-    m.b_slow_v, m.b_fast_v, m.slow_s, m.fast_s = x[B_SLOW], x[B_FAST], p.slow_s, p.fast_s
+    m.bias_v = x[B_SLOW] + x[B_FAST]
     m.soc_std = math.hypot(SOC_STD_SHARE * s.soc_std, MIN_SOC_STD)
     m.weakest_std = p.cell_spread if p.series > 1.0 else 0.0
     m.capacity_std = CAPACITY_STD_SHARE * math.sqrt(cov[LN_Q, LN_Q])
     m.voltage_std_v = VOLTAGE_STD_V * p.series * math.sqrt(arrhenius(VOLTAGE_STD_J, s.temperature_c))
     m.load_std, m.resistance_mean, m.resistance_std = LOAD_STD, RESISTANCE_MEAN, RESISTANCE_STD
-    m.growth_mean, m.growth_std = GROWTH_MEAN, GROWTH_STD
+    cold = max(s.weak, 1.0)
+    m.growth = GROWTH * cold
+    m.early_soc = EARLY_SOC * cold if p.learned > 0.0 else EARLY_PLATEAU_SOC  # the curve of a plateau is not learned
     project_voltage(m, s, p)
     project_resistances(m, s, p)
 

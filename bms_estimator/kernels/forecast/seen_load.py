@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
-from bms_estimator.kernels.forecast.draws import loaded_voltage, remaining_bias
+from bms_estimator.kernels.forecast.draws import loaded_voltage
 from bms_estimator.kernels.forecast.projected_pack import grid_position
 from bms_estimator.kernels.forecast.random_numbers import uniform
 from bms_estimator.model.arrays import Floats, Record, Records
@@ -33,9 +33,9 @@ def follow_seen_load(m: Record, blocks: Records, block_s: float, steps: int, dra
         steps: Maximum number of blocks of a draw.
         draws: Shape (draws,), dtype DRAW, by ``draw_packs``; the outcomes are written.
     """
-    decay, bias_v, nowhere = np.exp(-block_s / TAUS), biases(m, block_s, steps), np.empty(0)
+    decay, nowhere = np.exp(-block_s / TAUS), np.empty(0)
     for n in range(draws.shape[0]):
-        follow_draw(m, blocks, block_s, steps, draws[n], decay, bias_v, 0, nowhere, nowhere)
+        follow_draw(m, blocks, block_s, steps, draws[n], decay, 0, nowhere, nowhere)
 
 
 @njit(cache=True)
@@ -54,18 +54,9 @@ def record_curves(
     After its cut-off a draw keeps its SOC and the cut-off voltage. ``soc`` and ``voltage_v`` have the shape
     (draws, points). The outcomes of the draws are overwritten.
     """
-    decay, bias_v = np.exp(-block_s / TAUS), biases(m, block_s, steps)
+    decay = np.exp(-block_s / TAUS)
     for n in range(draws.shape[0]):
-        follow_draw(m, blocks, block_s, steps, draws[n], decay, bias_v, stride, soc[n], voltage_v[n])
-
-
-@njit(cache=True)
-def biases(m: Record, block_s: float, steps: int) -> Floats:
-    """Return ``remaining_bias`` in the middle of each block [V]."""
-    bias_v = np.empty(steps)
-    for n in range(steps):
-        bias_v[n] = remaining_bias(m, (n + 0.5) * block_s)
-    return bias_v
+        follow_draw(m, blocks, block_s, steps, draws[n], decay, stride, soc[n], voltage_v[n])
 
 
 @njit(cache=True)
@@ -76,7 +67,6 @@ def follow_draw(
     steps: int,
     d: Record,
     decay: Floats,
-    bias_v: Floats,
     stride: int,
     soc_points: Floats,
     voltage_points_v: Floats,
@@ -91,13 +81,13 @@ def follow_draw(
         i, t = grid_position(middle)
         difference_v = difference_drop(m, d, row, i, t)
         drop_v = d.load * (row.drop_v[i] + t * (row.drop_v[i + 1] - row.drop_v[i])) + difference_v
-        if loaded_voltage(d, m, middle, bias_v[step], drop_v) <= m.cutoff_v:
+        if loaded_voltage(d, m, middle, drop_v) <= m.cutoff_v:
             d.ended = 1
             break
         if stride > 0 and step % stride == 0:
             mean_drop_v = d.load * mean_drop(m, row, i, t) + difference_v
             soc_points[step // stride] = middle
-            voltage_points_v[step // stride] = loaded_voltage(d, m, middle, bias_v[step], mean_drop_v)
+            voltage_points_v[step // stride] = loaded_voltage(d, m, middle, mean_drop_v)
         soc = min(soc - moved, 1.0)
         step += 1
         advance_load(blocks, block_s, decay, d)
