@@ -64,8 +64,20 @@ def constant_power(moment: Moment) -> Quantiles:
 
 
 def true_load_given(moment: Moment, samples: SampleBlock) -> Quantiles:
-    """Return the forecast of the model under the true load. ``samples`` end at the cut-off, after which the load repeats."""
-    return under_load(moment, load_by_second(samples, moment.time_s, float(samples["time_s"][-1])))
+    """Return the forecast of the model under the true load, after whose end its last half hour repeats.
+
+    Args:
+        moment: Moment of the forecast.
+        samples: Samples of the discharge, also after the cut-off.
+    """
+    end_s = float(samples["time_s"][-1])
+    true_load = load_by_second(samples, moment.time_s, end_s)
+    last_load = load_by_second(samples, end_s - REPEATED_S, end_s)
+    if true_load is None or last_load is None:
+        return UNKNOWN
+    repeats = 1 + int(moment.left_s / REPEATED_S)
+    current_a = np.concatenate([true_load.current_a, *[last_load.current_a] * repeats])
+    return under_load(moment, GivenLoad(np.ones(current_a.size), current_a, np.full(current_a.size, math.nan)))
 
 
 def drawn_truth(moment: Moment, by_true_load: Quantiles) -> float:

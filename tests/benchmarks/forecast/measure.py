@@ -89,7 +89,7 @@ def of_slow_baselines(ours: Outcome, moment: Moment, discharge: Discharge) -> It
     repeated = baselines.half_hour_repeated(moment)
     if np.isfinite(repeated.p50_s):
         yield replace(ours, method=HALF_HOUR, said=repeated)
-    given = baselines.true_load_given(moment, discharge.samples)
+    given = baselines.true_load_given(moment, discharge.load)
     if np.isfinite(given.p50_s):
         yield replace(ours, method=GIVEN, said=given)
         yield replace(ours, method=PERFECT, truth_s=max(baselines.drawn_truth(moment, given), 1.0))
