@@ -15,26 +15,46 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tests.benchmarks.forecast.captures import Case, cases, other_cases
-from tests.benchmarks.forecast.measure import outcomes
-from tests.benchmarks.forecast.simulations import SIMULATIONS, Simulation
-from tests.benchmarks.forecast.tables import tables
-from tests.benchmarks.recipes import Recipe
+from tests.benchmarks.forecast.ablation import PARTS, outcomes_without_parts
+from tests.benchmarks.forecast.captures import OWN, Case, cases, other_cases
+from tests.benchmarks.forecast.measure import outcomes_of_discharge
+from tests.benchmarks.forecast.scores import Outcome
+from tests.benchmarks.forecast.simulations import SIMULATIONS, Simulation, simulate_discharge
+from tests.benchmarks.forecast.tables import ablation_tables, tables
+from tests.benchmarks.forecast.truth import read_discharge
+from tests.benchmarks.recipes import Recipe, cell_file
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables."""
     options = parser().parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        of_cases = (outcomes(case, Path(folder), has_baselines=not options.no_baselines) for case in chosen(options))
+        of_cases = (run(case, Path(folder), options) for case in chosen(options))
         found = list(chain.from_iterable(of_cases))
     if options.json:
         sys.stdout.write(json.dumps([asdict(outcome) for outcome in found]) + "\n")
         return
     console = Console(width=None if sys.stdout.isatty() else 200)
-    for table in tables(found):
+    for table in ablation_tables(found, [part.name for part in PARTS]) if options.ablation else tables(found):
         if table.row_count:
             console.print(table)
+
+
+def run(case: Case | Simulation, folder: Path, options: argparse.Namespace) -> Iterator[Outcome]:
+    """Yield the outcomes of a case; none if its capture is not a discharge. Cell files are computed in ``folder``."""
+    if isinstance(case, Simulation):
+        discharge, cell = simulate_discharge(case)
+        case = case.case
+    else:
+        found = read_discharge(case)
+        if found is None:
+            return
+        discharge, cell = found, cell_file(case.recipe, folder)
+    if options.ablation:
+        yield from outcomes_without_parts(case, discharge, cell)
+    else:
+        has_baselines = not options.no_baselines and case.file == OWN
+        yield from outcomes_of_discharge(case, discharge, cell, has_baselines=has_baselines)
 
 
 def chosen(options: argparse.Namespace) -> Iterator[Case | Simulation]:
@@ -58,6 +78,7 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--capacity-ah", type=float, default=3.0, help="capacity of this cell [Ah]; default: %(default)g")
     made.add_argument("--no-baselines", action="store_true", help="run only the forecast")
+    made.add_argument("--ablation", action="store_true", help="run the forecast without one of its parts at a time")
     made.add_argument("--json", action="store_true", help="print each outcome instead of tables")
     return made
 

@@ -2,19 +2,16 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import CellModel
 from tests.benchmarks.forecast import baselines
-from tests.benchmarks.forecast.captures import OWN, Case
+from tests.benchmarks.forecast.captures import Case
 from tests.benchmarks.forecast.moments import Moment, moments
 from tests.benchmarks.forecast.scores import Outcome
-from tests.benchmarks.forecast.simulations import Simulation, simulate_discharge
-from tests.benchmarks.forecast.truth import Discharge, read_discharge
-from tests.benchmarks.recipes import cell_file
+from tests.benchmarks.forecast.truth import Discharge
 
 FORECAST, COUNT, HALF_HOUR, POWER = "forecast", "charge / mean current", "half an hour repeated", "constant power"
 PERFECT, GIVEN = "perfect model", "true load given"
@@ -29,51 +26,40 @@ TEMPERATURE_TOLERANCE_K = 3.0
 """Distance from the temperatures of a cell file within which the file knows the temperature [K]."""
 
 
-def outcomes(case: Case | Simulation, folder: Path, *, has_baselines: bool = True) -> Iterator[Outcome]:
-    """Yield the outcomes of a case; none if its capture is not a discharge.
-
-    Args:
-        case: Capture and cell file.
-        folder: Folder in which cell files are computed.
-        has_baselines: True: the other methods run, too, if the cell file is of the first kind, ``OWN``.
-    """
-    if isinstance(case, Simulation):
-        discharge, cell = simulate_discharge(case)
-        yield from outcomes_of_discharge(case.case, discharge, cell, has_baselines=False)
-        return
-    discharge = read_discharge(case)
-    if discharge is not None:
-        cell = cell_file(case.recipe, folder)
-        yield from outcomes_of_discharge(case, discharge, cell, has_baselines=has_baselines and case.file == OWN)
-
-
 def outcomes_of_discharge(
     case: Case, discharge: Discharge, cell: CellModel, *, has_baselines: bool
 ) -> Iterator[Outcome]:
-    """Yield the outcomes of a discharge with a cell file."""
+    """Yield the outcomes of a discharge by the forecast and, if wanted, by the other methods."""
     for n, moment in enumerate(moments(discharge, cell)):
         said = baselines.quantiles_of(moment.forecast)
         if np.isnan(said.p50_s):
             continue  # the forecast has a reason to say nothing
-        ours = Outcome(
-            FORECAST,
-            case.name,
-            case.file,
-            case.load,
-            case.is_phosphate,
-            discharge.temperature_c if np.isfinite(discharge.temperature_c) else REFERENCE_C,
-            knows_temperature(cell, discharge.temperature_c),
-            baselines.mean_current(discharge.samples) / case.recipe.capacity_ah,
-            moment.left_s,
-            moment.left_s,
-            said,
-        )
+        ours = outcome(FORECAST, said, case, discharge, cell, moment)
         yield ours
         if has_baselines:
             yield from of_fast_baselines(ours, moment)
             is_due = n % EVERY == 0 or any(abs(moment.left_s - s) < 1.0 for s in LEADS_S)
             if is_due and min(moment.left_s, said.p50_s) < MAX_LEFT_S:
                 yield from of_slow_baselines(ours, moment, discharge)
+
+
+def outcome(
+    method: str, said: baselines.Quantiles, case: Case, discharge: Discharge, cell: CellModel, moment: Moment
+) -> Outcome:
+    """Return the outcome of a method at a moment of a discharge."""
+    return Outcome(
+        method,
+        case.name,
+        case.file,
+        case.load,
+        case.is_phosphate,
+        discharge.temperature_c if np.isfinite(discharge.temperature_c) else REFERENCE_C,
+        knows_temperature(cell, discharge.temperature_c),
+        baselines.mean_current(discharge.samples) / case.recipe.capacity_ah,
+        moment.left_s,
+        moment.left_s,
+        said,
+    )
 
 
 def of_fast_baselines(ours: Outcome, moment: Moment) -> Iterator[Outcome]:

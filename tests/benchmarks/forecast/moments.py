@@ -44,16 +44,26 @@ class Moment:
 
 
 def moments(discharge: Discharge, cell: CellModel, interval_s: float = INTERVAL_S) -> Iterator[Moment]:
-    """Yield the moments of a discharge in the order of time, whole intervals before the cut-off.
+    """Yield the moments of a discharge. The first SOC is that of the OCV, as it is without a setting.
 
     Args:
         discharge: Samples until the cut-off.
-        cell: Cell file of the estimator. The first SOC is that of the OCV, as it is without a setting.
+        cell: Cell file of the estimator.
+        interval_s: Interval between two moments [s].
+    """
+    estimator = Estimator(cell)
+    return moments_of(Forecaster(estimator, estimator, cutoff_v=discharge.cutoff_v), discharge, interval_s)
+
+
+def moments_of(forecaster: Forecaster, discharge: Discharge, interval_s: float) -> Iterator[Moment]:
+    """Yield the moments of a discharge in the order of time, whole intervals before the cut-off.
+
+    Args:
+        forecaster: Forecaster before the first sample.
+        discharge: Samples until the cut-off.
         interval_s: Interval between two moments [s].
     """
     samples, end_s = discharge.samples, discharge.end_s
-    estimator = Estimator(cell)
-    forecaster = Forecaster(estimator, estimator, cutoff_v=discharge.cutoff_v)
     due_s = np.arange(end_s - interval_s, samples["time_s"][0], -interval_s)[::-1]
     start = 0
     for end in np.unique(np.searchsorted(samples["time_s"], due_s, side="right")).tolist():

@@ -5,11 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bms_estimator.model.arrays import Floats
 from tests.benchmarks.forecast.baselines import Quantiles
 from tests.benchmarks.forecast.moments import INTERVAL_S
 
 OUTSIDE = 2.0 / 0.1
 """Weight of the distance outside a 90 % interval in its interval score."""
+LEVELS = np.array([0.05, 0.5, 0.95])
+"""Levels of the quantiles of a forecast."""
+MIN_QUANTILE_S = 1.0
+"""Minimum of a quantile of which the logarithm is taken [s]."""
 MINUTE_S = 60.0
 
 
@@ -56,7 +61,9 @@ class Score:
     interval: float
     """Median of the interval score of the 90 % band / T."""
     mean_interval: float
-    """Mean of the same."""
+    """Mean of the interval score / T."""
+    pinball: float
+    """Mean pinball loss of ln of the three quantiles. It is a proper score, and no single forecast decides it."""
 
 
 def score(outcomes: Iterable[Outcome]) -> Score | None:
@@ -74,7 +81,14 @@ def score(outcomes: Iterable[Outcome]) -> Score | None:
         float(np.mean(early_s > 0.0)),
         float(np.median(interval)),
         float(np.mean(interval)),
+        pinball_loss(np.log(truth_s), np.log(np.maximum(rows[:, 1:], MIN_QUANTILE_S))),
     )
+
+
+def pinball_loss(truth: Floats, quantiles: Floats) -> float:
+    """Return the mean pinball loss of the quantiles ``LEVELS``. Shapes (n,) and (n, 3)."""
+    above = truth[:, None] - quantiles
+    return float(np.mean(np.maximum(LEVELS * above, (LEVELS - 1.0) * above)))
 
 
 def said_between(low_min: float, high_min: float) -> Condition:

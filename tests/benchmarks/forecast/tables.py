@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 
 from rich import box
 from rich.table import Table
@@ -31,7 +32,16 @@ DRIVE_TARGETS = {3600.0: "20 %", 1800.0: "40 %", 1200.0: "40 %", 600.0: "50 %"}
 """Error to reach in drives at each time before the cut-off [s]."""
 HALF_C = 0.45
 """C-rate from which on a constant load is judged; the capacity of a cell file is not exactly its C-rate's."""
-COLUMNS = ("forecasts", "captures", "median error", "in 90 % band", "before 5 %", "interval score", "its mean")
+COLUMNS = (
+    "forecasts",
+    "captures",
+    "median error",
+    "in 90 % band",
+    "before 5 %",
+    "interval score",
+    "its mean",
+    "pinball loss",
+)
 
 
 @dataclass(frozen=True)
@@ -68,6 +78,14 @@ def tables(outcomes: list[Outcome]) -> Iterator[Table]:
     yield table("by capture", judged, list(capture_groups(judged)))
 
 
+def ablation_tables(outcomes: list[Outcome], parts: list[str]) -> Iterator[Table]:
+    """Yield a table for each kind of load and cell file, with a row for the forecast without each part."""
+    judged = [o for o in outcomes if said_between(*BY_FORECAST_MIN)(o)]
+    for load, kind in product((DRIVE, PULSES, CONSTANT), FILES):
+        of_kind = (o for o in judged if o.load == load and o.file == kind)
+        yield table(f"{load}, {kind}: without", of_kind, [Group(part, _method(part, kind)) for part in parts])
+
+
 def table(title: str, outcomes: Iterable[Outcome], groups: list[Group]) -> Table:
     """Return a table with a row for each group that has outcomes."""
     found = list(outcomes)
@@ -90,6 +108,7 @@ def cells(scores: Score, captures: int) -> Iterator[str]:
     yield f"{captures}"
     yield from (f"{100 * x:.0f} %" for x in (scores.error, scores.inside, scores.early))
     yield from (f"{x:.2f}" for x in (scores.interval, scores.mean_interval))
+    yield f"{scores.pinball:.3f}"
 
 
 def method_groups() -> list[Group]:

@@ -51,6 +51,13 @@ def test_shares_count_each_forecast_once():
     assert (scores.count, scores.inside, scores.early) == (4, 0.5, 0.25)
 
 
+def test_pinball_loss_weights_each_side_of_a_quantile_by_its_level():
+    e = math.e
+    scores = score([replace(OUTCOME, truth_s=100.0, said=Quantiles(100.0 / e, 100.0, 100.0 * e))])
+    assert scores is not None
+    assert scores.pinball == pytest.approx((0.05 + 0.0 + 0.05) / 3.0)
+
+
 def test_no_outcomes_have_no_score():
     assert score([]) is None
 

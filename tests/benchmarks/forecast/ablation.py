@@ -1,0 +1,115 @@
+"""Ablation of the forecast: its scores without one part at a time, from one replay of each capture."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.forecast.given_load import GivenLoad
+from bms_estimator.forecast.projection import Projection, project_seen_load
+from bms_estimator.model.arrays import Floats, Records
+from bms_estimator.model.cell import CellModel
+from tests.benchmarks.forecast.baselines import quantiles_of
+from tests.benchmarks.forecast.captures import Case
+from tests.benchmarks.forecast.measure import MAX_LEFT_S, outcome
+from tests.benchmarks.forecast.moments import moments_of
+from tests.benchmarks.forecast.scores import Outcome
+from tests.benchmarks.forecast.truth import Discharge
+
+INTERVAL_S = 120.0
+"""Interval between two moments [s]."""
+SHUFFLED_S = 10
+"""Length of the pieces of the load whose order is lost [s]."""
+SHUFFLE_SEED = 1
+
+SeenLoad = tuple[Floats, Floats]
+"""Mean and largest current of each second [A]."""
+
+
+def unchanged(seen: SeenLoad) -> SeenLoad:
+    """Return the load as it is."""
+    return seen
+
+
+def last_seconds(seconds: int) -> Callable[[SeenLoad], SeenLoad]:
+    """Return a function that returns the last ``seconds`` of a load."""
+    return lambda seen: (seen[0][-seconds:], seen[1][-seconds:])
+
+
+def without_peaks(seen: SeenLoad) -> SeenLoad:
+    """Return a load whose largest current of each second is its mean."""
+    return seen[0], seen[0]
+
+
+def shuffled(seen: SeenLoad) -> SeenLoad:
+    """Return a load whose pieces of ``SHUFFLED_S`` are in random order."""
+    pieces = seen[0].size // SHUFFLED_S
+    order = np.random.default_rng(SHUFFLE_SEED).permutation(pieces)
+    mean_a, max_a = (part[: pieces * SHUFFLED_S].reshape(pieces, SHUFFLED_S)[order].ravel() for part in seen)
+    return mean_a, max_a
+
+
+@dataclass(frozen=True)
+class Part:
+    """Part of the forecast, and what disables it."""
+
+    name: str
+    pack: Mapping[str, float] = field(default_factory=dict)
+    """Fields of PROJECTED_PACK with the values that disable the part."""
+    load: Callable[[SeenLoad], SeenLoad] = unchanged
+    """Function that changes the load that was seen."""
+
+
+STDS = ("soc_std", "capacity_std", "voltage_std_v", "load_std", "resistance_std", "growth_std")
+"""Fields of PROJECTED_PACK with the spread of the draws."""
+PARTS = (
+    Part("nothing"),
+    Part("load before the last 7,200 s", load=last_seconds(7200)),
+    Part("load before the last 1,800 s", load=last_seconds(1800)),
+    Part("order of the load beyond 10 s", load=shuffled),
+    Part("peaks within a second", load=without_peaks),
+    Part("growth of R towards empty", {"growth_mean": 0.0, "growth_std": 0.0}),
+    *(Part(f"spread: {name}", {name: 0.0}) for name in STDS),
+    Part("all spreads but the load's order", dict.fromkeys(STDS, 0.0)),
+)
+"""Parts of the forecast."""
+
+
+class PartForecaster(Forecaster):
+    """Forecaster with one part disabled.
+
+    Attributes:
+        part: The disabled part.
+    """
+
+    part = PARTS[0]
+
+    def _pack(self) -> Records:
+        pack = super()._pack()
+        for name, value in self.part.pack.items():
+            pack[name] = value
+        return pack
+
+    def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:
+        if load is not None:
+            return super()._project(pack, load)
+        mean_a, max_a = self.part.load(self.load.mean_and_max())
+        if not mean_a.mean() > pack["offset_a"][0]:
+            return None
+        return project_seen_load(pack, mean_a, max_a, self._seed())
+
+
+def outcomes_without_parts(case: Case, discharge: Discharge, cell: CellModel) -> Iterator[Outcome]:
+    """Yield the outcomes of the forecast without each part, with the name of the part as method."""
+    estimator = Estimator(cell)
+    forecaster = PartForecaster(estimator, estimator, cutoff_v=discharge.cutoff_v)
+    for moment in moments_of(forecaster, discharge, INTERVAL_S):
+        if not min(moment.left_s, moment.value("time_to_cutoff_s")) < MAX_LEFT_S:
+            continue  # also without a forecast
+        for part in PARTS:
+            forecaster.part = part
+            said = quantiles_of(forecaster.forecast())
+            yield outcome(part.name, said, case, discharge, cell, moment)
+        forecaster.part = PARTS[0]
