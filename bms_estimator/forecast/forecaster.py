@@ -26,8 +26,10 @@ from bms_estimator.model.sample import SampleBlock
 
 MIN_INTERVAL_S = 10.0
 """Minimum interval between two forecasts, on the clock of the samples [s]."""
-MAX_INTERVAL_S = 60.0
+MAX_INTERVAL_S = 120.0
 """Maximum interval between two forecasts [s]."""
+RETRY_S = 30.0
+"""Interval after which a missing forecast is tried again [s]."""
 INTERVAL_OF_TIME_LEFT = 1.0 / 60.0
 """Interval between two forecasts as a fraction of the time to the cut-off, within its limits."""
 MIN_LOAD_S = 300
@@ -194,9 +196,9 @@ class Forecaster:
 
 def _interval_s(forecast: Forecast) -> float:
     """Return the time until the next forecast [s]. It is shorter near the cut-off."""
+    if forecast.reason is not None:
+        return RETRY_S
     time_left_s = float(forecast.values["time_to_cutoff_s"][0])
-    if math.isnan(time_left_s):
-        return MAX_INTERVAL_S
     return min(max(INTERVAL_OF_TIME_LEFT * time_left_s, MIN_INTERVAL_S), MAX_INTERVAL_S)
 
 

@@ -127,6 +127,27 @@ def test_a_low_load_lasts_for_its_mean_current():
     assert median_s == pytest.approx(0.9 * TRUTH.cell.capacity_ah / 0.05 * 3600.0, rel=0.1)
 
 
+def test_a_pack_in_series_may_end_earlier_by_its_weakest_cell():
+    block = constant_load(1.5, 1000)
+    cell = forecaster()
+    cell.run(block)
+    pack_block = block.copy()
+    pack_block["voltage_v"] *= 6.0
+    estimator = Estimator(TRUTH.pack(6, 1), initial_soc=0.9)
+    pack = Forecaster(estimator, estimator, cutoff_v=6.0 * CUTOFF_V)
+    pack.run(pack_block)
+    assert pack.estimator.soc == pytest.approx(cell.estimator.soc, abs=0.01)
+    ratios = np.divide(values_of(pack.latest, *BAND), values_of(cell.latest, *BAND))
+    assert ratios[0] < 0.95
+    assert 0.9 < ratios[1] < 1.0
+
+
+def test_a_voltage_below_the_cutoff_ends_at_once():
+    forecasts = forecaster(cutoff_v=4.1)
+    forecasts.run(constant_load(1.5, 400))
+    assert values_of(forecasts.latest, "time_to_cutoff_s", "cutoff_within_2min") == [pytest.approx(5.0, abs=5.0), 1.0]
+
+
 def test_the_reason_says_why_there_is_no_forecast():
     forecasts = forecaster()
     assert forecasts.latest.reason == "no sample has been processed yet"
