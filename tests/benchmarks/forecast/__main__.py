@@ -1,6 +1,6 @@
 """Forecasts of the time to the cut-off on real captures, beside other methods.
 
-Each discharge is replayed through the estimator and the forecaster. At each minute before the cut-off the forecast is compared
+Each discharge is replayed through the estimator and the forecaster. Every minute before the cut-off the forecast is compared
 with the true time to the cut-off T, in the last two hours also with other methods. docs/theory/forecast.md tells what is measured.
 """
 
@@ -18,6 +18,7 @@ from rich.console import Console
 from tests.benchmarks.forecast.ablation import PARTS, outcomes_without_parts
 from tests.benchmarks.forecast.captures import OWN, Case, cases, other_cases
 from tests.benchmarks.forecast.measure import outcomes_of_discharge
+from tests.benchmarks.forecast.moments import INTERVAL_S
 from tests.benchmarks.forecast.scores import Outcome
 from tests.benchmarks.forecast.simulations import SIMULATIONS, Simulation, simulate_discharge
 from tests.benchmarks.forecast.tables import ablation_tables, tables
@@ -51,10 +52,10 @@ def run(case: Case | Simulation, folder: Path, options: argparse.Namespace) -> I
             return
         discharge, cell = found, cell_file(case.recipe, folder)
     if options.ablation:
-        yield from outcomes_without_parts(case, discharge, cell)
+        yield from outcomes_without_parts(case, discharge, cell, options.interval)
     else:
         has_baselines = not options.no_baselines and case.file == OWN
-        yield from outcomes_of_discharge(case, discharge, cell, has_baselines=has_baselines)
+        yield from outcomes_of_discharge(case, discharge, cell, options.interval, has_baselines=has_baselines)
 
 
 def chosen(options: argparse.Namespace) -> Iterator[Case | Simulation]:
@@ -77,6 +78,9 @@ def parser() -> argparse.ArgumentParser:
         help="cell file, or name of a cell, for the captures of --data; default: by the name of the folder CELL",
     )
     made.add_argument("--capacity-ah", type=float, default=3.0, help="capacity of this cell [Ah]; default: %(default)g")
+    made.add_argument(
+        "--interval", type=float, default=INTERVAL_S, help="time between two forecasts [s]; default: %(default)g"
+    )
     made.add_argument("--no-baselines", action="store_true", help="run only the forecast")
     made.add_argument("--ablation", action="store_true", help="run the forecast without one of its parts at a time")
     made.add_argument("--json", action="store_true", help="print each outcome instead of tables")

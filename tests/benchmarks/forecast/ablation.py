@@ -18,8 +18,6 @@ from tests.benchmarks.forecast.moments import moments_of
 from tests.benchmarks.forecast.scores import Outcome
 from tests.benchmarks.forecast.truth import Discharge
 
-INTERVAL_S = 120.0
-"""Interval between two moments [s]."""
 SHUFFLED_S = 10
 """Length of the pieces of the load whose order is lost [s]."""
 SHUFFLE_SEED = 1
@@ -62,7 +60,7 @@ class Part:
     """Function that changes the load that was seen."""
 
 
-STDS = ("soc_std", "capacity_std", "voltage_std_v", "load_std", "resistance_std", "growth_std")
+STDS = ("soc_std", "capacity_std", "voltage_std_v", "load_std", "resistance_std")
 """Fields of PROJECTED_PACK with the spread of the draws."""
 PARTS = (
     Part("nothing"),
@@ -70,7 +68,8 @@ PARTS = (
     Part("load before the last 1,800 s", load=last_seconds(1800)),
     Part("order of the load beyond 10 s", load=shuffled),
     Part("peaks within a second", load=without_peaks),
-    Part("growth of R towards empty", {"growth_mean": 0.0, "growth_std": 0.0}),
+    Part("growth of R towards empty", {"growth": 0.0}),
+    Part("SOC at which a loaded cell is empty", {"early_soc": 0.0}),
     *(Part(f"spread: {name}", {name: 0.0}) for name in STDS),
     Part("all spreads but the load's order", dict.fromkeys(STDS, 0.0)),
 )
@@ -101,11 +100,11 @@ class PartForecaster(Forecaster):
         return project_seen_load(pack, mean_a, max_a, self._seed())
 
 
-def outcomes_without_parts(case: Case, discharge: Discharge, cell: CellModel) -> Iterator[Outcome]:
+def outcomes_without_parts(case: Case, discharge: Discharge, cell: CellModel, interval_s: float) -> Iterator[Outcome]:
     """Yield the outcomes of the forecast without each part, with the name of the part as method."""
     estimator = Estimator(cell)
     forecaster = PartForecaster(estimator, estimator, cutoff_v=discharge.cutoff_v)
-    for moment in moments_of(forecaster, discharge, INTERVAL_S):
+    for moment in moments_of(forecaster, discharge, interval_s):
         if not min(moment.left_s, moment.value("time_to_cutoff_s")) < MAX_LEFT_S:
             continue  # also without a forecast
         for part in PARTS:

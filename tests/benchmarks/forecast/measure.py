@@ -8,9 +8,9 @@ import numpy as np
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import CellModel
 from tests.benchmarks.forecast import baselines
-from tests.benchmarks.forecast.captures import Case
+from tests.benchmarks.forecast.captures import PULSES, Case
 from tests.benchmarks.forecast.moments import Moment, moments
-from tests.benchmarks.forecast.scores import Outcome
+from tests.benchmarks.forecast.scores import Outcome, lead
 from tests.benchmarks.forecast.truth import Discharge
 
 FORECAST, COUNT, HALF_HOUR, POWER = "forecast", "charge / mean current", "half an hour repeated", "constant power"
@@ -19,7 +19,7 @@ PERFECT, GIVEN = "perfect model", "true load given"
 MAX_LEFT_S = 7200.0
 """Time to the cut-off, by the capture or by the forecast, up to which the slow methods run [s]."""
 EVERY = 2
-"""Number of moments for each moment at which the slow methods run, except in the last ``LEADS_S``."""
+"""Number of moments for each moment at which the slow methods run, besides those at ``LEADS_S``."""
 LEADS_S = (3600.0, 1800.0, 1200.0, 600.0, 300.0, 120.0)
 """Times before the cut-off at which the forecasts are judged [s]."""
 TEMPERATURE_TOLERANCE_K = 3.0
@@ -27,10 +27,13 @@ TEMPERATURE_TOLERANCE_K = 3.0
 
 
 def outcomes_of_discharge(
-    case: Case, discharge: Discharge, cell: CellModel, *, has_baselines: bool
+    case: Case, discharge: Discharge, cell: CellModel, interval_s: float, *, has_baselines: bool
 ) -> Iterator[Outcome]:
-    """Yield the outcomes of a discharge by the forecast and, if wanted, by the other methods."""
-    for n, moment in enumerate(moments(discharge, cell)):
+    """Yield the outcomes of a discharge by the forecast and, if wanted, by the other methods.
+
+    The slow methods do not run on pulses, whose rests make long loads.
+    """
+    for n, moment in enumerate(moments(discharge, cell, interval_s)):
         said = baselines.quantiles_of(moment.forecast)
         if np.isnan(said.p50_s):
             continue  # the forecast has a reason to say nothing
@@ -38,8 +41,8 @@ def outcomes_of_discharge(
         yield ours
         if has_baselines:
             yield from of_fast_baselines(ours, moment)
-            is_due = n % EVERY == 0 or any(abs(moment.left_s - s) < 1.0 for s in LEADS_S)
-            if is_due and min(moment.left_s, said.p50_s) < MAX_LEFT_S:
+            is_due = n % EVERY == 0 or lead(*LEADS_S)(ours)
+            if case.load != PULSES and is_due and min(moment.left_s, said.p50_s) < MAX_LEFT_S:
                 yield from of_slow_baselines(ours, moment, discharge)
 
 
