@@ -37,7 +37,7 @@ MIN_BLOCK_S = 1.0
 """Resolution of a given load [s]: mean and peak of each block remain."""
 MAX_BLOCKS = 10_000
 """Maximum number of blocks of a given load within a horizon."""
-MAX_TOTAL_STEPS = 1_000_000
+MAX_TOTAL_STEPS = 500_000
 """Maximum number of steps of all draws under a given load, unless there are only ``MIN_DRAWS``."""
 MIN_DRAWS = 100
 """Minimum number of draws under a given load with many parts."""
@@ -133,7 +133,7 @@ def project_trip(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
     step_s, (soc, voltage_v) = horizon_s / (CURVE_POINTS - 1), np.empty((2, draws.size, CURVE_POINTS))
     follow_given_load(pack[0], parts, horizon_s, draws, step_s, soc, voltage_v)
     time_s = np.where(draws["ended"] == 1, draws["time_s"], math.inf)
-    return _curve(step_s * np.arange(CURVE_POINTS), soc, voltage_v, time_s)
+    return _curve(step_s * np.arange(CURVE_POINTS, dtype=np.float64), soc, voltage_v, time_s)
 
 
 def _full_time_s(pack: Records, load_a: float) -> float:

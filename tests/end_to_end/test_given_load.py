@@ -106,7 +106,7 @@ async def test_page_answers_for_a_power_with_a_duration(browser: Browser, servic
         answer = await answer_of(page_tab)
         assert "Charge for this load: enough, probability 100 %" in answer
         assert "90 % band" in answer
-        assert "Energy needed: 150 Wh" in answer
+        assert "Energy needed: 150.0 Wh" in answer
         await page_tab.page.get_by_role("spinbutton", name="for min").fill("6000")
         assert "Charge for this load: not enough, probability 0 %" in await answer_of(page_tab)
         assert page_tab.errors == []

@@ -1,9 +1,10 @@
 """Trips: loads that a user gives, and their outcome."""
 
+import re
+
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import MAX_TRIP_S, constant_trip, profile_trip
@@ -24,7 +25,7 @@ def array(*values: float) -> np.ndarray:
 @pytest.fixture(scope="module")
 def forecaster() -> Forecaster:
     """Return the forecaster of a cell at rest at SOC 0.5."""
-    estimator: Estimator = new_estimator(Settings(pack=PackSettings(initial_soc=0.5)), CELL)
+    estimator = new_estimator(Settings(pack=PackSettings(initial_soc=0.5)), CELL)
     forecaster = Forecaster(estimator, estimator, cutoff_v=CUTOFF_V)
     samples = np.zeros(60, SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(60), 3.62, 25.0
@@ -82,9 +83,8 @@ def test_profile_keeps_each_load_until_the_next_point() -> None:
     ],
 )
 def test_invalid_profile_is_rejected_with_its_point(time_s: list[float], values: list[float], text: str) -> None:
-    with pytest.raises(UserError, match="^.*") as caught:
+    with pytest.raises(UserError, match=re.escape(text)):
         profile_trip("power_w", array(*time_s), array(*values))
-    assert text in str(caught.value)
 
 
 @pytest.mark.parametrize("duration_s", [0.0, -1.0, 2.0 * MAX_TRIP_S, float("nan")])

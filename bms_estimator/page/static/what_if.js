@@ -57,10 +57,9 @@ async function request(body) {
 /** Lines of the answer. */
 function answer(data) {
 	const line = (...parts) => node("p", {}, ...parts);
-	if (data.reason) return [line(`No time to the cut-off: ${data.reason}.`)];
 	const { time_to_cutoff_s: median, time_to_cutoff_p05_s: early, time_to_cutoff_p95_s: late, trip } = data;
 	const band = `90 % band ${f.durations(early, late)}`;
-	const lines = [line(`Cut-off at ${f.volts(data.cutoff_v)}: `, median < 600 ? band : node("b", {}, `in ${f.duration(median)}`), median < 600 ? "" : `, ${band}`)];
+	const lines = [data.reason ? line(`No time to the cut-off: ${data.reason}.`) : line(`Cut-off at ${f.volts(data.cutoff_v)}: `, median < 600 ? band : node("b", {}, `in ${f.duration(median)}`), median < 600 ? "" : `, ${band}`)];
 	if (!trip) return lines;
 	const percent = (x) => f.percent(x, 0);
 	return [

@@ -5,9 +5,10 @@ from typing import Any
 from pydantic.json_schema import models_json_schema
 
 from bms_estimator.model.payloads import PAYLOAD_VERSION
+from bms_estimator.mqtt.receive_queue import MAX_BYTES
 from bms_estimator.settings.pack import DEVICE_NAME, MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
-from bms_estimator.sinks.mqtt.requests import COMMANDS, MAX_PAYLOAD_BYTES
+from bms_estimator.sinks.mqtt.requests import COMMANDS, MAX_PAYLOAD_BYTES, READS
 from bms_estimator.sinks.mqtt.topics import TOPICS
 from bms_estimator.version import __version__
 
@@ -25,16 +26,30 @@ AVAILABILITIES = {
 }
 TRANSACTION = {"type": ["string", "integer", "null"], "description": "repeated in the response"}
 """JSON schema of the field ``transaction`` of requests and responses."""
+PROFILE = {
+    "type": "array",
+    "minItems": 2,
+    "items": {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},
+}
+"""JSON schema of a list of pairs of time [s] and load."""
 ARGUMENTS: dict[str, Document] = {
     "set_soc": {"soc": {"type": "number", "minimum": 0, "maximum": 1, "description": "state of charge"}},
     "current_zero": {},
     "acknowledge_alarm": {"name": {"type": ["string", "null"], "description": "name of an alarm; default: all"}},
     "publish_rate": {"rate_hz": {"type": "number", "minimum": MIN_RATE_HZ, "maximum": MAX_RATE_HZ}},
     "forget_pack": {},
+    "forecast": {
+        "power_w": {"type": "number", "description": "constant power [W], positive on discharge"},
+        "current_a": {"type": "number", "description": "constant current [A], positive on discharge"},
+        "duration_s": {"type": "number", "description": "duration of the constant load [s]; default: no end"},
+        "profile": PROFILE
+        | {"description": "pairs of time [s] and power [W] until the next time; the last is the end"},
+        "current_profile": PROFILE | {"description": "as profile, with current [A]"},
+    },
 }
-"""JSON schemas of the fields of each command."""
-OPTIONAL = ("name",)
-"""Optional fields of commands."""
+"""JSON schemas of the fields of each request."""
+OPTIONAL = ("name", *ARGUMENTS["forecast"])
+"""Optional fields of requests."""
 RESPONSE = {
     "type": "object",
     "properties": {
@@ -79,7 +94,7 @@ def document(base_topic: str) -> Document:
         add_send_operation(name, meaning, 1, retain=True)
         messages[name] = {"contentType": "text/plain", "payload": {"type": "string", "enum": ["online", "offline"]}}
     messages["response"] = {"contentType": "application/json", "payload": RESPONSE}
-    for name in COMMANDS:
+    for name in COMMANDS + READS:
         request, response = f"request_{name}", f"response_{name}"
         add_channel(request, f"request/{name}", request)
         add_channel(response, f"response/{name}", "response")
@@ -121,8 +136,13 @@ def _arguments(name: str) -> Document:
         "type": "object",
         "properties": arguments | {"transaction": TRANSACTION},
         "required": [field for field in arguments if field not in OPTIONAL],
-        "description": f"at most {MAX_PAYLOAD_BYTES} bytes; may be empty if no field is required",
+        "description": f"at most {_max_size(name)}; may be empty if no field is required",
     }
+
+
+def _max_size(name: str) -> str:
+    """Return the maximum size of a request, as text. The longer requests of ``READS`` are limited by the connection."""
+    return f"{MAX_BYTES} bytes with its topic" if name in READS else f"{MAX_PAYLOAD_BYTES} bytes"
 
 
 def _ref(kind: str, name: str) -> Document:

@@ -21,9 +21,11 @@ from bms_estimator.sources.captures.tables.text_format import (
     split_cells,
 )
 
-TIME, CURRENT, POWER, VOLTAGE = "time_s", "current_a", "power_w", "voltage_v"
-"""Names of the columns."""
-LOADS: tuple[LoadQuantity, ...] = (CURRENT, POWER)
+TIME, VOLTAGE = "time_s", "voltage_v"
+"""Names of the columns of time and voltage."""
+CURRENT: LoadQuantity = "current_a"
+"""Name of the column of the current, as in a capture."""
+LOADS: tuple[LoadQuantity, ...] = (CURRENT, "power_w")
 """Columns that give the load."""
 
 

@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.model.payloads import PAYLOAD_VERSION
 from bms_estimator.sinks.mqtt.asyncapi import ARGUMENTS, document
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
-from bms_estimator.sinks.mqtt.requests import COMMANDS
+from bms_estimator.sinks.mqtt.requests import COMMANDS, READS
 from bms_estimator.sinks.mqtt.topics import TOPICS
 from tests.command_line import run
 from tests.sinks.mqtt.payload_record import current_record, find_broken, read_record
@@ -91,7 +91,7 @@ def test_references_of_the_document_resolve() -> None:
 
 def test_document_has_all_topics_and_fields() -> None:
     addresses = {channel["address"] for channel in DOCUMENT["channels"].values()}
-    for name in ("state", "sensor/availability", "alarm/{alarm}", *(f"request/{name}" for name in COMMANDS)):
+    for name in ("state", "sensor/availability", "alarm/{alarm}", *(f"request/{name}" for name in COMMANDS + READS)):
         assert f"bms/{{device}}/{name}" in addresses
     schemas = DOCUMENT["components"]["schemas"]
     for topic in TOPICS.values():
@@ -101,8 +101,8 @@ def test_document_has_all_topics_and_fields() -> None:
 
 
 def test_document_has_the_arguments_of_each_command() -> None:
-    assert set(ARGUMENTS) == set(COMMANDS)
-    payloads = {name: DOCUMENT["components"]["messages"][f"request_{name}"]["payload"] for name in COMMANDS}
+    assert set(ARGUMENTS) == {*COMMANDS, *READS}
+    payloads = {name: DOCUMENT["components"]["messages"][f"request_{name}"]["payload"] for name in COMMANDS + READS}
     assert payloads["set_soc"]["required"] == ["soc"]
     assert payloads["acknowledge_alarm"]["required"] == []
     assert set(payloads["current_zero"]["properties"]) == {"transaction"}
