@@ -13,7 +13,7 @@ def restore_seen_load(file: HistoryFile, load: LoadHistory) -> str:
         load: Empty load.
 
     Returns:
-        Reason for which the file cannot be used, and the load stays empty; empty if there is none.
+        Reason for which the file cannot be used, in which case the load stays empty; an empty text without such a reason.
     """
     try:
         arrays = file.load()

@@ -26,6 +26,7 @@ def condense(load: GivenLoad, block_s: float) -> GivenLoad:
     others_s = np.add.reduceat(duration_s, first) - duration_s[peak]
     others_sum = np.add.reduceat(duration_s * values, first) - duration_s[peak] * values[peak]
     mean = np.divide(others_sum, others_s, out=np.zeros(first.size), where=peak > first)
+    mean = np.minimum(mean, values[peak])  # after rounding
     joined_s = _alternate(np.where(peak > first, others_s, 0.0), duration_s[peak])
     joined = _alternate(mean, values[peak])[joined_s > 0.0]
     joined_s, unknown = joined_s[joined_s > 0.0], np.full(joined.size, np.nan)
