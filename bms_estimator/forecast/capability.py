@@ -93,7 +93,7 @@ def write_capability(
                 state, settings, duration_s, limit_v, max_a, QUANTILE_STDS, scratch
             )
     mean_a = mean_load(state, settings)
-    charge_as = usable_charge(state, settings, mean_a, max(mean_a, largest_a), cutoff_v, scratch)[0]
+    charge_as = usable_charge(state, settings, mean_a, max(mean_a, largest_a), cutoff_v, scratch)
     values["usable_capacity_ah"] = charge_as / 3600.0
     present_a = charge_current(state, settings)
     if present_a < 0.0:

@@ -20,7 +20,6 @@ from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES, TAUS
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
-from bms_estimator.kernels.forecast.discharge import usable_charge
 from bms_estimator.kernels.forecast.power import available_power, new_scratch
 from bms_estimator.kernels.kalman_filter.records import STATES
 from bms_estimator.model.cell import load_cell
@@ -176,10 +175,6 @@ def test_the_usable_capacity_is_the_charge_that_a_constant_load_draws() -> None:
     true_ah = (true_soc[1200] - true_soc[end]) * TRUTH.cell.capacity_ah
     values = capability(estimator, largest_a=current_a)
     assert values["usable_capacity_ah"] == pytest.approx(true_ah, rel=0.05)
-    state, settings = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
-    charge_as, energy_j = usable_charge(state, settings, current_a, current_a, CUTOFF_V, new_scratch())
-    true_mean_v = block["voltage_v"][1200:end].mean()
-    assert energy_j / charge_as == pytest.approx(true_mean_v, rel=0.02)
 
 
 def test_a_peak_of_the_load_reduces_the_usable_capacity() -> None:

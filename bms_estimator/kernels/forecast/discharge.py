@@ -1,4 +1,4 @@
-"""Charge and energy down to the cut-off voltage under a load like the present one.
+"""Charge down to the cut-off voltage under a load like the present one.
 
 The mean current of the load discharges the pack and polarizes the RC pairs. The cut-off comes at a peak of the load, which
 adds a drop over R_0 and over a part of R_1. The filter has learned the resistances at higher SOCs, and they are larger than in
@@ -42,12 +42,8 @@ def mean_load(s: Record, p: Record) -> float:
 
 
 @njit(cache=True)
-def usable_charge(
-    s: Record, p: Record, mean_a: float, peak_a: float, cutoff_v: float, ohm: Floats
-) -> tuple[float, float]:
-    """Return charge [A s] and energy at the terminals [J] until the voltage reaches the cut-off or the SOC reaches 0.
-
-    Both are weighted means over the hypotheses.
+def usable_charge(s: Record, p: Record, mean_a: float, peak_a: float, cutoff_v: float, ohm: Floats) -> float:
+    """Return the charge until the voltage reaches the cut-off or the SOC reaches 0 [A s], the weighted mean over the hypotheses.
 
     Args:
         s: Record of EKF_STATE.
@@ -57,51 +53,36 @@ def usable_charge(
         cutoff_v: Voltage that ends the discharge [V].
         ohm: Scratch space of shape (RESISTANCES,).
     """
-    total = charge_as = energy_j = 0.0
+    total = charge_as = 0.0
     for q in range(s.count):
         weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
-        soc, mean_v = _discharge(s, p, q, mean_a, peak_a, cutoff_v, ohm)
-        moved_as = (s.mean[q, SOC] - soc) * hypothesis_capacity(s, p, q)
+        end_soc = soc_at_cutoff(s, p, q, mean_a, peak_a, cutoff_v, ohm)
         total += weight
-        charge_as += weight * moved_as
-        energy_j += weight * moved_as * mean_v
-    return charge_as / total, energy_j / total
+        charge_as += weight * max(s.mean[q, SOC] - end_soc, 0.0) * hypothesis_capacity(s, p, q)
+    return charge_as / total
 
 
 @njit(cache=True)
-def _discharge(
-    s: Record, p: Record, q: int, mean_a: float, peak_a: float, cutoff_v: float, ohm: Floats
-) -> tuple[float, float]:
-    """Return the SOC at the end of the discharge, and the mean voltage until then [V]."""
-    first_soc = soc = s.mean[q, SOC]
-    voltage_v, peak_drop_v = _voltage(s, p, q, mean_a, peak_a, soc, ohm)
-    sum_v = 0.0
-    while soc > 0.0 and voltage_v - peak_drop_v > cutoff_v:
+def soc_at_cutoff(s: Record, p: Record, q: int, mean_a: float, peak_a: float, cutoff_v: float, ohm: Floats) -> float:
+    """Return the SOC at which the voltage of hypothesis ``q`` reaches the cut-off; 0 if it does not."""
+    soc = s.mean[q, SOC]
+    above_v = peak_voltage(s, p, q, mean_a, peak_a, soc, ohm) - cutoff_v
+    while soc > 0.0 and above_v > 0.0:
         step = min(SOC_STEP, soc)
-        next_v, next_drop_v = _voltage(s, p, q, mean_a, peak_a, soc - step, ohm)
-        fall_v = voltage_v - peak_drop_v - (next_v - next_drop_v)
-        above_v = voltage_v - peak_drop_v - cutoff_v
-        share = above_v / fall_v if fall_v > above_v else 1.0  # of the step before the cut-off
-        sum_v += share * step * (voltage_v + 0.5 * share * (next_v - voltage_v))
-        soc -= share * step
-        if share < 1.0:
-            break
-        voltage_v, peak_drop_v = next_v, next_drop_v
-    moved = first_soc - soc
-    return soc, sum_v / moved if moved > 0.0 else 0.0
+        next_v = peak_voltage(s, p, q, mean_a, peak_a, soc - step, ohm) - cutoff_v
+        if next_v <= 0.0:
+            return soc - step * above_v / (above_v - next_v)
+        soc, above_v = soc - step, next_v
+    return soc
 
 
 @njit(cache=True)
-def _voltage(
-    s: Record, p: Record, q: int, mean_a: float, peak_a: float, soc: float, ohm: Floats
-) -> tuple[float, float]:
-    """Return the voltage at ``soc`` under the mean current, and the additional drop at a peak [V]."""
+def peak_voltage(s: Record, p: Record, q: int, mean_a: float, peak_a: float, soc: float, ohm: Floats) -> float:
+    """Return the voltage at a peak of the load at ``soc``, after the mean current until there [V]."""
     elapsed_s = (s.mean[q, SOC] - soc) * hypothesis_capacity(s, p, q) / mean_a
     scaled_resistances(s, p, q, soc, ohm)
-    growth = GROWTH * (max(GROWTH_SOC - soc, 0.0) - max(GROWTH_SOC - s.mean[q, SOC], 0.0)) / GROWTH_SOC
-    drop_v = ohm[0] * mean_a
+    drop_v = ohm[0] * peak_a + PEAK_SHARE_R_1 * ohm[1] * (peak_a - mean_a)
     for k in range(BRANCHES):
         drop_v += ohm[1 + k] * branch_current(s, q, k, mean_a, elapsed_s)
-    peak_drop_v = (ohm[0] + PEAK_SHARE_R_1 * ohm[1]) * (peak_a - mean_a)
-    factor = RESISTANCE_FACTOR + growth
-    return open_circuit_voltage(s, p, q, soc, elapsed_s) - factor * drop_v, factor * peak_drop_v
+    growth = GROWTH * (max(GROWTH_SOC - soc, 0.0) - max(GROWTH_SOC - s.mean[q, SOC], 0.0)) / GROWTH_SOC
+    return open_circuit_voltage(s, p, q, soc, elapsed_s) - (RESISTANCE_FACTOR + growth) * drop_v

@@ -36,8 +36,10 @@ from bms_estimator.numba_cache import njit
 CHECKED = (0.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)
 """Fractions of the duration at which the voltage is checked. It is not always lowest or highest at the end: after a larger load,
 the RC pairs recover while the SOC still falls."""
-BISECTIONS = 24
-"""Number of bisections. The error of the current is below 1e-7 of the current limit."""
+MAX_ITERATIONS = 24
+"""Maximum number of iterations of the search for the current. About five suffice."""
+TOLERANCE_V = 1e-6
+"""Distance of the voltage from the limit at which the search ends [V]."""
 MIN_REACH_SOC = 1e-3
 """Minimum SOC width of the OCV's secant."""
 
@@ -58,24 +60,59 @@ def available_power(
         scratch: Scratch space of shape (RESISTANCES + STATES,).
     """
     direction = math.copysign(1.0, max_a)
-    if (
-        max_a == 0.0
-        or closest_voltage(s, p, 0.0, duration_s, direction, stds, scratch) * direction <= limit_v * direction
-    ):
+    at_rest_v = direction * (closest_voltage(s, p, 0.0, duration_s, direction, stds, scratch) - limit_v)
+    if max_a == 0.0 or at_rest_v <= 0.0:
         return 0.0
     current_a = max_a
-    if closest_voltage(s, p, max_a, duration_s, direction, stds, scratch) * direction < limit_v * direction:
-        low_a, high_a = 0.0, max_a
-        for _ in range(BISECTIONS):
-            middle_a = 0.5 * (low_a + high_a)
-            if closest_voltage(s, p, middle_a, duration_s, direction, stds, scratch) * direction >= limit_v * direction:
-                low_a = middle_a
-            else:
-                high_a = middle_a
-        current_a = low_a
+    at_max_v = direction * (closest_voltage(s, p, max_a, duration_s, direction, stds, scratch) - limit_v)
+    if at_max_v < 0.0:
+        current_a = current_at_limit(s, p, duration_s, limit_v, (max_a, at_rest_v, at_max_v), stds, scratch)
     if direction > 0.0:
         return current_a * closest_voltage(s, p, current_a, duration_s, direction, stds, scratch)
     return -current_a * voltage_quantile(s, p, current_a, 0.0, 0.0, scratch)  # the voltage is lowest at the beginning
+
+
+@njit(cache=True)
+def current_at_limit(
+    s: Record,
+    p: Record,
+    duration_s: float,
+    limit_v: float,
+    bracket: tuple[float, float, float],
+    stds: float,
+    scratch: Floats,
+) -> float:
+    """Return the current whose quantile of the voltage comes closest to ``limit_v`` without crossing it [A].
+
+    The method is the false position with halved weights (Illinois). The voltage is nearly linear in the current.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        duration_s: Duration of the current [s].
+        limit_v: Limit of the voltage [V].
+        bracket: Largest current [A], and distance of the voltage from the limit at rest and at this current [V]; the first is
+            above and the second below 0.
+        stds: Distance of the quantile from the mean towards the limit, in standard deviations.
+        scratch: Scratch space of shape (RESISTANCES + STATES,).
+    """
+    outside_a, inside_v, outside_v = bracket
+    inside_a, last = 0.0, 0
+    direction = math.copysign(1.0, outside_a)
+    for _ in range(MAX_ITERATIONS):
+        middle_a = (inside_a * outside_v - outside_a * inside_v) / (outside_v - inside_v)
+        distance_v = direction * (closest_voltage(s, p, middle_a, duration_s, direction, stds, scratch) - limit_v)
+        if abs(distance_v) < TOLERANCE_V:
+            return middle_a
+        if distance_v > 0.0:
+            inside_a, inside_v = middle_a, distance_v
+            outside_v *= 0.5 if last == 1 else 1.0
+            last = 1
+        else:
+            outside_a, outside_v = middle_a, distance_v
+            inside_v *= 0.5 if last == -1 else 1.0
+            last = -1
+    return inside_a
 
 
 @njit(cache=True)
