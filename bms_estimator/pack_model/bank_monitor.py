@@ -9,7 +9,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.open_circuit import drawn_soc, row_soc
-from bms_estimator.pack_model.weakest_cell import ReferenceCurve, WeakestCell, compare
+from bms_estimator.pack_model.weakest_cell import MIN_ROWS, Comparison, ReferenceCurve, WeakestCell
 from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_STD, WEAK_CELL_STD
 
 CHARGED_SOC = 0.05
@@ -86,12 +86,11 @@ class BankMonitor:
         if self._discharge is None or self._discharge.start_s != rows["elapsed_s"][start]:
             self._discharge = self._begin(rows, start, fit)
         discharge, measured = self._discharge, rows[start:][is_discharge(rows[start:])]
-        if discharge.reference is None:
+        if discharge.reference is None or measured.size < MIN_ROWS:
             return
         soc = discharge.soc(self._cell, measured)
-        result = compare(self._cell, discharge.fit, discharge.reference, measured, soc)
-        if result is not None:
-            self._decide(result, discharge.start_s, float(rows["elapsed_s"][-1]))
+        comparison = Comparison(self._cell, discharge.fit, discharge.reference, measured, soc)
+        self._decide(comparison.weakest(), discharge.start_s, float(rows["elapsed_s"][-1]))
 
     def _begin(self, rows: NDArray[np.void], start: int, fit: PackFit) -> Discharge:
         """Return the discharge that begins with the row ``start``. While a cell is weak, the fit does not change."""

@@ -14,9 +14,9 @@ from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS
 
 HALF_ROW_SOC = 0.01
 """Half width of the secant that gives the slope of the OCV: the secant covers the SOC range of a row."""
-COLLAPSE_V = 20.0
-"""Slope of the OCV of a cell below SOC 0 [V per unit SOC]. Assumed: over-discharged cells fall to 0 V within a few percent to
-20 % of their capacity."""
+COLLAPSE_V = 50.0
+"""Slope of the OCV of a cell below SOC 0 [V per unit SOC]. The voltage of an over-discharged cell falls to 0 within a few
+percent of its capacity. Assumed."""
 
 
 @dataclass(frozen=True)

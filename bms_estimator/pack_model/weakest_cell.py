@@ -44,6 +44,12 @@ COMMON_SOC_STD, COMMON_CAPACITY_STD = 0.02, 0.01
 """Std of the change of SOC and capacity that all cells share, since the reference: error of the SOC, and aging."""
 COMMON_DROP_STD, COMMON_ENTROPY_STD_V, COMMON_VOLTAGE_STD_V = 0.05, 1e-4, 1e-3
 """Std of the common relative change of the overpotential, of the temperature coefficient [V/K], and of the voltage [V]."""
+COMMON_DROP_STD_PER_K, DROP_STD_PER_K = 0.02, 0.005
+"""Increase of the relative std of the overpotential with the difference of the temperature from that of the reference [1/K]:
+of the common change, and of that along SOC. The temperature dependence of a generic cell file is that of another cell."""
+LOAD_DROP_STD = 0.1
+"""Relative std of the difference of the overpotential from its mean in the reference, independent from row to row. The
+estimator's RC pairs are less exact for loads that differ from the usual ones."""
 SHIFTS, SHRINKS = np.linspace(0.0, 0.4, 21), np.linspace(0.0, 0.6, 25)
 """Tested values of ``shift`` and ``shrink``."""
 SHIFT_STD, SHRINK_STD = 0.03, Noise.cell_spread
@@ -67,7 +73,8 @@ class WeakestCell:
     filter_soc: float
     """SOC of the bank by the filter at the last row."""
     deviation_std: float
-    """Deviation from the reference in the direction of one weak cell: square root of twice the log-likelihood ratio [std]."""
+    """Deviation from the reference in the direction of one weak cell: square root of twice the log-likelihood ratio without the
+    row that supports it most [std]."""
     mean: Floats
     """Mean of ``shift`` and ``shrink``."""
     covariance: Floats
@@ -108,6 +115,8 @@ class ReferenceCurve:
     """Std by which another discharge of the same bank differs from ``error_v``, shape (BINS,) [V]."""
     temperature_c: float
     """Mean temperature [degC]."""
+    drop_v: float
+    """Mean overpotential [V]."""
 
     @classmethod
     def of(cls, cell: CellCurves, fit: PackFit, rows: NDArray[np.void]) -> "ReferenceCurve | None":
@@ -134,13 +143,12 @@ class ReferenceCurve:
             error_v=np.interp(BIN_SOC, BIN_SOC[is_known], mean_v[is_known]) if is_known.any() else np.zeros(BINS),
             std_v=np.sqrt(variance_v2 * (1.0 + 1.0 / np.maximum(count, 1)) + unknown_v2),
             temperature_c=float(measured.temperature_c.mean()),
+            drop_v=float(measured.drop_v.mean()),
         )
 
 
-def compare(
-    cell: CellCurves, fit: PackFit, reference: ReferenceCurve, rows: NDArray[np.void], soc: Floats
-) -> WeakestCell | None:
-    """Return the weakest cell by the rows of one discharge; None if there are too few rows.
+class Comparison:
+    """Comparison of one discharge with the reference of its bank.
 
     The likelihood of each hypothesis contains changes that all cells share: SOC, capacity, resistances, temperature
     coefficient and voltage.
@@ -151,48 +159,67 @@ def compare(
         reference: Reference of the bank.
         rows: Shape (n,), dtype HISTORY_ROW: rows of the discharge with a voltage.
         soc: SOC of the rows, if no cell were weak, shape (n,).
+
+    Attributes:
+        measured: Open-circuit voltages of the rows.
+        deviation_v: Deviation of E_o of the mean cell from the reference, shape (n,) [V].
     """
-    if rows.size < MIN_ROWS:
-        return None
-    measured, z = OpenCircuit.of(cell, fit, rows, soc), soc
-    deviation_v = measured.error_v - np.interp(z, BIN_SOC, reference.error_v)
-    whitening = np.linalg.cholesky(_covariance(cell, fit, reference, measured))
-    y = solve_triangular(whitening, deviation_v, lower=True)
-    templates = solve_triangular(whitening, weak_cell_deviation(cell, fit, measured), lower=True)
-    ln_likelihood = templates.T @ y - 0.5 * (templates**2).sum(axis=0)
-    ln_weight = LN_PRIOR + LIKELIHOOD_EXPONENT * ln_likelihood
-    weight = np.exp(ln_weight - ln_weight.max())
-    values = np.stack([SHIFT, SHRINK])
-    return WeakestCell(
-        soc=float(z[-1]),
-        filter_soc=float(rows["soc"][-1]),
-        deviation_std=math.sqrt(max(2.0 * float(ln_likelihood.max()), 0.0)),
-        mean=np.average(values, axis=1, weights=weight),
-        covariance=np.cov(values, aweights=weight, ddof=0).astype(np.float64),
-    )
 
+    def __init__(
+        self, cell: CellCurves, fit: PackFit, reference: ReferenceCurve, rows: NDArray[np.void], soc: Floats
+    ) -> None:
+        self.measured = OpenCircuit.of(cell, fit, rows, soc)
+        self.deviation_v: Floats = self.measured.error_v - np.interp(soc, BIN_SOC, reference.error_v)
+        self._cell, self._fit, self._filter_soc = cell, fit, float(rows["soc"][-1])
+        self._whitening = np.linalg.cholesky(_covariance(cell, fit, reference, self.measured))
 
-def weak_cell_deviation(cell: CellCurves, fit: PackFit, measured: OpenCircuit) -> Floats:
-    """Return the deviation of E_o of the mean cell in each row by each hypothesis, shape (n, hypotheses) [V]."""
-    soc = measured.soc[:, None]
-    weak_soc = soc - SHIFT - SHRINK * (1.0 - soc)
-    weak_v = fitted_ocv(cell, fit, weak_soc) - measured.overpotential.at(weak_soc)
-    return np.asarray((weak_v - fitted_ocv(cell, fit, soc) + measured.drop_v[:, None]) / cell.series)
+    def weakest(self, deviation_v: Floats | None = None) -> WeakestCell:
+        """Return the estimate of the weakest cell by a deviation, shape (n,) [V]; default: ``deviation_v``."""
+        y = solve_triangular(self._whitening, self.deviation_v if deviation_v is None else deviation_v, lower=True)
+        templates = solve_triangular(self._whitening, self.by_weak_cell(SHIFT, SHRINK), lower=True)
+        by_row = templates * y[:, None] - 0.5 * templates**2
+        ln_likelihood = by_row.sum(axis=0) - np.maximum(by_row.max(axis=0), 0.0)  # one wrong row is no evidence
+        ln_weight = LN_PRIOR + LIKELIHOOD_EXPONENT * ln_likelihood
+        weight = np.exp(ln_weight - ln_weight.max())
+        values = np.stack([SHIFT, SHRINK])
+        return WeakestCell(
+            soc=float(self.measured.soc[-1]),
+            filter_soc=self._filter_soc,
+            deviation_std=math.sqrt(max(2.0 * float(ln_likelihood.max()), 0.0)),
+            mean=np.average(values, axis=1, weights=weight),
+            covariance=np.cov(values, aweights=weight, ddof=0).astype(np.float64),
+        )
+
+    def by_weak_cell(self, shift: Floats, shrink: Floats) -> Floats:
+        """Return the deviations of E_o of the mean cell by m weak cells, shape (n, m) [V].
+
+        Args:
+            shift: SOC by which each lies below the others when these are full, shape (m,).
+            shrink: Capacity of the others relative to that of each, minus 1, shape (m,).
+        """
+        soc = self.measured.soc[:, None]
+        weak_soc = soc - shift - shrink * (1.0 - soc)
+        weak_v = fitted_ocv(self._cell, self._fit, weak_soc) - self.measured.overpotential.at(weak_soc)
+        other_v = fitted_ocv(self._cell, self._fit, soc) - self.measured.drop_v[:, None]
+        return np.asarray((weak_v - other_v) / self._cell.series)
 
 
 def _covariance(cell: CellCurves, fit: PackFit, reference: ReferenceCurve, measured: OpenCircuit) -> Floats:
     """Return the covariance of the deviations of a healthy bank, shape (n, n) [V^2]."""
     z = measured.soc
-    std_v, slope_v = np.interp(z, BIN_SOC, reference.std_v), fitted_slope(cell, fit, z)
+    away_k = measured.temperature_c - reference.temperature_c
+    std_v = np.hypot(np.interp(z, BIN_SOC, reference.std_v), DROP_STD_PER_K * away_k * measured.drop_v)
+    slope_v = fitted_slope(cell, fit, z)
     common = np.column_stack(
         [
             COMMON_SOC_STD * slope_v,
             COMMON_CAPACITY_STD * slope_v * (1.0 - z),
-            COMMON_DROP_STD * measured.drop_v,
-            COMMON_ENTROPY_STD_V * (measured.temperature_c - reference.temperature_c),
+            np.hypot(COMMON_DROP_STD, COMMON_DROP_STD_PER_K * away_k) * measured.drop_v,
+            COMMON_ENTROPY_STD_V * away_k,
             np.full(z.size, COMMON_VOLTAGE_STD_V),
         ]
     )
     correlation = (1.0 - INDEPENDENT_FRACTION) * np.exp(-np.abs(z[:, None] - z) / CORRELATED_SOC)
     correlation[np.diag_indices(z.size)] = 1.0
-    return np.asarray(np.outer(std_v, std_v) * correlation + common @ common.T)
+    by_load_v2 = (LOAD_DROP_STD * (measured.drop_v - reference.drop_v)) ** 2
+    return np.asarray(np.outer(std_v, std_v) * correlation + common @ common.T + np.diag(by_load_v2))

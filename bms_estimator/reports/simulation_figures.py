@@ -15,6 +15,7 @@ from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_le
 from bms_estimator.model.arrays import Floats
 from bms_estimator.plot.style import COLORS, FAINT
 from bms_estimator.plot.thinning import thin
+from bms_estimator.reports.bank_figure import LOAD_C, WEAK_SOC, BankExperiment
 from bms_estimator.reports.report_items import Figure, Reproduction
 from bms_estimator.reports.simulation import (
     FINAL_SOC,
@@ -31,8 +32,6 @@ NO_VALUES = "The thesis prints no value of the figure that could be compared."
 """Reason of a figure without printed values."""
 FULL_SOC_GRID = np.linspace(0.0, 1.0, 1001)
 """SOC grid over the full range."""
-WEAK_BATTERY_SOC = (0.85, 0.7)
-"""Initial SOC of the weak batteries in Fig. 43."""
 
 
 def curve(key: str, title: str, unit: str, values: Floats, limits: tuple[float, float] | None = None) -> Figure:
@@ -387,24 +386,30 @@ def dynamic_static_plot(axes: Any, dynamic: Prediction, static: Prediction) -> N
 
 
 def figure_43(s: Simulation) -> Figure:
-    """Draw the open-circuit voltage E_o of a healthy and of a faulty bank of three batteries in series."""
-    drawn = np.linspace(0.0, 1.0, 800)
-    starts = {"healthy bank": (1.0, 1.0, 1.0), "two weak batteries": (1.0, *WEAK_BATTERY_SOC)}
+    """Draw the open-circuit voltage E_o of a healthy and of a faulty bank of three batteries, with the located dips."""
+    bank = BankExperiment(s.cell)
+    dips = bank.dips
 
     def draw(axes: Any) -> None:
-        for label, initial in starts.items():
-            bank = [sum(emf(max(soc - q, 0.0), s.cell.a) for soc in initial) for q in drawn]
-            axes.plot(drawn, bank, label=label)
+        for label, discharge in (("healthy bank", bank.healthy), ("two weak batteries", bank.faulty)):
+            axes.plot(discharge.drawn, discharge.e_o_v, label=label)
+        for drawn in dips:
+            axes.axvline(drawn, color=FAINT, linestyle="--", label="located dip" if drawn == dips[0] else None)
+        axes.axvline(bank.warning, color=COLORS[2], linestyle=":", label="warning")
         axes.set(xlabel="charge drawn, in capacities of one battery", ylabel="E_o of the bank [V]")
         axes.legend()
 
+    found = " and ".join(f"{drawn:.2f}" for drawn in dips)
     return Figure(
         "43",
         "E_o of a healthy bank and of one with two weak batteries",
         plot(draw, salt="figure-43"),
         Reproduction.NO_DATA,
-        "The bank's batteries and their SOC are not printed; here three cells of Chen and Mora in series, two of which start at SOC "
-        f"{WEAK_BATTERY_SOC[0]:g} and {WEAK_BATTERY_SOC[1]:g}. As in print, each weak battery causes a dip when it is empty.",
+        f"The bank's batteries and their SOC are not printed; here three cells of Chen and Mora in series under a load of {LOAD_C:g} C, "
+        f"two of which start at SOC {WEAK_SOC[0]:g} and {WEAK_SOC[1]:g}. E_o is the measured voltage, corrected for the load. As in print, "
+        f"each weak battery causes a dip when it is empty. The dips are located at {found} of the charge, where E_o falls fastest below "
+        f"that of the healthy bank. The comparison with two healthy discharges warns at {bank.warning:.2f}. The sum does not show which "
+        "battery is weak.",
     )
 
 

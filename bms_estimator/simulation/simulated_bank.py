@@ -23,11 +23,9 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.numba_cache import njit
+from bms_estimator.pack_model.open_circuit import COLLAPSE_V
 from bms_estimator.settings.observer import IdentifierSettings
 
-COLLAPSE_V = 50.0
-"""Slope of the OCV of a cell below SOC 0 [V per unit SOC]. The voltage of an over-discharged cell falls to 0 within a few
-percent of its capacity. Assumed."""
 TAPER_C = 0.05
 """Current at which the charger ends the charge, as a C-rate of the mean capacity."""
 FAST_FRACTION = 0.6

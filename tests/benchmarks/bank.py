@@ -37,6 +37,8 @@ MAX_GRADIENT_K = 5.0
 """Temperature difference between the coldest and the warmest cell [K]."""
 HEALTHY_CYCLES = 5
 """Number of cycles before a cell becomes weak."""
+REFERENCE_CYCLES = 2
+"""Number of cycles of which no discharge is compared, because they are the first reference."""
 MODEL_ERROR_V = 8e-3
 """Model error of a cell in the idealized bound [V]."""
 
@@ -107,7 +109,9 @@ def false_alarms(banks: int, cycles: int) -> None:
             largest += by_cycle.values()
         deviation = np.array(largest)
         limits = [f"{(deviation >= limit).sum()}" for limit in (3.0, 4.0, WEAK_CELL_STD)]
-        print_row(series, deviation.size, *limits, f"{deviation.max():.1f}", f"{within(errors):.0%}")
+        print_row(
+            series, banks * (cycles - REFERENCE_CYCLES), *limits, f"{deviation.max():.1f}", f"{within(errors):.0%}"
+        )
 
 
 def detections(banks: int) -> None:
@@ -159,8 +163,8 @@ def quantiles(values: list[float] | Floats) -> str:
 def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--banks", type=int, default=5, help="number of simulated banks of each kind")
-    parser.add_argument("--cycles", type=int, default=25, help="number of cycles of a healthy bank")
+    parser.add_argument("--banks", type=int, default=2, help="number of simulated banks of each kind")
+    parser.add_argument("--cycles", type=int, default=16, help="number of cycles of a healthy bank")
     arguments = parser.parse_args()
     false_alarms(arguments.banks, arguments.cycles)
     detections(arguments.banks)

@@ -182,7 +182,7 @@ function alarmRow(a) {
 const SHOWN = {
 	voltage_v: f.volts, voltage_estimate_v: f.volts, current_a: f.amperes, power_w: f.watts, temperature_c: f.celsius,
 	innovation_v: f.millivolts, usable_capacity_ah: f.ampereHours, remaining_energy_wh: f.wattHours, remaining_capacity_ah: f.ampereHours,
-	energy_out_kwh: (x) => f.wattHours(1e3 * x), energy_in_kwh: (x) => f.wattHours(1e3 * x), soc: f.percent, stability_margin: f.percent,
+	energy_out_kwh: (x) => f.wattHours(1e3 * x), energy_in_kwh: (x) => f.wattHours(1e3 * x), soc: f.percent, weakest_cell_soc: f.percent, stability_margin: f.percent,
 };
 
 /** Time to the cut-off, or while charging to full, with its 90 % band. Below ten minutes a single load peak decides, so only the band is shown. */
@@ -199,6 +199,7 @@ function drawState(s) {
 	for (const [name, show] of Object.entries(SHOWN)) put(name, show(s[name]));
 	for (const part of parts) hide(part, !number(part.dataset.of === "time_left" ? time : s[part.dataset.of]));
 	put("soc_std", f.percent(number(s.soc_std) ? 2 * s.soc_std : null));
+	put("weakest_cell_soc_std", f.percent(number(s.weakest_cell_soc_std) ? 2 * s.weakest_cell_soc_std : null));
 	put("time_left", left);
 	put("time_left_label", label);
 	put("time_left_band", band);
