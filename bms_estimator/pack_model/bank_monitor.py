@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit
+from bms_estimator.pack_model.history import History, WeakCellTime
 from bms_estimator.pack_model.open_circuit import drawn_soc, row_soc
 from bms_estimator.pack_model.weakest_cell import MIN_ROWS, Comparison, ReferenceCurve, WeakestCell
 from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_STD, WEAK_CELL_STD
@@ -47,7 +48,6 @@ class BankMonitor:
 
     Attributes:
         weakest: Present result; None before the first comparison.
-        is_weak: True after a discharge that found a weak cell, until one as deep does not.
     """
 
     def __init__(self, cell: CellCurves) -> None:
@@ -57,74 +57,75 @@ class BankMonitor:
     def reset(self) -> None:
         """Forget all results, as for a new bank."""
         self.weakest: WeakestCell | None = None
-        self.is_weak = False
-        self._decided_s, self._decided_soc = (
-            -np.inf,
-            np.inf,
-        )  # discharge of ``weakest``, and SOC that a later one must reach
-        self._weak_s: list[tuple[float, float]] = []  # times of discharges with a weak cell
+        self._decided_s, self._healthy_soc = -np.inf, np.inf  # discharge of ``weakest``, and its SOC if no cell is weak
         self._discharge: Discharge | None = None
 
-    def add(self, rows: NDArray[np.void], new: int, fit: PackFit) -> None:
+    def add(self, history: History, new: int, fit: PackFit) -> None:
         """Evaluate the last ``new`` rows of a history, one by one.
 
         Args:
-            rows: Shape (n,), dtype HISTORY_ROW, in order of time.
+            history: History of the bank; times of weak cells are added.
             new: Number of new rows.
             fit: Latest fit of the history.
         """
         if fit.is_exchanged and self._discharge is not None and self._discharge.fit.first_segment < fit.first_segment:
             self.reset()
-        rows = rows[rows["segment"] >= fit.first_segment]
+            history.weak_cell_times.clear()
+        rows = history.rows[history.rows["segment"] >= fit.first_segment]
         for end in range(max(rows.size - new, 0) + 1, rows.size + 1):
             if is_discharge(rows[end - 1 : end]).all():
-                self._evaluate(rows[:end], fit)
+                self._evaluate(rows[:end], history.weak_cell_times, fit)
 
-    def _evaluate(self, rows: NDArray[np.void], fit: PackFit) -> None:
+    def _evaluate(self, rows: NDArray[np.void], weak: list[WeakCellTime], fit: PackFit) -> None:
         """Compare the discharge that the last row belongs to."""
         start = discharge_start(rows, CHARGED_SOC * self._cell.capacity_as)
         if self._discharge is None or self._discharge.start_s != rows["elapsed_s"][start]:
-            self._discharge = self._begin(rows, start, fit)
+            self._discharge = self._begin(rows, start, weak, fit)
         discharge, measured = self._discharge, rows[start:][is_discharge(rows[start:])]
         if discharge.reference is None or measured.size < MIN_ROWS:
             return
         soc = discharge.soc(self._cell, measured)
-        comparison = Comparison(self._cell, discharge.fit, discharge.reference, measured, soc)
-        self._decide(comparison.weakest(), discharge.start_s, float(rows["elapsed_s"][-1]))
+        result = Comparison(self._cell, discharge.fit, discharge.reference, measured, soc).weakest()
+        self._decide(result, weak, discharge.start_s, float(rows["elapsed_s"][-1]))
 
-    def _begin(self, rows: NDArray[np.void], start: int, fit: PackFit) -> Discharge:
+    def _begin(self, rows: NDArray[np.void], start: int, weak: list[WeakCellTime], fit: PackFit) -> Discharge:
         """Return the discharge that begins with the row ``start``. While a cell is weak, the fit does not change."""
-        used = self._discharge.fit if self.is_weak and self._discharge is not None else fit
+        used = self._discharge.fit if is_weak_now(weak) and self._discharge is not None else fit
         first = rows[start : start + 1]
         return Discharge(
             start_s=float(first["elapsed_s"][0]),
             fit=used,
-            reference=ReferenceCurve.of(self._cell, used, self._reference_rows(rows[:start])),
+            reference=ReferenceCurve.of(self._cell, used, reference_rows(rows[:start], weak)),
             start_soc=float(row_soc(self._cell, fit, first)[0]),
             start_as=float(first["charge_as"][0]),
         )
 
-    def _reference_rows(self, rows: NDArray[np.void]) -> NDArray[np.void]:
-        """Return the rows of discharges without a weak cell."""
-        is_reference = is_discharge(rows)
-        for start_s, end_s in self._weak_s:
-            is_reference &= (rows["elapsed_s"] < start_s) | (rows["elapsed_s"] > end_s)
-        return rows[is_reference]
-
-    def _decide(self, result: WeakestCell, start_s: float, now_s: float) -> None:
+    def _decide(self, result: WeakestCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
         """Replace the present result if the discharge that began at ``start_s`` decides."""
-        was_weak, is_same = self.is_weak, start_s == self._decided_s
+        was_weak, is_same = is_weak_now(weak), start_s == self._decided_s
         is_weak = result.deviation_std >= (WEAK_CELL_CLEAR_STD if was_weak else WEAK_CELL_STD)
-        decides = is_same or is_weak or result.soc <= self._decided_soc
-        if was_weak and (is_weak or not decides):
-            self._weak_s[-1] = self._weak_s[-1][0], now_s
-        elif is_weak:
-            self._weak_s.append((start_s, now_s))
-        if not decides:
+        if not (is_same or is_weak or result.soc <= (weak[-1].soc if was_weak else self._healthy_soc)):
             return
-        if not (is_same and was_weak and is_weak):  # the SOC at which a discharge first finds the weak cell
-            self._decided_soc = result.soc
-        self.weakest, self.is_weak, self._decided_s = result, is_weak, start_s
+        if is_weak and not was_weak:
+            weak.append(WeakCellTime(start_s, np.inf, result.soc))
+        elif is_weak and not is_same:
+            weak[-1] = weak[-1]._replace(soc=result.soc)
+        elif was_weak and not is_weak:
+            weak[-1] = weak[-1]._replace(end_s=now_s if is_same else start_s)
+        self.weakest, self._decided_s, self._healthy_soc = result, start_s, result.soc
+
+
+def is_weak_now(weak: list[WeakCellTime]) -> bool:
+    """Return True if a cell is weak at the end of the history."""
+    return bool(weak) and np.isinf(weak[-1].end_s)
+
+
+def reference_rows(rows: NDArray[np.void], weak: list[WeakCellTime]) -> NDArray[np.void]:
+    """Return the rows of discharges without a weak cell."""
+    is_reference = is_discharge(rows)
+    for time in weak:
+        is_reference &= (rows["elapsed_s"] < time.start_s) | (rows["elapsed_s"] >= time.end_s)
+    return rows[is_reference]
 
 
 def is_discharge(rows: NDArray[np.void]) -> NDArray[np.bool_]:

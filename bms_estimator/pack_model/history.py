@@ -1,5 +1,8 @@
 """History of a pack with a bounded number of rows. Old rows are merged."""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,15 +25,28 @@ OLD_S = 2.0 * DAY_S
 """Age from which on rows are merged [s]."""
 
 
+class WeakCellTime(NamedTuple):
+    """Time in which a cell of the bank was weak. Its discharges are no reference."""
+
+    start_s: float
+    """Time of the first row of the discharge that found the weak cell [s]."""
+    end_s: float
+    """Start of the discharge that did not find it [s]; infinite: it is still weak."""
+    soc: float
+    """SOC at which the last discharge found it."""
+
+
 class History:
     """Rows of one pack in order of time.
 
     Attributes:
         rows: Shape (n,), dtype HISTORY_ROW.
+        weak_cell_times: Times in which a cell of the bank was weak.
     """
 
-    def __init__(self, rows: NDArray[np.void] | None = None) -> None:
+    def __init__(self, rows: NDArray[np.void] | None = None, weak_cell_times: Sequence[WeakCellTime] = ()) -> None:
         self.rows: NDArray[np.void] = np.zeros(0, HISTORY_ROW) if rows is None else rows
+        self.weak_cell_times = list(weak_cell_times)
 
     def append(self, rows: NDArray[np.void], capacity_as: float) -> None:
         """Append rows. If there are too many, merge old rows, and drop the oldest if there are still too many."""

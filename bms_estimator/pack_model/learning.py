@@ -201,7 +201,7 @@ class SlowFit:
             self._new_rows += count
             self.unsaved_rows += count
             if self.bank and self.saved_fit is not None:
-                self.bank.add(self.history.rows, count, self.saved_fit)
+                self.bank.add(self.history, count, self.saved_fit)
             h["count"] = 0
             h["rows"] = np.zeros(1, HISTORY_ROW)  # unused rows would depend on the division of the samples into blocks
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import CURVE, PackFit
-from bms_estimator.pack_model.history import MAX_ROWS, History
+from bms_estimator.pack_model.history import MAX_ROWS, History, WeakCellTime
 
 SAVED_MINIMA = 2
 """Number of a fit's minima that are saved. The next fit starts from two minima (``fit.starts``)."""
@@ -86,11 +86,20 @@ def neutral_fit() -> PackFit:
 
 def history_arrays(history: History, fit: PackFit | None) -> dict[str, NDArray[Any]]:
     """Return history and fit as arrays by name."""
-    arrays = {"rows": history.rows, **curve_arrays(fit)}
+    weak_s = np.array(history.weak_cell_times).reshape(-1, len(WeakCellTime._fields))
+    arrays = {"rows": history.rows, "weak_cell_times": weak_s, **curve_arrays(fit)}
     if fit is not None:
         arrays |= {"row_elapsed_s": fit.row_elapsed_s, "row_soc": fit.row_soc}
         arrays["curves"] = np.array(fit.curves[:SAVED_MINIMA]).reshape(min(len(fit.curves), SAVED_MINIMA), -1)
     return arrays
+
+
+def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
+    """Return the times of weak cells. An earlier version did not save them."""
+    saved = arrays.get("weak_cell_times", np.zeros((0, len(WeakCellTime._fields))))
+    if saved.ndim != 2 or saved.shape[1] != len(WeakCellTime._fields) or np.isnan(saved).any():
+        raise ValueError("the times of weak cells are damaged")
+    return [WeakCellTime(*row) for row in saved.tolist()]
 
 
 def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
@@ -108,10 +117,11 @@ def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
         raise ValueError("a row is not finite")
     if (np.diff(rows["segment"]) < 0.0).any():
         raise ValueError("its rows are not in the order of time")
+    history = History(rows, _weak_cell_times(arrays))
     fit = fit_of_curves({name: value for name, value in arrays.items() if name in _SHAPES})
     if fit is None:
-        return History(rows), None
+        return history, None
     elapsed_s, soc, starts = (arrays.get(name, np.zeros(0)) for name in _START_FIELDS)
     if elapsed_s.shape != soc.shape or elapsed_s.ndim != 1 or not np.isfinite(starts).all():
         raise ValueError("the starts of the next fit are damaged")
-    return History(rows), replace(fit, row_elapsed_s=elapsed_s, row_soc=soc, curves=tuple(starts))
+    return history, replace(fit, row_elapsed_s=elapsed_s, row_soc=soc, curves=tuple(starts))
