@@ -1,0 +1,159 @@
+"""Estimator of the single cells of a pack whose cell voltages are measured, beside the estimator of the pack."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bms_estimator.estimator.estimator import Estimator, TraceBlock
+from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
+from bms_estimator.kernels.cells.cell_filter import BIAS_V
+from bms_estimator.kernels.cells.records import BANK, CAPACITY, CELL, LEAK, RESISTANCE, SOC, STATES, ReadingFault
+from bms_estimator.kernels.cells.step import run_cells
+from bms_estimator.model.arrays import Floats, Records
+from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.model.sample import CellBlock, SampleBlock
+
+MIN_CELLS = 3
+"""Minimum number of cells. With two cells nothing shows which one deviates."""
+LEAK_STDS = 4.0
+"""Std by which the self-discharge of a cell must exceed that of the other cells to count as a short."""
+
+CONSTANT_FRACTION = 0.5
+"""Fraction of ``BIAS_V`` that is constant, such as the offset of a converter."""
+MEAN_SLOPE_SOC = (0.1, 0.9)
+"""SOC range of the mean slope of the OCV, without its steep ends."""
+
+
+@dataclass(frozen=True)
+class CellDeviations:
+    """Deviations of the cells of a pack, each an array of shape (m,).
+
+    Attributes:
+        soc: SOC, 0..1.
+        soc_std: Standard deviation of ``soc``.
+        soc_deviation: SOC less the mean SOC of the cells.
+        soc_deviation_std: Standard deviation of ``soc_deviation``.
+        resistance_ratio: Resistance relative to the median of the cells.
+        resistance_ratio_std: Standard deviation of ``resistance_ratio``.
+        capacity_ratio: Capacity relative to the median of the cells.
+        self_discharge_a: Self-discharge current above the median of the cells [A].
+        self_discharge_std_a: Standard deviation of ``self_discharge_a`` [A].
+        fault: Faults of the readings, each a ``ReadingFault``.
+        reading_error_v: Error of the readings [V]; 0 without a fault.
+        contact_ohm: Resistance of a faulty contact [ohm]; 0 without one.
+    """
+
+    soc: Floats
+    soc_std: Floats
+    soc_deviation: Floats
+    soc_deviation_std: Floats
+    resistance_ratio: Floats
+    resistance_ratio_std: Floats
+    capacity_ratio: Floats
+    self_discharge_a: Floats
+    self_discharge_std_a: Floats
+    fault: tuple[ReadingFault, ...]
+    reading_error_v: Floats
+    contact_ohm: Floats
+
+    @property
+    def weakest(self) -> int:
+        """Index of the cell with the lowest SOC."""
+        return int(np.argmin(self.soc))
+
+    @property
+    def proven_self_discharge_a(self) -> Floats:
+        """Lower bound of ``self_discharge_a``, by ``LEAK_STDS`` standard deviations [A]."""
+        return self.self_discharge_a - LEAK_STDS * self.self_discharge_std_a
+
+
+class CellEstimator:
+    """Estimators of all cells of one pack. They start with the first sample that has all cell voltages.
+
+    Args:
+        estimator: Estimator of the pack; read only. Without its identifier there is no estimate of the cells.
+        balancing_v: Cell voltage from which a balancer may be active [V].
+
+    Attributes:
+        cells: State of the cells, shape (m,), dtype CELL; m is 0 before the first cell voltages.
+        bank: State that the cells share, shape (1,), dtype BANK.
+    """
+
+    def __init__(self, estimator: Estimator, balancing_v: float) -> None:
+        self._estimator, self._balancing_v = estimator, balancing_v
+        self._series = estimator.cell.cell.series_count
+        enabled = estimator.identifying and not isinstance(estimator.cell, FuelCellModel)
+        self._enabled = enabled and self._series >= MIN_CELLS
+        self._start(0)
+
+    def _start(self, count: int) -> None:
+        self.cells: Records = np.zeros(count, CELL)
+        self.bank: Records = np.zeros(1, BANK)
+        self._scratch = np.zeros(2 * count + STATES)
+
+    def run(self, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
+        """Process a block of samples.
+
+        A block without cell voltages, or with another number of cells than the pack has in series, has no effect.
+
+        Args:
+            samples: Samples, shape (n,), dtype SAMPLE.
+            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
+            trace: Estimates of the accepted samples.
+        """
+        if not self._enabled or cells_v.shape != (samples.size, self._series) or not trace.size:
+            return
+        if not self.cells.size:
+            self._start(self._series)
+        run_cells(
+            self.cells,
+            self.bank,
+            self._estimator.settings_record["filter"],
+            self._balancing_v,
+            np.ascontiguousarray(samples["time_s"]),
+            np.ascontiguousarray(cells_v),
+            trace,
+            self._scratch,
+        )
+
+    @property
+    def _systematic_soc_std(self) -> float:
+        """Std of a cell's SOC by the constant part of its voltage error, which no average over time reduces."""
+        p = self._estimator.settings_record["filter"][0]
+        low, high = (round(soc * (OCV_POINTS - 1)) for soc in MEAN_SLOPE_SOC)
+        slope_v = (p["ocv_v"][high] - p["ocv_v"][low]) / p["series"] / (MEAN_SLOPE_SOC[1] - MEAN_SLOPE_SOC[0])
+        return CONSTANT_FRACTION * BIAS_V / float(slope_v)
+
+    @property
+    def deviations(self) -> CellDeviations | None:
+        """Present deviations of the cells; None before the first sample with cell voltages."""
+        bank = self.bank[0]
+        if not bank["started"]:
+            return None
+        mean, variance = self.cells["mean"], np.diagonal(self.cells["covariance"], axis1=1, axis2=2)
+        std = np.sqrt(np.maximum(variance, 0.0))
+        std[:, SOC] = np.hypot(std[:, SOC], self._systematic_soc_std)
+        capacity_ah = float(self._estimator.settings["capacity_as"][0]) / 3600.0
+        deviation = mean[:, SOC] - mean[:, SOC].mean()
+        resistance, capacity = 1.0 + mean[:, RESISTANCE], 1.0 / np.maximum(1.0 + mean[:, CAPACITY], 0.1)
+        pack_std = float(self._estimator.record["filter"]["soc_std"][0])
+        return CellDeviations(
+            soc=np.clip(bank["soc"] + deviation, 0.0, 1.0),
+            soc_std=np.hypot(std[:, SOC], pack_std),
+            soc_deviation=deviation,
+            soc_deviation_std=std[:, SOC],
+            resistance_ratio=resistance / np.median(resistance),
+            resistance_ratio_std=std[:, RESISTANCE],
+            capacity_ratio=capacity / np.median(capacity),
+            self_discharge_a=capacity_ah * (mean[:, LEAK] - np.median(mean[:, LEAK])),
+            self_discharge_std_a=capacity_ah * std[:, LEAK],
+            fault=tuple(ReadingFault(int(fault)) for fault in self.cells["fault"]),
+            reading_error_v=self.cells["error_v"].copy(),
+            contact_ohm=np.where(self.cells["fault"] == ReadingFault.CONTACT, -self.cells["error_ohm"], 0.0),
+        )
+
+    def resume(self, unseen_s: float) -> None:
+        """Prepare for samples with another time base, after a gap of ``unseen_s`` [s]; infinite if unknown."""
+        self.bank["time_s"] = np.inf
+        self.bank["unseen_s"] = unseen_s if math.isfinite(unseen_s) else 0.0

@@ -1,0 +1,144 @@
+"""Kalman filter of one cell's deviations, with scalar measurements.
+
+``c`` is a record of CELL, ``b`` of BANK, ``p`` of EKF_SETTINGS.
+"""
+
+import math
+
+from bms_estimator.kernels.cells.records import BIAS, CAPACITY, LEAK, RESISTANCE, SOC, STATES
+from bms_estimator.model.arrays import Floats, Record
+from bms_estimator.numba_cache import njit
+
+SOC_STD = 0.1
+"""P(0): std of a cell's SOC about the mean."""
+CAPACITY_STD = 0.08
+"""P(0): relative std of a cell's capacity."""
+RESISTANCE_STD = 0.1
+"""P(0): relative std of a cell's resistance, including the effect of its temperature."""
+LEAK_STD = 3e-5
+"""P(0): std of the self-discharge of an intact cell [1/h]: 2 % a month."""
+BIAS_V = 0.003
+"""P(0): std of a cell's voltage at equal SOC and current, by offsets of the readings and different OCV curves [V]."""
+BIAS_SOC = 0.1
+"""Q: charge throughput over which BIAS changes [SOC]. At rest it is constant, so that a long rest is no proof of an SOC."""
+CHARGE_STD = 3e-4
+"""Q: std of a cell's SOC after a throughput of 1, by differences of the charge efficiency."""
+RESISTANCE_DRIFT = 0.05
+"""Q: relative change of a cell's resistance in one hour, because the cells warm up differently."""
+LEAK_DRIFT = 5e-7
+"""Q: change of the self-discharge in one hour [1/h]."""
+GAP_STD = 0.003
+"""Q: std of a cell's SOC after a gap, in which a balancer may have been active."""
+BALANCING_C = 0.005
+"""Q: current of a balancer, as a C-rate."""
+READING_V = 0.001
+"""R: std of the mean of a cell's readings in one window [V]."""
+DROP_ERROR = 0.05
+"""R: relative std of the overpotential, because current and voltages are not measured at one time."""
+MAX_RESISTANCE_STD = 0.3
+"""Maximum of the relative std of a cell's resistance after a time without a load."""
+CURVE_STDS = 3.0
+"""Range of a cell's SOC in which its OCV counts as possible, in std."""
+KNEE_SOC = 0.02
+"""Std of the SOC at which the OCV curve of a single cell falls near empty."""
+HOUR_S = 3600.0
+"""Duration of an hour [s]."""
+
+
+@njit(cache=True)
+def initialize_cell(c: Record) -> None:
+    """Write the initial state of a cell, of which nothing is known."""
+    for i in range(STATES):
+        c.mean[i] = 0.0
+        for j in range(STATES):
+            c.covariance[i, j] = 0.0
+    c.covariance[SOC, SOC] = SOC_STD**2
+    c.covariance[CAPACITY, CAPACITY] = CAPACITY_STD**2
+    c.covariance[RESISTANCE, RESISTANCE] = RESISTANCE_STD**2
+    c.covariance[LEAK, LEAK] = LEAK_STD**2
+    c.covariance[BIAS, BIAS] = BIAS_V**2
+    c.held_v = math.nan
+
+
+@njit(cache=True)
+def ocv_and_slope(p: Record, soc: float) -> tuple[float, float]:
+    """Return the OCV of one cell at ``soc`` and its slope dE/dSOC, both in volts. The curve is extended linearly."""
+    last = p.ocv_v.size - 2
+    position = soc * (last + 1)
+    j = min(max(int(position), 0), last)
+    step_v = p.ocv_v[j + 1] - p.ocv_v[j]
+    return (p.ocv_v[j] + (position - j) * step_v) / p.series, step_v * (last + 1) / p.series
+
+
+@njit(cache=True)
+def predict_cell(c: Record, b: Record, balancing_variance: float) -> None:
+    """Advance a cell's state over the window ``b``.
+
+    ``balancing_variance`` is the variance of the SOC that a balancer may have changed.
+    """
+    x, cov, hours = c.mean, c.covariance, b.elapsed_s / HOUR_S
+    x[SOC] += b.change * x[CAPACITY] - hours * x[LEAK]
+    kept = math.exp(-b.throughput / BIAS_SOC)
+    x[BIAS] *= kept
+    # F has a unit diagonal except for BIAS, and two entries in the row of the SOC
+    for j in range(STATES):
+        cov[SOC, j] += b.change * cov[CAPACITY, j] - hours * cov[LEAK, j]
+        cov[BIAS, j] *= kept
+    for j in range(STATES):
+        cov[j, SOC] += b.change * cov[j, CAPACITY] - hours * cov[j, LEAK]
+        cov[j, BIAS] *= kept
+    cov[SOC, SOC] += CHARGE_STD**2 * b.throughput + balancing_variance + (GAP_STD**2 if b.gap else 0.0)
+    drift = RESISTANCE_DRIFT**2 * hours
+    cov[RESISTANCE, RESISTANCE] = min(cov[RESISTANCE, RESISTANCE] + drift, MAX_RESISTANCE_STD**2)
+    cov[LEAK, LEAK] += LEAK_DRIFT**2 * hours
+    cov[BIAS, BIAS] += BIAS_V**2 * (1.0 - kept * kept)
+
+
+@njit(cache=True)
+def deviation_v(c: Record, p: Record, soc: float, drop_v: float) -> tuple[float, float, float]:
+    """Return the predicted deviation of a cell's voltage, its derivative by the cell's SOC, and that by the pack's SOC [V].
+
+    Args:
+        c: The cell.
+        p: Settings of the pack's filter.
+        soc: SOC of the reference cell.
+        drop_v: Overpotential of the reference cell [V].
+    """
+    cell_v, cell_slope_v = ocv_and_slope(p, soc + c.mean[SOC])
+    reference_v, slope_v = ocv_and_slope(p, soc)
+    return cell_v - reference_v - c.mean[RESISTANCE] * drop_v + c.mean[BIAS], cell_slope_v, cell_slope_v - slope_v
+
+
+@njit(cache=True)
+def write_ph(c: Record, slope_v: float, drop_v: float, ph: Floats) -> float:
+    """Write P H' to ``ph``, shape (STATES,), and return H P H' [V^2]."""
+    cov = c.covariance
+    for i in range(STATES):
+        ph[i] = slope_v * cov[i, SOC] - drop_v * cov[i, RESISTANCE] + cov[i, BIAS]
+    return slope_v * ph[SOC] - drop_v * ph[RESISTANCE] + ph[BIAS]
+
+
+@njit(cache=True)
+def correct_cell(c: Record, innovation_v: float, variance_v2: float, ph: Floats) -> None:
+    """Correct a cell's state by an innovation [V] of variance ``variance_v2``. ``ph`` is P H'."""
+    for i in range(STATES):
+        gain = ph[i] / variance_v2
+        c.mean[i] += gain * innovation_v
+        for j in range(STATES):
+            c.covariance[i, j] -= gain * ph[j]
+
+
+@njit(cache=True)
+def measurement_variance(drop_v: float, by_pack_v: float, soc_std: float) -> float:
+    """Return R [V^2]; ``by_pack_v`` is the derivative of the deviation by the pack's SOC [V]."""
+    return READING_V**2 + (DROP_ERROR * drop_v) ** 2 + (by_pack_v * soc_std) ** 2
+
+
+@njit(cache=True)
+def curve_range_v(c: Record, p: Record, soc: float, soc_std: float) -> float:
+    """Return the largest change of the cell's OCV within ``CURVE_STDS`` std of its SOC [V]."""
+    half = CURVE_STDS * math.sqrt(c.covariance[SOC, SOC] + soc_std**2 + KNEE_SOC**2)
+    middle_v = ocv_and_slope(p, soc + c.mean[SOC])[0]
+    above_v = ocv_and_slope(p, soc + c.mean[SOC] + half)[0]
+    below_v = ocv_and_slope(p, soc + c.mean[SOC] - half)[0]
+    return max(above_v - middle_v, middle_v - below_v)

@@ -1,0 +1,237 @@
+"""Step of the estimators of all cells of a pack: windows of samples, and one update of each cell for each window."""
+
+import math
+
+from bms_estimator.kernels.cells.cell_filter import (
+    BALANCING_C,
+    HOUR_S,
+    correct_cell,
+    curve_range_v,
+    deviation_v,
+    initialize_cell,
+    measurement_variance,
+    predict_cell,
+    write_ph,
+)
+from bms_estimator.kernels.cells.reading_faults import (
+    STUCK_V,
+    end_fault,
+    examine_reading,
+    is_jump,
+    is_stuck,
+    mark_sense_wires,
+)
+from bms_estimator.kernels.cells.records import LEAK, SOC, STATES, ReadingFault
+from bms_estimator.model.arrays import Floats, Record, Records
+from bms_estimator.numba_cache import njit
+
+WINDOW_S = 10.0
+"""Minimum duration of a window [s]. Its means suppress noise, and delays between the readings of current and cells."""
+MAX_STEP_S = 60.0
+"""Maximum time between two samples over which the current counts as measured [s]."""
+TREND_MEMORY = 0.9
+"""Fraction of ``trend`` that remains after a window."""
+MAX_TREND = 1.0
+"""Maximum of the mean normalized innovation. For white innovations it is 4 std."""
+INFLATION = 1e4
+"""Factor on the variance of the self-discharge after ``MAX_TREND`` is exceeded, because a short may have appeared. The
+range from 1 kohm to 1 ohm needs two such steps."""
+SOC_CHANGE = 0.03
+"""Std of a cell's SOC that a short may have drained before ``MAX_TREND`` is exceeded."""
+MAX_LEAK_STD = 1.0
+"""Maximum std of the self-discharge [1/h]."""
+_NONE, _STUCK = int(ReadingFault.NONE), int(ReadingFault.STUCK)
+
+
+@njit(cache=True)
+def run_cells(
+    cells: Records,
+    bank: Records,
+    filter_settings: Records,
+    balancing_v: float,
+    times_s: Floats,
+    cells_v: Floats,
+    trace: Records,
+    scratch: Floats,
+) -> None:
+    """Process a block of samples.
+
+    Args:
+        cells: Shape (m,), dtype CELL; updated.
+        bank: Shape (1,), dtype BANK; updated.
+        filter_settings: Shape (1,), dtype EKF_SETTINGS.
+        balancing_v: Cell voltage from which a balancer may be active [V].
+        times_s: Times of the samples [s], shape (n,).
+        cells_v: Cell voltages [V], shape (n, m).
+        trace: Trace rows of the accepted samples, dtype TRACE.
+        scratch: Shape (2 m + STATES,); overwritten.
+    """
+    r = 0
+    for j in range(times_s.size):
+        if r == trace.size:
+            return
+        if times_s[j] != trace[r].time_s:  # the sample was rejected
+            continue
+        row = trace[r]
+        r += 1
+        if add_sample(cells, bank[0], filter_settings[0], cells_v[j], row) and bank[0].elapsed_s >= WINDOW_S:
+            update_cells(cells, bank[0], filter_settings[0], balancing_v, row.soc, row.soc_std, scratch)
+
+
+@njit(cache=True)
+def add_sample(cells: Records, b: Record, p: Record, cells_v: Floats, row: Record) -> bool:
+    """Add a sample to the window. Return False if the pack's filter has no estimate.
+
+    ``b`` is a record of BANK, ``p`` of EKF_SETTINGS, ``row`` of TRACE.
+    """
+    if not math.isfinite(row.soc + row.soc_std + row.r_s_ohm + row.r_ts_ohm + row.r_tl_ohm):
+        return False
+    current_a = row.current_a
+    if not b.started:
+        for i in range(cells.size):
+            initialize_cell(cells[i])
+        b.started, b.time_s, b.soc, b.x_ts_a, b.x_tl_a = 1, row.time_s, row.soc, current_a, current_a
+    dt_s = row.time_s - b.time_s
+    if not 0.0 <= dt_s < math.inf:  # another time base
+        dt_s = b.unseen_s
+    b.unseen_s = 0.0
+    if dt_s > MAX_STEP_S:
+        b.gap, held_a, change = 1, 0.0, row.soc - b.soc
+    else:
+        held_a = current_a
+        change = -0.5 * (b.current_a + current_a) * dt_s / p.capacity_as
+    b.x_ts_a = held_a + (b.x_ts_a - held_a) * math.exp(-dt_s / row.tau_ts_s)
+    b.x_tl_a = held_a + (b.x_tl_a - held_a) * math.exp(-dt_s / row.tau_tl_s)
+    b.time_s, b.current_a, b.soc = row.time_s, current_a, row.soc
+    b.elapsed_s += dt_s
+    b.change += change
+    b.throughput += abs(change)
+    b.sum_a += current_a
+    b.sum_drop_v += (row.r_s_ohm * current_a + row.r_ts_ohm * b.x_ts_a + row.r_tl_ohm * b.x_tl_a) / p.series
+    b.samples += 1
+    for i in range(cells.size):
+        if math.isfinite(cells_v[i]):
+            cells[i].sum_v += cells_v[i]
+            cells[i].samples += 1
+    return True
+
+
+@njit(cache=True)
+def update_cells(
+    cells: Records, b: Record, p: Record, balancing_v: float, soc: float, soc_std: float, scratch: Floats
+) -> None:
+    """Update all cells by the means of a window, and begin the next window.
+
+    ``b`` is a record of BANK, ``p`` of EKF_SETTINGS; the other arguments are those of ``run_cells``.
+    """
+    m = cells.size
+    voltages_v, errors_v, ph = scratch[:m], scratch[m : 2 * m], scratch[2 * m : 2 * m + STATES]
+    current_a, drop_v = b.sum_a / b.samples, b.sum_drop_v / b.samples
+    highest_v = 0.0
+    for i in range(m):
+        c = cells[i]
+        voltages_v[i] = c.sum_v / c.samples if c.samples else math.nan
+        if c.samples and c.fault == _NONE:
+            highest_v = max(highest_v, voltages_v[i])
+    balancing_variance = balancing_soc_variance(b, highest_v >= balancing_v and current_a <= 0.0)
+    for i in range(m):
+        predict_cell(cells[i], b, balancing_variance)
+        errors_v[i] = voltages_v[i] - deviation_v(cells[i], p, soc, drop_v)[0]
+    reference_v, median_v = median(errors_v, cells), median(voltages_v, cells)
+    for i in range(m):
+        if math.isfinite(voltages_v[i]) and math.isfinite(reference_v):
+            _, slope_v, by_pack_v = deviation_v(cells[i], p, soc, drop_v)
+            noise_v2 = measurement_variance(drop_v, by_pack_v, soc_std)
+            variance_v2 = noise_v2 + write_ph(cells[i], slope_v, drop_v, ph)
+            innovation_v = errors_v[i] - reference_v
+            stuck = is_stuck(cells[i], voltages_v[i], median_v)
+            curve_v = curve_range_v(cells[i], p, soc, soc_std)
+            update_cell(cells[i], b, innovation_v, variance_v2, curve_v, current_a, ph, stuck)
+        cells[i].sum_v, cells[i].samples = 0.0, 0
+    mark_sense_wires(cells)
+    b.samples = b.gap = 0
+    b.elapsed_s = b.change = b.throughput = b.sum_a = b.sum_drop_v = 0.0
+
+
+@njit(cache=True)
+def update_cell(
+    c: Record,
+    b: Record,
+    innovation_v: float,
+    variance_v2: float,
+    curve_v: float,
+    current_a: float,
+    ph: Floats,
+    stuck: bool,
+) -> None:
+    """Correct a cell's state, unless its reading is faulty.
+
+    Args:
+        c: The cell; updated.
+        b: Window, dtype BANK.
+        innovation_v: Innovation [V].
+        variance_v2: Its variance S [V^2].
+        curve_v: Change of the OCV within the uncertainty of the cell's SOC [V].
+        current_a: Mean current of the window [A].
+        ph: P H', shape (STATES,).
+        stuck: True if the reading does not respond to the load.
+    """
+    if stuck:
+        c.fault, c.error_v = _STUCK, max(abs(innovation_v), STUCK_V)
+        return
+    if c.fault == _STUCK:
+        end_fault(c)
+    if c.suspect_s > 0.0 or (is_jump(c, innovation_v, variance_v2, curve_v) and not b.gap):
+        examine_reading(c, innovation_v, current_a, b.elapsed_s, variance_v2)
+        return
+    c.innovation_v = innovation_v
+    c.trend = TREND_MEMORY * c.trend + (1.0 - TREND_MEMORY) * innovation_v / math.sqrt(variance_v2)
+    if abs(c.trend) > MAX_TREND:
+        c.trend = 0.0
+        c.covariance[LEAK, LEAK] = min(INFLATION * c.covariance[LEAK, LEAK], MAX_LEAK_STD**2)
+        c.covariance[SOC, SOC] += SOC_CHANGE**2
+        return
+    correct_cell(c, innovation_v, variance_v2, ph)
+
+
+@njit(cache=True)
+def balancing_soc_variance(b: Record, active: bool) -> float:
+    """Return the variance of a cell's SOC that a balancer may have changed in the window ``b``, dtype BANK.
+
+    A balancer drains the same cells for hours. The std therefore grows in proportion to the time.
+    """
+    if not active:
+        b.balancing_s = 0.0
+        return 0.0
+    before_s = b.balancing_s
+    b.balancing_s += b.elapsed_s
+    return (BALANCING_C / HOUR_S) ** 2 * (b.balancing_s**2 - before_s**2)
+
+
+@njit(cache=True)
+def median(values: Floats, cells: Records) -> float:
+    """Return the median of the finite values of cells without a faulty reading; NaN if fewer than two have one.
+
+    It is found by counting, because a sorted copy would need memory. ``values`` has shape (m,).
+    """
+    count = 0
+    for i in range(values.size):
+        count += math.isfinite(values[i]) and cells[i].fault == _NONE
+    if count < 2:
+        return math.nan
+    return 0.5 * (ranked(values, cells, (count - 1) // 2) + ranked(values, cells, count // 2))
+
+
+@njit(cache=True)
+def ranked(values: Floats, cells: Records, rank: int) -> float:
+    """Return the value with ``rank`` smaller ones, from 0, among the finite values of cells without a faulty reading."""
+    for i in range(values.size):
+        if math.isfinite(values[i]) and cells[i].fault == _NONE:
+            smaller = equal = 0
+            for j in range(values.size):
+                if math.isfinite(values[j]) and cells[j].fault == _NONE:
+                    smaller += values[j] < values[i]
+                    equal += values[j] == values[i]
+            if smaller <= rank < smaller + equal:
+                return values[i]
+    return math.nan
