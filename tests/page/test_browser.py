@@ -399,7 +399,7 @@ async def test_pack_with_an_alarm_is_listed_first_among_too_many_packs(
             await live.publish(f"crowd/a{number:03}/availability", b"online", qos=1, retain=True)
         await page_tab.until("() => document.getElementById('hidden').textContent === '36 more devices not shown'")
         await live.publish("crowd/zz/alarm/over_temperature", alarm.model_dump_json(), qos=1, retain=True)
-        await page_tab.until("() => document.querySelector('#packs button').textContent === 'zz'")
+        await page_tab.until("() => document.querySelector('#packs button')?.textContent === 'zz'")
         await page_tab.until("() => document.getElementById('hidden').textContent === '37 more devices not shown'")
         assert await page_tab.page.get_by_role("tab").count() == MAX_DEVICES
         first = page_tab.page.get_by_role("tab").first
