@@ -32,7 +32,11 @@ def rows() -> Iterator[Row]:
     forecaster = Forecaster(estimator, estimator, cutoff_v=CUTOFF_V)
     forecaster.run(pulses(MAX_LOAD_S + HOUR_S, rate_hz=1))
     mean_a, max_a = forecaster.load.mean_and_max()
-    pack, blocks, draws = np.zeros(1, PROJECTED_PACK), np.zeros(MAX_LOAD_S // BLOCK_S, LOAD_BLOCK), np.zeros(DRAWS, DRAW)
+    pack, blocks, draws = (
+        np.zeros(1, PROJECTED_PACK),
+        np.zeros(MAX_LOAD_S // BLOCK_S, LOAD_BLOCK),
+        np.zeros(DRAWS, DRAW),
+    )
     project_pack(pack[0], estimator.record[0]["filter"], estimator.settings_record[0]["filter"], NO_CUTOFF_V)
     draw_packs(pack[0], np.uint64(1), draws)
     table_ms = shortest_ms(lambda: tabulate_blocks(pack[0], mean_a, max_a, BLOCK_S, blocks))
@@ -44,7 +48,9 @@ def rows() -> Iterator[Row]:
     forecast_ms = shortest_ms(forecaster.forecast)
     share = forecast_ms / (10.0 * MIN_INTERVAL_S)
     yield Row("  whole forecast", "-", f"{forecast_ms:.1f} ms", None)
-    yield Row(f"  share of a core with a forecast each {MIN_INTERVAL_S:.0f} s", "at most 1 %", f"{share:.2f} %", share <= 1.0)
+    yield Row(
+        f"  share of a core with a forecast each {MIN_INTERVAL_S:.0f} s", "at most 1 %", f"{share:.2f} %", share <= 1.0
+    )
 
 
 def shortest_ms(call: Callable[[], object]) -> float:
