@@ -22,7 +22,7 @@ CURVE_POINTS = 60
 """Maximum number of points of a curve."""
 BLOCK_S = 10
 """Minimum length of a block of the load [s]."""
-MAX_STEPS = 720
+MAX_STEPS = 360
 """Maximum number of blocks that a draw passes. For a longer horizon the blocks are longer, so that the cost is bounded."""
 MIN_BLOCKS = 10
 """Minimum number of blocks in the load that was seen, which limits their length."""

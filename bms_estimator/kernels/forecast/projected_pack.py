@@ -47,8 +47,8 @@ in which concentrations recover. The growth increases with the Arrhenius factor 
 EARLY_SOC = 0.005
 """SOC by which a loaded cell is empty before its OCV curve ends, at 25 C. It increases in the cold as ``GROWTH`` does."""
 EARLY_PLATEAU_SOC = 0.015
-"""The same for a cell whose OCV has a plateau, at all temperatures. Its SOC is corrected only at the knees, and the errors of
-both knees add up."""
+"""Value that replaces ``EARLY_SOC`` for a cell whose OCV has a plateau, at all temperatures. Its knee near empty is steep, so that
+the knee's error along SOC decides. Drives of an LFP cell at 25, 5 and -15 C reached the cut-off at SOC 0.01 to 0.03."""
 
 PROJECTED_PACK = np.dtype(
     [
