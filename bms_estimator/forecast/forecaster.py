@@ -11,6 +11,7 @@ from bms_estimator.forecast.capability import PowerLimits, cell_power_limits, wr
 from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastCurve, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import LoadHistory
+from bms_estimator.forecast.past_minutes import MINUTE_S, PastMinutes
 from bms_estimator.forecast.projection import (
     Projection,
     project_given_load,
@@ -61,6 +62,7 @@ class Forecaster:
 
     Attributes:
         load: Load that was seen.
+        past: Load of the minutes of this and earlier discharges.
         latest: The last forecast.
     """
 
@@ -71,6 +73,7 @@ class Forecaster:
         self._limits = limits or cell_power_limits(estimator.cell)
         filter_settings = estimator.cell_file_settings
         self.load = LoadHistory(float(filter_settings["capacity_as"]), float(filter_settings["unmeasured_s"]))
+        self.past = PastMinutes()
         self.latest = Forecast(math.nan, unknown_values(), "no sample has been processed yet", None)
         self._runner, self._due_s = runner, -math.inf
         self._rows: list[tuple[ForecastRows, int]] = []
@@ -93,6 +96,7 @@ class Forecaster:
             before = trace.size if due is None else max(trace.size - 1, 0)
             self._rows.append((self.latest.values, before))
             if due is not None:
+                self.past.add(self.load)
                 self.latest = self.forecast()
                 self._due_s = float(block["time_s"][end - 1]) + _interval_s(self.latest)
                 self._rows.append((self.latest.values, trace.size - before))
@@ -105,6 +109,7 @@ class Forecaster:
         """Process a block of samples and store their load. This is faster if only a later forecast is needed."""
         trace = self._runner.run(block)
         self.load.add(trace)
+        self.past.add(self.load)
         return trace
 
     @property
@@ -185,7 +190,7 @@ class Forecaster:
         mean_a, max_a = self.load.mean_and_max()
         if mean_a.mean() <= pack["offset_a"][0]:
             return None
-        return project_seen_load(pack, mean_a, max_a, self._seed())
+        return project_seen_load(pack, mean_a, max_a, self._seed(), self.past.analogues(mean_a.size // MINUTE_S))
 
     def _seed(self) -> int:
         """Return the seed of the random numbers, by time and number of the last sample."""

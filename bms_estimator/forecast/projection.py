@@ -1,9 +1,11 @@
 """Distribution of the time to the cut-off: the pack run forward under many drawn or given loads."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.forecast.condensed_load import condense
 from bms_estimator.forecast.forecast import ForecastCurve
@@ -20,6 +22,8 @@ CURVE_DRAWS = 200
 """Number of draws from which the curves are computed."""
 CURVE_POINTS = 60
 """Maximum number of points of a curve."""
+DRAWN_LOADS = 3
+"""Weight of the drawn loads, in numbers of analogues."""
 BLOCK_S = 10
 """Minimum length of a block of the load [s]."""
 MAX_STEPS = 360
@@ -59,7 +63,9 @@ class Projection:
     curve: ForecastCurve
 
 
-def project_seen_load(pack: Records, mean_a: Floats, max_a: Floats, seed: int) -> Projection:
+def project_seen_load(
+    pack: Records, mean_a: Floats, max_a: Floats, seed: int, analogues: Sequence[GivenLoad] = ()
+) -> Projection:
     """Run the pack forward under loads drawn from the load that was seen.
 
     Args:
@@ -67,6 +73,7 @@ def project_seen_load(pack: Records, mean_a: Floats, max_a: Floats, seed: int) -
         mean_a: Mean current of each second [A], with a mean above the offset of the sensor.
         max_a: Largest current of each second [A].
         seed: Seed of the random numbers, 0 to 2**64 - 1.
+        analogues: Loads that followed similar loads of earlier discharges. Each replaces the drawn load of a part of the draws.
     """
     m = pack[0]
     load_a = float(mean_a.mean() - m["offset_a"])
@@ -78,13 +85,34 @@ def project_seen_load(pack: Records, mean_a: Floats, max_a: Floats, seed: int) -
     tabulate_blocks(m, mean_a[-used:], max_a[-used:], block_s, blocks)
     draws = _draws(m, seed)
     follow_seen_load(m, blocks, float(block_s), steps, draws)
+    parts_of_draws = list(_analogue_parts(pack, analogues, horizon_s))
+    for chosen, parts in parts_of_draws:
+        followed, no_points = draws[chosen], np.empty((chosen.size, 0))
+        follow_given_load(m, parts, horizon_s, followed, math.inf, no_points, no_points)
+        draws[chosen] = followed
     time_s, charge_as = _extrapolated(draws, load_a)
     curve_steps = min(math.ceil(CURVE_END * time_quantiles(time_s)[-1] / block_s), steps)
     stride = math.ceil(curve_steps / CURVE_POINTS)
     soc, voltage_v = np.empty((2, CURVE_DRAWS, math.ceil(curve_steps / stride)))
     record_curves(m, blocks, float(block_s), curve_steps, draws[:CURVE_DRAWS], stride, soc, voltage_v)
+    for drawn, parts in parts_of_draws:
+        chosen = drawn[drawn < CURVE_DRAWS]
+        soc_points, voltage_points_v = np.empty((2, chosen.size, soc.shape[1]))
+        follow_given_load(
+            m, parts, curve_steps * block_s, draws[chosen], stride * block_s, soc_points, voltage_points_v
+        )
+        soc[chosen], voltage_v[chosen] = soc_points, voltage_points_v
     elapsed_s: Floats = block_s * (np.arange(soc.shape[1], dtype=np.float64) * stride + 0.5)
     return Projection(time_s, charge_as, _curve(elapsed_s, soc, voltage_v, time_s))
+
+
+def _analogue_parts(
+    pack: Records, analogues: Sequence[GivenLoad], horizon_s: float
+) -> Iterator[tuple[NDArray[np.int64], Records]]:
+    """Yield the indices of the draws that follow each analogue, and its parts without the offset of the sensor."""
+    for number, load in enumerate(analogues):
+        true_load = replace(load, current_a=load.current_a - pack["offset_a"][0])
+        yield np.arange(number, DRAWS, len(analogues) + DRAWN_LOADS), _parts(true_load, horizon_s)
 
 
 def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.forecast.load_history import MAX_LOAD_S, LoadHistory
+from bms_estimator.forecast.past_minutes import MAX_MINUTES, PastMinutes
 
 MAX_CURRENT_A = 1e6
 """Maximum plausible absolute current [A]."""
 
 
-def load_arrays(load: LoadHistory) -> dict[str, NDArray[Any]]:
+def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]:
     """Return the load as arrays by name, which ``restore_load`` accepts."""
     row = load.record[0]
     mean_a, max_a = load.mean_and_max()
@@ -22,28 +23,33 @@ def load_arrays(load: LoadHistory) -> dict[str, NDArray[Any]]:
         "filtered_a": np.array(row["filtered_a"]),
         "last_a": np.array(row["last_a"]),
         "rest_s": np.array(row["rest_s"]),
+        "minutes_mean_a": past.mean_a.astype(np.float32),
+        "minutes_max_a": past.max_a.astype(np.float32),
     }
 
 
-def restore_load(load: LoadHistory, arrays: Mapping[str, NDArray[Any]]) -> None:
+def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Restore a load.
 
     Args:
         load: Empty load; unchanged if the arrays are invalid.
+        past: Empty minutes; unchanged if the arrays are invalid.
         arrays: Arrays of ``load_arrays``.
 
     Raises:
         ValueError: An array is missing, or has another shape or implausible values.
     """
-    missing = [name for name in load_arrays(load) if name not in arrays]
+    missing = [name for name in load_arrays(load, past) if name not in arrays]
     if missing:
         raise ValueError(f"{', '.join(missing)}: missing")
     mean_a, max_a, scalars = arrays["mean_a"], arrays["max_a"], [arrays[n] for n in ("filtered_a", "last_a", "rest_s")]
-    if mean_a.ndim != 1 or mean_a.shape != max_a.shape or mean_a.size > MAX_LOAD_S or any(v.ndim for v in scalars):
-        raise ValueError(
-            f"arrays of shapes {mean_a.shape} and {max_a.shape}: must be equal, with at most {MAX_LOAD_S} elements"
-        )
-    for values in (mean_a, max_a, *scalars):
+    minutes_mean_a, minutes_max_a = arrays["minutes_mean_a"], arrays["minutes_max_a"]
+    for mean, largest, most in ((mean_a, max_a, MAX_LOAD_S), (minutes_mean_a, minutes_max_a, MAX_MINUTES)):
+        if mean.ndim != 1 or mean.shape != largest.shape or mean.size > most or any(v.ndim for v in scalars):
+            raise ValueError(
+                f"arrays of shapes {mean.shape} and {largest.shape}: must be equal, with at most {most} elements"
+            )
+    for values in (mean_a, max_a, minutes_mean_a, minutes_max_a, *scalars):
         if values.dtype.kind not in "fi" or not (np.abs(values) <= MAX_CURRENT_A).all():
             raise ValueError("a value is not finite, or too large")
     if (mean_a > max_a).any() or arrays["rest_s"] < 0:
@@ -53,3 +59,4 @@ def restore_load(load: LoadHistory, arrays: Mapping[str, NDArray[Any]]) -> None:
         row[name] = arrays[name]
     row["count"], row["next"] = mean_a.size, mean_a.size % MAX_LOAD_S
     row["mean_a"][: mean_a.size], row["max_a"][: mean_a.size] = mean_a, max_a
+    past.restore(minutes_mean_a.astype(float), minutes_max_a.astype(float), load)

@@ -12,7 +12,7 @@ import structlog
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.estimator import Estimator
-from bms_estimator.forecast.load_history import LoadHistory
+from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
@@ -36,9 +36,9 @@ log = structlog.get_logger(__name__)
 
 
 class SeenLoad(NamedTuple):
-    """Load that was seen, and its file."""
+    """Forecaster with the load that was seen, and the file of this load."""
 
-    load: LoadHistory
+    forecaster: Forecaster
     file: HistoryFile
 
 
@@ -173,8 +173,8 @@ class CheckpointWriter:
         samples = self._progress[0]
         if self._seen_load is None or samples == self._samples_of_saved_load:
             return
-        load, file = self._seen_load
-        arrays = load_arrays(load)
+        forecaster, file = self._seen_load
+        arrays = load_arrays(forecaster.load, forecaster.past)
         if await self._write(lambda: file.save(arrays), file.path):
             self._samples_of_saved_load = samples
 

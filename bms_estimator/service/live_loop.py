@@ -100,7 +100,7 @@ async def run_estimation_loop(
     counters, outcome = restore_pack(estimator, pack_model, checkpoint, history, clock)
     restored_s = since_boot()
     forecaster = new_forecaster(settings, cell, estimator, pack_model)
-    seen_load = SeenLoad(forecaster.load, load_file) if forecaster and load_file else None
+    seen_load = SeenLoad(forecaster, load_file) if forecaster and load_file else None
     if seen_load:
         _restore_load(seen_load)
     totals = LifetimeTotals(estimator, counters.total)
@@ -232,11 +232,11 @@ async def _measure_lag(publisher: Publisher) -> None:
 
 def _restore_load(seen: SeenLoad) -> None:
     """Restore the load that an earlier run saw; a damaged file is logged, and the next save replaces it."""
-    file, reason = str(seen.file.path), restore_seen_load(seen.file, seen.load)
+    file, reason = str(seen.file.path), restore_seen_load(seen.file, seen.forecaster)
     if reason:
         log.warning("the load that was seen is damaged and was not restored", file=file, reason=reason)
     else:
-        log.info("load", file=file, seconds=seen.load.seconds)
+        log.info("load", file=file, seconds=seen.forecaster.load.seconds)
 
 
 def _restore_alarms(publisher: Publisher, saved: str) -> None:

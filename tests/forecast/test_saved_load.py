@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.forecast.load_history import MAX_LOAD_S, LoadHistory
+from bms_estimator.forecast.past_minutes import PastMinutes
 from bms_estimator.forecast.saved_load import load_arrays, restore_load
 from bms_estimator.kernels.trace import TRACE
 
@@ -29,8 +30,10 @@ def drive(seconds: int, first_s: float = 0.0) -> Any:
 
 @pytest.mark.parametrize("seconds", [2, 700, MAX_LOAD_S + 500])
 def test_restored_load_continues_like_the_saved_one(seconds: int) -> None:
-    load, restored = seen_load(seconds), LoadHistory(CAPACITY_AS)
-    restore_load(restored, load_arrays(load))
+    load, past, restored, restored_past = seen_load(seconds), PastMinutes(), LoadHistory(CAPACITY_AS), PastMinutes()
+    past.add(load)
+    restore_load(restored, restored_past, load_arrays(load, past))
+    assert restored_past.mean_a == pytest.approx(past.mean_a, rel=1e-6)
     assert restored.seconds == load.seconds
     more = drive(600, 1e6)  # after a gap
     for each in (load, restored):
@@ -51,14 +54,16 @@ def test_restored_load_continues_like_the_saved_one(seconds: int) -> None:
         lambda arrays: arrays.update(mean_a=np.ones((2, 2)), max_a=np.ones((2, 2))),
         lambda arrays: arrays.update(mean_a=2.0 * arrays["max_a"]),
         lambda arrays: arrays.update(rest_s=np.array(-1)),
+        lambda arrays: arrays.update(minutes_mean_a=np.full(3, np.inf), minutes_max_a=np.full(3, np.inf)),
+        lambda arrays: arrays.update(minutes_mean_a=np.ones(3)),
         lambda arrays: arrays.update(rest_s=np.zeros(2)),
         lambda arrays: arrays.update(filtered_a=np.array("x")),
     ],
 )
 def test_damaged_arrays_are_rejected_and_change_nothing(damage: Callable[[dict[str, Any]], object]) -> None:
-    arrays, load = load_arrays(seen_load(400)), LoadHistory(CAPACITY_AS)
+    arrays, load, past = load_arrays(seen_load(400), PastMinutes()), LoadHistory(CAPACITY_AS), PastMinutes()
     damage(arrays)
     empty = load.record.tobytes()
     with pytest.raises(ValueError, match=r"missing|must be equal|not finite|above the largest"):
-        restore_load(load, arrays)
+        restore_load(load, past, arrays)
     assert load.record.tobytes() == empty

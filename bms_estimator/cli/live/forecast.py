@@ -205,7 +205,7 @@ def _saved_state(settings: Settings, model: PackModel) -> _Start:
     if forecaster is None:
         raise _no_forecaster(model)
     load_file = HistoryFile(folder, settings, model, LOAD_SUFFIX)
-    if reason := restore_seen_load(load_file, forecaster.load):
+    if reason := restore_seen_load(load_file, forecaster):
         typer.echo(f"warning: {load_file.path}: the load that was seen is unknown: {reason}", err=True)
     return _Start(settings.pack.name, forecaster, content.unseen_s)
 

@@ -49,7 +49,7 @@ def pack(tmp_path_factory: pytest.TempPathFactory, samples: SampleBlock) -> Path
     forecaster.run(samples)
     (folder / "state").mkdir()
     CheckpointFile(folder / "state", settings, cell).save(estimator.record, RunCounters(0, new_totals(0.0)))
-    HistoryFile(folder / "state", settings, cell, LOAD_SUFFIX).save(load_arrays(forecaster.load))
+    HistoryFile(folder / "state", settings, cell, LOAD_SUFFIX).save(load_arrays(forecaster.load, forecaster.past))
     return file
 
 
