@@ -66,7 +66,7 @@ MAX_DISCHARGE_C = 5.0
 default: it only rejects invalid samples, and lies far above the continuous current of most cells."""
 COLLAPSE_CLEAR_FRACTION = 0.5
 """Clear level of ``collapse_risk`` as a fraction of its limit."""
-WEAK_CELL_STD, WEAK_CELL_CLEAR_STD = 5.0, 3.0
+WEAK_CELL_STD, WEAK_CELL_CLEAR_STD = 3.0, 1.5
 """Default limit and clear level of ``weak_cell``: deviation of a discharge from the bank's reference [std]. docs/pack/bank.md
 has its false alarms."""
 CURRENT_CLEAR_FRACTION = 0.95

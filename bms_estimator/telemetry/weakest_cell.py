@@ -30,7 +30,7 @@ def weakest_cell_values(model: SlowFit | None) -> WeakestCellValues:
     """Return the values of the weakest cell by the last comparison and the filter's present SOC.
 
     Args:
-        model: Slow fit of the bank; read only. None: there is none.
+        model: Slow fit of the bank; read only. None: the pack has no slow fit.
     """
     if model is None or model.bank is None or model.bank.weakest is None or math.isnan(model.estimator.soc):
         return UNKNOWN

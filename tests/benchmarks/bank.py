@@ -97,7 +97,7 @@ def bound(cell: CellModel, series: int, capacity_ratio: float) -> float:
 
 def false_alarms(banks: int, cycles: int) -> None:
     """Print the largest deviations of healthy banks."""
-    print_row("cells", "discharges", "above 3", "above 4", f"above {WEAK_CELL_STD:g}", "largest", "SOC within 2 std")
+    print_row("cells", "discharges", "above 1", "above 2", f"above {WEAK_CELL_STD:g}", "largest", "SOC within 2 std")
     for series in SERIES:
         largest: list[float] = []
         errors: list[float] = []
@@ -108,7 +108,7 @@ def false_alarms(banks: int, cycles: int) -> None:
                 errors.append((each.estimated[0] - each.true_soc) / each.estimated[1])
             largest += by_cycle.values()
         deviation = np.array(largest)
-        limits = [f"{(deviation >= limit).sum()}" for limit in (3.0, 4.0, WEAK_CELL_STD)]
+        limits = [f"{(deviation >= limit).sum()}" for limit in (1.0, 2.0, WEAK_CELL_STD)]
         print_row(
             series, banks * (cycles - REFERENCE_CYCLES), *limits, f"{deviation.max():.1f}", f"{within(errors):.0%}"
         )

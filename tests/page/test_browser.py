@@ -55,6 +55,8 @@ STATE_VALUES = {  # as published in ``state``
     "energy_in_kwh": 123.456,
     "delta_1": 0.031,
     "delta_2": 0.0789,
+    "weakest_cell_soc": 0.3871,
+    "weakest_cell_soc_std": 0.0184,
     "stability_margin": 0.3532,
     "cells_v": [3.271, 3.2755, None, 3.2688],
 }
@@ -76,6 +78,8 @@ SHOWN_TEXTS = {  # by quantity (attribute ``data-q``)
     "energy_in_kwh": "123.5 kWh",
     "stop": "7.9",
     "deltas": "δ₁ 3.1 %, δ₂ 7.9 %",
+    "weakest_cell_soc": "38.7",
+    "weakest_cell_soc_std": "3.7",  # two std in percent
     "stability_margin": "35.3",
     "celllow": "3.269 V · cell 4",
     "cellhigh": "3.276 V · cell 2",
