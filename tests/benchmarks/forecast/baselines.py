@@ -14,6 +14,10 @@ from tests.benchmarks.recipes import charge_ah
 
 MEAN_CURRENT_S, REPEATED_S = 600.0, 1800.0
 """Durations of the mean current, and of the load that is repeated [s]."""
+CONSTANT_S = 3600.0
+"""Duration of a part of a constant load [s]. The forecast divides it into steps."""
+MAX_STEPS = 14_400
+"""Maximum number of steps in which a repeated load empties the pack. A small load is given in steps of more than a second."""
 NORMAL_95 = 1.645
 """95 % quantile of the standard normal distribution."""
 
@@ -48,8 +52,12 @@ def charge_over_mean_current(moment: Moment) -> Quantiles:
 
 def half_hour_repeated(moment: Moment) -> Quantiles:
     """Return the forecast of the model under the load of the last half hour, repeated."""
-    recent = last(moment.samples, REPEATED_S)
-    return under_load(moment, load_by_second(recent, float(recent["time_s"][0]), moment.time_s))
+    recent, estimator = last(moment.samples, REPEATED_S), moment.forecaster.estimator
+    charge_as = estimator.soc * float(estimator.settings[0]["capacity_as"])
+    step_s = math.ceil(charge_as / max(mean_current(recent), 1e-6) / MAX_STEPS)
+    if not 1 <= step_s <= REPEATED_S:
+        return UNKNOWN
+    return under_load(moment, load_by_second(recent, float(recent["time_s"][0]), moment.time_s, step_s))
 
 
 def constant_power(moment: Moment) -> Quantiles:
@@ -59,7 +67,7 @@ def constant_power(moment: Moment) -> Quantiles:
     power_w = float(np.sum((recent["current_a"] * recent["voltage_v"])[:-1] * steps_s) / max(np.sum(steps_s), 1.0))
     if not power_w > 0.0:
         return UNKNOWN
-    median_s = under_load(moment, GivenLoad(np.array([1.0]), np.array([math.nan]), np.array([power_w]))).p50_s
+    median_s = under_load(moment, GivenLoad(np.array([CONSTANT_S]), np.array([math.nan]), np.array([power_w]))).p50_s
     return Quantiles(median_s, median_s, median_s)
 
 
@@ -97,14 +105,14 @@ def under_load(moment: Moment, load: GivenLoad | None) -> Quantiles:
     return quantiles_of(moment.forecaster.forecast(load))
 
 
-def load_by_second(samples: SampleBlock, begin_s: float, end_s: float) -> GivenLoad | None:
-    """Return the mean current of each second from ``begin_s`` to ``end_s`` [s]; None if that is less than a second."""
-    edges_s = np.arange(begin_s, end_s + 0.5)
+def load_by_second(samples: SampleBlock, begin_s: float, end_s: float, step_s: int = 1) -> GivenLoad | None:
+    """Return the mean current of each ``step_s`` from ``begin_s`` to ``end_s`` [s]; None if that is less than a step."""
+    edges_s = np.arange(begin_s, end_s + 0.5, step_s)
     if edges_s.size < 2:
         return None
     time_s = np.maximum.accumulate(samples["time_s"])
-    current_a = 3600.0 * np.diff(np.interp(edges_s, time_s, charge_ah(samples)))
-    return GivenLoad(np.ones(current_a.size), current_a, np.full(current_a.size, math.nan))
+    current_a = 3600.0 * np.diff(np.interp(edges_s, time_s, charge_ah(samples))) / step_s
+    return GivenLoad(np.full(current_a.size, float(step_s)), current_a, np.full(current_a.size, math.nan))
 
 
 def mean_current(samples: SampleBlock) -> float:
