@@ -21,7 +21,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank observability resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads cell-schema notebook lock
+.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank observability power resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads cell-schema notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -105,6 +105,9 @@ observability: venv ## the lower bound of the std of the SOC by cell and SOC win
 
 forecast: venv ## forecasts of the time to cut-off on real captures, beside other methods, e.g. make forecast ARGS="n10_us06 leaf": half an hour
 	@$(BIN)/python -m tests.benchmarks.forecast $(ARGS)
+
+power: venv ## available power, usable capacity and time to full against real captures: two minutes
+	@$(BIN)/python -m tests.benchmarks.capability
 
 chapter5: venv ## the experiments of the thesis's chapter 5 on real captures, beside Tables 11 and 13
 	@$(BIN)/python -m tests.benchmarks.thesis.chapter5
