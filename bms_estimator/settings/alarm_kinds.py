@@ -68,7 +68,9 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
         device_class="battery",
     ),
     "collapse_risk": AlarmKind(
-        "the voltage may fall to the cut-off within minutes", "reduce the load, and charge", ("voltage", "current")
+        "the voltage may reach the cut-off within 5 min (probability)",
+        "reduce the load, and charge",
+        ("voltage", "current"),
     ),
     "stability_margin_low": AlarmKind(
         "the SOC is close to the value below which the model is unstable",

@@ -74,7 +74,7 @@ class FractionRule(AlarmRule):
 
 
 class CollapseRule(AlarmRule):
-    """Alarm on the risk of the cut-off within minutes; its limit follows from the accepted rate of false alarms."""
+    """Alarm on the probability of the cut-off; its limit follows from the accepted rate of false alarms."""
 
     false_alarms_per_month: Positive = Field(
         default=1.0,
@@ -165,7 +165,7 @@ class AlarmSettings(Strict):
     soc_low: FractionRule = FractionRule()
     collapse_risk: CollapseRule = Field(
         default=CollapseRule(),
-        description="risk that the voltage falls to the cut-off within minutes, by the forecast",
+        description="probability of the cut-off within 5 min, by the forecast",
     )
     stability_margin_low: FractionRule = FractionRule()
     cell_imbalance: VoltageRule = VoltageRule(delay_s=60.0)

@@ -5,13 +5,23 @@ import math
 import numpy as np
 
 USE_H_PER_MONTH = 60.0
-"""Hours of use in a month: two hours a day."""
-FALSE_ALARMS = ((0.5, 0.9), (1.0, 0.7), (3.0, 0.5), (10.0, 0.2))
-"""Pairs of the number of false alarms in 100 h of use and the limit, by ``make collapse`` (docs/theory/collapse.md)."""
+"""Hours of use in a month, at two hours a day."""
+FALSE_ALARMS = (
+    (0.3, 0.70),
+    (0.6, 0.66),
+    (1.2, 0.58),
+    (2.2, 0.46),
+    (4.3, 0.30),
+    (7.1, 0.18),
+    (14.0, 0.10),
+    (19.5, 0.05),
+)
+"""Pairs of the number of false alarms in 100 h of use and the limit: points of the measured curve of all discharges
+(``make collapse``, docs/theory/collapse.md)."""
 
 
 def collapse_limit(false_alarms_per_month: float) -> float:
-    """Return the risk at which the alarm is raised, 0..1.
+    """Return the probability of the cut-off at which the alarm is raised, 0..1.
 
     The limit is interpolated over the logarithm of the rate. Outside the measured curve it is that of the curve's end.
 

@@ -25,7 +25,7 @@ from bms_estimator.telemetry.alarm_inputs import LOSS_TEXTS, Inputs, count_value
 from bms_estimator.telemetry.alarm_samples import SampleBuffer, SampleIntervals
 from bms_estimator.telemetry.alarm_state import AlarmState, AlarmTransition, RaisedAlarm
 from bms_estimator.telemetry.alarm_text import alarm_text
-from bms_estimator.telemetry.collapse_risk import collapse_risks, collapse_text
+from bms_estimator.telemetry.collapse_risk import collapse_risks, time_left_text
 
 SENSOR_SUSPECTS = (
     InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
@@ -422,7 +422,7 @@ class AlarmEvaluator:
         for transition in state.update(times_s, steps_s, values, wall_offset_s):
             if transition.raised is not None and forecasts is not None:
                 at = int(np.flatnonzero(times_s == transition.at_s)[-1])
-                self._reasons[name] = Reasons(InputFault(0), (collapse_text(forecasts[at]),))
+                self._reasons[name] = Reasons(InputFault(0), (time_left_text(forecasts[at]),))
             self._record(state, [transition])
 
     def _record(self, state: AlarmState, transitions: Iterable[AlarmTransition]) -> None:

@@ -1,4 +1,4 @@
-"""Risk that the voltage falls to the cut-off within minutes, by the forecast."""
+"""Value and text of the alarm ``collapse_risk``: the probability of the cut-off within 5 min, by the forecast."""
 
 import numpy as np
 
@@ -20,9 +20,7 @@ def collapse_risks(forecasts: ForecastRows, is_charging: np.ndarray) -> Floats:
     return np.where(np.isnan(probability) & is_charging, 0.0, probability)
 
 
-def collapse_text(forecast: np.void) -> str:
-    """Return the probability of the cut-off and the band of the time left, one sentence, for a record FORECAST."""
-    percent = 100.0 * float(forecast["cutoff_within_5min"])
+def time_left_text(forecast: np.void) -> str:
+    """Return the band of the time to the cut-off, one sentence, for a record FORECAST."""
     early_min, late_min = (float(forecast[f"time_to_cutoff_{name}_s"]) / 60.0 for name in ("p05", "p95"))
-    band = f"the voltage reaches it in {early_min:.0f} to {late_min:.0f} min (90 %)"
-    return f"when raised: cut-off within 5 min with a probability of {percent:.0f} %; {band}"
+    return f"the time left was {early_min:.0f} to {late_min:.0f} min (90 % band) when the alarm was raised"

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -144,6 +145,43 @@ async def test_transitions_of_a_replay_do_not_depend_on_the_size_of_blocks(tmp_p
     result = await replayed(path, settings())
     result_of_long_blocks = await replayed(path, settings(), at_once=True)
     assert _transitions(result_of_long_blocks) == _transitions(result) != []
+
+
+@pytest.fixture(scope="module")
+def knee(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the capture of a pack that is driven into the knee and then charged."""
+    return record(tmp_path_factory.mktemp("knee") / "capture.bms", knee_lines())
+
+
+async def test_collapse_risk_says_probability_and_time_left_and_does_not_depend_on_the_size_of_blocks(
+    knee: Path,
+) -> None:
+    result = await replayed(knee, settings(pack={}), at_once=True)
+    raised = next(change.alarm for change in result.changes if change.alarm.name == "collapse_risk")
+    assert raised.value is not None
+    assert raised.limit is not None
+    assert raised.limit <= raised.value <= 1.0
+    assert f"{raised.value:.4g}, limit" in raised.text
+    assert re.search(r"the time left was \d+ to \d+ min \(90 % band\)", raised.text)
+    of_single_samples = await replayed(knee, settings(pack={}))
+    assert of_single_samples.transitions("collapse_risk") == result.transitions("collapse_risk")
+
+
+async def test_a_higher_accepted_rate_of_false_alarms_warns_earlier(knee: Path) -> None:
+    times_s = []
+    for rate in (1.0, 3.0):
+        alarms = {"collapse_risk": {"false_alarms_per_month": rate}}
+        result = await replayed(knee, settings(alarms, pack={}), at_once=True)
+        times_s.append(result.transitions("collapse_risk")[0][0])
+    assert times_s[1] < times_s[0]
+
+
+async def test_collapse_risk_stays_raised_over_a_restart_until_there_is_a_forecast(tmp_path: Path) -> None:
+    saved = json.dumps({"collapse_risk": {"since_s": WALL_S, "value": 0.9, "gone": False, "acknowledged": False}})
+    resting = record(tmp_path / "capture.bms", [Line(200, voltage_v=6.4)])
+    result = await replayed(resting, settings(), saved_state=saved, at_once=True)
+    assert result.transitions("collapse_risk") == []
+    assert next(alarm for alarm in result.snapshots[-1].alarms if alarm.name == "collapse_risk").active
 
 
 def _transitions(result: ReplayResult) -> list[tuple[float, str, bool]]:

@@ -1,5 +1,7 @@
 """``alarms``: raised alarms of a capture. ``config``: check and output of the alarms' limits and hooks."""
 
+import csv
+import gzip
 import json
 from pathlib import Path
 
@@ -7,6 +9,10 @@ import pytest
 
 from tests.command_line import run
 from tests.telemetry.alarm_captures import Line, record
+
+LEAF = Path(__file__).parents[2] / "data" / "leaf" / "cc_1c.csv.gz"
+LEAF_CHARGED_S = 17_000.0
+"""Time at which the part of the capture ends [s]."""
 
 
 @pytest.fixture
@@ -45,6 +51,25 @@ def test_raised_alarms_are_listed_with_their_times(
     assert code == 0
     assert "over_temperature" in out
     assert "latched" in out
+
+
+def test_collapse_risk_is_raised_before_the_cut_off_of_a_real_cell_and_cleared_in_its_charge(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The capture is of a Leaf cell: a discharge at 1 C to 3.0 V, a rest of half an hour, and a charge at C/2."""
+    capture, pack_file = tmp_path / "leaf.csv", tmp_path / "pack.toml"
+    with gzip.open(LEAF, "rt") as file:
+        rows = [row for row in csv.reader(file) if row[0] == "time_s" or 9500.0 < float(row[0]) < LEAF_CHARGED_S]
+    with capture.open("w") as file:
+        csv.writer(file).writerows(rows)
+    pack_file.write_text("[pack]\ncell = 'leaf'\ncutoff_v = 3.05\n")
+    cutoff_s = next(float(row[0]) for row in rows[1:] if float(row[2]) < 3.05)
+    code, out, _ = run(capsys, "alarms", capture, "--pack", pack_file, "--json")
+    assert code == 0
+    (alarm,) = (each for each in json.loads(out)["raised"] if each["alarm"] == "collapse_risk")
+    assert cutoff_s - 600.0 < alarm["raised_s"] < cutoff_s - 60.0
+    assert cutoff_s < alarm["ended_s"]
+    assert alarm["value"] >= alarm["limit"]
 
 
 @pytest.mark.parametrize(
