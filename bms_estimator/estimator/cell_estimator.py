@@ -11,11 +11,10 @@ from bms_estimator.kernels.cells.cell_filter import BIAS_V
 from bms_estimator.kernels.cells.records import BANK, CAPACITY, CELL, LEAK, RESISTANCE, SOC, STATES, ReadingFault
 from bms_estimator.kernels.cells.step import run_cells
 from bms_estimator.model.arrays import Floats, Records
-from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.settings.alarm_limits import MIN_CELLS, balancing_voltage_v
 
-MIN_CELLS = 3
-"""Minimum number of cells. With two cells nothing shows which one deviates."""
 LEAK_STDS = 4.0
 """Std by which the self-discharge of a cell must exceed that of the other cells to count as a short."""
 
@@ -30,6 +29,7 @@ class CellDeviations:
     """Deviations of the cells of a pack, each an array of shape (m,).
 
     Attributes:
+        at_s: Time of the estimate on the samples' clock [s].
         soc: SOC, 0..1.
         soc_std: Standard deviation of ``soc``.
         soc_deviation: SOC less the mean SOC of the cells.
@@ -44,6 +44,7 @@ class CellDeviations:
         contact_ohm: Resistance of a faulty contact [ohm]; 0 without one.
     """
 
+    at_s: float
     soc: Floats
     soc_std: Floats
     soc_deviation: Floats
@@ -73,18 +74,19 @@ class CellEstimator:
 
     Args:
         estimator: Estimator of the pack; read only. Without its identifier there is no estimate of the cells.
-        balancing_v: Cell voltage from which a balancer may be active [V].
 
     Attributes:
         cells: State of the cells, shape (m,), dtype CELL; m is 0 before the first cell voltages.
         bank: State that the cells share, shape (1,), dtype BANK.
     """
 
-    def __init__(self, estimator: Estimator, balancing_v: float) -> None:
-        self._estimator, self._balancing_v = estimator, balancing_v
-        self._series = estimator.cell.cell.series_count
-        enabled = estimator.identifying and not isinstance(estimator.cell, FuelCellModel)
-        self._enabled = enabled and self._series >= MIN_CELLS
+    def __init__(self, estimator: Estimator) -> None:
+        self._estimator, cell = estimator, estimator.cell
+        self._series = cell.cell.series_count
+        self._enabled = estimator.identifying and isinstance(cell, CellModel) and self._series >= MIN_CELLS
+        self._balancing_v = balancing_voltage_v(cell) if isinstance(cell, CellModel) else math.inf
+        self._deviations: CellDeviations | None = None
+        self._deviations_window = 0  # window of ``_deviations``
         self._start(0)
 
     def _start(self, count: int) -> None:
@@ -127,10 +129,14 @@ class CellEstimator:
 
     @property
     def deviations(self) -> CellDeviations | None:
-        """Present deviations of the cells; None before the first sample with cell voltages."""
+        """Deviations of the cells at the end of the last window; None before the first window with cell voltages."""
+        window = int(self.bank["windows"][0])
+        if window != self._deviations_window:
+            self._deviations, self._deviations_window = self._compute_deviations(), window
+        return self._deviations
+
+    def _compute_deviations(self) -> CellDeviations:
         bank = self.bank[0]
-        if not bank["started"]:
-            return None
         mean, variance = self.cells["mean"], np.diagonal(self.cells["covariance"], axis1=1, axis2=2)
         std = np.sqrt(np.maximum(variance, 0.0))
         std[:, SOC] = np.hypot(std[:, SOC], self._systematic_soc_std)
@@ -139,6 +145,7 @@ class CellEstimator:
         resistance, capacity = 1.0 + mean[:, RESISTANCE], 1.0 / np.maximum(1.0 + mean[:, CAPACITY], 0.1)
         pack_std = float(self._estimator.record["filter"]["soc_std"][0])
         return CellDeviations(
+            at_s=float(bank["time_s"]),
             soc=np.clip(bank["soc"] + deviation, 0.0, 1.0),
             soc_std=np.hypot(std[:, SOC], pack_std),
             soc_deviation=deviation,

@@ -66,13 +66,13 @@ class Estimate(Payload):
         Field(description="mean temperature [C]; null without a sensor")
     )
     cell_lowest_v: Annotated[
-        float | None, Quantity(Entity("Weakest cell, voltage", "V", 3, 0.005, "voltage"), packs="with cell voltages")
+        float | None, Quantity(Entity("Lowest cell, voltage", "V", 3, 0.005, "voltage"), packs="with cell voltages")
     ] = Field(description="lowest cell voltage at the last sample [V]; null without cell voltages")
     cell_highest_v: Annotated[
         float | None, Quantity(raw_entity("Highest cell, voltage", "V", 3, "voltage"), packs="with cell voltages")
     ] = Field(description="highest cell voltage at the last sample [V]; null without cell voltages")
     cell_lowest: Annotated[
-        int | None, Quantity(Entity("Weakest cell", None, 0, 1.0, state_class=None), packs="with cell voltages")
+        int | None, Quantity(Entity("Lowest cell", None, 0, 1.0, state_class=None), packs="with cell voltages")
     ] = Field(description="number of the lowest cell, from 1")
     cell_highest: Annotated[
         int | None,
@@ -149,8 +149,8 @@ class Estimate(Payload):
         float | None, Quantity(Entity("Weakest cell, SOC", None, 3, 0.01), packs="batteries", prometheus="ratio")
     ] = Field(
         default=None,
-        description="SOC of the weakest cell in series by the bank's voltage, 0..1; null for a single cell, and before a "
-        "discharge was compared with earlier ones. The voltage of the bank does not show which cell it is",
+        description="SOC of the weakest cell, 0..1: by the cell voltages, or without them by the voltage of the bank; null for a single cell, "
+        "and before the first comparison",
     )
     weakest_cell_soc_std: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
         default=None, description="standard deviation of weakest_cell_soc"
@@ -162,6 +162,22 @@ class Estimate(Payload):
     usable_capacity_to_weakest_ah: Annotated[
         float | None, Quantity(raw_entity("Usable capacity to the weakest cell", "Ah", 2), packs="batteries")
     ] = Field(default=None, description="remaining charge until the weakest cell is empty [Ah]")
+    weakest_cell: Annotated[
+        int | None, Quantity(Entity("Weakest cell", None, 0, 1.0, state_class=None), packs="with cell voltages")
+    ] = Field(
+        default=None,
+        description="number of the cell with the lowest SOC, from 1; null before the first estimate of the cells, and "
+        "without cell voltages",
+    )
+    cell_soc_spread: Annotated[
+        float | None, Quantity(Entity("Cell spread, SOC", None, 3, 0.005), packs="with cell voltages")
+    ] = Field(default=None, description="highest less lowest SOC of the cells; null as weakest_cell")
+    cell_r_spread: Annotated[
+        float | None, Quantity(Entity("Cell spread, resistance", None, 2, 0.02), packs="with cell voltages")
+    ] = Field(
+        default=None,
+        description="highest less lowest resistance of the cells, relative to their median; null as weakest_cell",
+    )
     charge_out_ah: Annotated[
         float, Quantity(total_entity("Charge out", "Ah", 2)._replace(enabled=False), prometheus="counter")
     ] = Field(description=f"discharged {_COUNTED} [Ah]")
@@ -482,6 +498,37 @@ class ForecastReport(Payload):
     survival: list[float | None] = Field(description="probability that the load is still on at this time, 0..1")
 
 
+CellFaultName = Literal["internal short", "contact", "sense wire", "wrong reading", "stuck reading"]
+"""Fault of a cell, or of the reading of its voltage."""
+
+
+class CellReport(Payload):
+    """One cell in series."""
+
+    number: int = Field(description="number, from 1")
+    soc: float = Field(description="state of charge, 0..1")
+    soc_std: float = Field(description="standard deviation of soc")
+    soc_deviation: float = Field(description="SOC less the mean SOC of the cells")
+    soc_deviation_std: float = Field(description="standard deviation of soc_deviation")
+    resistance_ratio: float = Field(description="resistance relative to the median of the cells")
+    resistance_ratio_std: float = Field(description="standard deviation of resistance_ratio")
+    capacity_ratio: float = Field(description="capacity relative to the median of the cells")
+    self_discharge_a: float = Field(description="self-discharge current above the median of the cells [A]")
+    self_discharge_std_a: float = Field(description="standard deviation of self_discharge_a [A]")
+    fault: CellFaultName | None = Field(
+        description="internal short: a fault of the cell; contact, sense wire, wrong reading, stuck reading: faults of the "
+        "measurement of its voltage; null: none"
+    )
+
+
+class CellsReport(Payload):
+    """Topic ``cells``, retained: comparison of the cells in series of a pack with cell voltages."""
+
+    publish_time: str = Field(description="time at which this message was created, ISO 8601, UTC")
+    weakest: int = Field(description="number of the cell with the lowest SOC, from 1")
+    cells: list[CellReport] = Field(description="all cells, from number 1 on")
+
+
 class Snapshot(NamedTuple):
     """Payloads of one publication."""
 
@@ -494,3 +541,5 @@ class Snapshot(NamedTuple):
     """All alarms, raised or not."""
     forecast: ForecastReport | None = None
     """Curves of the last forecast; None before the first sample and without a forecaster."""
+    cells: CellsReport | None = None
+    """Comparison of the cells, made once a minute; None without cell voltages."""

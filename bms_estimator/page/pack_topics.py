@@ -14,7 +14,9 @@ PACKS = "packs"
 """Key of the names of all packs and of the number of packs that are not shown."""
 STATE, PARAMETERS, RECENT, ELEMENTS = "state", "parameters", "recent", "elements"
 """Topics of state and parameters, and two keys that exist only here: recent states, and elements over SOC."""
-SHOWN_TOPICS = frozenset({STATE, PARAMETERS, "forecast", "health", "info", "event", AVAILABILITY, SENSOR_AVAILABILITY})
+SHOWN_TOPICS = frozenset(
+    {STATE, PARAMETERS, "forecast", "health", "cells", "info", "event", AVAILABILITY, SENSOR_AVAILABILITY}
+)
 ALARM = "alarm/"
 """Prefix of the topics of alarms."""
 ELEMENTS_OVER_SOC = frozenset({"r_s_ohm", "r_ts_ohm", "c_ts_farad", "r_tl_ohm", "c_tl_farad"})

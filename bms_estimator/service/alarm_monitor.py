@@ -6,6 +6,7 @@ from collections.abc import Callable
 import structlog
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import ForecastRows
 from bms_estimator.model.clock import Clock
@@ -18,6 +19,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarm_inputs import Inputs
 from bms_estimator.telemetry.alarms import NO_FORECAST, AlarmEvaluator, Change, SampleCounts
+from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.weakest_cell import WeakestCellValues
 
@@ -43,6 +45,7 @@ class AlarmMonitor:
         on_alarm: Called with each change of an alarm, as soon as it occurs.
         hooks: Successes and failures of alarm hooks; None without hooks.
         weakest_cell: Returns the values of the weakest cell.
+        cells: Estimators of the single cells; read only; None: none.
 
     Attributes:
         alarms: The monitored alarms and their states.
@@ -63,8 +66,10 @@ class AlarmMonitor:
         on_alarm: Callable[[Change], object],
         hooks: Callable[[], HookHealth | None] = lambda: None,
         weakest_cell: Callable[[], WeakestCellValues] = WeakestCellValues,
+        cells: CellEstimator | None = None,
     ) -> None:
-        self._hooks, self._weakest_cell = hooks, weakest_cell
+        self._hooks, self._weakest_cell, self._cells = hooks, weakest_cell, cells
+        self._cells_seen: CellDeviations | None = None  # evaluated last
         self._estimator, self._source, self._clock, self._on_alarm = estimator, source, clock, on_alarm
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
@@ -110,6 +115,10 @@ class AlarmMonitor:
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
         self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts)
         self.alarms.evaluate_weak_cell(self._weakest_cell().deviation_std, self._arrival_s)
+        cells = self._cells.deviations if self._cells else None
+        if cells is not None and cells is not self._cells_seen:
+            self._cells_seen = cells
+            self.alarms.evaluate_cells(cell_faults(cells), self._arrival_s)
         self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.silence_reason or "")
         if (hooks := self._hooks()) is not None:
             self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall())

@@ -13,6 +13,7 @@ from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.checkpoint.load_file import restore_seen_load
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.forecaster import Runner
 from bms_estimator.model.clock import Clock, since_boot
@@ -95,6 +96,7 @@ async def run_estimation_loop(
     hooks = hooks or AlarmHooks((), name, None, None)
     notifier = notifier or SystemdNotifier([name])
     estimator = new_estimator(settings, cell)
+    cells = CellEstimator(estimator)
     fit_thread = FitThread(clock, fit_executor)
     pack_model = new_slow_fit(settings, estimator, submit=fit_thread.submit, on_failure=fit_thread.log_failure)
     counters, outcome = restore_pack(estimator, pack_model, checkpoint, history, clock)
@@ -121,6 +123,7 @@ async def run_estimation_loop(
         hooks=lambda: hooks.health,
         pack_model=lambda: pack_model_health(pack_model, fit_thread.times) if pack_model else None,
         weakest_cell=lambda: weakest_cell_values(pack_model),
+        cells=cells,
         on_alarm=hooks.on_alarm_change,
         forecaster=forecaster,
     )
@@ -151,7 +154,16 @@ async def run_estimation_loop(
         await stack.enter_async_context(hooks)
         notifier.ready(name)
         tasks = [
-            _estimate(source, estimator, forecaster or pack_model or estimator, totals, publisher, edge, restored_s),
+            _estimate(
+                source,
+                estimator,
+                forecaster or pack_model or estimator,
+                cells,
+                totals,
+                publisher,
+                edge,
+                restored_s,
+            ),
             _keep_alive(publisher, notifier, name, clock),
             _measure_lag(publisher),
         ]
@@ -175,6 +187,7 @@ async def _estimate(
     source: Source,
     estimator: Estimator,
     runner: Runner,
+    cells: CellEstimator,
     totals: LifetimeTotals,
     publisher: Publisher,
     edge: BlockSender | None,
@@ -186,6 +199,7 @@ async def _estimate(
         source: Supplies the blocks.
         estimator: Estimator.
         runner: The estimator, or the forecaster or slow fit that runs it.
+        cells: Estimators of the single cells.
         totals: Totals over restarts.
         publisher: Publisher.
         edge: Sender that receives all samples; None: no sender.
@@ -199,6 +213,7 @@ async def _estimate(
         if edge:
             edge.take(received.samples)
         trace = runner.run(received.samples)
+        cells.run(received.samples, received.cells_v, trace)
         totals.add(trace)
         publisher.add(received, trace)
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 import structlog
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.cell import CellModel
@@ -27,10 +28,12 @@ from bms_estimator.model.payloads import (
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.latency import Latency
+from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source, SourceHealth
 from bms_estimator.telemetry.alarms import NO_FORECAST, Change
+from bms_estimator.telemetry.cells import NO_SHORT_LIMIT_A, make_cells_payload, weakest_cell_fields
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
 from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
@@ -40,7 +43,7 @@ from bms_estimator.telemetry.publish_window import Window, WindowSummary
 from bms_estimator.telemetry.remaining_charge import remaining_charge
 from bms_estimator.telemetry.rest_detector import RestDetector
 from bms_estimator.telemetry.state import make_info_payload, make_state_payload
-from bms_estimator.telemetry.weakest_cell import WeakestCellValues
+from bms_estimator.telemetry.weakest_cell import WeakestCellValues, bank_fields
 
 log = structlog.get_logger(__name__)
 
@@ -48,6 +51,8 @@ SLOW_S = 1.0
 """Minimum interval between two payloads of parameters, health or info, at any publish rate [s]."""
 FORECAST_S = 60.0
 """Minimum interval between two payloads of the forecast's curves [s]."""
+CELLS_S = 60.0
+"""Minimum interval between two comparisons of the cells [s]."""
 SOURCE_HUNG_S = 20.0
 """Time after which a source whose task has not run counts as hung [s]. A missing port is retried at least every 10 s."""
 
@@ -72,6 +77,7 @@ class Publisher:
         hooks: Returns successes and failures of alarm hooks; None without hooks.
         pack_model: Returns the state of the slow fit; None without one.
         weakest_cell: Returns the values of the weakest cell.
+        cells: Estimators of the single cells; read only; None: none.
         on_alarm: Called with each alarm that is raised or cleared.
         forecaster: Supplies the forecasts; None: there are none.
 
@@ -104,6 +110,7 @@ class Publisher:
         hooks: Callable[[], HookHealth | None] = lambda: None,
         pack_model: Callable[[], PackModelHealth | None] = lambda: None,
         weakest_cell: Callable[[], WeakestCellValues] = WeakestCellValues,
+        cells: CellEstimator | None = None,
         on_alarm: Callable[[Change], object] = lambda _: None,
         forecaster: Forecaster | None = None,
     ) -> None:
@@ -125,8 +132,14 @@ class Publisher:
         self.saved_flow: ChargeEnergy | None = None
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
-        self._window = Window()
-        self.alarm_monitor = AlarmMonitor(settings, cell, estimator, source, clock, on_alarm, hooks, weakest_cell)
+        self._window, self._cells = Window(), cells
+        self._cells_s = -math.inf  # time of the last comparison of the cells, monotonic clock
+        self.alarm_monitor = AlarmMonitor(
+            settings, cell, estimator, source, clock, on_alarm, hooks, weakest_cell, cells
+        )
+        self._short_limit_a = next(
+            (each.limit for each in monitored_alarms(settings, cell) if each.name == "cell_short"), NO_SHORT_LIMIT_A
+        )
         self._logged_faults = 0  # bits of ``InputFault``
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
@@ -201,7 +214,7 @@ class Publisher:
 
     def publish_last(self) -> None:
         """Publish a last snapshot with all payloads recomputed."""
-        self._slow_s = self._forecast_s = -math.inf
+        self._slow_s = self._forecast_s = self._cells_s = -math.inf
         self.publish()
 
     @property
@@ -236,7 +249,7 @@ class Publisher:
 
     def _next_snapshot(self, now_s: float) -> Snapshot:
         """Return a snapshot with the estimate of this window. Other payloads are recomputed only when they are due."""
-        _, parameters, health, info, _, forecast = self.snapshot
+        _, parameters, health, info, _, forecast, cells = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
         estimate = self._estimate(summary, wall_s) if summary else None
         if summary and now_s - self._forecast_s >= FORECAST_S:
@@ -249,7 +262,13 @@ class Publisher:
         if slow_due or health.sensor_online != (message is None):
             health = self._health(now_s, message)
             self._log_input_faults(health)
-        return Snapshot(estimate, parameters, health, info, self.alarm_monitor.report, forecast)
+        if now_s - self._cells_s >= CELLS_S and self._deviations is not None:
+            self._cells_s, cells = now_s, make_cells_payload(self._deviations, self._short_limit_a, wall_s)
+        return Snapshot(estimate, parameters, health, info, self.alarm_monitor.report, forecast, cells)
+
+    @property
+    def _deviations(self) -> CellDeviations | None:
+        return self._cells.deviations if self._cells else None
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         remaining = remaining_charge(self._estimator, window.current_a)
@@ -265,7 +284,7 @@ class Publisher:
             wall_s,
             self._flow,
             capacity_ah,
-            self._weakest_cell(),
+            bank_fields(self._weakest_cell()) | weakest_cell_fields(self._deviations),
         )
 
     def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:

@@ -86,6 +86,18 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
         "measure each cell, because the bank's voltage does not show which one it is; until then charge earlier",
         ("voltage", "current"),
     ),
+    "cell_short": AlarmKind(
+        "a cell discharges itself, as with an internal short",
+        "disconnect the pack, move it away from anything that burns, and replace the cell",
+        ("current", "cells"),
+        "A",
+    ),
+    "cell_sensor_fault": AlarmKind(
+        "the reading of a cell's voltage is wrong",
+        "check the contacts and sense wires of the cell; the cell itself may be intact",
+        ("current", "cells"),
+        "V",
+    ),
     "sensor_fault": AlarmKind(
         "samples are lost, unusable or from two publishers",
         "check sensors and wiring; the counters in topic health name the fault",

@@ -73,6 +73,17 @@ CURRENT_CLEAR_FRACTION = 0.95
 """Default clear level of a current as a fraction of its limit."""
 
 
+MIN_CELLS = 3
+"""Minimum number of cells that are compared with each other. With two cells nothing shows which one deviates."""
+MIN_SHORT_C = 1 / 30_000
+"""Default limit of the self-discharge of a cell above that of the others, as a C-rate [1/h]: 2.4 % a month."""
+MIN_READING_ERROR_V = 0.01
+"""Default limit of the error of a cell's reading [V]: ten steps of the usual converter."""
+BALANCING_BELOW_V = 0.25
+"""Voltage below the default limit of ``cell_over_voltage`` from which balancers are usually active [V]: 3.40 V for LFP,
+4.00 V for cells that are charged to 4.2 V."""
+
+
 class _Default(NamedTuple):
     """Default limit and clear level of an alarm."""
 
@@ -80,6 +91,9 @@ class _Default(NamedTuple):
     """None: the alarm is not monitored unless a limit is configured."""
     clear: float | None
     """Level at which the alarm ends; None: equal to the limit."""
+
+
+_UNMONITORED = _Default(None, None)
 
 
 def monitored_alarms(settings: Settings, cell: PackModel) -> tuple[AlarmDefinition, ...]:
@@ -115,6 +129,15 @@ def min_charge_current_a(cell: PackModel) -> float:
     # a fuel cell has no capacity
     reference_a = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
     return MIN_CHARGE_C * reference_a
+
+
+def balancing_voltage_v(cell: CellModel) -> float:
+    """Return the cell voltage from which a balancer may be active [V].
+
+    Args:
+        cell: Model of the whole pack.
+    """
+    return _voltage_limits(cell).over_v - BALANCING_BELOW_V
 
 
 def implausible_limits(settings: Settings, cell: PackModel) -> list[str]:
@@ -194,10 +217,17 @@ def _collapse_default(settings: Settings, cell: PackModel) -> _Default:
     return _Default(limit, COLLAPSE_CLEAR_FRACTION * limit)
 
 
+def _voltage_limits(cell: CellModel) -> VoltageLimits:
+    """Return the default voltage limits of one cell of a pack."""
+    nominal_v = cell.cell.nominal_voltage_v / cell.cell.series_count
+    return next(limits for max_nominal_v, limits in _VOLTAGE_LIMITS if nominal_v < max_nominal_v)
+
+
 def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
     c, n = cell.cell, cell.cell.series_count
-    nominal_v = c.nominal_voltage_v / n
-    v = next(limits for max_nominal_v, limits in _VOLTAGE_LIMITS if nominal_v < max_nominal_v)
+    v = _voltage_limits(cell)
+    short_a = MIN_SHORT_C * c.capacity_ah
+    compares = n >= MIN_CELLS
     charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less
     discharge_a = min(MAX_DISCHARGE_C * c.capacity_ah, c.current_max_a)
     return {
@@ -207,21 +237,24 @@ def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
         "cell_under_voltage": _Default(v.under_v, v.under_clear_v),
         "discharge_over_current": _Default(discharge_a, CURRENT_CLEAR_FRACTION * discharge_a),
         "charge_over_current": _Default(charge_a, CURRENT_CLEAR_FRACTION * charge_a),
+        "cell_short": _Default(short_a, 0.5 * short_a) if compares else _UNMONITORED,
+        "cell_sensor_fault": _Default(MIN_READING_ERROR_V, 0.5 * MIN_READING_ERROR_V) if compares else _UNMONITORED,
     }
 
 
 def _stack_defaults(cell: PackModel) -> dict[AlarmName, _Default]:
     """Return the defaults of a fuel cell, which has no cell voltages and must not be charged."""
     c = cell.cell
-    unmonitored = _Default(None, None)
     return {
         "pack_over_voltage": _Default(c.voltage_max_v, 0.98 * c.voltage_max_v),
         "pack_under_voltage": _Default(c.voltage_min_v, 1.1 * c.voltage_min_v),
-        "cell_over_voltage": unmonitored,
-        "cell_under_voltage": unmonitored,
+        "cell_over_voltage": _UNMONITORED,
+        "cell_under_voltage": _UNMONITORED,
+        "cell_short": _UNMONITORED,
+        "cell_sensor_fault": _UNMONITORED,
         "discharge_over_current": _Default(c.current_max_a, CURRENT_CLEAR_FRACTION * c.current_max_a),
-        "charge_over_current": unmonitored,
-        "charging_below_freezing": unmonitored,
-        "weak_cell": unmonitored,
+        "charge_over_current": _UNMONITORED,
+        "charging_below_freezing": _UNMONITORED,
+        "weak_cell": _UNMONITORED,
         "over_temperature": _Default(90.0, 85.0),
     }

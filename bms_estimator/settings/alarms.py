@@ -22,6 +22,8 @@ AlarmName = Literal[
     "stability_margin_low",
     "cell_imbalance",
     "weak_cell",
+    "cell_short",
+    "cell_sensor_fault",
     "sensor_fault",
     "model_mismatch",
     "link_lost",
@@ -172,6 +174,13 @@ class AlarmSettings(Strict):
     weak_cell: DeviationRule = Field(
         default=DeviationRule(delay_s=0.0, clear_delay_s=0.0),
         description="limit: deviation of a discharge from earlier ones in the direction of one weak cell, in standard deviations",
+    )
+    cell_short: CurrentRule = Field(
+        default=CurrentRule(severity="critical", delay_s=60.0, clear_delay_s=600.0),
+        description="limit_a: self-discharge current of a cell above that of the other cells",
+    )
+    cell_sensor_fault: VoltageRule = Field(
+        default=VoltageRule(delay_s=60.0), description="limit_v: error of a cell's reading"
     )
     sensor_fault: FractionRule = Field(
         default=FractionRule(clear_delay_s=30.0), description="limit: fraction of samples that are lost or unusable"

@@ -25,6 +25,7 @@ from bms_estimator.telemetry.alarm_inputs import LOSS_TEXTS, Inputs, count_value
 from bms_estimator.telemetry.alarm_samples import SampleBuffer, SampleIntervals
 from bms_estimator.telemetry.alarm_state import AlarmState, AlarmTransition, RaisedAlarm
 from bms_estimator.telemetry.alarm_text import alarm_text
+from bms_estimator.telemetry.cells import CellFault, CellFaults
 from bms_estimator.telemetry.collapse_risk import collapse_risks, time_left_text
 
 SENSOR_SUSPECTS = (
@@ -39,6 +40,8 @@ INPUTS = "inputs"
 """Key of the measured quantities in the saved state. All other keys but ``SILENCE`` are names of alarms."""
 SILENCE = "silence"
 """Key of the reason why no samples arrived, in the saved state."""
+CELLS_GAP_S = 60.0
+"""Minimum length of a gap between two evaluations of the single cells [s]."""
 BAD_FRACTION_INTERVAL_S = 1.0
 """Minimum interval over which the fraction of lost and unusable samples is computed [s]."""
 
@@ -124,6 +127,7 @@ class AlarmEvaluator:
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
         # no interval is a gap, because losses are counted in gaps, too, and a weak cell remains weak
         self._loss_intervals, self._weak_cell_intervals = SampleIntervals(math.inf), SampleIntervals(math.inf)
+        self._cell_intervals = SampleIntervals(CELLS_GAP_S)
         self._buffer = SampleBuffer()
         self._counts: SampleCounts | None = None
         self._counted_s = -math.inf
@@ -220,6 +224,23 @@ class AlarmEvaluator:
             _, observed_s = self._weak_cell_intervals.measure(time_s)
             self._evaluate_values("weak_cell", time_s, observed_s, np.array([deviation_std]), arrival_s - self._at_s)
             self._save_state()
+
+    def evaluate_cells(self, faults: CellFaults, arrival_s: float) -> None:
+        """Evaluate the alarms on faults of single cells.
+
+        Args:
+            faults: Faults at the last sample.
+            arrival_s: Arrival of this sample on the wall clock [s since 1970].
+        """
+        times_s = np.array([faults.at_s])
+        _, observed_s = self._cell_intervals.measure(times_s)
+        values: dict[AlarmName, CellFault] = {"cell_short": faults.short, "cell_sensor_fault": faults.reading}
+        for name, fault in values.items():
+            state = self._states.get(name)
+            if state is not None and state.raised is None:  # the text of a raised alarm does not change
+                self._reasons[name] = Reasons(InputFault(0), fault.texts)
+            self._evaluate_values(name, times_s, observed_s, np.array([fault.value]), arrival_s - faults.at_s)
+        self._save_state()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Acknowledge an alarm, or all alarms. Return their names. Alarms whose cause is gone end now.

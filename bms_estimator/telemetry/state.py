@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import forecast_fields
 from bms_estimator.telemetry.publish_window import WindowSummary
 from bms_estimator.telemetry.remaining_charge import RemainingCharge
-from bms_estimator.telemetry.weakest_cell import UNKNOWN, WeakestCellValues
 from bms_estimator.version import __version__
 
 COMPUTED = {"voltage_v", "current_a", "temperature_c", "converged", "lock"}
@@ -41,7 +41,7 @@ def make_state_payload(
     now_s: float,
     flow: ChargeEnergy,
     capacity_ah: float | None,
-    weakest: WeakestCellValues = UNKNOWN,
+    cell_fields: Mapping[str, Any] = MappingProxyType({}),
 ) -> Estimate:
     """Return the payload of topic ``state``.
 
@@ -53,7 +53,7 @@ def make_state_payload(
         now_s: Wall clock [s since 1970].
         flow: Charge and energy at the terminals.
         capacity_ah: Rated capacity of the pack [Ah]; None for a fuel cell.
-        weakest: Values of the weakest cell.
+        cell_fields: Fields about single cells (``weakest_cell_fields``).
     """
     # a tuple of plain numbers, because reading the fields of a numpy record one by one is slow
     values = zip(TRACE.names or (), window.last.item(), strict=True)
@@ -73,10 +73,7 @@ def make_state_payload(
         remaining_capacity_ah=finite(remaining.capacity_ah),
         remaining_energy_wh=finite(remaining.energy_wh),
         **forecast_fields(forecast, float(window.last["time_s"])),
-        weakest_cell_soc=finite(weakest.weakest_cell_soc),
-        weakest_cell_soc_std=finite(weakest.weakest_cell_soc_std),
-        weakest_cell_capacity=finite(weakest.weakest_cell_capacity),
-        usable_capacity_to_weakest_ah=finite(weakest.usable_capacity_to_weakest_ah),
+        **cell_fields,
         **flow._asdict(),
         equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
         # the learning law does not change delta1 and delta2, and only this law has an adaptation gain

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.telemetry.state import finite
 
 
 class WeakestCellValues(NamedTuple):
@@ -42,3 +43,10 @@ def weakest_cell_values(model: SlowFit | None) -> WeakestCellValues:
     return WeakestCellValues(
         soc, math.hypot(std, filter_std), weakest.capacity_ratio, usable_soc * capacity_ah, weakest.deviation_std
     )
+
+
+def bank_fields(values: WeakestCellValues) -> dict[str, float | int | None]:
+    """Return the fields of ``Estimate`` about the weakest cell of a bank."""
+    fields = values._asdict()
+    del fields["deviation_std"]  # only the alarm uses it
+    return {name: finite(value) for name, value in fields.items()}

@@ -28,6 +28,7 @@ from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.cli.options.silenced_log import silenced_log
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
@@ -120,6 +121,7 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     without_hooks = settings.alarms.model_copy(update={"hook": ()})
     settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
+    cells = CellEstimator(estimator)
     slow_fit = new_slow_fit(settings, estimator)
     forecaster = new_forecaster(settings, model, estimator, slow_fit)
     runner = forecaster or slow_fit or estimator
@@ -130,12 +132,14 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
         source,
         clock,
         changes.append,
+        cells=cells,
         weakest_cell=lambda: weakest_cell_values(slow_fit),
     )
     with progress_bar("replaying") as bar:
         async for received in source:
             now_s = max(now_s, float(received.samples["time_s"][-1]))
             trace = runner.run(received.samples)
+            cells.run(received.samples, received.cells_v, trace)
             monitor.add(received, trace, now_s, forecaster.rows if forecaster else NO_FORECAST)
             bar.update(source.fraction)
     monitor.evaluate(now_s)

@@ -34,6 +34,7 @@ from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_broker, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.clock import Clock
@@ -162,12 +163,14 @@ async def _replay(
     if forecaster:  # forecasts at intervals take longer than the estimates, and the summary needs only the last one
         run = forecaster.run if table or settings.mqtt else forecaster.run_without_forecast
     async with AsyncExitStack() as stack:
-        publisher = await _open_publisher(stack, settings, model, estimator, pack_model, forecaster, source)
+        cells = CellEstimator(estimator)
+        publisher = await _open_publisher(stack, settings, model, estimator, pack_model, forecaster, cells, source)
         stack.enter_context(table or nullcontext())
         bar = stack.enter_context(progress_bar("replaying"))
         started_s, impossible = time.perf_counter(), None
         async for received in source:
             trace = run(received.samples)
+            cells.run(received.samples, received.cells_v, trace)
             summary.add(trace)
             if trace.size < received.samples.size:  # samples were dropped
                 impossible = out_of_range_reason(received.samples, estimator.settings[0]) or impossible
@@ -193,6 +196,7 @@ async def _open_publisher(
     estimator: Estimator,
     pack_model: SlowFit | None,
     forecaster: Forecaster | None,
+    cells: CellEstimator,
     source: Replay,
 ) -> Publisher | None:
     """Return the publisher; None without a broker."""
@@ -216,6 +220,7 @@ async def _open_publisher(
         pack_model=lambda: pack_model_health(pack_model, FitTimes(None, None)) if pack_model else None,
         weakest_cell=lambda: weakest_cell_values(pack_model),
         forecaster=forecaster,
+        cells=cells,
     )
 
 

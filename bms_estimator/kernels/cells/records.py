@@ -70,6 +70,7 @@ BANK = np.dtype(
         ("soc", "f8"),  # SOC of the pack at the last sample
         ("x_ts_a", "f8"),  # current filtered with tau_ts [A]
         ("x_tl_a", "f8"),  # current filtered with tau_tl [A]
+        ("windows", "i8"),  # number of windows since the start
         ("samples", "i8"),  # number of samples in the window
         ("elapsed_s", "f8"),  # duration of the window [s]
         ("change", "f8"),  # change of the SOC in the window by the charge

@@ -149,6 +149,7 @@ def update_cells(
             update_cell(cells[i], b, innovation_v, variance_v2, curve_v, current_a, ph, stuck)
         cells[i].sum_v, cells[i].samples = 0.0, 0
     mark_sense_wires(cells)
+    b.windows += 1
     b.samples = b.gap = 0
     b.elapsed_s = b.change = b.throughput = b.sum_a = b.sum_drop_v = 0.0
 

@@ -107,7 +107,7 @@ class MessageBuilder:
         Returns:
             The messages, and the state that the broker has after them.
         """
-        _, parameters, health, info, alarms, forecast = snapshot
+        _, parameters, health, info, alarms, forecast, cells = snapshot
         before, messages = sent.snapshot, []
         has_sample = bool(parameters.elements)
         # parameters and health have a publish time, so that each new object is published
@@ -121,6 +121,8 @@ class MessageBuilder:
             messages.append(self._retained("health", health.json_bytes))
         if before is None or before.info != info:
             messages.append(self._retained("info", info.json_bytes))
+        if cells is not None and (before is None or before.cells is not cells):
+            messages.append(self._retained("cells", cells.json_bytes))
         discovery_inputs = self._discovery_inputs(sent, snapshot)
         if discovery_inputs != sent.discovery_inputs:
             payload = self._discovery(discovery_inputs)

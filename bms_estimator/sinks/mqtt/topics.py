@@ -11,6 +11,7 @@ from bms_estimator.model.events import Event
 from bms_estimator.model.payloads import (
     PAYLOAD_VERSION,
     Alarm,
+    CellsReport,
     Estimate,
     ForecastReport,
     Health,
@@ -37,6 +38,7 @@ TOPICS = {
     "forecast": Topic(ForecastReport, 0, retain=False, when="once a minute, from the first sample on"),
     "health": Topic(Health, 1, retain=True, when="each second, and when the sensor comes or goes"),
     "info": Topic(Info, 1, retain=True, when="on change"),
+    "cells": Topic(CellsReport, 1, retain=True, when="each minute, with cell voltages"),
     "alarm": Topic(Alarm, 1, retain=True, when="on change"),
 }
 """Payload models by topic; each alarm has a topic below ``alarm/``."""

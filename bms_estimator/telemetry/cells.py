@@ -1,0 +1,114 @@
+"""Payload of topic ``cells``, and faults of single cells as inputs of alarms."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from bms_estimator.estimator.cell_estimator import CellDeviations
+from bms_estimator.kernels.cells.records import ReadingFault
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.payloads import CellFaultName, CellReport, CellsReport
+from bms_estimator.telemetry.state import finite
+
+_FAULT_NAMES: dict[ReadingFault, CellFaultName] = {
+    ReadingFault.STUCK: "stuck reading",
+    ReadingFault.CONTACT: "contact",
+    ReadingFault.OFFSET: "wrong reading",
+    ReadingFault.SENSE_WIRE: "sense wire",
+}
+
+
+class CellFault(NamedTuple):
+    """Largest fault of a kind among all cells."""
+
+    value: float
+    """Value in the unit of the alarm."""
+    texts: tuple[str, ...]
+    """Faulty cells, one sentence each."""
+
+
+class CellFaults(NamedTuple):
+    """Faults of the cells at one time."""
+
+    at_s: float
+    """Time on the samples' clock [s]."""
+    short: CellFault
+    """Self-discharge current that is proven for a cell [A]."""
+    reading: CellFault
+    """Error of a reading [V]."""
+
+
+def cell_faults(cells: CellDeviations) -> CellFaults:
+    """Return the faults of the cells."""
+    proven_a = cells.proven_self_discharge_a
+    i = int(np.argmax(proven_a))
+    short_text = f"cell {i + 1} discharges itself by {cells.self_discharge_a[i]:.3g} A more than the other cells"
+    faulty = [i for i, fault in enumerate(cells.fault) if fault]
+    return CellFaults(
+        cells.at_s,
+        CellFault(max(float(proven_a[i]), 0.0), (short_text,) if proven_a[i] > 0.0 else ()),
+        CellFault(float(cells.reading_error_v.max()), tuple(_reading_text(cells, i) for i in faulty)),
+    )
+
+
+def _reading_text(cells: CellDeviations, i: int) -> str:
+    """Describe the faulty reading of cell ``i``, from 0."""
+    error = f"the reading of cell {i + 1} is wrong by {1e3 * cells.reading_error_v[i]:.0f} mV"
+    match cells.fault[i]:
+        case ReadingFault.STUCK:
+            return f"the reading of cell {i + 1} does not respond to the load"
+        case ReadingFault.CONTACT:
+            return f"a contact of cell {i + 1} has a resistance of {1e3 * cells.contact_ohm[i]:.2g} mΩ"
+        case ReadingFault.SENSE_WIRE:
+            return f"{error}, and that of a neighbor by the opposite: the sense wire between them is faulty"
+    return error
+
+
+def make_cells_payload(cells: CellDeviations, short_limit_a: float, now_s: float) -> CellsReport:
+    """Return the payload of topic ``cells``.
+
+    Args:
+        cells: Deviations of the cells.
+        short_limit_a: Proven self-discharge current from which a cell counts as shorted [A].
+        now_s: Wall clock [s since 1970].
+    """
+    is_short = cells.proven_self_discharge_a >= short_limit_a
+    return CellsReport(
+        publish_time=iso_utc(now_s),
+        weakest=cells.weakest + 1,
+        cells=[
+            CellReport(
+                number=i + 1,
+                soc=float(cells.soc[i]),
+                soc_std=float(cells.soc_std[i]),
+                soc_deviation=float(cells.soc_deviation[i]),
+                soc_deviation_std=float(cells.soc_deviation_std[i]),
+                resistance_ratio=float(cells.resistance_ratio[i]),
+                resistance_ratio_std=float(cells.resistance_ratio_std[i]),
+                capacity_ratio=float(cells.capacity_ratio[i]),
+                self_discharge_a=float(cells.self_discharge_a[i]),
+                self_discharge_std_a=float(cells.self_discharge_std_a[i]),
+                fault="internal short" if is_short[i] else _FAULT_NAMES.get(cells.fault[i]),
+            )
+            for i in range(cells.soc.size)
+        ],
+    )
+
+
+def weakest_cell_fields(cells: CellDeviations | None) -> dict[str, float | int | None]:
+    """Return the fields of ``Estimate`` about single cells; None without estimates of the cells."""
+    if cells is None:
+        return {}
+    i = cells.weakest
+    return {
+        "weakest_cell": i + 1,
+        "weakest_cell_soc": finite(cells.soc[i]),
+        "weakest_cell_soc_std": finite(cells.soc_std[i]),
+        "cell_soc_spread": float(np.ptp(cells.soc_deviation)),
+        "cell_r_spread": float(np.ptp(cells.resistance_ratio)),
+    }
+
+
+NO_SHORT_LIMIT_A = math.inf
+"""Limit of the self-discharge without the alarm ``cell_short`` [A]."""
