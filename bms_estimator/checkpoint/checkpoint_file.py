@@ -46,6 +46,8 @@ MAX_LATER_FILES = 4
 """Maximum number of quarantined files of later formats, which serve a return to the later version."""
 _COUNTER_FIELDS = "restarts", "total", "clean", "alarms"
 """Field names of the run counters in the file."""
+_CELLS = "cells."
+"""Prefix of the names of the arrays of single cells in the file."""
 _CURVES = "fit."
 """Prefix of the names of the fit's arrays in the file."""
 MAX_COUNT = 1e15
@@ -86,6 +88,8 @@ class CheckpointContent:
     curves: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Arrays of the fit to whose curves the state is relative (``pack_model.saved.curve_arrays``); empty: the curves are
     those of the cell file."""
+    cells: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """State of the estimators of single cells (``CellEstimator.saved_state``); empty without cell voltages."""
 
 
 class CheckpointFile:
@@ -115,7 +119,11 @@ class CheckpointFile:
         """Number of samples and SOC of the last saved state; None before the first save of this run."""
 
     def save(
-        self, state: NDArray[np.void], counters: RunCounters, curves: Mapping[str, NDArray[Any]] | None = None
+        self,
+        state: NDArray[np.void],
+        counters: RunCounters,
+        curves: Mapping[str, NDArray[Any]] | None = None,
+        cells: Mapping[str, NDArray[Any]] | None = None,
     ) -> None:
         """Write the file atomically: after a power cut either the old or the new file exists.
 
@@ -125,12 +133,14 @@ class CheckpointFile:
             state: Shape (1,), dtype ESTIMATOR_STATE.
             counters: Counters of this and earlier runs.
             curves: Arrays of the fit to whose curves the state is relative; None or empty: those of the cell file.
+            cells: State of the estimators of single cells; None or empty without cell voltages.
 
         Raises:
             OSError: The file cannot be written.
         """
         content = {"identity": self._identity, "observer": self._observer, "state": state, **asdict(self._now())}
         content |= {f"{_CURVES}{name}": array for name, array in (curves or {}).items()}
+        content |= {f"{_CELLS}{name}": array for name, array in (cells or {}).items()}
         self._write(content, counters)
 
     def update_counters(self, counters: RunCounters) -> None:
@@ -226,8 +236,7 @@ class CheckpointFile:
         self._content = {name: v for name, v in file.items() if name not in ("format", *_COUNTER_FIELDS)}
         if str(file["observer"]) != self._observer:
             state = without_observer(state)
-        curves = {name.removeprefix(_CURVES): v for name, v in file.items() if name.startswith(_CURVES)}
-        return CheckpointContent(state, unseen_s, counters, "", curves)
+        return CheckpointContent(state, unseen_s, counters, "", _with_prefix(file, _CURVES), _with_prefix(file, _CELLS))
 
     def _remove_oldest(self) -> None:
         """Remove the pack's oldest files beyond ``MAX_FILES``, because each configured cell leaves a file."""
@@ -246,6 +255,11 @@ class _RejectedError(Exception):
     def __init__(self, reason: str, counters: RunCounters | None = None) -> None:
         super().__init__(reason)
         self.counters = counters
+
+
+def _with_prefix(file: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays whose names begin with ``prefix``, without it."""
+    return {name.removeprefix(prefix): v for name, v in file.items() if name.startswith(prefix)}
 
 
 def _next_counters(file: Mapping[str, NDArray[Any]], now_s: float) -> RunCounters:

@@ -1,9 +1,12 @@
 """Estimator of the single cells of a pack whose cell voltages are measured, beside the estimator of the pack."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
@@ -20,6 +23,8 @@ LEAK_STDS = 4.0
 
 CONSTANT_FRACTION = 0.5
 """Fraction of ``BIAS_V`` that is constant, such as the offset of a converter."""
+MAX_MEAN = np.array([1.0, 10.0, 10.0, 10.0, 1.0])
+"""Maximum plausible magnitudes of the states of a cell."""
 MEAN_SLOPE_SOC = (0.1, 0.9)
 """SOC range of the mean slope of the OCV, without its steep ends."""
 
@@ -160,7 +165,52 @@ class CellEstimator:
             contact_ohm=np.where(self.cells["fault"] == ReadingFault.CONTACT, -self.cells["error_ohm"], 0.0),
         )
 
-    def resume(self, unseen_s: float) -> None:
-        """Prepare for samples with another time base, after a gap of ``unseen_s`` [s]; infinite if unknown."""
+    @property
+    def saved_state(self) -> Mapping[str, NDArray[Any]]:
+        """Copy of the state for ``restore`` after a restart; empty before the first window."""
+        return {"cells": self.cells.copy(), "bank": self.bank.copy()} if self.bank["windows"][0] else {}
+
+    def restore(self, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
+        """Restore a ``saved_state``. The next sample has another time base.
+
+        Args:
+            saved: State of an earlier run; an empty one has no effect.
+            unseen_s: Time without samples [s]; infinite if unknown.
+
+        Returns:
+            Reason for which the state is invalid and was not restored; empty if it was restored.
+        """
+        if not saved or not self._enabled:
+            return ""
+        cells, bank = saved.get("cells"), saved.get("bank")
+        if cells is None or bank is None or (cells.dtype, bank.dtype) != (CELL, BANK) or bank.shape != (1,):
+            return "it was saved by another version"
+        if cells.shape != (self._series,):
+            return f"it has {cells.size} cells, and the pack has {self._series} in series"
+        if reason := _invalid_reason(cells, bank):
+            return reason
+        self._start(self._series)
+        self.cells[...], self.bank[...] = cells, bank
         self.bank["time_s"] = np.inf
         self.bank["unseen_s"] = unseen_s if math.isfinite(unseen_s) else 0.0
+        return ""
+
+
+def _invalid_reason(cells: Records, bank: Records) -> str:
+    """Return the reason for which a saved state is invalid; empty if it is valid."""
+    variance = np.diagonal(cells["covariance"], axis1=1, axis2=2)
+    numbers = (
+        cells["mean"],
+        cells["covariance"],
+        cells["sums"],
+        *(bank[name] for name in BANK.names or () if name != "time_s"),
+    )
+    if not all(np.isfinite(values).all() for values in numbers if values.dtype.kind == "f"):
+        return "a value is not finite"
+    if (variance < 0.0).any():
+        return "a variance is negative"
+    if (np.abs(cells["mean"]) > MAX_MEAN).any():
+        return "a deviation of a cell is implausible"
+    if not set(cells["fault"].tolist()) <= set(ReadingFault):
+        return "a fault is unknown"
+    return ""

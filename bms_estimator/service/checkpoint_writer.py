@@ -12,6 +12,7 @@ import structlog
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.pack_model.learning import SlowFit
@@ -55,6 +56,7 @@ class CheckpointWriter:
         pack_model: Slow fit, whose history is saved when its ``revision`` changes; None: no history.
         history: File of the history; None: no history.
         seen_load: Load that was seen, which is saved every ``LOAD_SAVE_S``; None: it is not saved.
+        cells: Estimators of the single cells; read only; None: none.
     """
 
     def __init__(
@@ -69,8 +71,9 @@ class CheckpointWriter:
         pack_model: SlowFit | None = None,
         history: HistoryFile | None = None,
         seen_load: SeenLoad | None = None,
+        cells: CellEstimator | None = None,
     ) -> None:
-        self._interval_s, self._seen_load = interval_s, seen_load
+        self._interval_s, self._seen_load, self._cells = interval_s, seen_load, cells
         self._samples_of_saved_load = 0
         self._pack_model, self._history = pack_model, history
         self._saved_revision = pack_model.revision if pack_model else 0
@@ -143,8 +146,8 @@ class CheckpointWriter:
                 return await self._write_with_counters(counters, lambda: self._checkpoint.update_counters(counters))
             return True
         state, fit = self._estimator.record.copy(), self._pack_model.fit if self._pack_model else None
-        curves = curve_arrays(fit)
-        if not await self._write_with_counters(counters, lambda: self._checkpoint.save(state, counters, curves)):
+        curves, cells = curve_arrays(fit), self._cells.saved_state if self._cells else None
+        if not await self._write_with_counters(counters, lambda: self._checkpoint.save(state, counters, curves, cells)):
             self._publisher.saved_flow = None  # the unsaved totals are published
             return False
         self._publisher.checkpoint, self._saved_progress, self._saved_fit = "saved", progress, fit

@@ -4,6 +4,7 @@ import gc
 
 import numpy as np
 
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
@@ -13,6 +14,7 @@ from bms_estimator.pack_model.saved import neutral_fit
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.kernel_subtrees import CELL, second_process
 from bms_estimator.service.pack_forecaster import load_forecast_kernels
+from bms_estimator.settings.alarm_limits import MIN_CELLS
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload
@@ -45,6 +47,8 @@ def _call_kernels() -> None:
     trace = estimator.run(sample)
     ChargeEnergyMeter(ChargeEnergy(), 1.0).add(trace)
     Window().add(trace, 0.0)
+    pack = cell.pack(MIN_CELLS, 1)
+    CellEstimator(new_estimator(Settings(), pack)).run(sample, np.zeros((1, MIN_CELLS)), trace)
     estimator.set_soc(0.5)
     estimator.resume(0.0)
     make_parameters_payload(estimator, 0.0)

@@ -99,7 +99,7 @@ async def run_estimation_loop(
     cells = CellEstimator(estimator)
     fit_thread = FitThread(clock, fit_executor)
     pack_model = new_slow_fit(settings, estimator, submit=fit_thread.submit, on_failure=fit_thread.log_failure)
-    counters, outcome = restore_pack(estimator, pack_model, checkpoint, history, clock)
+    counters, outcome = restore_pack(estimator, pack_model, checkpoint, history, clock, cells)
     restored_s = since_boot()
     forecaster = new_forecaster(settings, cell, estimator, pack_model)
     seen_load = SeenLoad(forecaster, load_file) if forecaster and load_file else None
@@ -143,6 +143,7 @@ async def run_estimation_loop(
             pack_model=pack_model,
             history=history,
             seen_load=seen_load,
+            cells=cells,
         )
         if checkpoint
         else None

@@ -8,6 +8,7 @@ from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointContent
 from bms_estimator.checkpoint.history_file import HistoryFile, RejectedHistoryError
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.pack_model.curve_change import return_to_cell_file
 from bms_estimator.pack_model.fit import PackFit
@@ -26,6 +27,7 @@ def restore_pack(
     checkpoint: CheckpointFile | None,
     history: HistoryFile | None,
     clock: Clock,
+    cells: CellEstimator | None = None,
 ) -> tuple[RunCounters, str]:
     """Restore a valid checkpoint and a valid history; rejected files are quarantined.
 
@@ -38,6 +40,7 @@ def restore_pack(
         checkpoint: File of the state; None: the state is not saved.
         history: File of the history; None: the history is not saved.
         clock: The clocks.
+        cells: New estimators of the single cells; None: none.
 
     Returns:
         Counters of earlier runs, and the outcome of the checkpoint as text.
@@ -58,6 +61,8 @@ def restore_pack(
         return_to_cell_file(estimator)
     if pack_model:
         pack_model.resume(content.unseen_s if restored else math.inf, restored=restored)
+    if cells and restored and (reason := cells.restore(content.cells, content.unseen_s)):
+        log.warning("the state of the single cells was dropped", reason=reason)
     if refused := outcome.startswith(REJECTED):
         outcome = f"{outcome}; {checkpoint.quarantine()}"
     write_log = log.warning if refused else log.info

@@ -112,6 +112,7 @@ function draw() {
 	drawAlarms(pack);
 	drawState(state);
 	drawCells(state);
+	drawRanks(pack.topics.cells);
 	drawParameters(pack.topics.parameters);
 	drawHealth(pack);
 	drawEvents(pack);
@@ -260,6 +261,19 @@ function drawCells(s) {
 	put("cellmean", `${mean.toFixed(3)} V`);
 	put("cellapart", f.millivolts(high - low));
 	put("celldev", f.millivolts(Math.sqrt(known.reduce((a, b) => a + (b - mean) ** 2, 0) / count)));
+}
+
+/** Draw the cells, the one with the lowest SOC first. */
+function drawRanks(report) {
+	const cells = Array.isArray(report?.cells) ? report.cells.filter((c) => number(c?.soc)) : [];
+	hide($("cellranks"), !cells.length);
+	if (!cells.length || !changed($("cellranks"), report)) return;
+	const ranked = cells.sort((a, b) => a.soc - b.soc), [weakest] = ranked;
+	put("weakestcell", `cell ${weakest.number}, SOC ${f.percent(weakest.soc)} ± ${f.percent(2 * weakest.soc_std)} %`);
+	$("cellranks").querySelector("tbody").replaceChildren(...ranked.map((c) => node("tr", { "data-cell": c.number },
+		node("th", { scope: "row" }, String(c.number)),
+		...[f.percent(c.soc), f.percent(c.soc_std), f.percent(c.resistance_ratio, 0), f.percent(c.capacity_ratio, 0), f.digits(1e3 * c.self_discharge_a, 2)].map((x) => node("td", {}, x)),
+		node("td", { class: c.fault ? "bad" : "" }, c.fault ?? ""))));
 }
 
 // parameters, health, events
