@@ -4,6 +4,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
+from bms_estimator.forecast.capability import power_limits
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.model.cell import CellModel, load_cell
@@ -33,7 +34,12 @@ def new_forecaster(
     """
     if not isinstance(cell, CellModel) or not estimator.identifying:
         return None
-    return Forecaster(estimator, pack_model or estimator, cutoff_v=load_cutoff_v(settings, cell))
+    return Forecaster(
+        estimator,
+        pack_model or estimator,
+        cutoff_v=load_cutoff_v(settings, cell),
+        limits=power_limits(settings, cell),
+    )
 
 
 def load_forecast_kernels() -> None:
