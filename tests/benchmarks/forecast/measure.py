@@ -9,7 +9,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import CellModel
 from tests.benchmarks.forecast import baselines
 from tests.benchmarks.forecast.captures import PULSES, Case
-from tests.benchmarks.forecast.moments import Moment, moments
+from tests.benchmarks.forecast.moments import Moment, last, moments
 from tests.benchmarks.forecast.scores import Outcome, lead
 from tests.benchmarks.forecast.truth import Discharge
 
@@ -22,6 +22,8 @@ EVERY = 2
 """Number of moments for each moment at which the slow methods run, besides those at ``LEADS_S``."""
 LEADS_S = (3600.0, 1800.0, 1200.0, 600.0, 300.0, 120.0)
 """Times before the cut-off at which the forecasts are judged [s]."""
+RATE_S = 600.0
+"""Time before the cut-off of which the mean current is the C-rate of a discharge [s]."""
 TEMPERATURE_TOLERANCE_K = 3.0
 """Distance from the temperatures of a cell file within which the file knows the temperature [K]."""
 
@@ -58,7 +60,7 @@ def outcome(
         case.is_phosphate,
         discharge.temperature_c if np.isfinite(discharge.temperature_c) else REFERENCE_C,
         knows_temperature(cell, discharge.temperature_c),
-        baselines.mean_current(discharge.samples) / case.recipe.capacity_ah,
+        baselines.mean_current(last(discharge.samples, RATE_S)) / case.recipe.capacity_ah,
         moment.left_s,
         moment.left_s,
         said,

@@ -34,7 +34,7 @@ class Outcome:
     knows_temperature: bool
     """True if the cell file was measured at this temperature, too."""
     rate_c: float
-    """Mean current until the cut-off, as a C-rate."""
+    """Mean current before the cut-off, as a C-rate."""
     lead_s: float
     """True time to the cut-off in the capture [s]."""
     truth_s: float

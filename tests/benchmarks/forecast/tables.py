@@ -73,7 +73,7 @@ def tables(outcomes: list[Outcome]) -> Iterator[Table]:
         yield table(f"by time before the cut-off, drives: {name}", drives, list(lead_groups(name)))
     given = [o for o in outcomes if o.method == GIVEN and 300.0 - 1.0 <= o.lead_s <= 4800.0]
     yield table(f"{GIVEN} (cut-off in 5 to 80 min)", given, list(temperature_groups("5 %")))
-    constant = [o for o in of_forecast if o.load == CONSTANT and o.rate_c >= HALF_C]
+    constant = [o for o in own if o.load == CONSTANT and o.rate_c >= HALF_C]
     yield table("constant load from C/2, by time before the cut-off", constant, list(constant_groups()))
     yield table("by capture", judged, list(capture_groups(judged)))
 
