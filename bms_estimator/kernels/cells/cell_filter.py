@@ -37,7 +37,7 @@ DROP_ERROR = 0.05
 """R: relative std of the overpotential, because current and voltages are not measured at one time."""
 MAX_RESISTANCE_STD = 0.3
 """Maximum of the relative std of a cell's resistance after a time without a load."""
-CURVE_STDS = 3.0
+CURVE_STDS = 2.0
 """Range of a cell's SOC in which its OCV counts as possible, in std."""
 KNEE_SOC = 0.02
 """Std of the SOC at which the OCV curve of a single cell falls near empty."""
@@ -135,10 +135,10 @@ def measurement_variance(drop_v: float, by_pack_v: float, soc_std: float) -> flo
 
 
 @njit(cache=True)
-def curve_range_v(c: Record, p: Record, soc: float, soc_std: float) -> float:
-    """Return the largest change of the cell's OCV within ``CURVE_STDS`` std of its SOC [V]."""
-    half = CURVE_STDS * math.sqrt(c.covariance[SOC, SOC] + soc_std**2 + KNEE_SOC**2)
-    middle_v = ocv_and_slope(p, soc + c.mean[SOC])[0]
+def curve_range_v(c: Record, p: Record, soc: float) -> float:
+    """Return the largest error of the tangent to the OCV curve within ``CURVE_STDS`` std of the cell's SOC [V]."""
+    half = CURVE_STDS * math.sqrt(c.covariance[SOC, SOC] + KNEE_SOC**2)
+    middle_v, slope_v = ocv_and_slope(p, soc + c.mean[SOC])
     above_v = ocv_and_slope(p, soc + c.mean[SOC] + half)[0]
     below_v = ocv_and_slope(p, soc + c.mean[SOC] - half)[0]
-    return max(above_v - middle_v, middle_v - below_v)
+    return max(abs(above_v - middle_v - slope_v * half), abs(middle_v - below_v - slope_v * half))

@@ -13,10 +13,13 @@ from bms_estimator.numba_cache import njit
 
 GATE_V = 0.010
 """Minimum innovation that may be a fault of the reading [V]: ten steps of the usual converter."""
-GATE_STD = 5.0
+GATE_STD = 4.0
 """Minimum innovation that may be a fault of the reading, in std."""
 JUMP_FRACTION = 0.5
-"""Minimum fraction of the innovation that appeared within one window, if the innovation jumped."""
+"""Minimum fraction of the innovation that exceeds its mean over ``JUMP_S``, if the innovation jumped."""
+JUMP_S = 120.0
+"""Time constant of the mean innovation before a jump [s]. The voltage of a cell of 20 Ah with a short of 1 ohm drifts by
+about 4 mV in this time, which is less than ``GATE_V``."""
 MEMORY_S = 300.0
 """Time constant of the sums that attribute an error to the current or to an offset [s]."""
 CONFIRMATION_S = 60.0
@@ -47,13 +50,14 @@ def is_stuck(c: Record, voltage_v: float, reference_v: float) -> bool:
 
 @njit(cache=True)
 def is_jump(c: Record, innovation_v: float, variance_v2: float, curve_v: float) -> bool:
-    """Return True if the innovation left its range within the last window.
+    """Return True if the innovation left its range within minutes.
 
     Args:
         c: The cell.
         innovation_v: Innovation [V].
         variance_v2: Its variance S [V^2].
-        curve_v: Change of the OCV within the uncertainty of the cell's SOC [V], which is large near empty.
+        curve_v: Error of the tangent to the OCV curve within the uncertainty of the cell's SOC [V], which is large near
+            empty.
     """
     is_large = abs(innovation_v) > max(GATE_V, GATE_STD * math.sqrt(variance_v2), curve_v)
     return is_large and abs(innovation_v - c.innovation_v) > JUMP_FRACTION * abs(innovation_v)

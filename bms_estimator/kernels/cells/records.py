@@ -45,8 +45,9 @@ CELL = np.dtype(
         ("covariance", "f8", (STATES, STATES)),
         ("sum_v", "f8"),  # sum of the voltages in the window [V]
         ("samples", "i8"),  # number of voltages in the window
-        ("innovation_v", "f8"),  # measured less predicted deviation from the other cells, last window [V]
-        ("trend", "f8"),  # running mean of the normalized innovation
+        ("innovation_v", "f8"),  # measured less predicted deviation from the other cells, mean over two minutes [V]
+        ("fast_trend", "f8"),  # mean of the normalized innovation over minutes
+        ("slow_trend", "f8"),  # mean of the normalized innovation over hours
         ("held_v", "f8"),  # voltage at its last change [V]
         ("held_reference_v", "f8"),  # median voltage of the cells at that time [V]
         ("sums", "f8", 5),  # decaying sums since a jump of the innovation

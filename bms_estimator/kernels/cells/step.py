@@ -5,6 +5,7 @@ import math
 from bms_estimator.kernels.cells.cell_filter import (
     BALANCING_C,
     HOUR_S,
+    MAX_RESISTANCE_STD,
     correct_cell,
     curve_range_v,
     deviation_v,
@@ -14,6 +15,7 @@ from bms_estimator.kernels.cells.cell_filter import (
     write_ph,
 )
 from bms_estimator.kernels.cells.reading_faults import (
+    JUMP_S,
     STUCK_V,
     end_fault,
     examine_reading,
@@ -21,7 +23,7 @@ from bms_estimator.kernels.cells.reading_faults import (
     is_stuck,
     mark_sense_wires,
 )
-from bms_estimator.kernels.cells.records import LEAK, SOC, STATES, ReadingFault
+from bms_estimator.kernels.cells.records import CAPACITY, LEAK, RESISTANCE, SOC, STATES, ReadingFault
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
@@ -29,15 +31,21 @@ WINDOW_S = 10.0
 """Minimum duration of a window [s]. Its means suppress noise, and delays between the readings of current and cells."""
 MAX_STEP_S = 60.0
 """Maximum time between two samples over which the current counts as measured [s]."""
-TREND_MEMORY = 0.9
-"""Fraction of ``trend`` that remains after a window."""
-MAX_TREND = 1.0
-"""Maximum of the mean normalized innovation. For white innovations it is 4 std."""
+FAST_MEMORY = 0.9
+"""Fraction of ``fast_trend`` that remains after a window."""
+SLOW_MEMORY = 0.997
+"""Fraction of ``slow_trend`` that remains after a window: a time constant of about an hour."""
+MAX_FAST_TREND = 1.0
+"""Maximum of ``fast_trend``. For white innovations it is 4 std."""
+MAX_SLOW_TREND = 0.2
+"""Maximum of ``slow_trend``: seven times the largest value of simulated healthy cells in 60 h."""
 INFLATION = 1e4
-"""Factor on the variance of the self-discharge after ``MAX_TREND`` is exceeded, because a short may have appeared. The
+"""Factor on the variance of the self-discharge after a trend exceeds its maximum, because a short may have appeared. The
 range from 1 kohm to 1 ohm needs two such steps."""
 SOC_CHANGE = 0.03
-"""Std of a cell's SOC that a short may have drained before ``MAX_TREND`` is exceeded."""
+"""Std of a cell's SOC that a short may have drained before a trend exceeds its maximum."""
+CAPACITY_CHANGE = 0.03
+"""Std by which the relative capacity of a cell may have changed before a trend exceeds its maximum."""
 MAX_LEAK_STD = 1.0
 """Maximum std of the self-discharge [1/h]."""
 _NONE, _STUCK = int(ReadingFault.NONE), int(ReadingFault.STUCK)
@@ -145,7 +153,7 @@ def update_cells(
             variance_v2 = noise_v2 + write_ph(cells[i], slope_v, drop_v, ph)
             innovation_v = errors_v[i] - reference_v
             stuck = is_stuck(cells[i], voltages_v[i], median_v)
-            curve_v = curve_range_v(cells[i], p, soc, soc_std)
+            curve_v = curve_range_v(cells[i], p, soc)
             update_cell(cells[i], b, innovation_v, variance_v2, curve_v, current_a, ph, stuck)
         cells[i].sum_v, cells[i].samples = 0.0, 0
     mark_sense_wires(cells)
@@ -172,7 +180,7 @@ def update_cell(
         b: Window, dtype BANK.
         innovation_v: Innovation [V].
         variance_v2: Its variance S [V^2].
-        curve_v: Change of the OCV within the uncertainty of the cell's SOC [V].
+        curve_v: Error of the tangent to the OCV curve within the uncertainty of the cell's SOC [V].
         current_a: Mean current of the window [A].
         ph: P H', shape (STATES,).
         stuck: True if the reading does not respond to the load.
@@ -185,12 +193,16 @@ def update_cell(
     if c.suspect_s > 0.0 or (is_jump(c, innovation_v, variance_v2, curve_v) and not b.gap):
         examine_reading(c, innovation_v, current_a, b.elapsed_s, variance_v2)
         return
-    c.innovation_v = innovation_v
-    c.trend = TREND_MEMORY * c.trend + (1.0 - TREND_MEMORY) * innovation_v / math.sqrt(variance_v2)
-    if abs(c.trend) > MAX_TREND:
-        c.trend = 0.0
+    c.innovation_v += (1.0 - math.exp(-b.elapsed_s / JUMP_S)) * (innovation_v - c.innovation_v)
+    normalized = innovation_v / math.sqrt(variance_v2)
+    c.fast_trend += (1.0 - FAST_MEMORY) * (normalized - c.fast_trend)
+    c.slow_trend += (1.0 - SLOW_MEMORY) * (normalized - c.slow_trend)
+    if abs(c.fast_trend) > MAX_FAST_TREND or abs(c.slow_trend) > MAX_SLOW_TREND:
+        c.fast_trend = c.slow_trend = 0.0
         c.covariance[LEAK, LEAK] = min(INFLATION * c.covariance[LEAK, LEAK], MAX_LEAK_STD**2)
         c.covariance[SOC, SOC] += SOC_CHANGE**2
+        c.covariance[CAPACITY, CAPACITY] += CAPACITY_CHANGE**2
+        c.covariance[RESISTANCE, RESISTANCE] = MAX_RESISTANCE_STD**2
         return
     correct_cell(c, innovation_v, variance_v2, ph)
 
