@@ -1,7 +1,7 @@
-"""Table of the largest voltage drop in each block of the load that was seen, over the SOC.
+"""Blocks of the observed load, each with its largest voltage drop as a function of SOC.
 
-The RC network is linear. A draw that passes a block with other currents in its RC pairs than in the past adds the difference,
-which decays exactly.
+The RC network is linear. The table contains the drop with the RC currents that the block began with in the past. A draw that
+enters the block with other RC currents adds the voltage of the difference, which decays exponentially.
 """
 
 import math
@@ -12,22 +12,23 @@ from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, TAUS
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
-PEAK_SHARE = 0.35
-"""Share of the RC pair of 1 s that has settled at the largest current of a second."""
+PEAK_FRACTION = 0.35
+"""Fraction of a peak current within a second that the RC pair of 1 s follows. Over its first second, the
+response to a current step has the mean 1/e."""
 
 LOAD_BLOCK = np.dtype(
     [
         ("mean_a", "f8"),  # mean current [A]
-        ("drop_v", "f8", GRID),  # largest voltage drop over SOC 0..1 [V]
-        ("peak_s", "f8"),  # time of the largest drop from the beginning [s]
-        ("peak_decay", "f8", BRANCHES),  # decay of the RC pairs until then
+        ("drop_v", "f8", GRID),  # largest voltage drop at each node of SOC 0..1 [V]
+        ("peak_s", "f8"),  # time from the beginning to the largest drop [s]
+        ("peak_decay", "f8", BRANCHES),  # decay factor of each RC pair until the largest drop
         ("begin_a", "f8", BRANCHES),  # filtered currents at the beginning [A]
         ("end_a", "f8", BRANCHES),  # filtered currents at the end [A]
         ("mean_x_a", "f8", BRANCHES),  # mean filtered currents [A]
     ],
     align=True,
 )
-"""Block of the load that was seen."""
+"""Block of the observed load."""
 
 
 @njit(cache=True)
@@ -55,7 +56,7 @@ def tabulate_blocks(m: Record, mean_a: Floats, max_a: Floats, block_s: int, bloc
             for k in range(BRANCHES):
                 x[k] = current_a + (x[k] - current_a) * decay[k]
                 row.mean_x_a[k] += x[k] / block_s
-                x_a = x[k] + (PEAK_SHARE * (peak_a - current_a) if k == 0 else 0.0)
+                x_a = x[k] + (PEAK_FRACTION * (peak_a - current_a) if k == 0 else 0.0)
                 for i in range(GRID):
                     drop[i] += m.ohm[1 + k, i] * x_a
             for i in range(GRID):

@@ -21,7 +21,7 @@ SOC_STEP = 0.0025
 """SOC charged in a step. In the constant-voltage phase, the current changes by a few percent in a step."""
 MAX_STEPS = 800
 """Maximum number of steps: twice the SOC range."""
-PRESENT = 2
+CURRENT_PAIR = 2
 """Index of the RC pair (30 s) whose filtered current is the present charge current."""
 
 
@@ -32,7 +32,7 @@ def charge_current(s: Record, p: Record) -> float:
     Short regeneration does not make the current filtered by RC pair ``TREND`` (120 s) negative.
     """
     max_a = -MIN_CHARGE_C * p.capacity_as / 3600.0
-    present_a = s.x_a[PRESENT] + s.mean[s.best, X + PRESENT]
+    present_a = s.x_a[CURRENT_PAIR] + s.mean[s.best, X + CURRENT_PAIR]
     return present_a if max(present_a, s.x_a[TREND] + s.mean[s.best, X + TREND]) < max_a else 0.0
 
 

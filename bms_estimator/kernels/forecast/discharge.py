@@ -1,8 +1,8 @@
-"""Charge down to the cut-off voltage under a load like the present one.
+"""Charge that remains until the cut-off voltage, under a load with a given mean and peak.
 
-The mean current of the load discharges the pack and polarizes the RC pairs. The cut-off comes at a peak of the load, which
-adds a drop over R_0 and over a part of R_1. The filter has learned the resistances at higher SOCs, and they are larger than in
-the cell file towards empty.
+The mean current discharges the pack and polarizes the RC pairs. The voltage reaches the cut-off at a peak, which adds a drop
+over R_0 and over a part of R_1. The filter has learned the resistances at higher SOCs. Near empty they exceed those of the cell
+file, so that they are increased towards SOC 0.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Currents are positive on discharge.
 """
@@ -21,14 +21,15 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 MIN_LOAD_C = 0.05
-"""Minimum mean current of the load, as a C-rate. At rest and while charging, the load has this mean."""
+"""Minimum mean current of the load, as a C-rate. It is used at rest and while charging."""
 PEAK_SHARE_R_1 = 0.35
-"""Fraction of R_1 (1 s) that a peak polarizes."""
+"""Fraction of a peak current that the RC pair R_1 (1 s) follows. Over its first second, the response to a
+current step has the mean 1/e."""
 RESISTANCE_FACTOR = 1.05
-"""Factor on all resistances until the end of a discharge."""
+"""Factor on all resistances. Its effect is in docs/theory/available-power.md, as is that of ``GROWTH``."""
 GROWTH = 0.5
-"""Additional increase of all resistances from ``GROWTH_SOC`` to SOC 0, relative to those of the cell file. Few captures of a
-calibration contain loads near empty."""
+"""Additional increase of all resistances from ``GROWTH_SOC`` to SOC 0, as a fraction. The cell file has too small resistances
+there, because few calibration captures contain loads near empty."""
 GROWTH_SOC = 0.4
 """SOC below which the resistances increase by ``GROWTH``."""
 SOC_STEP = 0.005

@@ -1,4 +1,4 @@
-"""Spread of the draws: what each draw assumes of pack and load.
+"""Draws (Monte Carlo samples) of pack and load: the assumptions of each.
 
 ``d`` is a record of DRAW, ``m`` of PROJECTED_PACK.
 """
@@ -14,21 +14,21 @@ from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 
 GROWTH_SOC = 0.4
-"""SOC below which the resistances grow."""
+"""SOC below which the resistances increase."""
 
 DRAW = np.dtype(
     [
         ("begin_soc", "f8"),  # SOC of the weakest cell at the beginning
-        ("capacity_as", "f8"),  # of the weakest cell [A s]
+        ("capacity_as", "f8"),  # capacity of the weakest cell [A s]
         ("load", "f8"),  # factor on the load
         ("voltage_v", "f8"),  # error of the voltage [V]
         ("resistance", "f8"),  # factor on the voltage drop
-        ("first_generator", "u8"),  # state of the generator of random numbers after these
-        ("generator", "u8"),  # present state of the generator
+        ("first_generator", "u8"),  # state of the random generator after the assumptions were drawn
+        ("generator", "u8"),  # present state of the random generator
         ("block", "i8"),  # index of the present block of the load
-        ("run", "i8"),  # number of blocks until the next jump to another one
-        ("difference_a", "f8", BRANCHES),  # currents of the RC pairs, less those of the present block in the past [A]
-        ("slower", "i8"),  # index of the first RC pair that has such a difference
+        ("run", "i8"),  # number of blocks until the next jump to a random block
+        ("difference_a", "f8", BRANCHES),  # RC currents minus those with which the present block was tabulated [A]
+        ("first_pair", "i8"),  # index of the first RC pair with a difference that is not negligible
         ("ended", "i8"),  # 1: the cut-off came within the horizon
         ("time_s", "f8"),  # time until the cut-off or the horizon [s]
         ("soc", "f8"),  # SOC at that time
@@ -54,32 +54,35 @@ def draw_packs(m: Record, seed: np.uint64, draws: Records) -> None:
 @njit(cache=True)
 def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
     """Draw pack and load factor of one draw from its generator."""
-    generator, of_soc = normal(generator)
-    generator, of_capacity = normal(generator)
-    generator, of_load = normal(generator)
-    generator, of_voltage = normal(generator)
-    generator, of_resistance = normal(generator)
-    generator, of_weakest = normal(generator)
-    weakest = m.weakest_std * max(of_weakest, 0.0)  # the weakest cell is never better than the mean
-    d.begin_soc = m.soc - m.early_soc + m.soc_std * of_soc
+    generator, soc_stds = normal(generator)
+    generator, capacity_stds = normal(generator)
+    generator, load_stds = normal(generator)
+    generator, voltage_stds = normal(generator)
+    generator, resistance_stds = normal(generator)
+    generator, weakest_stds = normal(generator)
+    weakest = m.weakest_std * max(weakest_stds, 0.0)  # the weakest cell is never better than the mean
+    d.begin_soc = m.soc - m.early_soc + m.soc_std * soc_stds
     d.begin_soc -= weakest * max(1.0 - d.begin_soc, 0.0)
-    d.capacity_as = m.capacity_as * math.exp(m.capacity_std * of_capacity) / (1.0 + weakest)
-    d.load = math.exp(m.load_std * of_load)
-    d.voltage_v = m.voltage_std_v * of_voltage
-    d.resistance = m.resistance_mean + m.resistance_std * of_resistance
+    d.capacity_as = m.capacity_as * math.exp(m.capacity_std * capacity_stds) / (1.0 + weakest)
+    d.load = math.exp(m.load_std * load_stds)
+    d.voltage_v = m.voltage_std_v * voltage_stds
+    d.resistance = m.resistance_mean + m.resistance_std * resistance_stds
     d.first_generator = generator
 
 
 @njit(cache=True)
-def lowness(soc: float) -> float:
-    """Return 0 above ``GROWTH_SOC``, rising to 1 at SOC 0."""
+def growth_fraction(soc: float) -> float:
+    """Return the fraction of the growth that applies at ``soc``: 0 above ``GROWTH_SOC``, 1 at SOC 0, linear in between."""
     return min(max(1.0 - soc / GROWTH_SOC, 0.0), 1.0)
 
 
 @njit(cache=True)
 def drop_factor(d: Record, m: Record, soc: float) -> float:
-    """Return the factor on the model's voltage drop at ``soc``. The present resistances contain the growth until now."""
-    return d.resistance + m.growth * max(lowness(soc) - lowness(m.soc), 0.0)
+    """Return the factor on the model's voltage drop at ``soc``.
+
+    The filter's resistances already contain the growth down to the present SOC, so that only the rest is added.
+    """
+    return d.resistance + m.growth * max(growth_fraction(soc) - growth_fraction(m.soc), 0.0)
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""Draws under a load that the user gives."""
+"""Simulation of draws under a load that the user gives."""
 
 import math
 
@@ -13,9 +13,9 @@ from bms_estimator.numba_cache import njit
 LOAD_PART = np.dtype(
     [
         ("duration_s", "f8"),
-        ("current_a", "f8"),  # NaN: the power is given [A]
-        ("power_w", "f8"),  # [W]
-        ("decay", "f8", BRANCHES),  # decay of the RC pairs over the duration
+        ("current_a", "f8"),  # current [A]; NaN: ``power_w`` applies
+        ("power_w", "f8"),  # power [W]; ignored if there is a current
+        ("decay", "f8", BRANCHES),  # decay factor of each RC pair over the duration
     ],
     align=True,
 )
@@ -34,11 +34,11 @@ def set_decays(parts: Records) -> None:
 def follow_given_load(
     m: Record, parts: Records, horizon_s: float, draws: Records, curve_step_s: float, soc: Floats, voltage_v: Floats
 ) -> None:
-    """Follow each draw until the cut-off or the horizon, and write curves.
+    """Simulate each draw until the cut-off or the horizon, and write its curves.
 
     Args:
         m: Record of PROJECTED_PACK.
-        parts: Shape (n,), dtype LOAD_PART; repeated after its end.
+        parts: Shape (n,), dtype LOAD_PART; the load repeats after its last part.
         horizon_s: Maximum time of a draw [s].
         draws: Shape (draws,), dtype DRAW, by ``draw_packs``; the outcomes are written.
         curve_step_s: Time between two points of the curves [s].
@@ -59,7 +59,10 @@ def follow_draw(
     soc_points: Floats,
     voltage_points_v: Floats,
 ) -> None:
-    """Follow one draw until the cut-off or the horizon. After its cut-off it keeps its SOC and the cut-off voltage."""
+    """Simulate one draw until the cut-off or the horizon.
+
+    After the cut-off, the points of its curve have the SOC at the cut-off and the cut-off voltage.
+    """
     x_a, ohm, at, point = m.x_a.copy(), np.empty(BRANCHES), 0, 0
     soc, elapsed_s, d.ended = d.begin_soc, 0.0, 0
     while elapsed_s < horizon_s:
@@ -92,13 +95,13 @@ def follow_draw(
 
 @njit(cache=True)
 def part_current(part: Record, source_v: float, ohm: float) -> float:
-    """Return the current of a part whose voltage is ``source_v`` - ``ohm`` i at its end [A].
+    """Return the current i of a part [A]. The terminal voltage at its end is ``source_v`` - ``ohm`` i.
 
-    It is infinite if the pack cannot supply the power.
+    The current is infinite if the pack cannot supply the power.
     """
     if not math.isnan(part.current_a):
         return part.current_a
-    square_v2 = source_v * source_v - 4.0 * ohm * part.power_w
-    if source_v <= 0.0 or square_v2 < 0.0:
+    discriminant_v2 = source_v * source_v - 4.0 * ohm * part.power_w
+    if source_v <= 0.0 or discriminant_v2 < 0.0:
         return math.inf
-    return 2.0 * part.power_w / (source_v + math.sqrt(square_v2))
+    return 2.0 * part.power_w / (source_v + math.sqrt(discriminant_v2))

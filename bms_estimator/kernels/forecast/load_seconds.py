@@ -14,10 +14,10 @@ from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
 MAX_LOAD_S = 20_000
-"""Capacity of the ring buffer [s]."""
+"""Capacity of the ring buffer [s]: about 5.5 hours of use, in 160 kB."""
 MAX_REST_S = 4000
-"""Maximum length of a rest in the ring buffer [s]."""
-CHARGE_SHARE = 1.0 - math.exp(-1.0 / TAU_S[CHARGE])
+"""Maximum length of a rest in the ring buffer [s]. The rest of a longer one is not stored, so that the load before it remains."""
+CHARGE_WEIGHT = 1.0 - math.exp(-1.0 / TAU_S[CHARGE])
 """Weight of a new second in the filtered current that distinguishes a charge from regeneration."""
 
 LOAD = np.dtype(
@@ -25,9 +25,9 @@ LOAD = np.dtype(
         ("started", "i8"),  # 1: there is a previous row
         ("time_s", "f8"),  # time stamp of the previous row [s]
         ("current_a", "f8"),  # current of the previous row [A]
-        ("part_s", "f8"),  # elapsed part of the present second [s]
-        ("part_as", "f8"),  # charge in this part [A s]
-        ("part_max_a", "f8"),  # largest current in this part [A]
+        ("part_s", "f8"),  # elapsed time of the present second [s]
+        ("part_as", "f8"),  # charge of the present second until now [A s]
+        ("part_max_a", "f8"),  # largest current of the present second until now [A]
         ("filtered_a", "f8"),  # current, filtered with the time constant of the RC pair ``CHARGE`` [A]
         ("last_a", "f8"),  # mean current of the last complete second [A]
         ("rest_s", "i8"),  # duration of the present rest [s]
@@ -38,7 +38,7 @@ LOAD = np.dtype(
     ],
     align=True,
 )
-"""Load that was seen, and the second that is not complete."""
+"""Observed load: the stored seconds, and the present incomplete one."""
 
 
 @njit(cache=True)
@@ -71,7 +71,7 @@ def begin_second(load: Record) -> None:
 
 @njit(cache=True)
 def add_step(load: Record, step_s: float, mean_a: float, end_a: float, one_c_a: float) -> None:
-    """Divide a step among the seconds that it touches. ``end_a`` is the current at its end [A]."""
+    """Divide a step between two rows among the seconds that it spans. ``end_a`` is the current at its end [A]."""
     while load.part_s + step_s >= 1.0:
         part_s = 1.0 - load.part_s
         step_s -= part_s
@@ -88,10 +88,10 @@ def add_step(load: Record, step_s: float, mean_a: float, end_a: float, one_c_a: 
 def add_second(load: Record, mean_a: float, max_a: float, one_c_a: float) -> None:
     """Add a complete second, unless it belongs to a charge, to a rest after a charge, or to a long rest.
 
-    A long charge empties the ring buffer. The first second of discharge after the charge ends it.
+    A long charge empties the ring buffer. The first second of discharge ends the charge.
     """
     load.last_a = mean_a
-    load.filtered_a += CHARGE_SHARE * (mean_a - load.filtered_a)
+    load.filtered_a += CHARGE_WEIGHT * (mean_a - load.filtered_a)
     load.rest_s = load.rest_s + 1 if abs(mean_a) <= REST_C * one_c_a else 0
     if load.filtered_a < -CHARGE_C * one_c_a:
         load.count = 0

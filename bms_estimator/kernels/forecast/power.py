@@ -1,9 +1,9 @@
 """Available power: constant power that the pack supplies or accepts until its voltage reaches a limit.
 
-The largest constant current is sought for which the voltage stays inside the limit with a stated probability. The voltage has
-the mean and the variance of the filter's mixture of hypotheses, propagated to the end of the current. The power is that
-current times the lowest voltage meanwhile. A constant power of this size never draws a larger current, so that its voltage
-stays inside the limit, too.
+A search finds the largest constant current with which a given quantile of the voltage stays within the limit. Mean and variance
+of the voltage come from the filter's mixture of hypotheses, propagated to the end of the current. The available power is this
+current times the lowest voltage during the current. A constant power of this size never draws a larger current, and therefore
+stays within the limit, too.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Currents are positive on discharge.
 """
@@ -33,15 +33,15 @@ from bms_estimator.kernels.kalman_filter.records import (
 from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
-CHECKED = (0.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)
+CHECKED_FRACTIONS = (0.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)
 """Fractions of the duration at which the voltage is checked. It is not always lowest or highest at the end: after a larger load,
 the RC pairs recover while the SOC still falls."""
 MAX_ITERATIONS = 24
 """Maximum number of iterations of the search for the current. About five suffice."""
 TOLERANCE_V = 1e-6
-"""Distance of the voltage from the limit at which the search ends [V]."""
-MIN_REACH_SOC = 1e-3
-"""Minimum SOC width of the OCV's secant."""
+"""Distance from the limit below which the search ends [V]."""
+MIN_SECANT_SOC = 1e-3
+"""Minimum width of the OCV's secant [SOC]. A narrower one would only add rounding errors."""
 
 
 @njit(cache=True)
@@ -82,17 +82,17 @@ def current_at_limit(
     stds: float,
     scratch: Floats,
 ) -> float:
-    """Return the current whose quantile of the voltage comes closest to ``limit_v`` without crossing it [A].
+    """Return the largest current with which the quantile of the voltage does not cross ``limit_v`` [A].
 
-    The method is the false position with halved weights (Illinois). The voltage is nearly linear in the current.
+    The method is regula falsi (Illinois variant). It converges fast, because the voltage is nearly linear in the current.
 
     Args:
         s: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
         duration_s: Duration of the current [s].
         limit_v: Limit of the voltage [V].
-        bracket: Largest current [A], and distance of the voltage from the limit at rest and at this current [V]; the first is
-            above and the second below 0.
+        bracket: Largest current [A], and distance of the voltage from the limit at rest (above 0)
+            and at this current (below 0) [V].
         stds: Distance of the quantile from the mean towards the limit, in standard deviations.
         scratch: Scratch space of shape (RESISTANCES + STATES,).
     """
@@ -119,7 +119,7 @@ def current_at_limit(
 def closest_voltage(
     s: Record, p: Record, current_a: float, duration_s: float, direction: float, stds: float, scratch: Floats
 ) -> float:
-    """Return the quantile of the voltage at the checked time at which it is closest to the limit [V].
+    """Return the quantile of the voltage that is closest to the limit, over the times ``CHECKED_FRACTIONS`` [V].
 
     Args:
         s: Record of EKF_STATE.
@@ -131,7 +131,7 @@ def closest_voltage(
         scratch: Scratch space of shape (RESISTANCES + STATES,).
     """
     closest_v = math.inf * direction
-    for fraction in CHECKED:
+    for fraction in CHECKED_FRACTIONS:
         voltage_v = voltage_quantile(s, p, current_a, fraction * duration_s, -direction * stds, scratch)
         if voltage_v * direction < closest_v * direction:
             closest_v = voltage_v
@@ -144,7 +144,7 @@ def voltage_quantile(s: Record, p: Record, current_a: float, elapsed_s: float, s
 
     Mean and variance are those of the mixture of hypotheses.
     """
-    total = mean_v = square_v2 = 0.0
+    total = mean_v = mean_square_v2 = 0.0
     reference_v = voltage_after(s, p, s.best, current_a, elapsed_s, scratch[:RESISTANCES])  # limits the rounding error
     for q in range(s.count):
         weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
@@ -152,9 +152,9 @@ def voltage_quantile(s: Record, p: Record, current_a: float, elapsed_s: float, s
         variance_v2 = voltage_variance(s, p, q, current_a, elapsed_s, stds, scratch) if stds != 0.0 else 0.0
         total += weight
         mean_v += weight * deviation_v
-        square_v2 += weight * (variance_v2 + deviation_v * deviation_v)
-    mean_v, square_v2 = mean_v / total, square_v2 / total
-    return reference_v + mean_v + stds * math.sqrt(max(square_v2 - mean_v * mean_v, 0.0))
+        mean_square_v2 += weight * (variance_v2 + deviation_v * deviation_v)
+    mean_v, mean_square_v2 = mean_v / total, mean_square_v2 / total
+    return reference_v + mean_v + stds * math.sqrt(max(mean_square_v2 - mean_v * mean_v, 0.0))
 
 
 @njit(cache=True)
@@ -163,7 +163,7 @@ def voltage_variance(
 ) -> float:
     """Return the variance of the voltage after ``elapsed_s`` of the constant current [V^2].
 
-    It is H P H' of the filter's covariance, and the errors of the model that the current adds.
+    It is H P H' with the filter's covariance P, plus the variance of the model error that the current adds.
 
     Args:
         s: Record of EKF_STATE.
@@ -178,9 +178,9 @@ def voltage_variance(
     moved_soc = current_a * elapsed_s / hypothesis_capacity(s, p, q)
     soc = x[SOC] - moved_soc
     h[:] = 0.0
-    reach_soc = math.copysign(max(abs(stds) * math.sqrt(cov[SOC, SOC]), MIN_REACH_SOC), stds)
+    secant_soc = math.copysign(max(abs(stds) * math.sqrt(cov[SOC, SOC]), MIN_SECANT_SOC), stds)
     e_o_v = ocv(soc, p.ocv_v, p.ocv_slope_v)
-    h[SOC] = (ocv(soc + reach_soc, p.ocv_v, p.ocv_slope_v) - e_o_v) / reach_soc
+    h[SOC] = (ocv(soc + secant_soc, p.ocv_v, p.ocv_slope_v) - e_o_v) / secant_soc
     h[LN_Q] = h[SOC] * moved_soc
     h[LN_R0] = -ohm[0] * current_a
     for k in range(BRANCHES):
@@ -197,6 +197,7 @@ def voltage_variance(
         if h[j] != 0.0:
             for k in range(STATES):
                 variance_v2 += h[j] * cov[j, k] * h[k]
+    # P contains the model error at the usual load. The decayed part of the biases is replaced by new model error.
     usual_v2 = load_bias_variance(s, p, q, s.rms_a2)
     pulse_v2 = load_bias_variance(s, p, q, max(current_a * current_a, s.rms_a2))
     renewed = 1.0 - 0.5 * (h[B_SLOW] * h[B_SLOW] + h[B_FAST] * h[B_FAST])

@@ -1,6 +1,7 @@
-"""Pack as it is now, with the curves of its voltage over the SOC, from which each draw starts.
+"""Present state of the pack and its voltage as a function of SOC, from which each draw starts.
 
 ``m`` is a record of PROJECTED_PACK, ``s`` of EKF_STATE, ``p`` of EKF_SETTINGS. Voltages and resistances are of the whole pack.
+The parameters of the draws were chosen with discharges of real captures (docs/theory/collapse.md).
 """
 
 import math
@@ -25,37 +26,37 @@ from bms_estimator.kernels.kalman_filter.records import (
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-SOC_STD_SHARE = 0.5
-"""Share of the filter's std of the SOC that the draws use. The other half is not independent of the biases."""
+SOC_STD_FACTOR = 0.5
+"""Factor on the filter's std of the SOC in the draws. The full std would count twice the error that SOC and biases share."""
 MIN_SOC_STD = 0.02
-"""Std of the SOC that is added to the filter's [SOC]."""
-CAPACITY_STD_SHARE = 0.5
-"""Share of the filter's std of the capacity that the draws use."""
+"""Minimum std of the SOC, added in quadrature to that of the filter [SOC]."""
+CAPACITY_STD_FACTOR = 0.5
+"""Factor on the filter's std of the capacity in the draws."""
 VOLTAGE_STD_V = 0.02
-"""Std of the error of one cell's model at 25 C that lasts until the cut-off [V]."""
+"""Std of the voltage error of one cell's model at 25 C, constant until the cut-off [V]."""
 VOLTAGE_STD_J = 22e3
 """Activation energy of ``VOLTAGE_STD_V`` squared [J/mol]."""
 LOAD_STD = 0.1
-"""Std of ln of the future over the drawn load."""
+"""Std of ln (future load / drawn load)."""
 RESISTANCE_MEAN = 1.05
-"""Mean factor on the voltage drop."""
+"""Mean factor on the voltage drop of the present model."""
 RESISTANCE_STD = 0.05
 """Std of the factor on the voltage drop."""
 GROWTH = 0.75
 """Relative growth of the voltage drop towards SOC 0, beyond that of the cell file, at 25 C. Cell files are measured with rests,
 in which concentrations recover. The growth increases with the Arrhenius factor of ``WEAK_J`` in the cold."""
 EARLY_SOC = 0.005
-"""SOC by which a loaded cell is empty before its OCV curve ends, at 25 C. It increases in the cold as ``GROWTH`` does."""
+"""SOC of the OCV curve at which a loaded cell is empty, at 25 C. It increases in the cold as ``GROWTH`` does."""
 EARLY_PLATEAU_SOC = 0.015
-"""Value that replaces ``EARLY_SOC`` for a cell whose OCV has a plateau, at all temperatures. Its knee near empty is steep, so that
-the knee's error along SOC decides. Drives of an LFP cell at 25, 5 and -15 C reached the cut-off at SOC 0.01 to 0.03."""
+"""Substitute for ``EARLY_SOC`` in cells whose OCV has a plateau, at all temperatures. Their knee near empty is steep, so that the
+error of its SOC decides. Drives of an LFP cell at 25, 5 and -15 C reached the cut-off at SOC 0.01 to 0.03."""
 
 PROJECTED_PACK = np.dtype(
     [
-        ("soc", "f8"),  # by the filter
+        ("soc", "f8"),  # SOC by the filter
         ("early_soc", "f8"),  # SOC at which the loaded pack is empty
-        ("capacity_as", "f8"),  # by the filter [A s]
-        ("offset_a", "f8"),  # measured less true current [A]
+        ("capacity_as", "f8"),  # capacity by the filter [A s]
+        ("offset_a", "f8"),  # measured minus true current [A]
         ("x_a", "f8", BRANCHES),  # filtered currents of the RC pairs [A]
         ("bias_v", "f8"),  # present error of the model; near empty it is mainly a shift of the knee, which persists [V]
         ("cutoff_v", "f8"),
@@ -63,7 +64,7 @@ PROJECTED_PACK = np.dtype(
         ("weakest_std", "f8"),  # std of the weakest cell's SOC below the mean, per unit of SOC discharged
         ("capacity_std", "f8"),  # std of ln capacity
         ("voltage_std_v", "f8"),
-        ("load_std", "f8"),  # std of ln of the future over the drawn load
+        ("load_std", "f8"),  # std of ln (future load / drawn load)
         ("resistance_mean", "f8"),  # mean factor on the voltage drop
         ("resistance_std", "f8"),
         ("growth", "f8"),  # relative growth of the voltage drop towards empty
@@ -73,21 +74,21 @@ PROJECTED_PACK = np.dtype(
     ],
     align=True,
 )
-"""Present state of a pack, its curves, and the spread of the draws."""
+"""Present state of a pack, its curves, and the parameters of the distribution of the draws."""
 
 
 @njit(cache=True)
 def project_pack(m: Record, s: Record, p: Record, cutoff_v: float) -> None:
-    """Write the pack by the likeliest hypothesis of the filter to ``m``."""
+    """Write the pack to ``m``, by the likeliest hypothesis of the filter."""
     x, cov = s.mean[s.best], s.covariance[s.best]
     m.soc, m.cutoff_v, m.offset_a = x[SOC], cutoff_v, x[OFFSET]
     m.capacity_as = p.capacity_as * math.exp(x[LN_Q])
     for k in range(BRANCHES):
         m.x_a[k] = s.x_a[k] + x[X + k]
     m.bias_v = x[B_SLOW] + x[B_FAST]
-    m.soc_std = math.hypot(SOC_STD_SHARE * s.soc_std, MIN_SOC_STD)
+    m.soc_std = math.hypot(SOC_STD_FACTOR * s.soc_std, MIN_SOC_STD)
     m.weakest_std = p.cell_spread if p.series > 1.0 else 0.0
-    m.capacity_std = CAPACITY_STD_SHARE * math.sqrt(cov[LN_Q, LN_Q])
+    m.capacity_std = CAPACITY_STD_FACTOR * math.sqrt(cov[LN_Q, LN_Q])
     m.voltage_std_v = VOLTAGE_STD_V * p.series * math.sqrt(arrhenius(VOLTAGE_STD_J, s.temperature_c))
     m.load_std, m.resistance_mean, m.resistance_std = LOAD_STD, RESISTANCE_MEAN, RESISTANCE_STD
     cold = max(s.weak, 1.0)

@@ -1,6 +1,6 @@
-"""Random numbers of the draws: splitmix64, whose state is one integer.
+"""Random numbers of the draws: splitmix64 (Steele, Lea and Flood, OOPSLA 2014), whose state is one integer.
 
-Each draw has a generator of its own, so that a draw can be repeated alone. (Steele, Lea and Flood, OOPSLA 2014.)
+Each draw has its own generator, so that it can be repeated alone. The constants are those of splitmix64.
 """
 
 import math
@@ -13,13 +13,13 @@ _INCREMENT = np.uint64(0x9E3779B97F4A7C15)
 _FIRST_FACTOR = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND_FACTOR = np.uint64(0x94D049BB133111EB)
 _SHIFTS = np.uint64(30), np.uint64(27), np.uint64(31)
-_TO_53_BITS = np.uint64(11)
-_UNIT = 2.0**-53
+_SHIFT_TO_53_BITS = np.uint64(11)
+_UNIT_OF_53_BITS = 2.0**-53
 
 
 @njit(cache=True)
 def mix(state: np.uint64) -> np.uint64:
-    """Return the random integer that belongs to a state of the generator."""
+    """Return the random integer of a generator state."""
     z = (state ^ (state >> _SHIFTS[0])) * _FIRST_FACTOR
     z = (z ^ (z >> _SHIFTS[1])) * _SECOND_FACTOR
     return z ^ (z >> _SHIFTS[2])
@@ -35,7 +35,7 @@ def generator_of_draw(seed: np.uint64, draw: int) -> np.uint64:
 def uniform(state: np.uint64) -> tuple[np.uint64, float]:
     """Return the next state, and a random number above 0 and below 1."""
     state += _INCREMENT
-    return state, (float(mix(state) >> _TO_53_BITS) + 0.5) * _UNIT
+    return state, (float(mix(state) >> _SHIFT_TO_53_BITS) + 0.5) * _UNIT_OF_53_BITS
 
 
 @njit(cache=True)

@@ -1,7 +1,7 @@
-"""Draws under a load like the one that was seen: stationary bootstrap of its blocks (Politis and Romano 1994).
+"""Simulation of draws under a load like the observed one: stationary bootstrap of its blocks (Politis and Romano 1994).
 
-Each draw passes the blocks in their order, from a random one on, and continues from another random block after ``RUN_S`` on
-average.
+Each draw starts at a random block and passes the following blocks in order. After ``MEAN_RUN_S`` on average it jumps to another
+random block.
 """
 
 import math
@@ -15,16 +15,16 @@ from bms_estimator.kernels.forecast.random_numbers import uniform
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
-RUN_S = 300.0
-"""Mean time for which a draw passes the load in its order [s]."""
+MEAN_RUN_S = 300.0
+"""Mean time between two jumps of a draw [s]: the scale over which the order of the observed load is kept."""
 
-NEGLIGIBLE_C = 1e-3
-"""Difference of an RC pair's current that is left out, as a C-rate."""
+NEGLIGIBLE_DIFFERENCE_C = 1e-3
+"""Difference of an RC current below which it counts as zero, as a C-rate."""
 
 
 @njit(cache=True)
 def follow_seen_load(m: Record, blocks: Records, block_s: float, steps: int, draws: Records) -> None:
-    """Follow each draw until the cut-off, or through ``steps`` blocks.
+    """Simulate each draw until the cut-off, or for ``steps`` blocks.
 
     Args:
         m: Record of PROJECTED_PACK.
@@ -33,9 +33,9 @@ def follow_seen_load(m: Record, blocks: Records, block_s: float, steps: int, dra
         steps: Maximum number of blocks of a draw.
         draws: Shape (draws,), dtype DRAW, by ``draw_packs``; the outcomes are written.
     """
-    decay, nowhere = np.exp(-block_s / TAUS), np.empty(0)
+    decay, no_points = np.exp(-block_s / TAUS), np.empty(0)
     for n in range(draws.shape[0]):
-        follow_draw(m, blocks, block_s, steps, draws[n], decay, 0, nowhere, nowhere)
+        follow_draw(m, blocks, block_s, steps, draws[n], decay, 0, no_points, no_points)
 
 
 @njit(cache=True)
@@ -49,10 +49,10 @@ def record_curves(
     soc: Floats,
     voltage_v: Floats,
 ) -> None:
-    """Follow draws as ``follow_seen_load`` does, and write SOC and mean voltage at every ``stride``-th block.
+    """Simulate draws as ``follow_seen_load`` does, and write SOC and mean voltage at every ``stride``-th block.
 
-    After its cut-off a draw keeps its SOC and the cut-off voltage. ``soc`` and ``voltage_v`` have the shape
-    (draws, points). The outcomes of the draws are overwritten.
+    After the cut-off, the points of a draw have the SOC at the cut-off and the cut-off voltage. ``soc`` and ``voltage_v`` have
+    the shape (draws, points). The outcomes of the draws are overwritten.
     """
     decay = np.exp(-block_s / TAUS)
     for n in range(draws.shape[0]):
@@ -71,7 +71,7 @@ def follow_draw(
     soc_points: Floats,
     voltage_points_v: Floats,
 ) -> None:
-    """Follow one draw until the cut-off or through ``steps`` blocks. With ``stride`` above 0, write its curve."""
+    """Simulate one draw until the cut-off, or for ``steps`` blocks. With ``stride`` above 0, write its curve."""
     begin_load(m, blocks, block_s, d)
     soc, d.ended, step = d.begin_soc, 0, 0
     while step < steps:
@@ -103,8 +103,8 @@ def follow_draw(
 
 @njit(cache=True)
 def begin_load(m: Record, blocks: Records, block_s: float, d: Record) -> None:
-    """Set the first block of a draw."""
-    d.generator, d.slower = d.first_generator, 0
+    """Set the first block of a draw, and the differences of its RC currents."""
+    d.generator, d.first_pair = d.first_generator, 0
     jump(blocks, block_s, d)
     for k in range(BRANCHES):
         d.difference_a[k] = m.x_a[k] - d.load * blocks[d.block].begin_a[k]
@@ -112,20 +112,20 @@ def begin_load(m: Record, blocks: Records, block_s: float, d: Record) -> None:
 
 @njit(cache=True)
 def advance_load(blocks: Records, block_s: float, decay: Floats, d: Record) -> None:
-    """Set the next block of a draw, and the differences of the RC pairs at its beginning."""
-    negligible_a = NEGLIGIBLE_C * d.capacity_as / 3600.0
-    for k in range(d.slower, BRANCHES):
+    """Set the next block of a draw, and the differences of its RC currents at the beginning of this block."""
+    negligible_a = NEGLIGIBLE_DIFFERENCE_C * d.capacity_as / 3600.0
+    for k in range(d.first_pair, BRANCHES):
         d.difference_a[k] *= decay[k]
-    while d.slower < BRANCHES and abs(d.difference_a[d.slower]) < negligible_a:
-        d.difference_a[d.slower] = 0.0
-        d.slower += 1
+    while d.first_pair < BRANCHES and abs(d.difference_a[d.first_pair]) < negligible_a:
+        d.difference_a[d.first_pair] = 0.0
+        d.first_pair += 1
     last = d.block
     d.block = last + 1 if last + 1 < blocks.shape[0] else 0
     d.run -= 1
     if d.run == 0:
         jump(blocks, block_s, d)
     if d.block != last + 1:
-        d.slower = 0
+        d.first_pair = 0
         for k in range(BRANCHES):
             d.difference_a[k] += d.load * (blocks[last].end_a[k] - blocks[d.block].begin_a[k])
 
@@ -136,18 +136,18 @@ def jump(blocks: Records, block_s: float, d: Record) -> None:
     d.generator, u = uniform(d.generator)
     d.block = int(u * blocks.shape[0])
     d.generator, u = uniform(d.generator)
-    probability = min(block_s / RUN_S, 1.0)
+    probability = min(block_s / MEAN_RUN_S, 1.0)
     d.run = 1 if probability >= 1.0 else 1 + int(math.log(u) / math.log1p(-probability))
 
 
 @njit(cache=True)
 def difference_drop(m: Record, d: Record, row: Record, i: int, t: float) -> float:
-    """Return the drop by the differences of the RC pairs at the peak of a block [V].
+    """Return the voltage drop that the differences of the RC currents cause at the peak of a block [V].
 
-    ``i`` and ``t`` are a position in the SOC grid.
+    ``i`` and ``t`` are a position in the SOC grid (``grid_position``).
     """
     drop_v = 0.0
-    for k in range(d.slower, BRANCHES):
+    for k in range(d.first_pair, BRANCHES):
         r_ohm = m.ohm[1 + k, i] + t * (m.ohm[1 + k, i + 1] - m.ohm[1 + k, i])
         drop_v += r_ohm * d.difference_a[k] * row.peak_decay[k]
     return drop_v
@@ -155,7 +155,7 @@ def difference_drop(m: Record, d: Record, row: Record, i: int, t: float) -> floa
 
 @njit(cache=True)
 def mean_drop(m: Record, row: Record, i: int, t: float) -> float:
-    """Return the mean drop of a block, as it was in the past, at a position in the SOC grid [V]."""
+    """Return the mean voltage drop of a block with its tabulated RC currents, at a position in the SOC grid [V]."""
     drop_v = (m.ohm[0, i] + t * (m.ohm[0, i + 1] - m.ohm[0, i])) * row.mean_a
     for k in range(BRANCHES):
         drop_v += (m.ohm[1 + k, i] + t * (m.ohm[1 + k, i + 1] - m.ohm[1 + k, i])) * row.mean_x_a[k]
