@@ -14,6 +14,7 @@ from bms_estimator.forecast.load_history import LoadHistory
 from bms_estimator.forecast.past_minutes import MINUTE_S, PastMinutes
 from bms_estimator.forecast.projection import (
     Projection,
+    discharges,
     project_given_load,
     project_seen_load,
     project_trip,
@@ -188,7 +189,7 @@ class Forecaster:
             projection = project_given_load(pack, load, self._seed())
             return projection if np.isfinite(projection.time_s).all() else None
         mean_a, max_a = self.load.mean_and_max()
-        if mean_a.mean() <= pack["offset_a"][0]:
+        if not discharges(pack, float(mean_a.mean() - pack["offset_a"][0])):
             return None
         return project_seen_load(pack, mean_a, max_a, self._seed(), self.past.analogues(mean_a.size // MINUTE_S))
 

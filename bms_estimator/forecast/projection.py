@@ -30,6 +30,8 @@ MAX_STEPS = 360
 """Maximum number of blocks that a draw passes. For a longer horizon the blocks are longer, so that the cost is bounded."""
 MIN_BLOCKS = 10
 """Minimum number of blocks in the load that was seen, which limits their length."""
+MAX_FULL_TIME_S = 1e9
+"""Time in which a load must draw the whole charge, to count as a discharge [s]: 30 years."""
 HORIZON_RATIO = 1.5
 """Horizon of the draws, in multiples of the time in which the mean load draws the whole charge. Draws that outlive it are
 extrapolated by the mean load."""
@@ -41,6 +43,9 @@ MIN_BLOCK_S = 1.0
 """Resolution of a given load [s]: mean and peak of each block remain."""
 MAX_BLOCKS = 10_000
 """Maximum number of blocks of a given load within a horizon."""
+MAX_DRAW_STEPS = 2 * MAX_BLOCKS
+"""Maximum number of parts of a given load that a draw passes. A short load that discharges the pack slowly repeats more often,
+and is extrapolated from there."""
 MAX_TOTAL_STEPS = 500_000
 """Maximum number of steps of all draws under a given load, unless there are only ``MIN_DRAWS``."""
 MIN_DRAWS = 100
@@ -125,8 +130,11 @@ def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:
     """
     m = pack[0]
     load_a = _mean_current(pack, load)
+    if not discharges(pack, load_a):
+        load_a = 0.0
     horizon_s = HORIZON_RATIO * _full_time_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
-    parts = _parts(load, horizon_s)
+    parts = _parts(_prolonged(load, horizon_s), horizon_s)
+    horizon_s = min(horizon_s, MAX_DRAW_STEPS * float(parts["duration_s"].mean()))
     draws = _draws(m, seed)[: _draw_count(parts, horizon_s)]
     no_points = np.empty((draws.size, 0))
     follow_given_load(m, parts, horizon_s, draws, math.inf, no_points, no_points)
@@ -164,6 +172,11 @@ def project_trip(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
     return _curve(step_s * np.arange(CURVE_POINTS, dtype=np.float64), soc, voltage_v, time_s)
 
 
+def discharges(pack: Records, load_a: float) -> bool:
+    """Return True if a load with a mean of ``load_a`` [A] discharges the pack within ``MAX_FULL_TIME_S``."""
+    return load_a > 0.0 and _full_time_s(pack, load_a) <= MAX_FULL_TIME_S
+
+
 def _full_time_s(pack: Records, load_a: float) -> float:
     """Return the time in which the mean load draws the whole remaining charge [s]."""
     return max(float(pack["soc"][0]), 0.02) * float(pack["capacity_as"][0]) / load_a
@@ -175,6 +188,12 @@ def _mean_current(pack: Records, load: GivenLoad) -> float:
     present_v = float(pack["voltage_v"][0, round(min(max(float(pack["soc"][0]), 0.0), 1.0) * soc_points)])
     current_a = np.where(np.isnan(load.current_a), load.power_w / present_v, load.current_a)
     return float(np.average(current_a, weights=load.duration_s))
+
+
+def _prolonged(load: GivenLoad, horizon_s: float) -> GivenLoad:
+    """Return a load that repeats less often within a horizon: a constant one, and one shorter than ``MIN_BLOCK_S``."""
+    length_s = horizon_s if load.duration_s.size == 1 else MIN_BLOCK_S
+    return replace(load, duration_s=load.duration_s * max(length_s / float(load.duration_s.sum()), 1.0))
 
 
 def _draw_count(parts: Records, horizon_s: float) -> int:

@@ -43,6 +43,8 @@ _OUT_OF_RANGE = int(SampleOutcome.OUT_OF_RANGE)
 _REPEATED = int(SampleOutcome.REPEATED)
 _SATURATED = int(SampleOutcome.SATURATED)
 _SATURATED_BITS = int(SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED)
+MAX_TIME_S = 1e30
+"""Maximum magnitude of a time stamp [s]. The squares of longer gaps could overflow."""
 _VOLTAGE_HELD = int(SampleStatus.VOLTAGE_HELD)
 _CURRENT_HELD = int(SampleStatus.CURRENT_HELD)
 
@@ -59,7 +61,8 @@ def validate_sample(s: Record, p: Record, time_s: float, current_a: float, volta
     if status & _SATURATED_BITS:
         s.dropped_saturated += 1
         return _SATURATED
-    if not (p.voltage_min_v <= voltage_v <= p.voltage_max_v and abs(current_a) <= p.current_max_a):
+    in_range = p.voltage_min_v <= voltage_v <= p.voltage_max_v and abs(current_a) <= p.current_max_a
+    if not in_range or abs(time_s) > MAX_TIME_S:
         s.dropped_range += 1
         return _OUT_OF_RANGE
     if s.started and time_s == s.time_s:

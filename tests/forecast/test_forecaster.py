@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.forecast import projection
 from bms_estimator.forecast.forecast import FORECAST
 from bms_estimator.forecast.forecaster import MAX_INTERVAL_S, Forecaster
 from bms_estimator.forecast.given_load import GivenLoad
@@ -172,3 +173,44 @@ def test_a_clock_that_is_set_back_does_not_delay_the_next_forecast():
     forecasts.run(block)
     assert forecasts.latest.time_s > 900.0
     assert forecasts.latest.time_s < 1000.0
+
+
+@pytest.mark.parametrize("time_s", [1e300, -1e300])
+def test_a_time_stamp_whose_square_overflows_is_rejected(drive, time_s):
+    block, forecasts = drive[:1500].copy(), forecaster()
+    block["time_s"][700] = time_s
+    forecasts.run(block)
+    assert forecasts.estimator.state["dropped_range"][0] == 1
+    p05_s, median_s, p95_s = values_of(forecasts.latest, *BAND)
+    assert 0.0 < p05_s <= median_s <= p95_s < np.inf
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "current_a"),
+    [([3600.0], [1e-6]), ([0.001], [1.0]), ([0.001, 0.001], [1.0, 0.5]), ([60.0, 60.0], [1.0, -0.9999])],
+)
+def test_the_cost_of_a_short_or_small_load_is_bounded(drive, monkeypatch, duration_s, current_a):
+    steps = []
+    follow = projection.follow_given_load
+
+    def counted(m, parts, horizon_s, draws, *points):
+        steps.append(draws.size * horizon_s / parts["duration_s"].mean())
+        if steps[-1] < 1e7:
+            follow(m, parts, horizon_s, draws, *points)
+
+    monkeypatch.setattr(projection, "follow_given_load", counted)
+    forecasts = forecaster()
+    forecasts.run(drive[:400])
+    unknown = np.full(len(current_a), np.nan)
+    forecasts.forecast(GivenLoad(np.array(duration_s), np.array(current_a), unknown))
+    assert max(steps) <= projection.MIN_DRAWS * projection.MAX_DRAW_STEPS * 1.01
+
+
+def test_a_short_constant_load_repeats(drive):
+    forecasts = forecaster()
+    forecasts.run(drive[:400])
+    short, long = (
+        forecasts.forecast(GivenLoad(np.array([duration_s]), np.array([1.5]), np.array([np.nan])))
+        for duration_s in (0.5, 3600.0)
+    )
+    assert values_of(short, *BAND) == pytest.approx(values_of(long, *BAND), rel=1e-6)
