@@ -14,7 +14,7 @@ from bms_estimator.pack_model.weakest_cell import MIN_ROWS, Comparison, Referenc
 from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_STD, WEAK_CELL_STD
 
 CHARGED_SOC = 0.05
-"""Charge that ends a discharge, as a fraction of the capacity. Regeneration is smaller."""
+"""Charge after which a discharge has ended, as a fraction of the capacity. Regeneration during a discharge is smaller."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Discharge:
     start_soc: float
     """SOC at its first row."""
     start_as: float
-    """Counter of the charge at its first row [A s]."""
+    """Charge counter at its first row [A s]."""
 
     def soc(self, cell: CellCurves, rows: NDArray[np.void]) -> Floats:
         """Return the SOC of rows of the discharge by the counted charge."""
@@ -40,8 +40,8 @@ class Discharge:
 class BankMonitor:
     """Monitor of the weakest cell of one bank.
 
-    A result is replaced by that of a later discharge once this discharge finds a weak cell, or has gone as deep as the result
-    without one. Discharges with a weak cell do not become part of the reference.
+    A later discharge replaces the result as soon as it shows a weak cell. If it shows none, it replaces the result only when its
+    SOC has fallen as low as in the earlier discharge. Discharges with a weak cell do not become part of the reference.
 
     Args:
         cell: Curves of the cell file.
@@ -55,9 +55,12 @@ class BankMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all results, as for a new bank."""
+        """Discard all results, as for a new bank."""
         self.weakest: WeakestCell | None = None
-        self._decided_s, self._healthy_soc = -np.inf, np.inf  # discharge of ``weakest``, and its SOC if no cell is weak
+        self._result_start_s, self._result_soc = (
+            -np.inf,
+            np.inf,
+        )  # start of the discharge of ``weakest``, and its lowest SOC
         self._discharge: Discharge | None = None
 
     def add(self, history: History, new: int, fit: PackFit) -> None:
@@ -77,7 +80,7 @@ class BankMonitor:
                 self._evaluate(rows[:end], history.weak_cell_times, fit)
 
     def _evaluate(self, rows: NDArray[np.void], weak: list[WeakCellTime], fit: PackFit) -> None:
-        """Compare the discharge that the last row belongs to."""
+        """Compare the discharge of the last row with its reference."""
         start = discharge_start(rows, CHARGED_SOC * self._cell.capacity_as)
         if self._discharge is None or self._discharge.start_s != rows["elapsed_s"][start]:
             self._discharge = self._begin(rows, start, weak, fit)
@@ -86,25 +89,25 @@ class BankMonitor:
             return
         soc = discharge.soc(self._cell, measured)
         result = Comparison(self._cell, discharge.fit, discharge.reference, measured, soc).weakest()
-        self._decide(result, weak, discharge.start_s, float(rows["elapsed_s"][-1]))
+        self._replace_result(result, weak, discharge.start_s, float(rows["elapsed_s"][-1]))
 
     def _begin(self, rows: NDArray[np.void], start: int, weak: list[WeakCellTime], fit: PackFit) -> Discharge:
-        """Return the discharge that begins with the row ``start``. While a cell is weak, the fit does not change."""
-        used = self._discharge.fit if is_weak_now(weak) and self._discharge is not None else fit
+        """Return the discharge that begins with the row ``start``. While a cell is weak, the earlier fit is kept."""
+        fit_before = self._discharge.fit if is_weak_now(weak) and self._discharge is not None else fit
         first = rows[start : start + 1]
         return Discharge(
             start_s=float(first["elapsed_s"][0]),
-            fit=used,
-            reference=ReferenceCurve.of(self._cell, used, reference_rows(rows[:start], weak)),
+            fit=fit_before,
+            reference=ReferenceCurve.of(self._cell, fit_before, reference_rows(rows[:start], weak)),
             start_soc=float(row_soc(self._cell, fit, first)[0]),
             start_as=float(first["charge_as"][0]),
         )
 
-    def _decide(self, result: WeakestCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
-        """Replace the present result if the discharge that began at ``start_s`` decides."""
-        was_weak, is_same = is_weak_now(weak), start_s == self._decided_s
+    def _replace_result(self, result: WeakestCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
+        """Replace the present result if the discharge from ``start_s`` shows a weak cell, is as deep, or gave that result."""
+        was_weak, is_same = is_weak_now(weak), start_s == self._result_start_s
         is_weak = result.deviation_std >= (WEAK_CELL_CLEAR_STD if was_weak else WEAK_CELL_STD)
-        if not (is_same or is_weak or result.soc <= (weak[-1].soc if was_weak else self._healthy_soc)):
+        if not (is_same or is_weak or result.soc <= (weak[-1].soc if was_weak else self._result_soc)):
             return
         if is_weak and not was_weak:
             weak.append(WeakCellTime(start_s, np.inf, result.soc))
@@ -112,7 +115,7 @@ class BankMonitor:
             weak[-1] = weak[-1]._replace(soc=result.soc)
         elif was_weak and not is_weak:
             weak[-1] = weak[-1]._replace(end_s=now_s if is_same else start_s)
-        self.weakest, self._decided_s, self._healthy_soc = result, start_s, result.soc
+        self.weakest, self._result_start_s, self._result_soc = result, start_s, result.soc
 
 
 def is_weak_now(weak: list[WeakCellTime]) -> bool:

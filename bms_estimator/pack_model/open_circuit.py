@@ -13,7 +13,7 @@ from bms_estimator.pack_model.fit import LN_Q, OFFSET, SOC, PackFit
 from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS
 
 HALF_ROW_SOC = 0.01
-"""Half width of the secant that gives the slope of the OCV: the secant covers the SOC range of a row."""
+"""Half width of the secant for the slope of the OCV. A row of the history covers 2 % of SOC, and so does the secant."""
 COLLAPSE_V = 50.0
 """Slope of the OCV of a cell below SOC 0 [V per unit SOC]. The voltage of an over-discharged cell falls to 0 within a few
 percent of its capacity. Assumed."""
@@ -40,7 +40,7 @@ class OpenCircuit:
 
         Args:
             cell: Curves of the cell file.
-            fit: Fit of the history that contains the rows or ends before them.
+            fit: Fit of the history; the rows may be later than its last row.
             rows: Shape (n,), dtype HISTORY_ROW.
             soc: SOC of the rows, shape (n,).
         """
@@ -80,9 +80,9 @@ class Overpotential:
 
 
 def row_soc(cell: CellCurves, fit: PackFit, rows: NDArray[np.void]) -> Floats:
-    """Return the SOC of rows: that of the fit, and after its last row the SOC by the counted charge.
+    """Return the SOC of rows: the fitted SOC up to the last fitted row, then its value minus the charge drawn since.
 
-    After a gap since the fit it is the SOC of the filter.
+    Rows after a gap since the fit have the SOC of the filter.
     """
     since_fit = drawn_soc(cell, fit, rows["charge_as"] - fit.charge_as)
     counted = np.where(rows["segment"] == fit.segment, fit.mean[SOC] - since_fit, rows["soc"])
@@ -98,7 +98,7 @@ def drawn_soc(cell: CellCurves, fit: PackFit, charge_as: Floats) -> Floats:
 
 
 def fitted_ocv(cell: CellCurves, fit: PackFit, soc: Floats) -> Floats:
-    """Return the fitted OCV of the mean cell [V], which collapses below SOC 0 and is never negative."""
+    """Return the fitted OCV of the mean cell [V]. Below SOC 0 it falls by ``COLLAPSE_V``, but not below 0 V."""
     ocv_v = cell.ocv(np.maximum(soc, 0.0)) + np.interp(soc, SOC_GRID, fit.curve_v) + COLLAPSE_V * np.minimum(soc, 0.0)
     return np.asarray(np.maximum(ocv_v, 0.0))
 

@@ -6,9 +6,8 @@ open-circuit voltage of the mean cell deviates from the reference by
     (E(z - d) - V(z - d) - E(z) + V(z)) / N,    d(z) = shift + shrink (1 - z)
 
 where E is the fitted OCV, V the overpotential under the present load, z the SOC of the other cells and d the SOC by which
-the weak cell lies below them. ``shift`` is a
-lower SOC when the others are full, and 1 / (1 + shrink) is the capacity relative to theirs. The sum of the voltages does
-not depend on the position of the weak cell, so that it cannot tell which cell it is.
+the weak cell lies below them. ``shift`` is d when the others are full, and 1 / (1 + shrink) is the capacity of the weak cell
+relative to theirs. The position of the weak cell remains unknown, because the sum of the voltages does not depend on it.
 """
 
 import math
@@ -29,34 +28,38 @@ BINS = 50
 BIN_SOC = (np.arange(BINS) + 0.5) / BINS
 """SOC in the middle of each bin."""
 MIN_REFERENCE_ROWS = 50
-"""Minimum number of rows of the reference: one or two complete discharges."""
+"""Minimum number of rows of the reference: one complete discharge, or two of half the capacity."""
 MIN_ROWS = 4
 """Minimum number of rows of a discharge for a comparison."""
 PRIOR_ROWS = 4.0
 """Weight of the prior variance of a bin, in rows."""
 REPEAT_STD_V, REPEAT_STD_SOC = 1.5e-3, 0.002
-"""Prior std by which E_o of the mean cell differs from discharge to discharge: of the voltage [V] and along SOC. Assumed."""
+"""Prior std of the difference of E_o of the mean cell between two discharges: a voltage error [V] and a SOC error. Assumed."""
 INDEPENDENT_FRACTION = 0.3
-"""Fraction of this variance that is independent from row to row. The rest is correlated over ``CORRELATED_SOC``."""
+"""Fraction of the variance of E_o between discharges that is independent from row to row. The rest is correlated over
+``CORRELATED_SOC``."""
 CORRELATED_SOC = 0.15
-"""Correlation length of the difference between two discharges [SOC]."""
+"""Correlation length of the difference of E_o between two discharges [SOC]."""
 COMMON_SOC_STD, COMMON_CAPACITY_STD = 0.02, 0.01
-"""Std of the change of SOC and capacity that all cells share, since the reference: error of the SOC, and aging."""
+"""Std of the changes of SOC (error of the estimate) and capacity (aging) that all cells share since the reference."""
 COMMON_DROP_STD, COMMON_ENTROPY_STD_V, COMMON_VOLTAGE_STD_V = 0.05, 1e-4, 1e-3
-"""Std of the common relative change of the overpotential, of the temperature coefficient [V/K], and of the voltage [V]."""
+"""Std of other changes that all cells share: relative change of the overpotential, temperature coefficient [V/K], and
+voltage [V]."""
 COMMON_DROP_STD_PER_K, DROP_STD_PER_K = 0.02, 0.005
-"""Increase of the relative std of the overpotential with the difference of the temperature from that of the reference [1/K]:
-of the common change, and of that along SOC. The temperature dependence of a generic cell file is that of another cell."""
+"""Increase of the relative std of the overpotential per kelvin of temperature difference from the reference [1/K]: of the
+change that all rows share, and of the change of single rows. The temperature dependence of a generic cell file is that of
+another cell."""
 LOAD_DROP_STD = 0.1
-"""Relative std of the difference of the overpotential from its mean in the reference, independent from row to row. The
-estimator's RC pairs are less exact for loads that differ from the usual ones."""
+"""Error std of the overpotential, as a fraction of its difference from the mean overpotential of the reference; independent
+from row to row. The RC pairs are less exact for loads that differ from the usual ones."""
 SHIFTS, SHRINKS = np.linspace(0.0, 0.4, 21), np.linspace(0.0, 0.6, 25)
 """Tested values of ``shift`` and ``shrink``."""
 SHIFT_STD, SHRINK_STD = 0.03, Noise.cell_spread
-"""Std of the prior of ``shift`` (assumed) and ``shrink``. Without a comparison, the prior of ``shrink`` gives the spread that
-the published ``soc_std`` contains."""
-MIN_BELOW_STD = 0.01
-"""Minimum std of the weak cell's SOC below the others."""
+"""Std of the prior of ``shift`` (assumed) and ``shrink``. The prior of ``shrink`` equals the spread of the
+cells in the published ``soc_std``."""
+MIN_DIFFERENCE_STD = 0.01
+"""Minimum std of the difference between the SOCs of the weak cell and of the others. It is half the step of the
+grid of ``shift``."""
 
 SHIFT, SHRINK = (values.ravel() for values in np.meshgrid(SHIFTS, SHRINKS, indexing="ij"))
 """``shift`` and ``shrink`` of each hypothesis."""
@@ -73,8 +76,7 @@ class WeakestCell:
     filter_soc: float
     """SOC of the bank by the filter at the last row."""
     deviation_std: float
-    """Deviation from the reference in the direction of one weak cell: square root of twice the log-likelihood ratio without the
-    row that supports it most [std]."""
+    """Significance of a weak cell: square root of twice the log-likelihood ratio, without the row that supports it most [std]."""
     mean: Floats
     """Mean of ``shift`` and ``shrink``."""
     covariance: Floats
@@ -97,22 +99,22 @@ class WeakestCell:
     def weakest_soc(self, filter_soc: float) -> tuple[float, float]:
         """Return mean and std of the weakest cell's SOC when the filter's SOC of the bank is ``filter_soc``.
 
-        The std is that of the difference from the other cells. The SOC of an over-discharged cell is 0.
+        The std contains only the uncertainty of the difference from the other cells. The SOC of an over-discharged cell is 0.
         """
         soc = self.others_soc(filter_soc)
         weights = np.array([1.0, 1.0 - soc])
         variance = max(float(weights @ self.covariance @ weights), 0.0)
-        return max(soc - float(weights @ self.mean), 0.0), math.hypot(math.sqrt(variance), MIN_BELOW_STD)
+        return max(soc - float(weights @ self.mean), 0.0), math.hypot(math.sqrt(variance), MIN_DIFFERENCE_STD)
 
 
 @dataclass(frozen=True)
 class ReferenceCurve:
-    """Mean difference of E_o from the fitted OCV in the reference discharges, and its std, for each SOC bin."""
+    """Mean and std of the difference of E_o from the fitted OCV in the reference discharges, for each SOC bin."""
 
     error_v: Floats
     """Mean of ``OpenCircuit.error_v``, shape (BINS,) [V]."""
     std_v: Floats
-    """Std by which another discharge of the same bank differs from ``error_v``, shape (BINS,) [V]."""
+    """Std of the difference of another discharge of the same bank from ``error_v``, shape (BINS,) [V]."""
     temperature_c: float
     """Mean temperature [degC]."""
     drop_v: float
@@ -150,7 +152,7 @@ class ReferenceCurve:
 class Comparison:
     """Comparison of one discharge with the reference of its bank.
 
-    The likelihood of each hypothesis contains changes that all cells share: SOC, capacity, resistances, temperature
+    The likelihood of each hypothesis allows for changes that all cells share: of SOC, capacity, resistances, temperature
     coefficient and voltage.
 
     Args:
@@ -158,7 +160,7 @@ class Comparison:
         fit: Fit of the history.
         reference: Reference of the bank.
         rows: Shape (n,), dtype HISTORY_ROW: rows of the discharge with a voltage.
-        soc: SOC of the rows, if no cell were weak, shape (n,).
+        soc: SOC of the rows under the assumption that no cell is weak, shape (n,).
 
     Attributes:
         measured: Open-circuit voltages of the rows.
@@ -175,10 +177,14 @@ class Comparison:
 
     def weakest(self, deviation_v: Floats | None = None) -> WeakestCell:
         """Return the estimate of the weakest cell by a deviation, shape (n,) [V]; default: ``deviation_v``."""
-        y = solve_triangular(self._whitening, self.deviation_v if deviation_v is None else deviation_v, lower=True)
+        whitened = solve_triangular(
+            self._whitening, self.deviation_v if deviation_v is None else deviation_v, lower=True
+        )
         templates = solve_triangular(self._whitening, self.by_weak_cell(SHIFT, SHRINK), lower=True)
-        by_row = templates * y[:, None] - 0.5 * templates**2
-        ln_likelihood = by_row.sum(axis=0) - np.maximum(by_row.max(axis=0), 0.0)  # one wrong row is no evidence
+        ln_likelihood_of_row = templates * whitened[:, None] - 0.5 * templates**2
+        ln_likelihood = ln_likelihood_of_row.sum(axis=0) - np.maximum(
+            ln_likelihood_of_row.max(axis=0), 0.0
+        )  # a single wrong row must not raise the alarm
         ln_weight = LN_PRIOR + LIKELIHOOD_EXPONENT * ln_likelihood
         weight = np.exp(ln_weight - ln_weight.max())
         values = np.stack([SHIFT, SHRINK])
@@ -191,11 +197,11 @@ class Comparison:
         )
 
     def by_weak_cell(self, shift: Floats, shrink: Floats) -> Floats:
-        """Return the deviations of E_o of the mean cell by m weak cells, shape (n, m) [V].
+        """Return the deviations of E_o of the mean cell for m hypothetical weak cells, shape (n, m) [V].
 
         Args:
-            shift: SOC by which each lies below the others when these are full, shape (m,).
-            shrink: Capacity of the others relative to that of each, minus 1, shape (m,).
+            shift: SOC of each weak cell below the others when these are full, shape (m,).
+            shrink: Capacity of the others relative to that of the weak cell, minus 1, shape (m,).
         """
         soc = self.measured.soc[:, None]
         weak_soc = soc - shift - shrink * (1.0 - soc)
@@ -207,15 +213,17 @@ class Comparison:
 def _covariance(cell: CellCurves, fit: PackFit, reference: ReferenceCurve, measured: OpenCircuit) -> Floats:
     """Return the covariance of the deviations of a healthy bank, shape (n, n) [V^2]."""
     z = measured.soc
-    away_k = measured.temperature_c - reference.temperature_c
-    std_v = np.hypot(np.interp(z, BIN_SOC, reference.std_v), DROP_STD_PER_K * away_k * measured.drop_v)
+    temperature_difference_k = measured.temperature_c - reference.temperature_c
+    std_v = np.hypot(
+        np.interp(z, BIN_SOC, reference.std_v), DROP_STD_PER_K * temperature_difference_k * measured.drop_v
+    )
     slope_v = fitted_slope(cell, fit, z)
     common = np.column_stack(
         [
             COMMON_SOC_STD * slope_v,
             COMMON_CAPACITY_STD * slope_v * (1.0 - z),
-            np.hypot(COMMON_DROP_STD, COMMON_DROP_STD_PER_K * away_k) * measured.drop_v,
-            COMMON_ENTROPY_STD_V * away_k,
+            np.hypot(COMMON_DROP_STD, COMMON_DROP_STD_PER_K * temperature_difference_k) * measured.drop_v,
+            COMMON_ENTROPY_STD_V * temperature_difference_k,
             np.full(z.size, COMMON_VOLTAGE_STD_V),
         ]
     )

@@ -29,7 +29,7 @@ from bms_estimator.settings.observer import IdentifierSettings
 TAPER_C = 0.05
 """Current at which the charger ends the charge, as a C-rate of the mean capacity."""
 FAST_FRACTION = 0.6
-"""Fraction of the hysteresis with the shorter charge constant of ``HYSTERESIS_SOC``."""
+"""Fraction of the hysteresis that follows the charge with the first (shorter) constant of ``HYSTERESIS_SOC``."""
 STATE = np.dtype(
     [
         ("soc", "f8"),
@@ -142,12 +142,12 @@ class BankHistory:
 
 
 class SimulatedBank:
-    """Bank that is simulated part by part. The cells have the RC ladder, OCV and hysteresis of a cell file.
+    """Bank that can be simulated in several runs. Its cells have the RC pairs, OCV and hysteresis of a cell file.
 
     Args:
         cell: Cell model of one cell.
         cells: Properties of the cells.
-        full_v: Voltage of the bank that the charger does not exceed [V]. It ends the charge at ``TAPER_C``.
+        full_v: Voltage of the bank at which the charger limits the current [V]. It ends the charge at ``TAPER_C``.
         cutoff_v: Voltage of the bank below which the load is disconnected until the next charge [V].
 
     Attributes:
@@ -171,11 +171,11 @@ class SimulatedBank:
         return self._state["soc"].copy()
 
     def discharge_cell(self, cell: int, soc: float) -> None:
-        """Lower the SOC of one cell by ``soc``, as by an internal short in the past."""
+        """Lower the SOC of one cell by ``soc``, as after an internal short."""
         self._state["soc"][cell] -= soc
 
     def run(self, current_a: Floats, step_s: float = 1.0, temperature_c: float | Floats = 25.0) -> BankHistory:
-        """Simulate requested currents, each of which flows for ``step_s`` [s].
+        """Simulate the bank with one requested current in each step.
 
         Args:
             current_a: Requested current [A], positive on discharge, shape (n,).
@@ -224,7 +224,7 @@ def simulate(
         properties: Capacity [A s], factor on the resistances, resistance of the internal short [ohm] and temperature above
             that of the bank [K], shape (4, cells).
         limits_v: Cut-off voltage and charger voltage of the bank [V].
-        stopped: Sign of the current that a limit has stopped, shape (1,); updated.
+        stopped: Direction of the current that a limit has switched off: 1 discharge, -1 charge, 0 none; shape (1,); updated.
         step_s: Interval between two times [s].
         bank_c: Temperature of the bank [degC], shape (n,).
         current_a: Requested current, replaced by the current that flowed [A], shape (n,).
@@ -245,9 +245,9 @@ def simulate(
             series_ohm += properties[1, c] * ohm[0]
         bank_v = cell_v[n].sum()
         if i < 0.0 and bank_v > limits_v[1]:  # constant voltage
-            held_a = min(i + (bank_v - limits_v[1]) / series_ohm, 0.0)
-            cell_v[n] -= (held_a - i) * series_ohm / cells
-            i = held_a
+            limited_a = min(i + (bank_v - limits_v[1]) / series_ohm, 0.0)
+            cell_v[n] -= (limited_a - i) * series_ohm / cells
+            i = limited_a
             stopped[0] = -1.0 if i > -TAPER_C * capacity_as.mean() / 3600.0 else 0.0
         elif i > 0.0 and bank_v < limits_v[0]:
             stopped[0] = 1.0
@@ -307,5 +307,5 @@ def advance(s: Record, current_a: float, drawn_a: float, step_s: float, capacity
     drawn_soc = drawn_a * step_s / capacity_as
     s.soc -= drawn_soc
     for k in range(2):
-        share = 1.0 - np.exp(-abs(drawn_soc) / HYSTERESIS_SOC[k])
-        s.hysteresis[k] -= share * (s.hysteresis[k] + np.sign(drawn_soc))
+        weight = 1.0 - np.exp(-abs(drawn_soc) / HYSTERESIS_SOC[k])
+        s.hysteresis[k] -= weight * (s.hysteresis[k] + np.sign(drawn_soc))
