@@ -1,6 +1,6 @@
 """Present capability of a pack: available power, usable capacity, and time to full.
 
-These values need no load ahead, so that they exist at rest and in a charge, too.
+These values need no forecast of the load, and therefore exist at rest and during a charge, too.
 """
 
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ def cell_power_limits(cell: PackModel) -> PowerLimits:
 def power_limits(settings: Settings, cell: CellModel) -> PowerLimits:
     """Return the limits of the pack's alarms, which are at most those of the cell file.
 
-    A switched-off alarm of a current gives the limit of the cell file, and that of the temperature none.
+    If an alarm of a current is switched off, the limit of the cell file applies. If that of the temperature is, there is no limit.
 
     Args:
         settings: Settings of the pack.
@@ -71,7 +71,7 @@ def write_capability(
 ) -> None:
     """Write available power, usable capacity and time to full to ``values``.
 
-    Without samples, without the identifier and for a fuel cell the values do not change.
+    The values stay unchanged before the first sample, without the identifier and for a fuel cell.
 
     Args:
         values: Shape (1,), dtype ``FORECAST``; written.

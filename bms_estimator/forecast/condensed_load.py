@@ -1,4 +1,4 @@
-"""Given load with fewer parts, so that the cost of a forecast does not depend on the resolution of a profile."""
+"""Reduction of a given load to fewer parts, so that a profile with a high resolution does not slow down a forecast."""
 
 import numpy as np
 
@@ -7,10 +7,10 @@ from bms_estimator.model.arrays import Floats
 
 
 def condense(load: GivenLoad, block_s: float) -> GivenLoad:
-    """Return a load in which short parts are joined. Mean and peak of each block remain, because a peak may end the discharge.
+    """Return a load whose short parts are merged. Mean and peak of each block remain, because a peak may end the discharge.
 
-    Of the parts that begin within a block of ``block_s``, the one with the largest load becomes the last part. The mean of the
-    others becomes the first part.
+    The parts that begin within a block of ``block_s`` become two parts: first the mean of all but the largest load, then the
+    largest load.
 
     Args:
         load: Load; either all parts have a current, or all have a power.
@@ -26,15 +26,15 @@ def condense(load: GivenLoad, block_s: float) -> GivenLoad:
     others_s = np.add.reduceat(duration_s, first) - duration_s[peak]
     others_sum = np.add.reduceat(duration_s * values, first) - duration_s[peak] * values[peak]
     mean = np.divide(others_sum, others_s, out=np.zeros(first.size), where=peak > first)
-    mean = np.minimum(mean, values[peak])  # after rounding
-    joined_s = _alternate(np.where(peak > first, others_s, 0.0), duration_s[peak])
-    joined = _alternate(mean, values[peak])[joined_s > 0.0]
-    joined_s, unknown = joined_s[joined_s > 0.0], np.full(joined.size, np.nan)
+    mean = np.minimum(mean, values[peak])  # rounding may lift the mean above the peak
+    merged_s = _interleave(np.where(peak > first, others_s, 0.0), duration_s[peak])
+    merged = _interleave(mean, values[peak])[merged_s > 0.0]
+    merged_s, unknown = merged_s[merged_s > 0.0], np.full(merged.size, np.nan)
     if np.isnan(load.current_a).all():
-        return GivenLoad(joined_s, current_a=unknown, power_w=joined)
-    return GivenLoad(joined_s, current_a=joined, power_w=unknown)
+        return GivenLoad(merged_s, current_a=unknown, power_w=merged)
+    return GivenLoad(merged_s, current_a=merged, power_w=unknown)
 
 
-def _alternate(first: Floats, second: Floats) -> Floats:
-    """Return the elements of two arrays of shape (n,) in turn, shape (2 n,)."""
+def _interleave(first: Floats, second: Floats) -> Floats:
+    """Return two arrays of shape (n,) interleaved, shape (2 n,)."""
     return np.stack([first, second], axis=1).ravel()

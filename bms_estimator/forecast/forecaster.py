@@ -1,4 +1,4 @@
-"""Estimator with a forecast at intervals of the samples' clock."""
+"""Estimator that also makes forecasts, at intervals on the clock of the samples."""
 
 import math
 from typing import Protocol
@@ -27,19 +27,20 @@ from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.sample import SampleBlock
 
 MIN_INTERVAL_S = 10.0
-"""Minimum interval between two forecasts, on the clock of the samples [s]."""
+"""Minimum interval between two forecasts, on the clock of the samples [s]. It limits the CPU time near the cut-off."""
 MAX_INTERVAL_S = 120.0
 """Maximum interval between two forecasts [s]."""
 RETRY_S = 30.0
-"""Interval after which a missing forecast is tried again [s]."""
+"""Retry interval if no forecast could be made [s]."""
 INTERVAL_OF_TIME_LEFT = 1.0 / 60.0
-"""Interval between two forecasts as a fraction of the time to the cut-off, within its limits."""
+"""Interval between two forecasts as a fraction of the median time to the cut-off, between the limits above."""
 MIN_LOAD_S = 300
-"""Minimum length of the load that was seen, for a forecast [s]."""
+"""Minimum length of the observed load for a forecast [s]."""
 MAX_REST_S = 900
-"""Duration of a rest after which the load that was seen says nothing about the next one [s]."""
+"""Duration of a rest after which the next load is assumed to be unlike the observed one [s]."""
 _HASH_FACTOR = 0x9E3779B97F4A7C15
-_INTEGERS = 2**64
+"""Factor of Fibonacci hashing, 2**64 over the golden ratio: seeds of adjacent samples differ in many bits."""
+_SEED_COUNT = 2**64
 
 
 class Runner(Protocol):
@@ -62,8 +63,8 @@ class Forecaster:
         limits: Limits of the available power; None: those of the cell file.
 
     Attributes:
-        load: Load that was seen.
-        past: Load of the minutes of this and earlier discharges.
+        load: Load observed since the last long charge.
+        past: Load of this and earlier discharges, minute by minute.
         latest: The last forecast.
     """
 
@@ -107,7 +108,7 @@ class Forecaster:
         return np.concatenate(traces) if traces else np.zeros(0, TRACE)
 
     def run_without_forecast(self, block: SampleBlock) -> TraceBlock:
-        """Process a block of samples and store their load. This is faster if only a later forecast is needed."""
+        """Process a block of samples and store their load, without the forecasts that ``run`` makes."""
         trace = self._runner.run(block)
         self.load.add(trace)
         self.past.add(self.load)
@@ -115,7 +116,7 @@ class Forecaster:
 
     @property
     def rows(self) -> ForecastRows:
-        """Values valid at each row of the trace that ``run`` returned last, dtype ``FORECAST``."""
+        """Values of the latest forecast at each row of the trace that ``run`` returned last, dtype ``FORECAST``."""
         parts = [np.repeat(values, count) for values, count in self._rows]
         return np.concatenate(parts) if parts else np.zeros(0, FORECAST)
 
@@ -123,7 +124,7 @@ class Forecaster:
         """Return a forecast from the present state.
 
         Args:
-            load: Load to expect; None: a load like the one that was seen.
+            load: Expected load; None: a load like the observed one.
         """
         values, time_s = unknown_values(), float(self.estimator.state["time_s"][0])
         write_capability(values, self.estimator, self.cutoff_v, self._limits, float(self.load.max_a.max(initial=0.0)))
@@ -148,7 +149,7 @@ class Forecaster:
     def _first_due(self, time_s: np.ndarray) -> int | None:
         """Return the index of the first sample at which a forecast is due; None without such a sample.
 
-        A clock that was set back must not delay the next forecast.
+        A sample more than ``MAX_INTERVAL_S`` before the due time shows that the clock was set back, and is due at once.
         """
         earliest_s = self._due_s - MAX_INTERVAL_S
         due = np.isfinite(time_s) & ((time_s >= self._due_s) | (time_s < earliest_s))
@@ -156,7 +157,7 @@ class Forecaster:
         return first if due.size and due[first] else None
 
     def _missing_state(self) -> str | None:
-        """Return the reason why no load can be projected; None if it can."""
+        """Return the reason why the pack cannot be projected; None if it can."""
         if isinstance(self.estimator.cell, FuelCellModel):
             return "a fuel cell has no state of charge"
         if not self.estimator.identifying:
@@ -166,7 +167,7 @@ class Forecaster:
         return None
 
     def _missing_load(self) -> str | None:
-        """Return the reason why the load that was seen says nothing about the next one; None if it does."""
+        """Return the reason why the observed load cannot represent the next one; None if it can."""
         if self.load.is_charging:
             return "the pack is being charged"
         if self.load.rest_s >= MAX_REST_S:
@@ -176,7 +177,7 @@ class Forecaster:
         return None
 
     def _pack(self) -> Records:
-        """Return the pack as it is now, shape (1,), dtype ``PROJECTED_PACK``."""
+        """Return the present state of the pack, shape (1,), dtype ``PROJECTED_PACK``."""
         pack = np.zeros(1, PROJECTED_PACK)
         project_pack(
             pack[0], self.estimator.record[0]["filter"], self.estimator.settings_record[0]["filter"], self.cutoff_v
@@ -197,7 +198,7 @@ class Forecaster:
         """Return the seed of the random numbers, by time and number of the last sample."""
         state = self.estimator.state
         time_bits = int(state["time_s"].view(np.uint64)[0])
-        return (time_bits * _HASH_FACTOR + int(state["samples"][0])) % _INTEGERS
+        return (time_bits * _HASH_FACTOR + int(state["samples"][0])) % _SEED_COUNT
 
 
 def _interval_s(forecast: Forecast) -> float:

@@ -7,7 +7,7 @@ from bms_estimator.model.arrays import Floats
 
 @dataclass(frozen=True)
 class GivenLoad:
-    """Load over the time ahead, constant between its points. It repeats after its end.
+    """Future load, in parts with a constant current or power. It repeats after its last part.
 
     Attributes:
         duration_s: Duration of each part [s], shape (n,), above 0.

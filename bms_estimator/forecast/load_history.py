@@ -1,4 +1,4 @@
-"""Load that was seen since the last long charge, second by second."""
+"""Observed load since the last long charge, second by second."""
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class LoadHistory:
 
     @property
     def is_charging(self) -> bool:
-        """True in a long charge. Regeneration is shorter."""
+        """True during a long charge, False during regeneration, which is shorter."""
         row = self.record[0]
         return bool(row["filtered_a"] < -CHARGE_C * self._one_c_a and row["last_a"] < -REST_C * self._one_c_a)
 

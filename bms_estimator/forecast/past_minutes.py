@@ -1,4 +1,4 @@
-"""Load of past discharges, minute by minute, and the times in it at which the load was like the present one."""
+"""Load of past discharges, minute by minute, and the search in it for loads like the present one (analogues)."""
 
 import numpy as np
 
@@ -11,15 +11,15 @@ MINUTE_S = 60
 MAX_MINUTES = 20_000
 """Maximum number of stored minutes: a year with 55 minutes of use a day."""
 COMPARED_MINUTES = 20
-"""Length of the load that is compared."""
+"""Length of the present load that is compared with past ones."""
 MAX_DIFFERENCE = 0.25
-"""Maximum mean absolute difference of two loads that are alike, as a fraction of the mean."""
+"""Maximum mean absolute difference of similar loads, as a fraction of the present mean."""
 MIN_AHEAD_MINUTES = 30
-"""Minimum length of the load that followed a similar one."""
+"""Minimum length of the load after a similar one, which is used as the future load."""
 MAX_ANALOGUES = 10
-"""Maximum number of similar loads, the most similar ones."""
+"""Maximum number of analogues; the most similar ones are used."""
 PEAK_S = 5.0
-"""Duration of the largest current of a minute [s]."""
+"""Assumed duration of the largest current of a minute [s], which is not stored."""
 
 
 class PastMinutes:
@@ -33,7 +33,7 @@ class PastMinutes:
     def __init__(self) -> None:
         self.mean_a: Floats = np.zeros(0)
         self.max_a: Floats = np.zeros(0)
-        self._next = 0  # index in the ring buffer of the load, of the first second that is not in a minute yet
+        self._next = 0  # index in the ring buffer of ``LoadHistory``: first second not yet added
 
     def add(self, load: LoadHistory) -> None:
         """Add the complete minutes of a load since the previous call."""
@@ -48,7 +48,7 @@ class PastMinutes:
         self.max_a = np.append(self.max_a, max_a.reshape(-1, MINUTE_S).max(axis=1))[-MAX_MINUTES:]
 
     def restore(self, mean_a: Floats, max_a: Floats, load: LoadHistory) -> None:
-        """Restore saved minutes. The seconds that ``load`` contains are in them already."""
+        """Restore saved minutes, which already include the seconds of ``load``."""
         self.mean_a, self.max_a, self._next = mean_a, max_a, int(load.record["next"][0])
 
     def analogues(self, present_minutes: int) -> list[GivenLoad]:
@@ -71,7 +71,7 @@ class PastMinutes:
         return [self._load_after(end) for end in ends]
 
     def _load_after(self, end: int) -> GivenLoad:
-        """Return the load from the minute ``end`` on: the mean of each minute, and its largest current for ``PEAK_S``."""
+        """Return the load from the minute ``end`` on. Each minute has its mean, and its largest current for ``PEAK_S``."""
         mean_a, max_a = self.mean_a[end:], self.max_a[end:]
         others_a = (mean_a * MINUTE_S - max_a * PEAK_S) / (MINUTE_S - PEAK_S)
         current_a = np.stack([others_a, max_a], axis=1).ravel()

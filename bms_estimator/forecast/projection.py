@@ -1,4 +1,4 @@
-"""Distribution of the time to the cut-off: the pack run forward under many drawn or given loads."""
+"""Distribution of the time to the cut-off: Monte Carlo simulation of the pack under drawn or given loads."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -23,24 +23,26 @@ CURVE_DRAWS = 200
 CURVE_POINTS = 60
 """Maximum number of points of a curve."""
 DRAWN_LOADS = 3
-"""Weight of the drawn loads, in numbers of analogues."""
+"""Weight of the randomly drawn loads: they get as many draws as this number of analogues."""
 BLOCK_S = 10
-"""Minimum length of a block of the load [s]."""
+"""Minimum length of a block of the observed load [s]."""
 MAX_STEPS = 360
 """Maximum number of blocks that a draw passes. For a longer horizon the blocks are longer, so that the cost is bounded."""
 MIN_BLOCKS = 10
-"""Minimum number of blocks in the load that was seen, which limits their length."""
-MAX_FULL_TIME_S = 1e9
+"""Minimum number of blocks in the observed load. It limits the length of a block, so that the bootstrap has enough of them."""
+MAX_TIME_TO_EMPTY_S = 1e9
 """Time in which a load must draw the whole charge, to count as a discharge [s]: 30 years."""
 HORIZON_RATIO = 1.5
-"""Horizon of the draws, in multiples of the time in which the mean load draws the whole charge. Draws that outlive it are
-extrapolated by the mean load."""
+"""Horizon of the draws, in multiples of the time in which the mean load draws the whole charge. Draws that have not
+ended by then are extrapolated at the mean load."""
 CURVE_END = 1.05
 """Length of the curves in multiples of the 95 % quantile of the time to the cut-off."""
+MIN_REMAINING_SOC = 0.02
+"""Minimum SOC for the horizon. The true SOC of a draw may be higher than an estimate near 0."""
 END_TOLERANCE = 1e-9
-"""Part of a trip by which its end is earlier, so that rounding does not begin the load again."""
+"""Fraction by which a trip is shortened, so that rounding does not start a repetition of its load."""
 MIN_BLOCK_S = 1.0
-"""Resolution of a given load [s]: mean and peak of each block remain."""
+"""Minimum length of a block of a given load [s]. Shorter parts are merged to mean and peak of a block."""
 MAX_BLOCKS = 10_000
 """Maximum number of blocks of a given load within a horizon."""
 MAX_DRAW_STEPS = 2 * MAX_BLOCKS
@@ -60,7 +62,7 @@ class Projection:
     Attributes:
         time_s: Time to the cut-off of each draw [s]; infinite if the load never discharges the pack.
         charge_as: Charge until then [A s].
-        curve: Curves of SOC and voltage.
+        curve: Quantiles of SOC and voltage over time.
     """
 
     time_s: Floats
@@ -71,18 +73,18 @@ class Projection:
 def project_seen_load(
     pack: Records, mean_a: Floats, max_a: Floats, seed: int, analogues: Sequence[GivenLoad] = ()
 ) -> Projection:
-    """Run the pack forward under loads drawn from the load that was seen.
+    """Simulate the pack under loads drawn from the observed load.
 
     Args:
         pack: Shape (1,), dtype ``PROJECTED_PACK``.
         mean_a: Mean current of each second [A], with a mean above the offset of the sensor.
         max_a: Largest current of each second [A].
         seed: Seed of the random numbers, 0 to 2**64 - 1.
-        analogues: Loads that followed similar loads of earlier discharges. Each replaces the drawn load of a part of the draws.
+        analogues: Loads that followed similar loads of earlier discharges. Some of the draws follow them instead of drawn loads.
     """
     m = pack[0]
     load_a = float(mean_a.mean() - m["offset_a"])
-    horizon_s = HORIZON_RATIO * _full_time_s(pack, load_a)
+    horizon_s = HORIZON_RATIO * _time_to_empty_s(pack, load_a)
     block_s = min(max(BLOCK_S, math.ceil(horizon_s / MAX_STEPS)), max(mean_a.size // MIN_BLOCKS, 1))
     steps = min(math.ceil(horizon_s / block_s), MAX_STEPS)
     blocks = np.zeros(mean_a.size // block_s, LOAD_BLOCK)
@@ -114,14 +116,14 @@ def project_seen_load(
 def _analogue_parts(
     pack: Records, analogues: Sequence[GivenLoad], horizon_s: float
 ) -> Iterator[tuple[NDArray[np.int64], Records]]:
-    """Yield the indices of the draws that follow each analogue, and its parts without the offset of the sensor."""
+    """Yield the indices of the draws that follow each analogue, and its parts, corrected for the offset of the sensor."""
     for number, load in enumerate(analogues):
         true_load = replace(load, current_a=load.current_a - pack["offset_a"][0])
         yield np.arange(number, DRAWS, len(analogues) + DRAWN_LOADS), _parts(true_load, horizon_s)
 
 
 def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:
-    """Run the pack forward under a given load.
+    """Simulate the pack under a given load.
 
     Args:
         pack: Shape (1,), dtype ``PROJECTED_PACK``.
@@ -132,7 +134,7 @@ def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:
     load_a = _mean_current(pack, load)
     if not discharges(pack, load_a):
         load_a = 0.0
-    horizon_s = HORIZON_RATIO * _full_time_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
+    horizon_s = HORIZON_RATIO * _time_to_empty_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
     parts = _parts(_prolonged(load, horizon_s), horizon_s)
     horizon_s = min(horizon_s, MAX_DRAW_STEPS * float(parts["duration_s"].mean()))
     draws = _draws(m, seed)[: _draw_count(parts, horizon_s)]
@@ -155,7 +157,7 @@ def time_quantiles(time_s: Floats) -> tuple[float, float, float]:
 
 
 def project_trip(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
-    """Return the curves until the end of a load, at which the last point lies.
+    """Return the curves until the end of a load. Their last point is that end.
 
     Args:
         pack: Shape (1,), dtype ``PROJECTED_PACK``.
@@ -173,17 +175,17 @@ def project_trip(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
 
 
 def discharges(pack: Records, load_a: float) -> bool:
-    """Return True if a load with a mean of ``load_a`` [A] discharges the pack within ``MAX_FULL_TIME_S``."""
-    return load_a > 0.0 and _full_time_s(pack, load_a) <= MAX_FULL_TIME_S
+    """Return True if a load with a mean of ``load_a`` [A] discharges the pack within ``MAX_TIME_TO_EMPTY_S``."""
+    return load_a > 0.0 and _time_to_empty_s(pack, load_a) <= MAX_TIME_TO_EMPTY_S
 
 
-def _full_time_s(pack: Records, load_a: float) -> float:
-    """Return the time in which the mean load draws the whole remaining charge [s]."""
-    return max(float(pack["soc"][0]), 0.02) * float(pack["capacity_as"][0]) / load_a
+def _time_to_empty_s(pack: Records, load_a: float) -> float:
+    """Return the time in which the mean load draws the whole remaining charge, at least 2 % of the capacity [s]."""
+    return max(float(pack["soc"][0]), MIN_REMAINING_SOC) * float(pack["capacity_as"][0]) / load_a
 
 
 def _mean_current(pack: Records, load: GivenLoad) -> float:
-    """Return the mean current of a given load [A], at the present voltage without load."""
+    """Return the mean current of a given load [A]. A power counts as a current at the present voltage without load."""
     soc_points = pack["voltage_v"].shape[1] - 1
     present_v = float(pack["voltage_v"][0, round(min(max(float(pack["soc"][0]), 0.0), 1.0) * soc_points)])
     current_a = np.where(np.isnan(load.current_a), load.power_w / present_v, load.current_a)
@@ -203,7 +205,7 @@ def _draw_count(parts: Records, horizon_s: float) -> int:
 
 
 def _parts(load: GivenLoad, horizon_s: float) -> Records:
-    """Return the parts of a load for a horizon: long parts are divided, and parts shorter than a second are joined."""
+    """Return the parts of a load for a horizon: long parts are divided, and short ones merged."""
     load = condense(load, max(horizon_s / MAX_BLOCKS, MIN_BLOCK_S))
     max_part_s = max(horizon_s / MAX_STEPS, MIN_BLOCK_S)
     pieces = np.ceil(load.duration_s / max_part_s).astype(int)
@@ -224,7 +226,7 @@ def _draws(m: np.void, seed: int) -> Records:
 def _extrapolated(draws: Records, load_a: float) -> tuple[Floats, Floats]:
     """Return time [s] and charge [A s] to the cut-off of each draw.
 
-    Draws that outlived the horizon continue at the mean load down to the median SOC at which the others ended.
+    Draws without a cut-off before the horizon continue at the mean load down to the median SOC at which the others ended.
     """
     ended, end_soc, time_s = draws["ended"] == 1, draws["soc"].copy(), draws["time_s"].copy()
     if not ended.all():

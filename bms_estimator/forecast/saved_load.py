@@ -1,4 +1,4 @@
-"""Load that was seen, as arrays for a file."""
+"""Observed load as arrays, for its file beside the checkpoint."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -32,8 +32,8 @@ def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDAr
     """Restore a load.
 
     Args:
-        load: Empty load; unchanged if the arrays are invalid.
-        past: Empty minutes; unchanged if the arrays are invalid.
+        load: Empty load to fill; unchanged if the arrays are invalid.
+        past: Empty minutes to fill; unchanged if the arrays are invalid.
         arrays: Arrays of ``load_arrays``.
 
     Raises:
@@ -44,10 +44,10 @@ def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDAr
         raise ValueError(f"{', '.join(missing)}: missing")
     mean_a, max_a, scalars = arrays["mean_a"], arrays["max_a"], [arrays[n] for n in ("filtered_a", "last_a", "rest_s")]
     minutes_mean_a, minutes_max_a = arrays["minutes_mean_a"], arrays["minutes_max_a"]
-    for mean, largest, most in ((mean_a, max_a, MAX_LOAD_S), (minutes_mean_a, minutes_max_a, MAX_MINUTES)):
-        if mean.ndim != 1 or mean.shape != largest.shape or mean.size > most or any(v.ndim for v in scalars):
+    for mean, largest, max_size in ((mean_a, max_a, MAX_LOAD_S), (minutes_mean_a, minutes_max_a, MAX_MINUTES)):
+        if mean.ndim != 1 or mean.shape != largest.shape or mean.size > max_size or any(v.ndim for v in scalars):
             raise ValueError(
-                f"arrays of shapes {mean.shape} and {largest.shape}: must be equal, with at most {most} elements"
+                f"arrays of shapes {mean.shape} and {largest.shape}: must be equal, with at max_size {max_size} elements"
             )
     for values in (mean_a, max_a, minutes_mean_a, minutes_max_a, *scalars):
         if values.dtype.kind not in "fi" or not (np.abs(values) <= MAX_CURRENT_A).all():

@@ -1,4 +1,4 @@
-"""Trip: a load that the user gives, until its end."""
+"""Trip: a future load that the user gives, as a constant or a profile."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -19,12 +19,12 @@ MAX_TRIP_S = 7.0 * 86_400.0
 MAX_POINTS = 1_000_000
 """Maximum number of points of a profile."""
 CONSTANT_PART_S = 3600.0
-"""Duration of the only part of a constant load without an end, which repeats [s]."""
+"""Duration of the single part of a constant load without an end [s]. The part repeats, so that any duration gives the same load."""
 
 
 @dataclass(frozen=True)
 class Trip:
-    """Load that the user gives, until its end.
+    """Future load that the user gives.
 
     Attributes:
         load: The load.
@@ -70,10 +70,10 @@ def profile_trip(quantity: LoadQuantity, time_s: Floats, values: Floats) -> Trip
     if not 2 <= time_s.size <= MAX_POINTS:
         raise UserError(f"{time_s.size} points: must be 2 to {MAX_POINTS:,}, of which the last is the end of the trip")
     duration_s = np.diff(time_s)
-    wrong = np.flatnonzero(~(duration_s > 0.0))
-    if wrong.size:
-        before_s, after_s = time_s[wrong[0] : wrong[0] + 2]
-        raise UserError(f"point {wrong[0] + 2}: time_s = {after_s:g} after {before_s:g}: must increase")
+    invalid = np.flatnonzero(~(duration_s > 0.0))
+    if invalid.size:
+        before_s, after_s = time_s[invalid[0] : invalid[0] + 2]
+        raise UserError(f"point {invalid[0] + 2}: time_s = {after_s:g} after {before_s:g}: must increase")
     if not time_s[-1] - time_s[0] <= MAX_TRIP_S:
         raise UserError(f"lasts {time_s[-1] - time_s[0]:g} s: must be at most {MAX_TRIP_S:g} s (seven days)")
     _check_values(quantity, values[:-1], "point {}: ")
@@ -82,10 +82,10 @@ def profile_trip(quantity: LoadQuantity, time_s: Floats, values: Floats) -> Trip
 
 def _check_values(quantity: LoadQuantity, values: Floats, place: str) -> None:
     """Reject values that are not numbers, or too large. ``place`` names the point of a value in the error."""
-    wrong = np.flatnonzero(~(np.abs(values) <= MAX_LOAD))
-    if wrong.size:
+    invalid = np.flatnonzero(~(np.abs(values) <= MAX_LOAD))
+    if invalid.size:
         raise UserError(
-            f"{place.format(wrong[0] + 1)}{quantity} = {values[wrong[0]]:g}: must be a number from {-MAX_LOAD:g} to {MAX_LOAD:g}"
+            f"{place.format(invalid[0] + 1)}{quantity} = {values[invalid[0]]:g}: must be a number from {-MAX_LOAD:g} to {MAX_LOAD:g}"
         )
 
 

@@ -11,7 +11,7 @@ from bms_estimator.forecast.trip import Trip
 
 Verdict = Literal["enough", "uncertain", "not enough"]
 """Answer to the question whether the charge is enough for a trip."""
-SURE = 0.95
+MIN_CERTAINTY = 0.95
 """Minimum probability of the verdicts ``enough`` and ``not enough``."""
 
 
@@ -21,9 +21,9 @@ class TripOutcome:
 
     Attributes:
         duration_s: Duration of the trip [s].
-        energy_wh: Energy that the trip needs [Wh]; charge during the trip counts as negative.
+        energy_wh: Energy that the trip needs [Wh]; charging during the trip counts as negative.
         enough_probability: Probability that the cut-off comes after the end of the trip, 0..1.
-        verdict: ``enough`` or ``not enough`` with a probability of at least ``SURE``, otherwise ``uncertain``.
+        verdict: ``enough`` or ``not enough`` with a probability of at least ``MIN_CERTAINTY``, otherwise ``uncertain``.
         soc_p05, soc_p50, soc_p95: Quantiles of the SOC at the end of the trip, or at an earlier cut-off, 0..1.
         voltage_p05_v, voltage_p50_v, voltage_p95_v: Quantiles of the terminal voltage at the end of the trip [V]. After a
             cut-off it is the cut-off voltage.
@@ -64,7 +64,7 @@ def trip_outcome(trip: Trip, curve: ForecastCurve) -> TripOutcome:
 
 
 def _energy_wh(load: GivenLoad, curve: ForecastCurve) -> float:
-    """Return the energy of a load [Wh]. The power of a current follows from the median of the voltage."""
+    """Return the energy of a load [Wh]. A current is converted to power with the median voltage."""
     middle_s = np.cumsum(load.duration_s) - 0.5 * load.duration_s
     voltage_v = np.interp(middle_s, curve.elapsed_s, curve.voltage_p50_v)
     power_w = np.where(np.isnan(load.power_w), load.current_a * voltage_v, load.power_w)
@@ -72,6 +72,6 @@ def _energy_wh(load: GivenLoad, curve: ForecastCurve) -> float:
 
 
 def _verdict(probability: float) -> Verdict:
-    if probability >= SURE:
+    if probability >= MIN_CERTAINTY:
         return "enough"
-    return "not enough" if probability <= 1.0 - SURE else "uncertain"
+    return "not enough" if probability <= 1.0 - MIN_CERTAINTY else "uncertain"

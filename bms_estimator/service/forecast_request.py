@@ -19,7 +19,7 @@ CONSTANTS: tuple[LoadQuantity, ...] = ("power_w", "current_a")
 PROFILES: dict[str, LoadQuantity] = {"profile": "power_w", "current_profile": "current_a"}
 """Quantity of the load in each argument that gives a profile."""
 MAX_NUMBER = 1e15
-"""Maximum absolute value of a number of a profile. Python reads longer integers of JSON, which do not fit in a float."""
+"""Maximum absolute value of a number in a profile. Python parses JSON integers of any size, also those too large for a float."""
 DURATION = "duration_s"
 """Argument that gives the duration of a constant load."""
 FIELDS = (
@@ -35,7 +35,7 @@ FIELDS = (
 
 
 def requested_trip(arguments: Mapping[str, Any]) -> Trip | None:
-    """Return the trip of a request; None: under the load that was seen.
+    """Return the trip of a request; None if it gives no load.
 
     Args:
         arguments: Arguments of the request: ``power_w`` or ``current_a``, and optionally ``duration_s``; or ``profile`` or
@@ -60,7 +60,7 @@ def _profile(name: str, points: Any) -> Trip:
     """Return the trip of a list of pairs.
 
     Raises:
-        UserError: ``points`` is something else, or ``profile_trip`` rejects it.
+        UserError: ``points`` is not a list of pairs, or ``profile_trip`` rejects it.
     """
     quantity = PROFILES[name]
     if not isinstance(points, list) or not all(_is_pair(point) for point in points):
@@ -85,7 +85,7 @@ def forecast_data(forecaster: Forecaster, trip: Trip | None) -> dict[str, Any]:
 
     Args:
         forecaster: Forecaster of the pack.
-        trip: Trip that is expected; None: a load like the one that was seen.
+        trip: Expected trip; None: a load like the observed one.
     """
     forecast = forecaster.forecast(trip.load if trip else None)
     curve = forecaster.trip_curve(trip.load) if trip and trip.has_end else None
@@ -97,7 +97,7 @@ def as_json_data(forecast: Forecast, outcome: TripOutcome | None, cutoff_v: floa
 
     Args:
         forecast: The forecast.
-        outcome: Outcome of the trip; None without a trip that ends.
+        outcome: Outcome of the trip; None without a trip, and for a trip without an end.
         cutoff_v: Voltage at which the load is switched off [V].
     """
     values = {name: _known(float(forecast.values[0][name])) for name in FIELDS}

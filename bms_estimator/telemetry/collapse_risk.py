@@ -9,8 +9,7 @@ from bms_estimator.model.arrays import Floats
 def collapse_risks(forecasts: ForecastRows, is_charging: np.ndarray) -> Floats:
     """Return the value of the alarm ``collapse_risk`` at each forecast, shape (n,), 0..1.
 
-    It is the probability of the cut-off within 5 min. It is 0 in a charge, in which there is no forecast, and otherwise NaN
-    without a forecast.
+    It is the probability of the cut-off within 5 min. Without a forecast it is 0 during a charge, and otherwise NaN.
 
     Args:
         forecasts: Forecasts, shape (n,), dtype FORECAST.
@@ -21,6 +20,6 @@ def collapse_risks(forecasts: ForecastRows, is_charging: np.ndarray) -> Floats:
 
 
 def time_left_text(forecast: np.void) -> str:
-    """Return the band of the time to the cut-off, one sentence, for a record FORECAST."""
+    """Return a sentence with the 90 % band of the time to the cut-off, from a record FORECAST."""
     early_min, late_min = (float(forecast[f"time_to_cutoff_{name}_s"]) / 60.0 for name in ("p05", "p95"))
     return f"the time left was {early_min:.0f} to {late_min:.0f} min (90 % band) when the alarm was raised"

@@ -2,9 +2,9 @@
 
 import math
 
-MIN_POINT_S = 600.0
-"""Shortest median time to the cut-off that is shown [s]. Below it, a single load peak decides, so that only the band and the
-probability are shown."""
+MIN_SHOWN_MEDIAN_S = 600.0
+"""Minimum median time to the cut-off that is shown [s]. Below it only the band and the probability are shown, because a single
+load peak may decide."""
 
 
 CUTOFF_FIELDS = ("time_to_cutoff_s", "time_to_cutoff_p05_s", "time_to_cutoff_p95_s", "cutoff_within_5min")
@@ -16,7 +16,7 @@ def cutoff_text(
 ) -> str | None:
     """Return the time to the cut-off with its 90 % band; None if it is unknown.
 
-    For example ``1:52 h (1:20 to 2:31)``, and below ``MIN_POINT_S`` ``3 to 9 min, 40 % within 5 min``.
+    For example ``1:52 h (1:20 to 2:31)``, or below ``MIN_SHOWN_MEDIAN_S`` ``3 to 9 min, 40 % within 5 min``.
 
     Args:
         median_s: Median of the time to the cut-off [s].
@@ -26,7 +26,7 @@ def cutoff_text(
     """
     if median_s is None or p05_s is None or p95_s is None:
         return None
-    if median_s >= MIN_POINT_S:
+    if median_s >= MIN_SHOWN_MEDIAN_S:
         return f"{clock_duration(median_s)} h ({clock_duration(p05_s)} to {clock_duration(p95_s)})"
     band = f"{p05_s / 60.0:.0f} to {p95_s / 60.0:.0f} min"
     return band if within_5min is None else f"{band}, {100.0 * within_5min:.0f} % within 5 min"

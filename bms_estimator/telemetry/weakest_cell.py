@@ -28,7 +28,7 @@ UNKNOWN = WeakestCellValues()
 
 
 def weakest_cell_values(model: SlowFit | None) -> WeakestCellValues:
-    """Return the values of the weakest cell by the last comparison and the filter's present SOC.
+    """Return the values of the weakest cell, from the last comparison and the filter's present SOC.
 
     Args:
         model: Slow fit of the bank; read only. None: the pack has no slow fit.

@@ -42,14 +42,14 @@ def rested(soc: float, temperature_c: float = 25.0) -> Estimator:
 
 
 def capability(estimator: Estimator, *, limits: PowerLimits | None = None, largest_a: float = 0.0) -> dict[str, float]:
-    """Return the values by name."""
+    """Return available power, usable capacity and time to full by field name."""
     values = unknown_values()
     write_capability(values, estimator, CUTOFF_V, limits or cell_power_limits(estimator.cell), largest_a)
     return dict(zip(values.dtype.names, values[0].item(), strict=True))
 
 
 def ideal(estimator: Estimator) -> tuple[np.void, np.void]:
-    """Return state and settings of the filter with the state of a rested cell that equals its file."""
+    """Return state and settings of the filter, with the state set to that of a rested cell that equals its cell file."""
     state, settings = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
     soc = float(state["mean"][state["best"], 0])
     state["count"], state["best"], state["ln_weight"][0] = 1, 0, 0.0

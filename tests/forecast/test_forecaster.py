@@ -54,10 +54,10 @@ def test_the_slow_fit_as_runner_gives_a_row_for_each_trace_row(drive):
 def test_the_band_contains_the_true_time_under_a_load_like_the_one_seen(drive):
     end_s, forecasts = cutoff_s(drive), forecaster()
     forecasts.run(drive[drive["time_s"] < end_s - 900.0])
-    trues_s = end_s - forecasts.latest.time_s
+    true_s = end_s - forecasts.latest.time_s
     p05_s, median_s, p95_s = values_of(forecasts.latest, *BAND)
-    assert p05_s < trues_s < p95_s
-    assert median_s == pytest.approx(trues_s, rel=0.35)
+    assert p05_s < true_s < p95_s
+    assert median_s == pytest.approx(true_s, rel=0.35)
     assert values_of(forecasts.latest, "cutoff_within_2min")[0] < 0.1
     assert 0.1 < values_of(forecasts.latest, "cutoff_within_15min")[0] < 0.9
 

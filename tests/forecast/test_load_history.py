@@ -1,4 +1,4 @@
-"""Load that was seen: seconds at any sample rate, gaps, charges and rests."""
+"""Observed load: seconds at any sample rate, gaps, charges and rests."""
 
 import numpy as np
 import pytest
@@ -31,6 +31,7 @@ def test_a_ramp_has_the_same_seconds_at_each_sample_rate(rate_hz):
     load = history_of(rows(np.linspace(0.1, 0.6, count), 1.0 / rate_hz))
     assert load.seconds == pytest.approx(seconds, abs=1)
     assert load.mean_a.mean() == pytest.approx(0.35, abs=0.01)
+    # tolerance: slope of the ramp times half of a second or of a sample interval, whichever is longer
     exact_a = np.interp(np.arange(load.seconds) + 0.5, [0, seconds], [0.1, 0.6])
     assert np.abs(load.mean_a - exact_a).max() < 0.5 * 0.5 / 100 * max(1.0 / rate_hz, 1.0) + 1e-6
 

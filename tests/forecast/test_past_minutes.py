@@ -9,7 +9,7 @@ from bms_estimator.kernels.trace import TRACE
 
 CAPACITY_AS = 3.0 * 3600.0
 MINUTES = 60
-"""Duration of a drive."""
+"""Duration of a drive [min]."""
 
 
 def route(seed: int) -> np.ndarray:
@@ -32,7 +32,7 @@ def after_drives(*drives: np.ndarray) -> tuple[PastMinutes, LoadHistory]:
     return past, load
 
 
-def test_load_after_a_similar_one_begins_where_the_similar_one_ended() -> None:
+def test_analogue_is_the_load_that_followed_a_similar_one() -> None:
     drive = route(1)
     past, load = after_drives(drive, route(2), drive[: 25 * MINUTE_S])
     [analogue, *_] = past.analogues(load.seconds // MINUTE_S)

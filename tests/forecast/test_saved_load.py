@@ -1,4 +1,4 @@
-"""Load that was seen, saved and restored."""
+"""Observed load, saved and restored."""
 
 from collections.abc import Callable
 from typing import Any

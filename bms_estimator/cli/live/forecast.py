@@ -50,11 +50,11 @@ from bms_estimator.sources.captures.trip_file import read_trip
 from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 
 PLOT_FORMATS = (".png", ".svg", ".pdf")
-"""Endings of the file of the plot."""
+"""Allowed extensions of the plot file."""
 
 
 @dataclass(frozen=True)
-class _Start:
+class _InitialState:
     """Pack at the start of the forecast.
 
     Attributes:
@@ -128,7 +128,7 @@ def forecast(
     plot: Annotated[
         Path | None,
         typer.Option(
-            help=f"file for a plot of SOC and voltage over the time ahead: {', '.join(PLOT_FORMATS)}",
+            help=f"file for a plot of the predicted SOC and voltage: {', '.join(PLOT_FORMATS)}",
             show_default=False,
         ),
     ] = None,
@@ -137,8 +137,8 @@ def forecast(
 ) -> None:
     """Forecast the time to cut-off under an expected load, from the state of a pack or from the end of a capture.
 
-    The state is that of the last checkpoint of the pack's service, which may be running. Without a load the forecast assumes
-    a load like the one that was seen.
+    The state is that of the last checkpoint of the pack's service, which may be running. If no load is given, a load like
+    the observed one is expected.
     """
     if pack is None and capture is None:
         raise UserError("give the settings file of a pack, or --capture FILE --cell NAME")
@@ -157,7 +157,7 @@ def forecast(
         curve = start.forecaster.trip_curve(trip.load) if trip and trip.has_end else None
     outcome = trip_outcome(trip, curve) if trip and curve else None
     if plot is not None:
-        _draw(plot, start, curve or result.curve)
+        _write_plot(plot, start, curve or result.curve)
     if as_json:
         sys.stdout.write(json.dumps(as_json_data(result, outcome, start.forecaster.cutoff_v)) + "\n")
     else:
@@ -167,7 +167,7 @@ def forecast(
 def _trip(
     load: Path | None, current_a: float | None, power_w: float | None, duration_s: float | None
 ) -> tuple[Trip | None, str]:
-    """Return the trip that the options give, and its description; None: a load like the one that was seen.
+    """Return the trip that the options give, and its description; None: a load like the observed one.
 
     Raises:
         UserError: More than one load is given, or a load cannot be used.
@@ -189,11 +189,11 @@ def _trip(
         return constant_trip("current_a", current_a, duration_s), f"{current_a:g} A{end_text}"
     if power_w is not None:
         return constant_trip("power_w", power_w, duration_s), f"{power_w:g} W{end_text}"
-    return None, "like the load that was seen"
+    return None, "like the observed load"
 
 
-def _saved_state(settings: Settings, model: PackModel) -> _Start:
-    """Return the pack in the state of its checkpoint, with the load that was saved beside it. No file changes.
+def _saved_state(settings: Settings, model: PackModel) -> _InitialState:
+    """Return the pack with the state of its checkpoint and the observed load saved beside it. No file is changed.
 
     Raises:
         UserError: There is no valid checkpoint, or no forecast for this pack.
@@ -207,7 +207,7 @@ def _saved_state(settings: Settings, model: PackModel) -> _Start:
     load_file = HistoryFile(folder, settings, model, LOAD_SUFFIX)
     if reason := restore_seen_load(load_file, forecaster):
         typer.echo(f"warning: {load_file.path}: the load that was seen is unknown: {reason}", err=True)
-    return _Start(settings.pack.name, forecaster, content.unseen_s)
+    return _InitialState(settings.pack.name, forecaster, content.unseen_s)
 
 
 def _end_of_capture(
@@ -218,8 +218,8 @@ def _end_of_capture(
     column_map: MappedColumns,
     *,
     has_pack: bool,
-) -> _Start:
-    """Return the pack at the end of a capture, whose load counts as seen.
+) -> _InitialState:
+    """Return the pack at the end of a capture. The load of the capture is the observed load.
 
     Raises:
         UserError: The capture cannot be read or has no usable sample, or there is no forecast for this cell.
@@ -236,14 +236,14 @@ def _end_of_capture(
         forecaster.run(read_with_bar(path, source))
         if not estimator.state["samples"][0]:
             raise UserError(f"{path}: no usable sample")
-    return _Start(path.name, forecaster, None)
+    return _InitialState(path.name, forecaster, None)
 
 
 def _no_forecaster(model: PackModel) -> UserError:
     return UserError(f"{model.cell.name}: a forecast needs a battery, and identifier.enabled = true in the settings")
 
 
-def _result_table(start: _Start, load: str, forecast: Forecast, outcome: TripOutcome | None) -> Table:
+def _result_table(start: _InitialState, load: str, forecast: Forecast, outcome: TripOutcome | None) -> Table:
     """Return the result as a table."""
     table = Table(title=start.name, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
@@ -291,8 +291,8 @@ def _check_plot_file(plot: Path, inputs: list[Path], *, force: bool) -> None:
     check_output_file(plot, inputs, force=force, option="--plot")
 
 
-def _draw(plot: Path, start: _Start, curve: ForecastCurve | None) -> None:
-    """Draw SOC and voltage over the time ahead.
+def _write_plot(plot: Path, start: _InitialState, curve: ForecastCurve | None) -> None:
+    """Write a plot of the predicted SOC and voltage to a file.
 
     Raises:
         UserError: There is no curve, or the file cannot be written.
