@@ -1,4 +1,4 @@
-"""Files of arrays beside the checkpoint of the same pack: the history with its last fit, and the load that was seen."""
+"""Files of arrays beside the checkpoint of the same pack: the history with its last fit, and the observed load."""
 
 import io
 from collections.abc import Mapping

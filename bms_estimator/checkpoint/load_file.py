@@ -1,4 +1,4 @@
-"""Restore of the load that was seen, from its file beside the checkpoint."""
+"""Restore of the observed load, from its file beside the checkpoint."""
 
 from bms_estimator.checkpoint.history_file import HistoryFile, RejectedHistoryError
 from bms_estimator.forecast.forecaster import Forecaster

@@ -32,13 +32,13 @@ ForecastRows = NDArray[np.void]
 
 @dataclass(frozen=True)
 class ForecastCurve:
-    """Quantiles over the time ahead, each of shape (n,).
+    """Quantiles as functions of the time after the forecast, each of shape (n,).
 
     Attributes:
         elapsed_s: Time from the forecast [s], increasing.
         soc_p05, soc_p50, soc_p95: Quantiles of the SOC, 0..1.
         voltage_p05_v, voltage_p50_v, voltage_p95_v: Quantiles of the terminal voltage [V].
-        survival: Probability that the cut-off comes later, 0..1.
+        survival: Probability that the cut-off is later than ``elapsed_s``, 0..1.
     """
 
     elapsed_s: Floats
@@ -58,7 +58,7 @@ class Forecast:
     Attributes:
         time_s: Time stamp of the sample [s].
         values: Shape (1,), dtype ``FORECAST``.
-        reason: Reason why there is no time to the cut-off; None if there is one.
+        reason: Reason why the time to the cut-off is unknown; None if it is known.
         curve: Curves; None without a time to the cut-off.
     """
 

@@ -29,7 +29,7 @@ CHECK_S = 1.0
 DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
 LOAD_SAVE_S = 300.0
-"""Interval between two saves of the load that was seen [s]. A crash loses at most the load of this time."""
+"""Interval between two saves of the observed load [s]. A crash loses at most the load of this time."""
 FINAL_SAVE_S = 5.0
 """Timeout of the save at shutdown [s]; systemd waits 90 s before it kills a service."""
 
@@ -37,7 +37,7 @@ log = structlog.get_logger(__name__)
 
 
 class SeenLoad(NamedTuple):
-    """Forecaster with the load that was seen, and the file of this load."""
+    """Forecaster with the observed load, and the file of this load."""
 
     forecaster: Forecaster
     file: HistoryFile
@@ -55,7 +55,7 @@ class CheckpointWriter:
         interval_s: Maximum interval between two saves [s].
         pack_model: Slow fit, whose history is saved when its ``revision`` changes; None: no history.
         history: File of the history; None: no history.
-        seen_load: Load that was seen, which is saved every ``LOAD_SAVE_S``; None: it is not saved.
+        seen_load: Observed load, which is saved every ``LOAD_SAVE_S``; None: it is not saved.
         cells: Estimators of the single cells; read only; None: none.
     """
 
@@ -172,7 +172,7 @@ class CheckpointWriter:
         return False
 
     async def _save_load(self) -> None:
-        """Save the load that was seen, if there are new samples."""
+        """Save the observed load, if there are new samples."""
         samples = self._progress[0]
         if self._seen_load is None or samples == self._samples_of_saved_load:
             return

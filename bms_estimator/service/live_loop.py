@@ -86,7 +86,7 @@ async def run_estimation_loop(
         hooks: Alarm hooks; opened and closed here.
         edge: Sender that also receives all samples. Its owner opens and closes it. None: no sender.
         history: File of the history and the last fit; None: they are not saved.
-        load_file: File of the load that was seen; None: it is not saved.
+        load_file: File of the observed load; None: it is not saved.
         fit_executor: Runs the fits of the pack's model; None: a thread of their own.
 
     Returns:

@@ -125,7 +125,7 @@ class RequestHandlers:
         return {"rows": rows}
 
     async def forecast(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return a forecast from the present state, under the load of the request or a load like the one that was seen.
+        """Return a forecast from the present state, under the load of the request or a load like the observed one.
 
         Raises:
             UserError: An argument is invalid, or there are no forecasts for this pack.

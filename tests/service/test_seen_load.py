@@ -1,4 +1,4 @@
-"""Load that was seen: it survives a restart of the service, and a damaged file is dropped."""
+"""Observed load: it survives a restart of the service, and a damaged file is dropped."""
 
 import asyncio
 from pathlib import Path
