@@ -47,7 +47,7 @@ COMMON_DROP_STD, COMMON_ENTROPY_STD_V, COMMON_VOLTAGE_STD_V = 0.05, 1e-4, 1e-3
 voltage [V]."""
 COMMON_DROP_STD_PER_K, DROP_STD_PER_K = 0.02, 0.005
 """Increase of the relative std of the overpotential per kelvin of temperature difference from the reference [1/K]: of the
-change that all rows share, and of the change of single rows. The temperature dependence of a generic cell file is that of
+change that all rows share, and of that which varies along SOC. The temperature dependence of a generic cell file is that of
 another cell."""
 LOAD_DROP_STD = 0.1
 """Error std of the overpotential, as a fraction of its difference from the mean overpotential of the reference; independent
@@ -55,11 +55,11 @@ from row to row. The RC pairs are less exact for loads that differ from the usua
 SHIFTS, SHRINKS = np.linspace(0.0, 0.4, 21), np.linspace(0.0, 0.6, 25)
 """Tested values of ``shift`` and ``shrink``."""
 SHIFT_STD, SHRINK_STD = 0.03, Noise.cell_spread
-"""Std of the prior of ``shift`` (assumed) and ``shrink``. The prior of ``shrink`` equals the spread of the
-cells in the published ``soc_std``."""
+"""Std of the prior of ``shift`` (assumed) and ``shrink``. The prior of ``shrink`` equals the spread of the cells
+in the published ``soc_std``."""
 MIN_DIFFERENCE_STD = 0.01
-"""Minimum std of the difference between the SOCs of the weak cell and of the others. It is half the step of the
-grid of ``shift``."""
+"""Minimum std of the difference between the SOCs of the weak cell and of the others, added in quadrature: half the step of
+``SHIFTS``."""
 
 SHIFT, SHRINK = (values.ravel() for values in np.meshgrid(SHIFTS, SHRINKS, indexing="ij"))
 """``shift`` and ``shrink`` of each hypothesis."""
@@ -181,10 +181,9 @@ class Comparison:
             self._whitening, self.deviation_v if deviation_v is None else deviation_v, lower=True
         )
         templates = solve_triangular(self._whitening, self.by_weak_cell(SHIFT, SHRINK), lower=True)
-        ln_likelihood_of_row = templates * whitened[:, None] - 0.5 * templates**2
-        ln_likelihood = ln_likelihood_of_row.sum(axis=0) - np.maximum(
-            ln_likelihood_of_row.max(axis=0), 0.0
-        )  # a single wrong row must not raise the alarm
+        ln_by_row = templates * whitened[:, None] - 0.5 * templates**2
+        # without the row that supports a hypothesis most, because a single wrong row must not raise the alarm
+        ln_likelihood = ln_by_row.sum(axis=0) - np.maximum(ln_by_row.max(axis=0), 0.0)
         ln_weight = LN_PRIOR + LIKELIHOOD_EXPONENT * ln_likelihood
         weight = np.exp(ln_weight - ln_weight.max())
         values = np.stack([SHIFT, SHRINK])
@@ -213,17 +212,15 @@ class Comparison:
 def _covariance(cell: CellCurves, fit: PackFit, reference: ReferenceCurve, measured: OpenCircuit) -> Floats:
     """Return the covariance of the deviations of a healthy bank, shape (n, n) [V^2]."""
     z = measured.soc
-    temperature_difference_k = measured.temperature_c - reference.temperature_c
-    std_v = np.hypot(
-        np.interp(z, BIN_SOC, reference.std_v), DROP_STD_PER_K * temperature_difference_k * measured.drop_v
-    )
+    difference_k = measured.temperature_c - reference.temperature_c
+    std_v = np.hypot(np.interp(z, BIN_SOC, reference.std_v), DROP_STD_PER_K * difference_k * measured.drop_v)
     slope_v = fitted_slope(cell, fit, z)
     common = np.column_stack(
         [
             COMMON_SOC_STD * slope_v,
             COMMON_CAPACITY_STD * slope_v * (1.0 - z),
-            np.hypot(COMMON_DROP_STD, COMMON_DROP_STD_PER_K * temperature_difference_k) * measured.drop_v,
-            COMMON_ENTROPY_STD_V * temperature_difference_k,
+            np.hypot(COMMON_DROP_STD, COMMON_DROP_STD_PER_K * difference_k) * measured.drop_v,
+            COMMON_ENTROPY_STD_V * difference_k,
             np.full(z.size, COMMON_VOLTAGE_STD_V),
         ]
     )

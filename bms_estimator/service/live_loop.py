@@ -247,10 +247,10 @@ async def _measure_lag(publisher: Publisher) -> None:
 
 
 def _restore_load(seen: SeenLoad) -> None:
-    """Restore the load that an earlier run saw; a damaged file is logged, and the next save replaces it."""
+    """Restore the load that an earlier run observed. A damaged file is logged, and the next save replaces it."""
     file, reason = str(seen.file.path), restore_seen_load(seen.file, seen.forecaster)
     if reason:
-        log.warning("the load that was seen is damaged and was not restored", file=file, reason=reason)
+        log.warning("the observed load is damaged and was not restored", file=file, reason=reason)
     else:
         log.info("load", file=file, seconds=seen.forecaster.load.seconds)
 

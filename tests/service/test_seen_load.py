@@ -70,7 +70,7 @@ async def test_damaged_load_is_dropped_with_the_reason_and_replaced(folder: Path
     file.path.write_bytes(b"damaged")
     with capture_logs() as lines:
         answer = await run_service(folder, discharge(5))
-    [warning] = [line for line in lines if "load that was seen" in line["event"]]
+    [warning] = [line for line in lines if "observed load" in line["event"]]
     assert warning["reason"].startswith("damaged")
     assert b"less than 300 s of load" in answer
     assert file.load()

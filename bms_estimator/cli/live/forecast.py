@@ -206,7 +206,7 @@ def _saved_state(settings: Settings, model: PackModel) -> _InitialState:
         raise _no_forecaster(model)
     load_file = HistoryFile(folder, settings, model, LOAD_SUFFIX)
     if reason := restore_seen_load(load_file, forecaster):
-        typer.echo(f"warning: {load_file.path}: the load that was seen is unknown: {reason}", err=True)
+        typer.echo(f"warning: {load_file.path}: the observed load is unknown: {reason}", err=True)
     return _InitialState(settings.pack.name, forecaster, content.unseen_s)
 
 

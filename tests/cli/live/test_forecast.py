@@ -202,4 +202,4 @@ def test_damaged_load_is_reported_and_a_given_load_still_works(
     load_file(copy).write_bytes(b"damaged")
     code, out, err = run(capsys, "forecast", copy, "--power-w", 5)
     assert (code, "time to 2.8 V" in out) == (0, True)
-    assert "the load that was seen is unknown: damaged" in err
+    assert "the observed load is unknown: damaged" in err
