@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.sources.source import ReceivedSamples
 
 
@@ -18,7 +18,7 @@ class ScriptedSource:
         self.silence_reason: str | None = None
         self.board: dict[str, str] = {}
         self.clock_ppm: float | None = None
-        self._queue: asyncio.Queue[SampleBlock | None] = asyncio.Queue()
+        self._queue: asyncio.Queue[ReceivedSamples | None] = asyncio.Queue()
 
     async def __aenter__(self) -> Self:
         return self
@@ -27,14 +27,18 @@ class ScriptedSource:
         pass
 
     async def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
-        while (block := await self._queue.get()) is not None:
-            self.counters["frames_received"] += block.size
-            yield ReceivedSamples(block, NO_CELLS)
+        while (received := await self._queue.get()) is not None:
+            self.counters["frames_received"] += received.samples.size
+            yield received
 
     def give(self, *rows: tuple[float, float, float] | tuple[float, float, float, float, int]) -> None:
         """Add a block with rows of (time_s, current_a, voltage_v[, temperature_c, status])."""
         padded = [row if len(row) == 5 else (*row, np.nan, 0) for row in rows]
-        self._queue.put_nowait(np.array(padded, dtype=SAMPLE))
+        self.give_block(np.array(padded, dtype=SAMPLE))
+
+    def give_block(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS) -> None:
+        """Add a block of samples with their cell voltages."""
+        self._queue.put_nowait(ReceivedSamples(samples, cells_v))
 
     def finish(self) -> None:
         self._queue.put_nowait(None)

@@ -191,9 +191,13 @@ class CellEstimator:
             return reason
         self._start(self._series)
         self.cells[...], self.bank[...] = cells, bank
+        self.resume(unseen_s)
+        return ""
+
+    def resume(self, unseen_s: float) -> None:
+        """Prepare for samples with another time base, after a gap of ``unseen_s`` [s]; infinite if unknown."""
         self.bank["time_s"] = np.inf
         self.bank["unseen_s"] = unseen_s if math.isfinite(unseen_s) else 0.0
-        return ""
 
 
 def _invalid_reason(cells: Records, bank: Records) -> str:

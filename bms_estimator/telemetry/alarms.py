@@ -128,6 +128,7 @@ class AlarmEvaluator:
         # no interval is a gap, because losses are counted in gaps, too, and a weak cell remains weak
         self._loss_intervals, self._weak_cell_intervals = SampleIntervals(math.inf), SampleIntervals(math.inf)
         self._cell_intervals = SampleIntervals(CELLS_GAP_S)
+        self._cell_kinds = CellFault(0.0).kinds  # faulty readings in the text of their alarm
         self._buffer = SampleBuffer()
         self._counts: SampleCounts | None = None
         self._counted_s = -math.inf
@@ -237,8 +238,9 @@ class AlarmEvaluator:
         values: dict[AlarmName, CellFault] = {"cell_short": faults.short, "cell_sensor_fault": faults.reading}
         for name, fault in values.items():
             state = self._states.get(name)
-            if state is not None and state.raised is None:  # the text of a raised alarm does not change
-                self._reasons[name] = Reasons(InputFault(0), fault.texts)
+            # the text of a raised alarm changes only with the kinds of its faults, because its numbers change often
+            if state is not None and (state.raised is None or (fault.kinds and fault.kinds != self._cell_kinds)):
+                self._reasons[name], self._cell_kinds = Reasons(InputFault(0), fault.texts), fault.kinds
             self._evaluate_values(name, times_s, observed_s, np.array([fault.value]), arrival_s - faults.at_s)
         self._save_state()
 

@@ -24,8 +24,10 @@ class CellFault(NamedTuple):
 
     value: float
     """Value in the unit of the alarm."""
-    texts: tuple[str, ...]
+    texts: tuple[str, ...] = ()
     """Faulty cells, one sentence each."""
+    kinds: tuple[tuple[int, ReadingFault], ...] = ()
+    """Index and fault of each faulty cell; the texts also contain numbers, which change."""
 
 
 class CellFaults(NamedTuple):
@@ -47,8 +49,12 @@ def cell_faults(cells: CellDeviations) -> CellFaults:
     faulty = [i for i, fault in enumerate(cells.fault) if fault]
     return CellFaults(
         cells.at_s,
-        CellFault(max(float(proven_a[i]), 0.0), (short_text,) if proven_a[i] > 0.0 else ()),
-        CellFault(float(cells.reading_error_v.max()), tuple(_reading_text(cells, i) for i in faulty)),
+        CellFault(max(float(proven_a[i]), 0.0), (short_text,)) if proven_a[i] > 0.0 else CellFault(0.0),
+        CellFault(
+            float(cells.reading_error_v.max()),
+            tuple(_reading_text(cells, i) for i in faulty),
+            tuple((i, cells.fault[i]) for i in faulty),
+        ),
     )
 
 

@@ -32,6 +32,8 @@ CONTACT_FRACTION = 0.5
 """Minimum fraction of the squared error that a contact's resistance explains."""
 STUCK_STEP_V = 2e-4
 """Change of a window's mean voltage that shows that a reading is alive [V]."""
+ALIVE_V = 0.002
+"""Change of the other cells' voltage to which a correct reading responds [V]."""
 STUCK_V = 0.03
 """Change of the other cells' voltage to which a stuck reading does not respond [V]."""
 OPPOSITE_TOLERANCE = 0.3
@@ -41,11 +43,17 @@ _CONTACT, _OFFSET, _WIRE = int(ReadingFault.CONTACT), int(ReadingFault.OFFSET), 
 
 
 @njit(cache=True)
-def is_stuck(c: Record, voltage_v: float, reference_v: float) -> bool:
-    """Return True if the reading does not follow the median voltage ``reference_v`` of the cells [V]."""
+def unanswered_v(c: Record, voltage_v: float, reference_v: float) -> float:
+    """Return the change of the median voltage of the cells since the last change of this reading [V].
+
+    Args:
+        c: The cell; updated.
+        voltage_v: Voltage of the cell [V].
+        reference_v: Median voltage of the cells [V].
+    """
     if not abs(voltage_v - c.held_v) <= STUCK_STEP_V:
         c.held_v, c.held_reference_v = voltage_v, reference_v
-    return abs(reference_v - c.held_reference_v) > STUCK_V
+    return abs(reference_v - c.held_reference_v)
 
 
 @njit(cache=True)
@@ -64,7 +72,9 @@ def is_jump(c: Record, innovation_v: float, variance_v2: float, curve_v: float) 
 
 
 @njit(cache=True)
-def examine_reading(c: Record, innovation_v: float, current_a: float, elapsed_s: float, noise_v2: float) -> None:
+def examine_reading(
+    c: Record, innovation_v: float, current_a: float, elapsed_s: float, noise_v2: float, alive: bool
+) -> None:
     """Examine the reading of a cell after a jump: classify its fault, or end it after correct readings.
 
     Args:
@@ -73,10 +83,11 @@ def examine_reading(c: Record, innovation_v: float, current_a: float, elapsed_s:
         current_a: Mean current of the window [A].
         elapsed_s: Duration of the window [s].
         noise_v2: Variance of an innovation without the fault [V^2].
+        alive: True if the reading responds to the load. A stuck one is right by chance when the voltage passes it.
     """
     decay = math.exp(-elapsed_s / MEMORY_S)
     expected_v = c.offset_v + c.error_ohm * current_a
-    contradicts = abs(expected_v) > GATE_V and abs(innovation_v) < 0.5 * abs(expected_v)
+    contradicts = alive and abs(expected_v) > GATE_V and abs(innovation_v) < 0.5 * abs(expected_v)
     if contradicts:
         c.recovered_s += elapsed_s
         if c.recovered_s >= RECOVERY_S:

@@ -15,13 +15,14 @@ from bms_estimator.kernels.cells.cell_filter import (
     write_ph,
 )
 from bms_estimator.kernels.cells.reading_faults import (
+    ALIVE_V,
     JUMP_S,
     STUCK_V,
     end_fault,
     examine_reading,
     is_jump,
-    is_stuck,
     mark_sense_wires,
+    unanswered_v,
 )
 from bms_estimator.kernels.cells.records import CAPACITY, LEAK, RESISTANCE, SOC, STATES, ReadingFault
 from bms_estimator.model.arrays import Floats, Record, Records
@@ -46,6 +47,8 @@ SOC_CHANGE = 0.03
 """Std of a cell's SOC that a short may have drained before a trend exceeds its maximum."""
 CAPACITY_CHANGE = 0.03
 """Std by which the relative capacity of a cell may have changed before a trend exceeds its maximum."""
+MIN_CELL_SOC, MAX_CELL_SOC = -0.2, 1.2
+"""Range of the SOC of a cell that is over-discharged or overcharged."""
 MAX_LEAK_STD = 1.0
 """Maximum std of the self-discharge [1/h]."""
 _NONE, _STUCK = int(ReadingFault.NONE), int(ReadingFault.STUCK)
@@ -152,9 +155,10 @@ def update_cells(
             noise_v2 = measurement_variance(drop_v, by_pack_v, soc_std)
             variance_v2 = noise_v2 + write_ph(cells[i], slope_v, drop_v, ph)
             innovation_v = errors_v[i] - reference_v
-            stuck = is_stuck(cells[i], voltages_v[i], median_v)
+            ignored_v = unanswered_v(cells[i], voltages_v[i], median_v)
             curve_v = curve_range_v(cells[i], p, soc)
-            update_cell(cells[i], b, innovation_v, variance_v2, curve_v, current_a, ph, stuck)
+            update_cell(cells[i], b, innovation_v, variance_v2, curve_v, current_a, ph, ignored_v)
+        cells[i].mean[SOC] = min(max(cells[i].mean[SOC], MIN_CELL_SOC - soc), MAX_CELL_SOC - soc)
         cells[i].sum_v, cells[i].samples = 0.0, 0
     mark_sense_wires(cells)
     b.windows += 1
@@ -171,7 +175,7 @@ def update_cell(
     curve_v: float,
     current_a: float,
     ph: Floats,
-    stuck: bool,
+    ignored_v: float,
 ) -> None:
     """Correct a cell's state, unless its reading is faulty.
 
@@ -183,15 +187,15 @@ def update_cell(
         curve_v: Error of the tangent to the OCV curve within the uncertainty of the cell's SOC [V].
         current_a: Mean current of the window [A].
         ph: P H', shape (STATES,).
-        stuck: True if the reading does not respond to the load.
+        ignored_v: Change of the other cells' voltage to which the reading has not responded [V].
     """
-    if stuck:
+    if ignored_v > STUCK_V:
         c.fault, c.error_v = _STUCK, max(abs(innovation_v), STUCK_V)
         return
     if c.fault == _STUCK:
         end_fault(c)
     if c.suspect_s > 0.0 or (is_jump(c, innovation_v, variance_v2, curve_v) and not b.gap):
-        examine_reading(c, innovation_v, current_a, b.elapsed_s, variance_v2)
+        examine_reading(c, innovation_v, current_a, b.elapsed_s, variance_v2, ignored_v < ALIVE_V)
         return
     c.innovation_v += (1.0 - math.exp(-b.elapsed_s / JUMP_S)) * (innovation_v - c.innovation_v)
     normalized = innovation_v / math.sqrt(variance_v2)

@@ -9,11 +9,19 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.payloads import Snapshot
+from bms_estimator.service.publisher import Publisher
+from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sampling import BOARD
 from bms_estimator.simulation.simulated_bank import BankCells, BankHistory, SimulatedBank
+from bms_estimator.sources.source import ReceivedSamples
+from bms_estimator.telemetry.alarms import Change
+from tests.collector import Collector
+from tests.scripted_source import ScriptedSource
 
-CELLS, CAPACITY_AH, STEP_S = 6, 20.0, 10.0
-"""Number of cells, their capacity [Ah], and the interval of the samples [s]."""
+CELLS, CAPACITY_AH, STEP_S, BLOCK = 6, 20.0, 10.0, 6
+"""Number of cells, their capacity [Ah], the interval of the samples [s], and the number of samples in a block."""
 NOISE_V = 5e-4
 """Std of a cell's reading [V], which has a resolution of 1 mV."""
 Wiring = Callable[[BankHistory], Floats]
@@ -37,7 +45,18 @@ class SimulatedPack:
         self.estimator = Estimator(self.model, voltage_resolution_v=0.01, sampling=BOARD)
         self.cells = CellEstimator(self.estimator)
         self.offset_v = 0.001 * self.rng.standard_normal(self.bank.cells.soc.size)
-        self.on_block: Callable[[], object] = lambda: None
+        self.changes = list[Change]()
+        self._now_s, self._sink = 0.0, Collector()
+        self._publisher = Publisher(
+            Settings.model_validate({"publish": {"rate_hz": 0.1}}),
+            self.model,
+            self.estimator,
+            source=ScriptedSource(),
+            sinks=[self._sink],
+            clock=Clock(wall=lambda: self._now_s, monotonic=lambda: self._now_s),
+            cells=self.cells,
+            on_alarm=self.changes.append,
+        )
         self._direction = 1.0
 
     def run(self, hours: float, wiring: Wiring = lambda history: history.cell_v) -> BankHistory:
@@ -52,13 +71,26 @@ class SimulatedPack:
         return history
 
     def measure(self, history: BankHistory, wiring: Wiring = lambda history: history.cell_v) -> None:
-        """Estimate from the samples of a block."""
+        """Estimate from the samples of a block, and publish the estimates."""
         noise_v = NOISE_V * self.rng.standard_normal(history.cell_v.shape)
         cells_v = wiring(replace(history, cell_v=history.cell_v + self.offset_v + noise_v))
         samples = history.samples(self.rng, 2e-3, 0.01)
-        trace = self.estimator.run(samples)
-        self.cells.run(samples, np.round(cells_v, 3), trace)
-        self.on_block()
+        for begin in range(0, samples.size, BLOCK):
+            received = ReceivedSamples(samples[begin : begin + BLOCK], np.round(cells_v[begin : begin + BLOCK], 3))
+            self._now_s = float(received.samples["time_s"][-1])
+            trace = self.estimator.run(received.samples)
+            self.cells.run(received.samples, received.cells_v, trace)
+            self._publisher.add(received, trace)
+
+    @property
+    def published(self) -> Snapshot:
+        """The last snapshot with an estimate."""
+        return next(each for each in reversed(self._sink.snapshots) if each.estimate)
+
+    def transitions(self, alarm: str) -> list[bool]:
+        """Return the states to which an alarm has changed."""
+        changes = [each for each in self.changes if each.alarm.name == alarm and each.field == "active"]
+        return [change.alarm.active for change in changes]
 
     def short(self, cell: int, leak_ohm: float) -> None:
         """Connect a resistance across a cell; infinite: remove it."""
