@@ -189,7 +189,7 @@ def update_cell(
         ph: P H', shape (STATES,).
         ignored_v: Change of the other cells' voltage to which the reading has not responded [V].
     """
-    if ignored_v > STUCK_V:
+    if ignored_v > STUCK_V or (c.fault == _STUCK and ignored_v > 0.0):  # 0: the reading has changed in this window
         c.fault, c.error_v = _STUCK, max(abs(innovation_v), STUCK_V)
         return
     if c.fault == _STUCK:
