@@ -10,11 +10,11 @@ FALSE_ALARMS = (
     (0.3, 0.70),
     (0.6, 0.66),
     (1.2, 0.58),
-    (2.2, 0.46),
+    (2.1, 0.46),
     (4.3, 0.30),
-    (7.1, 0.18),
-    (14.0, 0.10),
-    (19.5, 0.05),
+    (7.0, 0.18),
+    (13.7, 0.10),
+    (19.2, 0.05),
 )
 """Pairs of the number of false alarms in 100 h of use and the limit: points of the measured curve of all discharges
 (``make collapse``, docs/theory/collapse.md)."""
