@@ -41,7 +41,7 @@ MAX_ITERATIONS = 24
 TOLERANCE_V = 1e-6
 """Distance from the limit below which the search ends [V]."""
 MIN_SECANT_SOC = 1e-3
-"""Minimum width of the OCV's secant [SOC]. It prevents a division by 0 for the median."""
+"""Minimum width of the OCV's secant [SOC]. It prevents a division by a std near 0."""
 
 
 @njit(cache=True)
