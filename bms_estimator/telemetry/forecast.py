@@ -48,7 +48,7 @@ def make_forecast_payload(forecast: Forecast, cutoff_v: float, window: WindowSum
     curve = forecast.curve
     age_s = max(float(window.last["time_s"]) - forecast.time_s, 0.0)
     return ForecastReport(
-        time=iso_utc(window.arrival_s - (age_s if math.isfinite(age_s) else 0.0)),
+        time=iso_utc(max(window.arrival_s - age_s, 0.0) if math.isfinite(age_s) else window.arrival_s),
         publish_time=iso_utc(now_s),
         reason=forecast.reason,
         cutoff_v=cutoff_v,

@@ -71,3 +71,8 @@ def test_a_report_without_a_forecast_has_empty_curves_and_a_reason() -> None:
 )
 def test_below_ten_minutes_the_text_has_the_band_and_the_probability_only(values: tuple[float, ...], text: str) -> None:
     assert cutoff_text(*values) == text
+
+
+def test_curves_from_before_a_jump_of_the_samples_clock_have_a_time_that_can_be_published() -> None:
+    report = make_forecast_payload(FORECAST, CUTOFF_V, window_at(FORECAST.time_s + 1e12), NOW)
+    assert report.time == iso_utc(0.0)

@@ -32,6 +32,8 @@ WINDOW_S = 10.0
 """Minimum duration of a window [s]. Its means suppress noise, and delays between the readings of current and cells."""
 MAX_STEP_S = 60.0
 """Maximum time between two samples over which the current counts as measured [s]."""
+MAX_GAP_S = 1e9
+"""Time between two samples from which the clock counts as another one [s]: 30 years."""
 FAST_MEMORY = 0.9
 """Fraction of ``fast_trend`` that remains after a window."""
 SLOW_MEMORY = 0.997
@@ -103,7 +105,7 @@ def add_sample(cells: Records, b: Record, p: Record, cells_v: Floats, row: Recor
             initialize_cell(cells[i])
         b.started, b.time_s, b.soc, b.x_ts_a, b.x_tl_a = 1, row.time_s, row.soc, current_a, current_a
     dt_s = row.time_s - b.time_s
-    if not 0.0 <= dt_s < math.inf:  # another time base
+    if not 0.0 <= dt_s < MAX_GAP_S:  # another time base
         dt_s = b.unseen_s
     b.unseen_s = 0.0
     if dt_s > MAX_STEP_S:
