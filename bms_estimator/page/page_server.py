@@ -96,7 +96,11 @@ class PageServer(WebServer):
         forecast = self._forecasts.get(request.query.get("pack", ""))
         if forecast is None:
             raise web.HTTPNotFound(text="forecasts are made where the service of the pack runs\n")
-        body = await forecast(await request.read())
+        try:
+            payload = await request.read()
+        except web.RequestPayloadError:
+            raise web.HTTPBadRequest(text="the payload cannot be decoded\n") from None
+        body = await forecast(payload)
         if body is None:
             raise web.HTTPTooManyRequests(text="too many requests; wait some seconds\n")
         return web.Response(body=body, content_type="application/json", headers={"Cache-Control": "no-store"})

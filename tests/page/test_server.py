@@ -273,3 +273,16 @@ async def test_packs_that_share_an_address_share_a_page_until_the_last_one_ends(
     with pytest.raises(aiohttp.ClientConnectionError):
         async with aiohttp.ClientSession(url) as session, session.get("/"):
             pass
+
+
+async def test_a_form_that_cannot_be_decoded_is_rejected(hub, history):
+    async def forecast(_: bytes) -> bytes:
+        return b"{}"
+
+    async with (
+        PageServer(PageSettings(listen="127.0.0.1:0"), hub, history, {"attic": forecast}, retry=False) as server,
+        aiohttp.ClientSession(server.url) as session,
+    ):
+        headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
+        async with session.post("/forecast?pack=attic", data=b'{"power_w": 5}', headers=headers) as response:
+            assert (response.status, await response.text()) == (400, "the payload cannot be decoded\n")
