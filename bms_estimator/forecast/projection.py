@@ -43,9 +43,9 @@ END_TOLERANCE = 1e-9
 """Fraction by which a trip is shortened, so that rounding does not start a repetition of its load."""
 MIN_BLOCK_S = 1.0
 """Minimum length of a block of a given load [s]. Shorter parts are merged to mean and peak of a block."""
-MAX_BLOCKS = 10_000
+MAX_BLOCKS = 2500
 """Maximum number of blocks of a given load within a horizon."""
-MAX_DRAW_STEPS = 2 * MAX_BLOCKS
+MAX_DRAW_STEPS = 20_000
 """Maximum number of parts of a given load that a draw passes. A short load that discharges the pack slowly repeats more often,
 and is extrapolated from there."""
 MAX_TOTAL_STEPS = 500_000
@@ -194,8 +194,8 @@ def _mean_current(pack: Records, load: GivenLoad) -> float:
 
 def _prolonged(load: GivenLoad, horizon_s: float) -> GivenLoad:
     """Return a load that repeats less often within a horizon: a constant one, and one shorter than ``MIN_BLOCK_S``."""
-    length_s = horizon_s if load.duration_s.size == 1 else MIN_BLOCK_S
-    return replace(load, duration_s=load.duration_s * max(length_s / float(load.duration_s.sum()), 1.0))
+    length_s, end_s = horizon_s if load.duration_s.size == 1 else MIN_BLOCK_S, float(load.duration_s.sum())
+    return replace(load, duration_s=load.duration_s / end_s * length_s) if end_s < length_s else load
 
 
 def _draw_count(parts: Records, horizon_s: float) -> int:

@@ -187,7 +187,7 @@ def test_a_time_stamp_whose_square_overflows_is_rejected(drive, time_s):
 
 @pytest.mark.parametrize(
     ("duration_s", "current_a"),
-    [([3600.0], [1e-6]), ([0.001], [1.0]), ([0.001, 0.001], [1.0, 0.5]), ([60.0, 60.0], [1.0, -0.9999])],
+    [([3600.0], [1e-6]), ([1e-320], [1.0]), ([0.001, 0.001], [1.0, 0.5]), ([60.0, 60.0], [1.0, -0.9999])],
 )
 def test_the_cost_of_a_short_or_small_load_is_bounded(drive, monkeypatch, duration_s, current_a):
     steps = []
