@@ -5,7 +5,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.config_file import without_secrets
+from bms_estimator.model.config_file import error_reason, without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
 from bms_estimator.settings.mqtt import MqttSettings
@@ -84,8 +84,17 @@ def reject_soc_for_fuel_cell(model: PackModel, key: str) -> None:
 
 
 def with_pack(settings: Settings, **changes: object) -> Settings:
-    """Return settings with changed values of ``[pack]``."""
-    pack = PackSettings.model_validate(settings.pack.model_dump() | changes)
+    """Return settings with changed values of ``[pack]``.
+
+    Raises:
+        UserError: A value is invalid.
+    """
+    try:
+        pack = PackSettings.model_validate(settings.pack.model_dump() | changes)
+    except ValidationError as error:
+        detail = error.errors()[0]
+        name = ".".join(map(str, ("pack", *detail["loc"])))
+        raise UserError(f"{name} = {detail['input']}: {error_reason(detail)}") from None
     return settings.model_copy(update={"pack": pack})
 
 

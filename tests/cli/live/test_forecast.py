@@ -162,6 +162,7 @@ def test_plot_is_written_and_not_overwritten(
         (["PACK", "--duration-s", "60"], "--duration-s: belongs to --current-a or --power-w"),
         (["PACK", "--load", "none.csv"], "none.csv: no such file"),
         (["PACK", "--power-w", "5", "--cutoff-v", "9"], "must be below"),
+        (["PACK", "--power-w", "5", "--cutoff-v", "0"], "pack.cutoff_v = 0.0: must be "),
         (["PACK", "--power-w", "5", "--plot", "x.txt"], "must end in .png, .svg, .pdf"),
         (["--capture", "none.csv", "--cell", CELL], "none.csv: no such file"),
         (["--capture", "none.csv"], "give either --cell NAME"),
