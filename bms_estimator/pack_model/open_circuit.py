@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.bank_simulation import COLLAPSE_V
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition, arrhenius
@@ -14,9 +15,6 @@ from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS
 
 HALF_ROW_SOC = 0.01
 """Half width of the secant for the slope of the OCV. A row of the history covers 2 % of SOC, and so does the secant."""
-COLLAPSE_V = 50.0
-"""Slope of the OCV of a cell below SOC 0 [V per unit SOC]. The voltage of an over-discharged cell falls to 0 within a few
-percent of its capacity. Assumed."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,8 @@ GOOD_CELLS = (3.70, 3.70)
 WITHOUT_IDENTIFIER: dict[str, Any] = {"identifier": {"enabled": False}}
 """Settings by which the SOC is that of coulomb counting, without an uncertainty."""
 
+COMPARISONS = {"cell_short", "cell_sensor_fault"}
+"""Alarms that compare at least three cells: ``tests/service/test_cell_alarms.py``."""
 CAPTURES: dict[str, tuple[list[Line], dict[str, Any], list[tuple[float, bool]]]] = {
     "pack_over_voltage": ([Line(30), Line(10, voltage_v=8.6), Line(30)], {}, [(32.0, True)]),
     "pack_under_voltage": ([Line(30), Line(20, voltage_v=5.3), Line(60)], {}, [(35.0, True), (80.0, False)]),
@@ -87,7 +89,8 @@ raising contains the delay of the alarm.
 
 
 def test_each_alarm_has_a_capture() -> None:
-    assert set(CAPTURES) == set(ALARMS) - {"hook_failed", "weak_cell"}, "no capture has hooks or several discharges"
+    unrecorded = {"hook_failed", "weak_cell", *COMPARISONS}
+    assert set(CAPTURES) == set(ALARMS) - unrecorded, "no capture has hooks, several discharges or three cells"
 
 
 @pytest.mark.parametrize("name", CAPTURES)
@@ -118,6 +121,7 @@ async def test_a_healthy_pack_raises_no_alarm_and_alarms_of_unmeasured_quantitie
     assert set(ALARMS) - reported == {
         "hook_failed",
         "weak_cell",
+        *COMPARISONS,
         "cell_over_voltage",
         "cell_under_voltage",
         "cell_imbalance",

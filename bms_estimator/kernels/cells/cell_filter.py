@@ -29,8 +29,10 @@ LEAK_DRIFT = 5e-7
 """Q: change of the self-discharge in one hour [1/h]."""
 GAP_STD = 0.003
 """Q: std of a cell's SOC after a gap, in which a balancer may have been active."""
-BALANCING_C = 0.005
+BALANCING_C = 0.002
 """Q: current of a balancer, as a C-rate."""
+BALANCING_SPREAD_V = 0.005
+"""Minimum voltage above the lowest cell of a cell that a balancer drains [V]."""
 READING_V = 0.001
 """R: std of the mean of a cell's readings in one window [V]."""
 DROP_ERROR = 0.05

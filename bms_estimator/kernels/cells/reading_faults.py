@@ -7,7 +7,7 @@ A fault of the cell changes its voltage slowly, because its SOC and its resistan
 import math
 
 from bms_estimator.kernels.cells.cell_filter import MAX_RESISTANCE_STD
-from bms_estimator.kernels.cells.records import RESISTANCE, SUM_1, SUM_A, SUM_A2, SUM_AV, SUM_V, ReadingFault
+from bms_estimator.kernels.cells.records import LEAK, RESISTANCE, SOC, SUM_1, SUM_A, SUM_A2, SUM_AV, SUM_V, ReadingFault
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 
@@ -36,6 +36,10 @@ ALIVE_V = 0.002
 """Change of the other cells' voltage to which a correct reading responds [V]."""
 STUCK_V = 0.03
 """Change of the other cells' voltage to which a stuck reading does not respond [V]."""
+DRIFT_SOC_STD = 0.1
+"""Std of a cell's SOC if its error drifts."""
+DRIFT_LEAK_STD = 0.1
+"""Std of the self-discharge of a cell whose error drifts [1/h]."""
 OPPOSITE_TOLERANCE = 0.3
 """Maximum sum of two neighbors' errors, relative to the larger one, if they share a faulty sense wire."""
 _NONE, _STUCK = int(ReadingFault.NONE), int(ReadingFault.STUCK)
@@ -118,6 +122,14 @@ def examine_reading(
         return
     c.error_ohm, c.offset_v = (slope_ohm, offset_v) if is_contact else (0.0, mean_v)
     if c.suspect_s >= CONFIRMATION_S:
+        if is_contact or c.fault != _OFFSET:
+            c.first_offset_v = mean_v
+        if alive and not is_contact and abs(mean_v - c.first_offset_v) > max(GATE_V, 0.5 * abs(c.first_offset_v)):
+            # the error drifts, as after a short, and unlike the offset of a reading
+            end_fault(c)
+            c.covariance[SOC, SOC] += DRIFT_SOC_STD**2
+            c.covariance[LEAK, LEAK] = DRIFT_LEAK_STD**2
+            return
         c.fault = _CONTACT if is_contact else _OFFSET
         c.error_v = max(abs(innovation_v), math.sqrt(by_current_v2) if is_contact else abs(mean_v))
 

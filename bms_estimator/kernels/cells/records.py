@@ -55,6 +55,7 @@ CELL = np.dtype(
         ("recovered_s", "f8"),  # time in which the reading has contradicted the fault [s]
         ("error_ohm", "f8"),  # error of the reading per ampere [ohm]; minus the resistance of a contact
         ("offset_v", "f8"),  # part of the error that does not depend on the current [V]
+        ("first_offset_v", "f8"),  # offset_v when the fault was confirmed [V]
         ("error_v", "f8"),  # magnitude of the error of the reading [V]; 0 without a fault
         ("fault", "i8"),  # a ``ReadingFault``
     ],

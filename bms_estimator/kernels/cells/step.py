@@ -4,8 +4,8 @@ import math
 
 from bms_estimator.kernels.cells.cell_filter import (
     BALANCING_C,
+    BALANCING_SPREAD_V,
     HOUR_S,
-    MAX_RESISTANCE_STD,
     correct_cell,
     curve_range_v,
     deviation_v,
@@ -24,7 +24,7 @@ from bms_estimator.kernels.cells.reading_faults import (
     mark_sense_wires,
     unanswered_v,
 )
-from bms_estimator.kernels.cells.records import CAPACITY, LEAK, RESISTANCE, SOC, STATES, ReadingFault
+from bms_estimator.kernels.cells.records import CAPACITY, LEAK, SOC, STATES, ReadingFault
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
@@ -42,12 +42,12 @@ MAX_FAST_TREND = 1.0
 """Maximum of ``fast_trend``. For white innovations it is 4 std."""
 MAX_SLOW_TREND = 0.2
 """Maximum of ``slow_trend``: seven times the largest value of simulated healthy cells in 60 h."""
-INFLATION = 1e4
-"""Factor on the variance of the self-discharge after a trend exceeds its maximum, because a short may have appeared. The
-range from 1 kohm to 1 ohm needs two such steps."""
-SOC_CHANGE = 0.03
+INFLATION = 100.0
+"""Factor on the variance of the self-discharge after a trend exceeds its maximum, because a short may have appeared. A
+larger short exceeds it several times."""
+SOC_CHANGE = 0.01
 """Std of a cell's SOC that a short may have drained before a trend exceeds its maximum."""
-CAPACITY_CHANGE = 0.03
+CAPACITY_CHANGE = 0.01
 """Std by which the relative capacity of a cell may have changed before a trend exceeds its maximum."""
 MIN_CELL_SOC, MAX_CELL_SOC = -0.2, 1.2
 """Range of the SOC of a cell that is over-discharged or overcharged."""
@@ -140,15 +140,16 @@ def update_cells(
     m = cells.size
     voltages_v, errors_v, ph = scratch[:m], scratch[m : 2 * m], scratch[2 * m : 2 * m + STATES]
     current_a, drop_v = b.sum_a / b.samples, b.sum_drop_v / b.samples
-    highest_v = 0.0
+    lowest_v, highest_v = math.inf, 0.0
     for i in range(m):
         c = cells[i]
         voltages_v[i] = c.sum_v / c.samples if c.samples else math.nan
         if c.samples and c.fault == _NONE:
-            highest_v = max(highest_v, voltages_v[i])
+            lowest_v, highest_v = min(lowest_v, voltages_v[i]), max(highest_v, voltages_v[i])
     balancing_variance = balancing_soc_variance(b, highest_v >= balancing_v and current_a <= 0.0)
     for i in range(m):
-        predict_cell(cells[i], b, balancing_variance)
+        may_be_drained = voltages_v[i] > lowest_v + BALANCING_SPREAD_V
+        predict_cell(cells[i], b, balancing_variance if may_be_drained else 0.0)
         errors_v[i] = voltages_v[i] - deviation_v(cells[i], p, soc, drop_v)[0]
     reference_v, median_v = median(errors_v, cells), median(voltages_v, cells)
     for i in range(m):
@@ -208,7 +209,6 @@ def update_cell(
         c.covariance[LEAK, LEAK] = min(INFLATION * c.covariance[LEAK, LEAK], MAX_LEAK_STD**2)
         c.covariance[SOC, SOC] += SOC_CHANGE**2
         c.covariance[CAPACITY, CAPACITY] += CAPACITY_CHANGE**2
-        c.covariance[RESISTANCE, RESISTANCE] = MAX_RESISTANCE_STD**2
         return
     correct_cell(c, innovation_v, variance_v2, ph)
 

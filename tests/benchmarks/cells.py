@@ -1,0 +1,265 @@
+"""Figures of the estimators of single cells: detection of shorts, false alarms, cost. ``make cells``; docs/pack/cells.md.
+
+Three detectors of the field see the same cell voltages and are calibrated on the same healthy packs: the Shannon entropy of the cell
+voltages, the difference of a cell from the mean cell, and a CUSUM of this difference.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.settings.alarm_limits import MIN_READING_ERROR_V, MIN_SHORT_C
+from bms_estimator.settings.sampling import BOARD
+from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
+
+CELLS, CAPACITY_AH, STEP_S = 12, 50.0, 30.0
+"""Number of cells, their capacity [Ah], and the interval of the samples [s]."""
+NOISE_V, OFFSET_V, RESOLUTION_V = 5e-4, 1e-3, 1e-3
+"""Std of the noise of a reading, std of its constant offset, and its resolution [V]."""
+WARMER_K = 5.0
+"""Difference of the temperatures of the last and the first cell [K]."""
+AGING = 2e-4
+"""Mean relative loss of capacity, and half of the rise of the resistance, in one cycle. Each cell ages at its own rate."""
+SHORTED_CELL = 4
+"""Index of the cell with a short, from 0."""
+SHORTS_OHM = (1000.0, 300.0, 100.0, 30.0, 10.0, 3.0, 1.0)
+HEALTHY_CYCLES = 20
+"""Number of cycles before a short appears."""
+SAFETY = 1.2
+"""Factor of a detector's threshold on its largest value in healthy packs."""
+CUSUM_SLACK = 1.0
+"""Slack of the CUSUM in std of a cell's deviation."""
+
+
+@dataclass(frozen=True)
+class Hour:
+    """Mean deviations of the cells in one hour, and the results of the estimators at its end."""
+
+    time_h: float
+    deviation_v: Floats
+    """Voltage of each cell less the mean, mean over the hour [V], shape (cells,)."""
+    cells_v: Floats
+    """Voltages at the end of the hour [V]."""
+    soc: Floats
+    """True SOC of each cell."""
+    short_c: Floats
+    """Proven self-discharge of each cell, as a C-rate [1/h]."""
+    reading_error_v: float
+    z: Floats
+    """Errors of the SOC deviations in std."""
+
+
+def hours(chemistry: str, seed: int, cycles: int, short_ohm: float = np.inf) -> Iterator[Hour]:
+    """Simulate a pack and yield each hour. A short appears after ``HEALTHY_CYCLES``."""
+    rng = np.random.default_rng(seed)
+    cell = load_cell(chemistry, CAPACITY_AH)
+    drawn = BankCells.drawn(rng, CELLS, CAPACITY_AH, 0.9)
+    drawn = replace(drawn, warmer_k=np.linspace(0.0, WARMER_K, CELLS))
+    bank, rates = SimulatedBank(cell, drawn), np.exp(0.3 * rng.standard_normal(CELLS))
+    estimator = Estimator(cell.pack(CELLS, 1), voltage_resolution_v=0.01, sampling=BOARD)
+    estimators, offset_v = CellEstimator(estimator), OFFSET_V * rng.standard_normal(CELLS)
+    direction, turns, hour = 1.0, 0, 0
+    while turns < 2 * cycles:
+        mean = float(bank.soc.mean())
+        before, direction = direction, 1.0 if mean > 0.85 else -1.0 if mean < 0.3 else direction
+        turns += direction != before
+        leaks = np.full(CELLS, np.inf)
+        leaks[SHORTED_CELL] = short_ohm if turns >= 2 * HEALTHY_CYCLES else np.inf
+        aged = np.exp(-AGING * turns / 2 * rates)
+        bank.cells = replace(
+            drawn, capacity_ah=drawn.capacity_ah * aged, ohm_factor=drawn.ohm_factor / aged**2, leak_ohm=leaks
+        )
+        noise_a = 0.3 * np.repeat(rng.standard_normal(12), round(300.0 / STEP_S))
+        current_a = CAPACITY_AH * direction * 0.2 * np.maximum(1.0 + noise_a, 0.0)
+        celsius = 22.0 + 8.0 * np.sin(2.0 * np.pi * hour / 24.0)
+        history = bank.run(current_a, STEP_S, celsius)
+        noise_v = NOISE_V * rng.standard_normal(history.cell_v.shape)
+        cells_v = np.round((history.cell_v + offset_v + noise_v) / RESOLUTION_V) * RESOLUTION_V
+        samples = history.samples(rng, 2e-3, 0.01)
+        estimators.run(samples, cells_v, estimator.run(samples))
+        hour += 1
+        d = estimators.deviations
+        if d is None:
+            continue
+        true = bank.soc - bank.soc.mean()
+        yield Hour(
+            hour,
+            (cells_v - cells_v.mean(axis=1, keepdims=True)).mean(axis=0),
+            cells_v[-1],
+            bank.soc,
+            d.proven_self_discharge_a / CAPACITY_AH,
+            float(d.reading_error_v.max()),
+            (d.soc_deviation - true) / d.soc_deviation_std,
+        )
+
+
+def entropy_scores(course: list[Hour]) -> Floats:
+    """Return the Shannon-entropy score of each hour: deviation of a cell's share of the entropy over a day, in std of the cells."""
+    scores = np.zeros(len(course))
+    for i in range(24, len(course)):
+        voltages = np.array([hour.cells_v for hour in course[i - 24 : i]])
+        entropy = np.array([_entropy(column) for column in voltages.T])
+        scores[i] = np.abs(entropy - entropy.mean()).max() / max(float(entropy.std()), 1e-9)
+    return scores
+
+
+def _entropy(values: Floats) -> float:
+    counts, _ = np.histogram(values, bins=12)
+    share = counts[counts > 0] / values.size
+    return float(-(share * np.log(share)).sum())
+
+
+def difference_scores(course: list[Hour]) -> Floats:
+    """Return the mean-difference score of each hour: largest change of a cell's mean deviation since the first days [V]."""
+    deviation_v = np.array([hour.deviation_v for hour in course])
+    return np.abs(deviation_v - deviation_v[:48].mean(axis=0)).max(axis=1)
+
+
+def cusum_scores(course: list[Hour]) -> Floats:
+    """Return the CUSUM of each hour: largest lower-sided sum over the cells, in std of the first days."""
+    deviation_v = np.array([hour.deviation_v for hour in course])
+    mean_v, std_v = deviation_v[:48].mean(axis=0), deviation_v[:48].std(axis=0)
+    total, scores = np.zeros(deviation_v.shape[1]), np.zeros(len(course))
+    for i, row in enumerate((mean_v - deviation_v) / std_v - CUSUM_SLACK):
+        total = np.maximum(total + row, 0.0)
+        scores[i] = total.max()
+    return scores
+
+
+DETECTORS: dict[str, Callable[[list[Hour]], Floats]] = {
+    "entropy": entropy_scores,
+    "mean difference": difference_scores,
+    "CUSUM": cusum_scores,
+}
+"""Detectors of the field."""
+
+
+def own_scores(course: list[Hour]) -> Floats:
+    """Return the largest proven self-discharge relative to the limit of the alarm."""
+    return np.array([hour.short_c.max() / MIN_SHORT_C for hour in course])
+
+
+def delay_h(course: list[Hour], scores: Floats, threshold: float, begin: int) -> float:
+    """Return the time from the short to the first score above ``threshold`` [h]; infinite without one."""
+    late = [hour.time_h for hour, score in zip(course[begin:], scores[begin:], strict=True) if score >= threshold]
+    return late[0] - course[begin].time_h if late else np.inf
+
+
+def false_alarms(chemistry: str, cycles: int, seeds: int) -> list[list[Hour]]:
+    """Print the alarms of healthy packs. Return their courses."""
+    courses = []
+    shorts = readings = done = 0
+    largest, squares, worst, began_s = -np.inf, [], 0.0, time.perf_counter()
+    for seed in range(seeds):
+        courses.append(list(hours(chemistry, 1000 + seed, cycles // seeds)))
+        for hour in courses[-1]:
+            largest = max(largest, float(hour.short_c.max() / MIN_SHORT_C))
+            shorts += bool((hour.short_c >= MIN_SHORT_C).any())
+            readings += hour.reading_error_v >= MIN_READING_ERROR_V
+            squares.append(float((hour.z**2).mean()))
+            worst = max(worst, float(np.abs(hour.z).max()))
+        done += cycles // seeds
+    print_table(
+        ("healthy packs", "value"),
+        [
+            ("chemistry, cycles, packs", f"{chemistry}, {done}, {seeds}"),
+            ("hours with cell_short", str(shorts)),
+            ("hours with cell_sensor_fault", str(readings)),
+            ("largest proven self-discharge, of the limit", f"{largest:.2f}"),
+            ("SOC deviation: RMS error, largest error [std]", f"{np.sqrt(np.mean(squares)):.2f}, {worst:.1f}"),
+            ("duration [s]", f"{time.perf_counter() - began_s:.0f}"),
+        ],
+    )
+    return courses
+
+
+def delays(chemistry: str, healthy: list[list[Hour]], seeds: int, cycles: int) -> None:
+    """Print the detection delay of each short and detector.
+
+    Args:
+        chemistry: Name of a generic cell file.
+        healthy: Courses of healthy packs, in which no detector may raise an alarm.
+        seeds: Number of packs with each short.
+        cycles: Maximum number of cycles with a short of more than 50 ohm; others have a quarter of them.
+    """
+    thresholds = {name: SAFETY * max(score(course).max() for course in healthy) for name, score in DETECTORS.items()}
+    rows = []
+    for ohm in SHORTS_OHM:
+        found: dict[str, list[float]] = {name: [] for name in ("cell_short", *DETECTORS)}
+        for seed in range(seeds):
+            limit = cycles if ohm > 50.0 else max(cycles // 4, 4)
+            course = list(hours(chemistry, 500 + seed, HEALTHY_CYCLES + limit, ohm))
+            begin = len(list(hours(chemistry, 500 + seed, HEALTHY_CYCLES)))
+            found["cell_short"].append(delay_h(course, own_scores(course), 1.0, begin))
+            for name, score in DETECTORS.items():
+                found[name].append(delay_h(course, score(course), thresholds[name], begin))
+        rows.append((f"{ohm:g}", *(_hours_text(found[name]) for name in found)))
+    print_table(("short [ohm]", "cell_short [h]", *(f"{name} [h]" for name in DETECTORS)), rows)
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table."""
+    table = Table(*map(escape, header))
+    for row in rows:
+        table.add_row(*map(escape, row))
+    Console(width=110).print(table)
+
+
+def _hours_text(delays_h: list[float]) -> str:
+    return ", ".join("-" if np.isinf(each) else f"{each:.0f}" for each in delays_h)
+
+
+def cost(count: int = 96, rate_hz: float = 10.0, samples: int = 20_000) -> None:
+    """Print the cost of the estimators of all cells of a large pack."""
+    model = load_cell("nmc", CAPACITY_AH).pack(count, 1)
+    estimator = Estimator(model, sampling=BOARD)
+    cells, block = CellEstimator(estimator), np.zeros(samples, SAMPLE)
+    block["time_s"], block["current_a"], block["voltage_v"] = np.arange(samples) / rate_hz, 10.0, 3.7 * count
+    block["temperature_c"] = 25.0
+    cells_v = 3.7 + 0.01 * np.random.default_rng(1).standard_normal((samples, count))
+    trace = estimator.run(block).copy()
+    cells.run(block[:10], cells_v[:10], trace[:10])  # compiles
+    times_s = []
+    for begin in range(0, samples, 10):
+        part = slice(begin, begin + 10)
+        began_s = time.process_time()
+        cells.run(block[part], cells_v[part], trace[part])
+        times_s.append(time.process_time() - began_s)
+    sample_s = sum(times_s) / samples
+    print_table(
+        ("cost", "value"),
+        [
+            (f"{count} cells at {rate_hz:g} Hz, one block a second", f"{100 * sample_s * rate_hz:.4f} % of a core"),
+            ("each cell and sample", f"{1e9 * sample_s / count:.0f} ns"),
+        ],
+    )
+
+
+def main(arguments: list[str]) -> None:
+    """Print all tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--chemistry", default="nmc", help="name of a generic cell file")
+    parser.add_argument("--cycles", type=int, default=1000, help="cycles of healthy packs")
+    parser.add_argument("--packs", type=int, default=5, help="number of healthy packs")
+    parser.add_argument("--short-cycles", type=int, default=60, help="maximum number of cycles with a short")
+    parser.add_argument("--short-packs", type=int, default=2, help="number of packs with each short")
+    options = parser.parse_args(arguments)
+    cost()
+    healthy = false_alarms(options.chemistry, options.cycles, options.packs)
+    delays(options.chemistry, healthy, options.short_packs, options.short_cycles)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
