@@ -18,7 +18,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.settings.alarm_limits import MIN_CELLS, balancing_voltage_v
 
-LEAK_STDS = 4.0
+LEAK_STDS = 3.0
 """Std by which the self-discharge of a cell must exceed that of the other cells to count as a short."""
 
 CONSTANT_FRACTION = 0.5

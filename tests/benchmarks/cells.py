@@ -26,6 +26,8 @@ from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 
 CELLS, CAPACITY_AH, STEP_S = 12, 50.0, 30.0
 """Number of cells, their capacity [Ah], and the interval of the samples [s]."""
+BLOCKS = 6
+"""Number of simulated blocks in an hour."""
 NOISE_V, OFFSET_V, RESOLUTION_V = 5e-4, 1e-3, 1e-3
 """Std of the noise of a reading, std of its constant offset, and its resolution [V]."""
 WARMER_K = 5.0
@@ -70,7 +72,8 @@ def hours(chemistry: str, seed: int, cycles: int, short_ohm: float = np.inf) -> 
     bank, rates = SimulatedBank(cell, drawn), np.exp(0.3 * rng.standard_normal(CELLS))
     estimator = Estimator(cell.pack(CELLS, 1), voltage_resolution_v=0.01, sampling=BOARD)
     estimators, offset_v = CellEstimator(estimator), OFFSET_V * rng.standard_normal(CELLS)
-    direction, turns, hour = 1.0, 0, 0
+    direction, turns, block = 1.0, 0, 0
+    deviations_v: list[Floats] = []
     while turns < 2 * cycles:
         mean = float(bank.soc.mean())
         before, direction = direction, 1.0 if mean > 0.85 else -1.0 if mean < 0.3 else direction
@@ -81,22 +84,23 @@ def hours(chemistry: str, seed: int, cycles: int, short_ohm: float = np.inf) -> 
         bank.cells = replace(
             drawn, capacity_ah=drawn.capacity_ah * aged, ohm_factor=drawn.ohm_factor / aged**2, leak_ohm=leaks
         )
-        noise_a = 0.3 * np.repeat(rng.standard_normal(12), round(300.0 / STEP_S))
+        noise_a = 0.3 * np.repeat(rng.standard_normal(2), round(300.0 / STEP_S))
         current_a = CAPACITY_AH * direction * 0.2 * np.maximum(1.0 + noise_a, 0.0)
-        celsius = 22.0 + 8.0 * np.sin(2.0 * np.pi * hour / 24.0)
+        celsius = 22.0 + 8.0 * np.sin(2.0 * np.pi * block / (24 * BLOCKS))
         history = bank.run(current_a, STEP_S, celsius)
         noise_v = NOISE_V * rng.standard_normal(history.cell_v.shape)
         cells_v = np.round((history.cell_v + offset_v + noise_v) / RESOLUTION_V) * RESOLUTION_V
         samples = history.samples(rng, 2e-3, 0.01)
         estimators.run(samples, cells_v, estimator.run(samples))
-        hour += 1
+        block += 1
+        deviations_v.append((cells_v - cells_v.mean(axis=1, keepdims=True)).mean(axis=0))
         d = estimators.deviations
-        if d is None:
+        if d is None or block % BLOCKS:
             continue
         true = bank.soc - bank.soc.mean()
         yield Hour(
-            hour,
-            (cells_v - cells_v.mean(axis=1, keepdims=True)).mean(axis=0),
+            block / BLOCKS,
+            np.mean(deviations_v[-BLOCKS:], axis=0),
             cells_v[-1],
             bank.soc,
             d.proven_self_discharge_a / CAPACITY_AH,

@@ -131,9 +131,16 @@ def correct_cell(c: Record, innovation_v: float, variance_v2: float, ph: Floats)
 
 
 @njit(cache=True)
-def measurement_variance(drop_v: float, by_pack_v: float, soc_std: float) -> float:
-    """Return R [V^2]; ``by_pack_v`` is the derivative of the deviation by the pack's SOC [V]."""
-    return READING_V**2 + (DROP_ERROR * drop_v) ** 2 + (by_pack_v * soc_std) ** 2
+def measurement_variance(drop_v: float, by_pack_v: float, soc_std: float, curve_v: float) -> float:
+    """Return R [V^2].
+
+    Args:
+        drop_v: Overpotential of the reference cell [V].
+        by_pack_v: Derivative of the deviation by the pack's SOC [V].
+        soc_std: Std of the pack's SOC.
+        curve_v: Error of the tangent to the OCV curve (``curve_range_v``) [V].
+    """
+    return READING_V**2 + (DROP_ERROR * drop_v) ** 2 + (by_pack_v * soc_std) ** 2 + (0.5 * curve_v) ** 2
 
 
 @njit(cache=True)

@@ -40,7 +40,7 @@ SLOW_MEMORY = 0.997
 """Fraction of ``slow_trend`` that remains after a window: a time constant of about an hour."""
 MAX_FAST_TREND = 1.0
 """Maximum of ``fast_trend``. For white innovations it is 4 std."""
-MAX_SLOW_TREND = 0.2
+MAX_SLOW_TREND = 0.1
 """Maximum of ``slow_trend``: seven times the largest value of simulated healthy cells in 60 h."""
 INFLATION = 100.0
 """Factor on the variance of the self-discharge after a trend exceeds its maximum, because a short may have appeared. A
@@ -155,11 +155,11 @@ def update_cells(
     for i in range(m):
         if math.isfinite(voltages_v[i]) and math.isfinite(reference_v):
             _, slope_v, by_pack_v = deviation_v(cells[i], p, soc, drop_v)
-            noise_v2 = measurement_variance(drop_v, by_pack_v, soc_std)
+            curve_v = curve_range_v(cells[i], p, soc)
+            noise_v2 = measurement_variance(drop_v, by_pack_v, soc_std, curve_v)
             variance_v2 = noise_v2 + write_ph(cells[i], slope_v, drop_v, ph)
             innovation_v = errors_v[i] - reference_v
             ignored_v = unanswered_v(cells[i], voltages_v[i], median_v)
-            curve_v = curve_range_v(cells[i], p, soc)
             update_cell(cells[i], b, innovation_v, variance_v2, curve_v, current_a, ph, ignored_v)
         cells[i].mean[SOC] = min(max(cells[i].mean[SOC], MIN_CELL_SOC - soc), MAX_CELL_SOC - soc)
         cells[i].sum_v, cells[i].samples = 0.0, 0
