@@ -21,7 +21,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank observability power collapse resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads cell-schema notebook lock
+.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank cells observability power collapse resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads cell-schema notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -102,6 +102,9 @@ bank: venv ## the weakest cell of simulated banks: false alarms, detection and e
 
 collapse: venv ## the alarm before the cut-off: false alarms and warnings by signal, e.g. make collapse ARGS="--plot collapse.png": half an hour
 	@$(BIN)/python -m tests.benchmarks.collapse $(ARGS)
+
+cells: venv ## single cells of simulated packs: shorts, false alarms and cost, beside three other detectors: a minute
+	@$(BIN)/python -m tests.benchmarks.cells $(ARGS)
 
 observability: venv ## the lower bound of the std of the SOC by cell and SOC window, e.g. make observability ARGS="lfp --window 0.5 0.95"
 	@$(BIN)/python -m tests.benchmarks.observability $(ARGS)

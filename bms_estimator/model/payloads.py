@@ -148,34 +148,31 @@ class Estimate(Payload):
     weakest_cell_soc: Annotated[
         float | None, Quantity(Entity("Weakest cell, SOC", None, 3, 0.01), packs="batteries", prometheus="ratio")
     ] = Field(
-        default=None,
         description="SOC of the weakest cell, 0..1: by the cell voltages, or without them by the voltage of the bank; null for a single cell, "
         "and before the first comparison",
     )
     weakest_cell_soc_std: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
-        default=None, description="standard deviation of weakest_cell_soc"
+        description="standard deviation of weakest_cell_soc"
     )
     weakest_cell_capacity: Annotated[
         float | None,
         Quantity(Entity("Weakest cell, capacity", None, 2, 0.01), packs="batteries", prometheus="ratio"),
-    ] = Field(default=None, description="capacity of the weakest cell relative to the other cells")
+    ] = Field(description="capacity of the weakest cell relative to the other cells")
     usable_capacity_to_weakest_ah: Annotated[
         float | None, Quantity(raw_entity("Usable capacity to the weakest cell", "Ah", 2), packs="batteries")
-    ] = Field(default=None, description="remaining charge until the weakest cell is empty [Ah]")
+    ] = Field(description="remaining charge until the weakest cell is empty [Ah]")
     weakest_cell: Annotated[
         int | None, Quantity(Entity("Weakest cell", None, 0, 1.0, state_class=None), packs="with cell voltages")
     ] = Field(
-        default=None,
         description="number of the cell with the lowest SOC, from 1; null before the first estimate of the cells, and "
         "without cell voltages",
     )
     cell_soc_spread: Annotated[
         float | None, Quantity(Entity("Cell spread, SOC", None, 3, 0.005), packs="with cell voltages")
-    ] = Field(default=None, description="highest less lowest SOC of the cells; null as weakest_cell")
+    ] = Field(description="highest less lowest SOC of the cells; null as weakest_cell")
     cell_r_spread: Annotated[
         float | None, Quantity(Entity("Cell spread, resistance", None, 2, 0.02), packs="with cell voltages")
     ] = Field(
-        default=None,
         description="highest less lowest resistance of the cells, relative to their median; null as weakest_cell",
     )
     charge_out_ah: Annotated[

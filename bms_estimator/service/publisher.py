@@ -276,6 +276,7 @@ class Publisher:
         self._flow = self._flow.at_least(self.saved_flow or self._totals.flow)
         capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
         forecast = self._forecaster.latest if self._forecaster else self._no_forecast
+        cell_fields = weakest_cell_fields(self._deviations) if self._deviations else {}
         return make_state_payload(
             window,
             remaining,
@@ -284,7 +285,7 @@ class Publisher:
             wall_s,
             self._flow,
             capacity_ah,
-            bank_fields(self._weakest_cell()) | weakest_cell_fields(self._deviations),
+            bank_fields(self._weakest_cell()) | cell_fields,
         )
 
     def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:

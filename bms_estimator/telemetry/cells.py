@@ -102,10 +102,8 @@ def make_cells_payload(cells: CellDeviations, short_limit_a: float, now_s: float
     )
 
 
-def weakest_cell_fields(cells: CellDeviations | None) -> dict[str, float | int | None]:
-    """Return the fields of ``Estimate`` about single cells; None without estimates of the cells."""
-    if cells is None:
-        return {}
+def weakest_cell_fields(cells: CellDeviations) -> dict[str, float | int | None]:
+    """Return the fields of ``Estimate`` about estimates of single cells (``NO_CELL_FIELDS``)."""
     i = cells.weakest
     return {
         "weakest_cell": i + 1,

@@ -21,6 +21,16 @@ from bms_estimator.telemetry.publish_window import WindowSummary
 from bms_estimator.telemetry.remaining_charge import RemainingCharge
 from bms_estimator.version import __version__
 
+NO_CELL_FIELDS: Mapping[str, Any] = MappingProxyType(
+    dict.fromkeys(
+        (
+            *("weakest_cell", "weakest_cell_soc", "weakest_cell_soc_std", "weakest_cell_capacity"),
+            *("usable_capacity_to_weakest_ah", "cell_soc_spread", "cell_r_spread"),
+        ),
+        None,
+    )
+)
+"""Fields of ``Estimate`` about estimates of single cells, without any."""
 COMPUTED = {"voltage_v", "current_a", "temperature_c", "converged", "lock"}
 """Columns of the trace whose field of ``Estimate`` is computed: means, and booleans from integers."""
 COPIED = tuple(name for name in TRACE.names or () if name in Estimate.model_fields and name not in COMPUTED)
@@ -73,7 +83,7 @@ def make_state_payload(
         remaining_capacity_ah=finite(remaining.capacity_ah),
         remaining_energy_wh=finite(remaining.energy_wh),
         **forecast_fields(forecast, float(window.last["time_s"])),
-        **cell_fields,
+        **(NO_CELL_FIELDS | cell_fields),
         **flow._asdict(),
         equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
         # the learning law does not change delta1 and delta2, and only this law has an adaptation gain

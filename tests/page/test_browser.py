@@ -27,7 +27,7 @@ from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, start_program
-from tests.sinks.snapshots import CELL_SNAPSHOT, FORECAST, STACK_SNAPSHOT, forecast_at
+from tests.sinks.snapshots import CELL_SNAPSHOT, CELLS_REPORT, FORECAST, STACK_SNAPSHOT, forecast_at
 from tests.store.test_history import record_history, snapshot_at
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -245,6 +245,17 @@ async def test_unknown_values_are_hidden(browser: Browser, programs: RunningProg
         await page_tab.until_text("voltage_v", "")
         body = await page_tab.page.inner_text("body")
         assert not re.search("NaN|undefined|null|Infinity", body)
+        assert page_tab.errors == []
+
+
+async def test_cells_are_ranked_by_soc_and_the_weakest_is_named(browser: Browser, programs: RunningPrograms) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        await publish_state(programs.live, **STATE_VALUES)
+        await publish(programs.live, "cells", CELLS_REPORT.model_dump_json(), retain=False)
+        await page_tab.until_text("weakestcell", "cell 2, SOC 47.0 ± 2.0 %")
+        rows = page_tab.page.locator("#cellranks tbody tr")
+        assert [await rows.nth(i).get_attribute("data-cell") for i in range(4)] == ["2", "3", "1", "4"]
+        assert await rows.nth(0).locator("td").last.inner_text() == "internal short"
         assert page_tab.errors == []
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.simulated_pack import CAPACITY_AH, SimulatedPack, Wiring, stuck, with_contact, with_offset
+from bms_estimator.simulation.simulated_bank import BankCells
+from tests.simulated_pack import CAPACITY_AH, CELLS, SimulatedPack, Wiring, stuck, with_contact, with_offset
 
 
 @pytest.fixture(scope="module")
@@ -68,17 +69,18 @@ def test_a_healthy_pack_raises_no_alarm_of_its_cells(chemistry: str) -> None:
 
 
 def test_a_balancer_raises_no_alarm_of_a_short() -> None:
-    """A balancer drains one cell with C/100 while the pack is nearly full."""
-    pack = SimulatedPack()
+    """A balancer drains the highest cell with C/200 while the pack is nearly full."""
+    pack = SimulatedPack(BankCells.drawn(np.random.default_rng(5), CELLS, CAPACITY_AH, 0.9, soc_std=0.03))
     pack.run(3)
     discharge_a = CAPACITY_AH * 0.2
     for _ in range(6):
         pack.measure(pack.bank.run(np.full(360, -discharge_a), 10.0))
         while pack.bank.soc.mean() < 0.9:
             pack.measure(pack.bank.run(np.full(60, -discharge_a), 10.0))
-        pack.short(4, 4.1 / (CAPACITY_AH / 100.0))
+        highest = int(np.argmax(pack.bank.soc))
+        pack.short(highest, 4.1 / (CAPACITY_AH / 200.0))
         pack.measure(pack.bank.run(np.full(360, -0.01 * discharge_a), 10.0))
-        pack.short(4, np.inf)
+        pack.short(highest, np.inf)
         pack.measure(pack.bank.run(np.full(720, discharge_a), 10.0))
     assert pack.transitions("cell_short") == []
 

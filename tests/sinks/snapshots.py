@@ -5,8 +5,9 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecast import Forecast, ForecastCurve, unknown_values
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
-from bms_estimator.model.payloads import Alarm, LoopHealth, Snapshot
+from bms_estimator.model.payloads import Alarm, CellReport, CellsReport, LoopHealth, Snapshot
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.pack import Settings
@@ -124,6 +125,32 @@ SNAPSHOT_WITHOUT_SAMPLES = CELL_SNAPSHOT._replace(
 )
 """Snapshot before the first sample."""
 
+CELLS_REPORT = CellsReport(
+    publish_time=iso_utc(NOW),
+    weakest=2,
+    cells=[
+        CellReport(
+            number=number,
+            soc=soc,
+            soc_std=0.01,
+            soc_deviation=soc - 0.5,
+            soc_deviation_std=0.003,
+            resistance_ratio=ratio,
+            resistance_ratio_std=0.03,
+            capacity_ratio=1.0,
+            self_discharge_a=leak_a,
+            self_discharge_std_a=0.001,
+            fault=fault,
+        )
+        for number, soc, ratio, leak_a, fault in (
+            (1, 0.51, 0.98, 0.0, None),
+            (2, 0.47, 1.08, 0.02, "internal short"),
+            (3, 0.5, 1.0, 0.0, "contact"),
+            (4, 0.52, 1.01, -0.001, None),
+        )
+    ],
+)
+"""Comparison of four cells."""
 SOC_LOW_ALARM = Alarm(
     name="soc_low",
     severity="warning",

@@ -259,6 +259,9 @@ def test_cells_are_added_with_their_first_voltages_and_never_removed() -> None:
         "cell_lowest_v",
         "cell_highest",
         "cell_highest_v",
+        "weakest_cell",
+        "cell_soc_spread",
+        "cell_r_spread",
         *(f"cell_{n}_v" for n in (1, 2, 3)),
     }
     cell = after["components"]["cell_2_v"]

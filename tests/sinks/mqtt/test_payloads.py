@@ -12,7 +12,7 @@ from bms_estimator.sinks.mqtt.requests import COMMANDS, READS
 from bms_estimator.sinks.mqtt.topics import TOPICS
 from tests.command_line import run
 from tests.sinks.mqtt.payload_record import current_record, find_broken, read_record
-from tests.sinks.snapshots import CELL_SNAPSHOT, NOW, SOC_LOW_ALARM
+from tests.sinks.snapshots import CELL_SNAPSHOT, CELLS_REPORT, NOW, SOC_LOW_ALARM
 
 DOCUMENT = document("bms")
 HOW_TO_UPDATE = "run `make payloads`, which rewrites tests/sinks/mqtt/payloads.json"
@@ -52,7 +52,10 @@ def test_the_payload_version_is_published_in_info_and_schema() -> None:
 
 
 def test_messages_have_qos_and_retain_of_the_topic_table() -> None:
-    messages, snapshot = MessageBuilder("bms", "pack"), CELL_SNAPSHOT._replace(alarms=(SOC_LOW_ALARM,))
+    messages, snapshot = (
+        MessageBuilder("bms", "pack"),
+        CELL_SNAPSHOT._replace(alarms=(SOC_LOW_ALARM,), cells=CELLS_REPORT),
+    )
     messages_by_topic = {
         m.topic.removeprefix("bms/pack/"): m
         for m in (
