@@ -83,7 +83,7 @@ def make_state_payload(
         remaining_capacity_ah=finite(remaining.capacity_ah),
         remaining_energy_wh=finite(remaining.energy_wh),
         **forecast_fields(forecast, float(window.last["time_s"])),
-        **(NO_CELL_FIELDS | cell_fields),
+        **{**NO_CELL_FIELDS, **cell_fields},
         **flow._asdict(),
         equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
         # the learning law does not change delta1 and delta2, and only this law has an adaptation gain

@@ -87,7 +87,7 @@ def service(
 
 def checkpoints(state_home: Path) -> list[Path]:
     """Return the checkpoints in the default state folder."""
-    return list((state_home / "bms-estimator").glob("*.npz"))
+    return [path for path in (state_home / "bms-estimator").glob("*.npz") if ".load" not in path.suffixes]
 
 
 async def stop_service(process: Process) -> list[Any]:
