@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.arrays import Floats
@@ -177,10 +176,8 @@ class Comparison:
 
     def weakest(self, deviation_v: Floats | None = None) -> WeakestCell:
         """Return the estimate of the weakest cell by a deviation, shape (n,) [V]; default: ``deviation_v``."""
-        whitened = solve_triangular(
-            self._whitening, self.deviation_v if deviation_v is None else deviation_v, lower=True
-        )
-        templates = solve_triangular(self._whitening, self.by_weak_cell(SHIFT, SHRINK), lower=True)
+        whitened = np.linalg.solve(self._whitening, self.deviation_v if deviation_v is None else deviation_v)
+        templates = np.linalg.solve(self._whitening, self.by_weak_cell(SHIFT, SHRINK))
         ln_by_row = templates * whitened[:, None] - 0.5 * templates**2
         # without the row that supports a hypothesis most, because a single wrong row must not raise the alarm
         ln_likelihood = ln_by_row.sum(axis=0) - np.maximum(ln_by_row.max(axis=0), 0.0)

@@ -368,11 +368,11 @@ async def test_the_final_save_waits_for_a_running_save(tmp_path: Path) -> None:
     saving, began, release, saved_samples = threading.Lock(), threading.Event(), threading.Event(), []
 
     class SlowDisk(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters, curves: Any = None) -> None:
+        def save(self, state: Any, counters: RunCounters, curves: Any = None, cells: Any = None) -> None:
             assert saving.acquire(blocking=False), "two saves at once"
             began.set()
             assert release.wait(LONG_S)
-            super().save(state, counters, curves)
+            super().save(state, counters, curves, cells)
             saved_samples.append(int(state["observer"]["samples"][0]))
             saving.release()
 
@@ -402,8 +402,8 @@ async def test_changes_of_the_soc_are_saved_before_a_long_checkpoint_interval_ha
     loop = asyncio.get_running_loop()
 
     class ReportingFile(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters, curves: Any = None) -> None:
-            super().save(state, counters, curves)
+        def save(self, state: Any, counters: RunCounters, curves: Any = None, cells: Any = None) -> None:
+            super().save(state, counters, curves, cells)
             loop.call_soon_threadsafe(saved.put_nowait, float(state["observer"]["soc"][0]))
 
     class ReportingWriter(checkpoint_writer.CheckpointWriter):
@@ -479,8 +479,8 @@ async def test_an_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch
     saved_samples = []
 
     class CountingFile(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters, curves: Any = None) -> None:
-            super().save(state, counters, curves)
+        def save(self, state: Any, counters: RunCounters, curves: Any = None, cells: Any = None) -> None:
+            super().save(state, counters, curves, cells)
             saved_samples.append(state["observer"]["samples"][0])
 
     async with run_with_frequent_saves(CountingFile(tmp_path, SETTINGS, CELL)) as (source, sink, _):

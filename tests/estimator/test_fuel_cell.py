@@ -145,7 +145,7 @@ def test_a_replay_prints_numbers_or_none(state_value: float, printed: float | No
     estimator = Estimator(PEM)
     estimator.run(simulate_model(np.ones(PARAMETERS), 2.0))
     estimator.state["a"][0, 1] = state_value
-    r_ohm = Summary().result(estimator, None, 1, 1.0).parameters["r_ohm"]
+    r_ohm = Summary().result(estimator, None, None, 1, 1.0).parameters["r_ohm"]
     assert (r_ohm.value, r_ohm.std) == (printed, printed)
 
 

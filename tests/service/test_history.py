@@ -98,9 +98,9 @@ async def test_charge_and_energy_are_published_only_once_saved_so_that_a_kill_do
     release = threading.Event()
 
     class SlowDisk(CheckpointFile):
-        def save(self, state: Any, ledger: RunCounters, curves: Any = None) -> None:
+        def save(self, state: Any, ledger: RunCounters, curves: Any = None, cells: Any = None) -> None:
             assert release.wait(LONG_S)
-            super().save(state, ledger, curves)
+            super().save(state, ledger, curves, cells)
 
     file = SlowDisk(tmp_path, SETTINGS, CELL)
     async with run_with_frequent_saves(file) as (source, sink, _):
