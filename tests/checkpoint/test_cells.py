@@ -1,0 +1,59 @@
+"""State of the single cells in a checkpoint, over a restart of the service."""
+
+from pathlib import Path
+
+import numpy as np
+import structlog
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.model.clock import Clock
+from bms_estimator.service.restored_pack import restore_pack
+from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.lifetime_totals import new_totals
+from tests.simulated_pack import SimulatedPack
+
+
+def saved_checkpoint(folder: Path, pack: SimulatedPack) -> CheckpointFile:
+    """Save a checkpoint of a pack after two hours; return its file for the next run."""
+    pack.run(2)
+    file = CheckpointFile(folder, Settings(), pack.model)
+    file.save(pack.estimator.record, RunCounters(0, new_totals(0.0)), cells=pack.cells.saved_state)
+    return CheckpointFile(folder, Settings(), pack.model)
+
+
+def restarted(file: CheckpointFile, pack: SimulatedPack) -> CellEstimator:
+    """Return the estimators of the cells of the next run."""
+    estimator = Estimator(pack.model)
+    cells = CellEstimator(estimator)
+    restore_pack(estimator, None, file, None, Clock(), cells)
+    return cells
+
+
+def test_deviations_of_cells_are_equal_after_a_restart(tmp_path: Path) -> None:
+    pack = SimulatedPack()
+    cells = restarted(saved_checkpoint(tmp_path, pack), pack)
+    assert cells.deviations
+    assert pack.cells.deviations
+    assert np.array_equal(cells.deviations.soc_deviation, pack.cells.deviations.soc_deviation)
+
+
+def test_an_invalid_state_of_the_cells_is_dropped_with_a_reason_and_the_pack_is_restored(tmp_path: Path) -> None:
+    pack = SimulatedPack()
+    pack.run(1)
+    pack.cells.cells["covariance"][2] = np.nan
+    file = saved_checkpoint(tmp_path, pack)
+    with structlog.testing.capture_logs() as lines:
+        cells = restarted(file, pack)
+    assert cells.deviations is None
+    assert [line["reason"] for line in lines if "single cells" in line["event"]] == ["a value is not finite"]
+    assert any(line.get("outcome", "").startswith("restored") for line in lines)
+
+
+def test_a_checkpoint_without_cell_voltages_starts_the_cells_anew(tmp_path: Path) -> None:
+    pack = SimulatedPack()
+    pack.run(1)
+    file = CheckpointFile(tmp_path, Settings(), pack.model)
+    file.save(pack.estimator.record, RunCounters(0, new_totals(0.0)))
+    assert restarted(CheckpointFile(tmp_path, Settings(), pack.model), pack).deviations is None
