@@ -16,8 +16,7 @@ from tests.simulated_pack import SimulatedPack
 
 
 def saved_checkpoint(folder: Path, pack: SimulatedPack) -> CheckpointFile:
-    """Save a checkpoint of a pack after two hours; return its file for the next run."""
-    pack.run(2)
+    """Save a checkpoint of a pack; return its file for the next run."""
     file = CheckpointFile(folder, Settings(), pack.model)
     file.save(pack.estimator.record, RunCounters(0, new_totals(0.0)), cells=pack.cells.saved_state)
     return CheckpointFile(folder, Settings(), pack.model)
@@ -33,6 +32,7 @@ def restarted(file: CheckpointFile, pack: SimulatedPack) -> CellEstimator:
 
 def test_deviations_of_cells_are_equal_after_a_restart(tmp_path: Path) -> None:
     pack = SimulatedPack()
+    pack.run(2)
     cells = restarted(saved_checkpoint(tmp_path, pack), pack)
     assert cells.deviations
     assert pack.cells.deviations

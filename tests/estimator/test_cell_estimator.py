@@ -83,6 +83,16 @@ def test_a_cell_without_a_reading_keeps_its_estimate() -> None:
     assert np.abs(pack.cells.deviations.soc_deviation - true).max() < 0.02
 
 
+def test_a_state_that_is_not_finite_starts_again() -> None:
+    pack = SimulatedPack()
+    pack.run(1)
+    pack.cells.cells["covariance"][2] = np.nan
+    pack.run(4)
+    assert pack.cells.deviations
+    true = pack.bank.soc - pack.bank.soc.mean()
+    assert np.abs(pack.cells.deviations.soc_deviation - true).max() < 0.02
+
+
 @pytest.mark.parametrize("cells", [2, 5])
 def test_another_number_of_cell_voltages_than_cells_in_series_gives_no_estimate(cells: int) -> None:
     pack = SimulatedPack()

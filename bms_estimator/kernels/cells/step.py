@@ -161,6 +161,8 @@ def update_cells(
             innovation_v = errors_v[i] - reference_v
             ignored_v = unanswered_v(cells[i], voltages_v[i], median_v)
             update_cell(cells[i], b, innovation_v, variance_v2, curve_v, current_a, ph, ignored_v)
+        if not math.isfinite(cells[i].mean.sum() + cells[i].covariance.sum()):
+            initialize_cell(cells[i])
         cells[i].mean[SOC] = min(max(cells[i].mean[SOC], MIN_CELL_SOC - soc), MAX_CELL_SOC - soc)
         cells[i].sum_v, cells[i].samples = 0.0, 0
     mark_sense_wires(cells)
