@@ -109,7 +109,7 @@ class CellEstimator:
             cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
             trace: Estimates of the accepted samples.
         """
-        if not self._enabled or cells_v.shape != (samples.size, self._series) or not trace.size:
+        if not cells_v.size or not self._enabled or cells_v.shape != (samples.size, self._series) or not trace.size:
             return
         if not self.cells.size:
             self._start(self._series)

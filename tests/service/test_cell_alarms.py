@@ -68,7 +68,7 @@ def test_a_healthy_pack_raises_no_alarm_of_its_cells(chemistry: str) -> None:
     assert pack.transitions("cell_short") == pack.transitions("cell_sensor_fault") == []
 
 
-def test_a_balancer_raises_no_alarm_of_a_short() -> None:
+def test_a_balancer_that_drains_the_highest_cell_raises_no_alarm_of_a_short() -> None:
     """A balancer drains the highest cell with C/200 while the pack is nearly full."""
     pack = SimulatedPack(BankCells.drawn(np.random.default_rng(5), CELLS, CAPACITY_AH, 0.9, soc_std=0.03))
     pack.run(3)
