@@ -19,7 +19,7 @@ from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.settings.alarm_limits import MIN_CELLS, balancing_voltage_v
 
 LEAK_STDS = 3.0
-"""Std by which the self-discharge of a cell must exceed that of the other cells to count as a short."""
+"""Minimum excess of a cell's self-discharge over that of the reference cell that counts as a short [std]."""
 
 CONSTANT_FRACTION = 0.5
 """Fraction of ``BIAS_V`` that is constant, such as the offset of a converter."""

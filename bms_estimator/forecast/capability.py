@@ -49,9 +49,10 @@ def cell_power_limits(cell: PackModel) -> PowerLimits:
 
 
 def power_limits(settings: Settings, cell: CellModel) -> PowerLimits:
-    """Return the limits of the pack's alarms, which are at most those of the cell file.
+    """Return the limits by the pack's alarms. A current limit is never above that of the cell file.
 
-    If an alarm of a current is switched off, the limit of the cell file applies. If that of the temperature is, there is no limit.
+    If the alarm on a current is switched off, the limit of the cell file applies. If the alarm on charging below freezing is
+    switched off, no temperature limits the charge.
 
     Args:
         settings: Settings of the pack.

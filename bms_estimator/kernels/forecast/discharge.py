@@ -10,28 +10,24 @@ file, so that they are increased towards SOC 0.
 import math
 
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
+from bms_estimator.kernels.forecast.block_table import PEAK_FRACTION
 from bms_estimator.kernels.forecast.constant_current import (
     branch_current,
     hypothesis_capacity,
     open_circuit_voltage,
     scaled_resistances,
 )
+from bms_estimator.kernels.forecast.draws import growth_fraction
+from bms_estimator.kernels.forecast.projected_pack import RESISTANCE_MEAN
 from bms_estimator.kernels.kalman_filter.records import SOC
 from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 MIN_LOAD_C = 0.05
 """Minimum mean current of the load, as a C-rate. It is used at rest and while charging."""
-PEAK_SHARE_R_1 = 0.35
-"""Fraction of a peak current that the RC pair R_1 (1 s) follows. Over its first second, the response to a
-current step has the mean 1/e."""
-RESISTANCE_FACTOR = 1.05
-"""Factor on all resistances. Its effect is in docs/theory/available-power.md, as is that of ``GROWTH``."""
 GROWTH = 0.5
-"""Additional increase of all resistances from ``GROWTH_SOC`` to SOC 0, as a fraction. The cell file has too small resistances
-there, because few calibration captures contain loads near empty."""
-GROWTH_SOC = 0.4
-"""SOC below which the resistances increase by ``GROWTH``."""
+"""Additional increase of all resistances from ``draws.GROWTH_SOC`` to SOC 0, as a fraction. The cell file has too small resistances
+there, because few calibration captures contain loads near empty. Its effect is in docs/theory/available-power.md."""
 SOC_STEP = 0.005
 """Step of the SOC towards empty. The crossing of the cut-off voltage is interpolated within a step."""
 
@@ -82,8 +78,8 @@ def peak_voltage(s: Record, p: Record, q: int, mean_a: float, peak_a: float, soc
     """Return the voltage at a peak of the load at ``soc``, after the mean current until there [V]."""
     elapsed_s = (s.mean[q, SOC] - soc) * hypothesis_capacity(s, p, q) / mean_a
     scaled_resistances(s, p, q, soc, ohm)
-    drop_v = ohm[0] * peak_a + PEAK_SHARE_R_1 * ohm[1] * (peak_a - mean_a)
+    drop_v = ohm[0] * peak_a + PEAK_FRACTION * ohm[1] * (peak_a - mean_a)
     for k in range(BRANCHES):
         drop_v += ohm[1 + k] * branch_current(s, q, k, mean_a, elapsed_s)
-    growth = GROWTH * (max(GROWTH_SOC - soc, 0.0) - max(GROWTH_SOC - s.mean[q, SOC], 0.0)) / GROWTH_SOC
-    return open_circuit_voltage(s, p, q, soc, elapsed_s) - (RESISTANCE_FACTOR + growth) * drop_v
+    growth = GROWTH * (growth_fraction(soc) - growth_fraction(s.mean[q, SOC]))
+    return open_circuit_voltage(s, p, q, soc, elapsed_s) - (RESISTANCE_MEAN + growth) * drop_v

@@ -1,7 +1,7 @@
 """Present state of the pack and its voltage as a function of SOC, from which each draw starts.
 
 ``m`` is a record of PROJECTED_PACK, ``s`` of EKF_STATE, ``p`` of EKF_SETTINGS. Voltages and resistances are of the whole pack.
-The parameters of the draws were chosen with discharges of real captures (docs/theory/collapse.md).
+The parameters of the draws were chosen with discharges of real captures (docs/theory/forecast.md).
 """
 
 import math
