@@ -1,7 +1,8 @@
 """Forecasts of the time to the cut-off on real captures, beside other methods.
 
 Each discharge is replayed through the estimator and the forecaster. Every minute before the cut-off the forecast is compared
-with the true time to the cut-off T, in the last two hours also with other methods. docs/theory/forecast.md tells what is measured.
+with the true time to the cut-off T, in the last two hours also with other methods. docs/theory/forecast-figures.md defines the
+figures.
 """
 
 import argparse
