@@ -12,9 +12,9 @@ from mkdocs.structure.files import File, Files
 from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
 from bms_estimator.cli.main import COMMANDS
 from bms_estimator.model.payloads import Alarm, Estimate, ForecastReport, Health, Info, ParameterReport, Payload
-from bms_estimator.reports.report_items import Table
-from bms_estimator.reports.report_items import name as item_name
-from bms_estimator.reports.thesis_report import build
+from bms_estimator.reports.thesis.report import build
+from bms_estimator.reports.thesis.report_items import Table
+from bms_estimator.reports.thesis.report_items import name as item_name
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.settings_template import settings_file
 

@@ -16,11 +16,11 @@ from bms_estimator.calibration.verdict import SocErrors, coverage, judge, voltag
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.plot.cell_curves import ELEMENTS, PAIRS
-from bms_estimator.reports import printed_values
 from bms_estimator.reports.formats import number
 from bms_estimator.reports.parameter_table import parameter_group
 from bms_estimator.reports.report_page import Group, Plot, ReportPage, Section
 from bms_estimator.reports.svg_plot import small_plot
+from bms_estimator.reports.thesis import printed_values
 
 
 @dataclass(frozen=True)

@@ -7,20 +7,20 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from bms_estimator.model.config_file import Fraction, Positive, Strict, read_toml
 from bms_estimator.settings.alarms import AlarmSettings
-from bms_estimator.settings.ble_source import BleSource
-from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.charge_limits import ChargeLimits
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings, PrometheusSettings
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.settings.linux_source import LinuxSource
-from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.settings.sampling import Sampling
 from bms_estimator.settings.sensor import ALLOWED_WITH_SOURCE, SensorSettings
+from bms_estimator.settings.sources.ble import BleSource
+from bms_estimator.settings.sources.can import CanSource
+from bms_estimator.settings.sources.linux import LinuxSource
+from bms_estimator.settings.sources.modbus import ModbusSource
+from bms_estimator.settings.sources.mqtt import MqttSource
 
 SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource | BleSource, Field(discriminator="kind")]
 

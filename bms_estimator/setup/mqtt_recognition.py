@@ -5,8 +5,8 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
-from bms_estimator.settings.mqtt_profiles import DISCHARGE, PROFILES, ProfileName
-from bms_estimator.settings.mqtt_source import MqttSource, ValueLocation
+from bms_estimator.settings.sources.mqtt import MqttSource, ValueLocation
+from bms_estimator.settings.sources.mqtt_profiles import DISCHARGE, PROFILES, ProfileName
 from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice, values_text
 from bms_estimator.sources.mqtt.payload_value import InvalidValueError, read_cells, read_value
 

@@ -13,9 +13,9 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
-from bms_estimator.settings.modbus_source import PROFILES as MODBUS_PROFILES
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.sensor import SensorSettings
+from bms_estimator.settings.sources.modbus import PROFILES as MODBUS_PROFILES
 from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice
 from bms_estimator.setup.measurement import measure
 from bms_estimator.setup.mqtt_recognition import PublisherRecognition

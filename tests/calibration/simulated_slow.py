@@ -4,7 +4,7 @@ import numpy as np
 
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.reports.printed_values import TABLE_1
+from bms_estimator.reports.thesis.printed_values import TABLE_1
 
 CAPACITY_AH = 3.0
 CURRENT_A = 0.05 * CAPACITY_AH

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.settings.mqtt_profiles import PROFILES
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.mqtt_profiles import PROFILES
 from bms_estimator.sources.factory import make_line_producer
 
 DOCS = Path(__file__).parents[2] / "docs" / "pack"

@@ -3,8 +3,8 @@
 import sys
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.settings.ble_source import BleSource
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.ble import BleSource
 from bms_estimator.sources.line_source import LineProducer
 
 MIN_PYTHON_HEX = 0x030C0000

@@ -36,8 +36,8 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.settings.base_source import BaseSource
 from bms_estimator.settings.sensor import SensorSettings
+from bms_estimator.settings.sources.source import BaseSource
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES, split_records
 from bms_estimator.sources.captures.tables.text_file import GZIP_MAGIC
 

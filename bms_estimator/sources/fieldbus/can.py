@@ -12,8 +12,8 @@ import can
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
-from bms_estimator.settings.can_source import CanSource
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.can import CanSource
 from bms_estimator.sources.fieldbus.can_signals import CanDecoder
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 

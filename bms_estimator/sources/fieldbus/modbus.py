@@ -11,8 +11,8 @@ from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
-from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.modbus import ModbusSource
 from bms_estimator.sources.fieldbus.modbus_registers import (
     Request,
     Table,

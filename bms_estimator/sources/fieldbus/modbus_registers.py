@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.settings.modbus_source import MAX_WORDS, ModbusSource, Register
+from bms_estimator.settings.sources.modbus import MAX_WORDS, ModbusSource, Register
 
 GAP_WORDS = 8
 """Maximum gap of unused registers in one request. One request reads the values on both sides at the same moment.

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
-from bms_estimator.settings.linux_source import LinuxSource
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.linux import LinuxSource
 from bms_estimator.sources.line_source import SILENT_PERIODS, LineProducer, SourceUnavailableError
 from bms_estimator.sources.linux.sysfs import SYS, Channel, NotANumberError, find_channel, find_chip, read_number
 

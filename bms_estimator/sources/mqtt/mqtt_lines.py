@@ -17,8 +17,8 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.broker import BrokerSettings
-from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.mqtt import MqttSource
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from bms_estimator.model.decimal_text import number
-from bms_estimator.settings.mqtt_source import ValueLocation
+from bms_estimator.settings.sources.mqtt import ValueLocation
 
 MAX_SHOWN_CHARACTERS = 40
 """Maximum number of characters of an invalid number that are shown."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from bms_estimator.protocols.base.reading import sample_json_line
-from bms_estimator.settings.mqtt_source import MqttSource, ValueLocation
+from bms_estimator.settings.sources.mqtt import MqttSource, ValueLocation
 from bms_estimator.sources.mqtt.payload_value import (
     MAX_CELL_NUMBER,
     InvalidValueError,

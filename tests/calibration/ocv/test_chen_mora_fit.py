@@ -9,7 +9,7 @@ from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
 from bms_estimator.calibration.ocv.table_fit import fit_table
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.printed_values import TABLE_1, TABLE_8
+from bms_estimator.reports.thesis.printed_values import TABLE_1, TABLE_8
 from tests.calibration.simulated_load import TRUTH
 from tests.calibration.simulated_relaxation import relaxation
 

@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
 from bms_estimator.calibration.ocv.points import Points, joined, max_v, rms_v
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
-from bms_estimator.reports.printed_values import TABLE_1
+from bms_estimator.reports.thesis.printed_values import TABLE_1
 
 GRID = np.linspace(0.0, 1.0, 401)
 

@@ -14,7 +14,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import delta, ocv, r_s
 from bms_estimator.model.cell import Bounds, load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.simulation import discharge, with_bounds
+from bms_estimator.reports.thesis.simulation import discharge, with_bounds
 from bms_estimator.settings.observer import SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
 
 CELL = load_cell("chen_mora")

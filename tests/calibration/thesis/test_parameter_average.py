@@ -12,7 +12,7 @@ from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.simulation import discharge
+from bms_estimator.reports.thesis.simulation import discharge
 from bms_estimator.settings.observer import ObserverSettings
 
 CELL = load_cell("chen_mora")

@@ -14,7 +14,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.simulation import discharge
+from bms_estimator.reports.thesis.simulation import discharge
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps, wrong_start
 
 CELL = load_cell("chen_mora")

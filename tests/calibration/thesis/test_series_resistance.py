@@ -13,7 +13,7 @@ from bms_estimator.calibration.thesis.series_resistance import (
 from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.simulation import discharge
+from bms_estimator.reports.thesis.simulation import discharge
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps
 
 CELL = load_cell("chen_mora")

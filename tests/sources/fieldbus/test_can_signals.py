@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.settings.can_source import PROFILES, CanSource, CellSignals
+from bms_estimator.settings.sources.can import PROFILES, CanSource, CellSignals
 from bms_estimator.sources.fieldbus.can_signals import MAX_AGE_S, CanDecoder, FrameId
 
 PYLONTECH_DATA = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])

@@ -11,8 +11,8 @@ from pymodbus import FramerType
 from pymodbus.constants import ExcCodes
 
 from bms_estimator.protocols.base.reading import CONNECTED
-from bms_estimator.settings.modbus_source import ModbusSource
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.modbus import ModbusSource
 from bms_estimator.sources.factory import open_line_source
 from bms_estimator.sources.fieldbus.modbus import ModbusProducer
 from bms_estimator.sources.line_source import SourceUnavailableError

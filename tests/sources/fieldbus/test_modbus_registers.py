@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from bms_estimator.settings.modbus_source import MAX_WORDS, PROFILES, CellRegisters, ModbusSource, Register
+from bms_estimator.settings.sources.modbus import MAX_WORDS, PROFILES, CellRegisters, ModbusSource, Register
 from bms_estimator.sources.fieldbus.modbus_registers import (
     GAP_WORDS,
     RegisterQuantity,

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from bms_estimator.protocols.base.reading import CONNECTED, Reading, read_line
-from bms_estimator.settings.linux_source import LinuxSource
+from bms_estimator.settings.sources.linux import LinuxSource
 from bms_estimator.sources.line_source import SourceUnavailableError
 from bms_estimator.sources.linux.linux_sensor import LinuxSensor
 from tests.patience import LONG_S

@@ -1,6 +1,6 @@
 """Samples from the MQTT messages of other projects, reasons for missing samples, and detection of a second publisher.
 
-The payloads have the formats of the projects in ``settings/mqtt_profiles.py``, with invented values.
+The payloads have the formats of the projects in ``settings/sources/mqtt_profiles.py``, with invented values.
 """
 
 import json
@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SampleStatus
 from bms_estimator.protocols.devices.text import TextProtocol
-from bms_estimator.settings.mqtt_source import MqttSource
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.mqtt import MqttSource
 from bms_estimator.sources.mqtt.payload_value import MAX_CELL_NUMBER, InvalidValueError, read_cells, read_value
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
 

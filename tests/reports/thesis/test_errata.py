@@ -1,6 +1,6 @@
 """Computed errata of the thesis, compared with results by hand, by simulation, or by an identity.
 
-Numbers in parentheses are equations of the thesis. ``bms_estimator.reports.errata`` lists the errata by number. x2 and
+Numbers in parentheses are equations of the thesis. ``bms_estimator.reports.thesis.errata`` lists the errata by number. x2 and
 x3 are the voltages of both RC pairs, y is the terminal voltage, e the voltage error of the observer, u = -N e its
 input, N the Nussbaum gain, and ^ marks an estimate.
 """
@@ -26,11 +26,11 @@ from bms_estimator.kernels.cell_model.chen_mora import (
 )
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports import printed_pack, printed_values
-from bms_estimator.reports.errata import errata, ocv_error_ohm
-from bms_estimator.reports.quasi_steady import quasi_steady
-from bms_estimator.reports.simulated_experiment import pack, resistance_ohm
-from bms_estimator.reports.simulation import Simulation, discharge, observer_settings, table_5_cell
+from bms_estimator.reports.thesis import printed_pack, printed_values
+from bms_estimator.reports.thesis.errata import errata, ocv_error_ohm
+from bms_estimator.reports.thesis.quasi_steady import quasi_steady
+from bms_estimator.reports.thesis.simulated_experiment import pack, resistance_ohm
+from bms_estimator.reports.thesis.simulation import Simulation, discharge, observer_settings, table_5_cell
 
 CHEN_MORA = load_cell("chen_mora")
 CAPACITY_AS = CHEN_MORA.cell.capacity_ah * 3600.0

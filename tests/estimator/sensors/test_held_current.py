@@ -6,8 +6,8 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.settings.sampling import Sampling
+from tests.estimator.sensors.test_held_voltage import drive
 from tests.estimator.simulated_cell import TRUTH, measured
-from tests.estimator.test_held_voltage import drive
 
 PERIOD = 10
 """Seconds from one current to the next, and from one voltage to the next."""

@@ -11,12 +11,12 @@ import numpy as np
 from bms_estimator.kernels.cell_model.chen_mora import delta, emf, r_s
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports import printed_values
-from bms_estimator.reports.report_items import Figure, Reproduction
-from bms_estimator.reports.simulation import element, mean_error_percent
-from bms_estimator.reports.simulation_figures import NO_VALUES, condition_plot, elements_plot, products_plot
 from bms_estimator.reports.svg_plot import plot
-from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
+from bms_estimator.reports.thesis import printed_values
+from bms_estimator.reports.thesis.report_items import Figure, Reproduction
+from bms_estimator.reports.thesis.simulation import element, mean_error_percent
+from bms_estimator.reports.thesis.simulation_figures import NO_VALUES, condition_plot, elements_plot, products_plot
+from bms_estimator.reports.thesis.theorem_4_1_2 import PRODUCTS
 
 A = printed_values.tables_8_to_10()
 """Parameters a1..a21 of Tables 8 to 10 at index 1..21."""

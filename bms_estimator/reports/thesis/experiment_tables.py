@@ -10,11 +10,11 @@ import numpy as np
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE
 from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora
 from bms_estimator.calibration.ocv.points import max_v, pooled, rms_v
-from bms_estimator.reports import printed_values
-from bms_estimator.reports.experiment import Experiment
 from bms_estimator.reports.formats import number
-from bms_estimator.reports.procedure import KNEE_SOC, STATIC_SOC
-from bms_estimator.reports.report_items import Reproduction, Table
+from bms_estimator.reports.thesis import printed_values
+from bms_estimator.reports.thesis.experiment import Experiment
+from bms_estimator.reports.thesis.procedure import KNEE_SOC, STATIC_SOC
+from bms_estimator.reports.thesis.report_items import Reproduction, Table
 
 
 def table_8(experiment: Experiment) -> Table:

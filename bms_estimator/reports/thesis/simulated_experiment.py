@@ -17,8 +17,8 @@ import numpy as np
 from bms_estimator.kernels.cell_model.chen_mora import cell_step, terminal_voltage
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.reports import printed_values
-from bms_estimator.reports.procedure import Capture, Kind
+from bms_estimator.reports.thesis import printed_values
+from bms_estimator.reports.thesis.procedure import Capture, Kind
 
 VOLTAGE_RANGE_V = 30.0
 """Range of the divider [V]. The thesis's 0-25 V sensor would saturate: the curve of Table 8 begins at 25.40 V."""

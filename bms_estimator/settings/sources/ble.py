@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from bms_estimator.settings.base_source import BaseSource
+from bms_estimator.settings.sources.source import BaseSource
 
 VOLTAGE_RESOLUTION_V = 0.01
 """Voltage resolution of JBD [V]; that of JK is finer."""

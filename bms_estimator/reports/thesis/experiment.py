@@ -6,10 +6,10 @@ from functools import cached_property
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.reports.procedure import Capture, Procedure, kind_of
-from bms_estimator.reports.report_items import Reproduction
-from bms_estimator.reports.simulated_experiment import SensorChain, captures, experiments, pack
-from bms_estimator.reports.thesis_claims import claim
+from bms_estimator.reports.thesis.claims import claim
+from bms_estimator.reports.thesis.procedure import Capture, Procedure, kind_of
+from bms_estimator.reports.thesis.report_items import Reproduction
+from bms_estimator.reports.thesis.simulated_experiment import SensorChain, captures, experiments, pack
 
 FINE = SensorChain(bits=16)
 """Sensor chain of the dSpace board of the thesis, with 16 bits."""
@@ -66,7 +66,7 @@ class Experiment:
         return Procedure(pack(), captures(self._true_captures, COARSE), COARSE.voltage_step_v)
 
     def verdict_on_claims(self, *keys: str) -> tuple[Reproduction, str]:
-        """Return the common verdict on the claims ``keys`` of ``thesis_claims.CLAIMS``, and its reason.
+        """Return the common verdict on the claims ``keys`` of ``claims.CLAIMS``, and its reason.
 
         No claim is tested on the simulated pack, because the pack has exactly the form of the model.
         """

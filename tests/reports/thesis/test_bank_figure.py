@@ -1,7 +1,7 @@
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports.bank_figure import WEAK_SOC, BankExperiment
+from bms_estimator.reports.thesis.bank_figure import WEAK_SOC, BankExperiment
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Positive, Strict
-from bms_estimator.settings.base_source import BaseSource, Name
 from bms_estimator.settings.broker import BrokerSettings, BrokerUrls
-from bms_estimator.settings.mqtt_profiles import PROFILES, ProfileName
+from bms_estimator.settings.sources.mqtt_profiles import PROFILES, ProfileName
+from bms_estimator.settings.sources.source import BaseSource, Name
 
 Unit = Literal["V", "mV", "A", "mA", "C", "F", "K", "s", "ms", "iso"]
 ALLOWED_UNITS: Mapping[str, tuple[Unit, ...]] = {

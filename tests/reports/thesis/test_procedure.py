@@ -13,11 +13,11 @@ import pytest
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.experiment import Experiment, Recorded
-from bms_estimator.reports.experiment_figures import FIGURES
-from bms_estimator.reports.procedure import Capture, Kind, Procedure, kind_of, printed_bounds
-from bms_estimator.reports.report_items import Reproduction
-from bms_estimator.reports.thesis_claims import CLAIMS, Claim, Result, claim
+from bms_estimator.reports.thesis.claims import CLAIMS, Claim, Result, claim
+from bms_estimator.reports.thesis.experiment import Experiment, Recorded
+from bms_estimator.reports.thesis.experiment_figures import FIGURES
+from bms_estimator.reports.thesis.procedure import Capture, Kind, Procedure, kind_of, printed_bounds
+from bms_estimator.reports.thesis.report_items import Reproduction
 from bms_estimator.sources.captures.replay import load_capture
 from tests.benchmarks.thesis import chapter5
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps
@@ -25,7 +25,7 @@ from tests.calibration.simulated_relaxation import relaxation
 
 CAPACITY_AH = TRUTH.cell.capacity_ah
 KIND_BY_NAME = {"relaxation": Kind.RELAXATION, "slow": Kind.CONSTANT, "constant": Kind.CONSTANT, "steps": Kind.STEPS}
-RESULTS_DOCUMENT = Path(__file__).parents[1] / "benchmarks" / "thesis" / "chapter5_results.md"
+RESULTS_DOCUMENT = Path(__file__).parents[2] / "benchmarks" / "thesis" / "chapter5_results.md"
 
 
 @pytest.fixture(scope="module")

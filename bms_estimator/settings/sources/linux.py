@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from bms_estimator.model.config_file import Positive
-from bms_estimator.settings.base_source import BaseSource, Name
+from bms_estimator.settings.sources.source import BaseSource, Name
 
 RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
 """Voltage resolution at the pins by chip [V], from the data sheet of the INA219; for the ADS1015, at 4.096 V full scale."""

@@ -9,10 +9,10 @@ from bms_estimator.estimator.stability_conditions import lemma_conditions
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports import printed_values
 from bms_estimator.reports.formats import number, percent
-from bms_estimator.reports.report_items import Reproduction, Table
-from bms_estimator.reports.simulation import (
+from bms_estimator.reports.thesis import printed_values
+from bms_estimator.reports.thesis.report_items import Reproduction, Table
+from bms_estimator.reports.thesis.simulation import (
     CURRENT_A,
     FINAL_SOC,
     HIGH_CURRENT_A,
@@ -23,7 +23,7 @@ from bms_estimator.reports.simulation import (
     Simulation,
     mean_error_percent,
 )
-from bms_estimator.reports.theorem_4_1_2 import measure
+from bms_estimator.reports.thesis.theorem_4_1_2 import measure
 
 
 def table_1(_: Simulation) -> Table:

@@ -12,10 +12,10 @@ import numpy as np
 
 from bms_estimator.calibration.elements.initial_elements import initial_elements
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports import printed_values
-from bms_estimator.reports.procedure import Kind, Procedure
-from bms_estimator.reports.report_items import Reproduction
-from bms_estimator.reports.simulation import element
+from bms_estimator.reports.thesis import printed_values
+from bms_estimator.reports.thesis.procedure import Kind, Procedure
+from bms_estimator.reports.thesis.report_items import Reproduction
+from bms_estimator.reports.thesis.simulation import element
 
 PRODUCTS_PERCENT = 20.0
 """Maximum error of the products R_ts C_ts and R_tl C_tl [%], about ten times the 1.9 % of Table 7. Theorem 4.1.2 claims that

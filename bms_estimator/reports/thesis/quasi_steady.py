@@ -14,7 +14,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, cell_step, r_s, r_tl, r_ts, terminal_voltage
 from bms_estimator.model.cell import Bounds, CellModel
-from bms_estimator.reports.simulation import IDEAL_RESOLUTION_V, observer_settings, to_samples, with_bounds
+from bms_estimator.reports.thesis.simulation import IDEAL_RESOLUTION_V, observer_settings, to_samples, with_bounds
 
 STEP_S = 0.1
 """Simulation step [s]."""

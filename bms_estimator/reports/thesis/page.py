@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bms_estimator.reports.html import render
-from bms_estimator.reports.report_items import Figure, Item, Reproduction, Table, label, name
-from bms_estimator.reports.thesis_report import Report
+from bms_estimator.reports.thesis.report import Report
+from bms_estimator.reports.thesis.report_items import Figure, Item, Reproduction, Table, label, name
 
 CSS_CLASSES = {
     Reproduction.FITTED: "fitted",

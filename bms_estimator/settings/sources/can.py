@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.base_source import BaseSource, merge_profile
+from bms_estimator.settings.sources.source import BaseSource, merge_profile
 
 PROFILES: dict[str, dict[str, object]] = {
     "pylontech-can": {

@@ -12,13 +12,18 @@ import numpy as np
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
 from bms_estimator.plot.style import COLORS, FAINT
 from bms_estimator.plot.thinning import thin
-from bms_estimator.reports import printed_values
-from bms_estimator.reports.experiment import Experiment
-from bms_estimator.reports.procedure import Kind, Procedure
-from bms_estimator.reports.report_items import Figure, Reproduction
-from bms_estimator.reports.simulation import SOC_GRID
-from bms_estimator.reports.simulation_figures import crossing_plot, dynamic_static_plot, elements_plot, products_plot
 from bms_estimator.reports.svg_plot import plot
+from bms_estimator.reports.thesis import printed_values
+from bms_estimator.reports.thesis.experiment import Experiment
+from bms_estimator.reports.thesis.procedure import Kind, Procedure
+from bms_estimator.reports.thesis.report_items import Figure, Reproduction
+from bms_estimator.reports.thesis.simulation import SOC_GRID
+from bms_estimator.reports.thesis.simulation_figures import (
+    crossing_plot,
+    dynamic_static_plot,
+    elements_plot,
+    products_plot,
+)
 
 MAX_LOADS = 4
 """Maximum number of loads in a figure, as in Fig. 32."""

@@ -2,7 +2,7 @@
 
 The limit of a parameter is the mean of its upper and lower bound with the weights x and y (Lemma 4.1.3). Its estimate
 is the mean (3.19) over the time in which it moves from the initial value to the limit. delta1 (2.11) and delta2 (2.12)
-are the SOCs at which C_ts and C_tl are zero. Errata are those of ``bms_estimator.reports.errata``.
+are the SOCs at which C_ts and C_tl are zero. Errata are those of ``bms_estimator.reports.thesis.errata``.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ import pytest
 
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports import printed_values
+from bms_estimator.reports.thesis import printed_values
 
 LIMITS_4 = {1: 0.2995, 3: 0.04485, 6: 0.04990, 13: 0.1495, 15: 0.06970}
 """Limits of Table 4 by hand, by index of the parameter: (100 upper + lower) / 101."""

@@ -15,9 +15,10 @@ from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_le
 from bms_estimator.model.arrays import Floats
 from bms_estimator.plot.style import COLORS, FAINT
 from bms_estimator.plot.thinning import thin
-from bms_estimator.reports.bank_figure import LOAD_C, WEAK_SOC, BankExperiment
-from bms_estimator.reports.report_items import Figure, Reproduction
-from bms_estimator.reports.simulation import (
+from bms_estimator.reports.svg_plot import plot
+from bms_estimator.reports.thesis.bank_figure import LOAD_C, WEAK_SOC, BankExperiment
+from bms_estimator.reports.thesis.report_items import Figure, Reproduction
+from bms_estimator.reports.thesis.simulation import (
     FINAL_SOC,
     SOC_GRID,
     STATIC_SOC,
@@ -25,8 +26,7 @@ from bms_estimator.reports.simulation import (
     element,
     mean_error_percent,
 )
-from bms_estimator.reports.svg_plot import plot
-from bms_estimator.reports.theorem_4_1_2 import PRODUCTS
+from bms_estimator.reports.thesis.theorem_4_1_2 import PRODUCTS
 
 NO_VALUES = "The thesis prints no value of the figure that could be compared."
 """Reason of a figure without printed values."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.base_source import BaseSource, merge_profile
+from bms_estimator.settings.sources.source import BaseSource, merge_profile
 
 MAX_WORDS = 125
 """Maximum number of registers, which are 16-bit words, in a request (Modbus application protocol V1.1b3, section 6.3)."""

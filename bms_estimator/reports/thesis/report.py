@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports import (
+from bms_estimator.reports.thesis import (
     errata,
     experiment_figures,
     experiment_tables,
@@ -12,9 +12,9 @@ from bms_estimator.reports import (
     simulation_figures,
     simulation_tables,
 )
-from bms_estimator.reports.experiment import Experiment, Recorded
-from bms_estimator.reports.report_items import Figure, Item, Reproduction
-from bms_estimator.reports.simulation import Simulation
+from bms_estimator.reports.thesis.experiment import Experiment, Recorded
+from bms_estimator.reports.thesis.report_items import Figure, Item, Reproduction
+from bms_estimator.reports.thesis.simulation import Simulation
 
 DIAGRAMS = {
     "1": "Chen and Mora's battery model",

@@ -14,7 +14,7 @@ from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Bounds, CellModel
-from bms_estimator.reports.simulation import (
+from bms_estimator.reports.thesis.simulation import (
     IDEAL_RESOLUTION_V,
     discharge,
     mean_error_percent,

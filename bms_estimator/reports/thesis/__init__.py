@@ -1,0 +1,1 @@
+"""Report that reproduces the tables and figures of the thesis."""

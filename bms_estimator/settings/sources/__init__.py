@@ -1,0 +1,1 @@
+"""Table ``[source]`` of the settings file, one file for each kind of source."""
