@@ -10,7 +10,7 @@ from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sampling import BOARD

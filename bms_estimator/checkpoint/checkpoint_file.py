@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX
 from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity, without_observer
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.payloads import Totals
+from bms_estimator.model.payloads.totals import Totals
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
 from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private

@@ -8,12 +8,12 @@ import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from bms_estimator.demo.broker import LOOPBACK, DemoBroker, choose_port
 from bms_estimator.demo.true_soc import TrueSoc
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.payloads import Estimate, Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.service.pack_service import run_pack_service
@@ -26,6 +26,9 @@ from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sinks.terminal.sink import TerminalSink
 from bms_estimator.sinks.terminal.view_state import BAND_STDS
+
+if TYPE_CHECKING:
+    from bms_estimator.model.payloads.estimate import Estimate
 
 CELL = "chen_mora"
 """Cell file of the simulated pack and of the estimator."""

@@ -20,7 +20,7 @@ from bms_estimator.edge.block_store import BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES
 from bms_estimator.edge.sample_clock import SampleClock
 from bms_estimator.model.clock import Clock, since_boot
-from bms_estimator.model.payloads import EdgeHealth
+from bms_estimator.model.payloads.health import EdgeHealth
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.topic_cache import parse_payload
 from bms_estimator.page.history_query import HistoryQuery

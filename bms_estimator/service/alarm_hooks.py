@@ -11,7 +11,8 @@ from typing import Literal, NamedTuple, Self
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Alarm, HookHealth
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.process.backoff import Backoff
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service.hook_process import StartError, program_environment, run_program

@@ -12,7 +12,7 @@ from bms_estimator.forecast.forecast import ForecastRows
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads import HookHealth
+from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.settings.alarm_limits import min_charge_current_a, monitored_alarms, silent_limit_s
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings

@@ -18,7 +18,7 @@ from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.forecaster import Runner
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.payloads import RecordingHealth
+from bms_estimator.model.payloads.health import RecordingHealth
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import SystemdNotifier

@@ -12,19 +12,19 @@ from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.payloads import (
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.forecast import ForecastReport
+from bms_estimator.model.payloads.health import (
     FRESH_PERIODS,
     EdgeHealth,
-    Estimate,
-    ForecastReport,
     Health,
     HookHealth,
-    Info,
     LoopHealth,
-    PackModelHealth,
     RecordingHealth,
-    Snapshot,
 )
+from bms_estimator.model.payloads.info import Info
+from bms_estimator.model.payloads.pack_model import PackModelHealth
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.latency import Latency

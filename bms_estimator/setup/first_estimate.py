@@ -6,7 +6,8 @@ from typing import Self
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.payloads import Estimate, Snapshot
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.setup.measurement import first_sample_timeout_s, open_pack_source

@@ -2,7 +2,7 @@
 
 from typing import Protocol, Self
 
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 
 
 class Sink(Protocol):

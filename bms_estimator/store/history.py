@@ -12,7 +12,8 @@ from collections import deque
 from typing import Self, TypeVar
 
 from bms_estimator.model.events import Event, events
-from bms_estimator.model.payloads import Estimate, Snapshot
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, measured_time, minute_start
 

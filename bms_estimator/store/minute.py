@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import NamedTuple
 
-from bms_estimator.model.payloads import Estimate
+from bms_estimator.model.payloads.estimate import Estimate
 
 MINUTE_S = 60
 """Length of a minute [s]."""

@@ -16,7 +16,7 @@ from bms_estimator.forecast.forecast import ForecastRows, unknown_values
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads import Alarm
+from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarm_limits import AlarmDefinition

@@ -6,7 +6,7 @@ from typing import Any
 from bms_estimator.forecast.forecast import FORECAST, Forecast, unknown_values
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads import ForecastReport
+from bms_estimator.model.payloads.forecast import ForecastReport
 from bms_estimator.telemetry.publish_window import WindowSummary
 
 NAMES = FORECAST.names or ()

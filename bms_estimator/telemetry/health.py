@@ -12,16 +12,16 @@ from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads import (
+from bms_estimator.model.payloads.health import (
     AnchorReport,
     EdgeHealth,
     Health,
     HookHealth,
     LoopHealth,
-    PackModelHealth,
     RecordingHealth,
-    Totals,
 )
+from bms_estimator.model.payloads.pack_model import PackModelHealth
+from bms_estimator.model.payloads.totals import Totals
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 

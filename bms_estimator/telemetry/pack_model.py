@@ -6,7 +6,7 @@ import numpy as np
 
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads import FitReport, PackModelHealth
+from bms_estimator.model.payloads.pack_model import FitReport, PackModelHealth
 from bms_estimator.pack_model.history import DAY_S
 from bms_estimator.pack_model.learning import SlowFit
 

@@ -25,7 +25,7 @@ from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.model.payloads import OcvCurve, Parameter, ParameterReport
+from bms_estimator.model.payloads.parameters import OcvCurve, Parameter, ParameterReport
 from bms_estimator.telemetry.fuel_cell_parameters import VALID_STD, fuel_cell_parameters
 from bms_estimator.telemetry.ocv_formula import fit_ocv_formula
 from bms_estimator.telemetry.series_resistance import series_resistance_parameters

@@ -2,7 +2,7 @@
 
 from collections import deque
 
-from bms_estimator.model.payloads import Estimate
+from bms_estimator.model.payloads.estimate import Estimate
 
 REST_S = 30.0
 """Time for which current and voltage must have been constant [s]."""

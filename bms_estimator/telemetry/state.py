@@ -13,7 +13,9 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.payloads import PAYLOAD_VERSION, Estimate, Info
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.info import Info
+from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import forecast_fields

@@ -24,7 +24,7 @@ from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.kernels.kalman_filter.records import NODE, OFFSET
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.payloads import Health
+from bms_estimator.model.payloads.health import Health
 from bms_estimator.service import checkpoint_writer, live_loop
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings

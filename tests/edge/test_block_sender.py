@@ -15,7 +15,7 @@ from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import EdgeHealth
+from bms_estimator.model.payloads.health import EdgeHealth
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.edge import EdgeSettings
 from tests.fleet.nats_cluster import NatsCluster, running

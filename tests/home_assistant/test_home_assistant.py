@@ -12,7 +12,7 @@ from typing import Any
 import aiomqtt
 import pytest
 
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery

@@ -5,7 +5,8 @@ from typing import Any
 
 from bms_estimator.model.events import events
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads import AnchorReport, Snapshot
+from bms_estimator.model.payloads.health import AnchorReport
+from bms_estimator.model.payloads.snapshot import Snapshot
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 AT_41_C = f"no data at 41 C, the cell file knows 25 C: {InputFault.TEMPERATURE.text}"

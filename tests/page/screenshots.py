@@ -18,7 +18,7 @@ from unittest.mock import patch
 from playwright.async_api import Browser
 
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.setup.page.setup_server import SetupServer
 from bms_estimator.simulation.simulated_bms import SimulatedBms

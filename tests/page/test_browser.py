@@ -17,7 +17,7 @@ import pytest
 import pytest_asyncio
 from playwright.async_api import Browser
 
-from bms_estimator.model.payloads import Alarm
+from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.mqtt.topic_cache import MAX_DEVICES
 from bms_estimator.page.broker_page import dashboard
 from bms_estimator.settings.mqtt import MqttSettings

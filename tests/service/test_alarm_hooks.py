@@ -14,7 +14,8 @@ from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Alarm, HookHealth
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import alarm_hooks
 from bms_estimator.service.alarm_hooks import AlarmHooks, hook_warnings

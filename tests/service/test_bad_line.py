@@ -12,7 +12,8 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.payloads import Health, Snapshot
+from bms_estimator.model.payloads.health import Health
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.protocols.firmware.messages import MODULUS, BoardStatus, Hello, ResetCause, SampleMessage
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings

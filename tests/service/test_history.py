@@ -14,7 +14,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_LATER_FILES, CheckpointFile, RunCounters
 from bms_estimator.estimator.estimator import new_estimator
-from bms_estimator.model.payloads import Totals
+from bms_estimator.model.payloads.totals import Totals
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.service import checkpoint_writer
 from bms_estimator.service.live_loop import run_estimation_loop

@@ -18,7 +18,7 @@ from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Estimate
+from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model.learning import SlowFit

@@ -19,7 +19,8 @@ from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity, relative_series_resistance
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.events import events
-from bms_estimator.model.payloads import PackModelHealth, Snapshot
+from bms_estimator.model.payloads.pack_model import PackModelHealth
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model import fit as fit_module

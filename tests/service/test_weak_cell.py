@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.payloads import Estimate
+from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.sample import NO_CELLS
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.learning import SlowFit

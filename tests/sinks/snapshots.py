@@ -7,7 +7,10 @@ from bms_estimator.forecast.forecast import Forecast, ForecastCurve, unknown_val
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
-from bms_estimator.model.payloads import Alarm, CellReport, CellsReport, LoopHealth, Snapshot
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.cells import CellReport, CellsReport
+from bms_estimator.model.payloads.health import LoopHealth
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.pack import Settings

@@ -11,7 +11,7 @@ import pytest
 
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.store import database as database_module
 from bms_estimator.store import history as history_module
 from bms_estimator.store.database import Database, StoreError

@@ -12,7 +12,7 @@ import numpy as np
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings

@@ -5,7 +5,8 @@ import pytest
 
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads import Estimate, ForecastReport
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.forecast import ForecastReport
 from bms_estimator.telemetry.cutoff_text import cutoff_text
 from bms_estimator.telemetry.forecast import NAMES, forecast_fields, make_forecast_payload, no_forecast
 from bms_estimator.telemetry.publish_window import Window, WindowSummary

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 from pydantic_core import from_json
 
-from bms_estimator.model.payloads import Estimate, Snapshot
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.protocols.firmware.messages import DELIMITER, PROTOCOL_VERSION, MessageType, ProtocolError, unseal
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from tests.world.broker import Connection, Packet

@@ -17,7 +17,7 @@ from typing import Any, Self
 import structlog
 
 from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointContent, CheckpointFile
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.service import pack_service as service
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings

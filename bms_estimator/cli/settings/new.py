@@ -20,7 +20,7 @@ from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, com
 from bms_estimator.cli.settings.prompts import Prompts
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Estimate
+from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack_file import require_new

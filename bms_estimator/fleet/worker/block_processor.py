@@ -17,7 +17,7 @@ from bms_estimator.fleet.worker import hour_summary
 from bms_estimator.fleet.worker.density import MAX_TIMESTAMP_S
 from bms_estimator.fleet.worker.pack_state import CONFIG_DIGEST, LAST_STORE_NS, PACK_STATE, STATE_DIGEST, Fields
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads import Payload
+from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import no_forecast

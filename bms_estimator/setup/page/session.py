@@ -7,7 +7,7 @@ from enum import Enum
 from pathlib import Path
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Estimate
+from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack_file import require_new
 from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number

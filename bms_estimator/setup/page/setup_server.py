@@ -10,7 +10,7 @@ from pathlib import Path
 from aiohttp import web
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Estimate
+from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.page.page_server import FILES as PAGE_FILES
 from bms_estimator.page.web_server import File, WebServer

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Self
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.process.backoff import FIRST_DELAY_S, Backoff
 from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.process.systemd import credential

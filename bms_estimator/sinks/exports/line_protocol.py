@@ -3,7 +3,9 @@
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 
-from bms_estimator.model.payloads import Alarm, Estimate, Snapshot
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.snapshot import Snapshot
 
 STATE = "bms_state"
 """Name of the measurement of states. The tag ``device`` is the pack."""

@@ -11,7 +11,7 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.process.listener import CONNECTIONS, Listener
 from bms_estimator.settings.exports import PrometheusSettings
 from bms_estimator.sinks.exports.prometheus_metrics import metrics

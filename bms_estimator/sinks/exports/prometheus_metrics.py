@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from bms_estimator.model.payloads import Estimate, Health, Snapshot
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.health import Health
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.quantity import quantity
 
 

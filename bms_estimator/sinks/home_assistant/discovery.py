@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, get_args
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import FRESH_PERIODS, Info
+from bms_estimator.model.payloads.health import FRESH_PERIODS
+from bms_estimator.model.payloads.info import Info
 from bms_estimator.model.quantity import Entity
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS
 from bms_estimator.settings.alarms import ALARMS

@@ -4,7 +4,8 @@ Home Assistant's recorder stores a row for each change of each entity. The value
 a separate topic, on which they are rounded and published rarely (``entity_values``). Entities for research are disabled by default.
 """
 
-from bms_estimator.model.payloads import Estimate, Info
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.info import Info
 from bms_estimator.model.quantity import Entity, field_entities, raw_entity
 
 ESTIMATE = field_entities(Estimate, "all")

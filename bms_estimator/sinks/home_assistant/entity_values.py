@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.quantity import Entity
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs
 from bms_estimator.sinks.home_assistant.entities import cell_key, entities

@@ -6,7 +6,9 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from bms_estimator.model.events import events
-from bms_estimator.model.payloads import Health, Payload, Snapshot
+from bms_estimator.model.payloads.health import Health
+from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.home_assistant import HomeAssistantSettings

@@ -13,7 +13,7 @@ from typing import Self
 
 import structlog
 
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, ReceivedMessage
 from bms_estimator.mqtt.delivery_stats import DeliveryStats

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from typing import Self
 
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.topic_cache import TopicCache
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.command_line import PROGRAM, run
 from tests.mosquitto import Broker, Listener

@@ -23,7 +23,7 @@ from bms_estimator.fleet.worker.checkpoint_format import (
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.pack_state import PACK_STATE, UnpackedRecord
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.model.payloads import Estimate
+from bms_estimator.model.payloads.estimate import Estimate
 from tests.estimator.simulated_cell import pulses
 from tests.fleet.partition_stream import SAMPLES, Stream, blocks_of, deliver, table
 

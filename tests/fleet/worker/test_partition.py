@@ -22,7 +22,8 @@ from bms_estimator.fleet.worker.block_processor import MAX_PART_SAMPLES, BlockPr
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import load_any
-from bms_estimator.model.payloads import Estimate, ParameterReport
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.parameters import ParameterReport
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, Settings

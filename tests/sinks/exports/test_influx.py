@@ -13,7 +13,7 @@ import pytest
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.influx import BATCH, MAX_WAITING, InfluxSink
 from bms_estimator.sinks.exports.line_protocol import lines

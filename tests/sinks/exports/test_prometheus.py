@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads import Estimate, Health, Snapshot
+from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.health import Health
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.exports import PrometheusSettings
 from tests.free_port import free_port
 from tests.patience import LONG_S

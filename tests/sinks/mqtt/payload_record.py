@@ -61,7 +61,9 @@ def main() -> int:
     before = read_record() if RECORD.exists() else after
     violations = find_broken(before["fields"], after["fields"])
     if violations and before["payload_version"] >= after["payload_version"]:
-        sys.stderr.write("\n".join([*violations, "raise PAYLOAD_VERSION in bms_estimator/model/payloads.py"]) + "\n")
+        sys.stderr.write(
+            "\n".join([*violations, "raise PAYLOAD_VERSION in bms_estimator/model/payloads/payload.py"]) + "\n"
+        )
         return 1
     RECORD.write_text(json.dumps(after, indent=1) + "\n", encoding="utf-8")
     return 0

@@ -7,7 +7,7 @@ from rich.cells import cell_len
 from rich.console import Console
 from rich.screen import Screen
 
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.topic_cache import DeviceMessage, TopicCache
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.terminal.screen import MAX_MESSAGES, build_screen

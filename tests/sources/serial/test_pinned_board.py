@@ -18,7 +18,7 @@ from serial.tools import list_ports
 from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.payloads import Snapshot
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.protocols.firmware.messages import MessageType
 from bms_estimator.service.pack_service import run_pack_service

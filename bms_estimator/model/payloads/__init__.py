@@ -1,0 +1,1 @@
+"""Published payloads of one pack, one file for each topic."""
