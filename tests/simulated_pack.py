@@ -16,7 +16,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sampling import BOARD
 from bms_estimator.simulation.simulated_bank import BankCells, BankHistory, SimulatedBank
 from bms_estimator.sources.source import ReceivedSamples
-from bms_estimator.telemetry.alarms import Change
+from bms_estimator.telemetry.alarms.message import Change
 from tests.collector import Collector
 from tests.scripted_source import ScriptedSource
 

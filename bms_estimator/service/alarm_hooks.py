@@ -18,7 +18,7 @@ from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service.hook_process import StartError, program_environment, run_program
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.alarms import Change
+from bms_estimator.telemetry.alarms.message import Change
 
 MAX_JOBS = 100
 """Maximum number of queued jobs of a hook. If a slow program causes more, the oldest job is dropped."""

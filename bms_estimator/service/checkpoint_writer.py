@@ -18,7 +18,7 @@ from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.publisher import Publisher
-from bms_estimator.telemetry.alarms import AlarmEvaluator
+from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 

@@ -32,7 +32,8 @@ from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source, SourceHealth
-from bms_estimator.telemetry.alarms import NO_FORECAST, Change
+from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST
+from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import NO_SHORT_LIMIT_A, make_cells_payload, weakest_cell_fields
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast

@@ -24,7 +24,7 @@ from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.telemetry.alarms import Change
+from bms_estimator.telemetry.alarms.message import Change
 from tests.collector import Collector
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S

@@ -20,9 +20,10 @@ from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.settings.alarm_limits import AlarmDefinition, implausible_limits, monitored_alarms
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.telemetry.alarm_inputs import Inputs
-from bms_estimator.telemetry.alarm_state import AlarmState
-from bms_estimator.telemetry.alarms import AlarmEvaluator, SampleCounts
+from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
+from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
+from bms_estimator.telemetry.alarms.inputs import Inputs
+from bms_estimator.telemetry.alarms.state import AlarmState
 from tests.telemetry.alarm_captures import PACK, WALL_S, Line, ReplayResult, knee_lines, record, replayed, settings
 
 NAN = math.nan

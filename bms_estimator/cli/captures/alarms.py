@@ -38,7 +38,8 @@ from bms_estimator.service.fit_thread import new_slow_fit
 from bms_estimator.service.pack_forecaster import load_forecast_kernels, new_forecaster
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, open_capture
-from bms_estimator.telemetry.alarms import NO_FORECAST, Change
+from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST
+from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.weakest_cell import weakest_cell_values
 
 MAX_BLOCK_S = 1.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from bms_estimator.model.arrays import Floats
 from bms_estimator.settings.alarm_limits import AlarmDefinition
-from bms_estimator.telemetry.alarm_state import AlarmState
+from bms_estimator.telemetry.alarms.state import AlarmState
 from tests.benchmarks.collapse.signals import MAX_STEP_S, Discharge
 
 SOON_S = 900.0

@@ -13,13 +13,6 @@ from bms_estimator.settings.alarm_kinds import Quantity
 Counts = NDArray[np.int64]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 """All measured quantities."""
-LOSS_TEXTS: dict[Quantity, str] = {
-    "voltage": "the voltage is no longer measured",
-    "current": "the current is no longer measured",
-    "temperature": "the temperature is no longer measured",
-    "cells": "cell voltages are missing that were measured before",
-}
-"""Description of the loss, by quantity."""
 
 
 @dataclass

@@ -1,71 +1,20 @@
-"""Buffer of samples for the alarms, and the intervals between samples."""
+"""Buffer of samples for the alarms."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import FORECAST, ForecastRows
-from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
 
 INITIAL_ROWS = 256
 """Initial capacity of a buffer [rows]."""
-RECENT_STEPS = 4.0
-"""Maximum time between two long intervals that count as regular, in multiples of the longer interval."""
 _NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
 """Result of ``_cell_extremes`` for a sample without cell voltages."""
-
-
-@dataclass
-class SampleIntervals:
-    """Intervals between samples. A value is assumed to hold between two samples, unless there is a gap.
-
-    A gap is much longer than the longest recent interval. Samples that arrive in bursts have one long interval before each
-    burst. From the second burst on, these intervals do not count as gaps.
-
-    Attributes:
-        gap_s: Minimum length of a gap [s].
-    """
-
-    gap_s: float
-    _last_s: float = math.nan
-    _step_s: float = math.inf
-    _longest_s: float = 0.0
-    """Longest recent interval [s]."""
-    _longest_at_s: float = -math.inf
-    """Time of the last interval that is about as long as ``_longest_s`` [s]."""
-
-    def measure(self, times_s: Floats) -> tuple[Floats, Floats]:
-        """Return the interval before each sample, and the time in it for which a value holds.
-
-        Returns:
-            Two arrays of shape (n,) [s]. The interval is 0 after the clock was set back. A value holds for the whole
-            interval, or for 0 s in a gap.
-        """
-        passed_s = np.diff(times_s, prepend=self._last_s)
-        passed_s = np.where(passed_s > 0.0, passed_s, 0.0)
-        before_s = np.concatenate(([self._step_s], passed_s[:-1]))
-        observed_s = np.where(passed_s > np.maximum(self.gap_s, GAP_RATIO * before_s), 0.0, passed_s)
-        for i in np.flatnonzero(passed_s > self.gap_s).tolist():
-            if self._is_regular(float(times_s[i]), float(passed_s[i])):
-                observed_s[i] = passed_s[i]
-        self._last_s, self._step_s = float(times_s[-1]), float(passed_s[-1]) or self._step_s
-        return passed_s, observed_s
-
-    def _is_regular(self, at_s: float, step_s: float) -> bool:
-        """Return True if an interval of about this length occurred recently, and record the interval."""
-        is_recent = abs(at_s - self._longest_at_s) <= RECENT_STEPS * self._longest_s
-        is_regular = is_recent and step_s <= GAP_RATIO * self._longest_s
-        if not is_recent or step_s >= self._longest_s:
-            self._longest_s, self._longest_at_s = step_s, at_s
-        elif GAP_RATIO * step_s >= self._longest_s:
-            self._longest_at_s = at_s
-        return is_regular
 
 
 class SampleBuffer:

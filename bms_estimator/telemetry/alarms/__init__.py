@@ -1,0 +1,1 @@
+"""Alarms of one pack, evaluated from samples and estimates."""

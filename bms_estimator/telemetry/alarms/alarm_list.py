@@ -1,0 +1,212 @@
+"""All alarms of a pack: their states, causes, payloads and changes."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.input_faults import InputFault
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.settings.alarm_limits import AlarmDefinition
+from bms_estimator.settings.alarms import AlarmName
+from bms_estimator.telemetry.alarms.message import AlarmMessage, Change, alarm_payload
+from bms_estimator.telemetry.alarms.state import AlarmState, AlarmTransition, RaisedAlarm
+from bms_estimator.telemetry.alarms.unwatched import UnwatchedAlarms
+
+ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
+"""Alarms that are watched even before the first sample."""
+
+
+class Reasons(NamedTuple):
+    """Causes of an alarm beyond its value."""
+
+    suspects: InputFault
+    """Input faults that the filter suspects."""
+    texts: tuple[str, ...]
+    """Causes, one sentence each."""
+
+
+_NO_REASONS = Reasons(InputFault(0), ())
+
+
+class AlarmList:
+    """States of all alarms of one pack.
+
+    Args:
+        definitions: Definitions of the alarms.
+        lost_s: Maximum time without values that counts toward a delay [s].
+
+    Attributes:
+        states: State by name.
+    """
+
+    def __init__(self, definitions: Sequence[AlarmDefinition], lost_s: float) -> None:
+        self.states = {each.name: AlarmState(each, lost_s=lost_s) for each in definitions}
+        self._unwatched = UnwatchedAlarms()
+        self._reasons: dict[AlarmName, Reasons] = {}
+        self._changes: list[Change] = []
+        self._unreported: dict[AlarmName, AlarmMessage] = {}
+        self._payloads: dict[AlarmName, tuple[AlarmMessage, Alarm]] = {}  # rebuilt only when the message changes
+
+    @property
+    def active(self) -> tuple[AlarmName, ...]:
+        """Names of all raised alarms."""
+        return tuple(name for name, state in self.states.items() if state.raised is not None)
+
+    @property
+    def unwatched_critical(self) -> tuple[AlarmName, ...]:
+        """Names of critical alarms that cannot be watched although their quantities were measured before."""
+        return tuple(name for name in self._unwatched.reasons if self.states[name].definition.severity == "critical")
+
+    @property
+    def saved_state(self) -> dict[str, Any]:
+        """Raised alarms for ``restore`` after a restart."""
+        return {
+            name: {**state.raised._asdict(), "gone": state.cause_cleared, "acknowledged": state.acknowledged}
+            for name, state in self.states.items()
+            if state.raised is not None
+        }
+
+    def update(
+        self,
+        name: AlarmName,
+        times_s: Floats,
+        steps_s: Floats,
+        values: Floats,
+        wall_offset_s: float,
+        reason_at: Callable[[float], str] | None = None,
+    ) -> None:
+        """Process values of one alarm, if it is defined.
+
+        Args:
+            name: Name of the alarm.
+            times_s: As for ``AlarmState.update``.
+            steps_s: As for ``AlarmState.update``.
+            values: As for ``AlarmState.update``.
+            wall_offset_s: As for ``AlarmState.update``.
+            reason_at: Function that returns the cause of an alarm that was raised at a time on the samples' clock [s].
+        """
+        state = self.states.get(name)
+        if state is None:
+            return
+        for transition in state.update(times_s, steps_s, values, wall_offset_s):
+            if transition.raised is not None and reason_at is not None:
+                self.set_reasons(name, reason_at(transition.at_s))
+            self._record(state, [transition])
+
+    def raise_at(self, name: AlarmName, at_s: float, raised: RaisedAlarm) -> None:
+        """Raise an alarm without its delay, if it is defined and not yet raised.
+
+        Args:
+            name: Name of the alarm.
+            at_s: Time on the samples' clock [s].
+            raised: Time on the wall clock, and value.
+        """
+        state = self.states.get(name)
+        if state is not None:
+            self._record(state, state.raise_at(at_s, raised))
+
+    def acknowledge(self, name: AlarmName | None, at_s: float) -> list[AlarmName]:
+        """Acknowledge an alarm, or all alarms. Return their names. Alarms whose cause is gone end now.
+
+        Args:
+            name: Name of the alarm; None: all.
+            at_s: Time on the samples' clock [s].
+        """
+        raised = [state for key, state in self.states.items() if state.raised and name in (None, key)]
+        for state in raised:
+            if state.acknowledge():
+                self._changes.append(Change(at_s, self._payload(state)))
+        return [state.definition.name for state in raised]
+
+    def set_reasons(self, name: AlarmName, *texts: str) -> None:
+        """Replace the causes of an alarm, one sentence each."""
+        self._reasons[name] = Reasons(InputFault(0), texts)
+
+    def set_suspects(self, name: AlarmName, suspects: InputFault, suspicions: Sequence[str]) -> None:
+        """Replace the causes of an alarm by the texts of suspected faults if their set has changed.
+
+        The numbers in the texts may change each second and are therefore not compared.
+
+        Args:
+            name: Name of the alarm.
+            suspects: Input faults that the filter suspects now and that raise this alarm.
+            suspicions: All suspected faults, one sentence each.
+        """
+        state, before = self.states.get(name), self._reasons.get(name, _NO_REASONS)
+        if state is not None and suspects != before.suspects and (suspects or state.raised is None):
+            # a suspicion is the text of its fault, after numbers if there are any
+            texts = tuple(text for text in suspicions for suspect in suspects if text.endswith(suspect.text))
+            self._reasons[name] = Reasons(suspects, texts)
+
+    def set_unwatched(self, unwatched: UnwatchedAlarms, at_s: float) -> None:
+        """Replace the alarms that cannot be watched, and record the changes at ``at_s`` on the samples' clock [s]."""
+        before, self._unwatched = self._unwatched, unwatched
+        for name in sorted(before.reasons.keys() ^ unwatched.reasons.keys()):
+            self._changes.append(Change(at_s, self._payload(self.states[name]), "watched"))
+
+    def changes(self) -> list[Change]:
+        """Return the changes since the last call, oldest first."""
+        changes, self._changes = self._changes, []
+        return changes
+
+    def report(self) -> tuple[Alarm, ...]:
+        """Return all alarms that were ever watched.
+
+        An alarm that was raised since the last call is reported as raised, even if it has ended.
+        """
+        unreported, self._unreported = self._unreported, {}
+        return tuple(
+            alarm_payload(state.definition, unreported[name])
+            if state.raised is None and name in unreported
+            else self._payload(state)
+            for name, state in self.states.items()
+            if state.has_value or state.raised is not None or name in self._unwatched.reasons or name in ALWAYS
+        )
+
+    def restore(self, saved: Mapping[AlarmName, Any], unwatched: UnwatchedAlarms) -> None:
+        """Restore the ``saved_state`` of an earlier run and the alarms that cannot be watched.
+
+        Raises:
+            ValueError, TypeError, LookupError: The saved state is damaged.
+        """
+        self._unwatched = unwatched
+        for name, entry in saved.items():
+            state = self.states.get(name)
+            if state is None or (entry["gone"] and not state.definition.latch):
+                continue
+            since_s, value = float(entry["since_s"]), entry["value"]
+            iso_utc(since_s)  # raises ValueError for a time that cannot be published
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name}: value = {value}")
+            raised = RaisedAlarm(since_s, None if value is None else float(value))
+            state.restore(raised, cause_cleared=bool(entry["gone"]), acknowledged=bool(entry["acknowledged"]))
+
+    def _record(self, state: AlarmState, transitions: Iterable[AlarmTransition]) -> None:
+        """Record transitions for ``changes``, and raised alarms for ``report``."""
+        for transition in transitions:
+            message = self._message(state, transition.raised, cause_cleared=False)
+            if transition.raised is not None:
+                self._unreported[state.definition.name] = message
+            self._changes.append(Change(transition.at_s, alarm_payload(state.definition, message)))
+
+    def _payload(self, state: AlarmState) -> Alarm:
+        """Return the payload of an alarm, cached until its message changes."""
+        name = state.definition.name
+        message = self._message(state, state.raised, cause_cleared=state.cause_cleared)
+        latest = self._payloads.get(name)
+        if latest is None or latest[0] != message:
+            latest = self._payloads[name] = message, alarm_payload(state.definition, message)
+        return latest[1]
+
+    def _message(self, state: AlarmState, raised: RaisedAlarm | None, *, cause_cleared: bool) -> AlarmMessage:
+        """Return the changing content of the payload of an alarm."""
+        name = state.definition.name
+        losses = self._unwatched.loss_texts if name == "sensor_fault" else ()
+        return AlarmMessage(
+            raised,
+            cause_cleared=cause_cleared,
+            reasons=losses + self._reasons.get(name, _NO_REASONS).texts,
+            unwatched_reason=self._unwatched.reasons.get(name),
+        )

@@ -1,0 +1,319 @@
+"""All alarms of a pack, evaluated from samples and estimates.
+
+Alarms evaluate each sample, not the published means, and use the samples' clock. A replay therefore raises the alarms of
+the live run. They use raw values, including glitches that the estimator drops. The delays suppress single glitches.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.forecast.forecast import ForecastRows, unknown_values
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.input_faults import InputFault
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
+from bms_estimator.settings.alarm_limits import AlarmDefinition
+from bms_estimator.settings.alarms import AlarmName
+from bms_estimator.telemetry.alarms.alarm_list import AlarmList
+from bms_estimator.telemetry.alarms.collapse_risk import collapse_risks, time_left_text
+from bms_estimator.telemetry.alarms.faulty_fraction import FaultyFraction, SampleCounts
+from bms_estimator.telemetry.alarms.inputs import Inputs, count_values
+from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.sample_buffer import SampleBuffer
+from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
+from bms_estimator.telemetry.alarms.state import RaisedAlarm
+from bms_estimator.telemetry.alarms.unwatched import find_unwatched
+from bms_estimator.telemetry.alarms.values import estimated_values, measured_values
+from bms_estimator.telemetry.cells import CellFault, CellFaults
+
+SENSOR_SUSPECTS = (
+    InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
+)
+"""Input faults that raise ``sensor_fault``."""
+MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV
+"""Input faults that raise ``model_mismatch``."""
+INPUTS = "inputs"
+"""Key of the measured quantities in the saved state. All other keys but ``SILENCE`` are names of alarms."""
+SILENCE = "silence"
+"""Key of the reason why no samples arrived, in the saved state."""
+CELLS_GAP_S = 60.0
+"""Minimum length of a gap between two evaluations of the single cells [s]."""
+NO_FORECAST = unknown_values()
+"""Forecast at all samples of a pack without a forecaster."""
+_COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
+"""Column of SAMPLE by quantity."""
+
+
+class AlarmEvaluator:
+    """Evaluator of all alarms of one pack.
+
+    Args:
+        definitions: Definitions of the alarms.
+        charging_a: Minimum current into the pack that counts as charging [A].
+        gap_s: Minimum length of a gap between samples [s].
+        inputs: State of the measured quantities.
+        silence_limit_s: Time without a sample after which no alarm is watched [s].
+
+    Attributes:
+        rows: Number of samples that wait for ``evaluate``.
+        saved_state: State for ``restore`` after a restart, as JSON; empty if there is nothing to restore.
+    """
+
+    def __init__(
+        self,
+        definitions: Sequence[AlarmDefinition],
+        charging_a: float,
+        gap_s: float,
+        inputs: Inputs,
+        silence_limit_s: float,
+    ) -> None:
+        self._alarms = AlarmList(definitions, inputs.lost_s)
+        self._charging_a = charging_a
+        self._inputs, self._silence_limit_s = inputs, silence_limit_s
+        self._silence_reason = ""  # reason why no samples arrive; empty while they do
+        self._has_samples = False  # since the start of this run
+        self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
+        self._weak_cell_intervals = SampleIntervals(math.inf)  # no interval is a gap, because a weak cell remains weak
+        self._cell_intervals = SampleIntervals(CELLS_GAP_S)
+        self._cell_kinds = CellFault(0.0).kinds  # faulty readings in the text of their alarm
+        self._buffer = SampleBuffer()
+        self._faulty_fraction = FaultyFraction()
+        self._at_s = 0.0  # time of the last sample
+        self._mismatch_suspected = False
+        self.saved_state = ""
+
+    @property
+    def rows(self) -> int:
+        """Number of samples that wait for ``evaluate``."""
+        return self._buffer.size
+
+    def add(
+        self, block: SampleBlock, trace: TraceBlock, cells: CellBlock, forecasts: ForecastRows = NO_FORECAST
+    ) -> None:
+        """Buffer a block of samples, its estimates, its cell voltages and the forecast at each estimate for ``evaluate``."""
+        self._buffer.add(block, trace, cells, forecasts)
+
+    def evaluate(self, arrival_s: float, counts: SampleCounts, suspects: InputFault, suspicions: Sequence[str]) -> None:
+        """Evaluate all buffered samples.
+
+        Args:
+            arrival_s: Arrival of the last buffered sample on the wall clock [s since 1970].
+            counts: Numbers of samples since start.
+            suspects: Input faults that the filter suspects now.
+            suspicions: The suspected faults, one sentence each.
+        """
+        if not self.rows:
+            return
+        self._has_samples = True
+        samples, trace, forecasts, extremes_v = self._buffer.take()
+        self._alarms.set_suspects("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
+        self._alarms.set_suspects("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
+        if samples.size:
+            wall_offset_s = arrival_s - float(samples["time_s"][-1])
+            self._evaluate_samples(samples, extremes_v, wall_offset_s)
+            self._evaluate_faulty_fraction(float(samples["time_s"][-1]), counts, suspects, wall_offset_s)
+        if trace.size:
+            self._evaluate_estimates(trace, forecasts, suspects, arrival_s - float(trace["time_s"][-1]))
+        self._save_state()
+
+    def on_silence(self, silent_s: float, now_s: float, reason: str) -> None:
+        """Handle missing samples.
+
+        Args:
+            silent_s: Time since the last sample on the monotonic clock [s].
+            now_s: Wall clock [s since 1970].
+            reason: Reason for the silence; empty if unknown.
+        """
+        # a silence restored from an earlier run lasts until the first sample of this run
+        is_restored = bool(self._silence_reason) and not self._has_samples
+        if (silent_s >= self._silence_limit_s or is_restored) != bool(self._silence_reason):
+            self._silence_reason = "" if self._silence_reason else reason or "no samples arrive"
+            self._update_unwatched(self._at_s)
+            self._save_state()
+        state = self._alarms.states.get("link_lost")
+        if state is None or silent_s < state.definition.limit:
+            return
+        if state.cause_cleared:  # the cause of a latched alarm has returned
+            state.cause_cleared = False
+            self._save_state()
+        if state.raised is None:
+            self._alarms.set_reasons("link_lost", *([reason] if reason else []))
+            self._alarms.raise_at("link_lost", self._at_s, RaisedAlarm(now_s, silent_s))
+            self._save_state()
+
+    def evaluate_hooks(self, failing: Sequence[str], passed_s: float, now_s: float) -> None:
+        """Evaluate the alarm ``hook_failed``.
+
+        Args:
+            failing: Hooks whose last run failed, each with its reason.
+            passed_s: Time since the last call [s].
+            now_s: Wall clock [s since 1970].
+        """
+        if failing:
+            self._alarms.set_reasons("hook_failed", *failing)
+        value = np.array([math.inf if failing else 0.0])  # this alarm publishes no value
+        self._alarms.update("hook_failed", np.array([self._at_s]), np.array([passed_s]), value, now_s - self._at_s)
+        self._save_state()
+
+    def evaluate_weak_cell(self, deviation_std: float, arrival_s: float) -> None:
+        """Evaluate the alarm ``weak_cell`` at the last sample.
+
+        Args:
+            deviation_std: Deviation of the last discharge from the bank's reference [std]; NaN if unknown.
+            arrival_s: Arrival of the last sample on the wall clock [s since 1970].
+        """
+        if not math.isnan(deviation_std):
+            time_s = np.array([self._at_s])
+            _, observed_s = self._weak_cell_intervals.measure(time_s)
+            self._alarms.update("weak_cell", time_s, observed_s, np.array([deviation_std]), arrival_s - self._at_s)
+            self._save_state()
+
+    def evaluate_cells(self, faults: CellFaults, arrival_s: float) -> None:
+        """Evaluate the alarms on faults of single cells.
+
+        Args:
+            faults: Faults at the last sample.
+            arrival_s: Arrival of this sample on the wall clock [s since 1970].
+        """
+        times_s = np.array([faults.at_s])
+        _, observed_s = self._cell_intervals.measure(times_s)
+        values: dict[AlarmName, CellFault] = {"cell_short": faults.short, "cell_sensor_fault": faults.reading}
+        for name, fault in values.items():
+            state = self._alarms.states.get(name)
+            # the text of a raised alarm changes only with the kinds of its faults, because its numbers change often
+            if state is not None and (state.raised is None or (fault.kinds and fault.kinds != self._cell_kinds)):
+                self._alarms.set_reasons(name, *fault.texts)
+                self._cell_kinds = fault.kinds
+            self._alarms.update(name, times_s, observed_s, np.array([fault.value]), arrival_s - faults.at_s)
+        self._save_state()
+
+    def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
+        """Acknowledge an alarm, or all alarms. Return their names. Alarms whose cause is gone end now.
+
+        Args:
+            name: Name of the alarm; None: all.
+        """
+        acknowledged = self._alarms.acknowledge(name, self._at_s)
+        self._save_state()
+        return acknowledged
+
+    def names(self) -> tuple[AlarmName, ...]:
+        """Return the names of all alarms."""
+        return tuple(self._alarms.states)
+
+    @property
+    def active(self) -> tuple[AlarmName, ...]:
+        """Names of all raised alarms."""
+        return self._alarms.active
+
+    @property
+    def unwatched_critical(self) -> tuple[AlarmName, ...]:
+        """Names of critical alarms that cannot be watched although their quantities were measured before."""
+        return self._alarms.unwatched_critical
+
+    def changes(self) -> list[Change]:
+        """Return the changes since the last call, oldest first."""
+        return self._alarms.changes()
+
+    def report(self) -> tuple[Alarm, ...]:
+        """Return all alarms that were ever watched.
+
+        An alarm that was raised since the last call is reported as raised, even if it has ended.
+        """
+        return self._alarms.report()
+
+    def restore(self, saved_state: str) -> None:
+        """Restore the ``saved_state`` of an earlier run.
+
+        Raises:
+            ValueError, TypeError, LookupError: The saved state is damaged.
+        """
+        entries = json.loads(saved_state or "{}")
+        self._inputs.restore(entries.pop(INPUTS, {}))
+        self._silence_reason = str(entries.pop(SILENCE, ""))
+        unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason)
+        self._alarms.restore(entries, unwatched)
+        self._save_state()
+
+    def _evaluate_samples(self, samples: SampleBlock, extremes_v: Floats, wall_offset_s: float) -> None:
+        """Evaluate the alarms on measured values.
+
+        Args:
+            samples: Shape (n,), dtype SAMPLE.
+            extremes_v: Minimum and maximum cell voltage [V] and number of cell voltages, shape (n, 3).
+            wall_offset_s: Wall clock minus the samples' clock [s].
+        """
+        times_s = samples["time_s"]
+        self._at_s = float(times_s[-1])
+        passed_s, observed_s = self._sample_intervals.measure(times_s)
+        for name, series in measured_values(samples, extremes_v, self._charging_a).items():
+            self._alarms.update(name, times_s, observed_s, series, wall_offset_s)
+        gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # values hold for less than the interval only in a gap
+        self._alarms.update("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
+        counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
+        cells = extremes_v[:, 2].astype(np.int64)
+        for at_s in self._inputs.update(times_s, observed_s, counts | {"cells": cells}):
+            self._update_unwatched(at_s)
+            if self._is_blinded():  # without the delay of the alarm, because a quantity has been missing for ``lost_s``
+                self._alarms.raise_at("sensor_fault", at_s, RaisedAlarm(at_s + wall_offset_s, None))
+
+    def _update_unwatched(self, at_s: float) -> None:
+        """Update the alarms that cannot be watched at ``at_s`` on the samples' clock [s]."""
+        self._alarms.set_unwatched(find_unwatched(self.names(), self._inputs, self._silence_reason), at_s)
+
+    def _is_blinded(self) -> bool:
+        """Return True if a quantity is lost that a critical alarm needs."""
+        lost = set(self._inputs.lost)
+        return any(not lost.isdisjoint(ALARM_KINDS[name].needs) for name in self.unwatched_critical)
+
+    def _evaluate_faulty_fraction(
+        self, at_s: float, counts: SampleCounts, suspects: InputFault, wall_offset_s: float
+    ) -> None:
+        """Evaluate the fraction of samples that are lost or unusable."""
+        if (fraction := self._faulty_fraction.update(at_s, counts)) is None:
+            return
+        observed_s, value = fraction
+        if suspects & SENSOR_SUSPECTS or self._is_blinded():
+            value = math.inf  # above every limit
+        self._alarms.update("sensor_fault", np.array([at_s]), observed_s, np.array([value]), wall_offset_s)
+
+    def _evaluate_estimates(
+        self, trace: TraceBlock, forecasts: ForecastRows, suspects: InputFault, wall_offset_s: float
+    ) -> None:
+        """Evaluate the alarms on estimates.
+
+        Args:
+            trace: Shape (n,), dtype TRACE.
+            forecasts: Forecast at each row of the trace, shape (n,), dtype FORECAST.
+            suspects: Input faults that the filter suspects now.
+            wall_offset_s: Wall clock minus the samples' clock [s].
+        """
+        times_s = trace["time_s"]
+        _, observed_s = self._trace_intervals.measure(times_s)
+        is_mismatch = (trace["lock"] == 0) | self._mismatch_suspected
+        self._mismatch_suspected = bool(suspects & MODEL_SUSPECTS)
+        # a new suspicion counts from the last sample on, because its start is unknown
+        is_mismatch[-1] |= self._mismatch_suspected
+        for name, series in estimated_values(trace, is_mismatch).items():
+            self._alarms.update(name, times_s, observed_s, series, wall_offset_s)
+        risks = collapse_risks(forecasts, trace["current_a"] <= -self._charging_a)
+
+        def reason_at(at_s: float) -> str:
+            return time_left_text(forecasts[int(np.flatnonzero(times_s == at_s)[-1])])
+
+        self._alarms.update("collapse_risk", times_s, observed_s, risks, wall_offset_s, reason_at)
+
+    def _save_state(self) -> None:
+        """Update ``saved_state``, so that for example a relay that has cut the load stays open over a restart."""
+        saved: dict[str, Any] = self._alarms.saved_state
+        if inputs := self._inputs.saved_state:
+            saved[INPUTS] = inputs
+        if self._silence_reason:
+            saved[SILENCE] = self._silence_reason
+        self.saved_state = json.dumps(saved) if saved else ""

@@ -1,0 +1,51 @@
+"""Messages about an alarm: its payload and its changes."""
+
+from typing import Literal, NamedTuple
+
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.settings.alarm_limits import AlarmDefinition
+from bms_estimator.telemetry.alarms.state import RaisedAlarm
+from bms_estimator.telemetry.alarms.text import alarm_text
+
+
+class Change(NamedTuple):
+    """Change of an alarm: raised, ended, no longer watched, or watched again."""
+
+    at_s: float
+    """Time on the samples' clock [s]."""
+    alarm: Alarm
+    field: Literal["active", "watched"] = "active"
+    """Field of ``alarm`` that has changed."""
+
+
+class AlarmMessage(NamedTuple):
+    """Changing content of an alarm's payload."""
+
+    raised: RaisedAlarm | None
+    """Time and value of an active alarm; None if inactive."""
+    cause_cleared: bool
+    """True if the cause is gone but the alarm is latched."""
+    reasons: tuple[str, ...]
+    """Causes, one sentence each."""
+    unwatched_reason: str | None
+    """Reason why the alarm cannot be watched; None while it is watched."""
+
+
+def alarm_payload(definition: AlarmDefinition, message: AlarmMessage) -> Alarm:
+    """Return the payload of an alarm."""
+    raised, value = message.raised, message.raised.value if message.raised else None
+    text = alarm_text(definition, value, message.reasons, cause_cleared=message.cause_cleared) if raised else ""
+    return Alarm(
+        name=definition.name,
+        severity=definition.severity,
+        active=raised is not None,
+        latched=message.cause_cleared,
+        since=iso_utc(raised.since_s) if raised else None,
+        value=value,
+        limit=definition.limit,
+        unit=definition.kind.unit,
+        text=text,
+        watched=message.unwatched_reason is None,
+        unwatched_reason=message.unwatched_reason,
+    )

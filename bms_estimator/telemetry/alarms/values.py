@@ -1,0 +1,53 @@
+"""Values of the alarms on measured quantities and on estimates."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.sample import SampleBlock, SampleStatus
+from bms_estimator.settings.alarms import AlarmName
+
+
+def measured_values(samples: SampleBlock, extremes_v: Floats, charging_a: float) -> dict[AlarmName, Floats]:
+    """Return the values of the alarms on measured quantities, each of shape (n,).
+
+    Args:
+        samples: Shape (n,), dtype SAMPLE.
+        extremes_v: Minimum and maximum cell voltage [V] and number of cell voltages, shape (n, 3).
+        charging_a: Minimum current into the pack that counts as charging [A].
+    """
+    lowest_v, highest_v = extremes_v[:, 0], extremes_v[:, 1]
+    voltage_v, temperature_c = samples["voltage_v"], samples["temperature_c"]
+    is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
+    current_a = np.where(is_saturated, np.copysign(np.inf, samples["current_a"]), samples["current_a"])
+    # the temperature while charging; infinite while not charging, NaN if a quantity is not measured
+    charging_c = np.where(current_a <= -charging_a, temperature_c, np.inf)
+    charging_c[np.isnan(current_a) | np.isnan(temperature_c)] = np.nan
+    return {
+        "pack_over_voltage": voltage_v,
+        "pack_under_voltage": voltage_v,
+        "cell_over_voltage": highest_v,
+        "cell_under_voltage": lowest_v,
+        "cell_imbalance": highest_v - lowest_v,
+        "discharge_over_current": current_a,
+        "charge_over_current": -current_a,
+        "over_temperature": temperature_c,
+        "under_temperature": temperature_c,
+        "charging_below_freezing": charging_c,
+    }
+
+
+def estimated_values(trace: TraceBlock, is_mismatch: NDArray[np.bool_]) -> dict[AlarmName, Floats]:
+    """Return the values of the alarms on estimates, each of shape (n,).
+
+    Args:
+        trace: Shape (n,), dtype TRACE.
+        is_mismatch: True at estimates for which the filter suspects that the cell model is wrong, or the observer is out of lock; shape (n,).
+    """
+    std = trace["soc_std"]
+    return {
+        "soc_low": trace["soc"] - np.where(np.isnan(std), 0.0, std),
+        "stability_margin_low": trace["stability_margin"],
+        "model_mismatch": np.where(is_mismatch, np.inf, np.abs(trace["innovation_v"])),
+    }
