@@ -103,7 +103,7 @@ bank: venv ## the weakest cell of simulated banks: false alarms, detection and e
 collapse: venv ## the alarm before the cut-off: false alarms and warnings by signal, e.g. make collapse ARGS="--plot collapse.png": half an hour
 	@$(BIN)/python -m tests.benchmarks.collapse $(ARGS)
 
-cells: venv ## single cells of simulated packs: shorts, false alarms and cost, beside three other detectors: a minute
+cells: venv ## single cells of simulated packs: shorts and false alarms, beside three other detectors: minutes
 	@$(BIN)/python -m tests.benchmarks.cells $(ARGS)
 
 observability: venv ## the lower bound of the std of the SOC by cell and SOC window, e.g. make observability ARGS="lfp --window 0.5 0.95"

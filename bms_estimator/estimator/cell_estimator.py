@@ -135,6 +135,8 @@ class CellEstimator:
     @property
     def deviations(self) -> CellDeviations | None:
         """Deviations of the cells at the end of the last window; None before the first window with cell voltages."""
+        if not self.cells.size:
+            return None
         window = int(self.bank["windows"][0])
         if window != self._deviations_window:
             self._deviations, self._deviations_window = self._compute_deviations(), window

@@ -1,4 +1,4 @@
-"""Figures of the estimators of single cells: detection of shorts, false alarms, cost. ``make cells``; docs/pack/cells.md.
+"""Figures of the estimators of single cells: detection of shorts, false alarms. ``make cells``; docs/pack/cells.md.
 
 Three detectors of the field see the same cell voltages and are calibrated on the same healthy packs: the Shannon entropy of the cell
 voltages, the difference of a cell from the mean cell, and a CUSUM of this difference.
@@ -19,7 +19,6 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.alarm_limits import MIN_READING_ERROR_V, MIN_SHORT_C
 from bms_estimator.settings.sampling import BOARD
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
@@ -227,33 +226,6 @@ def _hours_text(delays_h: list[float]) -> str:
     return ", ".join("-" if np.isinf(each) else f"{each:.0f}" for each in delays_h)
 
 
-def cost(count: int = 96, rate_hz: float = 10.0, samples: int = 20_000) -> None:
-    """Print the cost of the estimators of all cells of a large pack."""
-    model = load_cell("nmc", CAPACITY_AH).pack(count, 1)
-    estimator = Estimator(model, sampling=BOARD)
-    cells, block = CellEstimator(estimator), np.zeros(samples, SAMPLE)
-    block["time_s"], block["current_a"], block["voltage_v"] = np.arange(samples) / rate_hz, 10.0, 3.7 * count
-    block["temperature_c"] = 25.0
-    cells_v = 3.7 + 0.01 * np.random.default_rng(1).standard_normal((samples, count))
-    trace = estimator.run(block).copy()
-    cells.run(block[:10], cells_v[:10], trace[:10])  # compiles
-    times_s = []
-    for begin in range(0, samples, 10):
-        part = slice(begin, begin + 10)
-        began_s = time.process_time()
-        cells.run(block[part], cells_v[part], trace[part])
-        _ = cells.deviations  # as for the alarms
-        times_s.append(time.process_time() - began_s)
-    sample_s = sum(times_s) / samples
-    print_table(
-        ("cost", "value"),
-        [
-            (f"{count} cells at {rate_hz:g} Hz, one block a second", f"{100 * sample_s * rate_hz:.4f} % of a core"),
-            ("each cell and sample", f"{1e9 * sample_s / count:.0f} ns"),
-        ],
-    )
-
-
 def main(arguments: list[str]) -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -266,7 +238,6 @@ def main(arguments: list[str]) -> None:
         "--first-seed", type=int, default=20_000, help="first seed; the constants were chosen with --first-seed 0"
     )
     options = parser.parse_args(arguments)
-    cost()
     healthy = false_alarms(options.chemistry, options.cycles, options.packs, options.first_seed)
     delays(options.chemistry, healthy, options.short_packs, options.short_cycles, options.first_seed)
 
