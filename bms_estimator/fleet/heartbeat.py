@@ -37,6 +37,10 @@ class Heartbeat(BaseModel):
     """Number of packs with deferred blocks that are missing in the table of packs."""
     unknown: tuple[str, ...] = ()
     """Names of some unknown packs."""
+    clock_error_count: int = 0
+    """Number of packs whose edge's clock is wrong (``worker.edge_clock``)."""
+    clock_errors: dict[str, float] = Field(default_factory=dict)
+    """Errors of some of these clocks by pack [s], the largest ones; positive if ahead."""
     waiting: int = 0
     """Number of messages that were received from the server and not processed yet."""
     hours_waiting: int = 0

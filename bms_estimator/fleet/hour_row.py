@@ -82,3 +82,16 @@ class Hour(Payload):
     delta_1: float | None = Field(description="SOC below which C_ts is negative, (2.11) of the thesis")
     delta_2: float | None = Field(description="SOC below which C_tl is negative, (2.12) of the thesis")
     suspects: int = Field(description="bits of model.input_faults.InputFault")
+    revision: int | None = Field(
+        default=None,
+        description="stream sequence number of the block that finished the row; of two rows of one hour the one with the "
+        "larger revision is valid; null from an older worker, as are the following values",
+    )
+    received_hour: int | None = Field(
+        default=None,
+        description="hour on the server's clock in which the block arrived that finished the row, in hours since 1970 UTC",
+    )
+    clock_error_s: float | None = Field(
+        default=None,
+        description="error of the edge's clock, positive if ahead [s]; null within the limits; other rows are quarantined",
+    )

@@ -21,6 +21,9 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DeviceName
 
+PAST_BLOCKS = 30 * 24 * 60
+"""Number of blocks before the present at which packs start that are faster than real time and send blocks without end:
+30 days."""
 MAX_PACKS = 999_999
 """Maximum number of packs, because their names end in a number of six digits."""
 
@@ -53,7 +56,7 @@ def simulate(
         datetime | None,
         typer.Option(
             metavar="TIME",
-            help="local time of the first sample, 2026-01-31T12:00:00; default: a minute ago",
+            help="local time of the first sample, 2026-01-31T12:00:00; default: a minute ago, or earlier if --speed is above 1",
             show_default=False,
         ),
     ] = None,
@@ -74,7 +77,7 @@ def simulate(
     """
     if mqtt is None and table is None and truth is None:
         raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write only the table of the packs")
-    fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin), prefix=_valid_prefix(prefix))
+    fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin, speed, blocks), prefix=_valid_prefix(prefix))
     for path, text in ((table, fleet.table), (truth, fleet.truth_table)):
         if path is not None:
             write_text(path, text())
@@ -91,10 +94,14 @@ async def _run(
     return await run_edges(fleet, edges, settings, connections=connections, stop=stop_on_signal(), report=typer.echo)
 
 
-def _begin_ns(begin: datetime | None) -> int:
-    """Return the start in nanoseconds since 1970; a time without a zone is local."""
+def _begin_ns(begin: datetime | None, speed: float, blocks: int | None) -> int:
+    """Return the start in nanoseconds since 1970; a time without a zone is local.
+
+    Packs that are faster than real time start in the past, because workers quarantine the hours of a clock that is ahead.
+    """
     if begin is None:
-        return time.time_ns() - BLOCK_S * 10**9
+        past_blocks = 1 if speed <= 1.0 else blocks or PAST_BLOCKS
+        return time.time_ns() - past_blocks * BLOCK_S * 10**9
     if not math.isfinite(begin.timestamp()) or begin.timestamp() <= 0:
         raise UserError(f"--begin {begin}: must be after 1970")
     return int(begin.timestamp()) * 10**9

@@ -30,6 +30,11 @@ class StoredMessage(NamedTuple):
     data: bytes
     headers: Mapping[str, str]
 
+    @property
+    def received_s(self) -> int:
+        """Server's clock at the arrival of the message, in whole seconds since 1970."""
+        return int(datetime.fromisoformat(self.headers["Nats-Time-Stamp"]).replace(microsecond=0).timestamp())
+
 
 class StreamError(Exception):
     """Error of a request to a stream, with its reason."""

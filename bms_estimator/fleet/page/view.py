@@ -70,7 +70,8 @@ class FleetView:
         """Return the overviews of packs and workers, the time, and the duration of uninterrupted reception."""
         result = self.packs.overview(now_s, self._since_s) | self.workers.overview(now_s)
         result["concerns"]["unknown"] = unknown = self._unknown_packs(now_s)
-        result["attention"] += unknown["count"]
+        result["concerns"]["clock"] = clock = self._packs_with_clock_error(now_s)
+        result["attention"] += unknown["count"] + clock["count"]
         return result | {
             "time": iso_utc(wall_s),
             "listening_s": round(now_s - self._since_s, 1),
@@ -85,6 +86,12 @@ class FleetView:
             self._state_counts.popleft()
         before_s, states = self._state_counts[0]
         return (self.packs.states - states) / (now_s - before_s) if now_s > before_s else None
+
+    def _packs_with_clock_error(self, now_s: float) -> dict[str, Any]:
+        """Return number, names and clock errors of packs with a wrong clock [s], the largest errors first."""
+        count, errors = self.workers.clock_errors(now_s)
+        largest = sorted(errors.items(), key=lambda each: -abs(each[1]))
+        return {"count": count, "packs": [[pack, error_s] for pack, error_s in largest][:MAX_LISTED]}
 
     def _unknown_packs(self, now_s: float) -> dict[str, Any]:
         """Return number, names and reasons of unknown packs. Reasons are deleted once no worker has an unknown pack."""

@@ -57,6 +57,12 @@ class FleetWorkers:
         count = sum(received[-1].heartbeat.unknown_count for received in alive.values())
         return count, sorted({name for received in alive.values() for name in received[-1].heartbeat.unknown})
 
+    def clock_errors(self, now_s: float) -> tuple[int, dict[str, float]]:
+        """Return the number of packs with a wrong clock, and the errors of some of them [s]."""
+        heartbeats = [received[-1].heartbeat for received in self._alive(now_s).values()]
+        errors = {pack: error_s for heartbeat in heartbeats for pack, error_s in heartbeat.clock_errors.items()}
+        return sum(heartbeat.clock_error_count for heartbeat in heartbeats), errors
+
     def overview(self, now_s: float) -> dict[str, Any]:
         """Return an overview of the workers.
 

@@ -23,7 +23,13 @@ from pydantic import ValidationError
 
 from bms_estimator.edge.subjects import HOURS_STREAM
 from bms_estimator.fleet.hour_row import Hour
-from bms_estimator.fleet.queries.parquet_files import compact, days_to_compact, remove_unfinished, write
+from bms_estimator.fleet.queries.parquet_files import (
+    QUARANTINE_FOLDER,
+    compact,
+    days_to_compact,
+    remove_unfinished,
+    write,
+)
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 
@@ -159,13 +165,13 @@ class Collector:
 
 
 def compact_days(folder: Path, now_s: float) -> None:
-    """Merge the files of the days of ``days_to_compact``. Disk errors are logged; the next call retries.
+    """Merge the files of the days of ``days_to_compact``, also in quarantine. Disk errors are logged; the next call retries.
 
     Args:
         folder: Folder of the Parquet files.
         now_s: Wall clock [s since 1970].
     """
-    for day in days_to_compact(folder, now_s):
+    for day in [*days_to_compact(folder, now_s), *days_to_compact(folder / QUARANTINE_FOLDER, now_s)]:
         try:
             compact(day)
         except (OSError, duckdb.Error) as error:
@@ -191,7 +197,8 @@ def only_collector(folder: Path) -> Iterator[None]:
             raise UserError(
                 f"--folder {folder}: another collector writes there; end it, or choose another folder"
             ) from None
-        remove_unfinished(folder)
+        for each in (folder, folder / QUARANTINE_FOLDER):
+            remove_unfinished(each)
         yield
     finally:
         os.close(descriptor)

@@ -6,7 +6,8 @@ Meaning, method and limits of each query are in docs/fleet/questions.md.
 import contextlib
 import math
 import re
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import resources
@@ -17,7 +18,15 @@ from typing import Any, NamedTuple
 import duckdb
 
 from bms_estimator.fleet.hour_row import HOUR_S
-from bms_estimator.fleet.queries.parquet_files import DAY_FOLDER_PREFIX, MERGED_PREFIX, SCHEMA, day_folder, is_complete
+from bms_estimator.fleet.queries.parquet_files import (
+    DAY_FOLDER_PREFIX,
+    MERGED_PREFIX,
+    QUARANTINE_FOLDER,
+    SCHEMA,
+    VALID_ROWS,
+    day_folder,
+    is_complete,
+)
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
 
@@ -49,6 +58,7 @@ QUESTIONS = {
     "failing": Query(("days", "packs", "fits"), "packs that will soon reach a limit, or have recent input faults"),
     "honest": Query(("days", "packs"), "how often the SOC was within 2 std, compared with later estimates"),
     "silent": Query(("days", "packs"), "packs without recent hours"),
+    "clocks": Query((), "packs whose edge's clock is wrong, so that their hours are quarantined"),
 }
 
 
@@ -113,9 +123,7 @@ def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limit
     if name not in QUESTIONS:
         raise UserError(f"{name}: no such query; there are {', '.join(QUESTIONS)}, and sql 'SELECT ...'")
     with open_database(folder, days) as database:
-        (now_hour,) = database.execute("SELECT max(hour) FROM hours").fetchone() or (None,)
-        if now_hour is None:
-            raise UserError(f"--folder {folder}: its files hold no rows yet")
+        (now_hour,) = database.execute("SELECT getvariable('now_hour')").fetchone() or (0,)
         parameters = vars(limits) | _parameters(int(now_hour))
         for table in QUESTIONS[name].tables:
             _run(database, _sql(table), parameters)
@@ -143,16 +151,29 @@ def select(folder: Path, query: str, *, days: int | None = None) -> Answer:
 
 
 @contextlib.contextmanager
-def open_database(folder: Path, days: int | None = None) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open a database with the view ``hours``: one row for each hour of each pack.
+def open_database(
+    folder: Path, days: int | None = None, *, wall: Callable[[], float] = time.time
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open a database with the view ``hours``, which has one row for each hour of each pack, and the view ``quarantined``.
+
+    The variable ``now_hour`` is the last complete hour on the server's clock when the newest row arrived. The days end with
+    this hour.
+
+    Args:
+        folder: Folder of the Parquet files.
+        days: Number of last days (UTC) that are used; None: all.
+        wall: Wall clock [s since 1970], used only if all rows are from workers that did not record the server's time.
 
     Raises:
         UserError: The folder does not exist, is empty, or has a damaged file.
     """
-    files = _files(folder, days)
+    files, quarantined = _files(folder), _files_by_day(folder / QUARANTINE_FOLDER)
     with duckdb.connect() as database, _user_errors(folder):
         database.execute("SET TimeZone = 'UTC'")
-        _create_hours_view(database, files)
+        now_hour = _present_hour(database, [*files.values(), *quarantined.values()], int(wall() // HOUR_S))
+        database.execute(f"SET VARIABLE now_hour = {now_hour}")
+        _create_hours_view(database, _last_days(files, now_hour, days))
+        _create_quarantined_view(database, _last_days(quarantined, now_hour, days))
         yield database
 
 
@@ -167,21 +188,16 @@ def _user_errors(folder: Path) -> Iterator[None]:
         ) from error
 
 
-def _files(folder: Path, days: int | None) -> dict[Path, list[Path]]:
-    """Return the files by day folder, all or those of the last ``days``.
+def _files(folder: Path) -> dict[Path, list[Path]]:
+    """Return the files by day folder.
 
     Raises:
         UserError: There is no file, or one is incomplete.
     """
     if not folder.is_dir():
         raise UserError(f"--folder {folder}: no such folder; `bms-estimator fleet collect --folder {folder}` fills it")
-    by_day = {day: sorted(day.glob("*.parquet")) for day in sorted(folder.glob(f"{DAY_FOLDER_PREFIX}*"))}
-    by_day = {day: files for day, files in by_day.items() if files}
-    if days is not None and by_day:
-        last = datetime.fromisoformat(max(by_day).name.removeprefix(DAY_FOLDER_PREFIX)).replace(tzinfo=UTC)
-        first = day_folder(folder, datetime.fromtimestamp(last.timestamp() - (days - 1) * 24 * HOUR_S, UTC).date())
-        by_day = {day: files for day, files in by_day.items() if day >= first}
-    if not by_day:
+    by_day = _files_by_day(folder)
+    if not by_day and not _files_by_day(folder / QUARANTINE_FOLDER):
         raise UserError(f"--folder {folder}: no hours yet: the first one of a pack is written when its next one begins")
     for file in (file for files in by_day.values() for file in files):
         if file.exists() and not is_complete(file):
@@ -189,8 +205,49 @@ def _files(folder: Path, days: int | None) -> dict[Path, list[Path]]:
     return by_day
 
 
+def _files_by_day(folder: Path) -> dict[Path, list[Path]]:
+    by_day = {day: sorted(day.glob("*.parquet")) for day in sorted(folder.glob(f"{DAY_FOLDER_PREFIX}*"))}
+    return {day: files for day, files in by_day.items() if files}
+
+
+def _present_hour(database: duckdb.DuckDBPyConnection, files: Iterable[list[Path]], wall_hour: int) -> int:
+    """Return the last complete hour on the server's clock when the newest row arrived.
+
+    If no row has the server's time, return the newest hour of a row that is not after ``wall_hour``, or ``wall_hour`` without
+    such a row. Only the statistics in the files are read.
+    """
+    names = [str(file) for day_files in files for file in day_files]
+    statistics = """
+        SELECT max(latest) FILTER (path_in_schema = 'received_hour') - 1,
+            max(latest) FILTER (path_in_schema = 'hour' AND latest <= $wall_hour)
+        FROM (SELECT path_in_schema, stats_max_value::BIGINT AS latest FROM parquet_metadata($names)
+            WHERE path_in_schema IN ('hour', 'received_hour'))
+    """
+    found = database.execute(statistics, {"names": names, "wall_hour": wall_hour}).fetchone() or ()
+    return next((int(hour) for hour in found if hour is not None), wall_hour)
+
+
+def _last_days(by_day: Mapping[Path, list[Path]], now_hour: int, days: int | None) -> dict[Path, list[Path]]:
+    """Return the files of the days up to the day of ``now_hour``, all or the last ``days``; and those of the next hour."""
+    last = _day_name(now_hour + 1)
+    first = "" if days is None else _day_name(now_hour - 24 * (days - 1))
+    return {day: files for day, files in by_day.items() if first <= day.name <= last}
+
+
+def _day_name(hour: int) -> str:
+    """Return the name of the folder of an hour's day."""
+    return day_folder(Path(), datetime.fromtimestamp(hour * HOUR_S, UTC).date()).name
+
+
+def _create_quarantined_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
+    """Create the view ``quarantined`` with the rows of packs with a wrong clock."""
+    names = [str(file) for day_files in files.values() for file in day_files]
+    read = database.read_parquet(names, union_by_name=True, hive_partitioning=False) if names else None
+    (database.table("all_columns") if read is None else read).create_view("quarantined")
+
+
 def _create_hours_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
-    """Create the view ``hours``. A day with a single, merged file has no duplicate rows and needs no deduplication.
+    """Create the view ``hours``. A day with a single, merged file has one row of each hour already.
 
     Raises:
         UserError: The files have other columns.
@@ -207,6 +264,9 @@ def _create_hours_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path,
                 f"{Path(paths[0]).parent}: its files lack the columns pack and hour: they are not from `fleet collect`"
             )
         (database.table("all_columns") if read is None else read).create_view(name)
+    repeated = "SELECT * FROM all_columns UNION ALL BY NAME SELECT * FROM maybe_twice"
+    database.execute(f"CREATE TEMP VIEW rows AS {repeated}")
+    database.execute(f"CREATE TEMP VIEW valid_rows AS {VALID_ROWS}")
     database.execute(_sql("hours"))
 
 

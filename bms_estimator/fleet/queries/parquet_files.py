@@ -1,7 +1,7 @@
 """Hourly rows of packs in Parquet files ``date=YYYY-MM-DD/*.parquet``, written atomically and merged by day.
 
-A file is written under a name that no query reads, synced to the disk, and renamed. A row may be in two files; queries
-drop the duplicate. The module needs pyarrow and duckdb.
+A file is written under a name that no query reads, synced to the disk, and renamed. An hour may be in several files; its
+valid row is that of the largest revision. The module needs pyarrow and duckdb.
 """
 
 import os
@@ -23,6 +23,9 @@ BATCH_PREFIX = "batch-"
 """Prefix of the name of a file that was not merged."""
 MERGED_PREFIX = "day-"
 """Prefix of the name of a file into which the files of a day were merged."""
+QUARANTINE_FOLDER = "_quarantine"
+"""Folder of the rows of packs with a wrong clock, in folders of the days on the server's clock. Readers of a folder of
+Parquet files, such as pyarrow and Spark, skip names that begin with ``_``."""
 UNFINISHED_SUFFIX = ".part"
 """Suffix of the name of an unfinished file."""
 MAX_FILES_PER_DAY = 48
@@ -31,6 +34,9 @@ ROW_GROUP = 100_000
 """Size of a row group [rows], the smallest unit that a query reads."""
 DAY_CLOSE_DELAY_S = 2 * HOUR_S
 """Time after the end of a day at which its files are merged [s], because most late blocks have arrived by then."""
+LATE_DELAY_S = HOUR_S
+"""Maximum time that a file of a day that was merged before waits to be merged too [s]. Until then, other late rows of
+the day are collected, because each merge writes the whole day."""
 MERGE_MEMORY = "500MB"
 """Memory limit of a merge. A day of 100,000 packs is larger. DuckDB then sorts it in parts on the disk."""
 _MAGIC = b"PAR1"
@@ -39,14 +45,20 @@ _MAGIC = b"PAR1"
 
 def _column(annotation: object) -> pa.DataType:
     """Return the column type. Single precision exceeds the accuracy of any value, and halves the size of the files."""
-    return pa.string() if annotation is str else pa.int32() if annotation is int else pa.float32()
+    types = {str: pa.string(), int: pa.int32(), int | None: pa.int64()}
+    return types.get(annotation, pa.float32())
 
 
 SCHEMA = pa.schema([(name, _column(field.annotation)) for name, field in Hour.model_fields.items()])
+VALID_ROWS = "SELECT * FROM rows QUALIFY row_number() OVER (PARTITION BY pack, hour ORDER BY revision DESC NULLS LAST, samples DESC) = 1"
+"""SQL query for one row of each hour and pack from ``rows``. A row without a revision is from an older worker. Two rows of
+one revision differ if a worker without a checkpoint has read only the end of the hour from the stream."""
 
 
 def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
     """Write rows to a new file for each of their days, and sync the files to the disk.
+
+    Rows with an error of the edge's clock are written to ``QUARANTINE_FOLDER``, by the day of their arrival.
 
     Args:
         folder: Folder of the Parquet files; created if missing.
@@ -63,7 +75,17 @@ def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
 
 def write_table(folder: Path, table: pa.Table) -> list[Path]:
     """Write a table with the columns of ``SCHEMA``. Result and errors are those of ``write``."""
-    days = pc.divide(table["hour"], 24)
+    is_dated = pc.is_null(table["clock_error_s"])
+    dated, quarantined = table.filter(is_dated), table.filter(pc.invert(is_dated))
+    return [
+        *_write_days(folder, dated, "hour"),
+        *_write_days(folder / QUARANTINE_FOLDER, quarantined, "received_hour"),
+    ]
+
+
+def _write_days(folder: Path, table: pa.Table, hour_column: str) -> list[Path]:
+    """Write rows to a new file for each day of a column of hours."""
+    days = pc.divide(table[hour_column], 24)
     return [_write_day(folder, int(day.as_py()), table.filter(pc.equal(days, day))) for day in pc.unique(days)]
 
 
@@ -103,7 +125,8 @@ def _sync(path: Path) -> None:
 def days_to_compact(folder: Path, now_s: float) -> list[Path]:
     """Return the folders of days whose files should be merged.
 
-    These are the unmerged days that have ended, and the days with at least ``MAX_FILES_PER_DAY`` files.
+    These are the days that have ended and have a file that was not merged, and the days with at least
+    ``MAX_FILES_PER_DAY`` files. A day that was merged before waits until such a file is ``LATE_DELAY_S`` old.
 
     Args:
         folder: Folder of the Parquet files.
@@ -113,16 +136,23 @@ def days_to_compact(folder: Path, now_s: float) -> list[Path]:
     days = []
     for day in sorted(folder.glob(f"{DAY_FOLDER_PREFIX}*")):
         files = complete_files(day)
-        is_unmerged = day.name.removeprefix(DAY_FOLDER_PREFIX) < ended_before and not any(
-            f.name.startswith(MERGED_PREFIX) for f in files
-        )
-        if len(files) >= MAX_FILES_PER_DAY or (is_unmerged and files):
+        has_ended = day.name.removeprefix(DAY_FOLDER_PREFIX) < ended_before
+        if len(files) >= MAX_FILES_PER_DAY or (has_ended and _needs_merge(files, now_s)):
             days.append(day)
     return days
 
 
+def _needs_merge(files: list[Path], now_s: float) -> bool:
+    """Return True if the files of an ended day should be merged. ``days_to_compact`` describes the rule."""
+    merged = [file for file in files if file.name.startswith(MERGED_PREFIX)]
+    others = [file for file in files if file not in merged]
+    if not merged:
+        return bool(others)
+    return len(merged) > 1 or any(file.stat().st_mtime <= now_s - LATE_DELAY_S for file in others)
+
+
 def compact(day: Path) -> Path:
-    """Merge the complete files of a day into one without duplicates, sorted by pack and hour. Return the new file.
+    """Merge the complete files of a day into one with one row of each hour, sorted by pack and hour. Return the new file.
 
     The old files are removed once the new one is on the disk, so that no row is lost if the process is killed.
 
@@ -137,9 +167,12 @@ def compact(day: Path) -> Path:
     unfinished = path.with_name(f".{path.name}{UNFINISHED_SUFFIX}")
     names = [str(file) for file in files]
     with duckdb.connect(config={"memory_limit": MERGE_MEMORY, "temp_directory": str(day / ".sorting")}) as database:
-        database.read_parquet(names, union_by_name=True, hive_partitioning=False).create_view("rows")
-        unique_rows = database.sql("SELECT DISTINCT ON (pack, hour) * FROM rows ORDER BY pack, hour")
-        unique_rows.write_parquet(str(unfinished), compression="zstd", row_group_size=ROW_GROUP)
+        stored = database.read_parquet(names, union_by_name=True, hive_partitioning=False)  # noqa: F841 - used in SQL
+        no_rows = SCHEMA.empty_table()  # noqa: F841 - because files of older versions lack columns
+        database.sql("SELECT * FROM no_rows UNION ALL BY NAME SELECT * FROM stored").create_view("rows")
+        database.sql(f"{VALID_ROWS} ORDER BY pack, hour").write_parquet(
+            str(unfinished), compression="zstd", row_group_size=ROW_GROUP
+        )
     _finish(unfinished, path)
     for file in files:
         file.unlink(missing_ok=True)

@@ -130,7 +130,8 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
         f'[server]\nfolder = "{demo.folder}/server"\nlisten = "{LOOPBACK}:{nats_port}"\n'
         f'mqtt = "{LOOPBACK}:{mqtt_port}"\nmonitor = "{LOOPBACK}:{monitor_port}"\n'
     )
-    begin_s = int(time.time()) - BLOCK_S  # the first blocks are then complete when the edges start
+    # the edges are faster than real time, and their clocks must not get ahead of the server's
+    begin_s = int(time.time() - SPEED * (demo.seconds + TIMEOUT_S)) - BLOCK_S
     fleet = SimulatedFleet(demo.packs, seed=SEED, begin_ns=begin_s * 10**9)
     table = demo.folder / "packs.csv"
     table.write_text(fleet.table())

@@ -12,9 +12,11 @@ from bms_estimator.checkpoint.identity import fields, without_observer
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
+from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.packs.pack_type import Digest, PackType
 from bms_estimator.fleet.worker import hour_summary
 from bms_estimator.fleet.worker.density import MAX_TIMESTAMP_S
+from bms_estimator.fleet.worker.edge_clock import Arrival, clock_error_s
 from bms_estimator.fleet.worker.pack_state import CONFIG_DIGEST, LAST_STORE_NS, PACK_STATE, STATE_DIGEST, Fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.payload import Payload
@@ -54,18 +56,22 @@ class BlockProcessor:
         self._observer = record[0]["estimator"]["observer"]
         self._window = Window()
 
-    def step(self, pack: str, block: Block, pack_type: PackType, unmigrated_fields: Fields | None) -> Publications:
+    def step(
+        self, pack: str, block: Block, arrival: Arrival, pack_type: PackType, unmigrated_fields: Fields | None
+    ) -> Publications:
         """Estimate the pack's next block and return the resulting messages.
 
         Args:
             pack: Name of the pack.
             block: The block; its implausible timestamps are set to NaN.
+            arrival: Arrival of the block at the server.
             pack_type: Type of the pack; its estimator is bound to the record.
             unmigrated_fields: Estimator fields that another version saved; None if they are already in the record.
         """
         self._check_times(block.samples)
         self._restore_or_reset(pack_type, unmigrated_fields, block)
-        rows, is_new_hour = self._roll_over_hour(pack, block, pack_type)
+        rows, is_new_hour = self._roll_over_hour(pack, block, arrival, pack_type)
+        self._check_clock(block, arrival)
         self._resume_after_store_change(pack_type.estimator, block)
         # another pack may have used the window meanwhile
         self._window.previous_end_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
@@ -104,7 +110,7 @@ class BlockProcessor:
         else:
             for name in ("flow", "hour", "estimator"):
                 record[name] = np.zeros((), PACK_STATE[name])
-            d[LAST_STORE_NS] = d["hour"] = 0
+            d[LAST_STORE_NS] = d["hour"] = d["clock_error_s"] = 0
             self._counters["begun_anew"] += has_state
         d[CONFIG_DIGEST], d[STATE_DIGEST] = pack_type.config_digest, pack_type.state_digest
 
@@ -162,6 +168,12 @@ class BlockProcessor:
             self._counters["no_time"] += int(np.count_nonzero(~plausible))
             times[~plausible] = math.nan
 
+    def _check_clock(self, block: Block, arrival: Arrival) -> None:
+        """Record an error of the edge's clock, which quarantines the row of the current hour."""
+        if error_s := clock_error_s(block, arrival.received_s):
+            self._delivery["clock_error_s"] = error_s
+            self._counters["clock_ahead" if error_s > 0.0 else "clock_behind"] += 1
+
     def _gap_s(self, block: Block) -> float:
         """Return the length of the gap before a block [s]; infinite if unknown."""
         d, times_s = self._delivery, _finite_times_s(block.samples)
@@ -171,7 +183,7 @@ class BlockProcessor:
         return gap_s if gap_s >= 0.0 else math.inf
 
     def _roll_over_hour(
-        self, pack: str, block: Block, pack_type: PackType
+        self, pack: str, block: Block, arrival: Arrival, pack_type: PackType
     ) -> tuple[tuple[tuple[str, bytes], ...], bool]:
         """If the block is of a later hour, finish the current hour and begin the new one.
 
@@ -185,10 +197,20 @@ class BlockProcessor:
         if current:
             settings = pack_type.settings.model_copy(update={"name": pack})
             row = hour_summary.row(settings, current, self._record["hour"], pack_type.estimator)
-            rows = ((f"{pack}.{current}", _json(row)),)
+            row = row.model_copy(update=self._origin(arrival))
+            rows = ((f"{pack}.{current}.{arrival.sequence}", _json(row)),)
         hour_summary.begin(self._record["hour"], self._record[0]["estimator"])
-        self._delivery["hour"] = hour
+        self._delivery["hour"], self._delivery["clock_error_s"] = hour, 0.0
         return rows, True
+
+    def _origin(self, arrival: Arrival) -> dict[str, float | None]:
+        """Return the fields of a row that describe the block that finished the hour, and the clock of the hour's blocks."""
+        received_s, error_s = arrival.received_s, float(self._delivery["clock_error_s"])
+        return {
+            "revision": arrival.sequence,
+            "received_hour": None if received_s is None else received_s // HOUR_S,
+            "clock_error_s": error_s or None,
+        }
 
     def _record_last_sample(self, block: Block) -> None:
         """Record store and timestamp of the last valid sample."""

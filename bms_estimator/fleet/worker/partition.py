@@ -27,6 +27,7 @@ from bms_estimator.fleet.worker.checkpoint_format import (
 )
 from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
 from bms_estimator.fleet.worker.density import density_fault
+from bms_estimator.fleet.worker.edge_clock import Arrival
 from bms_estimator.fleet.worker.pack_state import Fields, UnpackedRecord
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
@@ -70,6 +71,8 @@ class Partition:
         number: Number of the partition.
         sequence: Stream sequence number of the last processed or deferred message; 0: none.
         deferred: Queue of packs with deferred messages.
+        clock_errors: Errors of edges' clocks beyond the limits of ``edge_clock``, by pack [s], positive if ahead. A pack is
+            listed from a block with an error until the end of this hour on its clock.
     """
 
     def __init__(self, number: int, table: PackLookup, *, wall: Callable[[], float] = time.time) -> None:
@@ -81,6 +84,7 @@ class Partition:
         # delivery records of these packs, which only this process has updated since it restored the partition
         self._unmigrated_deliveries: dict[str, np.void] = {}
         self.deferred = Deferred()
+        self.clock_errors: dict[str, float] = {}
         self._type_by_pack: dict[str, PackType] = {}
         self._replied: set[str] = set()  # packs whose edge has had a reply from this worker
         self._logged_rejections: set[str] = set()
@@ -135,13 +139,15 @@ class Partition:
         self._unpacked.load(packed)
         return self._unpacked.record.copy()
 
-    def take(self, pack: str, data: bytes, sequence: int) -> BlockResult:
+    def take(self, pack: str, data: bytes, sequence: int, received_s: int | None = None) -> BlockResult:
         """Process a message of the stream, or defer it if its pack is unknown or has other deferred messages.
 
         Args:
             pack: Name of the sending pack.
             data: Bytes of a block; if they are damaged, the message is counted and skipped.
             sequence: Stream sequence number. A message that was already processed is counted and skipped.
+            received_s: Server's clock at the arrival of the message [s since 1970]; None: unknown, so that the edge's clock
+                is not checked.
         """
         if sequence <= self.sequence:
             self._counters["repeated"] += 1
@@ -155,7 +161,7 @@ class Partition:
         pack_type = self._look_up(pack)
         if pack_type is None:
             return self.defer(pack, sequence)
-        return self._take(pack, block, pack_type)
+        return self._take(pack, block, Arrival(sequence, received_s), pack_type)
 
     def defer(self, pack: str, sequence: int) -> BlockResult:
         """Defer a message: it stays in the stream until its pack is served."""
@@ -167,14 +173,14 @@ class Partition:
             self._counters["not_deferred"] += 1
         return BlockResult(pack)
 
-    def take_deferred(self, pack: str, data: bytes, sequence: int) -> BlockResult:
+    def take_deferred(self, pack: str, data: bytes, sequence: int, received_s: int | None = None) -> BlockResult:
         """Process the next deferred message of a known pack. ``take`` describes the arguments."""
         pack_type = self._look_up(pack)
         if pack_type is None or pack not in self.deferred:
             return BlockResult(pack)
         self.deferred.advance(pack, sequence)
         block = self._decode(data)
-        return self._take(pack, block, pack_type) if block else BlockResult(pack)
+        return self._take(pack, block, Arrival(sequence, received_s), pack_type) if block else BlockResult(pack)
 
     def is_known(self, pack: str) -> bool:
         """Return True if the table contains the pack."""
@@ -210,7 +216,7 @@ class Partition:
             pack_type = self._type_by_pack[pack] = self._types.of(*entry)
         return pack_type
 
-    def _take(self, pack: str, block: Block, pack_type: PackType) -> BlockResult:
+    def _take(self, pack: str, block: Block, arrival: Arrival, pack_type: PackType) -> BlockResult:
         """Process a block of a known pack."""
         unmigrated_fields = self._load(pack)
         d = self._unpacked.delivery
@@ -225,7 +231,7 @@ class Partition:
             if fault:
                 self._log_rejection(pack, fault)
             else:
-                stepped = self._step(pack, block, pack_type, unmigrated_fields)
+                stepped = self._step(pack, block, arrival, pack_type, unmigrated_fields)
             if stepped is None:  # reload the record, which the failed block may have changed
                 self._load(pack)
                 self._restore_unmigrated_delivery(pack)
@@ -234,6 +240,7 @@ class Partition:
                 self._counters["too_dense" if fault else "failed"] += 1
             result = stepped or BlockResult(pack, failed=int(not fault))
             mark_taken(d)
+            self._update_clock_error(pack, float(d["clock_error_s"]))
             self._unmigrated.pop(pack, None)
             self._unmigrated_deliveries.pop(pack, None)
         else:
@@ -247,6 +254,20 @@ class Partition:
         self._replied.add(pack)
         return result._replace(reply=edge_reply(order, d, block, is_first=is_first))
 
+    def _update_clock_error(self, pack: str, error_s: float) -> None:
+        """List a pack with the error of its edge's clock, and log a new error; 0 removes the pack from the list."""
+        if not error_s:
+            self.clock_errors.pop(pack, None)
+            return
+        if pack not in self.clock_errors:
+            log.warning(
+                "the clock of an edge is wrong: its hours are quarantined",
+                partition=self.number,
+                pack=pack,
+                clock_error_s=round(error_s),
+            )
+        self.clock_errors[pack] = error_s
+
     def _restore_unmigrated_delivery(self, pack: str) -> None:
         """Restore the delivery record of a pack whose stored record still has a previous layout."""
         if pack in self._unmigrated_deliveries:
@@ -259,11 +280,11 @@ class Partition:
             log.warning("a block is rejected", partition=self.number, pack=pack, reason=reason)
 
     def _step(
-        self, pack: str, block: Block, pack_type: PackType, unmigrated_fields: Fields | None
+        self, pack: str, block: Block, arrival: Arrival, pack_type: PackType, unmigrated_fields: Fields | None
     ) -> BlockResult | None:
         """Estimate the next block; None after an internal error."""
         try:
-            state, parameters, hours = self._processor.step(pack, block, pack_type, unmigrated_fields)
+            state, parameters, hours = self._processor.step(pack, block, arrival, pack_type, unmigrated_fields)
             return BlockResult(pack, state=state, parameters=parameters, hours=hours)
         except Exception:  # an internal error with one block must not stop the pack
             log.exception("a block is skipped", partition=self.number, pack=pack, number=block.number)

@@ -23,7 +23,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stored_messages import read_messages
-from bms_estimator.fleet.nats.stream_reader import StreamError
+from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
 from bms_estimator.fleet.worker.deferred import Span
@@ -244,7 +244,8 @@ class PartitionLease:
         if sequence > span.last:  # the stream has dropped the deferred messages
             partition.deferred.advance(pack, span.last)
             return
-        take = partial(partition.take_deferred, pack, data, sequence)
+        received_s = int(message.time.timestamp()) if message.time else None
+        take = partial(partition.take_deferred, pack, data, sequence, received_s)
         self._count_block(data)
         await self._publish(await self._step(pack, sequence, take))
 
@@ -258,7 +259,7 @@ class PartitionLease:
         partition = self.partition
         if partition is None or delivered.sequence <= partition.sequence:
             return
-        await self._publish(await self._take_or_defer(partition, delivered.pack, delivered.data, delivered.sequence))
+        await self._publish(await self._take_or_defer(partition, delivered.pack, delivered))
 
     async def _process_before(self, delivered: DeliveredMessage) -> None:
         """Bring the state up to the message before a delivered one."""
@@ -338,13 +339,16 @@ class PartitionLease:
         async with aclosing(messages):
             async for message in messages:
                 pack = message.subject.rpartition(".")[2]
-                result = await self._take_or_defer(partition, pack, message.data, message.sequence)
+                result = await self._take_or_defer(partition, pack, message)
                 latest[pack] = _merge(latest.get(pack), result)
         for result in latest.values():
             await self._publish(result)
 
-    async def _take_or_defer(self, partition: Partition, pack: str, data: bytes, sequence: int) -> BlockResult:
+    async def _take_or_defer(
+        self, partition: Partition, pack: str, message: DeliveredMessage | StoredMessage
+    ) -> BlockResult:
         """Process a message, or defer it if its pack has exhausted its budget or has deferred messages."""
+        data, sequence = message.data, message.sequence
         if subjects.partition_of(pack, self._partitions) != self.number:
             return partition.reject_misplaced(pack, sequence)
         if pack in partition.deferred or self._budget.is_exhausted(pack):
@@ -352,7 +356,7 @@ class PartitionLease:
             partition.defer(pack, sequence)
             self._wake_up_deferred.set()
             return BlockResult(pack)
-        result = await self._step(pack, sequence, partial(partition.take, pack, data, sequence))
+        result = await self._step(pack, sequence, partial(partition.take, pack, data, sequence, message.received_s))
         if pack not in partition.deferred:
             self._count_block(data)
         return result

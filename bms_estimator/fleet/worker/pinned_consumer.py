@@ -41,6 +41,8 @@ class DeliveredMessage(NamedTuple):
     data: bytes
     sequence: int
     """Sequence number in the stream."""
+    received_s: int
+    """Server's clock at the arrival of the message [s since 1970]."""
     pin: int
     """Number of the pin under which this worker received the message, from 1."""
     follows: bool
@@ -141,22 +143,38 @@ class PinnedConsumer:
         await self._nc.publish(self._next_subject, json.dumps(request).encode(), f"{self._inbox}.{self._pin_count}")
 
     def _queue_message(self, message: Msg, pin: str) -> None:
-        stream_sequence, consumer_sequence = parse_sequences(message.reply)
+        position = parse_position(message.reply)
         if pin != self._pin:
             self._pin, self._pin_count = pin, self._pin_count + 1
         self.trouble = ""
-        follows = consumer_sequence == self._last_consumer_sequence + 1
-        self._last_consumer_sequence = consumer_sequence
+        follows = position.consumer_sequence == self._last_consumer_sequence + 1
+        self._last_consumer_sequence = position.consumer_sequence
         pack = message.subject.rpartition(".")[2]
-        self.waiting.append(DeliveredMessage(pack, message.data, stream_sequence, self._pin_count, follows))
+        self.waiting.append(
+            DeliveredMessage(
+                pack, message.data, position.stream_sequence, position.received_s, self._pin_count, follows
+            )
+        )
 
 
-def parse_sequences(reply: str) -> tuple[int, int]:
-    """Return a message's sequence numbers in its stream and in its consumer; the latter has no gaps.
+class MessagePosition(NamedTuple):
+    """Position of a delivered message."""
+
+    stream_sequence: int
+    """Sequence number in the stream."""
+    consumer_sequence: int
+    """Sequence number in the consumer, without gaps."""
+    received_s: int
+    """Server's clock at the arrival of the message [s since 1970]."""
+
+
+def parse_position(reply: str) -> MessagePosition:
+    """Return the position of a delivered message.
 
     Args:
         reply: Acknowledgment subject (ADR-15 of NATS): 9 tokens, or at least 11 with the server's domain.
     """
     tokens = reply.split(".")
     first = 5 if len(tokens) == 9 else 7
-    return int(tokens[first]), int(tokens[first + 1])
+    stream_sequence, consumer_sequence, received_ns = (int(token) for token in tokens[first : first + 3])
+    return MessagePosition(stream_sequence, consumer_sequence, received_ns // 10**9)

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from heapq import nlargest
 from pathlib import Path
 
 import structlog
@@ -35,6 +36,8 @@ CHECK_S = 0.5
 """Interval between two checks for a due checkpoint or waiting summaries [s]."""
 MAX_UNKNOWN = 20
 """Maximum number of unknown packs that a heartbeat names."""
+MAX_CLOCK_ERRORS = 20
+"""Maximum number of packs with a wrong clock that a heartbeat names."""
 MAX_RELEASES = 8
 """Maximum number of partitions that are saved and released concurrently."""
 
@@ -331,11 +334,12 @@ class Worker:
 
     def _heartbeat(self) -> Heartbeat:
         owned_leases = [lease for lease in self._leases if lease.is_owned]
-        counters, unknown = Counter[str](), list[str]()
+        counters, unknown, clock_errors = Counter[str](), list[str](), dict[str, float]()
         for lease in owned_leases:
             if lease.partition:
                 counters.update(lease.partition.counters)
                 unknown += lease.partition.unknown
+                clock_errors |= lease.partition.clock_errors
         lags = [lease.lag_s for lease in owned_leases if lease.lag_s is not None]
         for lease in owned_leases:
             lease.lag_s = None  # a heartbeat has the largest lag since the previous heartbeat
@@ -355,6 +359,8 @@ class Worker:
             counters=dict(counters),
             unknown_count=len(unknown),
             unknown=tuple(sorted(unknown)[:MAX_UNKNOWN]),
+            clock_error_count=len(clock_errors),
+            clock_errors=dict(nlargest(MAX_CLOCK_ERRORS, clock_errors.items(), key=lambda each: abs(each[1]))),
             waiting=sum(len(lease.consumer.waiting) for lease in self._leases),
             hours_waiting=sum(len(lease.waiting_summaries) for lease in self._leases),
             checkpoint_age_s=max(ages, default=None),

@@ -96,7 +96,9 @@ async def _measure(packs: int, arguments: argparse.Namespace) -> dict[str, str]:
 
 
 async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dict[str, str]:
-    begin_s = int(time.time())
+    minutes = arguments.warm_up + arguments.minutes
+    # no block is from the future
+    begin_s = int(time.time() - 60.0 * minutes * max(arguments.speed - 1.0, 0.0))
     fleet = SimulatedFleet(packs, seed=SEED, begin_ns=begin_s * 10**9)
     load_begin_s = time.monotonic()
     await asyncio.to_thread(fleet_rig.load, fleet)
@@ -104,7 +106,6 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     names = [fleet_rig.start_worker(checkpoint_s=CHECKPOINT_S) for _ in range(arguments.workers)]
     received = await _listen(fleet_rig, fleet)
     await _wait_until(lambda: len(received.workers) == len(names))
-    minutes = arguments.warm_up + arguments.minutes
     begin = datetime.fromtimestamp(begin_s, UTC).replace(tzinfo=None).isoformat()
     blocks = round(minutes * arguments.speed) + 1
     edges = fleet_rig.simulate(packs, seed=SEED, begin=f"{begin}", speed=arguments.speed, blocks=blocks)

@@ -208,6 +208,16 @@ def test_unknown_packs_are_listed_until_they_are_known_or_no_worker_has_any():
     assert view.overview(4.0, 0.0)["concerns"]["unknown"] == {"count": 0, "packs": []}
 
 
+def test_packs_with_a_wrong_clock_are_listed_with_the_largest_errors_first():
+    view = FleetView(2, 0.0)
+    for worker, errors in (("v", {"a": 900.0}), ("w", {"b": -4e8})):
+        beat = heartbeat(worker, 0, clock_errors=errors, clock_error_count=3)
+        view.receive_worker(beat.model_dump_json().encode(), 0.0)
+    overview = view.overview(1.0, 0.0)
+    assert overview["concerns"]["clock"] == {"count": 6, "packs": [["b", -4e8], ["a", 900.0]]}
+    assert overview["attention"] == 6
+
+
 def test_rate_of_received_states_is_measured():
     view = FleetView(1, 0.0)
     for second in range(20):

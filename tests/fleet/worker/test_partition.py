@@ -279,7 +279,7 @@ class TestPublishedMessages:
         for index in hour_begins:
             ParameterReport.model_validate_json(results[index].parameters)
         rows = [row for result in results for row in result.hours]
-        assert [name for name, _ in rows] == ["a.480000", "a.480001"]
+        assert [name for name, _ in rows] == ["a.480000.181", "a.480001.361"]
         hours = [Hour.model_validate_json(row) for _, row in rows]
         assert [(row.pack, row.samples, row.seen_s) for row in hours] == [("a", 3600, 3599.0), ("a", 3600, 3600.0)]
         assert hours[0].soc == make_estimator(SETTINGS, CELL).run(samples[:3600])["soc"][-1]

@@ -21,6 +21,7 @@ from nats.aio.client import Client
 from bms_estimator.edge import subjects
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.packs.pack_bucket import PackBucket, write_bucket
@@ -56,7 +57,7 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run(tmp_path: P
     with running(tmp_path, NODES, partitions=PARTITIONS) as cluster, ExitStack() as stack:
         nc = await connected(cluster.urls)
         await make_streams(nc, partitions=PARTITIONS, replicas=NODES)
-        fleet = SimulatedFleet(PACKS, seed=SEED, begin_ns=time.time_ns())
+        fleet = SimulatedFleet(PACKS, seed=SEED, begin_ns=time.time_ns() - 86_400 * 10**9)  # the packs are fast
         await write_bucket(nc, subjects.PACKS_BUCKET, pack_rows(fleet, tmp_path / "packs.csv"))
         bucket = PackBucket(nc)
         await bucket.refresh()
@@ -138,15 +139,22 @@ async def kill_node(cluster: NatsCluster, rng: random.Random) -> str:
 
 
 async def stored_hours(nc: Client) -> dict[str, bytes]:
-    """Return all stored hour rows by their ids, after a check that none is stored twice."""
+    """Return all stored hour rows by pack and hour, after a check that none is stored twice."""
     js = nc.jetstream(timeout=LONG_S)
-    rows = {}
+    ids, rows = set[str](), dict[str, bytes]()
     state = (await js.stream_info(subjects.HOURS_STREAM)).state
     for sequence in range(1, state.last_seq + 1):
         message = await js.get_msg(subjects.HOURS_STREAM, sequence)
-        assert message.headers["Nats-Msg-Id"] not in rows
-        rows[message.headers["Nats-Msg-Id"]] = message.data
+        assert message.headers["Nats-Msg-Id"] not in ids
+        ids.add(message.headers["Nats-Msg-Id"])
+        rows |= without_arrival(message.data)
     return rows
+
+
+def without_arrival(data: bytes) -> dict[str, bytes]:
+    """Return an hour row without the fields of its last block's arrival, by pack and hour."""
+    row = Hour.model_validate_json(data).model_copy(update={"revision": None, "received_hour": None})
+    return {f"{row.pack}.{row.hour}": row.model_dump_json().encode()}
 
 
 def expected_hours(registry: PackRegistry, fleet: SimulatedFleet, edges: SimulatedEdges) -> dict[str, bytes]:
@@ -156,7 +164,8 @@ def expected_hours(registry: PackRegistry, fleet: SimulatedFleet, edges: Simulat
     for number in range(1, edges.last + 1):
         numbers = np.full(PACKS, number)
         for i, data in enumerate(fleet.blocks(packs, numbers, edges._ready_s(numbers))):
-            rows |= dict(partition.take(fleet.names[i], data, partition.sequence + 1).hours)
+            for _, row in partition.take(fleet.names[i], data, partition.sequence + 1).hours:
+                rows |= without_arrival(row)
     return rows
 
 

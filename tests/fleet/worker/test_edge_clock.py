@@ -1,0 +1,126 @@
+"""Edges with a wrong clock, judged by the server's time at the arrival of their blocks."""
+
+import time
+
+import numpy as np
+import pytest
+
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import Block, encode
+from bms_estimator.fleet.hour_row import Hour
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.worker.edge_clock import MAX_AHEAD_S, MAX_BEHIND_S
+from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.sample import SAMPLE
+from tests.fleet.nats_cluster import connected, running
+from tests.fleet.partition_stream import STORE_ID_NS, one_block, table
+from tests.fleet.workers import Heartbeats, Process, load_packs, send
+
+STORE_S = STORE_ID_NS // 10**9
+"""Creation time of the edge's store [s since 1970]."""
+YEAR_2040_S = 2_208_988_800
+"""Beginning of the year 2040 [s since 1970]."""
+
+
+def samples_until(last_s):
+    """Return the samples of a minute that end ``last_s`` after the creation of the store."""
+    rows = np.zeros(60, SAMPLE)
+    rows["time_s"] = last_s - 59.0 + np.arange(60)
+    rows["voltage_v"], rows["current_a"], rows["temperature_c"] = 3.7, 1.0, 25.0
+    return rows
+
+
+def row_of_an_hour(partition, ahead_s):
+    """Send two blocks whose edge is ``ahead_s`` ahead of the server, and return the row of the finished hour."""
+    for number, last_s in enumerate((3000.0, 4000.0), 1):
+        received_s = round(STORE_S + last_s - ahead_s)
+        result = partition.take("a", one_block(samples_until(last_s), number), number, received_s)
+    ((_, data),) = result.hours
+    return Hour.model_validate_json(data)
+
+
+@pytest.mark.parametrize(
+    "ahead_s",
+    [MAX_AHEAD_S, 0.0, -5 * 86_400.0, -MAX_BEHIND_S],
+    ids=["ten minutes ahead", "exact", "delivered after five days", "delivered after a year"],
+)
+def test_clock_within_the_limits_and_late_delivery_are_no_error(ahead_s):
+    partition = Partition(0, table)
+    row = row_of_an_hour(partition, ahead_s)
+    assert (row.clock_error_s, partition.clock_errors) == (None, {})
+    assert row.received_hour == int(STORE_S + 4000.0 - ahead_s) // 3600
+
+
+@pytest.mark.parametrize("ahead_s", [MAX_AHEAD_S + 1.0, -MAX_BEHIND_S - 1.0], ids=["ahead", "behind"])
+def test_error_beyond_a_limit_is_in_the_row_and_names_the_pack(ahead_s):
+    partition = Partition(0, table)
+    assert row_of_an_hour(partition, ahead_s).clock_error_s == ahead_s
+    assert partition.clock_errors == {"a": ahead_s}
+    assert partition.counters["clock_ahead" if ahead_s > 0.0 else "clock_behind"] == 2
+
+
+def test_hour_with_one_block_from_the_future_is_quarantined_and_the_following_hour_is_not():
+    partition = Partition(0, table)
+    rows = []
+    for number, (last_s, ahead_s) in enumerate([(1000.0, 7200.0), (2000.0, 0.0), (4000.0, 0.0), (8000.0, 0.0)], 1):
+        received_s = round(STORE_S + last_s - ahead_s)
+        result = partition.take("a", one_block(samples_until(last_s), number), number, received_s)
+        rows += [Hour.model_validate_json(data) for _, data in result.hours]
+    assert [row.clock_error_s for row in rows] == [7200.0, None]
+    assert partition.clock_errors == {}
+
+
+def test_clock_error_of_an_unfinished_hour_survives_a_takeover():
+    partition = Partition(0, table)
+    partition.take("a", one_block(samples_until(1000.0), 1), 1, round(STORE_S + 1000.0 - 7200.0))
+    restored = Partition.restore(0, table, b"".join(partition.snapshot().chunks()))
+    ((_, data),) = restored.take("a", one_block(samples_until(4000.0), 2), 2, STORE_S + 4000).hours
+    assert Hour.model_validate_json(data).clock_error_s == 7200.0
+
+
+def test_revision_of_a_row_is_the_sequence_of_the_block_that_finished_it():
+    partition = Partition(0, table)
+    partition.take("a", one_block(samples_until(3000.0), 1), 7)
+    ((message_id, data),) = partition.take("a", one_block(samples_until(4000.0), 2), 9).hours
+    assert Hour.model_validate_json(data).revision == 9
+    assert message_id.endswith(".9")
+
+
+async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_hours(tmp_path):
+    """Send blocks before the worker starts, which it reads from the stream, and after that, which it gets delivered."""
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=1)
+        await load_packs(nc, ["p1", "p2"])
+
+        stores_s = {"p1": YEAR_2040_S, "p2": int(time.time()) - 86_400}
+
+        async def send_hour(number):
+            for pack, store_s in stores_s.items():
+                data = encode(Block(store_s * 10**9, number, 1, time.time(), samples_until(3600.0 * number)))
+                await send(nc, pack, data)
+
+        await send_hour(1)
+        await send_hour(2)
+        worker = Process(tmp_path, cluster.url, "w1")
+        try:
+            async with Heartbeats(nc) as heartbeats:
+                await heartbeats.until(lambda last: "w1" in last and last["w1"].counters.get("blocks") == 4)
+                await send_hour(3)
+                await heartbeats.until(lambda last: last["w1"].counters.get("blocks") == 6)
+                heartbeat = heartbeats.last["w1"]
+            assert (heartbeat.clock_error_count, list(heartbeat.clock_errors)) == (1, ["p1"])
+            assert heartbeat.clock_errors["p1"] == pytest.approx(YEAR_2040_S + 10_800 - time.time(), abs=60.0)
+            assert await worker.end() == 0
+            rows = {}
+            stream = (await nc.jetstream().stream_info(subjects.HOURS_STREAM)).state
+            for sequence in range(1, stream.last_seq + 1):
+                row = Hour.model_validate_json((await nc.jetstream().get_msg(subjects.HOURS_STREAM, sequence)).data)
+                rows.setdefault(row.pack, []).append(row)
+        finally:
+            worker.kill()
+        assert [row.clock_error_s is not None for row in rows["p1"]] == [True, True]
+        assert [row.clock_error_s for row in rows["p2"]] == [None, None]
+        assert [row.revision for row in rows["p1"]] == [3, 5]
+        assert all(abs(row.received_hour - time.time() / 3600) < 2 for row in rows["p1"] + rows["p2"])
+        await nc.close()
