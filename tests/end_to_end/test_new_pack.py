@@ -28,7 +28,7 @@ from tests.end_to_end.lfp_pack import (
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
-CALIBRATION_SPEED, RUN_SPEED = 300.0, 500.0
+CALIBRATION_SPEED, RUN_SPEED = 1000.0, 500.0
 """Maximum speeds of the virtual board relative to real time, at 1 Hz."""
 
 
