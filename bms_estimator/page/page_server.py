@@ -20,15 +20,28 @@ MAX_HISTORY_QUERIES = 4
 """Maximum number of history queries that wait for the disk. Further queries wait until one of these has ended."""
 
 STATIC = Path(__file__).with_name("static")
+SCRIPTS = (
+    "cells.js",
+    "charts.js",
+    "curves.js",
+    "dom.js",
+    "elements.js",
+    "forecast.js",
+    "format.js",
+    "health.js",
+    "live.js",
+    "packs.js",
+    "page.js",
+    "parameters.js",
+    "state.js",
+    "uplot.js",
+    "what_if.js",
+)
+"""Scripts of the page."""
 FILES = {
     "/": File(STATIC / "index.html", "text/html"),
     "/style.css": File(STATIC / "style.css", "text/css"),
-    "/page.js": File(STATIC / "page.js", "text/javascript"),
-    "/live.js": File(STATIC / "live.js", "text/javascript"),
-    "/what_if.js": File(STATIC / "what_if.js", "text/javascript"),
-    "/format.js": File(STATIC / "format.js", "text/javascript"),
-    "/charts.js": File(STATIC / "charts.js", "text/javascript"),
-    "/uplot.js": File(STATIC / "uplot.js", "text/javascript"),
+    **{f"/{name}": File(STATIC / name, "text/javascript") for name in SCRIPTS},
     "/icon.svg": File(STATIC / "icon.svg", "image/svg+xml"),
 }
 """Static files by URL path."""

@@ -33,6 +33,7 @@ FILES = {
     "/fleet.css": File(STATIC / "fleet.css", "text/css"),
     "/fleet.js": File(STATIC / "fleet.js", "text/javascript"),
     "/style.css": File(SHARED / "style.css", "text/css"),
+    "/dom.js": File(SHARED / "dom.js", "text/javascript"),
     "/live.js": File(SHARED / "live.js", "text/javascript"),
     "/format.js": File(SHARED / "format.js", "text/javascript"),
     "/icon.svg": File(SHARED / "icon.svg", "image/svg+xml"),

@@ -1,4 +1,5 @@
 // Charts with uPlot. Colors come from the style sheet, light or dark.
+import { node } from "./dom.js";
 import { clock, dayMonth, hourMinute, when } from "./format.js";
 
 /* global uPlot */
@@ -34,9 +35,11 @@ export class Ring {
 	}
 }
 
+export const clip = (x) => Math.min(Math.max(x, 0), 1);
 /** Multiply by a factor. A missing value becomes null, uPlot's gap. */
 export const scaled = (values, factor) => Array.from(values, (x) => (x !== null && Number.isFinite(x) ? factor * x : null));
 export const nullGaps = (values) => scaled(values, 1);
+export const nulls = (time) => new Array(time.length).fill(null);
 
 const DAY_S = 86400, STEPS_S = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 3600, 7200, 14400, 21600, DAY_S, 2 * DAY_S, 5 * DAY_S, 10 * DAY_S];
 function timeLabels(plot, splits) {
@@ -76,21 +79,17 @@ class Sized {
 
 /** Chart over time. Data: times, edges of the band, value, and optionally a second value. Charts with equal `sync` share the cursor. */
 export class Curve extends Sized {
-	constructor(parent, { title, unit, color: name, height, minSpan, low, high, first = "measured", second, sync = "time" }) {
+	constructor(parent, title, unit, name, minSpan, { low, high, first = "measured", second, sync = "time" } = {}) {
 		super();
 		Object.assign(this, { title, unit });
-		this.box = document.createElement("figure");
-		this.box.className = "curve";
+		this.box = node("figure", { class: "curve" });
 		this.box.innerHTML = "<figcaption><b></b><span></span><output aria-hidden=true></output></figcaption><div role=img></div>";
 		const [caption, body] = this.box.children;
 		caption.children[0].textContent = title;
 		caption.children[1].textContent = unit;
 		if (second) {
 			for (const [line, label] of [[name, first], [second.color, second.label]]) {
-				const key = document.createElement("i");
-				key.className = line.slice(2);
-				key.textContent = label;
-				caption.insertBefore(key, caption.lastChild);
+				caption.insertBefore(node("i", { class: line.slice(2) }, label), caption.lastChild);
 			}
 		}
 		this.readout = caption.lastChild;
@@ -98,7 +97,7 @@ export class Curve extends Sized {
 		parent.append(this.box);
 		const edge = { ...thin, width: 0 };
 		this.plot = new uPlot({
-			width: 300, height, legend: { show: false }, padding: [8, 26, 0, 0],
+			width: 300, height: 132, legend: { show: false }, padding: [8, 26, 0, 0],
 			series: [{}, edge, edge, { ...thin, stroke: color(name), width: 1.6 }, ...(second ? [{ ...thin, stroke: color(second.color), width: 1.6, dash: second.dash }] : [])],
 			bands: [{ series: [1, 2], fill: faint(name) }],
 			cursor: { drag: { x: false, y: false }, points: { show: false }, sync: { key: sync } },

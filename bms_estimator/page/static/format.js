@@ -1,17 +1,17 @@
 // Numbers and times as text. Pure. Unknown values are "", never NaN.
 
-const isKnown = (x) => typeof x === "number" && Number.isFinite(x);
+export const isNumber = Number.isFinite;
 const withMinus = (text) => (Number(text) === 0 ? text.replace("-", "") : text).replace("-", "−");
 
 /** Fixed decimals; a minus sign in place of a hyphen, none before a zero. */
-export const fixed = (x, decimals) => (isKnown(x) ? withMinus(x.toFixed(decimals)) : "");
+export const fixed = (x, decimals) => (isNumber(x) ? withMinus(x.toFixed(decimals)) : "");
 
 /** About four digits: three decimals below 10, two below 100, one above. */
 export const plain = (x) => fixed(x, Math.abs(x) < 9.9995 ? 3 : Math.abs(x) < 99.995 ? 2 : 1);
 
 /** A small or large number by its digits: 1.234, 0.0123, 1.23e-5. */
 export function digits(x, count = 4) {
-	if (!isKnown(x)) return "";
+	if (!isNumber(x)) return "";
 	const size = Math.abs(x);
 	if (size !== 0 && (size < 1e-3 || size >= 1e6)) return withMinus(x.toExponential(count - 1));
 	return withMinus(Number(x.toPrecision(count)).toString());
@@ -19,7 +19,7 @@ export function digits(x, count = 4) {
 
 /** A value and its standard deviation, which determines the decimals of both. */
 export function withError(value, std, factor) {
-	if (!isKnown(std)) return [digits(factor * value), ""];
+	if (!isNumber(std)) return [digits(factor * value), ""];
 	const error = factor * std, decimals = Math.min(Math.max(1 - Math.floor(Math.log10(error || 1)), 0), 8);
 	return error < 1e-7 ? [digits(factor * value), digits(error, 2)] : [fixed(factor * value, decimals), digits(error, 2)];
 }
@@ -29,15 +29,16 @@ export const volts = (x) => unit(plain(x), "V");
 export const amperes = (x) => unit(plain(x), "A");
 export const watts = (x) => unit(fixed(x, Math.abs(x) < 9.995 ? 2 : Math.abs(x) < 99.95 ? 1 : 0), "W");
 export const celsius = (x) => unit(fixed(x, 1), "°C");
-export const millivolts = (x) => unit(isKnown(x) ? fixed(1e3 * x, Math.abs(x) < 0.1 ? 1 : 0) : "", "mV");
-export const percent = (x, decimals = 1) => (isKnown(x) ? fixed(100 * x, decimals) : "");
+export const millivolts = (x) => unit(isNumber(x) ? fixed(1e3 * x, Math.abs(x) < 0.1 ? 1 : 0) : "", "mV");
+export const words = (name) => name.replaceAll("_", " ").replace("soc", "SOC");
+export const percent = (x, decimals = 1) => (isNumber(x) ? fixed(100 * x, decimals) : "");
 export const ampereHours = (x) => unit(plain(x), "Ah");
 export const wattHours = (x) =>
 	Math.abs(x) >= 9999.5 ? unit(plain(x / 1e3), "kWh") : unit(fixed(x, Math.abs(x) < 9.995 ? 2 : Math.abs(x) < 999.5 ? 1 : 0), "Wh");
 
 /** Hours and minutes; only minutes below an hour, days from two days on. */
 export function duration(seconds) {
-	if (!isKnown(seconds)) return "";
+	if (!isNumber(seconds)) return "";
 	const minutes = Math.round(seconds / 60);
 	if (seconds < 90) return `${Math.round(seconds)} s`;
 	if (minutes < 60) return `${minutes} min`;
@@ -47,13 +48,13 @@ export function duration(seconds) {
 
 /** Two durations as a range: 3–15 min, 1 h 20 min – 2 h 31 min. */
 export function durations(from, to) {
-	if (!isKnown(from) || !isKnown(to)) return "";
+	if (!isNumber(from) || !isNumber(to)) return "";
 	return to < 3600 ? `${Math.round(from / 60)}–${Math.round(to / 60)} min` : `${duration(from)} – ${duration(to)}`;
 }
 
 const pad = (x) => String(x).padStart(2, "0");
-/** HH:MM:SS of this browser's clock. */
-export const clock = (date) => `${pad(date.getHours())}:${pad(date.getMinutes())}:${pad(date.getSeconds())}`;
 export const hourMinute = (date) => `${pad(date.getHours())}:${pad(date.getMinutes())}`;
+/** HH:MM:SS of this browser's clock. */
+export const clock = (date) => `${hourMinute(date)}:${pad(date.getSeconds())}`;
 export const dayMonth = (date) => `${date.getDate()} ${"Jan Feb Mar Apr May Jun Jul Aug Sep Oct Nov Dec".split(" ")[date.getMonth()]}`;
 export const when = (date) => `${dayMonth(date)} ${clock(date)}`;

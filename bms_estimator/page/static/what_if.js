@@ -1,11 +1,10 @@
 // The form "What if": a forecast under a load that the user gives.
+import { $, hide, node, text } from "./dom.js";
 import * as f from "./format.js";
-import { hide, node, text } from "./live.js";
 
 const MAX_BYTES = 131_072; // of a request
 const LOADS = { power_w: "profile", current_a: "current_profile" }; // argument of a profile, by its column
 const VERDICT_CLASS = { enough: "good", "not enough": "bad", uncertain: "low" };
-const $ = (id) => document.getElementById(id);
 let shown = null; // name of the pack
 
 /** Show the form for a pack; null: there are no forecasts. The answer for another pack is removed. */

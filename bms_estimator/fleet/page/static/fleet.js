@@ -1,20 +1,19 @@
 // Page of a fleet. An overview arrives every 2 s and is drawn at once. Details of a pack are requested when the user
 // chooses it.
+import { $, attribute, changed, hide, node, text } from "./dom.js";
 import * as f from "./format.js";
-import { attribute, changed, hide, listen, node, text } from "./live.js";
+import { listen } from "./live.js";
 
 const REFRESH_MS = 5000; // refresh interval of the displayed pack
 const MAX_LAG_S = 60; // a larger lag is marked as wrong
 const MAX_LISTED = 20; // packs in a list
 const COLORS = 8; // classes c0 to c7 of fleet.css
-const $ = (id) => document.getElementById(id);
-const number = (x) => typeof x === "number";
 const count = (n) => n.toLocaleString("en");
 const counted = (n, one, more = `${one}s`) => `${count(n)} ${n === 1 ? one : more}`;
 // missing values give an empty text or a dash
-const duration = (s) => (number(s) ? f.duration(s) : "");
-const seconds = (s) => (number(s) ? (s < 9.95 ? `${f.fixed(s, 1)} s` : f.duration(s)) : "–");
-const rate = (x) => (number(x) ? count(x < 9.95 ? Math.round(10 * x) / 10 : Math.round(x)) : "");
+const duration = (s) => (f.isNumber(s) ? f.duration(s) : "");
+const seconds = (s) => (f.isNumber(s) ? (s < 9.95 ? `${f.fixed(s, 1)} s` : f.duration(s)) : "–");
+const rate = (x) => (f.isNumber(x) ? count(x < 9.95 ? Math.round(10 * x) / 10 : Math.round(x)) : "");
 
 // last messages, their arrival [ms], and the user's choices
 const ui = {
@@ -96,9 +95,9 @@ function drawTiles({ packs, holders, unheld, twice, lag_s, workers, states_per_s
 	tile("held", unheld.length ? "wrong" : twice.length ? "low" : "fine");
 
 	put("lag", seconds(lag_s));
-	const samples = workers.map((w) => w.samples_per_s).filter(number);
+	const samples = workers.map((w) => w.samples_per_s).filter(f.isNumber);
 	put("rates", [`${rate(states_per_s) || 0} states/s`, samples.length && `${rate(samples.reduce((a, b) => a + b))} samples/s`].filter(Boolean).join(" · "));
-	tile("lag", !number(lag_s) ? "" : lag_s > MAX_LAG_S ? "wrong" : "fine");
+	tile("lag", !f.isNumber(lag_s) ? "" : lag_s > MAX_LAG_S ? "wrong" : "fine");
 
 	const present = KINDS.filter(([kind]) => concerns[kind]?.count).map(([kind, name]) => [concerns[kind].count, name]);
 	put("attention", count(attention));
@@ -130,7 +129,7 @@ function drawTypes(types) {
 	if (focused) [...$("types").querySelectorAll("button")].find((b) => b.dataset.type === focused)?.focus();
 }
 
-const percentText = (x, known = x) => (number(known) ? `${f.percent(x)} %` : "–");
+const percentText = (x, known = x) => (f.isNumber(known) ? `${f.percent(x)} %` : "–");
 function drawSpread(types, edges) {
 	const shown = types.find((t) => t.type === ui.type), some = shown ? [shown] : types, of = shown ? ` · ${shown.type}` : "";
 	const sum = (name) => some.reduce((all, t) => all.map((n, i) => n + t[name][i]), some[0]?.[name].map(() => 0) ?? []);
@@ -169,7 +168,7 @@ const KINDS = [
 	["suspects", "Suspected", (v) => v],
 	["uncertain", "Uncertain", (v) => `SOC known to ± ${f.percent(2 * v)} %`],
 	["soc", "Low SOC", (v) => `SOC ${f.percent(v)} %`],
-	["silent", "Silent", (v) => (number(v) ? `not heard for ${duration(v)}` : "never heard")],
+	["silent", "Silent", (v) => (f.isNumber(v) ? `not heard for ${duration(v)}` : "never heard")],
 	["clock", "Wrong clock", (v) => `its clock is ${duration(Math.abs(v))} ${v > 0 ? "ahead" : "behind"}`],
 	["unknown", "Unknown", (v) => `its blocks are held${v ? `: ${v}` : ""}`],
 ];
@@ -248,8 +247,8 @@ function drawWorkers({ workers, holders, unheld }) {
 
 // query results
 
-const percents = (x) => (number(x) ? `${f.percent(x)} %` : "");
-const between = (low, high, format) => (number(low) && number(high) ? `${format(low)} to ${format(high)}` : "");
+const percents = (x) => (f.isNumber(x) ? `${f.percent(x)} %` : "");
+const between = (low, high, format) => (f.isNumber(low) && f.isNumber(high) ? `${format(low)} to ${format(high)}` : "");
 // by query: title, note, text without rows, and columns as [heading, cell of a row]
 const QUESTIONS = {
 	soh: ["Capacity trend", "Change a year by type, with its 95 % band.", "No trend yet: seven days are needed.", [
@@ -257,13 +256,13 @@ const QUESTIONS = {
 		["A year", (r) => `${f.fixed(r.percent_per_year, 1)} %`], ["Band", (r) => between(r.percent_per_year_low, r.percent_per_year_high, (x) => `${f.fixed(x, 1)} %`)]]],
 	failing: ["About to fail", "Packs that reach a limit within 90 days, or have had suspected input faults recently.", "No pack.", [
 		["Pack", (r) => chooser(r.pack)], ["What", (r) => r.quantity.replaceAll("_", " ")], ["Value", (r) => f.digits(r.value, 3)], ["Limit", (r) => f.digits(r.limit, 3)],
-		["Days left", (r) => (number(r.days_left) ? f.fixed(r.days_left, 0) : "")]]],
+		["Days left", (r) => (f.isNumber(r.days_left) ? f.fixed(r.days_left, 0) : "")]]],
 	outliers: ["Outliers of their type", "Packs whose capacity or Rₛ deviates from those of their type.", "No pack.", [
 		["Pack", (r) => chooser(r.pack)], ["What", (r) => r.quantity.replaceAll("_", " ")], ["Value", (r) => f.digits(r.value, 3)], ["Type's median", (r) => f.digits(r.median_of_type, 3)],
 		["Deviations", (r) => f.fixed(r.score, 1)]]],
 	honest: ["Is the band correct?", "Fraction of hours in which the SOC was within ± two standard deviations, judged by later estimates; 95 % is correct.", "No hour can be judged yet.", [
 		["Of", (r) => [r.of, r.which].filter(Boolean).join(" ")], ["Packs", (r) => count(r.packs)], ["Within", (r) => percents(r.within_2_std)], ["95 % interval", (r) => between(r.low, r.high, percents)],
-		["Std should be", (r) => (number(r.std_should_be_times) ? `× ${f.fixed(r.std_should_be_times, 2)}` : "")]]],
+		["Std should be", (r) => (f.isNumber(r.std_should_be_times) ? `× ${f.fixed(r.std_should_be_times, 2)}` : "")]]],
 };
 
 function drawAnswers(answers) {
@@ -286,7 +285,7 @@ const STATE = [
 	["Voltage", (s) => f.volts(s.voltage_v)], ["estimated", (s) => f.volts(s.voltage_estimate_v)], ["Current", (s) => f.amperes(s.current_a)], ["Power", (s) => f.watts(s.power_w)],
 	["Temperature", (s) => f.celsius(s.temperature_c)], ["Charge left", (s) => f.ampereHours(s.remaining_capacity_ah)], ["Energy left", (s) => f.wattHours(s.remaining_energy_wh)],
 	["Innovation", (s) => f.millivolts(s.innovation_v)],
-	["Energy out", (s) => (number(s.energy_out_kwh) ? f.wattHours(1e3 * s.energy_out_kwh) : "")], ["Energy in", (s) => (number(s.energy_in_kwh) ? f.wattHours(1e3 * s.energy_in_kwh) : "")],
+	["Energy out", (s) => (f.isNumber(s.energy_out_kwh) ? f.wattHours(1e3 * s.energy_out_kwh) : "")], ["Energy in", (s) => (f.isNumber(s.energy_in_kwh) ? f.wattHours(1e3 * s.energy_in_kwh) : "")],
 	["Cycles", (s) => f.digits(s.equivalent_cycles, 3)], ["Measured", (s) => (s.time ? f.when(new Date(s.time)) : "")],
 ];
 
@@ -310,7 +309,7 @@ async function refresh() {
 		else if (answer.status === 404) reason = "Nothing was heard of this pack yet, and it is not in the table.";
 	} catch { /* the reason above is displayed */ }
 	if (ui.pack !== name) return;
-	text($("packwhat"), details ? [details.type, number(details.heard_s) ? `last message ${duration(details.heard_s)} ago` : "no message since the start of this page"].join(" · ") : reason);
+	text($("packwhat"), details ? [details.type, f.isNumber(details.heard_s) ? `last message ${duration(details.heard_s)} ago` : "no message since the start of this page"].join(" · ") : reason);
 	text($("packsuspects"), details?.suspects ?? "");
 	if (!details) return;
 	drawFacts(details.state ?? {});

@@ -1,0 +1,33 @@
+// Health of the source and the service, and the last events.
+import { $, changed, hide, node, text } from "./dom.js";
+import * as f from "./format.js";
+
+const rows = {};
+
+export function drawHealth({ topics: { health: h, info, state } }) {
+	if (!h) return;
+	const faults = [h.sensor_message, ...(h.suspects ?? [])].filter(Boolean);
+	if (changed($("suspects"), faults.join("\n"))) {
+		$("suspects").replaceChildren(...(faults.length ? faults.map((w) => node("li", { class: "bad" }, w)) : [node("li", { class: "good" }, "Nothing is suspected of the input.")]));
+	}
+	const of = (x, unit) => f.isNumber(x) && `${f.digits(x, 3)} ${unit}`;
+	const facts = {
+		Sensor: h.sensor_online ? "online" : "offline", "Sample rate": of(state?.sample_rate_hz, "Hz"), Frames: h.line?.frames_received,
+		"Frames lost": h.line?.frames_lost, "Wrong checksums": h.line?.crc_errors, "Line reopened": h.reconnects,
+		"Latency, median": of(1e3 * h.loop?.latency_p50_s || null, "ms"), "Board's clock": of(h.clock_ppm, "ppm"), Broker: h.broker_trouble,
+		"Waiting for it": h.publish_waiting, Disk: h.store_trouble, Checkpoint: h.checkpoint, "Running for": f.duration(h.uptime_s),
+		Crashes: h.total?.crashes, Version: info?.version,
+	};
+	for (const [name, value] of Object.entries(facts)) {
+		const row = (rows[name] ??= $("facts").appendChild(node("div", {}, node("dt", {}, name), node("dd", {}))));
+		hide(row, !value && value !== 0);
+		text(row.lastChild, f.isNumber(value) ? value.toLocaleString("en") : value || "");
+	}
+}
+
+export function drawEvents(pack) {
+	hide($("eventcard"), !pack.events.length);
+	if (!changed($("events"), `${pack.name} ${pack.events.length} ${pack.events[0]?.time}`)) return;
+	$("events").replaceChildren(...pack.events.map((e) => node("li", {},
+		node("time", { datetime: e.time }, f.when(new Date(e.time))), node("b", {}, f.words(e.name)), node("span", {}, e.text))));
+}

@@ -1,0 +1,55 @@
+// Values of the topic `state`, the time left, and the scale of the SOC.
+import { clip } from "./charts.js";
+import { $, attribute, hide, put } from "./dom.js";
+import * as f from "./format.js";
+
+const MIN_POINT_S = 600; // shortest time to the cut-off that is shown as one number [s]
+const SHOWN = {
+	voltage_v: f.volts, voltage_estimate_v: f.volts, current_a: f.amperes, power_w: f.watts, temperature_c: f.celsius,
+	innovation_v: f.millivolts, usable_capacity_ah: f.ampereHours, remaining_energy_wh: f.wattHours, remaining_capacity_ah: f.ampereHours,
+	energy_out_kwh: (x) => f.wattHours(1e3 * x), energy_in_kwh: (x) => f.wattHours(1e3 * x), soc: f.percent, weakest_cell_soc: f.percent, stability_margin: f.percent,
+};
+const parts = [...document.querySelectorAll("[data-of]")]; // shown only if there is a value
+
+/** Time to the cut-off, or while charging to full, with its 90 % band. Below ten minutes a single load peak decides, so only the band is shown. */
+function timeLeft(s) {
+	const { time_to_cutoff_s: median, time_to_cutoff_p05_s: early, time_to_cutoff_p95_s: late } = s;
+	if (!f.isNumber(median)) return ["To full", f.duration(s.time_to_full_s), ""];
+	const band = f.durations(early, late);
+	if (median >= MIN_POINT_S) return ["To cut-off", f.duration(median), `90 % band ${band}`];
+	return ["To cut-off", band, `90 % band; ${f.percent(s.cutoff_within_5min, 0)} % within 5 min`];
+}
+
+export function drawState(s) {
+	const time = s.time_to_cutoff_s ?? s.time_to_full_s, [label, left, band] = timeLeft(s);
+	for (const [name, show] of Object.entries(SHOWN)) put(name, show(s[name]));
+	for (const part of parts) hide(part, !f.isNumber(part.dataset.of === "time_left" ? time : s[part.dataset.of]));
+	put("soc_std", f.percent(f.isNumber(s.soc_std) ? 2 * s.soc_std : null));
+	put("weakest_cell_soc_std", f.percent(f.isNumber(s.weakest_cell_soc_std) ? 2 * s.weakest_cell_soc_std : null));
+	put("time_left", left);
+	put("time_left_label", label);
+	put("time_left_band", band);
+	put("way", s.current_a > 0 ? "discharging" : s.current_a < 0 ? "charging" : "at rest");
+	put("lock", `${s.lock ? "in lock" : "no lock"}, ${s.converged ? "converged" : "converging"}`);
+	if (f.isNumber(s.soc)) drawScale(s);
+}
+
+function drawScale(s) {
+	const known = [s.delta_1, s.delta_2].filter(f.isNumber), stop = Math.max(0, ...known), band = 2 * (s.soc_std ?? 0);
+	const place = (id, name, x) => {
+		const value = `${(100 * clip(x)).toFixed(2)}%`, element = $(id);
+		if (element[name] !== value) element.style[name] = element[name] = value;
+	};
+	place("fill", "width", s.soc - band);
+	place("band", "left", s.soc - band);
+	place("band", "width", clip(s.soc + band) - clip(s.soc - band));
+	place("at", "left", s.soc);
+	hide($("stopmark"), !known.length);
+	for (const [id, x] of [["stop", stop], ["stopmark", stop], ["d1", s.delta_1], ["d2", s.delta_2]]) place(id, id === "stop" ? "width" : "left", x ?? 0);
+	attribute($("stopmark"), "class", stop > 0.5 ? "left" : "");
+	put("stop", f.percent(stop));
+	put("deltas", [s.delta_1, s.delta_2].map((d, i) => f.isNumber(d) && `δ${"₁₂"[i]} ${f.percent(d)} %`).filter(Boolean).join(", "));
+	attribute($("fill"), "class", s.soc <= Math.max(stop, 0.1) ? "bad" : s.soc < 0.2 ? "low" : "");
+	attribute($("scale"), "aria-valuenow", String(Math.round(100 * s.soc)));
+	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %; stop discharging at ${f.percent(stop, 0)} %`);
+}
