@@ -27,6 +27,7 @@ from tests.sinks.home_assistant.test_discovery import (
     CELL_COUNT,
     MAX_ROWS_PER_MIN,
     all_values_changing,
+    cleared_alarm,
     components_of,
     noisy_cell,
     row_times,
@@ -265,13 +266,29 @@ def test_entities_are_unavailable_from_the_kill_of_the_service_until_its_restart
     home: HomeAssistant, packs: Packs
 ) -> None:
     def pack_states(states: dict[str, Any]) -> set[str]:
-        return {state["state"] for entity, state in states.items() if ".bms_pack_" in entity}
+        """Return the states of all entities but the one that is unavailable until the first forecast."""
+        entities = [entity for entity in states if ".bms_pack_" in entity and not entity.endswith("collapse_risk")]
+        return {states[entity]["state"] for entity in entities}
 
     packs.kill()
     home.until(lambda states: pack_states(states) == {"unavailable"})
     packs.start()
     states = home.until(lambda states: "unavailable" not in pack_states(states))
     assert number_state(states, SOC_ENTITY) == pytest.approx(50.0, abs=20.0)
+
+
+def test_collapse_risk_is_unavailable_until_its_first_value(home: HomeAssistant, broker: Broker) -> None:
+    publish_fast(broker, "early", iter([(0.0, CELL_SNAPSHOT)]), home)
+    entity = "binary_sensor.bms_early_alarm_collapse_risk"
+    assert home.states()[entity]["state"] == "unavailable"
+    payload = cleared_alarm("collapse_risk").json_bytes
+
+    async def publish() -> None:
+        async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+            await client.publish("bms/early/alarm/collapse_risk", payload, 1, retain=True)
+
+    asyncio.run(publish())
+    home.until(lambda states: states[entity]["state"] == "off")
 
 
 def test_silent_board_makes_alarms_unavailable_and_not_off(home: HomeAssistant, packs: Packs) -> None:

@@ -26,6 +26,8 @@ AVAILABILITY = "availability"
 """Topic of the service's availability, below the device's topic."""
 SENSOR_AVAILABILITY = "sensor/availability"
 """Topic of the sensor's availability, below the device's topic."""
+ANNOUNCED_ALARMS = ("collapse_risk",)
+"""Alarms with an entity in Home Assistant before their first value, which follows only after minutes of load."""
 
 
 class PublishedState(NamedTuple):
@@ -65,6 +67,7 @@ class MessageBuilder:
         alarms: Collection[str] = ALARMS,
     ) -> None:
         self._unwatched = tuple(name for name in ALARMS if name not in alarms)
+        self._announced = {name for name in ANNOUNCED_ALARMS if name in alarms}
         self.root = f"{base_topic}/{device}"
         self.commands: tuple[str, ...] = ()
         self._home_settings = home_assistant or HomeAssistantSettings()
@@ -141,7 +144,8 @@ class MessageBuilder:
         """Return the discovery data of a snapshot. The number of cells never decreases."""
         cells = len((snapshot.estimate and snapshot.estimate.cells_v) or ())
         known_cells = sent.discovery_inputs.cells if sent.discovery_inputs else 0
-        alarms = tuple(alarm.name for alarm in snapshot.alarms)
+        names = {alarm.name for alarm in snapshot.alarms} | self._announced
+        alarms = tuple(name for name in ALARMS if name in names)
         return DiscoveryInputs(snapshot.info, max(cells, known_cells), alarms, self.commands, self._unwatched)
 
     def _home_assistant(

@@ -272,7 +272,7 @@ def test_cells_are_added_with_their_first_voltages_and_never_removed() -> None:
 
 def test_allowed_commands_have_controls() -> None:
     [without_commands] = discoveries(CELL_SNAPSHOT)
-    assert {c["platform"] for c in components_of(without_commands).values()} == {"sensor"}
+    assert not any("command_topic" in component for component in components_of(without_commands).values())
     [with_commands] = discoveries(
         CELL_SNAPSHOT, commands=("set_soc", "current_zero", "acknowledge_alarm", "publish_rate", "forget_pack")
     )
@@ -301,9 +301,10 @@ def test_entities_of_an_earlier_configuration_are_removed() -> None:
     }
 
 
-def test_monitored_alarms_stay_available_while_the_sensor_is_silent() -> None:
-    alarm = Alarm(
-        name="soc_low",
+def cleared_alarm(name: str) -> Alarm:
+    """Return the payload of an alarm that is not raised."""
+    return Alarm(
+        name=name,
         severity="warning",
         active=False,
         latched=False,
@@ -313,7 +314,16 @@ def test_monitored_alarms_stay_available_while_the_sensor_is_silent() -> None:
         unit=None,
         text="",
     )
-    [message] = discoveries(CELL_SNAPSHOT._replace(alarms=(alarm,)))
+
+
+def test_collapse_risk_is_announced_before_its_first_value_and_once() -> None:
+    snapshots = CELL_SNAPSHOT, CELL_SNAPSHOT._replace(alarms=(cleared_alarm("collapse_risk"),))
+    [message] = discoveries(*snapshots)
+    assert message["components"]["alarm_collapse_risk"]["state_topic"] == "bms/pack/alarm/collapse_risk"
+
+
+def test_monitored_alarms_stay_available_while_the_sensor_is_silent() -> None:
+    [message] = discoveries(CELL_SNAPSHOT._replace(alarms=(cleared_alarm("soc_low"),)))
     component = message["components"]["alarm_soc_low"]
     assert (component["platform"], component["device_class"]) == ("binary_sensor", "battery")
     assert component["state_topic"] == "bms/pack/alarm/soc_low"
