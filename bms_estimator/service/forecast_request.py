@@ -1,5 +1,6 @@
 """Request for a forecast under a load that the client gives: its arguments, and the data of the response."""
 
+import asyncio
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -9,6 +10,7 @@ import numpy as np
 
 from bms_estimator.forecast.forecast import Forecast
 from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.forecast.forecaster_copy import copy_forecaster
 from bms_estimator.forecast.trip import MAX_LOAD, MAX_TRIP_S, LoadQuantity, Trip, constant_trip, profile_trip
 from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
 from bms_estimator.model.errors import UserError
@@ -78,6 +80,16 @@ def _is_pair(point: Any) -> bool:
         and len(point) == 2
         and all(isinstance(value, int | float) and abs(value) <= MAX_NUMBER for value in point)
     )
+
+
+async def forecast_in_thread(forecaster: Forecaster, trip: Trip | None) -> dict[str, Any]:
+    """Return a forecast from the present state, made in a thread, so that the event loop reads samples meanwhile.
+
+    Args:
+        forecaster: As for ``forecast_data``.
+        trip: As for ``forecast_data``.
+    """
+    return await asyncio.to_thread(forecast_data, copy_forecaster(forecaster), trip)
 
 
 def forecast_data(forecaster: Forecaster, trip: Trip | None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.errors import UserError
 from bms_estimator.pack_model.learning import SlowFit
-from bms_estimator.service.forecast_request import forecast_data, requested_trip
+from bms_estimator.service.forecast_request import forecast_in_thread, requested_trip
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
@@ -132,5 +132,4 @@ class RequestHandlers:
         """
         if self._forecaster is None:
             raise UserError("there are no forecasts for a fuel cell, or with identifier.enabled = false")
-        trip = requested_trip(arguments)
-        return forecast_data(self._forecaster, trip)
+        return await forecast_in_thread(self._forecaster, requested_trip(arguments))

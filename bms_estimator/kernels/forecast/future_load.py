@@ -30,7 +30,7 @@ def set_decays(parts: Records) -> None:
             parts[n].decay[k] = math.exp(-parts[n].duration_s / TAUS[k])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)  # a request for a forecast runs in a thread, while the event loop reads samples
 def follow_given_load(
     m: Record, parts: Records, horizon_s: float, draws: Records, curve_step_s: float, soc: Floats, voltage_v: Floats
 ) -> None:

@@ -22,7 +22,7 @@ NEGLIGIBLE_DIFFERENCE_C = 1e-3
 """Difference of an RC current below which it counts as zero, as a C-rate."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)  # a request for a forecast runs in a thread, while the event loop reads samples
 def follow_seen_load(m: Record, blocks: Records, block_s: float, steps: int, draws: Records) -> None:
     """Simulate each draw until the cut-off, or for ``steps`` blocks.
 
@@ -38,7 +38,7 @@ def follow_seen_load(m: Record, blocks: Records, block_s: float, steps: int, dra
         follow_draw(m, blocks, block_s, steps, draws[n], decay, 0, no_points, no_points)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)  # a request for a forecast runs in a thread, while the event loop reads samples
 def record_curves(
     m: Record,
     blocks: Records,

@@ -1,0 +1,69 @@
+"""Forecast of a request, made in a thread while samples arrive."""
+
+import asyncio
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bms_estimator.estimator import Estimator
+from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.forecast.trip import Trip, constant_trip
+from bms_estimator.kernels.forecast.future_load import follow_given_load
+from bms_estimator.kernels.forecast.seen_load import follow_seen_load, record_curves
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.service import forecast_request
+from bms_estimator.service.forecast_request import forecast_data, forecast_in_thread
+
+SAMPLES = np.zeros(800, SAMPLE)
+SAMPLES["time_s"], SAMPLES["temperature_c"] = np.arange(SAMPLES.size), 25.0
+SAMPLES["voltage_v"] = 3.9 - 1e-4 * np.arange(SAMPLES.size)
+SAMPLES["current_a"] = np.where(np.arange(SAMPLES.size) % 60 < 30, 0.8, 0.2)
+
+
+@pytest.fixture
+def forecaster() -> Forecaster:
+    """Return the forecaster of a cell after 400 s of load."""
+    estimator = Estimator(load_cell("chen_mora"), initial_soc=0.9)
+    forecaster = Forecaster(estimator, estimator, cutoff_v=3.0)
+    forecaster.run(SAMPLES[:400])
+    return forecaster
+
+
+@pytest.mark.parametrize("trip", [None, constant_trip("power_w", 2.0, 600.0)], ids=["observed load", "given load"])
+async def test_samples_that_arrive_meanwhile_do_not_change_the_forecast(
+    forecaster: Forecaster, trip: Trip | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected, samples_processed = forecast_data(forecaster, trip), threading.Event()
+
+    def forecast_later(*arguments: Any) -> dict[str, Any]:
+        samples_processed.wait()
+        return forecast_data(*arguments)
+
+    monkeypatch.setattr(forecast_request, "forecast_data", forecast_later)
+    response = asyncio.create_task(forecast_in_thread(forecaster, trip))
+    await asyncio.sleep(0)  # the task takes its copy
+    forecaster.run(SAMPLES[400:])
+    samples_processed.set()
+    assert await response == expected
+    assert forecast_data(forecaster, trip) != expected
+
+
+async def test_a_forecast_in_a_thread_does_not_change_later_estimates(forecaster: Forecaster) -> None:
+    estimator = Estimator(load_cell("chen_mora"), initial_soc=0.9)
+    undisturbed = Forecaster(estimator, estimator, cutoff_v=3.0)
+    undisturbed.run(SAMPLES[:400])
+    await forecast_in_thread(forecaster, constant_trip("power_w", 2.0, 600.0))
+    for each in (forecaster, undisturbed):
+        each.run(SAMPLES[400:])
+    assert forecaster.estimator.record.tobytes() == undisturbed.estimator.record.tobytes()
+    assert forecaster.latest.values.tobytes() == undisturbed.latest.values.tobytes()
+
+
+@pytest.mark.parametrize(
+    "kernel", [follow_seen_load, record_curves, follow_given_load], ids=lambda kernel: kernel.__name__
+)
+def test_simulation_of_the_draws_lets_other_threads_run(kernel: Any) -> None:
+    assert kernel.targetoptions["nogil"]
