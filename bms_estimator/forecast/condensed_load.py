@@ -9,8 +9,7 @@ from bms_estimator.model.arrays import Floats
 def condense(load: GivenLoad, block_s: float) -> GivenLoad:
     """Return a load whose short parts are merged. Mean and peak of each block remain, because a peak may end the discharge.
 
-    The parts that begin within a block of ``block_s`` become two parts: first the mean of all but the largest load, then the
-    largest load.
+    The parts that begin within a block become two parts: the mean of all but the largest load, and then the largest load.
 
     Args:
         load: Load; either all parts have a current, or all have a power.
@@ -19,10 +18,10 @@ def condense(load: GivenLoad, block_s: float) -> GivenLoad:
     ends_s = np.cumsum(load.duration_s)
     block = np.floor((ends_s - load.duration_s) / block_s)
     values = load.power_w if np.isnan(load.current_a).all() else load.current_a
-    order = np.lexsort((values, block))
+    order = np.lexsort((values, block))  # by block, and within a block by load
     duration_s, values, block = load.duration_s[order], values[order], block[order]
     first = np.flatnonzero(np.diff(block, prepend=-1.0))
-    peak = np.append(first[1:], block.size) - 1
+    peak = np.append(first[1:], block.size) - 1  # the last part of each block has its largest load
     others_s = np.add.reduceat(duration_s, first) - duration_s[peak]
     others_sum = np.add.reduceat(duration_s * values, first) - duration_s[peak] * values[peak]
     mean = np.divide(others_sum, others_s, out=np.zeros(first.size), where=peak > first)

@@ -1,4 +1,4 @@
-"""Forecast of a pack: present values and curves."""
+"""Forecast of a pack: values at one sample, and curves over the time after it."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ FORECAST = np.dtype(
     ],
     align=True,
 )
-"""Present values of a forecast; NaN if unknown. The names are those of the published fields."""
+"""Values of a forecast; NaN if unknown. The names are those of the published fields."""
 
 ForecastRows = NDArray[np.void]
 """Shape (n,), dtype ``FORECAST``."""

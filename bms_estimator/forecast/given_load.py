@@ -1,4 +1,4 @@
-"""Load that the user gives for a forecast."""
+"""Future load of a forecast, as a list of parts."""
 
 from dataclasses import dataclass
 
@@ -8,6 +8,8 @@ from bms_estimator.model.arrays import Floats
 @dataclass(frozen=True)
 class GivenLoad:
     """Future load, in parts with a constant current or power. It repeats after its last part.
+
+    The user gives it, or it is the load that followed a similar one in the past (``PastMinutes.analogues``).
 
     Attributes:
         duration_s: Duration of each part [s], shape (n,), above 0.

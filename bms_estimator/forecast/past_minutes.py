@@ -1,9 +1,10 @@
-"""Load of past discharges, minute by minute, and the search in it for loads like the present one (analogues)."""
+"""Load of past discharges, minute by minute, and the search in it for analogues: loads like the present one."""
 
 import numpy as np
 
 from bms_estimator.forecast.given_load import GivenLoad
-from bms_estimator.forecast.load_history import MAX_LOAD_S, LoadHistory
+from bms_estimator.forecast.load_history import LoadHistory
+from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 from bms_estimator.model.arrays import Floats
 
 MINUTE_S = 60
@@ -11,15 +12,15 @@ MINUTE_S = 60
 MAX_MINUTES = 20_000
 """Maximum number of stored minutes: a year with 55 minutes of use a day."""
 COMPARED_MINUTES = 20
-"""Length of the present load that is compared with past ones."""
+"""Length of the latest load that is compared with earlier ones [min]."""
 MAX_DIFFERENCE = 0.25
-"""Maximum mean absolute difference of similar loads, as a fraction of the present mean."""
+"""Maximum mean absolute difference of an analogue from the latest load, as a fraction of the mean of the latter."""
 MIN_AHEAD_MINUTES = 30
-"""Minimum length of the load after a similar one, which is used as the future load."""
+"""Minimum length of the load that followed an analogue [min]. A forecast uses that load as the future one."""
 MAX_ANALOGUES = 10
-"""Maximum number of analogues; the most similar ones are used."""
+"""Maximum number of analogues. If there are more, the most similar ones are used."""
 PEAK_S = 5.0
-"""Assumed duration of the largest current of a minute [s], which is not stored."""
+"""Assumed duration of the largest current of a minute [s]. Only the current itself is stored."""
 
 
 class PastMinutes:
@@ -52,7 +53,7 @@ class PastMinutes:
         self.mean_a, self.max_a, self._next = mean_a, max_a, int(load.record["next"][0])
 
     def analogues(self, present_minutes: int) -> list[GivenLoad]:
-        """Return the loads that followed similar loads of earlier discharges, the most similar one first.
+        """Return the loads that followed the analogues in earlier discharges, that of the most similar one first.
 
         Args:
             present_minutes: Number of the last minutes that belong to the present discharge.

@@ -1,4 +1,4 @@
-"""Observed load as arrays, for its file beside the checkpoint."""
+"""Observed load as arrays, which are saved in a file beside the checkpoint."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,15 +6,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.forecast.load_history import MAX_LOAD_S, LoadHistory
+from bms_estimator.forecast.load_history import LoadHistory
 from bms_estimator.forecast.past_minutes import MAX_MINUTES, PastMinutes
+from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 
 MAX_CURRENT_A = 1e6
 """Maximum plausible absolute current [A]."""
 
 
 def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]:
-    """Return the load as arrays by name, which ``restore_load`` accepts."""
+    """Return the load as arrays by name, for ``restore_load``."""
     row = load.record[0]
     mean_a, max_a = load.mean_and_max()
     return {
@@ -47,7 +48,7 @@ def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDAr
     for mean, largest, max_size in ((mean_a, max_a, MAX_LOAD_S), (minutes_mean_a, minutes_max_a, MAX_MINUTES)):
         if mean.ndim != 1 or mean.shape != largest.shape or mean.size > max_size or any(v.ndim for v in scalars):
             raise ValueError(
-                f"arrays of shapes {mean.shape} and {largest.shape}: must be equal, with at max_size {max_size} elements"
+                f"arrays of shapes {mean.shape} and {largest.shape}: must be equal, with at most {max_size} elements"
             )
     for values in (mean_a, max_a, minutes_mean_a, minutes_max_a, *scalars):
         if values.dtype.kind not in "fi" or not (np.abs(values) <= MAX_CURRENT_A).all():

@@ -81,7 +81,16 @@ def profile_trip(quantity: LoadQuantity, time_s: Floats, values: Floats) -> Trip
 
 
 def _check_values(quantity: LoadQuantity, values: Floats, place: str) -> None:
-    """Reject values that are not numbers, or too large. ``place`` names the point of a value in the error."""
+    """Check that all values are numbers and not too large.
+
+    Args:
+        quantity: Quantity of the values.
+        values: Values [A] or [W].
+        place: Beginning of the error; ``{}`` in it is replaced by the number of the value, from 1.
+
+    Raises:
+        UserError: A value is not a number, or too large.
+    """
     invalid = np.flatnonzero(~(np.abs(values) <= MAX_LOAD))
     if invalid.size:
         raise UserError(

@@ -16,10 +16,10 @@ from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
 from bms_estimator.model.errors import UserError
 from bms_estimator.sinks.mqtt.requests import number
 
-CONSTANTS: tuple[LoadQuantity, ...] = ("power_w", "current_a")
-"""Arguments that give a constant load."""
-PROFILES: dict[str, LoadQuantity] = {"profile": "power_w", "current_profile": "current_a"}
-"""Quantity of the load in each argument that gives a profile."""
+CONSTANT_LOADS: tuple[LoadQuantity, ...] = ("power_w", "current_a")
+"""Arguments that give a constant load, named after its quantity."""
+PROFILE_LOADS: dict[str, LoadQuantity] = {"profile": "power_w", "current_profile": "current_a"}
+"""Arguments that give a profile, each with the quantity of its load."""
 MAX_NUMBER = 1e15
 """Maximum absolute value of a number in a profile. Python parses JSON integers of any size, also those too large for a float."""
 DURATION = "duration_s"
@@ -46,12 +46,12 @@ def requested_trip(arguments: Mapping[str, Any]) -> Trip | None:
     Raises:
         UserError: An argument is invalid, or more than one load is given.
     """
-    names = [name for name in (*CONSTANTS, *PROFILES) if name in arguments]
+    names = [name for name in (*CONSTANT_LOADS, *PROFILE_LOADS) if name in arguments]
     if len(names) > 1:
         raise UserError(f"{' and '.join(names)}: give one of them")
-    if not names or names[0] in PROFILES:
+    if not names or names[0] in PROFILE_LOADS:
         if DURATION in arguments:
-            raise UserError(f"{DURATION}: belongs to {' or '.join(CONSTANTS)}")
+            raise UserError(f"{DURATION}: belongs to {' or '.join(CONSTANT_LOADS)}")
         return _profile(names[0], arguments[names[0]]) if names else None
     duration_s = number(arguments, DURATION, 0.0, MAX_TRIP_S) if DURATION in arguments else None
     quantity: LoadQuantity = "power_w" if names[0] == "power_w" else "current_a"
@@ -64,7 +64,7 @@ def _profile(name: str, points: Any) -> Trip:
     Raises:
         UserError: ``points`` is not a list of pairs, or ``profile_trip`` rejects it.
     """
-    quantity = PROFILES[name]
+    quantity = PROFILE_LOADS[name]
     if not isinstance(points, list) or not all(_is_pair(point) for point in points):
         raise UserError(f"{name}: must be a list of pairs [time_s, {quantity}]")
     pairs = np.array(points, dtype=float).reshape(-1, 2)
@@ -112,11 +112,11 @@ def as_json_data(forecast: Forecast, outcome: TripOutcome | None, cutoff_v: floa
         outcome: Outcome of the trip; None without a trip, and for a trip without an end.
         cutoff_v: Voltage at which the load is switched off [V].
     """
-    values = {name: _known(float(forecast.values[0][name])) for name in FIELDS}
-    trip = {name: _known(value) for name, value in asdict(outcome).items()} if outcome else None
+    values = {name: _finite_or_none(float(forecast.values[0][name])) for name in FIELDS}
+    trip = {name: _finite_or_none(value) for name, value in asdict(outcome).items()} if outcome else None
     return {**values, "cutoff_v": cutoff_v, "reason": forecast.reason, "trip": trip}
 
 
-def _known(value: Any) -> Any:
+def _finite_or_none(value: Any) -> Any:
     """Return None for NaN and infinity; another value unchanged."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

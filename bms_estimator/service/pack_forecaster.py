@@ -1,4 +1,4 @@
-"""Forecaster of a pack, as its settings define it."""
+"""Creation of the forecaster of a pack from its settings."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from bms_estimator.service.kernel_subtrees import CELL
 from bms_estimator.settings.pack import Settings
 
 WARM_UP_S = 330
-"""Duration of the load after which a forecast can be made, with a margin [s]."""
+"""Duration of the load with which the kernels are warmed up [s]. It is longer than ``forecaster.MIN_LOAD_S``, below which there is no forecast."""
 
 
 def new_forecaster(
@@ -43,7 +43,7 @@ def new_forecaster(
 
 
 def load_forecast_kernels() -> None:
-    """Compile or load the kernels of a forecast, so that no sample waits for them."""
+    """Compile the kernels of a forecast, or load them from the cache, so that no sample waits for them."""
     cell = load_cell(CELL)
     estimator = Estimator(cell, initial_soc=0.5)
     samples = np.zeros(WARM_UP_S, SAMPLE)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from bms_estimator.forecast.load_history import MAX_LOAD_S, LoadHistory
+from bms_estimator.forecast.load_history import LoadHistory
+from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 from bms_estimator.kernels.trace import TRACE
 
 CAPACITY_AS = 3600.0

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.forecast.load_history import MAX_LOAD_S, LoadHistory
+from bms_estimator.forecast.load_history import LoadHistory
 from bms_estimator.forecast.past_minutes import PastMinutes
 from bms_estimator.forecast.saved_load import load_arrays, restore_load
+from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 from bms_estimator.kernels.trace import TRACE
 
 CAPACITY_AS = 3.0 * 3600.0

@@ -4,7 +4,6 @@ import json
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -13,11 +12,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
-from bms_estimator.checkpoint.learned_state import estimator_of, load_valid
-from bms_estimator.checkpoint.load_file import restore_seen_load
-from bms_estimator.cli.options.capture_input import capture_file, print_guesses, read_with_bar
+from bms_estimator.cli.live.initial_state import InitialState, end_of_capture, saved_state
+from bms_estimator.cli.options.capture_input import capture_file, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     CELL_HELP,
@@ -32,40 +28,17 @@ from bms_estimator.cli.options.capture_options import (
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, with_pack
-from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.forecast import Forecast, ForecastCurve
-from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import MAX_LOAD, MAX_TRIP_S, Trip, constant_trip
 from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.process.state_folder import state_folder
 from bms_estimator.reports.formats import duration_text, number
-from bms_estimator.service.fit_thread import new_slow_fit
 from bms_estimator.service.forecast_request import as_json_data
-from bms_estimator.service.pack_forecaster import new_forecaster
-from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.captures.replay import open_capture
 from bms_estimator.sources.captures.trip_file import read_trip
 from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 
 PLOT_FORMATS = (".png", ".svg", ".pdf")
 """Allowed extensions of the plot file."""
-
-
-@dataclass(frozen=True)
-class _InitialState:
-    """Pack at the start of the forecast.
-
-    Attributes:
-        name: Name of the pack, or of the capture.
-        forecaster: Forecaster with the state of the pack.
-        age_s: Time since the state was saved [s]; infinite if unknown; None: the state is the end of a capture.
-    """
-
-    name: str
-    forecaster: Forecaster
-    age_s: float | None
 
 
 def forecast(
@@ -150,9 +123,9 @@ def forecast(
         settings = with_pack(settings, cutoff_v=cutoff_v)
     with show_compile_progress():
         if capture is not None:
-            start = _end_of_capture(settings, model, capture, current_sign, column_map, has_pack=pack is not None)
+            start = end_of_capture(settings, model, capture, current_sign, column_map, has_pack=pack is not None)
         else:
-            start = _saved_state(settings, model)
+            start = saved_state(settings, model)
         result = start.forecaster.forecast(trip.load if trip else None)
         curve = start.forecaster.trip_curve(trip.load) if trip and trip.has_end else None
     outcome = trip_outcome(trip, curve) if trip and curve else None
@@ -192,58 +165,7 @@ def _trip(
     return None, "like the observed load"
 
 
-def _saved_state(settings: Settings, model: PackModel) -> _InitialState:
-    """Return the pack with the state of its checkpoint and the observed load saved beside it. No file is changed.
-
-    Raises:
-        UserError: There is no valid checkpoint, or no forecast for this pack.
-    """
-    folder = state_folder(settings)
-    file = CheckpointFile(folder, settings, model)
-    content = load_valid(file, settings)
-    forecaster = new_forecaster(settings, model, estimator_of(content, file, settings, model), None)
-    if forecaster is None:
-        raise _no_forecaster(model)
-    load_file = HistoryFile(folder, settings, model, LOAD_SUFFIX)
-    if reason := restore_seen_load(load_file, forecaster):
-        typer.echo(f"warning: {load_file.path}: the observed load is unknown: {reason}", err=True)
-    return _InitialState(settings.pack.name, forecaster, content.unseen_s)
-
-
-def _end_of_capture(
-    settings: Settings,
-    model: PackModel,
-    capture: Path,
-    current_sign: SignOfCurrent,
-    column_map: MappedColumns,
-    *,
-    has_pack: bool,
-) -> _InitialState:
-    """Return the pack at the end of a capture. The load of the capture is the observed load.
-
-    Raises:
-        UserError: The capture cannot be read or has no usable sample, or there is no forecast for this cell.
-    """
-    with capture_file(capture) as path:
-        source = open_capture(
-            path, settings.sensor if has_pack else None, current_sign=current_sign, column_map=column_map
-        )
-        print_guesses(path.name, source)
-        estimator = new_estimator(settings, model)
-        forecaster = new_forecaster(settings, model, estimator, new_slow_fit(settings, estimator))
-        if forecaster is None:
-            raise _no_forecaster(model)
-        forecaster.run(read_with_bar(path, source))
-        if not estimator.state["samples"][0]:
-            raise UserError(f"{path}: no usable sample")
-    return _InitialState(path.name, forecaster, None)
-
-
-def _no_forecaster(model: PackModel) -> UserError:
-    return UserError(f"{model.cell.name}: a forecast needs a battery, and identifier.enabled = true in the settings")
-
-
-def _result_table(start: _InitialState, load: str, forecast: Forecast, outcome: TripOutcome | None) -> Table:
+def _result_table(start: InitialState, load: str, forecast: Forecast, outcome: TripOutcome | None) -> Table:
     """Return the result as a table."""
     table = Table(title=start.name, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
@@ -291,14 +213,16 @@ def _check_plot_file(plot: Path, inputs: list[Path], *, force: bool) -> None:
     check_output_file(plot, inputs, force=force, option="--plot")
 
 
-def _write_plot(plot: Path, start: _InitialState, curve: ForecastCurve | None) -> None:
+def _write_plot(plot: Path, start: InitialState, curve: ForecastCurve | None) -> None:
     """Write a plot of the predicted SOC and voltage to a file.
 
     Raises:
         UserError: There is no curve, or the file cannot be written.
     """
     if curve is None:
-        raise UserError(f"--plot {plot}: there is no forecast to draw; without --plot the command says why")
+        raise UserError(
+            f"--plot {plot}: there is no forecast to plot; run the command without --plot to see the reason"
+        )
     from matplotlib import pyplot as plt  # noqa: PLC0415 - optional
 
     from bms_estimator.plot.forecast import soc_ahead, voltage_ahead  # noqa: PLC0415 - optional

@@ -1,7 +1,8 @@
 """Blocks of the observed load, each with its largest voltage drop as a function of SOC.
 
-The RC network is linear. The table contains the drop with the RC currents that the block began with in the past. A draw that
-enters the block with other RC currents adds the voltage of the difference, which decays exponentially.
+An RC current is the current filtered with the time constant of an RC pair. The table contains the drop for the RC currents with
+which the block began when it was observed. A draw enters the block with other RC currents. Because the RC network is linear, it
+only adds the voltage of the difference, which decays exponentially.
 """
 
 import math
@@ -13,8 +14,8 @@ from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
 PEAK_FRACTION = 0.35
-"""Fraction of a peak current within a second that the RC pair of 1 s follows. Over its first second, the
-response to a current step has the mean 1/e."""
+"""Fraction of a peak current within a second that the RC pair of 1 s follows: about the mean response of this pair to a current
+step over the first second, 1/e."""
 
 LOAD_BLOCK = np.dtype(
     [
@@ -33,7 +34,7 @@ LOAD_BLOCK = np.dtype(
 
 @njit(cache=True)
 def tabulate_blocks(m: Record, mean_a: Floats, max_a: Floats, block_s: int, blocks: Records) -> None:
-    """Write one row for each block of ``block_s`` seconds.
+    """Tabulate the observed load, one row for each block of ``block_s`` seconds.
 
     Args:
         m: Record of PROJECTED_PACK.
@@ -43,8 +44,8 @@ def tabulate_blocks(m: Record, mean_a: Floats, max_a: Floats, block_s: int, bloc
         blocks: Shape (n,), dtype LOAD_BLOCK; written.
     """
     x, decay, drop = np.empty(BRANCHES), np.exp(-1.0 / TAUS), np.empty(GRID)
-    at_soc = round(min(max(m.soc, 0.0), 1.0) * (GRID - 1))
-    x[:] = mean_a.mean() - m.offset_a
+    present_node = round(min(max(m.soc, 0.0), 1.0) * (GRID - 1))  # its largest drop defines the time of the peak
+    x[:] = mean_a.mean() - m.offset_a  # the RC currents before the first second are unknown
     for n in range(blocks.shape[0]):
         row = blocks[n]
         row.mean_a, row.peak_s, row.mean_x_a[:], row.begin_a[:] = 0.0, 0.0, 0.0, x
@@ -61,7 +62,7 @@ def tabulate_blocks(m: Record, mean_a: Floats, max_a: Floats, block_s: int, bloc
                     drop[i] += m.ohm[1 + k, i] * x_a
             for i in range(GRID):
                 drop[i] += m.ohm[0, i] * peak_a
-            if drop[at_soc] > row.drop_v[at_soc]:
+            if drop[present_node] > row.drop_v[present_node]:
                 row.peak_s = j - n * block_s + 1.0
             for i in range(GRID):
                 row.drop_v[i] = max(row.drop_v[i], drop[i])

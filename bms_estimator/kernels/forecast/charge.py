@@ -20,9 +20,9 @@ MIN_CHARGE_C = 0.002
 SOC_STEP = 0.0025
 """SOC charged in a step. In the constant-voltage phase, the current changes by a few percent in a step."""
 MAX_STEPS = 800
-"""Maximum number of steps: twice the SOC range."""
+"""Maximum number of steps, in which twice the SOC range would be charged."""
 CURRENT_PAIR = 2
-"""Index of the RC pair (30 s) whose filtered current is the present charge current."""
+"""Index of the RC pair (30 s). The current filtered with its time constant counts as the present charge current."""
 
 
 @njit(cache=True)
@@ -52,12 +52,14 @@ def time_to_full(s: Record, p: Record, charge_a: float, full_v: float, tail_a: f
     for q in range(s.count):
         weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
         total += weight
-        time_s += weight * _charge(s, p, q, charge_a, full_v, tail_a, scratch)
+        time_s += weight * _hypothesis_time_to_full(s, p, q, charge_a, full_v, tail_a, scratch)
     return time_s / total
 
 
 @njit(cache=True)
-def _charge(s: Record, p: Record, q: int, charge_a: float, full_v: float, tail_a: float, scratch: Floats) -> float:
+def _hypothesis_time_to_full(
+    s: Record, p: Record, q: int, charge_a: float, full_v: float, tail_a: float, scratch: Floats
+) -> float:
     """Return the time until the charger ends the charge from the state of hypothesis ``q`` [s]."""
     ohm, x = scratch[:RESISTANCES], scratch[RESISTANCES:]
     for k in range(BRANCHES):

@@ -16,7 +16,7 @@ from bms_estimator.numba_cache import njit
 MAX_LOAD_S = 20_000
 """Capacity of the ring buffer [s]: about 5.5 hours of use, in 160 kB."""
 MAX_REST_S = 4000
-"""Maximum length of a rest in the ring buffer [s]. The rest of a longer one is not stored, so that the load before it remains."""
+"""Maximum length of a rest in the ring buffer [s]. Later seconds of the rest are not stored, because they would displace the load before it."""
 CHARGE_WEIGHT = 1.0 - math.exp(-1.0 / TAU_S[CHARGE])
 """Weight of a new second in the filtered current that distinguishes a charge from regeneration."""
 
@@ -28,7 +28,7 @@ LOAD = np.dtype(
         ("part_s", "f8"),  # elapsed time of the present second [s]
         ("part_as", "f8"),  # charge of the present second until now [A s]
         ("part_max_a", "f8"),  # largest current of the present second until now [A]
-        ("filtered_a", "f8"),  # current, filtered with the time constant of the RC pair ``CHARGE`` [A]
+        ("filtered_a", "f8"),  # current, filtered with the time constant ``TAU_S[CHARGE]`` [A]
         ("last_a", "f8"),  # mean current of the last complete second [A]
         ("rest_s", "i8"),  # duration of the present rest [s]
         ("count", "i8"),  # number of seconds in the ring buffer
@@ -65,7 +65,7 @@ def add_rows(load: Record, rows: Records, unmeasured_s: float, one_c_a: float) -
 
 @njit(cache=True)
 def begin_second(load: Record) -> None:
-    """Discard the present second and begin a new one."""
+    """Begin a new second. An incomplete one is discarded."""
     load.part_s, load.part_as, load.part_max_a = 0.0, 0.0, -math.inf
 
 

@@ -16,7 +16,7 @@ from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
 MEAN_RUN_S = 300.0
-"""Mean time between two jumps of a draw [s]: the scale over which the order of the observed load is kept."""
+"""Mean time between two jumps of a draw [s]. Over shorter times a draw keeps the order of the observed load."""
 
 NEGLIGIBLE_DIFFERENCE_C = 1e-3
 """Difference of an RC current below which it counts as zero, as a C-rate."""
@@ -103,7 +103,7 @@ def follow_draw(
 
 @njit(cache=True)
 def begin_load(m: Record, blocks: Records, block_s: float, d: Record) -> None:
-    """Set the first block of a draw, and the differences of its RC currents."""
+    """Set the first block of a draw, and the differences of its RC currents from the tabulated ones."""
     d.generator, d.first_pair = d.first_generator, 0
     jump(blocks, block_s, d)
     for k in range(BRANCHES):
@@ -112,7 +112,7 @@ def begin_load(m: Record, blocks: Records, block_s: float, d: Record) -> None:
 
 @njit(cache=True)
 def advance_load(blocks: Records, block_s: float, decay: Floats, d: Record) -> None:
-    """Set the next block of a draw, and the differences of its RC currents at the beginning of this block."""
+    """Set the next block of a draw, and the differences of its RC currents from the tabulated ones at the beginning of this block."""
     negligible_a = NEGLIGIBLE_DIFFERENCE_C * d.capacity_as / 3600.0
     for k in range(d.first_pair, BRANCHES):
         d.difference_a[k] *= decay[k]

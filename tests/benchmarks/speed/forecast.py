@@ -7,10 +7,10 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import MIN_INTERVAL_S, Forecaster
-from bms_estimator.forecast.load_history import MAX_LOAD_S
 from bms_estimator.forecast.projection import BLOCK_S, DRAWS
 from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
 from bms_estimator.kernels.forecast.draws import DRAW, draw_packs
+from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
 from bms_estimator.kernels.forecast.seen_load import follow_seen_load
 from bms_estimator.model.cell import load_cell

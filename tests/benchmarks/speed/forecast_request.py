@@ -8,8 +8,8 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
-from bms_estimator.forecast.load_history import MAX_LOAD_S
 from bms_estimator.forecast.trip import Trip, constant_trip, profile_trip
+from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 from bms_estimator.model.cell import load_cell
 from bms_estimator.service.forecast_request import forecast_data, forecast_in_thread
 from tests.benchmarks.load import CELL, pulses

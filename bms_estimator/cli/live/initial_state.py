@@ -1,0 +1,88 @@
+"""State of a pack at the start of a forecast: that of its checkpoint, or the end of a capture."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
+from bms_estimator.checkpoint.learned_state import estimator_of, load_valid
+from bms_estimator.checkpoint.load_file import restore_seen_load
+from bms_estimator.cli.options.capture_input import capture_file, print_guesses, read_with_bar
+from bms_estimator.cli.options.capture_options import MappedColumns, SignOfCurrent
+from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.service.fit_thread import new_slow_fit
+from bms_estimator.service.pack_forecaster import new_forecaster
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.captures.replay import open_capture
+
+
+@dataclass(frozen=True)
+class InitialState:
+    """Pack at the start of the forecast.
+
+    Attributes:
+        name: Name of the pack, or of the capture.
+        forecaster: Forecaster with the state of the pack.
+        age_s: Time since the state was saved [s]; infinite if unknown; None: the state is the end of a capture.
+    """
+
+    name: str
+    forecaster: Forecaster
+    age_s: float | None
+
+
+def saved_state(settings: Settings, model: PackModel) -> InitialState:
+    """Return the pack with the state of its checkpoint and the observed load saved beside it. No file is changed.
+
+    Raises:
+        UserError: There is no valid checkpoint, or no forecast for this pack.
+    """
+    folder = state_folder(settings)
+    file = CheckpointFile(folder, settings, model)
+    content = load_valid(file, settings)
+    forecaster = new_forecaster(settings, model, estimator_of(content, file, settings, model), None)
+    if forecaster is None:
+        raise _no_forecaster(model)
+    load_file = HistoryFile(folder, settings, model, LOAD_SUFFIX)
+    if reason := restore_seen_load(load_file, forecaster):
+        typer.echo(f"warning: {load_file.path}: the observed load is unknown: {reason}", err=True)
+    return InitialState(settings.pack.name, forecaster, content.unseen_s)
+
+
+def end_of_capture(
+    settings: Settings,
+    model: PackModel,
+    capture: Path,
+    current_sign: SignOfCurrent,
+    column_map: MappedColumns,
+    *,
+    has_pack: bool,
+) -> InitialState:
+    """Return the pack at the end of a capture. The load of the capture is the observed load.
+
+    Raises:
+        UserError: The capture cannot be read or has no usable sample, or there is no forecast for this cell.
+    """
+    with capture_file(capture) as path:
+        source = open_capture(
+            path, settings.sensor if has_pack else None, current_sign=current_sign, column_map=column_map
+        )
+        print_guesses(path.name, source)
+        estimator = new_estimator(settings, model)
+        forecaster = new_forecaster(settings, model, estimator, new_slow_fit(settings, estimator))
+        if forecaster is None:
+            raise _no_forecaster(model)
+        forecaster.run(read_with_bar(path, source))
+        if not estimator.state["samples"][0]:
+            raise UserError(f"{path}: no usable sample")
+    return InitialState(path.name, forecaster, None)
+
+
+def _no_forecaster(model: PackModel) -> UserError:
+    return UserError(f"{model.cell.name}: a forecast needs a battery, and identifier.enabled = true in the settings")
