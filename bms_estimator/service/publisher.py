@@ -28,13 +28,13 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.latency import Latency
-from bms_estimator.settings.alarm_limits import monitored_alarms
+from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source, SourceHealth
 from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.cells import NO_SHORT_LIMIT_A, make_cells_payload, weakest_cell_fields
+from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
 from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
@@ -138,9 +138,7 @@ class Publisher:
         self.alarm_monitor = AlarmMonitor(
             settings, cell, estimator, source, clock, on_alarm, hooks, weakest_cell, cells
         )
-        self._short_limit_a = next(
-            (each.limit for each in monitored_alarms(settings, cell) if each.name == "cell_short"), NO_SHORT_LIMIT_A
-        )
+        self._short_limit_a = short_limit_a(settings, cell)
         self._logged_faults = 0  # bits of ``InputFault``
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()

@@ -111,6 +111,11 @@ def monitored_alarms(settings: Settings, cell: PackModel) -> tuple[AlarmDefiniti
     return tuple(each for each in definitions if each is not None)
 
 
+def short_limit_a(settings: Settings, cell: PackModel) -> float:
+    """Return the limit of the alarm ``cell_short`` [A]; infinite if it is not monitored."""
+    return next((each.limit for each in monitored_alarms(settings, cell) if each.name == "cell_short"), math.inf)
+
+
 def silent_limit_s(settings: Settings) -> float:
     """Return the time without a sample after which ``link_lost`` is raised and no other alarm is monitored [s]."""
     rule = settings.alarms.link_lost

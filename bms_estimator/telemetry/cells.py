@@ -1,6 +1,5 @@
 """Payload of topic ``cells``, and faults of single cells as inputs of alarms."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -112,7 +111,3 @@ def weakest_cell_fields(cells: CellDeviations) -> dict[str, float | int | None]:
         "cell_soc_spread": float(np.ptp(cells.soc_deviation)),
         "cell_r_spread": float(np.ptp(cells.resistance_ratio)),
     }
-
-
-NO_SHORT_LIMIT_A = math.inf
-"""Limit of the self-discharge without the alarm ``cell_short`` [A]."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import AsyncExitStack, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich import box
@@ -45,12 +45,14 @@ from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.service.fit_thread import new_slow_fit
 from bms_estimator.service.pack_forecaster import load_forecast_kernels, new_forecaster
 from bms_estimator.service.publisher import Publisher
+from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.sinks.trace_file import TableSink, join_columns, table_sink
 from bms_estimator.sources.captures.replay import RawCapture, Replay, open_capture
 from bms_estimator.store.outbox import Outbox
+from bms_estimator.telemetry.cell_columns import CellColumns
 from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 from bms_estimator.telemetry.pack_model import FitTimes, pack_model_health
@@ -134,6 +136,8 @@ def replay(
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:
         Console().print(result_table(path.name, result))
+        if result.cells:
+            Console().print(cells_table(result.cells))
 
 
 def _unread_warnings(source: RawCapture, duration_s: float) -> Iterator[str]:
@@ -164,18 +168,20 @@ async def _replay(
         run = forecaster.run if table or settings.mqtt else forecaster.run_without_forecast
     async with AsyncExitStack() as stack:
         cells = CellEstimator(estimator)
+        cell_columns = CellColumns(cells)
+        run_cells = cell_columns.run if table else cells.run
         publisher = await _open_publisher(stack, settings, model, estimator, pack_model, forecaster, cells, source)
         stack.enter_context(table or nullcontext())
         bar = stack.enter_context(progress_bar("replaying"))
         started_s, impossible = time.perf_counter(), None
         async for received in source:
             trace = run(received.samples)
-            cells.run(received.samples, received.cells_v, trace)
+            run_cells(received.samples, received.cells_v, trace)
             summary.add(trace)
             if trace.size < received.samples.size:  # samples were dropped
                 impossible = out_of_range_reason(received.samples, estimator.settings[0]) or impossible
             if table:
-                table.write(join_columns(trace, forecaster.rows) if forecaster else trace)
+                table.write(join_columns(trace, *([forecaster.rows] if forecaster else []), *cell_columns.rows))
             if publisher:
                 publisher.add(received, trace)
                 await asyncio.sleep(0)  # the MQTT client runs in this event loop
@@ -185,7 +191,8 @@ async def _replay(
             publisher.publish_last()
     for kind, text in errors.items():
         typer.echo(f"warning: a fit of the pack's model failed: {kind}: {text}", err=True)
-    result = summary.result(estimator, pack_model, forecaster, source.samples, wall_s)
+    limit_a = short_limit_a(settings, model)
+    result = summary.result(estimator, pack_model, forecaster, cells, limit_a, source.samples, wall_s)
     return replace(result, impossible=impossible, temperatures_dropped=source.counters.get("implausible", 0))
 
 
@@ -251,6 +258,23 @@ def result_table(title: str, result: ReplayResult) -> Table:
         table.add_row(name, value)
     for suspicion in result.suspects:
         table.add_row("suspected", f"[yellow]{suspicion}[/]")
+    return table
+
+
+def cells_table(cells: list[dict[str, Any]]) -> Table:
+    """Return the cells in series as a table, with the lowest SOC first."""
+    table = Table(title="cells", title_justify="left", box=box.SIMPLE_HEAD)
+    for header in ("cell", "SOC", "resistance", "capacity", "self-discharge", "fault"):
+        table.add_column(header, justify="left" if header == "fault" else "right")
+    for cell in sorted(cells, key=lambda each: each["soc"]):
+        table.add_row(
+            str(cell["number"]),
+            f"{cell['soc']:.1%} ± {cell['soc_std']:.1%}",
+            f"{cell['resistance_ratio']:.2f} ± {cell['resistance_ratio_std']:.2f}",
+            f"{cell['capacity_ratio']:.3f}",
+            f"{1e3 * cell['self_discharge_a']:.1f} ± {1e3 * cell['self_discharge_std_a']:.1f} mA",
+            f"[red]{cell['fault']}[/]" if cell["fault"] else "",
+        )
     return table
 
 

@@ -8,10 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.telemetry.cell_columns import CELL_COLUMNS
+from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.state import finite
@@ -76,6 +79,17 @@ class ReplayResult:
     """Values of a forecast from the last sample; empty without a forecaster."""
     forecast_reason: str | None
     """Reason why this forecast has no time to the cut-off; None if it has one, or without a forecaster."""
+    weakest_cell: int | None
+    """Number of the cell with the lowest SOC at the end, from 1; None without cell voltages."""
+    weakest_cell_soc: float | None
+    """SOC of this cell, 0..1."""
+    weakest_cell_soc_std: float | None
+    cell_soc_spread: float | None
+    """Highest less lowest SOC of the cells."""
+    cell_r_spread: float | None
+    """Highest less lowest resistance of the cells, relative to the median."""
+    cells: list[dict[str, Any]]
+    """Cells in series at the end, with the fields of ``CellReport``; empty without cell voltages."""
     samples_per_s: float | None
     """Number of processed samples per second, including dropped samples."""
     wall_s: float
@@ -115,6 +129,8 @@ class Summary:
         estimator: Estimator,
         pack_model: SlowFit | None,
         forecaster: Forecaster | None,
+        cells: CellEstimator,
+        short_limit_a: float,
         sample_count: int,
         wall_s: float,
     ) -> ReplayResult:
@@ -124,6 +140,8 @@ class Summary:
             estimator: Estimator after the last sample.
             pack_model: Slow fit of the estimator; None without one.
             forecaster: Forecaster after the last sample; None without one.
+            cells: Estimators of the single cells after the last sample.
+            short_limit_a: Limit of the alarm ``cell_short`` [A].
             sample_count: Number of samples in the capture, including dropped samples.
             wall_s: Duration of the replay [s].
         """
@@ -161,6 +179,7 @@ class Summary:
             fits=pack_model.fits if pack_model else 0,
             failed_fits=pack_model.failed if pack_model else 0,
             **_last_forecast(forecaster),
+            **_last_cells(cells, short_limit_a),
             samples_per_s=sample_count / wall_s if wall_s > 0.0 else None,
             wall_s=wall_s,
         )
@@ -184,6 +203,15 @@ def _last_forecast(forecaster: Forecaster | None) -> dict[str, Any]:
     forecast = forecaster.forecast()
     values = {name: finite(forecast.values[0][name]) for name in forecast.values.dtype.names or ()}
     return {"forecast": values, "forecast_reason": forecast.reason}
+
+
+def _last_cells(cells: CellEstimator, short_limit_a: float) -> dict[str, Any]:
+    """Return the fields of ``ReplayResult`` with the cells in series."""
+    deviations = cells.deviations
+    if deviations is None:
+        return {**dict.fromkeys(CELL_COLUMNS.names or ()), "cells": []}
+    report = make_cells_payload(deviations, short_limit_a, now_s=0.0)  # the time is not part of the result
+    return {**weakest_cell_fields(deviations), "cells": [cell.model_dump() for cell in report.cells]}
 
 
 def _finite_field(row: np.void | None, name: str) -> float | None:
