@@ -4,7 +4,7 @@ import asyncio
 import sys
 from collections.abc import Collection, Container
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tomlkit
 import typer
@@ -16,6 +16,9 @@ from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, model_key, settings_of
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
+
+if TYPE_CHECKING:
+    from bms_estimator.fleet.worker.erasure import Erasure
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -69,10 +72,30 @@ def remove(
     server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
+    erase: Annotated[
+        bool, typer.Option("--erase", help="also erase their blocks, states and hourly summaries from the server")
+    ] = False,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="with --erase: also erase their rows from this folder of `fleet collect`, which must not run meanwhile",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
-    """Remove packs from the server's table; samples that they send later are stored but not estimated."""
-    asyncio.run(_remove(set(packs), (server, creds, ca)))
-    typer.echo(f"removed from the table: {', '.join(dict.fromkeys(packs))}")
+    """Remove packs from the server's table; samples that they send later are stored but not estimated.
+
+    The command prints which data of the packs remain.
+    """
+    names, address = dict.fromkeys(packs), (server, creds, ca)
+    if erase:
+        _erase(list(names), address, folder)
+        return
+    if folder is not None:
+        raise UserError("--folder: give it together with --erase")
+    asyncio.run(_remove(set(names), address))
+    typer.echo(f"removed from the table: {', '.join(names)}")
+    typer.echo("their blocks, states and hourly summaries remain; --erase erases them")
 
 
 @app.command()
@@ -159,6 +182,53 @@ async def _load(path: Path, table: PackTable, files: dict[str, str], address: Se
     }
     changes = ", ".join(f"{count} {change}" for change, count in counts.items() if count)
     return f"{path}: {len(rows)} packs of {spec_count} kinds: {changes}"
+
+
+def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> None:
+    """Erase packs from the server and from the Parquet files, and print what was erased and what remains."""
+    from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
+    from bms_estimator.fleet.queries.row_erasure import erase_rows  # noqa: PLC0415
+
+    if folder is None:
+        _print_erasures(asyncio.run(_erase_from_server(packs, address)))
+    else:
+        if not folder.is_dir():
+            raise UserError(f"--folder {folder}: no such folder")
+        with only_collector(folder):  # before anything is erased
+            _print_erasures(asyncio.run(_erase_from_server(packs, address)))
+            try:
+                typer.echo(f"{folder}: {erase_rows(folder, packs)} rows erased")
+            except OSError as error:
+                raise UserError(f"--folder {folder}: cannot be written, repeat the command: {error.strerror}") from None
+    remaining = ["their names in the table of packs, as marks of their removal"]
+    if folder is None:
+        remaining.append("their rows in the Parquet files of `fleet collect`: end it and repeat with --folder FOLDER")
+    remaining += [
+        "blocks on their edges, which they send again: stop the edges, revoke their tokens, delete PACK.edge.sqlite",
+        "last states on running fleet pages, until these are restarted",
+        "backups of the server and of the Parquet files, files of `fleet capture`, logs of workers",
+        "cell files of-PACK that `fleet identify --put` has uploaded",
+    ]
+    typer.echo("\n  ".join(["remaining:", *remaining]))
+
+
+async def _erase_from_server(packs: list[str], address: ServerAddress) -> "dict[str, Erasure]":
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
+    from bms_estimator.fleet.worker.erasure import erase_packs  # noqa: PLC0415
+
+    async with connected(*address) as nc:
+        return await erase_packs(nc, set(packs))
+
+
+def _print_erasures(erasures: "dict[str, Erasure]") -> None:
+    for pack, erasure in erasures.items():
+        typer.echo(
+            f"{pack}: {erasure.blocks} blocks, {erasure.hours} hourly summaries and the state in {erasure.checkpoints} "
+            "checkpoints erased"
+        )
+        for stream, count in erasure.remaining.items():
+            if stream != f"KV_{PACKS_BUCKET}":
+                typer.echo(f"{pack}: {count} messages remain in the stream {stream}")
 
 
 async def _remove(packs: set[str], address: ServerAddress) -> None:

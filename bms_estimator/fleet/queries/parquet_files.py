@@ -45,7 +45,7 @@ _MAGIC = b"PAR1"
 
 def _column(annotation: object) -> pa.DataType:
     """Return the column type. Single precision exceeds the accuracy of any value, and halves the size of the files."""
-    types = {str: pa.string(), int: pa.int32(), int | None: pa.int64()}
+    types: dict[object, pa.DataType] = {str: pa.string(), int: pa.int32(), int | None: pa.int64()}
     return types.get(annotation, pa.float32())
 
 
@@ -101,13 +101,18 @@ def _write_day(folder: Path, day: int, rows: pa.Table) -> Path:
         folder_of_day.mkdir(parents=True, exist_ok=True)
         _sync(folder)
     path = folder_of_day / f"{BATCH_PREFIX}{uuid.uuid4().hex}.parquet"
-    unfinished = path.with_name(f".{path.name}{UNFINISHED_SUFFIX}")
+    unfinished = unfinished_name(path)
     pq.write_table(rows, unfinished, compression="zstd")
-    _finish(unfinished, path)
+    finish(unfinished, path)
     return path
 
 
-def _finish(unfinished: Path, path: Path) -> None:
+def unfinished_name(path: Path) -> Path:
+    """Return the path under which a file is written before it is renamed to ``path``."""
+    return path.with_name(f".{path.name}{UNFINISHED_SUFFIX}")
+
+
+def finish(unfinished: Path, path: Path) -> None:
     """Sync an unfinished file, rename it, and sync the folder, so that the new name survives a power cut."""
     _sync(unfinished)
     unfinished.rename(path)
@@ -164,7 +169,7 @@ def compact(day: Path) -> Path:
     """
     files = complete_files(day)
     path = day / f"{MERGED_PREFIX}{uuid.uuid4().hex}.parquet"
-    unfinished = path.with_name(f".{path.name}{UNFINISHED_SUFFIX}")
+    unfinished = unfinished_name(path)
     names = [str(file) for file in files]
     with duckdb.connect(config={"memory_limit": MERGE_MEMORY, "temp_directory": str(day / ".sorting")}) as database:
         stored = database.read_parquet(names, union_by_name=True, hive_partitioning=False)  # noqa: F841 - used in SQL
@@ -173,7 +178,7 @@ def compact(day: Path) -> Path:
         database.sql(f"{VALID_ROWS} ORDER BY pack, hour").write_parquet(
             str(unfinished), compression="zstd", row_group_size=ROW_GROUP
         )
-    _finish(unfinished, path)
+    finish(unfinished, path)
     for file in files:
         file.unlink(missing_ok=True)
     return path

@@ -69,6 +69,11 @@ class Pointer(BaseModel):
     kept: tuple[CheckpointInfo, ...] = ()
     """Stored checkpoints, newest first."""
 
+    @property
+    def checkpoints(self) -> tuple[CheckpointInfo, ...]:
+        """All stored checkpoints."""
+        return self.kept
+
 
 class StoredPointer(NamedTuple):
     """Pointer as read from the bucket."""
@@ -168,6 +173,31 @@ class CheckpointStore:
             raise
         for old in kept[CHECKPOINTS_PER_PARTITION:]:
             await self._remove_object(old.object)
+        return claim
+
+    async def replace(self, claim: Claim, old: CheckpointInfo, chunks: Iterator[bytes] | None) -> Claim:
+        """Replace a stored checkpoint by one of the same messages, or remove it.
+
+        Args:
+            claim: Claim that the last write returned.
+            old: Checkpoint to replace.
+            chunks: Bytes of the new checkpoint; None: remove the old one.
+
+        Raises:
+            FencedError: A worker has taken the partition over; the old checkpoint remains.
+        """
+        pointer = claim.pointer
+        new: tuple[CheckpointInfo, ...] = ()
+        if chunks is not None:
+            size = await self._write_object(pointer.next, chunks)
+            new = (old.model_copy(update={"object": pointer.next, "bytes": size}),)
+        kept = tuple(info for each in pointer.kept for info in (new if each == old else (each,)))
+        try:
+            claim = await self._write_pointer(claim.partition, claim.revision, kept)
+        except FencedError:
+            await self._remove_object(pointer.next)
+            raise
+        await self._remove_object(old.object)
         return claim
 
     async def _read_pointer(self, partition: int) -> StoredPointer | None:

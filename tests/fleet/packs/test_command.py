@@ -66,7 +66,11 @@ def test_rows_are_removed_with_option_remove_or_by_name(url, table, capsys):
     )
     code, _, err = run(capsys, "fleet", "packs", "remove", "shed", "boat", "--server", url)
     assert (code, err) == (2, "error: boat: not in the table of packs; `fleet packs list` prints it\n")
-    assert run(capsys, "fleet", "packs", "remove", "shed", "--server", url) == (0, "removed from the table: shed\n", "")
+    code, out, err = run(capsys, "fleet", "packs", "remove", "shed", "--server", url)
+    assert (code, err) == (0, "")
+    assert out == (
+        "removed from the table: shed\ntheir blocks, states and hourly summaries remain; --erase erases them\n"
+    )
     assert run(capsys, "fleet", "packs", "list", "--server", url)[1] == "pack\n"
 
 

@@ -1,0 +1,176 @@
+"""Erasure of packs from the server: blocks, states in checkpoints and in the memory of workers, and hourly rows.
+
+The erasure claims the partition of a pack as a worker does. The owner is thereby fenced out, drops the partition from its
+memory, and takes it over again from the rewritten checkpoint. The other packs of the partition lose nothing, because their
+blocks since the checkpoint are in the stream.
+"""
+
+import asyncio
+import json
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import nats.errors
+from nats.aio.client import Client
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.stream_reader import StreamError
+from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer, partitions_of
+from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
+from bms_estimator.fleet.worker.checkpoint_format import CheckpointError, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, FencedError
+from bms_estimator.model.errors import UserError
+
+WORKER_NAME = "packs-remove"
+"""Name with which the erasure claims a partition."""
+TABLE_S = 3.0 * POLL_S
+"""Time after which workers have removed a pack from their copies of the table [s]."""
+MAX_CLAIMS = 20
+"""Maximum number of claims of a partition, because its worker may claim it again before its checkpoints are rewritten."""
+RETRY_S = 0.5
+"""Delay before a partition is claimed again [s]."""
+V = TypeVar("V")
+
+
+@dataclass(frozen=True)
+class Erasure:
+    """Numbers of erased items of one pack, and remaining messages.
+
+    Attributes:
+        blocks: Number of messages in the stream ``RAW``.
+        checkpoints: Number of checkpoints that contained the pack.
+        hours: Number of messages in the stream ``HOURS``.
+        remaining: Numbers of messages with the pack's name in their subject in the other streams of the tenant, by stream.
+    """
+
+    blocks: int
+    checkpoints: int
+    hours: int
+    remaining: Mapping[str, int]
+
+
+async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
+    """Remove packs from the table and erase them from the server.
+
+    Args:
+        nc: Connection to the tenant's NATS account, with the permissions of its administrator.
+        packs: Names of the packs.
+
+    Raises:
+        UserError: The server has no streams, or a checkpoint is of another version of this program.
+        StreamError: The server rejects a request.
+    """
+    partitions = await partitions_of(nc)
+    if partitions is None:
+        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
+    listed = packs & (await read_bucket(nc, subjects.PACKS_BUCKET)).keys()
+    if listed:
+        await remove_keys(nc, subjects.PACKS_BUCKET, listed)
+        await asyncio.sleep(TABLE_S)  # otherwise a worker may process a new block with the former settings
+    blocks, checkpoints = dict[str, int](), dict[str, int]()
+    for number in {subjects.partition_of(pack, partitions) for pack in packs}:
+        members = {pack for pack in packs if subjects.partition_of(pack, partitions) == number}
+        for pack in members:
+            blocks[pack] = await _purge(nc, subjects.RAW_STREAM, subjects.stored_raw(number, pack))
+        checkpoints |= await _erase_states(nc, number, members)
+    hours = {pack: await _purge(nc, subjects.HOURS_STREAM, subjects.hours(pack)) for pack in packs}
+    remaining = await _remaining(nc, packs)
+    return {pack: Erasure(blocks[pack], checkpoints[pack], hours[pack], remaining[pack]) for pack in packs}
+
+
+async def _erase_states(nc: Client, partition: int, packs: Collection[str]) -> dict[str, int]:
+    """Erase packs from all checkpoints of a partition and from its worker's memory. Return numbers of checkpoints by pack."""
+    js = nc.jetstream()
+    checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
+    store = CheckpointStore(nc, WORKER_NAME, checkpoints, await js.object_store(subjects.STATES_BUCKET))
+    counts = dict.fromkeys(packs, 0)
+    for _ in range(MAX_CLAIMS):
+        try:
+            await _rewrite_checkpoints(store, partition, counts)
+            break
+        except FencedError:
+            await asyncio.sleep(RETRY_S)
+    else:
+        raise UserError(
+            f"partition {partition}: its worker claims it at each attempt; end the workers and repeat the command"
+        )
+    # a worker whose pin ends checks its claim, finds it replaced, and drops the partition from its memory
+    request = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
+    with suppress(nats.errors.TimeoutError):
+        await nc.request(request, json.dumps({"group": GROUP}).encode(), timeout=RESPONSE_TIMEOUT_S)
+    return counts
+
+
+async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: dict[str, int]) -> None:
+    """Rewrite the checkpoints that contain one of the packs of ``counts``, and count them there. Remove damaged ones.
+
+    Raises:
+        FencedError: A worker has claimed the partition meanwhile.
+        UserError: A checkpoint is of another version of this program.
+    """
+    claim = await store.claim(partition)
+    damaged = set(claim.pointer.checkpoints)
+    async for info, data in store.load(claim):
+        damaged.discard(info)
+        try:
+            checkpoint = read_checkpoint(data)
+        except CheckpointError as error:
+            raise UserError(f"partition {partition}: {error}") from None
+        found = counts.keys() & {*checkpoint.packs, *checkpoint.unmigrated, *checkpoint.deferred}
+        if found:
+            rest = replace(
+                checkpoint,
+                packs=_without(checkpoint.packs, found),
+                unmigrated=_without(checkpoint.unmigrated, found),
+                deferred=_without(checkpoint.deferred, found),
+            )
+            claim = await store.replace(claim, info, rest.chunks())
+        for pack in found:
+            counts[pack] += 1
+    for info in damaged:  # its content is unknown
+        claim = await store.replace(claim, info, None)
+
+
+def _without(part: Mapping[str, V], packs: Collection[str]) -> dict[str, V]:
+    return {pack: value for pack, value in part.items() if pack not in packs}
+
+
+async def _purge(nc: Client, stream: str, subject: str) -> int:
+    """Remove the messages of a subject from a stream, and return their number."""
+    return int((await _api(nc, f"STREAM.PURGE.{stream}", {"filter": subject}))["purged"])
+
+
+async def _remaining(nc: Client, packs: Collection[str]) -> dict[str, dict[str, int]]:
+    """Return the numbers of messages with a pack's name in their subject, by pack and stream."""
+    remaining: dict[str, dict[str, int]] = {pack: {} for pack in packs}
+    for stream in (await _api(nc, "STREAM.NAMES", {}))["streams"] or ():
+        for pack in packs:
+            count = await _count_messages(nc, stream, pack)
+            if count:
+                remaining[pack][stream] = count
+    return remaining
+
+
+async def _count_messages(nc: Client, stream: str, pack: str) -> int:
+    """Return the number of a stream's messages with a pack's name as the last token of their subject."""
+    count = 0
+    for leading_tokens in range(1, 5):
+        subject = ".".join(["*"] * leading_tokens + [pack])
+        info = await _api(nc, f"STREAM.INFO.{stream}", {"subjects_filter": subject})
+        count += sum((info["state"].get("subjects") or {}).values())
+    return count
+
+
+async def _api(nc: Client, operation: str, request: dict[str, Any]) -> dict[str, Any]:
+    """Send a request to the JetStream API, because nats-py does not return the number of purged messages.
+
+    Raises:
+        StreamError: The server rejects the request.
+    """
+    response = await nc.request(f"$JS.API.{operation}", json.dumps(request).encode(), timeout=RESPONSE_TIMEOUT_S)
+    decoded: dict[str, Any] = json.loads(response.data)
+    if "error" in decoded:
+        raise StreamError(f"the server rejects {operation}: {decoded['error'].get('description', '')}")
+    return decoded

@@ -1,0 +1,122 @@
+"""``fleet packs remove --erase`` on the real server with a running worker."""
+
+import asyncio
+
+import nats
+import pytest
+
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import Block, encode
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.queries.collector import only_collector
+from bms_estimator.fleet.queries.duckdb_queries import run_query, select
+from bms_estimator.fleet.queries.parquet_files import write
+from tests.command_line import run
+from tests.fleet.hour_rows import BEGIN, make_hour
+from tests.fleet.nats_cluster import connected, running
+from tests.fleet.workers import STORE_ID_NS, Heartbeats, Process, end_states, estimated, load_packs, samples, send
+from tests.patience import LONG_S
+
+BLOCKS = 8
+"""Number of blocks of each pack, which last 80 minutes."""
+STREAMS = (subjects.RAW_STREAM, subjects.HOURS_STREAM, f"OBJ_{subjects.STATES_BUCKET}")
+
+
+def block(pack, number):
+    return encode(Block(STORE_ID_NS, number, 1, STORE_ID_NS / 1e9, samples(pack, number)))
+
+
+async def occurrences(nc, pack):
+    """Return the streams with a message that contains the pack's name."""
+    js, found = nc.jetstream(), []
+    for stream in STREAMS:
+        state = (await js.stream_info(stream)).state
+        for sequence in range(state.first_seq, state.last_seq + 1):
+            try:
+                message = await js.get_msg(stream, sequence)
+            except nats.js.errors.NotFoundError:
+                continue
+            if pack in message.subject or pack.encode() in (message.data or b""):
+                found.append(stream)
+    return sorted(set(found))
+
+
+async def test_erased_pack_is_in_no_stream_checkpoint_and_memory_and_the_other_pack_keeps_its_state(tmp_path, capsys):
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=1)
+        registry = await load_packs(nc, ["p1", "p2"])
+        worker = Process(tmp_path, cluster.url, "w1", "--checkpoint-s", 1)
+        try:
+            async with Heartbeats(nc) as heartbeats:
+                for number in range(1, BLOCKS):
+                    for pack in ("p1", "p2"):
+                        await send(nc, pack, block(pack, number))
+                blocks = 2 * (BLOCKS - 1)
+                await heartbeats.until(lambda last: "w1" in last and last["w1"].counters.get("blocks") == blocks)
+                async with asyncio.timeout(LONG_S):
+                    while len(await occurrences(nc, "p1")) < len(STREAMS):  # noqa: ASYNC110 - streams send no notification
+                        await asyncio.sleep(0.05)
+                command = ("fleet", "packs", "remove", "p1", "--erase", "--server", cluster.url)
+                code, out, err = await asyncio.to_thread(run, capsys, *command)
+                assert (code, err) == (0, "")
+                assert out.startswith(f"p1: {BLOCKS - 1} blocks, 1 hourly summaries and the state in ")
+                assert "0 checkpoints" not in out
+                assert "remaining:\n  their names in the table of packs" in out
+                assert await occurrences(nc, "p1") == []
+                await send(nc, "p2", block("p2", BLOCKS))
+                await heartbeats.until(lambda last: last["w1"].packs == 1)
+                await heartbeats.until(lambda last: last["w1"].counters.get("blocks", 0) >= BLOCKS)
+            assert await worker.end() == 0
+        finally:
+            worker.kill()
+        assert await occurrences(nc, "p1") == []
+        partition = (await end_states(nc, registry, 1))[0]
+        assert partition.state("p1") is None
+        state = partition.state("p2")
+        assert state["estimator"].tobytes() == estimated(registry, "p2", BLOCKS)
+        await nc.close()
+
+
+async def test_pack_without_a_worker_is_erased_and_messages_in_other_streams_are_reported(tmp_path, capsys):
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=1)
+        await nc.jetstream().add_stream(name="REJECTED", subjects=["rejected.*"])
+        await nc.jetstream().publish("rejected.p1", b"damaged")
+        await send(nc, "p1", block("p1", 1))
+        command = ("fleet", "packs", "remove", "p1", "--erase", "--server", cluster.url)
+        code, out, err = await asyncio.to_thread(run, capsys, *command)
+        assert (code, err) == (0, "")
+        assert out.startswith("p1: 1 blocks, 0 hourly summaries and the state in 0 checkpoints erased\n")
+        assert "p1: 1 messages remain in the stream REJECTED\n" in out
+        await nc.close()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Return a folder with rows of two packs, and one quarantined row of each."""
+    for pack in ("p1", "p2"):
+        write(tmp_path / "hours", [make_hour(pack, BEGIN + n, received_hour=BEGIN + n + 1) for n in range(30)])
+        write(tmp_path / "hours", [make_hour(pack, 5, received_hour=BEGIN, revision=1, clock_error_s=-4e8)])
+    return tmp_path / "hours"
+
+
+def test_rows_are_erased_from_the_files_while_no_collector_runs(tmp_path, folder, capsys):
+    with running(tmp_path, partitions=1) as cluster:
+
+        async def create_streams():
+            async with await nats.connect(cluster.url) as nc:
+                await make_streams(nc, partitions=1)
+
+        asyncio.run(create_streams())
+        command = ("fleet", "packs", "remove", "p1", "--erase", "--folder", folder, "--server", cluster.url)
+        with only_collector(folder):
+            code, _, err = run(capsys, *command)
+            assert (code, "another collector writes there" in err) == (2, True)
+        code, out, err = run(capsys, *command)
+    assert (code, err) == (0, "")
+    assert f"{folder}: 31 rows erased\n" in out
+    assert select(folder, "SELECT pack, count(*) FROM hours GROUP BY pack").rows == [("p2", 30)]
+    assert [row["pack"] for row in run_query(folder, "clocks").records] == ["p2"]
+    assert not any(b"p1" in file.read_bytes() for file in folder.rglob("*.parquet"))
