@@ -3,34 +3,37 @@
 Layout, little-endian::
 
     0  magic   4s  b"BMSB"
-    4  version u1  1
-    5  -       u1  0
+    4  version u1  1, or 2 with cell voltages
+    5  cells   u1  number of cells whose voltages the block has; 0 in version 1
     6  count   u2  samples, 1..65535
     8  store   u8  creation time of the edge's store [ns since 1970]; a later store replaces an earlier one
     16 number  u8  number of this block in its store, from 1
     24 oldest  u8  oldest number that the edge can still send; missing blocks before it will never arrive
     32 arrival f8  wall clock at the arrival of the last sample [s since 1970]
-    40 body        zlib of the columns time_s, current_a, voltage_v, temperature_c (f8), status (u4)
+    40 body        zlib of the columns time_s, current_a, voltage_v, temperature_c (f8), status (u4), and of the cell
+                   voltages (module ``cell_voltages``)
 
 ``time_s`` is the edge's clock: seconds since the creation of its store, never decreasing within a store. Its bits are
 written as differences of 64-bit integers. At a constant sample period nearly all differences are equal, which
-compresses well.
+compresses well. A program that reads only version 1 rejects a block of version 2 by its version.
 """
 
 import math
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.edge import cell_voltages
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 
-_HEADER = struct.Struct("<4sBxHQQQd")
+_HEADER = struct.Struct("<4sBBHQQQd")
 _OLDEST_OFFSET = 24
 """Offset of the field ``oldest`` in the header [bytes]."""
-_MAGIC, _VERSION = b"BMSB", 1
+_MAGIC = b"BMSB"
+_VERSION, _VERSION_WITH_CELLS = 1, 2
 MAX_SAMPLES = 65_535
 """Maximum number of samples of a block."""
 MAX_NUMBER = 2**63
@@ -54,6 +57,7 @@ class Block:
         oldest: Oldest number that the edge can still send; at most ``number``.
         arrival_s: Wall clock at the arrival of the last sample [s since 1970].
         samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MAX_SAMPLES`` of them.
+        cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
     """
 
     store_created_ns: int
@@ -61,6 +65,7 @@ class Block:
     oldest: int
     arrival_s: float
     samples: SampleBlock
+    cells_v: CellBlock = field(default_factory=lambda: NO_CELLS)
 
 
 def encode(block: Block) -> bytes:
@@ -71,12 +76,23 @@ def encode(block: Block) -> bytes:
     """
     if not 1 <= block.samples.size <= MAX_SAMPLES:
         raise ValueError(f"{block.samples.size} samples in a block: must be 1 to {MAX_SAMPLES}")
+    cells = block.cells_v.shape[1]
     header = _HEADER.pack(
-        _MAGIC, _VERSION, block.samples.size, block.store_created_ns, block.number, block.oldest, block.arrival_s
+        _MAGIC,
+        _VERSION_WITH_CELLS if cells else _VERSION,
+        cells,
+        block.samples.size,
+        block.store_created_ns,
+        block.number,
+        block.oldest,
+        block.arrival_s,
     )
     columns = [np.ascontiguousarray(block.samples[name], dtype=dtype) for name, dtype in _COLUMNS]
     columns[0] = _differences(columns[0].view("<u8"))
-    return header + zlib.compress(b"".join(column.tobytes() for column in columns))
+    body = [column.tobytes() for column in columns]
+    if cells:
+        body.append(cell_voltages.encode_cells(block.cells_v))
+    return header + zlib.compress(b"".join(body))
 
 
 def with_oldest(data: bytes, oldest: int) -> bytes:
@@ -92,12 +108,14 @@ def decode(data: bytes) -> Block:
     """
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         raise BlockError(f"{len(data)} bytes without the header of a block")
-    _, version, count, store, number, oldest, arrival_s = _HEADER.unpack_from(data)
-    if version != _VERSION:
-        raise BlockError(f"version {version}; this program reads version {_VERSION}")
+    _, version, cells, count, store, number, oldest, arrival_s = _HEADER.unpack_from(data)
+    if version not in (_VERSION, _VERSION_WITH_CELLS):
+        raise BlockError(f"version {version}; this program reads versions {_VERSION} and {_VERSION_WITH_CELLS}")
     if not (1 <= oldest <= number < MAX_NUMBER and 0 < store < MAX_NUMBER and math.isfinite(arrival_s)):
         raise BlockError(f"implausible header: store {store}, number {number}, oldest {oldest}, arrival {arrival_s}")
-    return Block(store, number, oldest, arrival_s, _decode_samples(data[_HEADER.size :], count))
+    cells = cells if version == _VERSION_WITH_CELLS else 0
+    samples, cells_v = _decode_body(data[_HEADER.size :], count, cells)
+    return Block(store, number, oldest, arrival_s, samples, cells_v)
 
 
 def peek_header(data: bytes) -> tuple[int, float]:
@@ -107,19 +125,29 @@ def peek_header(data: bytes) -> tuple[int, float]:
     """
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         return 0, math.inf
-    _, _, count, *_, arrival_s = _HEADER.unpack_from(data)
+    _, _, _, count, *_, arrival_s = _HEADER.unpack_from(data)
     return count, arrival_s if math.isfinite(arrival_s) else math.inf
 
 
-def _decode_samples(body: bytes, count: int) -> SampleBlock:
+def _decode_body(body: bytes, count: int, cells: int) -> tuple[SampleBlock, CellBlock]:
     size = count * _SAMPLE_BYTES
+    max_size = size + (cell_voltages.MAX_BYTES if cells else 0)
     unpacker = zlib.decompressobj()
     try:
-        raw = unpacker.decompress(body, size + 1)  # one byte more shows that the body is too long
+        raw = unpacker.decompress(body, max_size + 1)  # one byte more shows that the body is too long
     except zlib.error as error:
         raise BlockError(str(error)) from None
-    if len(raw) != size or count == 0 or not unpacker.eof or unpacker.unused_data:
+    is_size_plausible = size < len(raw) <= max_size if cells else len(raw) == size
+    if not is_size_plausible or count == 0 or not unpacker.eof or unpacker.unused_data:
         raise BlockError(f"the body does not hold {count} samples")
+    try:
+        cells_v = cell_voltages.decode_cells(raw[size:], count, cells) if cells else NO_CELLS
+    except ValueError as error:
+        raise BlockError(str(error)) from None
+    return _decode_samples(raw, count), cells_v
+
+
+def _decode_samples(raw: bytes, count: int) -> SampleBlock:
     samples = np.zeros(count, dtype=SAMPLE)
     offset = 0
     for name, dtype in _COLUMNS:

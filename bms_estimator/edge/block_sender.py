@@ -18,10 +18,11 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.batching import MAX_SAMPLES, Batcher
 from bms_estimator.edge.block_store import BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES
+from bms_estimator.edge.cell_voltages import MAX_CELLS
 from bms_estimator.edge.sample_clock import SampleClock
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.payloads.health import EdgeHealth
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
@@ -84,6 +85,7 @@ class BlockSender:
     ) -> None:
         self._clock, self._steady, self._handover_s = clock or Clock(), steady, handover_s
         self._block_s, self._batcher = settings.block_s, Batcher(settings.block_s, max_samples)
+        self._sends_cells = settings.cells
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
         self._request_topic = _topic(subjects.block_request(pack))
         max_bytes = int(settings.store_mib * MIB)
@@ -103,8 +105,14 @@ class BlockSender:
         self._task: asyncio.Task[None] | None = None
         self._stack = contextlib.AsyncExitStack()
 
-    def take(self, samples: SampleBlock) -> None:
-        """Add samples that have just arrived, with times of the source's clock, without waiting."""
+    def take(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS) -> None:
+        """Add samples that have just arrived, with times of the source's clock, without waiting.
+
+        Args:
+            samples: Samples, shape (n,).
+            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any. They are sent only with the setting
+                ``cells``.
+        """
         if self._sample_clock is None:
             raise RuntimeError("the sender accepts samples only within its context")
         if self._task is not None and self._task.done():
@@ -114,7 +122,8 @@ class BlockSender:
         self._sample_clock.advance_to(self.store.last_s)
         placed = samples.copy()
         placed["time_s"] = self._sample_clock.place(samples["time_s"], wall_s, self._steady())
-        completed = self._batcher.add(placed, wall_s)
+        is_sent = self._sends_cells and cells_v.shape[1] <= MAX_CELLS
+        completed = self._batcher.add(placed, wall_s, cells_v if is_sent else NO_CELLS)
         for block in completed:
             self.store.put(block)
         if completed or self._overdue_timer is None:

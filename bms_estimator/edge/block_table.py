@@ -182,6 +182,7 @@ def _insert(connection: sqlite3.Connection, state: StoreState, ready: ReadyBlock
         oldest=state.next_number,  # replaced by the oldest number at the time of sending
         arrival_s=ready.arrival_s,
         samples=samples,
+        cells_v=ready.cells_v,
     )
     data = encode(block)
     connection.execute("INSERT OR REPLACE INTO block VALUES (?, ?)", (state.next_number, data))

@@ -82,6 +82,22 @@ class Hour(Payload):
     delta_1: float | None = Field(description="SOC below which C_ts is negative, (2.11) of the thesis")
     delta_2: float | None = Field(description="SOC below which C_tl is negative, (2.12) of the thesis")
     suspects: int = Field(description="bits of model.input_faults.InputFault")
+    cell_spread_v: float | None = Field(
+        default=None,
+        description="mean difference between the highest and the lowest series cell [V]; null without cell voltages, as are "
+        "the following three values",
+    )
+    weakest_cell: int | None = Field(
+        default=None, description="number of the series cell with the lowest mean voltage, from 1"
+    )
+    weakest_cell_v: float | None = Field(
+        default=None, description="mean deviation of this cell from the mean of the cells [V]"
+    )
+    cells_rest_v: list[float] | None = Field(
+        default=None,
+        description="mean deviation of each series cell from the mean of the cells while the pack rests [V]; null without a "
+        "rest",
+    )
     revision: int | None = Field(
         default=None,
         description="stream sequence number of the block that finished the row; of two rows of one hour the one with the "

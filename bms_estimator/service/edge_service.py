@@ -66,7 +66,7 @@ async def serve_edge(
 async def _send_samples(source: Source, sender: BlockSender) -> None:
     """Pass all samples of the source to the block sender."""
     async for received in source:
-        sender.take(received.samples)
+        sender.take(received.samples, received.cells_v)
         await asyncio.sleep(0)  # a source that always has samples must not starve the sender
 
 

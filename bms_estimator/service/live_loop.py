@@ -212,7 +212,7 @@ async def _estimate(
             # the gap before the first sample after a restart also includes the wait for that sample
             estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s
         if edge:
-            edge.take(received.samples)
+            edge.take(received.samples, received.cells_v)
         trace = runner.run(received.samples)
         if received.cells_v.size:  # the call alone would take a tenth of the time of a block of one sample
             cells.run(received.samples, received.cells_v, trace)

@@ -24,3 +24,8 @@ class EdgeSettings(BrokerSettings):
         default=100.0,
         description="maximum size of the stored blocks [MiB]; the default holds 100 days at 1 Hz. A full store drops its oldest block",
     )
+    cells: bool = Field(
+        default=False,
+        description="send the voltages of the single cells too, if the source delivers them; upgrade all workers first, because "
+        "earlier ones reject these blocks",
+    )

@@ -58,6 +58,13 @@ QUESTIONS = {
     "failing": Query(("days", "packs", "fits"), "packs that will soon reach a limit, or have recent input faults"),
     "honest": Query(("days", "packs"), "how often the SOC was within 2 std, compared with later estimates"),
     "silent": Query(("days", "packs"), "packs without recent hours"),
+    "weak-cells": Query(("days", "packs"), "packs in which one series cell is below the others in most recent hours"),
+    "imbalance": Query(
+        ("days", "packs", "cell_days"), "packs whose cells differ at rest, and the trend of the difference"
+    ),
+    "self-discharge": Query(
+        ("days", "packs", "cell_days"), "cells whose voltage at rest falls over the days relative to the others"
+    ),
     "clocks": Query((), "packs whose edge's clock is wrong, so that their hours are quarantined"),
 }
 
@@ -81,7 +88,14 @@ class Limits:
     min_spread: float = 0.01
     """Query outliers: lower bound of the relative standard deviation between packs of a type."""
     recent_days: int = 3
-    """Query failing: number of most recent days. A pack is reported if more than half of them have a new input fault."""
+    """Query failing: number of most recent days. A pack is reported if more than half of them have a new input fault.
+    Queries weak-cells and imbalance use the rows of these days."""
+    weak_cell_v: float = 0.02
+    """Query weak-cells: minimum mean deviation of the weakest cell below the mean of the cells [V]."""
+    imbalance_v: float = 0.02
+    """Query imbalance: minimum difference between the highest and the lowest cell at rest [V]."""
+    self_discharge_v: float = 0.0002
+    """Query self-discharge: minimum fall of a cell's voltage relative to the others [V/day]."""
     silent_hours: int = 2
     """Query silent: maximum age of the last summary [h]. The newest summary of a live pack is of the previous hour."""
     max_packs: int = 10_000
@@ -288,7 +302,7 @@ def _reporting_limit_stds(database: duckdb.DuckDBPyConnection) -> float:
 
 
 def _sql(name: str) -> str:
-    return (SQL / f"{name}.sql").read_text(encoding="utf-8")
+    return (SQL / f"{name.replace('-', '_')}.sql").read_text(encoding="utf-8")
 
 
 def _run(database: duckdb.DuckDBPyConnection, query: str, parameters: Mapping[str, Any]) -> duckdb.DuckDBPyConnection:

@@ -45,7 +45,12 @@ _MAGIC = b"PAR1"
 
 def _column(annotation: object) -> pa.DataType:
     """Return the column type. Single precision exceeds the accuracy of any value, and halves the size of the files."""
-    types: dict[object, pa.DataType] = {str: pa.string(), int: pa.int32(), int | None: pa.int64()}
+    types: dict[object, pa.DataType] = {
+        str: pa.string(),
+        int: pa.int32(),
+        int | None: pa.int64(),
+        list[float] | None: pa.list_(pa.float32()),
+    }
     return types.get(annotation, pa.float32())
 
 

@@ -14,7 +14,7 @@ from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.packs.pack_type import Digest, PackType
-from bms_estimator.fleet.worker import hour_summary
+from bms_estimator.fleet.worker import cell_summary, hour_summary
 from bms_estimator.fleet.worker.density import MAX_TIMESTAMP_S
 from bms_estimator.fleet.worker.edge_clock import Arrival, clock_error_s
 from bms_estimator.fleet.worker.pack_state import CONFIG_DIGEST, LAST_STORE_NS, PACK_STATE, STATE_DIGEST, Fields
@@ -108,7 +108,7 @@ class BlockProcessor:
             self._hour["outliers_before"] = self._hour["searches_before"] = 0
             self._counters["not_taken_over" if error else "taken_over"] += 1
         else:
-            for name in ("flow", "hour", "estimator"):
+            for name in ("flow", "hour", "cells", "estimator"):
                 record[name] = np.zeros((), PACK_STATE[name])
             d[LAST_STORE_NS] = d["hour"] = d["clock_error_s"] = 0
             self._counters["begun_anew"] += has_state
@@ -139,6 +139,7 @@ class BlockProcessor:
             hour_summary.add(self._record["hour"], trace, part, pack_type.estimator)
             pack_type.meter.add(trace)
             self._window.add(trace, arrival_s)
+        cell_summary.add(self._record[0]["cells"], block, hour_summary.rest_current_a(pack_type.estimator))
         counters["blocks"] += 1
         counters["samples"] += block.samples.size
         counters["dropped_samples"] += block.samples.size - (int(observer["samples"]) - accepted_before)
@@ -197,9 +198,10 @@ class BlockProcessor:
         if current:
             settings = pack_type.settings.model_copy(update={"name": pack})
             row = hour_summary.row(settings, current, self._record["hour"], pack_type.estimator)
-            row = row.model_copy(update=self._origin(arrival))
+            row = row.model_copy(update=cell_summary.values(self._record[0]["cells"]) | self._origin(arrival))
             rows = ((f"{pack}.{current}.{arrival.sequence}", _json(row)),)
         hour_summary.begin(self._record["hour"], self._record[0]["estimator"])
+        self._record[0]["cells"] = np.zeros((), PACK_STATE["cells"])
         self._delivery["hour"], self._delivery["clock_error_s"] = hour, 0.0
         return rows, True
 

@@ -59,11 +59,15 @@ def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> No
         block: Block of samples.
         estimator: Estimator of the pack, or of another pack of its type: only its settings are read.
     """
-    settings = estimator.settings[0]
-    rest_a = REST_C * float(settings["capacity_as"]) / HOUR_S
-    accumulate_hour(sums, trace, int(sums["store"][0]) != block.store_created_ns, float(settings["gap_s"]), rest_a)
+    gap_s = float(estimator.settings[0]["gap_s"])
+    accumulate_hour(sums, trace, int(sums["store"][0]) != block.store_created_ns, gap_s, rest_current_a(estimator))
     sums["store"] = block.store_created_ns
     sums["dropped"] += block.samples.size - trace.size
+
+
+def rest_current_a(estimator: Estimator) -> float:
+    """Return the maximum current of a resting pack [A]."""
+    return REST_C * float(estimator.settings[0]["capacity_as"]) / HOUR_S
 
 
 def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.checkpoint.restore import copy_known_fields
+from bms_estimator.fleet.worker.cell_summary import CELL_SUMS
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
 from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
@@ -70,7 +71,14 @@ FLOW = np.dtype(
 )
 """Total charge and energy (``telemetry.charge_energy.ChargeEnergy``) and the sums of ``ChargeEnergyMeter``."""
 PACK_STATE = np.dtype(
-    [("delivery", DELIVERY), ("flow", FLOW), ("hour", HOUR_SUMS), ("estimator", ESTIMATOR_STATE)], align=True
+    [
+        ("delivery", DELIVERY),
+        ("flow", FLOW),
+        ("hour", HOUR_SUMS),
+        ("cells", CELL_SUMS),
+        ("estimator", ESTIMATOR_STATE),
+    ],
+    align=True,
 )
 
 

@@ -1,0 +1,69 @@
+"""Queries on the voltages of single cells, on simulated packs with known faults."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.fleet.queries.duckdb_queries import run_query
+from bms_estimator.fleet.queries.parquet_files import write
+from tests.fleet.hour_rows import BEGIN, make_hour
+
+DAYS, CELLS, PACKS = 30, 8, 20
+LEAKING, WEAK, IMBALANCED = "p3", "p7", "p11"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder with healthy packs and three faulty ones, each with four hours a day at a changing SOC."""
+    folder, rng = tmp_path_factory.mktemp("cells"), np.random.default_rng(1)
+    rows = []
+    for n in range(PACKS):
+        offset_v, slope_v = 0.002 * rng.standard_normal(CELLS), 0.01 * rng.standard_normal(CELLS)
+        for day in range(DAYS):
+            for hour in range(0, 24, 6):
+                soc = 0.5 + 0.3 * np.sin(0.7 * day + hour)
+                cells_v = offset_v + slope_v * (soc - 0.5) + 0.0005 * rng.standard_normal(CELLS)
+                cells_v[4] -= 0.001 * day if f"p{n}" == LEAKING else 0.0
+                cells_v[5] += 0.05 if f"p{n}" == IMBALANCED else 0.0
+                loaded_v = cells_v.copy()
+                loaded_v[2] -= 0.06 if f"p{n}" == WEAK else 0.0
+                loaded_v -= loaded_v.mean()
+                weakest = int(np.argmin(loaded_v))
+                values = {
+                    "soc": soc,
+                    "cell_spread_v": float(np.ptp(loaded_v)),
+                    "weakest_cell": weakest + 1,
+                    "weakest_cell_v": float(loaded_v[weakest]),
+                    "cells_rest_v": (cells_v - cells_v.mean()).tolist(),
+                }
+                rows.append(make_hour(f"p{n}", BEGIN + 24 * day + hour, **values))
+    write(folder, rows)
+    return folder
+
+
+def test_cell_that_is_below_the_others_under_load_is_found(folder):
+    rows = run_query(folder, "weak-cells").records
+    assert [(row["pack"], row["cell"]) for row in rows if row["pack"] != LEAKING] == [(WEAK, 3)]
+    (row,) = [row for row in rows if row["pack"] == WEAK]
+    assert row["deviation_v"] == pytest.approx(-0.06 * 7 / 8, abs=0.01)
+    assert row["fraction"] == 1.0
+
+
+def test_packs_whose_cells_differ_at_rest_are_found_with_the_trend(folder):
+    rows = {row["pack"]: row for row in run_query(folder, "imbalance").records}
+    assert rows.keys() == {IMBALANCED, LEAKING}
+    assert rows[IMBALANCED]["highest_cell"] == 6
+    assert rows[IMBALANCED]["spread_v_per_30_days"] == pytest.approx(0.0, abs=0.01)
+    assert rows[LEAKING]["lowest_cell"] == 5
+    assert rows[LEAKING]["spread_v_per_30_days"] == pytest.approx(0.03, abs=0.01)
+
+
+def test_cell_that_discharges_itself_is_found_at_any_soc(folder):
+    (row,) = run_query(folder, "self-discharge").records
+    assert (row["pack"], row["cell"]) == (LEAKING, 5)
+    assert row["mv_per_day"] == pytest.approx(-1.0 * 7 / 8, abs=0.05)  # relative to the mean, which falls too
+
+
+def test_fleet_without_cell_voltages_has_no_rows(tmp_path):
+    write(tmp_path, [make_hour("a", BEGIN + n, soc=0.5) for n in range(30)])
+    for name in ("weak-cells", "imbalance", "self-discharge"):
+        assert run_query(tmp_path, name).rows == []
