@@ -16,7 +16,7 @@ from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.health import EdgeHealth
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.settings.edge import EdgeSettings
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
@@ -59,13 +59,13 @@ class SimulatedEdge:
             handover_s=LONG_S,
         )
 
-    def add(self, minutes: float) -> None:
-        """Add the samples of a time, with voltages that differ from each other."""
+    def add(self, minutes: float, cells_v: CellBlock = NO_CELLS) -> None:
+        """Add the samples of a time, with voltages that differ from each other, each with the cell voltages ``cells_v``."""
         for _ in range(round(60 * minutes)):
             sample = np.zeros(1, dtype=SAMPLE)
             sample["time_s"], sample["voltage_v"] = self.now_s, 3.0 + 1e-6 * self._count
             sample["current_a"], sample["temperature_c"] = self._random.normal(), np.nan
-            self.edge.take(sample)
+            self.edge.take(sample, cells_v)
             sample["time_s"] += WALL_S
             self._sent.append(sample)
             self._count, self.now_s = self._count + 1, self.now_s + 1.0
@@ -94,6 +94,18 @@ async def until(condition) -> None:
     async with asyncio.timeout(LONG_S):
         while not condition():  # noqa: ASYNC110 - counters have no event
             await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize("cells", [False, True])
+async def test_cell_voltages_are_sent_with_setting_cells_only(
+    receiver: Receiver, engine: NatsCluster, tmp_path: Path, cells: bool
+) -> None:
+    simulated, cells_v = SimulatedEdge(receiver, tmp_path, url(engine), cells=cells), np.array([[3.31, 3.302, 3.3]])
+    async with simulated.edge:
+        simulated.add(2.5, cells_v)
+        await simulated.assert_all_received()
+    expected_v = np.tile(cells_v, (60, 1)) if cells else NO_CELLS
+    np.testing.assert_array_equal(receiver.blocks[0].cells_v, expected_v)
 
 
 async def test_samples_arrive_in_blocks_of_a_minute_and_the_rest_arrives_at_shutdown(

@@ -30,10 +30,15 @@ def soc_by_hour(rows):
     return {hour - BEGIN: soc for hour, soc in rows}
 
 
-def test_queries_use_the_row_with_the_largest_revision(folder):
-    rows = select(folder, "SELECT hour, soc FROM hours").rows
-    assert len(rows) == 5
-    assert soc_by_hour(rows)[3] == 0.75
+def test_queries_use_the_row_with_the_largest_revision_in_any_file(tmp_path):
+    (former,) = write(tmp_path, [make_hour("a", BEGIN + n, revision=10 * n, soc=0.5) for n in range(5)])
+    (valid,) = write(tmp_path, [make_hour("a", BEGIN + 3, revision=35, soc=0.75)])
+    for former_name, valid_name in (("batch-1", "batch-2"), ("batch-4", "batch-3")):
+        former = former.rename(former.with_name(f"{former_name}.parquet"))
+        valid = valid.rename(valid.with_name(f"{valid_name}.parquet"))
+        rows = select(tmp_path, "SELECT hour, soc FROM hours").rows
+        assert len(rows) == 5
+        assert soc_by_hour(rows)[3] == 0.75
 
 
 def test_merged_file_has_each_hour_once_with_its_largest_revision(folder):
