@@ -105,8 +105,8 @@ def ask(
 
 def _list_queries(queries: "dict[str, Query]") -> None:
     for name, query in queries.items():
-        typer.echo(f"{name:10}{query.help}")
-    typer.echo(f"{'sql':10}any SELECT from the view hours; fleet ask sql 'DESCRIBE hours' lists its columns")
+        typer.echo(f"{name:16}{query.help}")
+    typer.echo(f"{'sql':16}any SELECT from the view hours; fleet ask sql 'DESCRIBE hours' lists its columns")
 
 
 def _print_json(answer: "Answer") -> None:

@@ -40,6 +40,7 @@ def test_packs_with_a_wrong_clock_are_named_with_its_error(tmp_path):
     rows = {row["pack"]: row for row in run_query(tmp_path, "clocks").records}
     assert rows.keys() == {"ahead", "behind"}
     assert rows["ahead"]["clock_error_s"] == pytest.approx(3600.0 * (YEAR_2040 - BEGIN))
+    assert rows["ahead"]["edge_time"] == "2040-01-01T22:00:00Z"
     assert rows["behind"]["clock_error_s"] == pytest.approx(3600.0 * (YEAR_1970 - BEGIN))
     assert (rows["ahead"]["quarantined_hours"], rows["ahead"]["last_received"]) == (30, "2025-11-25T06:00:00Z")
 
