@@ -82,15 +82,16 @@ def write_table(folder: Path, table: pa.Table) -> list[Path]:
     """Write a table with the columns of ``SCHEMA``. Result and errors are those of ``write``."""
     is_dated = pc.is_null(table["clock_error_s"])
     dated, quarantined = table.filter(is_dated), table.filter(pc.invert(is_dated))
+    arrivals = pc.coalesce(quarantined["received_hour"], quarantined["hour"].cast(pa.int64()))
     return [
-        *_write_days(folder, dated, "hour"),
-        *_write_days(folder / QUARANTINE_FOLDER, quarantined, "received_hour"),
+        *_write_days(folder, dated, dated["hour"]),
+        *_write_days(folder / QUARANTINE_FOLDER, quarantined, arrivals),
     ]
 
 
-def _write_days(folder: Path, table: pa.Table, hour_column: str) -> list[Path]:
-    """Write rows to a new file for each day of a column of hours."""
-    days = pc.divide(table[hour_column], 24)
+def _write_days(folder: Path, table: pa.Table, hours: pa.ChunkedArray) -> list[Path]:
+    """Write rows to a new file for each day of ``hours``, which has one hour for each row."""
+    days = pc.divide(hours, 24)
     return [_write_day(folder, int(day.as_py()), table.filter(pc.equal(days, day))) for day in pc.unique(days)]
 
 

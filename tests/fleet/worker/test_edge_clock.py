@@ -8,9 +8,11 @@ import pytest
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.hour_row import Hour
+from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.edge_clock import MAX_AHEAD_S, MAX_BEHIND_S
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.fleet.worker.pinned_consumer import parse_position
 from bms_estimator.model.sample import SAMPLE
 from tests.fleet.nats_cluster import connected, running
 from tests.fleet.partition_stream import STORE_ID_NS, one_block, table
@@ -84,6 +86,25 @@ def test_revision_of_a_row_is_the_sequence_of_the_block_that_finished_it():
     ((message_id, data),) = partition.take("a", one_block(samples_until(4000.0), 2), 9).hours
     assert Hour.model_validate_json(data).revision == 9
     assert message_id.endswith(".9")
+
+
+async def test_arrival_time_is_the_same_whether_a_message_is_delivered_or_read_from_the_stream(tmp_path):
+    """Workers read messages in three ways. With different times they could judge a clock at the limit differently."""
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=1)
+        js, messages = nc.jetstream(), 20
+        for number in range(messages):
+            await js.publish(subjects.raw("p1"), b"%d" % number)
+        read = [each.received_s async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
+        subscription = await js.pull_subscribe("p.0.raw.*", durable="test", stream=subjects.RAW_STREAM)
+        delivered = await subscription.fetch(messages)
+        got = [await js.get_msg(subjects.RAW_STREAM, number + 1) for number in range(messages)]
+        assert len(read) == messages
+        assert read == [parse_position(message.reply).received_s for message in delivered]
+        assert read == [int(message.time.timestamp()) for message in got]
+        assert abs(read[-1] - time.time()) < 60.0
+        await nc.close()
 
 
 async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_hours(tmp_path):
