@@ -103,7 +103,7 @@ def model_itself(a: Floats, duration_s: float, *, seed: int = 0, noise_v: float 
     return Record(time_s, current_a, voltage_v, no_temperature, no_temperature).every(5)
 
 
-@njit()
+@njit(cache=True)
 def _cell_ohm(current_a: float, kelvin: float, water: float) -> float:
     """Return the resistance of a cell: Mann's membrane resistivity, and the contact."""
     density = current_a / AREA_CM2
@@ -112,7 +112,7 @@ def _cell_ohm(current_a: float, kelvin: float, water: float) -> float:
     return numerator / denominator * MEMBRANE_CM / AREA_CM2 + CONTACT_OHM
 
 
-@njit()
+@njit(cache=True)
 def _activation_v(kelvin: float) -> float:
     hydrogen = HYDROGEN_ATM / (1.09e6 * math.exp(77.0 / kelvin))
     oxygen = OXYGEN_ATM / (5.08e6 * math.exp(-498.0 / kelvin))
@@ -120,13 +120,13 @@ def _activation_v(kelvin: float) -> float:
     return -(XI_1 + xi_2 * kelvin + XI_3 * kelvin * math.log(oxygen))
 
 
-@njit()
+@njit(cache=True)
 def _nernst_v(kelvin: float) -> float:
     gases = math.log(HYDROGEN_ATM) + 0.5 * math.log(OXYGEN_ATM)
     return 1.229 - 8.5e-4 * (kelvin - 298.15) + 4.3085e-5 * kelvin * gases
 
 
-@njit()
+@njit(cache=True)
 def _run(time_s: Floats, current_a: Floats, more_ohm: Floats) -> tuple[Floats, Floats, Floats]:
     n = time_s.size
     voltage_v, temperature_c, r_ohm = np.empty(n), np.empty(n), np.empty(n)

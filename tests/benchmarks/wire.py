@@ -58,14 +58,14 @@ def sample_frames(block: SampleBlock, first: int = 0) -> NDArray[np.uint8]:
     return _frames(np.rint(block["time_s"] * 1e6).astype(np.int64), sums[0], sums[1], first)
 
 
-@njit()
+@njit(cache=True)
 def _put(packet, offset, size, value):
     """Write an unsigned integer, little-endian."""
     for i in range(size):
         packet[offset + i] = (value >> (8 * i)) & 0xFF
 
 
-@njit()
+@njit(cache=True)
 def _frames(board_us, voltage_sum, current_sum, first):
     frames = np.zeros((board_us.size, SAMPLE_FRAME_BYTES), dtype=np.uint8)
     packet = np.zeros(SAMPLE_BYTES, dtype=np.uint8)

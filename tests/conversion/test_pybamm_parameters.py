@@ -1,5 +1,6 @@
 """PyBaMM and PyBOP with exported parameters, against the open-loop model."""
 
+import functools
 import importlib.util
 from pathlib import Path
 from types import ModuleType
@@ -12,12 +13,16 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from tests.conversion.load import INITIAL_SOC, STEP_S, difference_mv, load_profile
 
-pybamm = pytest.importorskip("pybamm", reason="PyBaMM has no solvers for this processor")
-
 MAX_STEP_MV = 1.0
 """Maximum difference. It occurs at steps of the current, which PyBaMM and ``validate`` interpolate differently."""
 MAX_EMPTY_MV = 3.0
 """Maximum difference below SOC 0.2, where the resistances rise steeply."""
+
+
+@functools.cache
+def pybamm() -> ModuleType:
+    """Return the module. Its import takes a second, so that only the tests that use it import it."""
+    return pytest.importorskip("pybamm", reason="PyBaMM has no solvers for this processor")
 
 
 def nmc() -> CellModel:
@@ -39,7 +44,7 @@ def import_parameters(path: Path, cell: CellModel) -> ModuleType:
 
 
 def parameter_values(module: ModuleType, temperature_c: float):
-    values = pybamm.ParameterValues(module.get_parameter_values())
+    values = pybamm().ParameterValues(module.get_parameter_values())
     kelvin = temperature_c + 273.15
     values.update({"Initial SoC": INITIAL_SOC, "Ambient temperature [K]": kelvin, "Initial temperature [K]": kelvin})
     return values
@@ -48,9 +53,9 @@ def parameter_values(module: ModuleType, temperature_c: float):
 def solve(module: ModuleType, time_s: Floats, current_a: Floats, temperature_c: float) -> Floats:
     """Return the voltages of PyBaMM's Thevenin model [V]."""
     values = parameter_values(module, temperature_c)
-    values["Current function [A]"] = pybamm.Interpolant(time_s, current_a, pybamm.t)
-    model = pybamm.equivalent_circuit.Thevenin(options=module.OPTIONS)
-    simulation = pybamm.Simulation(model, parameter_values=values)
+    values["Current function [A]"] = pybamm().Interpolant(time_s, current_a, pybamm().t)
+    model = pybamm().equivalent_circuit.Thevenin(options=module.OPTIONS)
+    simulation = pybamm().Simulation(model, parameter_values=values)
     return simulation.solve([0.0, time_s[-1]], t_interp=time_s)["Voltage [V]"](time_s)
 
 
@@ -86,7 +91,7 @@ def test_pybop_predicts_the_voltage_of_the_rc_ladder(tmp_path):
     module = import_parameters(tmp_path, cell)
     time_s, current_a = load_profile(cell, final_soc=0.25)
     simulator = pybop.pybamm.Simulator(
-        pybamm.equivalent_circuit.Thevenin(options=module.OPTIONS),
+        pybamm().equivalent_circuit.Thevenin(options=module.OPTIONS),
         parameter_values=parameter_values(module, 25.0),
         protocol=pybop.Dataset({"Time [s]": time_s, "Current [A]": current_a}),
     )

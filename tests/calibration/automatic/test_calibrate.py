@@ -16,14 +16,18 @@ from tests.calibration.simulated_load import TRUTH, capture, constant, steps
 from tests.calibration.simulated_relaxation import relaxation
 
 GIVEN = load_cell("nca", 3.0)
-CAPTURES = {
-    "relaxation": Columns(relaxation(), "relaxation"),
-    "drive": Columns(capture(steps(seed=3), soc=1.0), "drive"),
-    "pulses": Columns(
-        capture(np.r_[np.zeros(60), np.tile(np.r_[np.full(30, 6.0), np.zeros(300)], 60)], soc=1.0), "pulses"
-    ),
-    "constant": Columns(capture(constant(), soc=1.0), "constant"),
-}
+
+
+@pytest.fixture(scope="module")
+def captures() -> dict[str, Columns]:
+    """Return captures of ``TRUTH`` by their kind."""
+    pulses_a = np.r_[np.zeros(60), np.tile(np.r_[np.full(30, 6.0), np.zeros(300)], 60)]
+    return {
+        "relaxation": Columns(relaxation(), "relaxation"),
+        "drive": Columns(capture(steps(seed=3), soc=1.0), "drive"),
+        "pulses": Columns(capture(pulses_a, soc=1.0), "pulses"),
+        "constant": Columns(capture(constant(), soc=1.0), "constant"),
+    }
 
 
 @pytest.mark.parametrize(
@@ -34,21 +38,21 @@ CAPTURES = {
         ("constant", "constant discharge at 0.25 C", False),
     ],
 )
-def test_a_capture_is_recognized_by_its_content(name, kind, gives_ocv) -> None:
-    recognized = recognize(CAPTURES[name], TRUTH)
+def test_a_capture_is_recognized_by_its_content(captures, name, kind, gives_ocv) -> None:
+    recognized = recognize(captures[name], TRUTH)
     assert (recognized.kind, recognized.gives_ocv, recognized.gives_resistances) == (kind, gives_ocv, True)
 
 
-def test_a_charge_above_the_rated_capacity_is_the_capacity() -> None:
+def test_a_charge_above_the_rated_capacity_is_the_capacity(captures) -> None:
     small = load_cell("nca", 2.5)
-    estimate = estimate_capacity([CAPTURES["relaxation"]], small)
+    estimate = estimate_capacity([captures["relaxation"]], small)
     assert estimate.capacity_ah == pytest.approx(0.97 * TRUTH.cell.capacity_ah, rel=0.01)  # it ends at SOC 0.03
     assert "relaxation, more than the expected 2.5 Ah" in estimate.origin
 
 
-def test_rests_measure_the_capacity_by_an_ocv_of_the_cell() -> None:
+def test_rests_measure_the_capacity_by_an_ocv_of_the_cell(captures) -> None:
     wrong = TRUTH.model_copy(update={"cell": TRUTH.cell.model_copy(update={"capacity_ah": 4.0})})
-    estimate = estimate_capacity([CAPTURES[name] for name in ("relaxation", "pulses", "drive")], wrong)
+    estimate = estimate_capacity([captures[name] for name in ("relaxation", "pulses", "drive")], wrong)
     assert "rests" in estimate.origin
     assert estimate.capacity_ah == pytest.approx(TRUTH.cell.capacity_ah, rel=0.04)
 
@@ -71,15 +75,15 @@ def test_rests_from_full_to_empty_measure_the_capacity_of_an_aged_pack(chemistry
     assert "rests" in estimate.origin
 
 
-def test_a_capture_without_ocv_is_held_back_first() -> None:
-    recognized = [recognize(CAPTURES[name], TRUTH) for name in ("relaxation", "constant", "pulses")]
+def test_a_capture_without_ocv_is_held_back_first(captures) -> None:
+    recognized = [recognize(captures[name], TRUTH) for name in ("relaxation", "constant", "pulses")]
     split = hold_back(recognized)
     assert split.held_back is recognized[1]
     assert [each.capture.name for each in split.resistances] == ["relaxation", "pulses"]
 
 
-def test_the_end_of_a_single_capture_is_held_back_from_the_resistances() -> None:
-    recognized = recognize(CAPTURES["relaxation"], TRUTH)
+def test_the_end_of_a_single_capture_is_held_back_from_the_resistances(captures) -> None:
+    recognized = recognize(captures["relaxation"], TRUTH)
     split = hold_back([recognized])
     first_part = split.resistances[0].capture.rows
     assert split.held_back is recognized
@@ -87,8 +91,8 @@ def test_the_end_of_a_single_capture_is_held_back_from_the_resistances() -> None
     assert split.ocv == (recognized,)
 
 
-def test_one_relaxation_test_gives_a_model_with_errors_of_millivolts() -> None:
-    calibration = calibrate([CAPTURES["relaxation"]], GIVEN, name="mine")
+def test_one_relaxation_test_gives_a_model_with_errors_of_millivolts(captures) -> None:
+    calibration = calibrate([captures["relaxation"]], GIVEN, name="mine")
     cell = calibration.model.cell
     assert calibration.has_held_back_data
     assert calibration.model.identification is not None
@@ -106,12 +110,12 @@ def test_captures_that_determine_nothing_are_listed_with_their_kind() -> None:
         calibrate([rest], GIVEN, name="mine")
 
 
-def test_captures_of_different_chemistries_are_named_with_their_voltages() -> None:
+def test_captures_of_different_chemistries_are_named_with_their_voltages(captures) -> None:
     lfp = relaxation()
     lfp["voltage_v"] *= 3.4 / 4.2
     message = r"not of one cell.*\nlfp: 2\.\d\d to 3\.\d\d V per cell\nrelaxation: \d\.\d\d to 4\.\d\d V per cell$"
     with pytest.raises(UserError, match=message):
-        calibrate([CAPTURES["relaxation"], Columns(lfp, "lfp")], GIVEN, name="mine")
+        calibrate([captures["relaxation"], Columns(lfp, "lfp")], GIVEN, name="mine")
 
 
 @pytest.mark.parametrize(("chemistry", "given", "is_warned"), [("lfp", "nmc", True), ("nmc", "lmo", False)])

@@ -56,7 +56,7 @@ class Truth:
     """Resistances at 25 C and small currents, shape (401, 8) [ohm]."""
 
 
-@njit()
+@njit(cache=True)
 def interpolate(soc, values):
     """Interpolate values at ``GRID`` linearly."""
     position = min(max(soc, 0.0), 1.0) * (len(values) - 1)
@@ -64,7 +64,7 @@ def interpolate(soc, values):
     return values[i] + (position - i) * (values[i + 1] - values[i])
 
 
-@njit()
+@njit(cache=True)
 def simulate(
     dt_s,
     current_a,
@@ -89,7 +89,7 @@ def simulate(
     return simulate_from(state, dt_s, current_a, room_c, capacity_ah, *curves, self_heating_k_per_w, low_v, high_v)
 
 
-@njit()
+@njit(cache=True)
 def rest_state(soc, hysteresis):
     """Return the state of a cell at rest, for ``simulate_from``.
 
@@ -102,7 +102,7 @@ def rest_state(soc, hysteresis):
     return state
 
 
-@njit()
+@njit(cache=True)
 def simulate_from(
     state,
     dt_s,
