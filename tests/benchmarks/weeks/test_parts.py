@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from bms_estimator.pack_model import fit
+from bms_estimator.pack_model import fit, learning
 from tests.benchmarks.weeks.parts import FEW_ROWS, NOTHING, PARTS
 from tests.benchmarks.weeks.runs import run_without, score_without
 from tests.conftest import SHARED_DATA
@@ -46,15 +46,16 @@ def recording() -> Recording:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def few_starts() -> Iterator[None]:
-    """Begin fits at two starts, because they take most of the time."""
+def few_fits() -> Iterator[None]:
+    """Fit a young history no more often than an old one, and begin fits at two starts: fits take most of the time."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learning, "MIN_INTERVAL_S", INTERVAL_S)
         patch.setattr(fit, "STARTS", fit.STARTS[:2])
         yield
 
 
 @pytest.fixture(scope="module")
-def estimates(recording: Recording, few_starts: None) -> np.ndarray:
+def estimates(recording: Recording, few_fits: None) -> np.ndarray:
     """Return SOC and std of the SOC with all parts."""
     return np.array(run_without(CASE, recording, PARTS[NOTHING], INTERVAL_S)[1:])
 
