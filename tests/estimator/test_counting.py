@@ -11,16 +11,16 @@ from scipy.stats import chi2
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import IdentifiedValue, current_offset, relative_capacity
 from bms_estimator.kernels.kalman_filter.records import LN_Q
-from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.learning import SlowFit
 from tests.estimator.anywhere.cases import Capture, Case, capture
 from tests.estimator.anywhere.use import DAY_S, cycles, days
+from tests.fit_interval import fits_every
 
 SEEDS = range(1, 9)
 OWN_CURVE = {"file_ocv_error_ratio": 0.5, "load_before_h": 0.0}
 """Half of the typical OCV error, and no load before the estimator starts."""
 FIT_INTERVAL_S = 3.0 * 3600.0
-"""Interval between two slow fits [s], of which each uses the whole history. The default of half an hour takes five times as long."""
+"""Interval between two slow fits [s]."""
 MAX_CAPACITY_ERROR = 0.025
 """Limit of the relative error of the capacity of each cell."""
 MAX_RMS_CAPACITY_ERROR = 0.015
@@ -49,14 +49,9 @@ def estimate_cycles(case: Case, initial_soc_error: float) -> Estimator:
     rng = np.random.default_rng(case.seed)
     recording = capture(case, cycles(rng, case.truth.capacity_ah, count=3, by_soc=0.7, rest_s=600))
     estimator = Estimator(recording.cell, initial_soc=float(np.clip(recording.soc[0] + initial_soc_error, 0.0, 1.0)))
-    SlowFit(estimator, interval_s=FIT_INTERVAL_S).run(recording.samples)
+    with fits_every(FIT_INTERVAL_S):
+        SlowFit(estimator, interval_s=FIT_INTERVAL_S).run(recording.samples)
     return estimator
-
-
-@pytest.fixture
-def few_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let ``SlowFit`` fit no more often than every ``FIT_INTERVAL_S``."""
-    monkeypatch.setattr(learning, "MIN_INTERVAL_S", FIT_INTERVAL_S)
 
 
 def simulate_use(case: Case, count: int) -> Capture:
@@ -65,7 +60,6 @@ def simulate_use(case: Case, count: int) -> Capture:
     return capture(case, days(rng, case.truth.capacity_ah, count, case.soc))
 
 
-@pytest.mark.usefixtures("few_fits")
 @pytest.mark.parametrize("initial_soc_error", [pytest.param(0.0, marks=pytest.mark.thorough), -0.2])
 def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(initial_soc_error: float) -> None:
     errors, errors_over_std = [], []
@@ -82,7 +76,6 @@ def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(initial_
     assert np.mean(np.square(errors_over_std)) < nees_limit(len(SEEDS))
 
 
-@pytest.mark.usefixtures("few_fits")
 def test_a_gain_error_of_the_current_sensor_is_learned_as_a_capacity() -> None:
     """A current sensor with a gain of 1.05 leads to a capacity that is 1.05 times as large.
 

@@ -6,8 +6,10 @@ from bms_estimator.model.cell import CellModel
 from tests.benchmarks.weeks.exported_file import learned_cell, score_of_another_day
 from tests.conftest import SHARED_DATA
 from tests.estimator.anywhere.cycles import total_ohm
+from tests.estimator.anywhere.use import DAY_S
 from tests.estimator.month.cases import Case
 from tests.estimator.month.packs import draw_pack
+from tests.fit_interval import fits_every
 
 CASES = (
     Case("LG M50", "full_nightly", days=3),
@@ -20,7 +22,8 @@ CASES = (
 @pytest.fixture(scope="module", params=CASES, ids=lambda case: f"{case.cell}, seed {case.seed}")
 def learned(request) -> tuple[Case, CellModel]:
     """Return a case, and the cell that is exported after it."""
-    return request.param, learned_cell(request.param, SHARED_DATA)
+    with fits_every(DAY_S):
+        return request.param, learned_cell(request.param, SHARED_DATA)
 
 
 def test_the_exported_resistances_are_those_of_the_pack(learned) -> None:

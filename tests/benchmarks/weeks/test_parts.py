@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from bms_estimator.pack_model import fit, learning
+from bms_estimator.pack_model import fit
 from tests.benchmarks.weeks.parts import FEW_ROWS, NOTHING, PARTS
 from tests.benchmarks.weeks.runs import run_without, score_without
 from tests.conftest import SHARED_DATA
@@ -16,6 +16,7 @@ from tests.estimator.month import uses
 from tests.estimator.month.cases import Case, Recording
 from tests.estimator.month.sources import SOLAR
 from tests.estimator.month.uses import HOUR_S, SOLAR_STEP_S, Phase, Use
+from tests.fit_interval import fits_every
 
 CASE = Case("LFP", "everything", SOLAR, declared_ah=20.0, days=4)
 INTERVAL_S = 1.5 * DAY_S
@@ -47,9 +48,8 @@ def recording() -> Recording:
 
 @pytest.fixture(autouse=True, scope="module")
 def few_fits() -> Iterator[None]:
-    """Fit a young history no more often than an old one, and begin fits at two starts: fits take most of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning, "MIN_INTERVAL_S", INTERVAL_S)
+    """Fit at ``INTERVAL_S`` only, and begin each fit at two starts."""
+    with fits_every(INTERVAL_S), pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit, "STARTS", fit.STARTS[:2])
         yield
 

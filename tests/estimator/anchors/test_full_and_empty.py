@@ -16,12 +16,15 @@ from bms_estimator.telemetry.health import identifier_counters, last_anchor
 from tests.estimator.anywhere.cases import OXIDE
 from tests.estimator.anywhere.truth import simulate
 from tests.estimator.anywhere.use import DAY_S, drive
+from tests.fit_interval import fits_every
 
 CAPACITY_AH = OXIDE.capacity_ah
 FULL_V = float(OXIDE.ocv_v[-1])
 """Voltage of the charger [V]."""
 DAYS = 5
 """Number of simulated days."""
+FIT_INTERVAL_S = 6.0 * 3600.0
+"""Interval between two slow fits [s]."""
 
 
 def days_with_a_charge() -> tuple[SampleBlock, Floats]:
@@ -50,7 +53,8 @@ def test_the_ends_of_charge_keep_the_soc_of_a_generic_cell_right() -> None:
     """Without the ends of charge, the RMSE is 4.7 % and 9 % of the time is inside two std."""
     samples, soc = days_with_a_charge()
     estimator = Estimator(load_cell("nmc", CAPACITY_AH), limits=ChargeLimits(full_voltage_v=FULL_V))
-    trace = SlowFit(estimator).run(samples)
+    with fits_every(FIT_INTERVAL_S):
+        trace = SlowFit(estimator, interval_s=FIT_INTERVAL_S).run(samples)
     assert identifier_counters(estimator.record[0])["full_anchors"] == DAYS
     after_first_day = slice(DAY_S, None)
     error = trace["soc"][after_first_day] - soc[after_first_day]
