@@ -1,8 +1,10 @@
 """``report`` and the residuals of ``validate``: contents of the pages, a pack's history, and errors of the commands."""
 
 import asyncio
+import contextlib
 import csv
 import html
+import io
 import math
 import re
 
@@ -11,6 +13,7 @@ import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.checkpoint.history_file import HistoryFile as FitHistoryFile
+from bms_estimator.cli.main import main
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.pack_model.fit import fit
@@ -53,13 +56,15 @@ def steps_csv(tmp_path_factory):
     return write_table(tmp_path_factory.mktemp("captures") / "steps.csv", rows)
 
 
-@pytest.fixture
-def page(tmp_path, capsys, steps_csv):
+@pytest.fixture(scope="module")
+def page(tmp_path_factory, steps_csv):
     """Return the page of a report on ``steps_csv``."""
-    code, out, err = run(capsys, "report", steps_csv, "--cell", "ncr18650", "--out", tmp_path / "report.html")
-    assert (code, err) == (0, "")
-    assert "The model predicts the voltage within" in out
-    return (tmp_path / "report.html").read_text(encoding="utf-8")
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    with contextlib.redirect_stdout(io.StringIO()) as out, pytest.raises(SystemExit) as ended:
+        main(["report", str(steps_csv), "--cell", "ncr18650", "--out", str(path)])
+    assert not ended.value.code
+    assert "The model predicts the voltage within" in out.getvalue()
+    return path.read_text(encoding="utf-8")
 
 
 def test_page_on_a_capture_has_verdict_figures_and_tables(page):

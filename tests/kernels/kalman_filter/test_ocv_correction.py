@@ -19,6 +19,7 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack_model.learning import SlowFit
 from tests.estimator.anywhere.cases import OXIDE, Case, cell_file, load_a
 from tests.estimator.anywhere.truth import simulate
+from tests.fit_interval import fits_every
 
 GENERIC = load_cell("nmc", 3.0)
 CURVE_GRID = np.linspace(0.0, 1.0, 41)
@@ -62,6 +63,10 @@ def test_an_ocv_with_a_plateau_is_not_learned() -> None:
     assert np.allclose(std_v, estimator.settings_record[0]["filter"]["curve_error_v"])
 
 
+FIT_INTERVAL_S = 3.0 * 3600.0
+"""Interval between two slow fits [s]."""
+
+
 def simulate_partial_cycles(
     cell: CellModel, cycles: int, passes: float = math.inf, *, slow_fit: bool = False
 ) -> tuple[np.ndarray, np.ndarray, Estimator]:
@@ -88,7 +93,9 @@ def simulate_partial_cycles(
     )
     estimator = Estimator(cell, initial_soc=soc + 0.1)
     throughput = np.cumsum(np.abs(current_a)) / 3600.0 / OXIDE.capacity_ah
-    trace = (SlowFit(estimator) if slow_fit else estimator).run(samples[throughput < passes])
+    with fits_every(FIT_INTERVAL_S):
+        runner = SlowFit(estimator, interval_s=FIT_INTERVAL_S) if slow_fit else estimator
+        trace = runner.run(samples[throughput < passes])
     true_soc = true_soc[: trace.size]
     return trace["soc"] - true_soc, trace["soc_std"].copy(), estimator
 

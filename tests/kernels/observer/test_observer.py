@@ -98,10 +98,12 @@ def test_without_a_dead_zone_k_grows_by_the_printed_law() -> None:
 
 DIVIDER_V = 25.0
 """Voltage range of the ADC with its divider [V]."""
-SAMPLES_PER_HOUR = 360_000
+ADC_STEPS = 1024
+HOURS, SAMPLES_PER_HOUR = 16, 360_000
 
 
-def simulate_thesis_pack_on_an_adc(bits: int, hours: int = 16) -> SampleBlock:
+@pytest.fixture(scope="module")
+def thesis_pack_on_an_adc() -> SampleBlock:
     """Return samples at 100 Hz of the thesis's pack, measured by a real converter (erratum 2).
 
     The pack has 22.2 V and 6.6 Ah and is discharged with 0.416 A. A divider for 0 to 25 V and an ADC with half a step
@@ -109,21 +111,21 @@ def simulate_thesis_pack_on_an_adc(bits: int, hours: int = 16) -> SampleBlock:
     pack would become unstable (erratum 14).
     """
     cell = load_cell("thunder_power_6s")
-    time_s = np.arange(hours * SAMPLES_PER_HOUR) * 0.01
+    time_s = np.arange(HOURS * SAMPLES_PER_HOUR) * 0.01
     load_end_s = 15.5 * 3600
     current_a = np.where(time_s < load_end_s, 0.416, 0.0)
     voltage_v, _ = simulate_cell((1.0, 0.0, 0.0), time_s, current_a, 6.6 * 3600, cell.a)
-    step_v = DIVIDER_V / 2**bits
+    step_v = DIVIDER_V / ADC_STEPS
     noise = np.random.default_rng(1).uniform(-0.5, 0.5, len(time_s))
     return make_samples(time_s, current_a, step_v * np.round(voltage_v / step_v + noise))
 
 
-def test_the_lock_is_held_for_16_hours_with_a_10_bit_adc() -> None:
+def test_the_lock_is_held_for_16_hours_with_a_10_bit_adc(thesis_pack_on_an_adc: SampleBlock) -> None:
     estimator = Estimator(
-        load_cell("thunder_power_6s"), voltage_resolution_v=DIVIDER_V / 1024, initial_soc=1.0, identifier=None
+        load_cell("thunder_power_6s"), voltage_resolution_v=DIVIDER_V / ADC_STEPS, initial_soc=1.0, identifier=None
     )
-    trace = estimator.run(simulate_thesis_pack_on_an_adc(bits=10))
-    assert len(trace) == 16 * SAMPLES_PER_HOUR
+    trace = estimator.run(thesis_pack_on_an_adc)
+    assert len(trace) == HOURS * SAMPLES_PER_HOUR
     assert trace["lock"].all()
     assert estimator.state["gain_rearms"][0] == 0
     after_start = trace["k"][trace["time_s"] > 60.0]
@@ -131,15 +133,17 @@ def test_the_lock_is_held_for_16_hours_with_a_10_bit_adc() -> None:
     assert trace["nussbaum_gain"].min() > 0.99
 
 
-def test_without_a_dead_zone_the_lock_is_lost_and_regained_and_losses_are_counted() -> None:
+def test_without_a_dead_zone_the_lock_is_lost_and_regained_and_losses_are_counted(
+    thesis_pack_on_an_adc: SampleBlock,
+) -> None:
     estimator = Estimator(
         load_cell("thunder_power_6s"),
         THESIS_LAW,
-        voltage_resolution_v=DIVIDER_V / 1024,
+        voltage_resolution_v=DIVIDER_V / ADC_STEPS,
         initial_soc=1.0,
         identifier=None,
     )
-    trace = estimator.run(simulate_thesis_pack_on_an_adc(bits=10))
+    trace = estimator.run(thesis_pack_on_an_adc)
     assert estimator.state["lock_losses"][0] >= 1
     lost = np.flatnonzero(np.diff(trace["lock"]) < 0)
     regained = np.flatnonzero(np.diff(trace["lock"]) > 0)
