@@ -11,7 +11,7 @@ from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.history import History, WeakCellTime
 from bms_estimator.pack_model.open_circuit import drawn_soc, row_soc
 from bms_estimator.pack_model.weakest_cell import MIN_ROWS, Comparison, ReferenceCurve, WeakestCell
-from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_STD, WEAK_CELL_STD
+from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_FRACTION, WEAK_CELL_STD
 
 CHARGED_SOC = 0.05
 """Charge after which a discharge has ended, as a fraction of the capacity. Regeneration during a discharge is smaller."""
@@ -106,7 +106,7 @@ class BankMonitor:
     def _replace_result(self, result: WeakestCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
         """Replace the present result if the discharge from ``start_s`` shows a weak cell, is as deep, or gave that result."""
         was_weak, is_same = is_weak_now(weak), start_s == self._result_start_s
-        is_weak = result.deviation_std >= (WEAK_CELL_CLEAR_STD if was_weak else WEAK_CELL_STD)
+        is_weak = result.deviation_std >= WEAK_CELL_STD * (WEAK_CELL_CLEAR_FRACTION if was_weak else 1.0)
         if not (is_same or is_weak or result.soc <= (weak[-1].soc if was_weak else self._result_soc)):
             return
         if is_weak and not was_weak:

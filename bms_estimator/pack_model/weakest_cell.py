@@ -32,23 +32,20 @@ MIN_ROWS = 4
 """Minimum number of rows of a discharge for a comparison."""
 PRIOR_ROWS = 4.0
 """Weight of the prior variance of a bin, in rows."""
-REPEAT_STD_V, REPEAT_STD_SOC = 1.5e-3, 0.002
-"""Prior std of the difference of E_o of the mean cell between two discharges: a voltage error [V] and a SOC error. Assumed."""
-INDEPENDENT_FRACTION = 0.3
+REPEAT_STD_V, REPEAT_STD_SOC = 1e-3, 0.003
+"""Prior std of the difference of E_o of the mean cell between two discharges: a voltage error [V] and a SOC error. This and the
+following constants maximize the likelihood of simulated healthy banks within a factor of three (docs/pack/bank.md)."""
+INDEPENDENT_FRACTION = 0.2
 """Fraction of the variance of E_o between discharges that is independent from row to row. The rest is correlated over
 ``CORRELATED_SOC``."""
-CORRELATED_SOC = 0.15
+CORRELATED_SOC = 0.4
 """Correlation length of the difference of E_o between two discharges [SOC]."""
-COMMON_SOC_STD, COMMON_CAPACITY_STD = 0.02, 0.01
-"""Std of the changes of SOC (error of the estimate) and capacity (aging) that all cells share since the reference."""
-COMMON_DROP_STD, COMMON_ENTROPY_STD_V, COMMON_VOLTAGE_STD_V = 0.05, 1e-4, 1e-3
-"""Std of other changes that all cells share: relative change of the overpotential, temperature coefficient [V/K], and
-voltage [V]."""
-COMMON_DROP_STD_PER_K, DROP_STD_PER_K = 0.02, 0.005
-"""Increase of the relative std of the overpotential per kelvin of temperature difference from the reference [1/K]: of the
-change that all rows share, and of that which varies along SOC. The temperature dependence of a generic cell file is that of
-another cell."""
-LOAD_DROP_STD = 0.1
+COMMON_SOC_STD, COMMON_CAPACITY_STD = 0.003, 0.003
+"""Std of the changes of SOC (error of the count) and capacity (aging) that all cells share since the reference."""
+COMMON_DROP_STD, COMMON_DROP_STD_PER_K = 0.01, 0.002
+"""Relative std of the overpotential that all cells and rows share, and its increase per kelvin of temperature difference from
+the reference [1/K]. The temperature dependence of a generic cell file is that of another cell."""
+LOAD_DROP_STD = 0.02
 """Error std of the overpotential, as a fraction of its difference from the mean overpotential of the reference; independent
 from row to row. The RC pairs are less exact for loads that differ from the usual ones."""
 SHIFTS, SHRINKS = np.linspace(0.0, 0.4, 21), np.linspace(0.0, 0.6, 25)
@@ -75,7 +72,8 @@ class WeakestCell:
     filter_soc: float
     """SOC of the bank by the filter at the last row."""
     deviation_std: float
-    """Significance of a weak cell: square root of twice the log-likelihood ratio, without the row that supports it most [std]."""
+    """Significance of a weak cell: square root of twice the log-likelihood ratio, without the row that supports it most [std].
+    It is 1 or less in most discharges of a healthy bank."""
     mean: Floats
     """Mean of ``shift`` and ``shrink``."""
     covariance: Floats
@@ -151,8 +149,7 @@ class ReferenceCurve:
 class Comparison:
     """Comparison of one discharge with the reference of its bank.
 
-    The likelihood of each hypothesis allows for changes that all cells share: of SOC, capacity, resistances, temperature
-    coefficient and voltage.
+    The likelihood of each hypothesis allows for changes that all cells share: of SOC, capacity and resistances.
 
     Args:
         cell: Curves of the cell file.
@@ -179,6 +176,9 @@ class Comparison:
         whitened = np.linalg.solve(self._whitening, self.deviation_v if deviation_v is None else deviation_v)
         templates = np.linalg.solve(self._whitening, self.by_weak_cell(SHIFT, SHRINK))
         ln_by_row = templates * whitened[:, None] - 0.5 * templates**2
+        # a bank whose remaining errors are larger than assumed needs a larger deviation
+        remaining = whitened - templates[:, ln_by_row.sum(axis=0).argmax()]
+        ln_by_row /= max(float(np.mean(remaining**2)), 1.0)
         # without the row that supports a hypothesis most, because a single wrong row must not raise the alarm
         ln_likelihood = ln_by_row.sum(axis=0) - np.maximum(ln_by_row.max(axis=0), 0.0)
         ln_weight = LN_PRIOR + LIKELIHOOD_EXPONENT * ln_likelihood
@@ -209,16 +209,14 @@ class Comparison:
 def _covariance(cell: CellCurves, fit: PackFit, reference: ReferenceCurve, measured: OpenCircuit) -> Floats:
     """Return the covariance of the deviations of a healthy bank, shape (n, n) [V^2]."""
     z = measured.soc
-    difference_k = measured.temperature_c - reference.temperature_c
-    std_v = np.hypot(np.interp(z, BIN_SOC, reference.std_v), DROP_STD_PER_K * difference_k * measured.drop_v)
+    std_v = np.interp(z, BIN_SOC, reference.std_v)
     slope_v = fitted_slope(cell, fit, z)
+    difference_k = measured.temperature_c - reference.temperature_c
     common = np.column_stack(
         [
             COMMON_SOC_STD * slope_v,
             COMMON_CAPACITY_STD * slope_v * (1.0 - z),
             np.hypot(COMMON_DROP_STD, COMMON_DROP_STD_PER_K * difference_k) * measured.drop_v,
-            COMMON_ENTROPY_STD_V * difference_k,
-            np.full(z.size, COMMON_VOLTAGE_STD_V),
         ]
     )
     correlation = (1.0 - INDEPENDENT_FRACTION) * np.exp(-np.abs(z[:, None] - z) / CORRELATED_SOC)

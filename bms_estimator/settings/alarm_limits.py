@@ -14,6 +14,7 @@ from bms_estimator.settings.alarm_kinds import ALARM_KINDS, AlarmKind
 from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
 from bms_estimator.settings.collapse_limit import collapse_limit
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.weak_cell_limit import DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH, weak_cell_limit
 
 MIN_SILENT_LIMIT_S = 10.0
 """Minimum default limit of ``link_lost`` [s]."""
@@ -66,9 +67,11 @@ MAX_DISCHARGE_C = 5.0
 default: it only rejects invalid samples, and lies far above the continuous current of most cells."""
 COLLAPSE_CLEAR_FRACTION = 0.5
 """Clear level of ``collapse_risk`` as a fraction of its limit."""
-WEAK_CELL_STD, WEAK_CELL_CLEAR_STD = 3.0, 1.5
-"""Default limit and clear level of ``weak_cell``: deviation of a discharge from the bank's reference [std]. docs/pack/bank.md
-has its false alarms."""
+WEAK_CELL_STD = weak_cell_limit(DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH)
+"""Default limit of ``weak_cell``: deviation of a discharge from the bank's reference [std]. It also decides which discharges
+are no reference."""
+WEAK_CELL_CLEAR_FRACTION = 0.5
+"""Clear level of ``weak_cell`` as a fraction of its limit."""
 CURRENT_CLEAR_FRACTION = 0.95
 """Default clear level of a current as a fraction of its limit."""
 
@@ -204,7 +207,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "collapse_risk": _collapse_default(settings, cell),
         "stability_margin_low": _Default(0.05, 0.08),
         "cell_imbalance": _Default(0.05, 0.03),
-        "weak_cell": _Default(WEAK_CELL_STD if n > 1 else None, WEAK_CELL_CLEAR_STD),
+        "weak_cell": _weak_cell_default(settings) if n > 1 else _UNMONITORED,
         "sensor_fault": _Default(0.1, 0.02),
         "model_mismatch": _Default(0.05 * n, 0.03 * n),
         "link_lost": _Default(_default_silent_limit_s(settings), None),
@@ -220,6 +223,12 @@ def _collapse_default(settings: Settings, cell: PackModel) -> _Default:
         return _Default(None, None)
     limit = collapse_limit(settings.alarms.collapse_risk.false_alarms_per_month)
     return _Default(limit, COLLAPSE_CLEAR_FRACTION * limit)
+
+
+def _weak_cell_default(settings: Settings) -> _Default:
+    """Return the limit for the accepted rate of false alarms."""
+    limit = weak_cell_limit(settings.alarms.weak_cell.false_alarms_per_month)
+    return _Default(limit, WEAK_CELL_CLEAR_FRACTION * limit)
 
 
 def _voltage_limits(cell: CellModel) -> VoltageLimits:

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Fraction, NotNegative, Positive, Strict
+from bms_estimator.settings.weak_cell_limit import DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH
 
 AlarmName = Literal[
     "pack_over_voltage",
@@ -75,20 +76,13 @@ class FractionRule(AlarmRule):
     clear: Fraction | None = None
 
 
-class CollapseRule(AlarmRule):
-    """Alarm on the probability of the cut-off; its limit follows from the accepted rate of false alarms."""
+class FalseAlarmRule(AlarmRule):
+    """Alarm whose limit follows from the accepted rate of false alarms."""
 
     false_alarms_per_month: Positive = Field(
         default=1.0,
-        description="accepted number of false alarms in a month of 60 h of use; a larger number warns earlier and of more cut-offs",
+        description="accepted number of false alarms in a month of 60 h of use; a larger number warns earlier and more often",
     )
-
-
-class DeviationRule(AlarmRule):
-    """Alarm on a deviation in standard deviations."""
-
-    limit: Positive | None = None
-    clear: NotNegative | None = None
 
 
 class LinkRule(AlarmRule):
@@ -165,15 +159,17 @@ class AlarmSettings(Strict):
     under_temperature: TemperatureRule = TemperatureRule()
     charging_below_freezing: TemperatureRule = TemperatureRule(severity="critical", clear_delay_s=10.0, latch=True)
     soc_low: FractionRule = FractionRule()
-    collapse_risk: CollapseRule = Field(
-        default=CollapseRule(),
+    collapse_risk: FalseAlarmRule = Field(
+        default=FalseAlarmRule(),
         description="probability of the cut-off within 5 min, by the forecast",
     )
     stability_margin_low: FractionRule = FractionRule()
     cell_imbalance: VoltageRule = VoltageRule(delay_s=60.0)
-    weak_cell: DeviationRule = Field(
-        default=DeviationRule(delay_s=0.0, clear_delay_s=0.0),
-        description="limit: deviation of a discharge from earlier ones in the direction of one weak cell, in standard deviations",
+    weak_cell: FalseAlarmRule = Field(
+        default=FalseAlarmRule(
+            delay_s=0.0, clear_delay_s=0.0, false_alarms_per_month=DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH
+        ),
+        description="deviation of a discharge from earlier ones in the direction of one weak cell, in standard deviations",
     )
     cell_short: CurrentRule = Field(
         default=CurrentRule(severity="critical", delay_s=60.0, clear_delay_s=600.0),

@@ -1,6 +1,7 @@
 """Limit of the alarm ``collapse_risk`` by the accepted rate of false alarms."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -23,11 +24,21 @@ FALSE_ALARMS = (
 def collapse_limit(false_alarms_per_month: float) -> float:
     """Return the probability of the cut-off at which the alarm is raised, 0..1.
 
-    The limit is interpolated over the logarithm of the rate. Outside the measured curve it is that of the curve's end.
-
     Args:
         false_alarms_per_month: Accepted number of false alarms in ``USE_H_PER_MONTH``, above 0.
     """
-    rates, limits = zip(*FALSE_ALARMS, strict=True)
+    return limit_of_rate(FALSE_ALARMS, false_alarms_per_month)
+
+
+def limit_of_rate(measured: Sequence[tuple[float, float]], false_alarms_per_month: float) -> float:
+    """Return the limit of an alarm for an accepted rate of false alarms.
+
+    The limit is interpolated over the logarithm of the rate. Outside the measured curve it is that of the curve's end.
+
+    Args:
+        measured: Pairs of the number of false alarms in 100 h of use and the limit, with increasing numbers.
+        false_alarms_per_month: Accepted number of false alarms in ``USE_H_PER_MONTH``, above 0.
+    """
+    rates, limits = zip(*measured, strict=True)
     in_100_h = 100.0 / USE_H_PER_MONTH * false_alarms_per_month
     return float(np.interp(math.log(in_100_h), np.log(rates), limits))

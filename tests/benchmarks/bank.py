@@ -1,44 +1,38 @@
 """Weakest cell of simulated banks in series: false alarms, charge drawn at detection, and error of its SOC.
 
-Run ``make bank``, or ``python -m tests.benchmarks.bank --banks N``.
-
-The true cells have the OCV and the resistances of ``ncr18650``, with a spread. The estimator has the generic file ``nca``.
+Run ``make bank``, or ``python -m tests.benchmarks.bank --banks N --seed S``. The first run simulates the banks
+(``tests.benchmarks.simulated_banks``); later runs take them from a cache.
 """
 
 import argparse
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.accumulators.history import ROW_SOC
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.bank_monitor import BankMonitor, is_discharge
+from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.weakest_cell import WeakestCell
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
-from bms_estimator.simulation.simulated_bank import BankCells
-from tests.pack_model.bank_cycles import CELL, ONE_C, cycle, new_bank
+from tests.benchmarks.simulated_banks import CHEMISTRIES, WEAK_CELLS, Recording, Step, recordings
+from tests.pack_model.bank_cycles import CELL
 
 SERIES = 3, 6, 12
 """Numbers of cells in series."""
-STEP_S = 3.0
-"""Interval between two samples [s]."""
-BLOCK = 20
-"""Number of samples of a block."""
-NOISE_V, RESOLUTION_V = 2e-3, 5e-3
-"""Std of the noise of a voltage sample per root of the number of cells, and resolution of the bank's voltage [V]."""
-FIT_S = 86400.0
-"""Interval between two slow fits [s]. The service fits each hour, which takes most of the time of this benchmark."""
-FILE_CAPACITY_RATIO = 1.03
-"""Capacity of the cell file relative to the true mean."""
-MAX_GRADIENT_K = 5.0
-"""Temperature difference between the coldest and the warmest cell [K]."""
-HEALTHY_CYCLES = 5
-"""Number of cycles before a cell becomes weak."""
+WORKERS = 2
+"""Number of processes."""
 REFERENCE_CYCLES = 2
 """Number of cycles of which no discharge is compared, because they are the first reference."""
+WEAK_AFTER = 6, 12
+"""Numbers of cycles after which a cell becomes weak for one cycle."""
+FADE, FADE_CYCLES = 0.012, 18
+"""Loss of capacity of a slowly weakening cell in each cycle, and number of cycles."""
+LIMITS_STD = 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0
+"""Limits of which the false alarms are counted."""
 MODEL_ERROR_V = 8e-3
 """Model error of a cell in the idealized bound [V]."""
 
@@ -47,102 +41,142 @@ MODEL_ERROR_V = 8e-3
 class Comparison:
     """Result after one row of a discharge."""
 
-    cycle: int
+    step: Step
     weakest: WeakestCell
-    drawn: float
-    """Charge drawn in the discharge, as a fraction of the mean capacity."""
-    estimated: tuple[float, float]
-    """SOC of the weakest cell and its std."""
-    true_soc: float
-    """True SOC of the weakest cell."""
+
+    @property
+    def error(self) -> float:
+        """Error of the SOC of the weakest cell."""
+        return self._estimate[0] - self.step.weakest_soc
+
+    @property
+    def error_std(self) -> float:
+        """Error of the SOC of the weakest cell, relative to its std."""
+        return self.error / self._estimate[1]
+
+    @property
+    def _estimate(self) -> tuple[float, float]:
+        """SOC of the weakest cell and its std. The filter's SOC is that of the middle of the row."""
+        return self.weakest.weakest_soc(self.weakest.filter_soc - 0.5 * ROW_SOC)
 
 
-def comparisons(
-    series: int, seed: int, cycles: int, capacity_ratio: float = 1.0, soc_below: float = 0.0
-) -> Iterator[Comparison]:
-    """Yield the comparisons of a bank, one of whose cells becomes weak after ``HEALTHY_CYCLES``."""
-    rng = np.random.default_rng(seed)
-    cells = BankCells.drawn(rng, series, ONE_C)
-    cells.warmer_k[:] = np.linspace(0.0, rng.uniform(0.0, MAX_GRADIENT_K), series)
-    bank = new_bank(cells)
-    file = load_cell("nca", FILE_CAPACITY_RATIO * ONE_C).pack(series, 1)
-    slow_fit = SlowFit(Estimator(file, voltage_resolution_v=RESOLUTION_V), interval_s=FIT_S)
-    assert slow_fit.bank is not None
-    latest = None
-    for number in range(cycles):
-        if number == HEALTHY_CYCLES:
-            bank.cells = cells.with_weak_cell(0, capacity_ratio=capacity_ratio)
-            bank.discharge_cell(0, soc_below)
-        for is_discharge, history in cycle(bank, rng, STEP_S):
-            samples = history.samples(rng, NOISE_V * np.sqrt(series), RESOLUTION_V)
-            drawn = np.cumsum(history.current_a) * STEP_S / 3600.0 / ONE_C
-            for begin in range(0, samples.size, BLOCK):
-                slow_fit.run(samples[begin : begin + BLOCK])
-                weakest, last = slow_fit.bank.weakest, min(begin + BLOCK, samples.size) - 1
-                if is_discharge and weakest is not None and weakest is not latest:
-                    latest = weakest
-                    estimated = weakest.weakest_soc(slow_fit.estimator.soc)
-                    true_soc = max(float(history.cell_soc[last].min()), 0.0)
-                    yield Comparison(number, weakest, float(drawn[last]), estimated, true_soc)
+def comparisons(recording: Recording, first_cycle: int = REFERENCE_CYCLES) -> Iterator[Comparison]:
+    """Yield the comparisons of a recorded bank from a cycle on."""
+    monitor, history, latest = BankMonitor(recording.curves), History(), None
+    rows = max(step.rows for step in recording.steps if step.cycle < first_cycle)
+    for step in recording.steps:
+        if step.cycle >= first_cycle:
+            history.rows = recording.rows[: step.rows]
+            monitor.add(history, step.rows - rows, recording.fits[step.cycle - 1])
+            rows = step.rows
+            if monitor.weakest is not None and monitor.weakest is not latest:
+                latest = monitor.weakest
+                yield Comparison(step, latest)
 
 
-def bound(cell: CellModel, series: int, capacity_ratio: float) -> float:
+@dataclass(frozen=True)
+class HealthyResult:
+    """Comparisons of a healthy bank."""
+
+    deviations: list[float]
+    """Largest deviation of each discharge [std]."""
+    errors_std: list[float]
+    """Errors of the SOC of the weakest cell, relative to their std."""
+    hours: float
+    """Duration of the compared discharges [h]."""
+
+
+@dataclass(frozen=True)
+class WeakResult:
+    """Comparisons in the discharge of a weak cell from the first one at the limit on; empty if it was not found."""
+
+    found: list[Comparison]
+
+
+def evaluate(chemistry: str, series: int, seed: int) -> tuple[HealthyResult, list[WeakResult]]:
+    """Return the results of one bank: healthy, and with each of ``WEAK_CELLS`` after each of ``WEAK_AFTER``."""
+    healthy, *faults = recordings(chemistry, series, seed, WEAK_CELLS, WEAK_AFTER)
+    largest: dict[int, float] = {}
+    errors: list[float] = []
+    for each in comparisons(healthy):
+        number = each.step.cycle
+        largest[number] = max(largest.get(number, 0.0), each.weakest.deviation_std)
+        errors.append(each.error_std)
+    last = [step.rows for step in healthy.steps if step.cycle < REFERENCE_CYCLES][-1]
+    compared = healthy.rows[last:]
+    hours = float(compared["duration_s"][is_discharge(compared)].sum()) / 3600.0
+    return HealthyResult(list(largest.values()), errors, hours), [
+        WeakResult(at_limit(recording, recording.steps[-1].cycle)) for recording in faults
+    ]
+
+
+def at_limit(recording: Recording, first_cycle: int) -> list[Comparison]:
+    """Return the comparisons at or above the limit of the alarm."""
+    found = comparisons(recording, first_cycle)
+    return [each for each in found if each.weakest.deviation_std >= WEAK_CELL_STD]
+
+
+def evaluate_fade(series: int, seed: int, fade: float) -> float:
+    """Return the capacity ratio at which a slowly weakening cell is found; NaN if it is not found."""
+    (recording,) = recordings("NCA", series, seed, (), (FADE_CYCLES,), fade)
+    found = at_limit(recording, REFERENCE_CYCLES)
+    return 1.0 - fade * found[0].step.cycle if found else np.nan
+
+
+def bound(series: int, capacity_ratio: float) -> float:
     """Return the charge drawn at which the weak cell's deviation reaches three std of the sum of the model errors."""
-    ocv_v = ocv_grid(cell)[0]
+    ocv_v = ocv_grid(CELL)[0]
     soc = np.linspace(0.0, 1.0, ocv_v.size)
     drawn = np.linspace(0.0, capacity_ratio, 2000)
     healthy_v, weak_v = (np.interp(1.0 - x, soc, ocv_v) for x in (drawn, drawn / capacity_ratio))
     return float(drawn[np.argmax(healthy_v - weak_v > 3.0 * MODEL_ERROR_V * np.sqrt(series))])
 
 
-def false_alarms(banks: int, cycles: int) -> None:
-    """Print the largest deviations of healthy banks."""
-    print_row("cells", "discharges", "above 1", "above 2", f"above {WEAK_CELL_STD:g}", "largest", "SOC within 2 std")
-    for series in SERIES:
-        largest: list[float] = []
-        errors: list[float] = []
-        for seed in range(banks):
-            by_cycle: dict[int, float] = {}
-            for each in comparisons(series, seed, cycles):
-                by_cycle[each.cycle] = max(by_cycle.get(each.cycle, 0.0), each.weakest.deviation_std)
-                errors.append((each.estimated[0] - each.true_soc) / each.estimated[1])
-            largest += by_cycle.values()
-        deviation = np.array(largest)
-        limits = [f"{(deviation >= limit).sum()}" for limit in (1.0, 2.0, WEAK_CELL_STD)]
+def print_healthy(results: dict[tuple[str, int], list[HealthyResult]]) -> None:
+    """Print the deviations of healthy banks and the false alarms at several limits."""
+    print_row("cells", "discharges", "RMS deviation", "largest", "false alarms", "SOC within 2 std")
+    for (chemistry, series), banks in results.items():
+        deviation = np.concatenate([bank.deviations for bank in banks])
+        errors = np.concatenate([bank.errors_std for bank in banks])
+        false_alarms, within = (deviation >= WEAK_CELL_STD).sum(), np.mean(np.abs(errors) <= 2.0)
+        rms = np.sqrt(np.mean(deviation**2))
         print_row(
-            series, banks * (cycles - REFERENCE_CYCLES), *limits, f"{deviation.max():.1f}", f"{within(errors):.0%}"
+            f"{series} {chemistry}",
+            deviation.size,
+            f"{rms:.2f}",
+            f"{deviation.max():.1f}",
+            false_alarms,
+            f"{within:.0%}",
         )
+    banks = [bank for group in results.values() for bank in group]
+    deviation, hours = np.concatenate([bank.deviations for bank in banks]), sum(bank.hours for bank in banks)
+    print_row("limit [std]", f"false alarms in {deviation.size} discharges of {hours:.0f} h", "in 100 h")
+    for limit in LIMITS_STD:
+        count = (deviation >= limit).sum()
+        print_row(f"{limit:g}", count, f"{100.0 * count / hours:.2f}")
 
 
-def detections(banks: int) -> None:
+def print_weak(results: dict[tuple[str, int], list[list[WeakResult]]]) -> None:
     """Print the charge drawn at detection."""
-    print_row(
-        "cells",
-        "capacity",
-        "SOC below",
-        "found",
-        "charge drawn",
-        "bound",
-        "SOC of the weak cell",
-        "RMS error of its SOC",
-    )
-    for series in SERIES:
-        for ratio, below in ((0.9, 0.0), (0.8, 0.0), (1.0, 0.1)):
-            drawn, errors, socs = [], [], []
-            for seed in range(100, 100 + banks):
-                found = [
-                    each
-                    for each in comparisons(series, seed, HEALTHY_CYCLES + 1, ratio, below)
-                    if each.cycle == HEALTHY_CYCLES and each.weakest.deviation_std >= WEAK_CELL_STD
-                ]
-                if found:
-                    drawn.append(found[0].drawn)
-                    socs.append(found[0].true_soc)
-                    errors += [each.estimated[0] - each.true_soc for each in found]
-            ideal = f"{bound(CELL, series, ratio):.2f}" if ratio < 1.0 else "-"
-            rms = f"{np.sqrt(np.mean(np.square(errors))):.3f}" if errors else "-"
-            found_of = f"{len(drawn)} of {banks}"
-            print_row(series, f"{ratio:g}", f"{below:g}", found_of, quantiles(drawn), ideal, quantiles(socs), rms)
+    print_row("cells", "weak cell", "found", "charge drawn", "bound", "SOC of the weak cell", "RMS error of its SOC")
+    for (chemistry, series), banks in results.items():
+        for kind, weak in enumerate(WEAK_CELLS):
+            each = [result.found for bank in banks for result in bank[kind :: len(WEAK_CELLS)]]
+            first = [found[0].step for found in each if found]
+            errors = [comparison.error for found in each for comparison in found]
+            fault = (
+                f"capacity {weak.capacity_ratio:.0%}" if weak.capacity_ratio < 1.0 else f"SOC {weak.soc_below:g} lower"
+            )
+            has_bound = chemistry == "NCA" and weak.capacity_ratio < 1.0
+            print_row(
+                f"{series} {chemistry}",
+                fault,
+                f"{len(first)} of {len(each)}",
+                quantiles([step.drawn for step in first]),
+                f"{bound(series, weak.capacity_ratio):.2f}" if has_bound else "",
+                quantiles([step.weakest_soc for step in first]),
+                f"{np.sqrt(np.mean(np.square(errors))):.3f}" if errors else "",
+            )
 
 
 def print_row(*cells: object) -> None:
@@ -150,24 +184,29 @@ def print_row(*cells: object) -> None:
     print("|", " | ".join(str(cell) for cell in cells), "|", flush=True)  # noqa: T201
 
 
-def within(errors: list[float]) -> float:
-    """Return the fraction of normalized errors within 2 std."""
-    return float(np.mean(np.abs(errors) <= 2.0)) if errors else np.nan
-
-
 def quantiles(values: list[float] | Floats) -> str:
     """Return median and range as text."""
-    return f"{np.median(values):.2f} ({np.min(values):.2f} to {np.max(values):.2f})" if len(values) else "-"
+    return f"{np.median(values):.2f} ({np.min(values):.2f} to {np.max(values):.2f})" if len(values) else ""
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--banks", type=int, default=2, help="number of simulated banks of each kind")
-    parser.add_argument("--cycles", type=int, default=16, help="number of cycles of a healthy bank")
+    parser.add_argument("--banks", type=int, default=4, help="number of banks of each size and chemistry")
+    parser.add_argument("--seed", type=int, default=2000, help="seed of the first bank")
+    parser.add_argument("--fade", type=int, default=0, help="number of banks with a slowly weakening cell")
     arguments = parser.parse_args()
-    false_alarms(arguments.banks, arguments.cycles)
-    detections(arguments.banks)
+    seeds = range(arguments.seed, arguments.seed + arguments.banks)
+    groups = [(chemistry, series) for chemistry in CHEMISTRIES for series in SERIES]
+    with ProcessPoolExecutor(WORKERS) as pool:
+        pending = {group: [pool.submit(evaluate, *group, seed) for seed in seeds] for group in groups}
+        results = {group: [future.result() for future in futures] for group, futures in pending.items()}
+        print_healthy({group: [healthy for healthy, _ in banks] for group, banks in results.items()})
+        print_weak({group: [weak for _, weak in banks] for group, banks in results.items()})
+        for series in SERIES[:2] if arguments.fade else ():
+            for fade in (FADE, 0.0):
+                banks = [pool.submit(evaluate_fade, series, seed, fade) for seed in seeds[: arguments.fade]]
+                print_row(series, f"capacity lost in a cycle {fade:g}", *(f"{bank.result():.2f}" for bank in banks))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,18 @@
+"""Limit of the alarm ``weak_cell`` by the accepted rate of false alarms."""
+
+from bms_estimator.settings.collapse_limit import limit_of_rate
+
+FALSE_ALARMS = ((0.15, 3.5), (0.3, 2.5), (1.0, 2.0), (3.0, 1.5))
+"""Pairs of the number of false alarms in 100 h of discharges and the limit [std]: points of the measured curve of healthy
+simulated banks (``make bank``, docs/pack/bank.md)."""
+DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH = 0.1
+"""Default of the accepted number of false alarms in a month of 60 h of use. About one a year."""
+
+
+def weak_cell_limit(false_alarms_per_month: float) -> float:
+    """Return the deviation at which the alarm is raised [std].
+
+    Args:
+        false_alarms_per_month: Accepted number of false alarms in a month of 60 h of use, above 0.
+    """
+    return limit_of_rate(FALSE_ALARMS, false_alarms_per_month)
