@@ -48,6 +48,9 @@ the reference [1/K]. The temperature dependence of a generic cell file is that o
 LOAD_DROP_STD = 0.02
 """Error std of the overpotential, as a fraction of its difference from the mean overpotential of the reference; independent
 from row to row. The RC pairs are less exact for loads that differ from the usual ones."""
+MAX_ERROR_RATIO = 3.0
+"""Maximum factor on the std. A bank whose errors are larger than assumed has a larger std, by the RMS of the errors that remain
+under the best hypothesis. They also remain if several cells are weak, which must not prevent the alarm."""
 SHIFTS, SHRINKS = np.linspace(0.0, 0.4, 21), np.linspace(0.0, 0.6, 25)
 """Tested values of ``shift`` and ``shrink``."""
 SHIFT_STD, SHRINK_STD = 0.03, Noise.cell_spread
@@ -161,6 +164,7 @@ class Comparison:
     Attributes:
         measured: Open-circuit voltages of the rows.
         deviation_v: Deviation of E_o of the mean cell from the reference, shape (n,) [V].
+        covariance_factor: Lower Cholesky factor of the covariance of ``deviation_v`` of a healthy bank, shape (n, n) [V].
     """
 
     def __init__(
@@ -169,16 +173,15 @@ class Comparison:
         self.measured = OpenCircuit.of(cell, fit, rows, soc)
         self.deviation_v: Floats = self.measured.error_v - np.interp(soc, BIN_SOC, reference.error_v)
         self._cell, self._fit, self._filter_soc = cell, fit, float(rows["soc"][-1])
-        self._whitening = np.linalg.cholesky(_covariance(cell, fit, reference, self.measured))
+        self.covariance_factor: Floats = np.linalg.cholesky(_covariance(cell, fit, reference, self.measured))
 
     def weakest(self, deviation_v: Floats | None = None) -> WeakestCell:
         """Return the estimate of the weakest cell by a deviation, shape (n,) [V]; default: ``deviation_v``."""
-        whitened = np.linalg.solve(self._whitening, self.deviation_v if deviation_v is None else deviation_v)
-        templates = np.linalg.solve(self._whitening, self.by_weak_cell(SHIFT, SHRINK))
+        whitened = np.linalg.solve(self.covariance_factor, self.deviation_v if deviation_v is None else deviation_v)
+        templates = np.linalg.solve(self.covariance_factor, self.by_weak_cell(SHIFT, SHRINK))
         ln_by_row = templates * whitened[:, None] - 0.5 * templates**2
-        # a bank whose remaining errors are larger than assumed needs a larger deviation
         remaining = whitened - templates[:, ln_by_row.sum(axis=0).argmax()]
-        ln_by_row /= max(float(np.mean(remaining**2)), 1.0)
+        ln_by_row /= np.clip(np.mean(remaining**2), 1.0, MAX_ERROR_RATIO**2)
         # without the row that supports a hypothesis most, because a single wrong row must not raise the alarm
         ln_likelihood = ln_by_row.sum(axis=0) - np.maximum(ln_by_row.max(axis=0), 0.0)
         ln_weight = LN_PRIOR + LIKELIHOOD_EXPONENT * ln_likelihood
