@@ -97,7 +97,7 @@ anywhere: venv ## SOC error from any starting point of real captures, e.g. make 
 month: venv ## SOC error over simulated weeks of use, day by day, e.g. make month ARGS="A123 --days 30 --seeds 1 2": minutes
 	@$(BIN)/python -m tests.estimator.month $(ARGS)
 
-bank: venv ## the weakest cell of simulated banks: false alarms, detection and error of its SOC: 15 minutes
+bank: venv ## the weakest cell of simulated banks: false alarms, detection and error of its SOC: up to 10 minutes
 	@$(BIN)/python -m tests.benchmarks.bank $(ARGS)
 
 collapse: venv ## the alarm before the cut-off: false alarms and warnings by signal, e.g. make collapse ARGS="--plot collapse.png": half an hour

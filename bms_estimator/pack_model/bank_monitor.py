@@ -1,20 +1,32 @@
 """Monitor that compares each discharge of a bank with its reference discharges, row by row."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit
-from bms_estimator.pack_model.history import History, WeakCellTime
+from bms_estimator.pack_model.history import History, ReferenceDischarges, WeakCellTime
 from bms_estimator.pack_model.open_circuit import drawn_soc, row_soc
-from bms_estimator.pack_model.weakest_cell import MIN_ROWS, Comparison, ReferenceCurve, WeakestCell
+from bms_estimator.pack_model.weakest_cell import (
+    MIN_REFERENCE_ROWS,
+    MIN_ROWS,
+    SINCE_EARLIER,
+    SINCE_FIRST,
+    Comparison,
+    Reference,
+    ReferenceCurve,
+    WeakestCell,
+)
 from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_FRACTION, WEAK_CELL_STD
 
 CHARGED_SOC = 0.05
 """Charge after which a discharge has ended, as a fraction of the capacity. Regeneration during a discharge is smaller."""
+
+FIRST_ROWS = 4 * MIN_REFERENCE_ROWS
+"""Number of rows of the first discharges that are kept as a reference: about four complete discharges."""
 
 
 @dataclass(frozen=True)
@@ -25,16 +37,20 @@ class Discharge:
     """Time of its first row [s]."""
     fit: PackFit
     """Fit from before the discharge. A later fit would absorb the weak cell."""
-    reference: ReferenceCurve | None
-    """Reference; None: too few rows."""
+    references: list[Reference]
+    """Earlier and first discharges of the bank; empty: too few rows."""
     start_soc: float
     """SOC at its first row."""
     start_as: float
     """Charge counter at its first row [A s]."""
 
-    def soc(self, cell: CellCurves, rows: NDArray[np.void]) -> Floats:
-        """Return the SOC of rows of the discharge by the counted charge."""
-        return np.asarray(self.start_soc - drawn_soc(cell, self.fit, rows["charge_as"] - self.start_as))
+    def weakest(self, cell: CellCurves, rows: NDArray[np.void]) -> list[WeakestCell]:
+        """Return the estimates from rows of the discharge by each reference. The SOC is that of the counted charge."""
+        drawn_as = rows["charge_as"] - self.start_as
+        return [
+            Comparison(cell, each, rows, self.start_soc - drawn_soc(cell, each.fit, drawn_as)).weakest()
+            for each in self.references
+        ]
 
 
 class BankMonitor:
@@ -74,34 +90,45 @@ class BankMonitor:
         if fit.is_exchanged and self._discharge is not None and self._discharge.fit.first_segment < fit.first_segment:
             self.reset()
             history.weak_cell_times.clear()
+            history.first = None
         rows = history.rows[history.rows["segment"] >= fit.first_segment]
         for end in range(max(rows.size - new, 0) + 1, rows.size + 1):
             if is_discharge(rows[end - 1 : end]).all():
-                self._evaluate(rows[:end], history.weak_cell_times, fit)
+                self._evaluate(rows[:end], history, fit)
 
-    def _evaluate(self, rows: NDArray[np.void], weak: list[WeakCellTime], fit: PackFit) -> None:
-        """Compare the discharge of the last row with its reference."""
+    def _evaluate(self, rows: NDArray[np.void], history: History, fit: PackFit) -> None:
+        """Compare the discharge of the last row with its references. The one from which it deviates most decides."""
         start = discharge_start(rows, CHARGED_SOC * self._cell.capacity_as)
         if self._discharge is None or self._discharge.start_s != rows["elapsed_s"][start]:
-            self._discharge = self._begin(rows, start, weak, fit)
+            self._discharge = self._begin(rows, start, history, fit)
         discharge, measured = self._discharge, rows[start:][is_discharge(rows[start:])]
-        if discharge.reference is None or measured.size < MIN_ROWS:
+        if not discharge.references or measured.size < MIN_ROWS:
             return
-        soc = discharge.soc(self._cell, measured)
-        result = Comparison(self._cell, discharge.fit, discharge.reference, measured, soc).weakest()
-        self._replace_result(result, weak, discharge.start_s, float(rows["elapsed_s"][-1]))
+        result = max(discharge.weakest(self._cell, measured), key=lambda each: each.deviation_std)
+        self._replace_result(result, history.weak_cell_times, discharge.start_s, float(rows["elapsed_s"][-1]))
 
-    def _begin(self, rows: NDArray[np.void], start: int, weak: list[WeakCellTime], fit: PackFit) -> Discharge:
+    def _begin(self, rows: NDArray[np.void], start: int, history: History, fit: PackFit) -> Discharge:
         """Return the discharge that begins with the row ``start``. While a cell is weak, the earlier fit is kept."""
+        weak = history.weak_cell_times
         fit_before = self._discharge.fit if is_weak_now(weak) and self._discharge is not None else fit
-        first = rows[start : start + 1]
+        begin, earlier = rows[start : start + 1], reference_rows(rows[:start], weak)
+        earlier["soc"] = row_soc(self._cell, fit_before, earlier)
+        if history.first is None and earlier.size >= FIRST_ROWS:
+            history.first = ReferenceDischarges(earlier, fit_before)
         return Discharge(
-            start_s=float(first["elapsed_s"][0]),
+            start_s=float(begin["elapsed_s"][0]),
             fit=fit_before,
-            reference=ReferenceCurve.of(self._cell, fit_before, reference_rows(rows[:start], weak)),
-            start_soc=float(row_soc(self._cell, fit, first)[0]),
-            start_as=float(first["charge_as"][0]),
+            references=list(self._references(ReferenceDischarges(earlier, fit_before), history.first)),
+            start_soc=float(row_soc(self._cell, fit, begin)[0]),
+            start_as=float(begin["charge_as"][0]),
         )
+
+    def _references(self, earlier: ReferenceDischarges, first: ReferenceDischarges | None) -> Iterator[Reference]:
+        """Yield the references with enough rows."""
+        for each, change in ((earlier, SINCE_EARLIER), (first, SINCE_FIRST)):
+            curve = each and ReferenceCurve.of(self._cell, each.fit, each.rows, each.rows["soc"])
+            if each and curve:
+                yield Reference(each.fit, curve, change)
 
     def _replace_result(self, result: WeakestCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
         """Replace the present result if the discharge from ``start_s`` shows a weak cell, is as deep, or gave that result."""

@@ -1,12 +1,14 @@
 """History of a pack with a bounded number of rows. Old rows are merged."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, ROW_SOC
+from bms_estimator.pack_model.fit import PackFit
 
 MAX_ROWS = 5000
 """Maximum number of rows."""
@@ -36,17 +38,34 @@ class WeakCellTime(NamedTuple):
     """SOC at which the last discharge found it."""
 
 
+@dataclass(frozen=True)
+class ReferenceDischarges:
+    """Rows of earlier discharges of a bank, and a fit after them."""
+
+    rows: NDArray[np.void]
+    """Shape (n,), dtype HISTORY_ROW. Their field ``soc`` is the fitted SOC."""
+    fit: PackFit
+
+
 class History:
     """Rows of one pack in order of time.
 
     Attributes:
         rows: Shape (n,), dtype HISTORY_ROW.
         weak_cell_times: Times in which a cell of the bank was weak.
+        first: First discharges of the bank; None: too few rows, or no bank. They do not change, so that a slowly weakening
+            cell deviates from them.
     """
 
-    def __init__(self, rows: NDArray[np.void] | None = None, weak_cell_times: Sequence[WeakCellTime] = ()) -> None:
+    def __init__(
+        self,
+        rows: NDArray[np.void] | None = None,
+        weak_cell_times: Sequence[WeakCellTime] = (),
+        first: ReferenceDischarges | None = None,
+    ) -> None:
         self.rows: NDArray[np.void] = np.zeros(0, HISTORY_ROW) if rows is None else rows
         self.weak_cell_times = list(weak_cell_times)
+        self.first = first
 
     def append(self, rows: NDArray[np.void], capacity_as: float) -> None:
         """Append rows. If there are too many, merge old rows, and drop the oldest if there are still too many."""

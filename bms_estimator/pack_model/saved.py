@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import CURVE, PackFit
-from bms_estimator.pack_model.history import MAX_ROWS, History, WeakCellTime
+from bms_estimator.pack_model.history import MAX_ROWS, History, ReferenceDischarges, WeakCellTime
 
 SAVED_MINIMA = 2
 """Number of a fit's minima that are saved. The next fit starts from two minima (``fit.starts``)."""
@@ -35,6 +35,9 @@ _NEW_ROW_FIELDS = {"between_a2", "skew_a2"}
 """Fields of a row that an earlier version did not save. They are variances, which it assumed to be 0."""
 _START_FIELDS = "row_elapsed_s", "row_soc", "curves"
 """Fields of a fit from which the next fit starts."""
+
+BANK = "bank_"
+"""Prefix of the arrays of the first discharges of a bank and of the fit after them."""
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -88,6 +91,9 @@ def history_arrays(history: History, fit: PackFit | None) -> dict[str, NDArray[A
     """Return history and fit as arrays by name."""
     weak_s = np.array(history.weak_cell_times).reshape(-1, len(WeakCellTime._fields))
     arrays = {"rows": history.rows, "weak_cell_times": weak_s, **curve_arrays(fit)}
+    if history.first is not None:
+        arrays["bank_rows"] = history.first.rows
+        arrays |= {BANK + name: array for name, array in curve_arrays(history.first.fit).items()}
     if fit is not None:
         arrays |= {"row_elapsed_s": fit.row_elapsed_s, "row_soc": fit.row_soc}
         arrays["curves"] = np.array(fit.curves[:SAVED_MINIMA]).reshape(min(len(fit.curves), SAVED_MINIMA), -1)
@@ -102,13 +108,19 @@ def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
     return [WeakCellTime(*row) for row in saved.tolist()]
 
 
-def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
-    """Return history and fit of ``history_arrays``.
+def _first_discharges(arrays: Arrays) -> ReferenceDischarges | None:
+    """Return the first discharges of a bank; None if none were saved."""
+    fit = fit_of_curves({name: arrays[BANK + name] for name in _SHAPES if BANK + name in arrays})
+    return None if fit is None else ReferenceDischarges(_checked_rows(arrays.get("bank_rows")), fit)
+
+
+def _checked_rows(saved: NDArray[Any] | None) -> NDArray[np.void]:
+    """Return saved rows.
 
     Raises:
-        ValueError: A field is missing, has another layout or is not finite.
+        ValueError: They have another layout, or are not finite or not in the order of time.
     """
-    rows = _with_present_fields(arrays.get("rows"))
+    rows = _with_present_fields(saved)
     if rows is None or rows.dtype != HISTORY_ROW or rows.ndim != 1 or rows.size > MAX_ROWS:
         raise ValueError("its rows have another layout")
     if not all(
@@ -117,7 +129,16 @@ def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
         raise ValueError("a row is not finite")
     if (np.diff(rows["segment"]) < 0.0).any():
         raise ValueError("its rows are not in the order of time")
-    history = History(rows, _weak_cell_times(arrays))
+    return rows
+
+
+def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
+    """Return history and fit of ``history_arrays``.
+
+    Raises:
+        ValueError: A field is missing, has another layout or is not finite.
+    """
+    history = History(_checked_rows(arrays.get("rows")), _weak_cell_times(arrays), _first_discharges(arrays))
     fit = fit_of_curves({name: value for name, value in arrays.items() if name in _SHAPES})
     if fit is None:
         return history, None

@@ -20,7 +20,7 @@ from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.fit import LIKELIHOOD_EXPONENT, PackFit
-from bms_estimator.pack_model.open_circuit import OpenCircuit, fitted_ocv, fitted_slope, row_soc
+from bms_estimator.pack_model.open_circuit import OpenCircuit, fitted_ocv, fitted_slope
 
 BINS = 50
 """Number of SOC bins of the reference."""
@@ -40,11 +40,9 @@ INDEPENDENT_FRACTION = 0.2
 ``CORRELATED_SOC``."""
 CORRELATED_SOC = 0.4
 """Correlation length of the difference of E_o between two discharges [SOC]."""
-COMMON_SOC_STD, COMMON_CAPACITY_STD = 0.003, 0.003
-"""Std of the changes of SOC (error of the count) and capacity (aging) that all cells share since the reference."""
-COMMON_DROP_STD, COMMON_DROP_STD_PER_K = 0.01, 0.002
-"""Relative std of the overpotential that all cells and rows share, and its increase per kelvin of temperature difference from
-the reference [1/K]. The temperature dependence of a generic cell file is that of another cell."""
+COMMON_DROP_STD_PER_K = 0.002
+"""Increase of the relative std of the overpotential that all cells and rows share per kelvin of temperature difference from the
+reference [1/K]. The temperature dependence of a generic cell file is that of another cell."""
 LOAD_DROP_STD = 0.02
 """Error std of the overpotential, as a fraction of its difference from the mean overpotential of the reference; independent
 from row to row. The RC pairs are less exact for loads that differ from the usual ones."""
@@ -64,6 +62,24 @@ SHIFT, SHRINK = (values.ravel() for values in np.meshgrid(SHIFTS, SHRINKS, index
 """``shift`` and ``shrink`` of each hypothesis."""
 LN_PRIOR = -0.5 * ((SHIFT / SHIFT_STD) ** 2 + (SHRINK / SHRINK_STD) ** 2)
 """ln of the prior density of each hypothesis, up to a constant."""
+
+
+@dataclass(frozen=True)
+class CommonChange:
+    """Std of the changes that all cells of a healthy bank share since the reference."""
+
+    soc: float
+    """Error of the counted SOC."""
+    capacity: float
+    """Relative change of the capacity."""
+    drop: float
+    """Relative change of the overpotential."""
+
+
+SINCE_EARLIER = CommonChange(soc=0.003, capacity=0.003, drop=0.01)
+"""Change since the earlier discharges of the history."""
+SINCE_FIRST = CommonChange(soc=0.005, capacity=0.05, drop=0.1)
+"""Change since the first discharges. Two std are 10 % less capacity and 20 % more resistance by aging. Assumed."""
 
 
 @dataclass(frozen=True)
@@ -121,17 +137,18 @@ class ReferenceCurve:
     """Mean overpotential [V]."""
 
     @classmethod
-    def of(cls, cell: CellCurves, fit: PackFit, rows: NDArray[np.void]) -> "ReferenceCurve | None":
+    def of(cls, cell: CellCurves, fit: PackFit, rows: NDArray[np.void], soc: Floats) -> "ReferenceCurve | None":
         """Return the curve of reference rows of discharges; None if there are too few.
 
         Args:
             cell: Curves of the cell file.
             fit: Fit of the history.
             rows: Shape (n,), dtype HISTORY_ROW.
+            soc: SOC of the rows, shape (n,).
         """
         if rows.size < MIN_REFERENCE_ROWS:
             return None
-        measured = OpenCircuit.of(cell, fit, rows, row_soc(cell, fit, rows))
+        measured = OpenCircuit.of(cell, fit, rows, soc)
         at = np.clip((measured.soc * BINS).astype(np.intp), 0, BINS - 1)
         count = np.bincount(at, minlength=BINS)
         mean_v = np.bincount(at, measured.error_v, BINS) / np.maximum(count, 1)
@@ -149,6 +166,15 @@ class ReferenceCurve:
         )
 
 
+@dataclass(frozen=True)
+class Reference:
+    """Reference of a bank, and the model with which a discharge is compared with it."""
+
+    fit: PackFit
+    curve: ReferenceCurve
+    common: CommonChange
+
+
 class Comparison:
     """Comparison of one discharge with the reference of its bank.
 
@@ -156,7 +182,6 @@ class Comparison:
 
     Args:
         cell: Curves of the cell file.
-        fit: Fit of the history.
         reference: Reference of the bank.
         rows: Shape (n,), dtype HISTORY_ROW: rows of the discharge with a voltage.
         soc: SOC of the rows under the assumption that no cell is weak, shape (n,).
@@ -167,13 +192,11 @@ class Comparison:
         covariance_factor: Lower Cholesky factor of the covariance of ``deviation_v`` of a healthy bank, shape (n, n) [V].
     """
 
-    def __init__(
-        self, cell: CellCurves, fit: PackFit, reference: ReferenceCurve, rows: NDArray[np.void], soc: Floats
-    ) -> None:
-        self.measured = OpenCircuit.of(cell, fit, rows, soc)
-        self.deviation_v: Floats = self.measured.error_v - np.interp(soc, BIN_SOC, reference.error_v)
-        self._cell, self._fit, self._filter_soc = cell, fit, float(rows["soc"][-1])
-        self.covariance_factor: Floats = np.linalg.cholesky(_covariance(cell, fit, reference, self.measured))
+    def __init__(self, cell: CellCurves, reference: Reference, rows: NDArray[np.void], soc: Floats) -> None:
+        self.measured = OpenCircuit.of(cell, reference.fit, rows, soc)
+        self.deviation_v: Floats = self.measured.error_v - np.interp(soc, BIN_SOC, reference.curve.error_v)
+        self._cell, self._fit, self._filter_soc = cell, reference.fit, float(rows["soc"][-1])
+        self.covariance_factor: Floats = np.linalg.cholesky(_covariance(cell, reference, self.measured))
 
     def weakest(self, deviation_v: Floats | None = None) -> WeakestCell:
         """Return the estimate of the weakest cell by a deviation, shape (n,) [V]; default: ``deviation_v``."""
@@ -209,20 +232,20 @@ class Comparison:
         return np.asarray((weak_v - other_v) / self._cell.series)
 
 
-def _covariance(cell: CellCurves, fit: PackFit, reference: ReferenceCurve, measured: OpenCircuit) -> Floats:
+def _covariance(cell: CellCurves, reference: Reference, measured: OpenCircuit) -> Floats:
     """Return the covariance of the deviations of a healthy bank, shape (n, n) [V^2]."""
-    z = measured.soc
-    std_v = np.interp(z, BIN_SOC, reference.std_v)
-    slope_v = fitted_slope(cell, fit, z)
-    difference_k = measured.temperature_c - reference.temperature_c
+    z, curve, change = measured.soc, reference.curve, reference.common
+    std_v = np.interp(z, BIN_SOC, curve.std_v)
+    slope_v = fitted_slope(cell, reference.fit, z)
+    difference_k = measured.temperature_c - curve.temperature_c
     common = np.column_stack(
         [
-            COMMON_SOC_STD * slope_v,
-            COMMON_CAPACITY_STD * slope_v * (1.0 - z),
-            np.hypot(COMMON_DROP_STD, COMMON_DROP_STD_PER_K * difference_k) * measured.drop_v,
+            change.soc * slope_v,
+            change.capacity * slope_v * (1.0 - z),
+            np.hypot(change.drop, COMMON_DROP_STD_PER_K * difference_k) * measured.drop_v,
         ]
     )
     correlation = (1.0 - INDEPENDENT_FRACTION) * np.exp(-np.abs(z[:, None] - z) / CORRELATED_SOC)
     correlation[np.diag_indices(z.size)] = 1.0
-    by_load_v2 = (LOAD_DROP_STD * (measured.drop_v - reference.drop_v)) ** 2
+    by_load_v2 = (LOAD_DROP_STD * (measured.drop_v - curve.drop_v)) ** 2
     return np.asarray(np.outer(std_v, std_v) * correlation + common @ common.T + np.diag(by_load_v2))

@@ -61,15 +61,21 @@ class Comparison:
         return self.weakest.weakest_soc(self.weakest.filter_soc - 0.5 * ROW_SOC)
 
 
-def comparisons(recording: Recording, first_cycle: int = REFERENCE_CYCLES) -> Iterator[Comparison]:
+def comparisons(recording: Recording, history: History, first_cycle: int = REFERENCE_CYCLES) -> Iterator[Comparison]:
     """Yield the comparisons of a recorded bank from a cycle on.
 
     Each discharge gets its own monitor, because a monitor keeps the result of a deeper discharge.
+
+    Args:
+        recording: Recording of the bank.
+        history: History with the first discharges of the bank, if they are known; updated.
+        first_cycle: Number of the first compared cycle.
     """
     rows = max(step.rows for step in recording.steps if step.cycle < first_cycle)
     compared = (step for step in recording.steps if step.cycle >= first_cycle)
     for _, steps in itertools.groupby(compared, lambda step: step.cycle):
-        monitor, history, latest = BankMonitor(recording.curves), History(), None
+        monitor, latest = BankMonitor(recording.curves), None
+        history.weak_cell_times.clear()
         for step in steps:
             history.rows = recording.rows[: step.rows]
             monitor.add(history, step.rows - rows, recording.fits[step.cycle - 1])
@@ -103,7 +109,8 @@ def evaluate(chemistry: str, series: int, seed: int) -> tuple[HealthyResult, lis
     healthy, *faults = recordings(chemistry, series, seed, WEAK_CELLS, WEAK_AFTER)
     largest: dict[int, float] = {}
     errors: list[float] = []
-    for each in comparisons(healthy):
+    history = History()
+    for each in comparisons(healthy, history):
         number = each.step.cycle
         largest[number] = max(largest.get(number, 0.0), each.weakest.deviation_std)
         errors.append(each.error_std)
@@ -111,20 +118,20 @@ def evaluate(chemistry: str, series: int, seed: int) -> tuple[HealthyResult, lis
     compared = healthy.rows[last:]
     hours = float(compared["duration_s"][is_discharge(compared)].sum()) / 3600.0
     return HealthyResult(list(largest.values()), errors, hours), [
-        WeakResult(at_limit(recording, recording.steps[-1].cycle)) for recording in faults
+        WeakResult(at_limit(recording, history, recording.steps[-1].cycle)) for recording in faults
     ]
 
 
-def at_limit(recording: Recording, first_cycle: int) -> list[Comparison]:
+def at_limit(recording: Recording, history: History, first_cycle: int) -> list[Comparison]:
     """Return the comparisons at or above the limit of the alarm."""
-    found = comparisons(recording, first_cycle)
-    return [each for each in found if each.weakest.deviation_std >= WEAK_CELL_STD]
+    compared = comparisons(recording, history, first_cycle)
+    return [each for each in compared if each.weakest.deviation_std >= WEAK_CELL_STD]
 
 
 def evaluate_fade(series: int, seed: int) -> float:
     """Return the capacity of a slowly weakening NCA cell when it is found, relative to its first; NaN if it is not found."""
     (recording,) = recordings("NCA", series, seed, (), (FADE_CYCLES,), FADE)
-    found = at_limit(recording, REFERENCE_CYCLES)
+    found = at_limit(recording, History(), REFERENCE_CYCLES)
     return (1.0 - FADE) ** found[0].step.cycle if found else np.nan
 
 
@@ -197,7 +204,7 @@ def quantiles(values: list[float] | Floats) -> str:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--banks", type=int, default=8, help="number of banks of each size and chemistry")
+    parser.add_argument("--banks", type=int, default=5, help="number of banks of each size and chemistry")
     parser.add_argument("--seed", type=int, default=2000, help="seed of the first bank")
     parser.add_argument("--fade", type=int, default=3, help="number of banks with a slowly weakening cell")
     arguments = parser.parse_args()

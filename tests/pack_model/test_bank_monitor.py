@@ -1,12 +1,14 @@
 """Monitor of a bank: division into discharges, decisions of later discharges, and times of weak cells."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.pack_model.bank_monitor import discharge_start, reference_rows
-from bms_estimator.pack_model.history import History, WeakCellTime
-from bms_estimator.pack_model.saved import history_arrays, history_of
+from bms_estimator.pack_model.history import History, ReferenceDischarges, WeakCellTime
+from bms_estimator.pack_model.saved import history_arrays, history_of, neutral_fit
 from bms_estimator.pack_model.weakest_cell import WeakestCell
 
 
@@ -45,6 +47,15 @@ def test_times_of_weak_cells_survive_a_restart() -> None:
     times = [WeakCellTime(60.0, 120.0, 0.5), WeakCellTime(240.0, np.inf, 0.4)]
     restored, _ = history_of(history_arrays(History(rows_of([0.0]), times), None))
     assert restored.weak_cell_times == times
+
+
+def test_first_discharges_survive_a_restart() -> None:
+    rows = rows_of([0.0, 1.0])
+    fit = replace(neutral_fit(), hysteresis=0.5)
+    restored, _ = history_of(history_arrays(History(rows, first=ReferenceDischarges(rows[:1], fit)), None))
+    assert restored.first is not None
+    assert restored.first.rows.tobytes() == rows[:1].tobytes()
+    assert restored.first.fit.hysteresis == 0.5
 
 
 def test_damaged_times_of_weak_cells_are_rejected() -> None:

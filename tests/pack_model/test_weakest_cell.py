@@ -9,7 +9,14 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.saved import neutral_fit
-from bms_estimator.pack_model.weakest_cell import BIN_SOC, MAX_ERROR_RATIO, Comparison, ReferenceCurve
+from bms_estimator.pack_model.weakest_cell import (
+    BIN_SOC,
+    MAX_ERROR_RATIO,
+    SINCE_EARLIER,
+    Comparison,
+    Reference,
+    ReferenceCurve,
+)
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 
 SERIES, STD_V = 6, 2e-3
@@ -21,8 +28,8 @@ def comparison() -> Comparison:
     curves = CellCurves(Estimator(load_cell("ncr18650").pack(SERIES, 1)).cell_file_settings)
     rows = np.zeros(SOC.size, HISTORY_ROW)
     rows["current_a"], rows["temperature_c"], rows["soc"] = 0.5 * curves.one_c_a, 25.0, SOC
-    reference = ReferenceCurve(np.zeros(BIN_SOC.size), np.full(BIN_SOC.size, STD_V), 25.0, 0.0)
-    return Comparison(curves, neutral_fit(), reference, rows, SOC)
+    curve = ReferenceCurve(np.zeros(BIN_SOC.size), np.full(BIN_SOC.size, STD_V), 25.0, 0.0)
+    return Comparison(curves, Reference(neutral_fit(), curve, SINCE_EARLIER), rows, SOC)
 
 
 def by_weak_cell(comparison: Comparison, capacity_ratio: float) -> Floats:

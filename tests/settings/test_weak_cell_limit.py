@@ -15,7 +15,8 @@ def limits(weak_cell: dict[str, object]) -> tuple[float, float]:
 
 
 def test_the_default_limit_is_that_of_the_monitor() -> None:
-    assert limits({"severity": "critical"}) == (WEAK_CELL_STD, WEAK_CELL_CLEAR_FRACTION * WEAK_CELL_STD)
+    expected = WEAK_CELL_STD, WEAK_CELL_CLEAR_FRACTION * WEAK_CELL_STD
+    assert limits({"severity": "critical"}) == pytest.approx(expected)
 
 
 def test_more_accepted_false_alarms_lower_the_limit() -> None:

@@ -12,9 +12,9 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.pack_model.bank_monitor import is_discharge
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.learning import SlowFit
-from bms_estimator.pack_model.open_circuit import OpenCircuit, fitted_ocv
+from bms_estimator.pack_model.open_circuit import OpenCircuit, fitted_ocv, row_soc
 from bms_estimator.pack_model.saved import neutral_fit
-from bms_estimator.pack_model.weakest_cell import MIN_ROWS, Comparison, ReferenceCurve
+from bms_estimator.pack_model.weakest_cell import MIN_ROWS, SINCE_EARLIER, Comparison, Reference, ReferenceCurve
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 
@@ -71,12 +71,9 @@ class BankExperiment:
     @cached_property
     def warning(self) -> float:
         """Charge drawn at which the comparison with the healthy discharges finds a weak battery."""
-        reference = ReferenceCurve.of(self._curves, self._fit, np.concatenate(self._healthy_rows))
-        if reference is None:
-            raise RuntimeError("two complete discharges have too few rows for a reference")
         rows, soc = self._faulty_rows, self._soc(self._faulty_rows)
         for end in range(MIN_ROWS, rows.size):
-            weakest = Comparison(self._curves, self._fit, reference, rows[:end], soc[:end]).weakest()
+            weakest = Comparison(self._curves, self._reference, rows[:end], soc[:end]).weakest()
             if weakest.deviation_std >= WEAK_CELL_STD:
                 return float(1.0 - soc[end - 1])
         return np.nan
@@ -102,6 +99,15 @@ class BankExperiment:
         cells = BankCells.equal(SERIES, self._cell.cell.capacity_ah)
         soc = np.array([1.0, *WEAK_SOC])
         return self._discharge(replace(cells, soc=soc), seed=HEALTHY_DISCHARGES)
+
+    @cached_property
+    def _reference(self) -> Reference:
+        """Reference of the healthy discharges."""
+        rows = np.concatenate(self._healthy_rows)
+        curve = ReferenceCurve.of(self._curves, self._fit, rows, row_soc(self._curves, self._fit, rows))
+        if curve is None:
+            raise RuntimeError("two complete discharges have too few rows for a reference")
+        return Reference(self._fit, curve, SINCE_EARLIER)
 
     def _discharge(self, cells: BankCells, seed: int) -> NDArray[np.void]:
         """Return the history rows of a complete discharge."""
