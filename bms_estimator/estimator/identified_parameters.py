@@ -55,16 +55,6 @@ def present_elements(record: np.void) -> dict[str, IdentifiedValue]:
     }
 
 
-def present_resistance(record: np.void) -> float:
-    """Return the total DC resistance at the present SOC, with all RC pairs in steady state [ohm].
-
-    Args:
-        record: Record of dtype ESTIMATOR_STATE, after a sample, with the identifier enabled.
-    """
-    ohm = record["elements"]["value"]
-    return float(ohm[R_S] + ohm[R_TS] + ohm[R_TL])
-
-
 def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
     """Return a_i of the fit over SOC; None if its element was observed in fewer than ``MIN_BINS`` SOC bins.
 

@@ -1,4 +1,4 @@
-"""Present capability of a pack: available power, usable capacity, and time to full.
+"""Present capability of a pack: available power, usable capacity, remaining energy, and time to full.
 
 These values need no forecast of the load, and therefore exist at rest and during a charge, too.
 """
@@ -11,8 +11,11 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecast import ForecastRows
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
-from bms_estimator.kernels.forecast.discharge import mean_load, usable_charge
+from bms_estimator.kernels.forecast.draws import DRAW
+from bms_estimator.kernels.forecast.mean_discharge import discharge_to_cutoff
 from bms_estimator.kernels.forecast.power import available_power, new_scratch
+from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
+from bms_estimator.model.arrays import Records
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.alarm_limits import monitored_alarms
@@ -70,7 +73,7 @@ def power_limits(settings: Settings, cell: CellModel) -> PowerLimits:
 def write_capability(
     values: ForecastRows, estimator: Estimator, cutoff_v: float, limits: PowerLimits, largest_a: float
 ) -> None:
-    """Write available power, usable capacity and time to full to ``values``.
+    """Write available power, usable capacity, remaining energy and time to full to ``values``.
 
     The values stay unchanged before the first sample, without the identifier and for a fuel cell.
 
@@ -93,11 +96,38 @@ def write_capability(
             values[f"available_{name}_power_{duration_s:.0f}s_w"] = available_power(
                 state, settings, duration_s, limit_v, max_a, QUANTILE_STDS, scratch
             )
-    mean_a = mean_load(state, settings)
-    charge_as = usable_charge(state, settings, mean_a, max(mean_a, largest_a), cutoff_v, scratch)
-    values["usable_capacity_ah"] = charge_as / 3600.0
+    write_usable_charge(values, estimator, cutoff_v, largest_a)
     present_a = charge_current(state, settings)
     if present_a < 0.0:
         values["time_to_full_s"] = time_to_full(
             state, settings, present_a, full_v, tail_a, np.empty(RESISTANCES + BRANCHES)
         )
+
+
+def write_usable_charge(values: ForecastRows, estimator: Estimator, cutoff_v: float, largest_a: float) -> None:
+    """Write usable capacity and remaining energy to ``values``. They stay unchanged as in ``write_capability``.
+
+    Args:
+        values: Shape (1,), dtype ``FORECAST``; written.
+        estimator: Estimator of the pack; read only.
+        cutoff_v: Terminal voltage at which the load is switched off [V].
+        largest_a: Largest current of the load [A]; below the mean current of ten minutes: this mean applies.
+    """
+    state, settings = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
+    if not state["started"]:
+        return
+    pack, draw = projected_pack(estimator, cutoff_v), np.zeros(1, DRAW)
+    charge_as, energy_ws = discharge_to_cutoff(pack[0], state, settings, largest_a, draw[0])
+    values["usable_capacity_ah"], values["remaining_energy_wh"] = charge_as / 3600.0, energy_ws / 3600.0
+
+
+def projected_pack(estimator: Estimator, cutoff_v: float) -> Records:
+    """Return the present state of the pack, shape (1,), dtype ``PROJECTED_PACK``.
+
+    Args:
+        estimator: Estimator of the pack with a started identifier; read only.
+        cutoff_v: Terminal voltage at which the load is switched off [V].
+    """
+    pack = np.zeros(1, PROJECTED_PACK)
+    project_pack(pack[0], estimator.record[0]["filter"], estimator.settings_record[0]["filter"], cutoff_v)
+    return pack

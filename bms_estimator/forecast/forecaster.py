@@ -7,7 +7,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.forecast.capability import PowerLimits, cell_power_limits, write_capability
+from bms_estimator.forecast.capability import PowerLimits, cell_power_limits, projected_pack, write_capability
 from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastCurve, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import LoadHistory
@@ -20,7 +20,6 @@ from bms_estimator.forecast.projection import (
     project_trip,
     time_quantiles,
 )
-from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Records
 from bms_estimator.model.fuel_cell import FuelCellModel
@@ -178,11 +177,7 @@ class Forecaster:
 
     def _pack(self) -> Records:
         """Return the present state of the pack, shape (1,), dtype ``PROJECTED_PACK``."""
-        pack = np.zeros(1, PROJECTED_PACK)
-        project_pack(
-            pack[0], self.estimator.record[0]["filter"], self.estimator.settings_record[0]["filter"], self.cutoff_v
-        )
-        return pack
+        return projected_pack(self.estimator, self.cutoff_v)
 
     def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:
         """Run the pack forward. Return None if the load does not discharge it."""

@@ -19,7 +19,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 
 COLLECT_AFTER = 50_000
 """Number of new objects after which garbage is collected while kernels compile. numba creates many objects that stay."""
@@ -54,6 +54,6 @@ def _call_kernels() -> None:
     make_parameters_payload(estimator, 0.0)
     SlowFit(estimator).adopt(neutral_fit())
     return_to_cell_file(estimator)
-    remaining_charge(estimator, 0.0)
+    remaining_capacity_ah(estimator)
     load_forecast_kernels()
     _ = FrameDecoder().clock_ppm

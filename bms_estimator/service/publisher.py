@@ -41,7 +41,7 @@ from bms_estimator.telemetry.health import dropped_text, make_health_payload, ou
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window, WindowSummary
-from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.rest_detector import RestDetector
 from bms_estimator.telemetry.state import make_info_payload, make_state_payload
 from bms_estimator.telemetry.weakest_cell import WeakestCellValues, bank_fields
@@ -270,7 +270,6 @@ class Publisher:
         return self._cells.deviations if self._cells else None
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
-        remaining = remaining_charge(self._estimator, window.current_a)
         # only saved values, so that the next run continues from there
         self._flow = self._flow.at_least(self.saved_flow or self._totals.flow)
         capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
@@ -278,7 +277,7 @@ class Publisher:
         cell_fields = weakest_cell_fields(self._deviations) if self._deviations else {}
         return make_state_payload(
             window,
-            remaining,
+            remaining_capacity_ah(self._estimator),
             forecast,
             self._source.counters,
             wall_s,

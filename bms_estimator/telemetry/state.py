@@ -20,7 +20,6 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import forecast_fields
 from bms_estimator.telemetry.publish_window import WindowSummary
-from bms_estimator.telemetry.remaining_charge import RemainingCharge
 from bms_estimator.version import __version__
 
 NO_CELL_FIELDS: Mapping[str, Any] = MappingProxyType(
@@ -47,7 +46,7 @@ def finite(value: float) -> float | None:
 
 def make_state_payload(
     window: WindowSummary,
-    remaining: RemainingCharge,
+    remaining_capacity_ah: float,
     forecast: Forecast,
     counters: Mapping[str, int],
     now_s: float,
@@ -59,7 +58,7 @@ def make_state_payload(
 
     Args:
         window: Summary since the last publication.
-        remaining: Remaining charge and energy.
+        remaining_capacity_ah: Charge down to SOC 0 [Ah]; NaN if unknown.
         forecast: The last forecast.
         counters: Counters of the source.
         now_s: Wall clock [s since 1970].
@@ -82,8 +81,7 @@ def make_state_payload(
         **_cells(window.cells_v),
         **{name: last[name] for name in COPIED},
         soc_percent=None if soc is None else 100.0 * soc,
-        remaining_capacity_ah=finite(remaining.capacity_ah),
-        remaining_energy_wh=finite(remaining.energy_wh),
+        remaining_capacity_ah=finite(remaining_capacity_ah),
         **forecast_fields(forecast, float(window.last["time_s"])),
         **{**NO_CELL_FIELDS, **cell_fields},
         **flow._asdict(),

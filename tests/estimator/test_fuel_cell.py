@@ -14,7 +14,7 @@ from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from tests import mann_stack
 
 PEM = load_fuel_cell("pem_30w")
@@ -83,7 +83,7 @@ def test_values_that_a_stack_does_not_have_are_nan_in_the_trace_and_null_in_payl
         assert np.isnan(trace[name]).all(), name
     assert np.isfinite(trace["voltage_estimate_v"]).all()
     assert (trace["lock"] == 1).all()
-    assert all(math.isnan(value) for value in vars(remaining_charge(estimator, 3.0)).values())
+    assert math.isnan(remaining_capacity_ah(estimator))
     report = make_parameters_payload(estimator, 0.0)
     assert (report.soc, report.a, report.ocv, report.state_of_health) == (None, {}, None, {})
     assert tuple(report.elements) == KEYS

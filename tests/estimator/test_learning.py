@@ -13,7 +13,7 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import no_forecast
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.state import make_state_payload
 from tests.estimator.random_steps import (
     FIRST_SOC,
@@ -312,7 +312,7 @@ def test_the_learning_law_publishes_gamma_k_and_the_improved_law_publishes_n_of_
         summary = window.take()
         assert summary is not None
         states[law] = make_state_payload(
-            summary, remaining_charge(estimator, 0.0), no_forecast("none"), {}, 0.0, ChargeEnergy(), 3.0
+            summary, remaining_capacity_ah(estimator), no_forecast("none"), {}, 0.0, ChargeEnergy(), 3.0
         )
         k = float(estimator.state["k"][0])
         assert states[law].adaptive_gain_k == k

@@ -20,7 +20,7 @@ from bms_estimator.telemetry.health import make_health_payload
 from bms_estimator.telemetry.lifetime_totals import new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.state import make_info_payload, make_state_payload
 
 NOW = 1_700_000_000.0
@@ -89,7 +89,7 @@ def _make_snapshot(
     return Snapshot(
         make_state_payload(
             summary,
-            remaining_charge(estimator, 0.0),
+            remaining_capacity_ah(estimator),
             FORECAST if isinstance(cell, CellModel) else no_forecast("a fuel cell"),
             {"crc_errors": 3},
             NOW,

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.checkpoint.restore import restore_state
@@ -15,7 +14,7 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.telemetry.health import identifier_counters, suspicions
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from tests.estimator.anywhere.cases import Case, capture
 
 CELL = load_cell("chen_mora").model_copy(update={"adaptation": {}})
@@ -23,8 +22,6 @@ CELL = load_cell("chen_mora").model_copy(update={"adaptation": {}})
 CAPACITY_AH = CELL.cell.capacity_ah
 NOW_S = 1.7e9
 """Wall clock of the publications [s since 1970]."""
-C_5_A = 0.055
-"""Current of C/5 [A]."""
 
 
 def estimator_at(soc: float) -> Estimator:
@@ -46,20 +43,13 @@ def pulses(current_a: float, hours: float) -> np.ndarray:
     return block
 
 
-def test_remaining_charge_and_energy_under_a_load() -> None:
-    left = remaining_charge(estimator_at(0.5), C_5_A)
-    assert left.capacity_ah == pytest.approx(0.5 * CAPACITY_AH)
-    energy_wh = CAPACITY_AH * quad(chen_mora.emf, 0.0, 0.5, args=(CELL.a,))[0]
-    assert remaining_charge(estimator_at(0.5), 0.0).energy_wh == pytest.approx(energy_wh, rel=1e-4)
-    a = estimator_at(0.5).state[0]["a"]
-    total_ohm = chen_mora.r_s(0.5, a) + chen_mora.r_ts(0.5, a) + chen_mora.r_tl(0.5, a)
-    lost_wh = remaining_charge(estimator_at(0.5), 0.0).energy_wh - left.energy_wh
-    assert lost_wh == pytest.approx(C_5_A * total_ohm * 0.5 * CAPACITY_AH)
+def test_the_remaining_charge_is_that_to_soc_0() -> None:
+    assert remaining_capacity_ah(estimator_at(0.5)) == pytest.approx(0.5 * CAPACITY_AH)
 
 
 def test_no_values_are_published_before_the_first_sample() -> None:
     estimator = Estimator(CELL, initial_soc=0.5, identifier=None)
-    assert math.isnan(remaining_charge(estimator, 1.0).capacity_ah)
+    assert math.isnan(remaining_capacity_ah(estimator))
     assert make_parameters_payload(estimator, NOW_S).elements == {}
 
 

@@ -4,6 +4,7 @@ The estimator is shared because its creation takes longer than estimating the sa
 """
 
 import hashlib
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import pack_identity
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
@@ -36,6 +38,7 @@ class PackType:
         estimator: Estimator bound to the unpacked record of the partition.
         meter: Charge and energy meter bound to the unpacked record.
         capacity_ah: Rated capacity of a pack [Ah]; None for a fuel cell.
+        cutoff_v: Voltage at which the load of a pack is switched off [V]; NaN for a fuel cell.
     """
 
     settings: PackSettings
@@ -44,6 +47,7 @@ class PackType:
     estimator: Estimator
     meter: ChargeEnergyMeter
     capacity_ah: float | None
+    cutoff_v: float
 
 
 @dataclass(frozen=True)
@@ -117,6 +121,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
         estimator=estimator,
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
+        cutoff_v=load_cutoff_v(settings, cell) if isinstance(cell, CellModel) else math.nan,
     )
 
 

@@ -18,14 +18,15 @@ from bms_estimator.fleet.worker import cell_summary, hour_summary
 from bms_estimator.fleet.worker.density import MAX_TIMESTAMP_S
 from bms_estimator.fleet.worker.edge_clock import Arrival, clock_error_s
 from bms_estimator.fleet.worker.pack_state import CONFIG_DIGEST, LAST_STORE_NS, PACK_STATE, STATE_DIGEST, Fields
+from bms_estimator.forecast.capability import write_usable_charge
+from bms_estimator.forecast.forecast import Forecast, unknown_values
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
-from bms_estimator.telemetry.forecast import no_forecast
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.state import make_state_payload
 
 MAX_WALL_S = 2.0**34
@@ -33,8 +34,9 @@ MAX_WALL_S = 2.0**34
 MAX_PART_SAMPLES = 4096
 """Maximum number of samples that are estimated at a time. It limits the buffer of estimates of 200 bytes each, which
 exists for each type of pack in each partition."""
-NO_FORECAST = no_forecast("a fleet worker makes no forecasts")
-"""Forecast in the payloads of a worker."""
+NO_PEAK_A = 0.0
+"""Largest current for ``write_usable_charge`` [A]. A worker does not store the peaks of the load, so that the mean applies."""
+NO_FORECAST_REASON = "a fleet worker makes no forecasts"
 
 Publications = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
 """Payloads of the topics ``state`` and ``parameters``, and message ids and rows of finished hours."""
@@ -154,8 +156,11 @@ class BlockProcessor:
             return None
         # ``blocks`` does not count the present block yet
         counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
-        remaining = remaining_charge(pack_type.estimator, window.current_a)
-        return _json(make_state_payload(window, remaining, NO_FORECAST, counters, now_s, totals, pack_type.capacity_ah))
+        values = unknown_values()
+        write_usable_charge(values, pack_type.estimator, pack_type.cutoff_v, NO_PEAK_A)
+        forecast = Forecast(float(window.last["time_s"]), values, NO_FORECAST_REASON, None)
+        remaining_ah = remaining_capacity_ah(pack_type.estimator)
+        return _json(make_state_payload(window, remaining_ah, forecast, counters, now_s, totals, pack_type.capacity_ah))
 
     def _parameters_payload(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
         """Return the payload of topic ``parameters``. Its ages refer to the arrival time of the samples."""

@@ -73,7 +73,10 @@ class Estimate(Payload):
     remaining_energy_wh: Annotated[
         float | None,
         Quantity(Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", is_primary=True), packs="batteries"),
-    ] = Field(description="remaining energy at the terminals to SOC 0 at current_a [Wh]")
+    ] = Field(
+        description="remaining energy at the terminals to the cut-off voltage at the present load and temperature [Wh]; null with a "
+        "forecast_reason without the identifier and for a fuel cell"
+    )
     time_to_cutoff_s: float | None = Field(
         description="median time until the load is switched off at the cut-off voltage [s], under a load like the one seen; "
         "below 600 s use the quantiles and probabilities; null with a forecast_reason"

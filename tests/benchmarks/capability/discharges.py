@@ -1,4 +1,4 @@
-"""Usable capacity against the charge that was drawn until the cut-off voltage in real captures."""
+"""Usable capacity and remaining energy against charge and energy drawn until the cut-off voltage in real captures."""
 
 from pathlib import Path
 
@@ -46,14 +46,18 @@ capacity."""
 
 def discharge_table(folder: Path) -> Table:
     """Return the table of the captures."""
-    table = Table(title="usable capacity: median error, in % of the capacity")
-    for column in ("capture", "cut-off", "SOC there", "usable_capacity_ah", "median", "charge to SOC 0", "median"):
+    table = Table(title="usable capacity and remaining energy: median absolute and median error, in % of the capacity")
+    columns = "capture", "cut-off", "SOC there", "usable_capacity_ah", "median", "charge to SOC 0", "median"
+    for column in (*columns, "remaining_energy_wh", "median"):
         table.add_column(column, justify="left" if column == "capture" else "right")
     for capture in CAPTURES:
         samples = capture.samples
         cutoff_v = cutoff_voltage(samples)
         rows = moments(capture, samples, cutoff_v, folder)
-        errors = 100.0 * (rows[:, 1:3] - rows[:, :1]) / capture.capacity_ah
+        rated_wh = capture.capacity_ah * float(np.median(samples["voltage_v"]))
+        errors = 100.0 * np.column_stack(
+            [(rows[:, 1:3] - rows[:, :1]) / capture.capacity_ah, (rows[:, 5] - rows[:, 4]) / rated_wh]
+        )
         cells = [text for error in errors.T for text in (f"{np.median(np.abs(error)):.1f}", f"{np.median(error):+.1f}")]
         table.add_row(capture.name, f"{cutoff_v:.2f} V", f"{rows[-1, 3]:.2f}", *cells)
     return table
@@ -67,8 +71,10 @@ def cutoff_voltage(samples: SampleBlock) -> float:
 
 
 def moments(capture: Capture, samples: SampleBlock, cutoff_v: float, folder: Path) -> Floats:
-    """Return a row for each moment: charge until the cut-off, usable capacity, charge to SOC 0 [Ah], and SOC."""
+    """Return a row for each moment: charge until the cut-off, usable capacity, charge to SOC 0 [Ah], SOC, and energy until the
+    cut-off, true and computed [Wh]."""
     drawn_ah, capacity_ah = charge_ah(samples), capture.capacity_ah
+    drawn_wh = np.append(0.0, np.cumsum(np.diff(drawn_ah) * samples["voltage_v"][:-1]))
     end = int(np.argmax((samples["voltage_v"] <= cutoff_v) & (samples["current_a"] > 0.0)))
     moments_ah = np.arange(FIRST, drawn_ah[end] / capacity_ah - LAST, STEP) * capacity_ah
     estimator, rows, position = capture.estimator(folder), [], 0
@@ -87,6 +93,8 @@ def moments(capture: Capture, samples: SampleBlock, cutoff_v: float, folder: Pat
                 values["usable_capacity_ah"][0],
                 estimator.soc * estimator.cell.cell.capacity_ah,
                 estimator.soc,
+                drawn_wh[end] - drawn_wh[moment],
+                values["remaining_energy_wh"][0],
             )
         )
     return np.array(rows)

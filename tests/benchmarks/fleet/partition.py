@@ -9,13 +9,14 @@ import numpy as np
 from bms_estimator.edge.block import Block, decode, encode
 from bms_estimator.fleet.worker import hour_summary
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.forecast.capability import write_usable_charge
+from bms_estimator.forecast.forecast import Forecast, unknown_values
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.forecast import no_forecast
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_charge import remaining_charge
+from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.state import make_state_payload
 from tests.benchmarks.load import CELL, pulses
 from tests.benchmarks.table import Row
@@ -95,10 +96,12 @@ def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) ->
         window.add(trace, wall_s)
         summary = window.take()
         assert summary is not None
-        remaining = remaining_charge(estimator, summary.current_a)
+        values = unknown_values()
+        write_usable_charge(values, estimator, pack_type.cutoff_v, 0.0)
+        forecast = Forecast(0.0, values, "none", None)
         return (
             make_state_payload(
-                summary, remaining, no_forecast("none"), {}, wall_s, pack_type.meter.update_totals(), 3.0
+                summary, remaining_capacity_ah(estimator), forecast, {}, wall_s, pack_type.meter.update_totals(), 3.0
             )
             .model_dump_json()
             .encode()
