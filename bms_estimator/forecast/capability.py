@@ -116,18 +116,19 @@ def write_usable_charge(values: ForecastRows, estimator: Estimator, cutoff_v: fl
     state, settings = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
     if not state["started"]:
         return
-    pack, draw = projected_pack(estimator, cutoff_v), np.zeros(1, DRAW)
+    pack, draw = projected_pack(estimator, cutoff_v, largest_a), np.zeros(1, DRAW)
     charge_as, energy_ws = discharge_to_cutoff(pack[0], state, settings, largest_a, draw[0])
     values["usable_capacity_ah"], values["remaining_energy_wh"] = charge_as / 3600.0, energy_ws / 3600.0
 
 
-def projected_pack(estimator: Estimator, cutoff_v: float) -> Records:
+def projected_pack(estimator: Estimator, cutoff_v: float, largest_a: float) -> Records:
     """Return the present state of the pack, shape (1,), dtype ``PROJECTED_PACK``.
 
     Args:
         estimator: Estimator of the pack with a started identifier; read only.
         cutoff_v: Terminal voltage at which the load is switched off [V].
+        largest_a: Largest current of the expected load [A].
     """
     pack = np.zeros(1, PROJECTED_PACK)
-    project_pack(pack[0], estimator.record[0]["filter"], estimator.settings_record[0]["filter"], cutoff_v)
+    project_pack(pack[0], estimator.record[0]["filter"], estimator.settings_record[0]["filter"], cutoff_v, largest_a)
     return pack

@@ -126,13 +126,13 @@ class Forecaster:
             load: Expected load; None: a load like the observed one.
         """
         values, time_s = unknown_values(), float(self.estimator.state["time_s"][0])
-        write_capability(values, self.estimator, self.cutoff_v, self._limits, float(self.load.max_a.max(initial=0.0)))
+        write_capability(values, self.estimator, self.cutoff_v, self._limits, self._largest_a)
         reason = self._missing_state()
         if reason is None and load is None:
             reason = self._missing_load()
         if reason is not None:
             return Forecast(time_s, values, reason, None)
-        pack = self._pack()
+        pack = self._pack(load)
         projection = self._project(pack, load)
         if projection is None:
             return Forecast(time_s, values, "the load does not discharge the pack on average", None)
@@ -143,7 +143,7 @@ class Forecaster:
 
     def trip_curve(self, load: GivenLoad) -> ForecastCurve | None:
         """Return the curves from the present state until the end of a given load; None without a state."""
-        return None if self._missing_state() else project_trip(self._pack(), load, self._seed())
+        return None if self._missing_state() else project_trip(self._pack(load), load, self._seed())
 
     def _first_due(self, time_s: np.ndarray) -> int | None:
         """Return the index of the first sample at which a forecast is due; None without such a sample.
@@ -175,9 +175,15 @@ class Forecaster:
             return f"less than {MIN_LOAD_S} s of load have been seen since the last charge"
         return None
 
-    def _pack(self) -> Records:
-        """Return the present state of the pack, shape (1,), dtype ``PROJECTED_PACK``."""
-        return projected_pack(self.estimator, self.cutoff_v)
+    @property
+    def _largest_a(self) -> float:
+        """Largest current of the observed load [A], at least 0."""
+        return float(self.load.max_a.max(initial=0.0))
+
+    def _pack(self, load: GivenLoad | None) -> Records:
+        """Return the present state of the pack under the given or the observed load, shape (1,), dtype ``PROJECTED_PACK``."""
+        largest_a = self._largest_a if load is None else load.largest_current_a(self.cutoff_v)
+        return projected_pack(self.estimator, self.cutoff_v, largest_a)
 
     def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:
         """Run the pack forward. Return None if the load does not discharge it."""

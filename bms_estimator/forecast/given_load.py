@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from bms_estimator.model.arrays import Floats
 
 
@@ -20,3 +22,8 @@ class GivenLoad:
     duration_s: Floats
     current_a: Floats
     power_w: Floats
+
+    def largest_current_a(self, voltage_v: float) -> float:
+        """Return the largest current [A], at least 0. A power draws its current at ``voltage_v``."""
+        current_a = np.where(np.isnan(self.current_a), self.power_w / voltage_v, self.current_a)
+        return float(current_a.max(initial=0.0))

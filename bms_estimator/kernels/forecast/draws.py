@@ -13,9 +13,6 @@ from bms_estimator.kernels.forecast.random_numbers import generator_of_draw, nor
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 
-GROWTH_SOC = 0.4
-"""SOC below which the resistances increase."""
-
 DRAW = np.dtype(
     [
         ("begin_soc", "f8"),  # SOC of the weakest cell at the beginning
@@ -61,7 +58,7 @@ def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
     generator, resistance_stds = normal(generator)
     generator, weakest_stds = normal(generator)
     weakest = m.weakest_std * max(weakest_stds, 0.0)  # the weakest cell is never better than the mean
-    d.begin_soc = m.soc - m.early_soc + m.soc_std * soc_stds
+    d.begin_soc = m.soc - m.surface_soc + m.soc_std * soc_stds
     d.begin_soc -= weakest * max(1.0 - d.begin_soc, 0.0)
     d.capacity_as = m.capacity_as * math.exp(m.capacity_std * capacity_stds) / (1.0 + weakest)
     d.load = math.exp(m.load_std * load_stds)
@@ -71,21 +68,6 @@ def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
 
 
 @njit(cache=True)
-def growth_fraction(soc: float) -> float:
-    """Return the fraction of the growth that applies at ``soc``: 0 above ``GROWTH_SOC``, 1 at SOC 0, linear in between."""
-    return min(max(1.0 - soc / GROWTH_SOC, 0.0), 1.0)
-
-
-@njit(cache=True)
-def drop_factor(d: Record, m: Record, soc: float) -> float:
-    """Return the factor on the model's voltage drop at ``soc``.
-
-    The filter's resistances already contain the growth down to the present SOC, so that only the rest is added.
-    """
-    return d.resistance + m.growth * max(growth_fraction(soc) - growth_fraction(m.soc), 0.0)
-
-
-@njit(cache=True)
 def loaded_voltage(d: Record, m: Record, soc: float, drop_v: float) -> float:
     """Return the terminal voltage at ``soc`` for the model's voltage drop ``drop_v`` [V]."""
-    return voltage_without_load(m, soc) + m.bias_v + d.voltage_v - drop_factor(d, m, soc) * drop_v
+    return voltage_without_load(m, soc) + m.bias_v + d.voltage_v - d.resistance * drop_v

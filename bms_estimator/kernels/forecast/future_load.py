@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
-from bms_estimator.kernels.forecast.draws import drop_factor
 from bms_estimator.kernels.forecast.projected_pack import grid_position, voltage_without_load
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
@@ -68,7 +67,7 @@ def follow_draw(
     while elapsed_s < horizon_s:
         part = parts[at]
         i, t = grid_position(soc)
-        factor = drop_factor(d, m, soc)
+        factor = d.resistance
         settled_ohm = m.ohm[0, i] + t * (m.ohm[0, i + 1] - m.ohm[0, i])
         source_v = voltage_without_load(m, soc) + m.bias_v + d.voltage_v
         for k in range(BRANCHES):

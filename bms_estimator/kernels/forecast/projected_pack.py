@@ -42,19 +42,26 @@ RESISTANCE_MEAN = 1.05
 """Mean factor on the voltage drop of the present model."""
 RESISTANCE_STD = 0.05
 """Std of the factor on the voltage drop."""
+GROWTH_SOC = 0.4
+"""SOC below which the fast resistances R_0 and R_1 grow beyond those of the cell file."""
 GROWTH = 0.75
-"""Relative growth of the voltage drop towards SOC 0, beyond that of the cell file, at 25 C. Cell files are measured with rests,
-in which concentrations recover. The growth increases with the Arrhenius factor of ``WEAK_J`` in the cold."""
-EARLY_SOC = 0.005
-"""SOC of the OCV curve at which a loaded cell is empty, at 25 C. It increases in the cold as ``GROWTH`` does."""
-EARLY_PLATEAU_SOC = 0.015
-"""Substitute for ``EARLY_SOC`` in cells whose OCV has a plateau, at all temperatures. Their knee near empty is steep, so that the
-error of its SOC decides. Drives of an LFP cell at 25, 5 and -15 C reached the cut-off at SOC 0.01 to 0.03."""
+"""Relative growth of the fast resistances from ``GROWTH_SOC`` to SOC 0, beyond that of the cell file, at 25 C. Few captures for cell
+files contain large currents near empty. The growth increases with the Arrhenius factor of ``WEAK_J`` in the cold. Without growth, or
+with growth of all resistances, the forecasts of real captures are worse (docs/theory/forecast.md)."""
+FAST_RESISTANCES = 2
+"""Number of fast resistances: R_0 and R_1. They decide the voltage at the peaks of a load, at which discharges end."""
+SURFACE_S = 15.0
+"""Charge by which the surface of the particles is emptier than their mean, per ampere of the peak current [A s / A], at 25 C.
+Diffusion in the particles needs this gradient. The voltage is that of the surface, so that the knee near empty comes earlier under
+large currents. The gradient increases with the Arrhenius factor of ``WEAK_J`` in the cold."""
 
 PROJECTED_PACK = np.dtype(
     [
         ("soc", "f8"),  # SOC by the filter
-        ("early_soc", "f8"),  # SOC at which the loaded pack is empty
+        (
+            "surface_soc",
+            "f8",
+        ),  # SOC by which the surface of the particles is emptier than their mean at the peaks of the load
         ("capacity_as", "f8"),  # capacity by the filter [A s]
         ("offset_a", "f8"),  # measured minus true current [A]
         ("x_a", "f8", BRANCHES),  # filtered currents of the RC pairs [A]
@@ -67,7 +74,6 @@ PROJECTED_PACK = np.dtype(
         ("load_std", "f8"),  # std of ln (future load / drawn load)
         ("resistance_mean", "f8"),  # mean factor on the voltage drop
         ("resistance_std", "f8"),
-        ("growth", "f8"),  # relative growth of the voltage drop towards empty
         ("voltage_v", "f8", OCV_POINTS),  # voltage without load over SOC 0..1, after a discharge to that SOC [V]
         ("end_slope_v", "f8"),  # slope with which the voltage continues below SOC 0 [V]
         ("ohm", "f8", (RESISTANCES, GRID)),  # resistances over SOC 0..1 [ohm]
@@ -78,8 +84,16 @@ PROJECTED_PACK = np.dtype(
 
 
 @njit(cache=True)
-def project_pack(m: Record, s: Record, p: Record, cutoff_v: float) -> None:
-    """Write the pack to ``m``, by the likeliest hypothesis of the filter."""
+def project_pack(m: Record, s: Record, p: Record, cutoff_v: float, peak_a: float) -> None:
+    """Write the pack to ``m``, by the likeliest hypothesis of the filter.
+
+    Args:
+        m: Record of PROJECTED_PACK; written.
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        cutoff_v: Terminal voltage at which the load is switched off [V].
+        peak_a: Largest current of the expected load [A]; below the mean current of ten minutes: this mean applies.
+    """
     x, cov = s.mean[s.best], s.covariance[s.best]
     m.soc, m.cutoff_v, m.offset_a = x[SOC], cutoff_v, x[OFFSET]
     m.capacity_as = p.capacity_as * math.exp(x[LN_Q])
@@ -91,9 +105,7 @@ def project_pack(m: Record, s: Record, p: Record, cutoff_v: float) -> None:
     m.capacity_std = CAPACITY_STD_FACTOR * math.sqrt(cov[LN_Q, LN_Q])
     m.voltage_std_v = VOLTAGE_STD_V * p.series * math.sqrt(arrhenius(VOLTAGE_STD_J, s.temperature_c))
     m.load_std, m.resistance_mean, m.resistance_std = LOAD_STD, RESISTANCE_MEAN, RESISTANCE_STD
-    cold = max(s.weak, 1.0)
-    m.growth = GROWTH * cold
-    m.early_soc = EARLY_SOC * cold if p.learned > 0.0 else EARLY_PLATEAU_SOC  # the curve of a plateau is not learned
+    m.surface_soc = SURFACE_S * max(s.weak, 1.0) * max(peak_a, s.mean_a, 0.0) / m.capacity_as
     project_voltage(m, s, p)
     project_resistances(m, s, p)
 
@@ -118,12 +130,29 @@ def project_voltage(m: Record, s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def project_resistances(m: Record, s: Record, p: Record) -> None:
-    """Write the resistances over the SOC, with the filter's factors."""
+    """Write the resistances over the SOC, with the filter's factors and the growth towards empty."""
     x = s.mean[s.best]
     for k in range(RESISTANCES):
         factor = math.exp(x[LN_R0 if k == 0 else LN_R])
         for n in range(GRID):
             m.ohm[k, n] = factor * (s.weak * p.weak_ohm[n, k] + s.strong * p.strong_ohm[n, k])
+            if k < FAST_RESISTANCES:
+                m.ohm[k, n] *= growth_factor(s, m.soc, n / (GRID - 1))
+
+
+@njit(cache=True)
+def growth_factor(s: Record, from_soc: float, to_soc: float) -> float:
+    """Return the factor by which the fast resistances grow beyond those of the cell file from one SOC to another, at least 1.
+
+    The filter's factors on the resistances already contain the growth down to the present SOC.
+    """
+    return 1.0 + GROWTH * max(s.weak, 1.0) * max(growth_fraction(to_soc) - growth_fraction(from_soc), 0.0)
+
+
+@njit(cache=True)
+def growth_fraction(soc: float) -> float:
+    """Return the fraction of the growth that applies at ``soc``: 0 above ``GROWTH_SOC``, 1 at SOC 0, linear in between."""
+    return min(max(1.0 - soc / GROWTH_SOC, 0.0), 1.0)
 
 
 @njit(cache=True)

@@ -9,6 +9,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.projection import Projection, project_seen_load
+from bms_estimator.kernels.cell_model.rc_ladder import GRID
+from bms_estimator.kernels.forecast.projected_pack import FAST_RESISTANCES, growth_factor
 from bms_estimator.model.arrays import Floats, Records
 from bms_estimator.model.cell import CellModel
 from tests.benchmarks.forecast.baselines import quantiles_of
@@ -56,6 +58,8 @@ class Part:
     name: str
     pack: Mapping[str, float] = field(default_factory=dict)
     """Fields of PROJECTED_PACK with the values that disable the part."""
+    grows: bool = True
+    """False: the fast resistances do not grow towards empty."""
     load: Callable[[SeenLoad], SeenLoad] = unchanged
     """Function that changes the load that was seen."""
 
@@ -68,8 +72,8 @@ PARTS = (
     Part("load before the last 1,800 s", load=last_seconds(1800)),
     Part("order of the load beyond 10 s", load=shuffled),
     Part("peaks within a second", load=without_peaks),
-    Part("growth of R towards empty", {"growth": 0.0}),
-    Part("SOC at which a loaded cell is empty", {"early_soc": 0.0}),
+    Part("growth of R towards empty", grows=False),
+    Part("SOC gradient in the particles", {"surface_soc": 0.0}),
     *(Part(f"spread: {name}", {name: 0.0}) for name in STDS),
     Part("all spreads but the load's order", dict.fromkeys(STDS, 0.0)),
 )
@@ -85,10 +89,13 @@ class PartForecaster(Forecaster):
 
     part = PARTS[0]
 
-    def _pack(self) -> Records:
-        pack = super()._pack()
+    def _pack(self, load: GivenLoad | None) -> Records:
+        pack, state = super()._pack(load), self.estimator.record[0]["filter"]
         for name, value in self.part.pack.items():
             pack[name] = value
+        if not self.part.grows:
+            nodes = np.linspace(0.0, 1.0, GRID)
+            pack["ohm"][0, :FAST_RESISTANCES] /= [growth_factor(state, pack["soc"][0], soc) for soc in nodes]
         return pack
 
     def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:

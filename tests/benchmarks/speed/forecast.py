@@ -37,7 +37,9 @@ def rows() -> Iterator[Row]:
         np.zeros(MAX_LOAD_S // BLOCK_S, LOAD_BLOCK),
         np.zeros(DRAWS, DRAW),
     )
-    project_pack(pack[0], estimator.record[0]["filter"], estimator.settings_record[0]["filter"], NO_CUTOFF_V)
+    project_pack(
+        pack[0], estimator.record[0]["filter"], estimator.settings_record[0]["filter"], NO_CUTOFF_V, float(max_a.max())
+    )
     draw_packs(pack[0], np.uint64(1), draws)
     table_ms = shortest_ms(lambda: tabulate_blocks(pack[0], mean_a, max_a, BLOCK_S, blocks))
     steps = HOUR_S // BLOCK_S
