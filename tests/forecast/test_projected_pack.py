@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.forecast.capability import projected_pack
+from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.forecast.projected_pack import FAST_RESISTANCES, GROWTH, SURFACE_S
 from bms_estimator.model.sample import SAMPLE
 from tests.estimator.simulated_cell import TRUTH
@@ -15,7 +17,7 @@ def pack_at(soc: float, *, temperature_c: float = 25.0, largest_a: float = 0.0) 
     """Return the projected pack and the settings of the filter, after one sample at rest."""
     estimator = Estimator(TRUTH, initial_soc=soc)
     block = np.zeros(1, SAMPLE)
-    block["voltage_v"], block["temperature_c"] = 3.7, temperature_c
+    block["voltage_v"], block["temperature_c"] = chen_mora.ocv(soc, *ocv_grid(TRUTH)), temperature_c
     estimator.run(block)
     return projected_pack(estimator, CUTOFF_V, largest_a)[0], estimator.settings_record[0]["filter"]
 
