@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.forecast.forecast import ForecastRows
+from bms_estimator.forecast.limiting_cells import full_cells, weak_cells
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
 from bms_estimator.kernels.forecast.draws import DRAW
@@ -71,9 +73,16 @@ def power_limits(settings: Settings, cell: CellModel) -> PowerLimits:
 
 
 def write_capability(
-    values: ForecastRows, estimator: Estimator, cutoff_v: float, limits: PowerLimits, largest_a: float
+    values: ForecastRows,
+    estimator: Estimator,
+    cutoff_v: float,
+    limits: PowerLimits,
+    largest_a: float,
+    cells: CellDeviations | None = None,
 ) -> None:
     """Write available power, usable capacity, remaining energy and time to full to ``values``.
+
+    With ``cells``, the cell that reaches its share of the voltage limit first limits power and capacity.
 
     The values stay unchanged before the first sample, without the identifier and for a fuel cell.
 
@@ -83,6 +92,7 @@ def write_capability(
         cutoff_v: Terminal voltage at which the load is switched off [V].
         limits: Limits of current and temperature.
         largest_a: Largest current of the load since the last long charge [A].
+        cells: Deviations of the single cells; None: unknown.
     """
     state, settings = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
     if not state["started"]:
@@ -91,12 +101,14 @@ def write_capability(
     full_v, tail_a = float(anchors["charger_v"]), float(anchors["tail_a"])
     charge_a = limits.charge_a if state["temperature_c"] >= limits.charge_min_c else 0.0
     scratch = new_scratch()
+    states_by_name = {"discharge": [state, *weak_cells(state, cells)], "charge": [state, *full_cells(state, cells)]}
     for duration_s in DURATIONS_S:
         for name, limit_v, max_a in (("discharge", cutoff_v, limits.discharge_a), ("charge", full_v, -charge_a)):
-            values[f"available_{name}_power_{duration_s:.0f}s_w"] = available_power(
-                state, settings, duration_s, limit_v, max_a, QUANTILE_STDS, scratch
+            values[f"available_{name}_power_{duration_s:.0f}s_w"] = min(
+                available_power(each, settings, duration_s, limit_v, max_a, QUANTILE_STDS, scratch)
+                for each in states_by_name[name]
             )
-    write_usable_charge(values, estimator, cutoff_v, largest_a)
+    write_usable_charge(values, estimator, cutoff_v, largest_a, cells)
     present_a = charge_current(state, settings)
     if present_a < 0.0:
         values["time_to_full_s"] = time_to_full(
@@ -104,7 +116,9 @@ def write_capability(
         )
 
 
-def write_usable_charge(values: ForecastRows, estimator: Estimator, cutoff_v: float, largest_a: float) -> None:
+def write_usable_charge(
+    values: ForecastRows, estimator: Estimator, cutoff_v: float, largest_a: float, cells: CellDeviations | None = None
+) -> None:
     """Write usable capacity and remaining energy to ``values``. They stay unchanged as in ``write_capability``.
 
     Args:
@@ -112,13 +126,31 @@ def write_usable_charge(values: ForecastRows, estimator: Estimator, cutoff_v: fl
         estimator: Estimator of the pack; read only.
         cutoff_v: Terminal voltage at which the load is switched off [V].
         largest_a: Largest current of the load [A]; below the mean current of ten minutes: this mean applies.
+        cells: Deviations of the single cells; None: unknown.
     """
-    state, settings = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
+    state = estimator.record[0]["filter"]
     if not state["started"]:
         return
-    pack, draw = projected_pack(estimator, cutoff_v, largest_a), np.zeros(1, DRAW)
-    charge_as, energy_ws = discharge_to_cutoff(pack[0], state, settings, largest_a, draw[0])
-    values["usable_capacity_ah"], values["remaining_energy_wh"] = charge_as / 3600.0, energy_ws / 3600.0
+    charge_as, energy_ws = usable_charge(state, estimator, cutoff_v, largest_a)
+    to_weakest_as = min(
+        [charge_as, *(usable_charge(s, estimator, cutoff_v, largest_a)[0] for s in weak_cells(state, cells))]
+    )
+    values["usable_capacity_ah"] = to_weakest_as / 3600.0
+    values["remaining_energy_wh"] = energy_ws / 3600.0 * (to_weakest_as / charge_as if charge_as > 0.0 else 1.0)
+
+
+def usable_charge(state: np.void, estimator: Estimator, cutoff_v: float, largest_a: float) -> tuple[float, float]:
+    """Return charge [A s] and energy at the terminals [W s] from a state of the filter to the cut-off.
+
+    Args:
+        state: Record of EKF_STATE: that of the pack, or of one with cells like a single cell.
+        estimator: Estimator of the pack; read only.
+        cutoff_v: Terminal voltage at which the load is switched off [V].
+        largest_a: Largest current of the load [A].
+    """
+    settings, pack, draw = estimator.settings_record[0]["filter"], np.zeros(1, PROJECTED_PACK), np.zeros(1, DRAW)
+    project_pack(pack[0], state, settings, cutoff_v, largest_a)
+    return discharge_to_cutoff(pack[0], state, settings, largest_a, draw[0])
 
 
 def projected_pack(estimator: Estimator, cutoff_v: float, largest_a: float) -> Records:

@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.capability import PowerLimits, cell_power_limits, projected_pack, write_capability
 from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastCurve, ForecastRows, unknown_values
@@ -23,7 +24,7 @@ from bms_estimator.forecast.projection import (
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Records
 from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 
 MIN_INTERVAL_S = 10.0
 """Minimum interval between two forecasts, on the clock of the samples [s]. It limits the CPU time near the cut-off."""
@@ -49,6 +50,17 @@ class Runner(Protocol):
         """Process a block of samples. Return one row for each accepted sample."""
 
 
+class CellRunner(Protocol):
+    """Estimators of the single cells."""
+
+    @property
+    def deviations(self) -> CellDeviations | None:
+        """Deviations of the cells at the end of the last window; None before the first window with cell voltages."""
+
+    def run(self, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
+        """Process a block of samples and their cell voltages."""
+
+
 class Forecaster:
     """Runs the estimator on blocks of samples, and makes a forecast at intervals.
 
@@ -60,6 +72,7 @@ class Forecaster:
         runner: The estimator, or the slow fit that runs it.
         cutoff_v: Terminal voltage at which the load is switched off [V].
         limits: Limits of the available power; None: those of the cell file.
+        cells: Estimators of the single cells, which ``run`` also runs; None: no cell voltages.
 
     Attributes:
         load: Load observed since the last long charge.
@@ -68,7 +81,13 @@ class Forecaster:
     """
 
     def __init__(
-        self, estimator: Estimator, runner: Runner, *, cutoff_v: float, limits: PowerLimits | None = None
+        self,
+        estimator: Estimator,
+        runner: Runner,
+        *,
+        cutoff_v: float,
+        limits: PowerLimits | None = None,
+        cells: CellRunner | None = None,
     ) -> None:
         self.estimator, self.cutoff_v = estimator, cutoff_v
         self._limits = limits or cell_power_limits(estimator.cell)
@@ -76,11 +95,16 @@ class Forecaster:
         self.load = LoadHistory(float(filter_settings["capacity_as"]), float(filter_settings["unmeasured_s"]))
         self.past = PastMinutes()
         self.latest = Forecast(math.nan, unknown_values(), "no sample has been processed yet", None)
-        self._runner, self._due_s = runner, -math.inf
+        self._runner, self._cells, self._due_s = runner, cells, -math.inf
+        self._has_cell_voltages, self._deviations = False, cells.deviations if cells else None
         self._rows: list[tuple[ForecastRows, int]] = []
 
-    def run(self, block: SampleBlock) -> TraceBlock:
+    def run(self, block: SampleBlock, cells_v: CellBlock = NO_CELLS) -> TraceBlock:
         """Process a block of samples.
+
+        Args:
+            block: Samples, shape (n,).
+            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
 
         Returns:
             One row of dtype ``TRACE`` for each accepted sample. The array is valid until the next call.
@@ -90,6 +114,7 @@ class Forecaster:
             due = self._first_due(block["time_s"][start:])
             end = block.size if due is None else start + due + 1
             trace = self._runner.run(block[start:end])
+            self._run_cells(block[start:end], cells_v[start:end], trace)
             self.load.add(trace)
             if start > 0 or end < block.size:
                 trace = trace.copy()
@@ -106,12 +131,21 @@ class Forecaster:
             return traces[0]
         return np.concatenate(traces) if traces else np.zeros(0, TRACE)
 
-    def run_without_forecast(self, block: SampleBlock) -> TraceBlock:
+    def run_without_forecast(self, block: SampleBlock, cells_v: CellBlock = NO_CELLS) -> TraceBlock:
         """Process a block of samples and store their load, without the forecasts that ``run`` makes."""
         trace = self._runner.run(block)
+        self._run_cells(block, cells_v, trace)
         self.load.add(trace)
         self.past.add(self.load)
         return trace
+
+    def _run_cells(self, block: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
+        if self._cells is None:
+            return
+        self._has_cell_voltages |= cells_v.size > 0
+        if self._has_cell_voltages:  # the call alone would take a tenth of the time of a block of one sample
+            self._cells.run(block, cells_v, trace)
+            self._deviations = self._cells.deviations
 
     @property
     def rows(self) -> ForecastRows:
@@ -126,7 +160,7 @@ class Forecaster:
             load: Expected load; None: a load like the observed one.
         """
         values, time_s = unknown_values(), float(self.estimator.state["time_s"][0])
-        write_capability(values, self.estimator, self.cutoff_v, self._limits, self._largest_a)
+        write_capability(values, self.estimator, self.cutoff_v, self._limits, self._largest_a, self._deviations)
         reason = self._missing_state()
         if reason is None and load is None:
             reason = self._missing_load()

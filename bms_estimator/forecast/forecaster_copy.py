@@ -12,9 +12,7 @@ def copy_forecaster(forecaster: Forecaster) -> Forecaster:
     estimator.settings = estimator.settings_record["observer"]
     other = copy(forecaster)
     other.estimator = estimator
-    other.load, other.past = (
-        copy(forecaster.load),
-        copy(forecaster.past),
-    )  # the arrays of ``past`` are never changed in place
+    other.load = copy(forecaster.load)
+    other.past = copy(forecaster.past)  # its arrays are never changed in place
     other.load.record = forecaster.load.record.copy()
     return other

@@ -15,7 +15,7 @@ from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
-from bms_estimator.forecast.forecaster import Runner
+from bms_estimator.forecast.forecaster import Forecaster, Runner
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads.health import RecordingHealth
@@ -101,7 +101,7 @@ async def run_estimation_loop(
     pack_model = new_slow_fit(settings, estimator, submit=fit_thread.submit, on_failure=fit_thread.log_failure)
     counters, outcome = restore_pack(estimator, pack_model, checkpoint, history, clock, cells)
     restored_s = since_boot()
-    forecaster = new_forecaster(settings, cell, estimator, pack_model)
+    forecaster = new_forecaster(settings, cell, estimator, pack_model, cells)
     seen_load = SeenLoad(forecaster, load_file) if forecaster and load_file else None
     if seen_load:
         _restore_load(seen_load)
@@ -158,8 +158,8 @@ async def run_estimation_loop(
             _estimate(
                 source,
                 estimator,
-                forecaster or pack_model or estimator,
-                cells,
+                forecaster,
+                pack_model or estimator,
                 totals,
                 publisher,
                 edge,
@@ -187,8 +187,8 @@ async def run_estimation_loop(
 async def _estimate(
     source: Source,
     estimator: Estimator,
+    forecaster: Forecaster | None,
     runner: Runner,
-    cells: CellEstimator,
     totals: LifetimeTotals,
     publisher: Publisher,
     edge: BlockSender | None,
@@ -199,8 +199,8 @@ async def _estimate(
     Args:
         source: Supplies the blocks.
         estimator: Estimator.
-        runner: The estimator, or the forecaster or slow fit that runs it.
-        cells: Estimators of the single cells.
+        forecaster: Forecaster, which also runs the estimators of the single cells; None: there are no forecasts.
+        runner: Runs the estimator without a forecaster.
         totals: Totals over restarts.
         publisher: Publisher.
         edge: Sender that receives all samples; None: no sender.
@@ -213,9 +213,7 @@ async def _estimate(
             estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s
         if edge:
             edge.take(received.samples, received.cells_v)
-        trace = runner.run(received.samples)
-        if received.cells_v.size:  # the call alone would take a tenth of the time of a block of one sample
-            cells.run(received.samples, received.cells_v, trace)
+        trace = forecaster.run(received.samples, received.cells_v) if forecaster else runner.run(received.samples)
         totals.add(trace)
         publisher.add(received, trace)
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks

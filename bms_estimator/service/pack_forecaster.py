@@ -5,7 +5,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.forecast.capability import power_limits
-from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.forecast.forecaster import CellRunner, Forecaster
 from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.fuel_cell import PackModel
@@ -19,7 +19,11 @@ WARM_UP_S = 330
 
 
 def new_forecaster(
-    settings: Settings, cell: PackModel, estimator: Estimator, pack_model: SlowFit | None
+    settings: Settings,
+    cell: PackModel,
+    estimator: Estimator,
+    pack_model: SlowFit | None,
+    cells: CellRunner | None = None,
 ) -> Forecaster | None:
     """Return the forecaster of a new estimator; None for a fuel cell, and without the identifier.
 
@@ -28,6 +32,7 @@ def new_forecaster(
         cell: Model of the whole pack.
         estimator: New estimator of the pack.
         pack_model: Slow fit of the estimator; None without one.
+        cells: Estimators of the single cells, which the forecaster runs; None: no cell voltages.
 
     Raises:
         UserError: The cut-off voltage is not below the voltage of the full pack.
@@ -39,6 +44,7 @@ def new_forecaster(
         pack_model or estimator,
         cutoff_v=load_cutoff_v(settings, cell),
         limits=power_limits(settings, cell),
+        cells=cells,
     )
 
 

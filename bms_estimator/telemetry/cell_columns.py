@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.arrays import Records
 from bms_estimator.model.sample import CellBlock, SampleBlock
@@ -30,30 +30,45 @@ class CellColumns:
 
     Args:
         cells: The estimators.
-
-    Attributes:
-        rows: Values at each row of the last block, dtype ``CELL_COLUMNS``, as the only item; empty if the first block had no
-            cell voltages.
     """
 
     def __init__(self, cells: CellEstimator) -> None:
         self._cells = cells
-        self._measured: bool | None = None  # None before the first block
-        self.rows = tuple[Records, ...]()
+        self._parts: list[Records] = []
+        self._has_columns: bool | None = None  # None before the first rows
+
+    @property
+    def deviations(self) -> CellDeviations | None:
+        """Deviations of the cells at the end of the last window; None before the first window with cell voltages."""
+        return self._cells.deviations
 
     def run(self, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
         """Process a block like ``CellEstimator.run``, in parts of ``INTERVAL_S``."""
-        if self._measured is None:
-            self._measured = cells_v.size > 0
-        if not self._measured:
-            return
         columns, accepted = np.empty(trace.size, CELL_COLUMNS), _accepted_indices(samples, trace)
         edges = [0, *(np.flatnonzero(np.diff(trace["time_s"] // INTERVAL_S)) + 1).tolist(), trace.size]
         for first, last in itertools.pairwise(edges):
             part = accepted[first:last]
             self._cells.run(samples[part], cells_v[part] if cells_v.size else cells_v, trace[first:last])
             columns[first:last] = _values(self._cells)
-        self.rows = (columns,)
+        self._parts.append(columns)
+
+    def take_rows(self, count: int) -> tuple[Records, ...]:
+        """Return the values at each row processed since the last call, and forget them.
+
+        Args:
+            count: Number of rows. Rows before the first block with cell voltages have no values.
+
+        Returns:
+            An array of dtype ``CELL_COLUMNS``, shape (count,), as the only item; empty if the first rows had no cell voltages,
+            because a table has the same columns throughout.
+        """
+        parts, self._parts = self._parts, []
+        if self._has_columns is None:
+            self._has_columns = bool(parts)
+        if not self._has_columns:
+            return ()
+        missing = count - sum(part.size for part in parts)
+        return (np.concatenate([np.full(missing, math.nan).astype(CELL_COLUMNS), *parts]),)
 
 
 def _accepted_indices(samples: SampleBlock, trace: TraceBlock) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

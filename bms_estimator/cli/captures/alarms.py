@@ -124,8 +124,8 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
     cells = CellEstimator(estimator)
     slow_fit = new_slow_fit(settings, estimator)
-    forecaster = new_forecaster(settings, model, estimator, slow_fit)
-    runner = forecaster or slow_fit or estimator
+    forecaster = new_forecaster(settings, model, estimator, slow_fit, cells)
+    runner = slow_fit or estimator
     monitor = AlarmMonitor(
         settings,
         model,
@@ -139,8 +139,7 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     with progress_bar("replaying") as bar:
         async for received in source:
             now_s = max(now_s, float(received.samples["time_s"][-1]))
-            trace = runner.run(received.samples)
-            cells.run(received.samples, received.cells_v, trace)
+            trace = forecaster.run(received.samples, received.cells_v) if forecaster else runner.run(received.samples)
             monitor.add(received, trace, now_s, forecaster.rows if forecaster else NO_FORECAST)
             bar.update(source.fraction)
     monitor.evaluate(now_s)

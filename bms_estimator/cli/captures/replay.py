@@ -4,7 +4,7 @@ import asyncio
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AsyncExitStack, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -35,11 +35,12 @@ from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.estimator import new_estimator
-from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.estimator.estimator import TraceBlock, new_estimator
+from bms_estimator.forecast.forecaster import Forecaster, Runner
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.service.fit_thread import new_slow_fit
@@ -162,26 +163,25 @@ async def _replay(
         pack_model = new_slow_fit(
             settings, estimator, on_failure=lambda error: errors.update({type(error).__name__: str(error)})
         )
-    forecaster = new_forecaster(settings, model, estimator, pack_model)
-    run = (pack_model or estimator).run
-    if forecaster:  # forecasts at intervals take longer than the estimates, and the summary needs only the last one
-        run = forecaster.run if table or settings.mqtt else forecaster.run_without_forecast
+    cells = CellEstimator(estimator)
+    cell_columns = CellColumns(cells)
+    forecaster = new_forecaster(settings, model, estimator, pack_model, cell_columns if table else cells)
+    # forecasts at intervals take longer than the estimates, and the summary needs only the last one
+    run = _run_function(forecaster, pack_model or estimator, with_forecasts=bool(table or settings.mqtt))
     async with AsyncExitStack() as stack:
-        cells = CellEstimator(estimator)
-        cell_columns = CellColumns(cells)
-        run_cells = cell_columns.run if table else cells.run
         publisher = await _open_publisher(stack, settings, model, estimator, pack_model, forecaster, cells, source)
         stack.enter_context(table or nullcontext())
         bar = stack.enter_context(progress_bar("replaying"))
         started_s, impossible = time.perf_counter(), None
         async for received in source:
-            trace = run(received.samples)
-            run_cells(received.samples, received.cells_v, trace)
+            trace = run(received.samples, received.cells_v)
             summary.add(trace)
             if trace.size < received.samples.size:  # samples were dropped
                 impossible = out_of_range_reason(received.samples, estimator.settings[0]) or impossible
             if table:
-                table.write(join_columns(trace, *([forecaster.rows] if forecaster else []), *cell_columns.rows))
+                table.write(
+                    join_columns(trace, *([forecaster.rows] if forecaster else []), *cell_columns.take_rows(trace.size))
+                )
             if publisher:
                 publisher.add(received, trace)
                 await asyncio.sleep(0)  # the MQTT client runs in this event loop
@@ -194,6 +194,15 @@ async def _replay(
     limit_a = short_limit_a(settings, model)
     result = summary.result(estimator, pack_model, forecaster, cells, limit_a, source.samples, wall_s)
     return replace(result, impossible=impossible, temperatures_dropped=source.counters.get("implausible", 0))
+
+
+def _run_function(
+    forecaster: Forecaster | None, runner: Runner, *, with_forecasts: bool
+) -> Callable[[SampleBlock, CellBlock], TraceBlock]:
+    """Return a function that processes samples and cell voltages, and returns the estimates."""
+    if forecaster is None:
+        return lambda samples, _: runner.run(samples)
+    return forecaster.run if with_forecasts else forecaster.run_without_forecast
 
 
 async def _open_publisher(

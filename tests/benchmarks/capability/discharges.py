@@ -1,16 +1,21 @@
 """Usable capacity and remaining energy against charge and energy drawn until the cut-off voltage in real captures."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from rich.table import Table
 
-from bms_estimator.forecast.capability import cell_power_limits, write_capability
+from bms_estimator.estimator import Estimator
+from bms_estimator.forecast.capability import cell_power_limits, projected_pack, write_capability
 from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.forecast.load_history import LoadHistory
+from bms_estimator.kernels.forecast.draws import DRAW
+from bms_estimator.kernels.forecast.mean_discharge import discharge_to_cutoff
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.capability.captures import Capture
+from tests.benchmarks.forecast.ablation import GRADIENT, GROWTH, Part, disable
 from tests.benchmarks.recipes import LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_25, PF_CYCLE, PF_US06, Recipe, charge_ah
 
 LG = Recipe(5.0, ("lgm50/rate_0p1c_25c",))
@@ -35,6 +40,8 @@ CAPTURES = (
     Capture("generic nca: PF 25 C, US06", Recipe(2.9, generic="nca"), PF + "25_us06"),
     Capture("generic nca: PF -10 C, US06", Recipe(2.9, generic="nca"), PF + "n10_us06"),
 )
+PARTS, NO_PEAKS = (GROWTH, GRADIENT), "peaks of the load"
+"""Parts of the model whose effect on the usable capacity is measured, and name of another one."""
 CUTOFF_V, LFP_CUTOFF_V, MAX_LFP_V = 2.6, 2.2, 3.4
 """Cut-off voltage of oxide and of LFP cells, and maximum median voltage of a capture of an LFP cell [V]."""
 LOWEST_QUANTILE, MARGIN_V = 1e-4, 0.01
@@ -50,6 +57,7 @@ def discharge_table(folder: Path) -> Table:
     columns = "capture", "cut-off", "SOC there", "usable_capacity_ah", "median", "charge to SOC 0", "median"
     for column in (*columns, "remaining_energy_wh", "median"):
         table.add_column(column, justify="left" if column == "capture" else "right")
+    without_parts: list[Floats] = []
     for capture in CAPTURES:
         samples = capture.samples
         cutoff_v = cutoff_voltage(samples)
@@ -60,6 +68,10 @@ def discharge_table(folder: Path) -> Table:
         )
         cells = [text for error in errors.T for text in (f"{np.median(np.abs(error)):.1f}", f"{np.median(error):+.1f}")]
         table.add_row(capture.name, f"{cutoff_v:.2f} V", f"{rows[-1, 3]:.2f}", *cells)
+        charge_errors = 100.0 * (rows[:, [1, *range(6, rows.shape[1])]] - rows[:, :1]) / capture.capacity_ah
+        without_parts.append(np.median(np.abs(charge_errors), axis=0))
+    means = zip(("nothing", *(part.name for part in PARTS), NO_PEAKS), np.mean(without_parts, axis=0), strict=True)
+    table.caption = "mean of the errors of usable_capacity_ah without " + ", ".join(f"{n}: {e:.2f}" for n, e in means)
     return table
 
 
@@ -71,8 +83,8 @@ def cutoff_voltage(samples: SampleBlock) -> float:
 
 
 def moments(capture: Capture, samples: SampleBlock, cutoff_v: float, folder: Path) -> Floats:
-    """Return a row for each moment: charge until the cut-off, usable capacity, charge to SOC 0 [Ah], SOC, and energy until the
-    cut-off, true and computed [Wh]."""
+    """Return a row for each moment: charge until the cut-off, usable capacity, charge to SOC 0 [Ah], SOC, energy until the
+    cut-off, true and computed [Wh], and usable capacity without parts of the model [Ah]."""
     drawn_ah, capacity_ah = charge_ah(samples), capture.capacity_ah
     drawn_wh = np.append(0.0, np.cumsum(np.diff(drawn_ah) * samples["voltage_v"][:-1]))
     end = int(np.argmax((samples["voltage_v"] <= cutoff_v) & (samples["current_a"] > 0.0)))
@@ -86,7 +98,8 @@ def moments(capture: Capture, samples: SampleBlock, cutoff_v: float, folder: Pat
     for moment in np.unique(np.searchsorted(drawn_ah[:end], moments_ah)):
         load.add(estimator.run(samples[position:moment]))
         position, values = moment, unknown_values()
-        write_capability(values, estimator, cutoff_v, limits, float(load.max_a.max(initial=0.0)))
+        largest_a = float(load.max_a.max(initial=0.0))
+        write_capability(values, estimator, cutoff_v, limits, largest_a)
         rows.append(
             (
                 drawn_ah[end] - drawn_ah[moment],
@@ -95,6 +108,16 @@ def moments(capture: Capture, samples: SampleBlock, cutoff_v: float, folder: Pat
                 estimator.soc,
                 drawn_wh[end] - drawn_wh[moment],
                 values["remaining_energy_wh"][0],
+                *usable_without_parts(estimator, cutoff_v, largest_a),
             )
         )
     return np.array(rows)
+
+
+def usable_without_parts(estimator: Estimator, cutoff_v: float, largest_a: float) -> Iterator[float]:
+    """Yield the usable capacity without each of ``PARTS``, and without the peaks of the load [Ah]."""
+    state, settings, draw = estimator.record[0]["filter"], estimator.settings_record[0]["filter"], np.zeros(1, DRAW)
+    for part, peak_a in (*((part, largest_a) for part in PARTS), (Part(NO_PEAKS), 0.0)):
+        pack = projected_pack(estimator, cutoff_v, peak_a)
+        disable(part, pack, estimator)
+        yield discharge_to_cutoff(pack[0], state, settings, peak_a, draw[0])[0] / 3600.0

@@ -66,18 +66,29 @@ class Part:
 
 STDS = ("soc_std", "capacity_std", "voltage_std_v", "load_std", "resistance_std")
 """Fields of PROJECTED_PACK with the spread of the draws."""
+GROWTH = Part("growth of R towards empty", grows=False)
+GRADIENT = Part("SOC gradient in the particles", {"surface_soc": 0.0})
 PARTS = (
     Part("nothing"),
     Part("load before the last 7,200 s", load=last_seconds(7200)),
     Part("load before the last 1,800 s", load=last_seconds(1800)),
     Part("order of the load beyond 10 s", load=shuffled),
     Part("peaks within a second", load=without_peaks),
-    Part("growth of R towards empty", grows=False),
-    Part("SOC gradient in the particles", {"surface_soc": 0.0}),
+    GROWTH,
+    GRADIENT,
     *(Part(f"spread: {name}", {name: 0.0}) for name in STDS),
     Part("all spreads but the load's order", dict.fromkeys(STDS, 0.0)),
 )
 """Parts of the forecast."""
+
+
+def disable(part: Part, pack: Records, estimator: Estimator) -> None:
+    """Disable a part in ``pack``, shape (1,), dtype ``PROJECTED_PACK``, which was computed from the state of ``estimator``."""
+    for name, value in part.pack.items():
+        pack[name] = value
+    if not part.grows:
+        state, nodes = estimator.record[0]["filter"], np.linspace(0.0, 1.0, GRID)
+        pack["ohm"][0, :FAST_RESISTANCES] /= [growth_factor(state, pack["soc"][0], soc) for soc in nodes]
 
 
 class PartForecaster(Forecaster):
@@ -90,12 +101,8 @@ class PartForecaster(Forecaster):
     part = PARTS[0]
 
     def _pack(self, load: GivenLoad | None) -> Records:
-        pack, state = super()._pack(load), self.estimator.record[0]["filter"]
-        for name, value in self.part.pack.items():
-            pack[name] = value
-        if not self.part.grows:
-            nodes = np.linspace(0.0, 1.0, GRID)
-            pack["ohm"][0, :FAST_RESISTANCES] /= [growth_factor(state, pack["soc"][0], soc) for soc in nodes]
+        pack = super()._pack(load)
+        disable(self.part, pack, self.estimator)
         return pack
 
     def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:
