@@ -33,7 +33,9 @@ _HEADER = struct.Struct("<4sBBHQQQd")
 _OLDEST_OFFSET = 24
 """Offset of the field ``oldest`` in the header [bytes]."""
 _MAGIC = b"BMSB"
-_VERSION, _VERSION_WITH_CELLS = 1, 2
+VERSION = 2
+"""Newest version of the format that this program reads. Blocks without cell voltages are of version 1."""
+_VERSION_WITHOUT_CELLS = 1
 MAX_SAMPLES = 65_535
 """Maximum number of samples of a block."""
 MAX_NUMBER = 2**63
@@ -79,7 +81,7 @@ def encode(block: Block) -> bytes:
     cells = block.cells_v.shape[1]
     header = _HEADER.pack(
         _MAGIC,
-        _VERSION_WITH_CELLS if cells else _VERSION,
+        VERSION if cells else _VERSION_WITHOUT_CELLS,
         cells,
         block.samples.size,
         block.store_created_ns,
@@ -109,11 +111,11 @@ def decode(data: bytes) -> Block:
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         raise BlockError(f"{len(data)} bytes without the header of a block")
     _, version, cells, count, store, number, oldest, arrival_s = _HEADER.unpack_from(data)
-    if version not in (_VERSION, _VERSION_WITH_CELLS):
-        raise BlockError(f"version {version}; this program reads versions {_VERSION} and {_VERSION_WITH_CELLS}")
+    if not _VERSION_WITHOUT_CELLS <= version <= VERSION:
+        raise BlockError(f"version {version}; this program reads versions {_VERSION_WITHOUT_CELLS} to {VERSION}")
     if not (1 <= oldest <= number < MAX_NUMBER and 0 < store < MAX_NUMBER and math.isfinite(arrival_s)):
         raise BlockError(f"implausible header: store {store}, number {number}, oldest {oldest}, arrival {arrival_s}")
-    cells = cells if version == _VERSION_WITH_CELLS else 0
+    cells = cells if version > _VERSION_WITHOUT_CELLS else 0
     samples, cells_v = _decode_body(data[_HEADER.size :], count, cells)
     return Block(store, number, oldest, arrival_s, samples, cells_v)
 

@@ -8,6 +8,17 @@ DEAD_S = 3.0
 """Time without a heartbeat after which a worker counts as dead [s]."""
 
 
+class RefusedPartition(BaseModel):
+    """Partition that a worker leaves to others, because it cannot read the last checkpoint."""
+
+    model_config = ConfigDict(frozen=True)
+
+    partition: int
+    """Number of the partition."""
+    format: int
+    """Format of the last checkpoint; 0 if the pointer to it is unreadable."""
+
+
 class Heartbeat(BaseModel):
     """State of a worker: its partitions, and counters since its start."""
 
@@ -16,6 +27,16 @@ class Heartbeat(BaseModel):
     id: str
     started_s: float
     """Wall clock at the worker's start [s since 1970]."""
+    version: str = ""
+    """Version of the program; empty for versions without this field."""
+    checkpoint_format: int = 1
+    """Newest format of checkpoints that the worker reads; versions without this field read format 1."""
+    oldest_checkpoint_format: int = 1
+    """Oldest format of checkpoints that the worker reads."""
+    block_version: int = 1
+    """Newest version of blocks that the worker reads; versions without this field read version 1."""
+    refused: tuple[RefusedPartition, ...] = ()
+    """Partitions that the worker leaves to others, because it cannot read their last checkpoints."""
     leaving: bool = False
     """True while the worker releases its partitions before it ends."""
     partitions: tuple[int, ...] = ()

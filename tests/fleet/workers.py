@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import aclosing, suppress
 from pathlib import Path
 from typing import Any, Self
@@ -79,9 +79,11 @@ async def send(nc: Client, pack: str, data: bytes) -> None:
 class Process:
     """Worker process, which starts at once and logs to a file."""
 
-    def __init__(self, folder: Path, url: str, name: str, *options: object) -> None:
+    def __init__(
+        self, folder: Path, url: str, name: str, *options: object, program: Sequence[object] = (PROGRAM,)
+    ) -> None:
         self.name, self._log = name, folder / f"{name}.log"
-        command = [PROGRAM, "fleet", "worker", "--server", url, "--name", name, *map(str, options)]
+        command = [*map(str, program), "fleet", "worker", "--server", url, "--name", name, *map(str, options)]
         with self._log.open("a") as log:
             self._process = subprocess.Popen(command, stderr=log)
 

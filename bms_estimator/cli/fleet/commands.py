@@ -17,6 +17,9 @@ COMMANDS = {
     "worker": LazyCommand(
         "bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."
     ),
+    "workers": LazyCommand(
+        "bms_estimator.cli.fleet.workers:workers", "List the workers, their versions and the partitions they refuse."
+    ),
     "packs": LazyCommand("bms_estimator.cli.fleet.packs:app", "Upload, list, show or remove the settings of packs."),
     "capture": LazyCommand(
         "bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a CSV or Parquet file."

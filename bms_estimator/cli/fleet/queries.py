@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.options.table import print_table
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
@@ -20,8 +18,6 @@ if TYPE_CHECKING:
 
 DEFAULT_FOLDER = Path("hours")
 """Default folder of the Parquet files."""
-MAX_TABLE_WIDTH = 10_000
-"""Maximum width of a printed table [characters], above that of any answer."""
 
 
 def collect(
@@ -120,16 +116,6 @@ def _print_csv(answer: "Answer") -> None:
 
 
 def _print_table(answer: "Answer") -> None:
-    """Print a table without truncating its columns to the terminal's width."""
-    table = Table(*answer.columns, box=box.SIMPLE)
-    for row in answer.rows:
-        table.add_row(
-            *("" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value) for value in row)
-        )
-    console = Console(highlight=False, markup=False)
-    console.width = max(
-        console.width, console.measure(table, options=console.options.update(max_width=MAX_TABLE_WIDTH)).maximum
-    )
-    console.print(table)
+    print_table(answer.columns, answer.rows)
     if not answer.rows:
         typer.echo("none")

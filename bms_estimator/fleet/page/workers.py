@@ -68,7 +68,8 @@ class FleetWorkers:
 
         Returns:
             ``workers`` (each: id, alive, partitions, activity), ``holders`` (index of each partition's worker, or -1),
-            ``unheld`` and ``twice`` (partitions with no worker or several), ``lag_s`` (the largest).
+            ``unheld`` and ``twice`` (partitions with no worker or several), ``refused`` (of ``unheld``: those whose
+            checkpoints no worker can read), ``lag_s`` (the largest).
         """
         for name in [name for name, received in self._by_worker.items() if received[-1].at_s < now_s - LISTED_S]:
             del self._by_worker[name]
@@ -89,11 +90,17 @@ class FleetWorkers:
             "holders": holders,
             "unheld": [n for n, index in enumerate(holders) if index == NO_WORKER],
             "twice": sorted(twice),
+            "refused": sorted({n for n in _refused(alive) if n < self.partitions and holders[n] == NO_WORKER}),
             "lag_s": max((lag for lag in lags if lag is not None), default=None),
         }
 
     def _alive(self, now_s: float) -> dict[str, deque[_Received]]:
         return {name: received for name, received in self._by_worker.items() if received[-1].at_s >= now_s - ALIVE_S}
+
+
+def _refused(workers: dict[str, deque[_Received]]) -> set[int]:
+    """Return the partitions that a worker refuses."""
+    return {each.partition for received in workers.values() for each in received[-1].heartbeat.refused}
 
 
 def _max_lag_s(received: deque[_Received]) -> float | None:
@@ -124,4 +131,7 @@ def _worker_overview(received: deque[_Received], now_s: float, alive: bool) -> d
         "rss_mib": heartbeat.rss_mib,
         "cpu": rate(heartbeat.cpu_s, first.heartbeat.cpu_s),
         "trouble": heartbeat.trouble,
+        "version": heartbeat.version,
+        "checkpoint_formats": [heartbeat.oldest_checkpoint_format, heartbeat.checkpoint_format],
+        "refused": [[each.partition, each.format] for each in heartbeat.refused],
     }

@@ -3,13 +3,17 @@
 Layout, little-endian::
 
     0  magic    8s   b"BMSFLEET"
-    8  format   u2   1
+    8  format   u2   FORMAT, or the format before it
     10 length   u4   of the header
     14 crc      u4   CRC-32 of the header
     18 header        JSON: partition, sequence, counters, spans of deferred messages, record layouts, number of entries
     .. chunks        length u4, CRC-32 u4, entries; the last has length 0
 
     entry:  layout u1, length of the name u2, of the data u4, name, data
+
+A version reads its own format and, by ``PREVIOUS``, the format before it. It writes either of the two. A worker writes the
+newest format that all live workers read, so that workers of two versions can take over partitions from each other. A reader of
+a format that it does not know raises ``UnreadableFormatError``, and the worker then leaves the partition to others.
 
 An entry is one pack's packed record; its layout is an index into the header's layouts. A layout names each field of a record,
 so that a version with other fields can restore the state. Layout 255 is not an index: an earlier version stored blocks of
@@ -19,7 +23,7 @@ unknown packs here. The messages of such a pack are read from the stream again.
 import json
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -29,8 +33,22 @@ from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.pack_state import PACK_STATE
 from bms_estimator.kernels.packed_record import symmetry_map
 
+Header = dict[str, Any]
+
+
+class HeaderMigration(NamedTuple):
+    """Conversions of a header between two successive formats. Entries need none, because layouts name their fields."""
+
+    upgrade: Callable[[Header], Header]
+    """Return a header of the older format as one of the newer format."""
+    downgrade: Callable[[Header], Header]
+    """Return a header of the newer format as one of the older format."""
+
+
 FORMAT = 1
-"""Version of the format."""
+"""Newest format that this version reads and writes."""
+PREVIOUS: HeaderMigration | None = None
+"""Migration between format ``FORMAT - 1`` and ``FORMAT``; None while ``FORMAT`` is the first format."""
 CHUNK_BYTES = 1 << 20
 """Size at which a chunk of entries is finished [bytes]."""
 _FILE_HEAD, _CHUNK_HEAD, _ENTRY_HEAD = struct.Struct("<8sHII"), struct.Struct("<II"), struct.Struct("<BHI")
@@ -45,6 +63,43 @@ _MAX_RECORD_BYTES = 1 << 24
 
 class CheckpointError(ValueError):
     """Unreadable checkpoint; the message gives the reason and a remedy."""
+
+
+class UnreadableFormatError(CheckpointError):
+    """Error of an intact checkpoint in a format that this version cannot read.
+
+    Args:
+        found: Format of the checkpoint; 0 if even the metadata of the checkpoint is unreadable.
+    """
+
+    def __init__(self, found: int) -> None:
+        what = f"the checkpoint is of format {found}" if found else "the pointer to the checkpoints is unreadable"
+        super().__init__(f"{what}, this version reads {readable_text()}: start a worker of the version that wrote it")
+        self.found = found
+
+
+def oldest_format() -> int:
+    """Return the oldest format that this version reads and writes."""
+    return FORMAT if PREVIOUS is None else FORMAT - 1
+
+
+def readable_text() -> str:
+    """Return the readable formats as text, such as ``1 and 2``."""
+    return f"{FORMAT}" if PREVIOUS is None else f"{FORMAT - 1} and {FORMAT}"
+
+
+def is_readable(found: int) -> bool:
+    """Return True if this version reads a format."""
+    return oldest_format() <= found <= FORMAT
+
+
+def common_format(newest_formats: Iterable[int]) -> int:
+    """Return the format to write: the newest one that all workers read, as far as this version writes it.
+
+    Args:
+        newest_formats: Newest format that each other worker reads.
+    """
+    return max(oldest_format(), min([FORMAT, *newest_formats]))
 
 
 class PreviousLayoutState(NamedTuple):
@@ -112,12 +167,17 @@ class PartitionCheckpoint:
     unmigrated: Mapping[str, PreviousLayoutState] = field(default_factory=dict)
     deferred: Mapping[str, Span] = field(default_factory=dict)
 
-    def chunks(self) -> Iterator[bytes]:
-        """Yield the checkpoint's bytes in chunks of about ``CHUNK_BYTES``."""
+    def chunks(self, file_format: int | None = None) -> Iterator[bytes]:
+        """Yield the checkpoint's bytes in chunks of about ``CHUNK_BYTES``.
+
+        Args:
+            file_format: Format to write, ``FORMAT`` or the one before it; None: ``FORMAT``.
+        """
+        file_format = file_format or FORMAT
         layouts = list(dict.fromkeys([CURRENT_LAYOUT, *(each.layout for each in self.unmigrated.values())]))[
             :_MAX_LAYOUTS
         ]
-        header = {
+        header: Header = {
             "partition": self.number,
             "sequence": self.sequence,
             "counters": dict(self.counters),
@@ -125,8 +185,10 @@ class PartitionCheckpoint:
             "layouts": [json.loads(layout) for layout in layouts],
             "entries": len(self.packs) + len(self.unmigrated),
         }
+        if PREVIOUS and file_format < FORMAT:
+            header = PREVIOUS.downgrade(header)
         text = json.dumps(header, separators=(",", ":")).encode()
-        chunk = [_FILE_HEAD.pack(_MAGIC, FORMAT, len(text), zlib.crc32(text)), text]
+        chunk = [_FILE_HEAD.pack(_MAGIC, file_format, len(text), zlib.crc32(text)), text]
         entries: list[bytes] = []
         size = 0
         for entry in self._entries(layouts):
@@ -159,7 +221,8 @@ def read_checkpoint(data: bytes) -> PartitionCheckpoint:
     """Read a whole checkpoint written by ``PartitionCheckpoint.chunks``.
 
     Raises:
-        CheckpointError: The bytes are damaged, not a checkpoint, or of an unknown format.
+        UnreadableFormatError: The checkpoint has a format that this version cannot read.
+        CheckpointError: The bytes are damaged or not a checkpoint.
     """
     try:
         return _read(memoryview(data))
@@ -173,13 +236,12 @@ def _read(data: memoryview) -> PartitionCheckpoint:
     magic, version, length, crc = _FILE_HEAD.unpack_from(data)
     if magic != _MAGIC:
         raise CheckpointError("not a checkpoint: its first bytes differ")
-    if version != FORMAT:
-        raise CheckpointError(
-            f"the checkpoint is of format {version}, this version reads {FORMAT}: start the version that wrote it, "
-            "or start without a checkpoint, from the stream"
-        )
+    if not is_readable(version):
+        raise UnreadableFormatError(version)
     header_end = _FILE_HEAD.size + length
     header = json.loads(_verify(data[_FILE_HEAD.size : header_end], length, crc))
+    if PREVIOUS and version < FORMAT:
+        header = PREVIOUS.upgrade(header)
     layouts = [json.dumps(layout, separators=(",", ":")) for layout in header["layouts"]]
     for layout in layouts:
         if layout != CURRENT_LAYOUT:

@@ -4,6 +4,8 @@ A pointer is replaced by compare-and-set on its revision. A worker that takes ov
 into the pointer. Therefore the next checkpoint of a slow or suspended former owner fails. An object is written before the
 pointer that names it. A pointer also names the next object, so that the next owner finds and removes the object of a
 worker that was killed between the two writes.
+
+The first checkpoint of each UTC day is stored for a month. A worker reads it if the newer checkpoints are damaged.
 """
 
 import asyncio
@@ -27,10 +29,15 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stored_messages import read_messages
+from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError, is_readable
 from bms_estimator.model.clock import iso_utc
 
 CHECKPOINTS_PER_PARTITION = 2
 """Number of stored checkpoints of a partition: the last checkpoint, and the previous one in case the last is damaged."""
+DAILY_CHECKPOINTS = 30
+"""Maximum number of stored checkpoints of a partition from different days, besides the last ones."""
+DAY_S = 86_400
+"""Duration of a day [s]."""
 MESSAGE_BYTES = 128 << 10
 """Size of one message of an object [bytes]."""
 _STREAM = f"OBJ_{subjects.STATES_BUCKET}"
@@ -55,6 +62,8 @@ class CheckpointInfo(BaseModel):
     """Size [bytes]."""
     made_s: float
     """Wall clock at which the checkpoint was written [s since 1970]."""
+    format: int = 1
+    """Format of the bytes (``checkpoint_format.FORMAT``); versions without this field wrote format 1."""
 
 
 class Pointer(BaseModel):
@@ -62,12 +71,19 @@ class Pointer(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    worker: str
+    worker: str = ""
     """Name of the owning worker."""
-    next: str
+    next: str = ""
     """Name of the object that this worker writes next. The object may already exist in part."""
     kept: tuple[CheckpointInfo, ...] = ()
-    """Stored checkpoints, newest first."""
+    """Last checkpoints, newest first."""
+    daily: tuple[CheckpointInfo, ...] = ()
+    """First checkpoints of the last days, newest first. The last of them may also be in ``kept``."""
+
+    @property
+    def checkpoints(self) -> tuple[CheckpointInfo, ...]:
+        """All stored checkpoints without repetitions, the last ones first."""
+        return tuple(dict.fromkeys((*self.kept, *self.daily)))
 
     @property
     def checkpoints(self) -> tuple[CheckpointInfo, ...]:
@@ -112,11 +128,13 @@ class CheckpointStore:
 
         Raises:
             FencedError: Another worker has claimed it at the same time.
+            UnreadableFormatError: The last checkpoint has a format that this version cannot read. Nothing was changed.
         """
         stored = await self._read_pointer(partition)
         if stored is None:
-            return await self._write_pointer(partition, 0, ())  # revision 0: the key must not exist
-        claim = await self._write_pointer(partition, stored.revision, stored.pointer.kept)
+            return await self._write_pointer(partition, 0, Pointer())  # revision 0: the key must not exist
+        _check_format(stored.pointer)
+        claim = await self._write_pointer(partition, stored.revision, stored.pointer)
         await self._remove_object(stored.pointer.next)
         return claim
 
@@ -133,9 +151,19 @@ class CheckpointStore:
             return Claim(claim.partition, stored.revision, stored.pointer)
         raise FencedError(stored.pointer.worker)
 
+    async def check_format(self, partition: int) -> None:
+        """Check that the last checkpoint of a partition can be read.
+
+        Raises:
+            UnreadableFormatError: It has a format that this version cannot read.
+        """
+        stored = await self._read_pointer(partition)
+        if stored is not None:
+            _check_format(stored.pointer)
+
     async def load(self, claim: Claim) -> AsyncGenerator[tuple[CheckpointInfo, bytes], None]:
-        """Yield the readable checkpoints, newest first; log the damaged ones."""
-        for kept in claim.pointer.kept:
+        """Yield the intact checkpoints, the last ones first; log the damaged ones."""
+        for kept in claim.pointer.checkpoints:
             try:
                 data = await self._read_object(kept.object)
             except (NotFoundError, BadObjectMetaError):
@@ -150,13 +178,14 @@ class CheckpointStore:
             else:
                 yield kept, data
 
-    async def write(self, claim: Claim, sequence: int, chunks: Iterator[bytes]) -> Claim:
+    async def write(self, claim: Claim, sequence: int, chunks: Iterator[bytes], *, file_format: int) -> Claim:
         """Write a checkpoint.
 
         Args:
             claim: Claim that the last write returned.
             sequence: Stream sequence number of the last included message.
             chunks: Bytes of the checkpoint; iterated in a thread.
+            file_format: Format of the bytes.
 
         Raises:
             FencedError: Another worker has taken the partition over; nothing was changed.
@@ -164,15 +193,20 @@ class CheckpointStore:
         claim = await self.confirm_claim(claim)
         pointer = claim.pointer
         size = await self._write_object(pointer.next, chunks)
-        info = CheckpointInfo(sequence=sequence, object=pointer.next, bytes=size, made_s=time.time())
-        kept = (info, *pointer.kept)
+        info = CheckpointInfo(
+            sequence=sequence, object=pointer.next, bytes=size, made_s=time.time(), format=file_format
+        )
+        new_pointer = Pointer(
+            kept=(info, *pointer.kept)[:CHECKPOINTS_PER_PARTITION], daily=_with_daily(pointer.daily, info)
+        )
         try:
-            claim = await self._write_pointer(claim.partition, claim.revision, kept[:CHECKPOINTS_PER_PARTITION])
+            claim = await self._write_pointer(claim.partition, claim.revision, new_pointer)
         except FencedError:
             await self._remove_object(pointer.next)
             raise
-        for old in kept[CHECKPOINTS_PER_PARTITION:]:
-            await self._remove_object(old.object)
+        for old in pointer.checkpoints:
+            if old not in new_pointer.checkpoints:
+                await self._remove_object(old.object)
         return claim
 
     async def replace(self, claim: Claim, old: CheckpointInfo, chunks: Iterator[bytes] | None) -> Claim:
@@ -201,6 +235,11 @@ class CheckpointStore:
         return claim
 
     async def _read_pointer(self, partition: int) -> StoredPointer | None:
+        """Return the pointer of a partition; None without one.
+
+        Raises:
+            UnreadableFormatError: The pointer is not one of this version.
+        """
         try:
             entry = await self._checkpoints.get(_key(partition))
         except KeyNotFoundError:
@@ -208,11 +247,16 @@ class CheckpointStore:
         try:
             return StoredPointer(entry.revision or 0, Pointer.model_validate_json(entry.value or b""))
         except ValidationError as error:
-            log.warning("the pointer to a checkpoint cannot be read", partition=partition, reason=str(error))
-            return StoredPointer(entry.revision or 0, Pointer(worker="", next=""))
+            raise UnreadableFormatError(0) from error
 
-    async def _write_pointer(self, partition: int, revision: int, kept: tuple[CheckpointInfo, ...]) -> Claim:
-        pointer = Pointer(worker=self._worker, next=f"p{partition}-{self._object_names.next().decode()}", kept=kept)
+    async def _write_pointer(self, partition: int, revision: int, pointer: Pointer) -> Claim:
+        """Write a pointer with the name of this worker and of its next object.
+
+        Raises:
+            FencedError: The stored pointer has another revision.
+        """
+        next_object = f"p{partition}-{self._object_names.next().decode()}"
+        pointer = pointer.model_copy(update={"worker": self._worker, "next": next_object})
         self._last_sent[partition] = pointer
         try:
             data = pointer.model_dump_json().encode()
@@ -262,6 +306,19 @@ class CheckpointStore:
         if name:
             for subject in (_metadata_subject(name), _chunk_subject(name)):
                 await self._js.purge_stream(_STREAM, subject=subject)
+
+
+def _check_format(pointer: Pointer) -> None:
+    """Raise UnreadableFormatError if the last checkpoint has a format that this version cannot read."""
+    if pointer.kept and not is_readable(pointer.kept[0].format):
+        raise UnreadableFormatError(pointer.kept[0].format)
+
+
+def _with_daily(daily: tuple[CheckpointInfo, ...], info: CheckpointInfo) -> tuple[CheckpointInfo, ...]:
+    """Return the daily checkpoints, with ``info`` added if it is the first one of its day."""
+    if any(each.made_s // DAY_S == info.made_s // DAY_S for each in daily):
+        return daily
+    return (info, *daily)[:DAILY_CHECKPOINTS]
 
 
 class _ChunkReader(io.RawIOBase):

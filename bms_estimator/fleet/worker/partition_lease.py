@@ -24,6 +24,7 @@ from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError
+from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
 from bms_estimator.fleet.worker.deferred import Span
@@ -42,6 +43,8 @@ MAX_PENDING_SUMMARIES = 128
 """Maximum number of published summaries that wait for the server's acknowledgment."""
 RETRYABLE_ERRORS = (NatsError, TimeoutError, StreamError)
 """Errors of the connection or the server after which a request is repeated."""
+_FENCED = (FencedError, UnreadableFormatError)
+"""Errors that show that another worker, possibly of another version, has claimed the partition of this worker."""
 
 log = structlog.get_logger(__name__)
 
@@ -58,6 +61,7 @@ class PartitionLease:
         step_lock: Lock of the worker, held while a block is estimated. The event loop can send requests and heartbeats between
             two blocks.
         partitions: Number of partitions of the stream.
+        checkpoint_format: Returns the format in which checkpoints are written, which all live workers read.
         is_busy: Returns True while any partition of the worker has received messages that are not processed.
 
     Attributes:
@@ -70,6 +74,8 @@ class PartitionLease:
         faults: Number of blocks skipped because of an internal error.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
         trouble: Text of the present error; empty without one.
+        refused_format: Format of the unreadable last checkpoint, because of which the partition is left to other workers;
+            None: the partition is not refused.
     """
 
     def __init__(
@@ -82,9 +88,11 @@ class PartitionLease:
         step_lock: asyncio.Lock,
         *,
         partitions: int,
+        checkpoint_format: Callable[[], int],
         is_busy: Callable[[], bool],
     ) -> None:
         self._partitions, self._is_busy, self._budget = partitions, is_busy, CpuBudget()
+        self._checkpoint_format = checkpoint_format
         self._nc, self.number, self._table, self._checkpoints = nc, number, table, checkpoints
         self._step_lock = step_lock
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
@@ -94,6 +102,7 @@ class PartitionLease:
         self.lag_s: float | None = None
         self.blocks = self.samples = self.faults = 0
         self.trouble, self.checkpoint_due_s = "", 0.0
+        self.refused_format: int | None = None
         self._pin = 0  # number of the pin under which the claim was last confirmed
         self._is_gapless = False  # the state includes all messages before the last delivered one
         self._pin_lapsed = False  # the ownership must be checked, because the pin has ended
@@ -107,6 +116,11 @@ class PartitionLease:
     def last_checkpoint(self) -> CheckpointInfo | None:
         """Last checkpoint; None without one."""
         return self.claim.pointer.kept[0] if self.claim and self.claim.pointer.kept else None
+
+    @property
+    def is_checkpoint_too_new(self) -> bool:
+        """True if a live worker cannot read the last checkpoint."""
+        return self.last_checkpoint is not None and self.last_checkpoint.format > self._checkpoint_format()
 
     @property
     def is_owned(self) -> bool:
@@ -146,7 +160,7 @@ class PartitionLease:
                 await self._wake_up.wait()
 
     async def save(self) -> None:
-        """Write a checkpoint if the state has changed since the last one.
+        """Write a checkpoint if the state has changed since the last one, or if a live worker cannot read the last one.
 
         Raises:
             nats.errors.Error: The server rejects it, or does not respond in time; the last checkpoint remains valid.
@@ -159,14 +173,17 @@ class PartitionLease:
                 self.last_checkpoint
                 and self.last_checkpoint.sequence == partition.sequence
                 and partition.deferred.is_saved
+                and not self.is_checkpoint_too_new
             ):
                 return
             snapshot, partition.deferred.is_saved = partition.snapshot(), True
             try:
                 # The summaries are sent first, because the next owner does not compute the summaries of saved samples again.
                 await self.send_summaries()
-                self.claim = await self._checkpoints.write(claim, snapshot.sequence, snapshot.chunks())
-            except FencedError as error:
+                file_format = self._checkpoint_format()
+                chunks = snapshot.chunks(file_format)
+                self.claim = await self._checkpoints.write(claim, snapshot.sequence, chunks, file_format=file_format)
+            except _FENCED as error:
                 self._drop_ownership(error)
             except BaseException:
                 partition.deferred.is_saved = False
@@ -311,11 +328,17 @@ class PartitionLease:
         return partition
 
     async def _restore(self, claim: Claim) -> Partition:
-        """Return the partition of the newest usable checkpoint; an empty one without a checkpoint."""
+        """Return the partition of the newest usable checkpoint; an empty one without a checkpoint.
+
+        Raises:
+            UnreadableFormatError: The newest intact checkpoint has a format that this version cannot read.
+        """
         async with aclosing(self._checkpoints.load(claim)) as checkpoints:
             async for checkpoint, data in checkpoints:
                 try:
                     partition = Partition.restore(self.number, self._table, data)
+                except UnreadableFormatError:  # an earlier checkpoint, or none, would lose what was learned
+                    raise
                 except ValueError as error:
                     log.warning(
                         "a checkpoint cannot be used: continuing from an earlier one, or from the stream",
@@ -407,15 +430,21 @@ class PartitionLease:
         if self.claim:
             try:
                 self.claim = await self._checkpoints.confirm_claim(self.claim)
-            except FencedError as error:
+            except _FENCED as error:
                 self._drop_ownership(error)
 
-    def _drop_ownership(self, error: FencedError) -> None:
+    def _drop_ownership(self, error: Exception) -> None:
         """Drop state and claim, because another worker has claimed the partition."""
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
         self.partition = self.claim = None
         self._pin, self._is_gapless = 0, False
         self.waiting_summaries.clear()  # the owner of the partition computes them from the last checkpoint on
+
+    def _refuse(self, error: UnreadableFormatError) -> None:
+        """Leave the partition to other workers. The worker that holds this lease then releases it."""
+        if self.refused_format is None:
+            log.error("partition refused and left to other workers", partition=self.number, reason=str(error))
+        self.refused_format = error.found
 
     async def _try(self, action: Callable[[], Awaitable[None]]) -> bool:
         """Return True if ``action`` succeeded; log the error if it failed."""
@@ -423,6 +452,9 @@ class PartitionLease:
             await action()
         except FencedError as error:
             self._drop_ownership(error)
+            return False
+        except UnreadableFormatError as error:
+            self._refuse(error)
             return False
         except RETRYABLE_ERRORS as error:
             if (text := error_text(error)) != self.trouble:

@@ -15,10 +15,12 @@ from nats.aio.msg import Msg
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
+from bms_estimator.edge.block import VERSION as BLOCK_VERSION
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
 from bms_estimator.fleet.nats.connection import close, connect, error_text
 from bms_estimator.fleet.nats.streams import partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
+from bms_estimator.fleet.worker.checkpoint_format import FORMAT, UnreadableFormatError, oldest_format
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.partition_lease import RETRY_S, RETRYABLE_ERRORS, PartitionLease
@@ -26,6 +28,7 @@ from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import end, until_first_ends
+from bms_estimator.version import __version__
 
 CHECKPOINT_S = 300.0
 """Default interval between two checkpoints of a partition [s]."""
@@ -34,6 +37,8 @@ DISCOVERY_S = 0.5
 once."""
 CHECK_S = 0.5
 """Interval between two checks for a due checkpoint or waiting summaries [s]."""
+REFUSAL_S = 10.0
+"""Interval between two checks whether the checkpoint of a refused partition has become readable [s]."""
 MAX_UNKNOWN = 20
 """Maximum number of unknown packs that a heartbeat names."""
 MAX_CLOCK_ERRORS = 20
@@ -179,6 +184,7 @@ class Worker:
             _repeat(RENEW_S, self._update_leases),
             _repeat(CHECK_S, self._save),
             _repeat(CHECK_S, self._send_hourly_summaries),
+            _repeat(REFUSAL_S, self._check_refused),
             self._bucket.follow(self._changed_packs.put_nowait),
             self._apply_table_changes(),
         )
@@ -213,7 +219,7 @@ class Worker:
         if heartbeat.id == self._options.name and heartbeat.started_s != self._started_s and not heartbeat.leaving:
             log.warning("another worker has the same name: give each worker a different --name", worker=heartbeat.id)
         now_s = time.monotonic()
-        if self._members.on_heartbeat(heartbeat.id, now_s, leaving=heartbeat.leaving):
+        if self._members.on_heartbeat(heartbeat, now_s):
             log.info("new worker", worker=heartbeat.id)
             await self._send_heartbeat()
 
@@ -252,6 +258,7 @@ class Worker:
         if not self._nc.is_connected or now_s > self._leases_updated_s + DEAD_S / 2.0:
             self._members.extend_all(now_s)
         self._leases_updated_s = now_s
+        await self._refuse_unreadable()
         share = self._members.share(self._partitions, now_s)
         for number in self._lease_tasks.keys() - share:
             self._start_release(number)
@@ -264,6 +271,28 @@ class Worker:
         if self._nc.is_connected:
             for lease in self._leases:
                 lease.check_silence()
+
+    async def _refuse_unreadable(self) -> None:
+        """Record the partitions whose checkpoints cannot be read, and announce them, so that other workers claim them."""
+        refused = {lease.number: lease.refused_format for lease in self._leases if lease.refused_format is not None}
+        if refused.keys() - self._members.refused.keys():
+            self._members.refused |= refused
+            await self._send_heartbeat()
+
+    async def _check_refused(self) -> None:
+        """Accept the refused partitions whose checkpoints another worker has written in a readable format since."""
+        for number in list(self._members.refused):
+            if number in self._lease_tasks or not self._nc.is_connected:
+                continue
+            try:
+                await self._checkpoints.check_format(number)
+            except UnreadableFormatError as error:
+                self._members.refused[number] = error.found
+            except RETRYABLE_ERRORS as error:
+                log.warning("a refused partition cannot be checked", partition=number, reason=error_text(error))
+            else:
+                log.info("the checkpoint of a refused partition has become readable", partition=number)
+                del self._members.refused[number]
 
     async def _send_requests(self) -> None:
         if self._nc.is_connected:
@@ -280,6 +309,7 @@ class Worker:
             self._inbox,
             self._step_lock,
             partitions=self._partitions,
+            checkpoint_format=lambda: self._members.checkpoint_format(time.monotonic()),
             is_busy=lambda: any(each.consumer.waiting for each in self._leases),
         )
         # spread the checkpoints of the partitions over the interval
@@ -301,10 +331,10 @@ class Worker:
         del self._lease_tasks[lease.number], self._releases[lease.number]
 
     async def _save(self) -> None:
-        """Write the due checkpoints."""
+        """Write the due checkpoints, and replace those that a live worker cannot read."""
         for lease in sorted(self._leases, key=lambda each: each.checkpoint_due_s):
             now_s = time.monotonic()
-            if lease.checkpoint_due_s <= now_s and self._nc.is_connected:
+            if (lease.checkpoint_due_s <= now_s or lease.is_checkpoint_too_new) and self._nc.is_connected:
                 lease.checkpoint_due_s = now_s + self._options.checkpoint_s
                 await self._try_to_store(lease, lease.save)
 
@@ -348,6 +378,11 @@ class Worker:
         return Heartbeat(
             id=self._options.name,
             started_s=self._started_s,
+            version=__version__,
+            checkpoint_format=FORMAT,
+            oldest_checkpoint_format=oldest_format(),
+            block_version=BLOCK_VERSION,
+            refused=self._members.refused_partitions(),
             leaving=self._leaving,
             partitions=tuple(lease.number for lease in owned_leases),
             packs=counters["packs"],

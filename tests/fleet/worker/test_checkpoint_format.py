@@ -1,6 +1,7 @@
 """Format of checkpoints: intact, damaged, and written by another version."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,8 @@ from bms_estimator.fleet.worker.checkpoint_format import (
     CheckpointError,
     PartitionCheckpoint,
     PreviousLayoutState,
+    UnreadableFormatError,
+    common_format,
     dtype_of,
     layout_of,
     read_checkpoint,
@@ -26,6 +29,8 @@ from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.payloads.estimate import Estimate
 from tests.estimator.simulated_cell import pulses
 from tests.fleet.partition_stream import SAMPLES, Stream, blocks_of, deliver, table
+from tests.fleet.worker import later_version
+from tests.fleet.worker.later_version import DOWNGRADED, UPGRADED
 
 names = st.text(max_size=10)
 snapshots = st.builds(
@@ -108,12 +113,33 @@ def test_checkpoint_of_another_partition_is_rejected() -> None:
         Partition.restore(4, table, to_bytes(PartitionCheckpoint(3, 0)))
 
 
-def test_error_of_a_newer_format_names_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checkpoint_format, "FORMAT", 2)
-    newer_format = to_bytes(PartitionCheckpoint(3, 0))
-    monkeypatch.undo()
-    with pytest.raises(CheckpointError, match="is of format 2, this version reads 1: start the version that wrote it"):
-        read_checkpoint(newer_format)
+@pytest.fixture
+def later_format(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """Set the next format as the newest one, which the migrations of ``later_version`` convert."""
+    with monkeypatch.context() as patched:
+        later_version.set_format(checkpoint_format.FORMAT + 1, patched.setattr)
+        yield checkpoint_format.FORMAT
+
+
+def test_previous_format_is_upgraded_when_it_is_read_and_downgraded_when_it_is_written(later_format: int) -> None:
+    snapshot = PartitionCheckpoint(3, 7, packs={"a": b"12345678"})
+    previous = b"".join(snapshot.chunks(later_format - 1))
+    assert read_checkpoint(previous) == replace(snapshot, counters={UPGRADED: 1, DOWNGRADED: 1})
+    assert read_checkpoint(to_bytes(snapshot)) == snapshot
+
+
+def test_error_of_an_unreadable_format_names_both_formats_and_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patched:
+        later_version.set_format(checkpoint_format.FORMAT + 1, patched.setattr)
+        later = to_bytes(PartitionCheckpoint(3, 0))
+    with pytest.raises(UnreadableFormatError, match=r"is of format 2, this version reads 1: start a worker of the ver"):
+        read_checkpoint(later)
+
+
+def test_all_live_workers_can_read_the_common_format_as_far_as_this_version_writes_it(later_format: int) -> None:
+    assert common_format([]) == later_format
+    assert common_format([later_format + 1, later_format - 1]) == later_format - 1
+    assert common_format([later_format - 2]) == later_format - 1
 
 
 def test_layout_is_restored_to_the_dtype_of_a_pack_state() -> None:

@@ -1,4 +1,4 @@
-"""Checkpoints on the real server: the last two, damaged ones, and those of a worker that lost the partition."""
+"""Checkpoints on the real server: last and daily ones, damaged ones, unreadable ones, and those of a fenced worker."""
 
 import asyncio
 import json
@@ -11,16 +11,43 @@ from nats.aio.subscription import Subscription
 from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.heartbeat import RefusedPartition
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim, FencedError
+from bms_estimator.fleet.worker import checkpoint_store
+from bms_estimator.fleet.worker.checkpoint_format import FORMAT, PartitionCheckpoint, UnreadableFormatError
+from bms_estimator.fleet.worker.checkpoint_store import (
+    CHECKPOINTS_PER_PARTITION,
+    DAILY_CHECKPOINTS,
+    CheckpointStore,
+    Claim,
+    FencedError,
+)
 from bms_estimator.fleet.worker.worker import Options, work
 from tests.fleet.nats_cluster import running
-from tests.fleet.workers import PERIOD_S, SAMPLES, block, end_states, estimated, load_packs, send, until
+from tests.fleet.workers import PERIOD_S, SAMPLES, Heartbeats, block, end_states, estimated, load_packs, send, until
 from tests.patience import LONG_S
 
 STATES_STREAM = f"OBJ_{subjects.STATES_BUCKET}"
 CHECKPOINT_BYTES = 300_000
 """Size of a checkpoint, which the object store splits into several messages [bytes]."""
+FORMAT_OFFSET = 8
+"""Offset of the format in a checkpoint [bytes]."""
+
+
+class Clock:
+    """Wall clock of the checkpoints, which stands still at noon, so that a test does not span two days."""
+
+    now_s = 1.79e9 // 86_400 * 86_400 + 43_200
+
+    def time(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(checkpoint_store, "time", clock)
+    return clock
 
 
 @pytest.fixture(scope="module")
@@ -62,37 +89,36 @@ async def _objects(nc: Client, partition: int) -> set[str]:
     }
 
 
-async def test_last_two_checkpoints_are_stored_and_damaged_ones_are_logged_and_skipped(nc):
+async def test_last_two_checkpoints_and_the_first_of_the_day_are_stored_and_damaged_ones_are_logged_and_skipped(nc):
     store = await _checkpoint_store(nc, "a")
     claim = await store.claim(7)
     written = [bytes([i]) * CHECKPOINT_BYTES for i in range(3)]
     for i, data in enumerate(written):
-        claim = await store.write(claim, i, iter([data[:1], b"", data[1:]]))
-    assert await _load(store, claim) == [written[2], written[1]]
+        claim = await store.write(claim, i, iter([data[:1], b"", data[1:]]), file_format=FORMAT)
+    assert await _load(store, claim) == [written[2], written[1], written[0]]
     newest, previous = claim.pointer.kept
-    assert await _objects(nc, 7) == {newest.object, previous.object}
 
     subject = await _chunk_subject(nc, newest.object)
     await nc.jetstream().purge_stream(STATES_STREAM, subject=subject, keep=1)  # only the last chunk remains
     with capture_logs() as logs:
-        assert await _load(store, claim) == [written[1]]
+        assert await _load(store, claim) == [written[1], written[0]]
     assert logs[0]["event"].startswith("a checkpoint is damaged")
     assert logs[0]["object"] == newest.object
     subject = await _chunk_subject(nc, previous.object)
     await nc.jetstream().purge_stream(STATES_STREAM, subject=subject)  # all chunks are replaced
     await nc.jetstream().publish(subject, b"x" * CHECKPOINT_BYTES)
-    assert await _load(store, claim) == []
+    assert await _load(store, claim) == [written[0]]  # the first one of the day
 
 
 async def test_worker_whose_partition_another_one_claimed_cannot_write_and_leaves_no_object(nc):
     former, owner = await _checkpoint_store(nc, "former"), await _checkpoint_store(nc, "owner")
-    claim = await former.write(await former.claim(8), 1, iter([b"1"]))
+    claim = await former.write(await former.claim(8), 1, iter([b"1"]), file_format=FORMAT)
     other_claim = await owner.claim(8)
     assert await owner.confirm_claim(other_claim) == other_claim
     with pytest.raises(FencedError, match="owner"):
         await former.confirm_claim(claim)
     with pytest.raises(FencedError, match="owner"):
-        await former.write(claim, 2, iter([b"2"]))
+        await former.write(claim, 2, iter([b"2"]), file_format=FORMAT)
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
     assert await _load(owner, other_claim) == [b"1"]
     # a worker was killed between two chunks of an object; the next claim removes them
@@ -106,15 +132,64 @@ async def test_worker_whose_partition_another_one_claimed_cannot_write_and_leave
 async def test_own_write_whose_response_was_lost_does_not_count_as_one_of_another_worker(nc):
     store, other = await _checkpoint_store(nc, "a"), await _checkpoint_store(nc, "b")
     claim = await store.claim(9)
-    await store.write(claim, 1, iter([b"1"]))
-    written = await store.write(claim, 2, iter([b"2"]))  # with the old claim, as after a lost response
+    await store.write(claim, 1, iter([b"1"]), file_format=FORMAT)
+    written = await store.write(
+        claim, 2, iter([b"2"]), file_format=FORMAT
+    )  # with the old claim, as after a lost response
     assert await _load(store, written) == [b"2", b"1"]
-    assert await _objects(nc, 9) == {kept.object for kept in written.pointer.kept}
-    await store.write(written, 3, iter([b"3"]))
+    assert await _objects(nc, 9) == {each.object for each in written.pointer.checkpoints}
+    await store.write(written, 3, iter([b"3"]), file_format=FORMAT)
     other_claim = await other.claim(9)
     with pytest.raises(FencedError, match="b"):
-        await store.write(written, 4, iter([b"4"]))
-    assert await _load(other, other_claim) == [b"3", b"2"]
+        await store.write(written, 4, iter([b"4"]), file_format=FORMAT)
+    assert await _load(other, other_claim) == [b"3", b"2", b"1"]
+
+
+async def test_first_checkpoint_of_each_of_the_last_30_days_is_stored_beside_the_last_two(nc, clock):
+    store = await _checkpoint_store(nc, "a")
+    claim = await store.claim(10)
+    for half_day in range(80):
+        clock.now_s += 43_200.0
+        claim = await store.write(claim, half_day, iter([b"%d" % half_day]), file_format=FORMAT)
+    last_days = [b"%d" % half_day for half_day in range(78, 18, -2)]
+    assert await _load(store, await store.claim(10)) == [b"79", *last_days]
+    assert len(await _objects(nc, 10)) == DAILY_CHECKPOINTS + 1  # the last but one is the first of its day
+
+
+async def test_claim_of_a_checkpoint_of_an_unreadable_format_fails_and_changes_nothing(nc):
+    later_version, this_version = await _checkpoint_store(nc, "later"), await _checkpoint_store(nc, "this")
+    claim = await later_version.write(await later_version.claim(11), 1, iter([b"1"]), file_format=FORMAT + 1)
+    for _ in range(CHECKPOINTS_PER_PARTITION + 1):
+        with pytest.raises(UnreadableFormatError, match=f"of format {FORMAT + 1}, this version reads {FORMAT}"):
+            await this_version.claim(11)
+    assert await later_version.confirm_claim(claim) == claim
+    assert await _load(later_version, claim) == [b"1"]
+
+
+async def test_pointer_of_another_version_is_not_replaced(nc):
+    bucket = await nc.jetstream().key_value(subjects.CHECKPOINTS_BUCKET)
+    revision = await bucket.put("p12", b'{"worker": "later", "next": {}}')
+    store = await _checkpoint_store(nc, "a")
+    with pytest.raises(UnreadableFormatError, match="pointer to the checkpoints is unreadable"):
+        await store.claim(12)
+    assert (await bucket.get("p12")).revision == revision
+
+
+async def test_worker_refuses_a_partition_whose_bytes_are_of_another_format_than_its_pointer_says(nc, url):
+    store = await _checkpoint_store(nc, "later")
+    data = bytearray(b"".join(PartitionCheckpoint(0, 1).chunks()))
+    data[FORMAT_OFFSET] = FORMAT + 1
+    await store.write(await store.claim(0), 1, iter([b"an earlier checkpoint"]), file_format=FORMAT)
+    claim = await store.write(await store.claim(0), 1, iter([bytes(data)]), file_format=FORMAT)
+    stop = asyncio.Event()
+    async with Heartbeats(nc) as heartbeats:
+        worker_task = asyncio.create_task(work(Options(url, "w"), stop))
+        await send(nc, "p1", block("p1", 1))
+        refused = (RefusedPartition(partition=0, format=FORMAT + 1),)
+        await heartbeats.until(lambda last: "w" in last and last["w"].refused == refused)
+        stop.set()
+        await worker_task
+    assert (await store.claim(0)).pointer.kept == claim.pointer.kept
 
 
 async def test_worker_waits_for_streams_and_table_rows_and_continues_from_the_newest_intact_checkpoint(tmp_path):
@@ -139,11 +214,11 @@ async def test_worker_waits_for_streams_and_table_rows_and_continues_from_the_ne
         late_states = await nc.subscribe(subjects.published("p2", "state"))
         registry = await load_packs(nc, ["p1", "p2"])
         number = 1
-        for damaged_count in (0, 1, 2):
+        for damaged_count in range(4):
             number += 1
             store = await _checkpoint_store(nc, "test")
-            for kept in (await store.claim(0)).pointer.kept[:damaged_count]:
-                await nc.jetstream().purge_stream(STATES_STREAM, subject=await _chunk_subject(nc, kept.object))
+            for checkpoint in (await store.claim(0)).pointer.checkpoints[:damaged_count]:
+                await nc.jetstream().purge_stream(STATES_STREAM, subject=await _chunk_subject(nc, checkpoint.object))
             stop = asyncio.Event()
             with capture_logs() as logs:
                 worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
@@ -153,7 +228,7 @@ async def test_worker_waits_for_streams_and_table_rows_and_continues_from_the_ne
                 await worker_task
             # a damaged checkpoint may be logged again when the worker is fenced and starts again
             assert len({line["object"] for line in logs if "is damaged" in line["event"]}) == damaged_count
-            assert any("from its beginning" in line["event"] for line in logs) == (damaged_count == 2)
+            assert any("from its beginning" in line["event"] for line in logs) == (damaged_count == 3)
         await _until_block(late_states, 1)  # although no block arrived after the pack became known
         state = (await end_states(nc, registry, 1))[0].state("p1")
         assert state is not None

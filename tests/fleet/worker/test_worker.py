@@ -170,9 +170,16 @@ def expected_hours(registry: PackRegistry, fleet: SimulatedFleet, edges: Simulat
 
 
 def test_partitions_are_shared_evenly_and_few_move_when_a_worker_joins() -> None:
-    before, after = assign_partitions(64, ["a", "b"]), assign_partitions(64, ["a", "b", "c"])
+    a, b, c = {"a": ()}, {"b": ()}, {"c": ()}
+    before, after = assign_partitions(64, a | b), assign_partitions(64, a | b | c)
     assert sorted(Counter(before).values()) == [32, 32]
     assert max(Counter(after).values()) == 22  # of 64 partitions among three workers
     moved = sum(old != new for old, new in zip(before, after, strict=True))
     assert moved <= 28  # the third worker gets at least 20
-    assert assign_partitions(3, ["a", "b"]) == assign_partitions(3, ["b", "a"])
+    assert assign_partitions(3, a | b) == assign_partitions(3, b | a)
+
+
+def test_refused_partition_belongs_to_another_worker_and_to_none_if_all_refuse_it() -> None:
+    refused_by_a = assign_partitions(8, {"a": (0, 1, 2, 3, 4, 5), "b": ()})
+    assert refused_by_a == ["b"] * 6 + ["a"] * 2
+    assert assign_partitions(2, {"a": (0,), "b": (0,)})[0] is None

@@ -80,7 +80,7 @@ function drawStatus() {
 
 function tile(id, state) { attribute($(id), "class", `card ${state}`); }
 
-function drawTiles({ packs, holders, unheld, twice, lag_s, workers, states_per_s, concerns, attention, listening_s }) {
+function drawTiles({ packs, holders, unheld, twice, refused, lag_s, workers, states_per_s, concerns, attention, listening_s }) {
 	const missing = packs.known - packs.alive, unsure = missing - packs.silent;
 	put("alive", count(packs.alive));
 	put("known", `of ${count(packs.known)}`);
@@ -91,7 +91,7 @@ function drawTiles({ packs, holders, unheld, twice, lag_s, workers, states_per_s
 	const alive = workers.filter((w) => w.alive).length;
 	put("held", count(holders.length - unheld.length));
 	put("partitions", `of ${holders.length}`);
-	put("unheld", unheld.length ? `unheld: ${rangesText(unheld)}` : twice.length ? `held twice: ${rangesText(twice)}` : `by ${counted(alive, "worker")}`);
+	put("unheld", refused.length ? `unreadable checkpoints: ${rangesText(refused)}` : unheld.length ? `unheld: ${rangesText(unheld)}` : twice.length ? `held twice: ${rangesText(twice)}` : `by ${counted(alive, "worker")}`);
 	tile("held", unheld.length ? "wrong" : twice.length ? "low" : "fine");
 
 	put("lag", seconds(lag_s));
@@ -240,9 +240,19 @@ function drawWorkers({ workers, holders, unheld }) {
 	$("workers").replaceChildren(...workers.map((w, i) => {
 		const values = w.alive ? [count(w.partitions), count(w.packs), seconds(w.lag_s), rate(w.samples_per_s) || "–"] : ["–", "–", `gone ${duration(w.heard_s)}`, "–"];
 		const name = node("td", {}, node("i", { class: `swatch c${i % COLORS}` }), w.id, w.leaving ? " (leaving)" : "");
+		for (const [format, partitions] of byFormat(w.refused)) {
+			name.append(node("p", { class: "bad" }, `refuses ${partitions.length > 1 ? "partitions" : "partition"} ${rangesText(partitions)}: checkpoint format ${format || "unknown"}, reads ${[...new Set(w.checkpoint_formats)].join(", ")}`));
+		}
 		if (w.trouble) name.append(node("p", { class: "bad" }, w.trouble));
 		return node("tr", w.alive ? {} : { class: "gone" }, name, ...values.map((value) => node("td", {}, value)));
 	}));
+}
+
+/** Partitions by the format of their checkpoints. */
+function byFormat(refused) {
+	const formats = new Map();
+	for (const [partition, format] of refused) formats.set(format, [...(formats.get(format) ?? []), partition]);
+	return formats;
 }
 
 // query results
