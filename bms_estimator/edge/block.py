@@ -22,6 +22,7 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,16 +109,44 @@ def decode(data: bytes) -> Block:
     Raises:
         BlockError: The bytes are not a block, or damaged.
     """
+    header = _decode_header(data)
+    samples, cells_v = _decode_body(data[_HEADER.size :], header.samples, header.cells)
+    return Block(header.store, header.number, header.oldest, header.arrival_s, samples, cells_v)
+
+
+class _Header(NamedTuple):
+    """Header of a block: the fields of ``Block``, and the numbers of samples and of cells."""
+
+    store: int
+    number: int
+    oldest: int
+    arrival_s: float
+    samples: int
+    cells: int
+
+
+def _decode_header(data: bytes) -> _Header:
+    """Return the header of a block."""
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         raise BlockError(f"{len(data)} bytes without the header of a block")
     _, version, cells, count, store, number, oldest, arrival_s = _HEADER.unpack_from(data)
     if not _VERSION_WITHOUT_CELLS <= version <= VERSION:
-        raise BlockError(f"version {version}; this program reads versions {_VERSION_WITHOUT_CELLS} to {VERSION}")
+        raise BlockError(
+            f"version {version}; this program reads versions {_VERSION_WITHOUT_CELLS} to {VERSION}: upgrade workers before edges"
+        )
     if not (1 <= oldest <= number < MAX_NUMBER and 0 < store < MAX_NUMBER and math.isfinite(arrival_s)):
         raise BlockError(f"implausible header: store {store}, number {number}, oldest {oldest}, arrival {arrival_s}")
-    cells = cells if version > _VERSION_WITHOUT_CELLS else 0
-    samples, cells_v = _decode_body(data[_HEADER.size :], count, cells)
-    return Block(store, number, oldest, arrival_s, samples, cells_v)
+    return _Header(store, number, oldest, arrival_s, count, cells if version > _VERSION_WITHOUT_CELLS else 0)
+
+
+def decode_header(data: bytes) -> Block:
+    """Decode only the header of a block. The returned block has no samples.
+
+    Raises:
+        BlockError: The bytes are not a block, or its header is damaged.
+    """
+    header = _decode_header(data)
+    return Block(header.store, header.number, header.oldest, header.arrival_s, np.zeros(0, SAMPLE))
 
 
 def peek_header(data: bytes) -> tuple[int, float]:

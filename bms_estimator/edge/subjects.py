@@ -5,6 +5,7 @@
 ``p.<partition>.raw.<pack>`` these blocks as the stream ``RAW`` stores them; publishing to this subject has no effect
 ``edge.<pack>.awaits``       ``BlockRequest`` to the edge: the block that a worker awaits next
 ``bms.<pack>.<topic>``       estimates, in the format of the command ``run``
+``dead.<pack>.<digest>``     a block that a worker could not process, stored in the stream ``DEAD``
 ``hours.<pack>``             one-hour summaries by a worker, stored in the stream ``HOURS``
 ``fleet.worker.<id>``        heartbeat of a worker, once a second, with its partitions and its lag
 ``fleet.unknown.<pack>``     one report of a worker that it has blocks of an unregistered pack, with the reason
@@ -15,7 +16,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-RAW_STREAM, HOURS_STREAM = "RAW", "HOURS"
+RAW_STREAM, HOURS_STREAM, DEAD_STREAM = "RAW", "HOURS", "DEAD"
 PACKS_BUCKET, CELLS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "cells", "checkpoints", "states"
 """Names of buckets. The first three are key-value buckets: settings by pack, cell files by name, and the last checkpoint
 by partition. The fourth is an object bucket with the content of the checkpoints."""
@@ -51,6 +52,11 @@ def published(pack: str, topic: str) -> str:
 def hours(pack: str = "*") -> str:
     """Return the subject of a pack's one-hour summaries."""
     return f"hours.{pack}"
+
+
+def dead(pack: str = "*", digest: str = "*") -> str:
+    """Return the subject of a block that a worker could not process."""
+    return f"dead.{pack}.{digest}"
 
 
 def worker(name: str = "*") -> str:

@@ -20,6 +20,9 @@ COMMANDS = {
     "workers": LazyCommand(
         "bms_estimator.cli.fleet.workers:workers", "List the workers, their versions and the partitions they refuse."
     ),
+    "dead-letters": LazyCommand(
+        "bms_estimator.cli.fleet.dead_letters:app", "List or replay blocks that workers could not process."
+    ),
     "packs": LazyCommand("bms_estimator.cli.fleet.packs:app", "Upload, list, show or remove the settings of packs."),
     "capture": LazyCommand(
         "bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a CSV or Parquet file."

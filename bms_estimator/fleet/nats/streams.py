@@ -29,6 +29,10 @@ HOURS_FRACTION = 1 / 16
 """Maximum size of the stream ``HOURS`` as a fraction of the maximum size of ``RAW``."""
 HOURS_AGE_S = 30 * 86_400.0
 """Maximum age of a message in the stream ``HOURS`` [s]."""
+DEAD_FRACTION = 1 / 64
+"""Maximum size of the stream ``DEAD`` as a fraction of the maximum size of ``RAW``."""
+DEAD_AGE_S = 30 * 86_400.0
+"""Maximum age of a message in the stream ``DEAD`` [s]."""
 MAX_BLOCK_BYTES = 256 << 10
 """Maximum size of a block in ``RAW`` [bytes]: 7,000 incompressible samples."""
 PACK_FRACTION = 1 / 3
@@ -85,7 +89,13 @@ async def make_streams(
             f"the stream {subjects.RAW_STREAM} has {existing} partitions, but {partitions} are configured: "
             "the number of a stream cannot change"
         )
-    for stream in (_raw_stream(partitions, raw_bytes, raw_age_s), _hours_stream(raw_bytes), *_bucket_streams()):
+    streams = (
+        _raw_stream(partitions, raw_bytes, raw_age_s),
+        _hours_stream(raw_bytes),
+        _dead_stream(raw_bytes),
+        *_bucket_streams(),
+    )
+    for stream in streams:
         await _retry(_ensure_stream, nc, stream | {"num_replicas": replicas})
     numbers = range(partitions)
     for first in range(0, partitions, CONSUMER_BATCH):
@@ -141,6 +151,17 @@ def _hours_stream(raw_bytes: int) -> dict[str, Any]:
         "allow_direct": True,
     }
     return _stream(subjects.HOURS_STREAM, subjects.hours(), duplicate_window=_ns(DUPLICATES_S), **limits)
+
+
+def _dead_stream(raw_bytes: int) -> dict[str, Any]:
+    limits = {
+        "max_bytes": round(DEAD_FRACTION * raw_bytes),
+        "max_age": _ns(DEAD_AGE_S),
+        "max_msgs_per_subject": 1,
+        "discard": "old",
+        "allow_direct": True,
+    }
+    return _stream(subjects.DEAD_STREAM, subjects.dead(), **limits)
 
 
 def _bucket_streams() -> list[dict[str, Any]]:

@@ -71,7 +71,9 @@ class FleetView:
         result = self.packs.overview(now_s, self._since_s) | self.workers.overview(now_s)
         result["concerns"]["unknown"] = unknown = self._unknown_packs(now_s)
         result["concerns"]["clock"] = clock = self._packs_with_clock_error(now_s)
-        result["attention"] += unknown["count"] + clock["count"]
+        dead = self.workers.dead_packs(now_s)
+        result["concerns"]["dead"] = {"count": len(dead), "packs": sorted(dead.items())[:MAX_LISTED]}
+        result["attention"] += unknown["count"] + clock["count"] + len(dead)
         return result | {
             "time": iso_utc(wall_s),
             "listening_s": round(now_s - self._since_s, 1),

@@ -68,6 +68,7 @@ _WORKER_PUBLISH = (
     "edge.*.awaits",
     "bms.>",
     "hours.*",
+    "dead.*.*",
     "fleet.>",
     "_INBOX.>",
 )

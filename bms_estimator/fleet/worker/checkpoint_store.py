@@ -80,15 +80,24 @@ class Pointer(BaseModel):
     daily: tuple[CheckpointInfo, ...] = ()
     """First checkpoints of the last days, newest first. The last of them may also be in ``kept``."""
 
+    unsaved_claims: int = 0
+    """Number of claims since the last checkpoint or the last orderly release."""
+
     @property
     def checkpoints(self) -> tuple[CheckpointInfo, ...]:
         """All stored checkpoints without repetitions, the last ones first."""
         return tuple(dict.fromkeys((*self.kept, *self.daily)))
 
-    @property
-    def checkpoints(self) -> tuple[CheckpointInfo, ...]:
-        """All stored checkpoints."""
-        return self.kept
+
+class ReplayRecord(BaseModel):
+    """Progress of a guarded replay of a partition (``replay_guard``)."""
+
+    model_config = ConfigDict(frozen=True)
+
+    sequence: int = 0
+    """Stream sequence number of the block that the holder processes; 0: none."""
+    deaths: dict[int, int] = {}
+    """Number of holders that died while they processed a block, by its stream sequence number."""
 
 
 class StoredPointer(NamedTuple):
@@ -118,7 +127,7 @@ class CheckpointStore:
     """
 
     def __init__(self, nc: Client, worker: str, checkpoints: KeyValue, states: ObjectStore) -> None:
-        self._nc, self._js, self._worker = nc, nc.jetstream(), worker
+        self._nc, self._js, self.worker = nc, nc.jetstream(), worker
         self._checkpoints, self._states = checkpoints, states
         self._object_names = NUID()
         self._last_sent: dict[int, Pointer] = {}  # by partition; its response may have been lost
@@ -134,7 +143,8 @@ class CheckpointStore:
         if stored is None:
             return await self._write_pointer(partition, 0, Pointer())  # revision 0: the key must not exist
         _check_format(stored.pointer)
-        claim = await self._write_pointer(partition, stored.revision, stored.pointer)
+        counted = stored.pointer.model_copy(update={"unsaved_claims": stored.pointer.unsaved_claims + 1})
+        claim = await self._write_pointer(partition, stored.revision, counted)
         await self._remove_object(stored.pointer.next)
         return claim
 
@@ -150,6 +160,32 @@ class CheckpointStore:
         if stored.pointer == self._last_sent.get(claim.partition):
             return Claim(claim.partition, stored.revision, stored.pointer)
         raise FencedError(stored.pointer.worker)
+
+    async def end_claim(self, claim: Claim) -> None:
+        """Record an orderly release of a partition whose last checkpoint is up to date.
+
+        Raises:
+            FencedError: Another worker has taken the partition over.
+        """
+        if claim.pointer.unsaved_claims:
+            pointer = claim.pointer.model_copy(update={"unsaved_claims": 0})
+            await self._write_pointer(claim.partition, claim.revision, pointer)
+
+    async def read_replay(self, partition: int) -> ReplayRecord:
+        """Return the record of the last guarded replay of a partition."""
+        try:
+            return ReplayRecord.model_validate_json((await self._checkpoints.get(_replay_key(partition))).value or b"")
+        except (KeyNotFoundError, ValidationError):
+            return ReplayRecord()
+
+    async def write_replay(self, partition: int, record: ReplayRecord) -> None:
+        """Store the record of a guarded replay."""
+        await self._checkpoints.put(_replay_key(partition), record.model_dump_json().encode())
+
+    async def send_replay(self, partition: int, record: ReplayRecord) -> None:
+        """Send the record of a guarded replay without waiting for its storage."""
+        subject = f"$KV.{subjects.CHECKPOINTS_BUCKET}.{_replay_key(partition)}"
+        await self._nc.publish(subject, record.model_dump_json().encode())
 
     async def check_format(self, partition: int) -> None:
         """Check that the last checkpoint of a partition can be read.
@@ -225,9 +261,9 @@ class CheckpointStore:
         if chunks is not None:
             size = await self._write_object(pointer.next, chunks)
             new = (old.model_copy(update={"object": pointer.next, "bytes": size}),)
-        kept = tuple(info for each in pointer.kept for info in (new if each == old else (each,)))
+        new_pointer = Pointer(kept=_replaced(pointer.kept, old, new), daily=_replaced(pointer.daily, old, new))
         try:
-            claim = await self._write_pointer(claim.partition, claim.revision, kept)
+            claim = await self._write_pointer(claim.partition, claim.revision, new_pointer)
         except FencedError:
             await self._remove_object(pointer.next)
             raise
@@ -256,7 +292,7 @@ class CheckpointStore:
             FencedError: The stored pointer has another revision.
         """
         next_object = f"p{partition}-{self._object_names.next().decode()}"
-        pointer = pointer.model_copy(update={"worker": self._worker, "next": next_object})
+        pointer = pointer.model_copy(update={"worker": self.worker, "next": next_object})
         self._last_sent[partition] = pointer
         try:
             data = pointer.model_dump_json().encode()
@@ -314,6 +350,13 @@ def _check_format(pointer: Pointer) -> None:
         raise UnreadableFormatError(pointer.kept[0].format)
 
 
+def _replaced(
+    infos: tuple[CheckpointInfo, ...], old: CheckpointInfo, new: tuple[CheckpointInfo, ...]
+) -> tuple[CheckpointInfo, ...]:
+    """Return checkpoints with ``new`` in place of ``old``."""
+    return tuple(info for each in infos for info in (new if each == old else (each,)))
+
+
 def _with_daily(daily: tuple[CheckpointInfo, ...], info: CheckpointInfo) -> tuple[CheckpointInfo, ...]:
     """Return the daily checkpoints, with ``info`` added if it is the first one of its day."""
     if any(each.made_s // DAY_S == info.made_s // DAY_S for each in daily):
@@ -359,3 +402,7 @@ def _digest(sha256: bytes) -> str:
 
 def _key(partition: int) -> str:
     return f"p{partition}"
+
+
+def _replay_key(partition: int) -> str:
+    return f"p{partition}.replay"

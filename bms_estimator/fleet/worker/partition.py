@@ -13,7 +13,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from bms_estimator.edge.block import Block, BlockError, decode
+from bms_estimator.edge.block import Block, BlockError, decode, decode_header
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.packs.pack_type import PackType, PackTypes
 from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken
@@ -35,6 +35,11 @@ from bms_estimator.settings.pack import Settings
 PackLookup = Callable[[str], tuple[Settings, PackModel] | None]
 """Function that returns settings and model of a pack; None: the pack is unknown."""
 
+LETHAL = "the workers that processed it have died"
+"""Reason for the dead letter of a lethal block."""
+INTERNAL_ERROR = "internal error; the log of the worker has the traceback"
+"""Reason for the dead letter of a block that was skipped because of an internal error."""
+
 log = structlog.get_logger(__name__)
 
 
@@ -49,6 +54,7 @@ class BlockResult(NamedTuple):
         hours: Message ids and rows of finished hours. The message id of a row is equal for all workers, so that the server
             drops repeated rows.
         failed: Number of blocks that were skipped because of an internal error.
+        dead: Reason for which the block becomes a dead letter; empty for a block that does not.
     """
 
     pack: str
@@ -57,6 +63,7 @@ class BlockResult(NamedTuple):
     parameters: bytes | None = None
     hours: tuple[tuple[str, bytes], ...] = ()
     failed: int = 0
+    dead: str = ""
 
 
 class Partition:
@@ -139,15 +146,18 @@ class Partition:
         self._unpacked.load(packed)
         return self._unpacked.record.copy()
 
-    def take(self, pack: str, data: bytes, sequence: int, received_s: int | None = None) -> BlockResult:
+    def take(
+        self, pack: str, data: bytes, sequence: int, received_s: int | None = None, *, is_lethal: bool = False
+    ) -> BlockResult:
         """Process a message of the stream, or defer it if its pack is unknown or has other deferred messages.
 
         Args:
             pack: Name of the sending pack.
-            data: Bytes of a block; if they are damaged, the message is counted and skipped.
+            data: Bytes of a block; if they cannot be decoded, the message is counted and skipped.
             sequence: Stream sequence number. A message that was already processed is counted and skipped.
             received_s: Server's clock at the arrival of the message [s since 1970]; None: unknown, so that the edge's clock
                 is not checked.
+            is_lethal: Skip the block, because it has killed workers (``replay_guard``).
         """
         if sequence <= self.sequence:
             self._counters["repeated"] += 1
@@ -155,13 +165,11 @@ class Partition:
         if pack in self.deferred:
             return self.defer(pack, sequence)
         self.sequence = sequence
-        block = self._decode(data)
-        if block is None:
-            return BlockResult(pack)
         pack_type = self._look_up(pack)
         if pack_type is None:
-            return self.defer(pack, sequence)
-        return self._take(pack, block, Arrival(sequence, received_s), pack_type)
+            is_block = isinstance(self._decode(data), Block)
+            return self.defer(pack, sequence) if is_block else BlockResult(pack)
+        return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def defer(self, pack: str, sequence: int) -> BlockResult:
         """Defer a message: it stays in the stream until its pack is served."""
@@ -173,14 +181,15 @@ class Partition:
             self._counters["not_deferred"] += 1
         return BlockResult(pack)
 
-    def take_deferred(self, pack: str, data: bytes, sequence: int, received_s: int | None = None) -> BlockResult:
+    def take_deferred(
+        self, pack: str, data: bytes, sequence: int, received_s: int | None = None, *, is_lethal: bool = False
+    ) -> BlockResult:
         """Process the next deferred message of a known pack. ``take`` describes the arguments."""
         pack_type = self._look_up(pack)
         if pack_type is None or pack not in self.deferred:
             return BlockResult(pack)
         self.deferred.advance(pack, sequence)
-        block = self._decode(data)
-        return self._take(pack, block, Arrival(sequence, received_s), pack_type) if block else BlockResult(pack)
+        return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def is_known(self, pack: str) -> bool:
         """Return True if the table contains the pack."""
@@ -198,13 +207,23 @@ class Partition:
         """Drop the cached settings of a pack, so that its next block reads them from the table."""
         self._type_by_pack.pop(pack, None)
 
-    def _decode(self, data: bytes) -> Block | None:
-        """Return the block in a message; None if it is damaged."""
+    def _decode_and_take(
+        self, pack: str, data: bytes, arrival: Arrival, pack_type: PackType, *, is_lethal: bool
+    ) -> BlockResult:
+        """Process a message of a known pack. Of a lethal block only the header is decoded."""
+        block = self._decode(data, decode_header if is_lethal else decode)
+        if isinstance(block, BlockError):
+            self._log_rejection(pack, str(block))
+            return BlockResult(pack, dead=str(block))
+        return self._take(pack, block, arrival, pack_type, is_lethal=is_lethal)
+
+    def _decode(self, data: bytes, decode_block: Callable[[bytes], Block] = decode) -> Block | BlockError:
+        """Return the block in a message, or the error of a damaged one."""
         try:
-            return decode(data)
-        except BlockError:
+            return decode_block(data)
+        except BlockError as error:
             self._counters["damaged"] += 1
-            return None
+            return error
 
     def _look_up(self, pack: str) -> PackType | None:
         """Return the type of a pack; None if the pack is unknown."""
@@ -216,7 +235,7 @@ class Partition:
             pack_type = self._type_by_pack[pack] = self._types.of(*entry)
         return pack_type
 
-    def _take(self, pack: str, block: Block, arrival: Arrival, pack_type: PackType) -> BlockResult:
+    def _take(self, pack: str, block: Block, arrival: Arrival, pack_type: PackType, *, is_lethal: bool) -> BlockResult:
         """Process a block of a known pack."""
         unmigrated_fields = self._load(pack)
         d = self._unpacked.delivery
@@ -227,7 +246,7 @@ class Partition:
         self._unpacked.count_lost(newly_lost)
         result = BlockResult(pack)
         if order is BlockOrder.NEXT:
-            stepped, fault = None, density_fault(block.samples)
+            stepped, fault = None, LETHAL if is_lethal else density_fault(block.samples)
             if fault:
                 self._log_rejection(pack, fault)
             else:
@@ -237,8 +256,9 @@ class Partition:
                 self._restore_unmigrated_delivery(pack)
                 classify_block(d, block)
                 self._unpacked.count_lost(newly_lost)
-                self._counters["too_dense" if fault else "failed"] += 1
-            result = stepped or BlockResult(pack, failed=int(not fault))
+                self._counters["lethal" if is_lethal else "too_dense" if fault else "failed"] += 1
+            dead = LETHAL if is_lethal else "" if fault else INTERNAL_ERROR
+            result = stepped or BlockResult(pack, failed=int(not fault), dead=dead)
             mark_taken(d)
             self._update_clock_error(pack, float(d["clock_error_s"]))
             self._unmigrated.pop(pack, None)

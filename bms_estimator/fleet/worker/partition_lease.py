@@ -22,14 +22,16 @@ from nats.js.errors import NotFoundError
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.connection import error_text
+from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError
 from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
 from bms_estimator.fleet.worker.deferred import Span
-from bms_estimator.fleet.worker.partition import BlockResult, PackLookup, Partition
+from bms_estimator.fleet.worker.partition import INTERNAL_ERROR, BlockResult, PackLookup, Partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
+from bms_estimator.fleet.worker.replay_guard import ReplayGuard
 from bms_estimator.process.tasks import until_first_ends
 
 RETRY_S = 0.5
@@ -69,9 +71,12 @@ class PartitionLease:
         partition: State of the packs; None while the partition is not taken over.
         claim: Claim of this worker; None while it has none.
         waiting_summaries: Summaries that the server has not acknowledged yet: (message id, pack, row).
+        waiting_dead_letters: Dead letters that the server has not acknowledged yet.
+        dead_packs: Reason of the last dead letter of each pack, since this lease began.
         lag_s: Largest lag since it was last reset to None [s].
         blocks, samples: Number of blocks and samples processed by this lease.
         faults: Number of blocks skipped because of an internal error.
+        dead_letters: Number of dead letters.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
         trouble: Text of the present error; empty without one.
         refused_format: Format of the unreadable last checkpoint, because of which the partition is left to other workers;
@@ -95,12 +100,15 @@ class PartitionLease:
         self._checkpoint_format = checkpoint_format
         self._nc, self.number, self._table, self._checkpoints = nc, number, table, checkpoints
         self._step_lock = step_lock
+        self._guard = ReplayGuard(checkpoints, number)
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
         self.partition: Partition | None = None
         self.claim: Claim | None = None
         self.waiting_summaries: deque[tuple[str, str, bytes]] = deque()
+        self.waiting_dead_letters: deque[DeadLetter] = deque()
+        self.dead_packs: dict[str, str] = {}
         self.lag_s: float | None = None
-        self.blocks = self.samples = self.faults = 0
+        self.blocks = self.samples = self.faults = self.dead_letters = 0
         self.trouble, self.checkpoint_due_s = "", 0.0
         self.refused_format: int | None = None
         self._pin = 0  # number of the pin under which the claim was last confirmed
@@ -178,8 +186,9 @@ class PartitionLease:
                 return
             snapshot, partition.deferred.is_saved = partition.snapshot(), True
             try:
-                # The summaries are sent first, because the next owner does not compute the summaries of saved samples again.
-                await self.send_summaries()
+                # Summaries and dead letters are sent first, because the next owner does not compute those of saved samples
+                # again.
+                await self.send_results()
                 file_format = self._checkpoint_format()
                 chunks = snapshot.chunks(file_format)
                 self.claim = await self._checkpoints.write(claim, snapshot.sequence, chunks, file_format=file_format)
@@ -189,11 +198,12 @@ class PartitionLease:
                 partition.deferred.is_saved = False
                 raise
 
-    async def send_summaries(self) -> None:
-        """Publish the waiting summaries and await the server's acknowledgment.
+    async def send_results(self) -> None:
+        """Publish the waiting summaries and dead letters, and await the server's acknowledgment.
 
         Raises:
-            nats.errors.Error: Some were not acknowledged; they remain in ``waiting_summaries``.
+            nats.errors.Error: Some were not acknowledged; they remain in ``waiting_summaries`` or
+                ``waiting_dead_letters``.
         """
         js = self._nc.jetstream()
 
@@ -207,11 +217,20 @@ class PartitionLease:
                 for row in rows:  # the queue was cleared meanwhile if the ownership was lost
                     if self.waiting_summaries and self.waiting_summaries[0] is row:
                         self.waiting_summaries.popleft()
+            while self.waiting_dead_letters:
+                letter = self.waiting_dead_letters[0]
+                await js.publish(letter.subject, letter.data, headers=letter.headers())
+                if self.waiting_dead_letters and self.waiting_dead_letters[0] is letter:
+                    self.waiting_dead_letters.popleft()
 
     async def release(self) -> None:
         """Write a checkpoint and release the partition; ``run`` has ended."""
         try:
             await self.save()
+            if self.claim:
+                await self._checkpoints.end_claim(self.claim)
+        except FencedError as error:
+            self._drop_ownership(error)
         except RETRYABLE_ERRORS as error:
             log.warning(
                 "released without a new checkpoint: the next owner reads the stream from the last one",
@@ -261,10 +280,9 @@ class PartitionLease:
         if sequence > span.last:  # the stream has dropped the deferred messages
             partition.deferred.advance(pack, span.last)
             return
-        received_s = int(message.time.timestamp()) if message.time else None
-        take = partial(partition.take_deferred, pack, data, sequence, received_s)
+        take = partial(partition.take_deferred, received_s=int(message.time.timestamp()) if message.time else None)
         self._count_block(data)
-        await self._publish(await self._step(pack, sequence, take))
+        await self._publish(await self._step(pack, data, sequence, take))
 
     async def _process_delivered(self, delivered: DeliveredMessage) -> None:
         """Process a delivered message after all earlier ones; return when that is done or the pin is lost."""
@@ -276,6 +294,11 @@ class PartitionLease:
         partition = self.partition
         if partition is None or delivered.sequence <= partition.sequence:
             return
+        if not await self._try(partial(self._take_delivered, partition, delivered)):
+            self._is_gapless = False
+
+    async def _take_delivered(self, partition: Partition, delivered: DeliveredMessage) -> None:
+        """Process a delivered message whose predecessors are all processed."""
         await self._publish(await self._take_or_defer(partition, delivered.pack, delivered))
 
     async def _process_before(self, delivered: DeliveredMessage) -> None:
@@ -313,9 +336,12 @@ class PartitionLease:
         if partition is None:
             claim = await self._checkpoints.claim(self.number)
             partition = await self._restore(claim)
+            last_sequence = await self._last_sequence()
+            await self._guard.begin(claim, last_sequence)
             self.partition, self.claim = partition, claim
             self._wake_up_deferred.set()
-        last_sequence = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
+        else:
+            last_sequence = await self._last_sequence()
         if partition.sequence > last_sequence:
             log.warning(
                 "the stream ends before the checkpoint, because it was recreated or has lost its end: reading it from its beginning",
@@ -326,6 +352,10 @@ class PartitionLease:
             partition.sequence = 0
             partition.deferred.clear()
         return partition
+
+    async def _last_sequence(self) -> int:
+        """Return the sequence number of the last message of the stream."""
+        return (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
 
     async def _restore(self, claim: Claim) -> Partition:
         """Return the partition of the newest usable checkpoint; an empty one without a checkpoint.
@@ -379,24 +409,35 @@ class PartitionLease:
             partition.defer(pack, sequence)
             self._wake_up_deferred.set()
             return BlockResult(pack)
-        result = await self._step(pack, sequence, partial(partition.take, pack, data, sequence, message.received_s))
+        result = await self._step(pack, data, sequence, partial(partition.take, received_s=message.received_s))
         if pack not in partition.deferred:
             self._count_block(data)
         return result
 
-    async def _step(self, pack: str, sequence: int, take: Callable[[], BlockResult]) -> BlockResult:
+    async def _step(self, pack: str, data: bytes, sequence: int, take: Callable[..., BlockResult]) -> BlockResult:
         """Process a message while no other block is processed, and charge the processor time to its pack."""
         async with self._step_lock:
             await asyncio.sleep(0)  # lets the event loop send heartbeats between two blocks
+            is_lethal = await self._guard.is_lethal(sequence)
             begin_s = time.thread_time()
             try:
-                result = take()
+                result = take(pack, data, sequence, is_lethal=is_lethal)
             except Exception:  # an internal error with one pack, which would otherwise end one worker after another
                 log.exception("a block is skipped", partition=self.number, pack=pack, sequence=sequence)
-                result = BlockResult(pack, failed=1)
+                result = BlockResult(pack, failed=1, dead=INTERNAL_ERROR)
             self._budget.charge(pack, time.thread_time() - begin_s)
-        self._record_result(result)
+            self._record_result(result)
+            if result.dead:
+                self._record_dead_letter(DeadLetter(pack, sequence, result.dead, self._checkpoints.worker, data))
+            await self._guard.end_block(sequence)
+        if is_lethal:
+            await self.save()  # the next owner must not meet the block again
         return result
+
+    def _record_dead_letter(self, letter: DeadLetter) -> None:
+        self.dead_letters += 1
+        self.dead_packs[letter.pack] = letter.reason
+        self.waiting_dead_letters.append(letter)
 
     def _count_block(self, data: bytes) -> None:
         """Count the block and its samples, and update the lag."""
@@ -438,6 +479,7 @@ class PartitionLease:
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
         self.partition = self.claim = None
         self._pin, self._is_gapless = 0, False
+        self.waiting_dead_letters.clear()
         self.waiting_summaries.clear()  # the owner of the partition computes them from the last checkpoint on
 
     def _refuse(self, error: UnreadableFormatError) -> None:

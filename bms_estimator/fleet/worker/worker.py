@@ -12,6 +12,7 @@ from pathlib import Path
 import structlog
 from nats.aio.client import Client
 from nats.aio.msg import Msg
+from nats.js.errors import NotFoundError
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
@@ -40,7 +41,7 @@ CHECK_S = 0.5
 REFUSAL_S = 10.0
 """Interval between two checks whether the checkpoint of a refused partition has become readable [s]."""
 MAX_UNKNOWN = 20
-"""Maximum number of unknown packs that a heartbeat names."""
+"""Maximum number of unknown packs, and of packs with dead letters, that a heartbeat names."""
 MAX_CLOCK_ERRORS = 20
 """Maximum number of packs with a wrong clock that a heartbeat names."""
 MAX_RELEASES = 8
@@ -122,6 +123,12 @@ async def _create_worker(nc: Client, options: Options, notifier: SystemdNotifier
     if partitions is None:
         raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
     js = nc.jetstream()
+    try:
+        await js.stream_info(subjects.DEAD_STREAM)
+    except NotFoundError:
+        raise UserError(
+            f"the server has no stream {subjects.DEAD_STREAM}: upgrade and restart `bms-estimator fleet serve` before the workers"
+        ) from None
     checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
     states = await js.object_store(subjects.STATES_BUCKET)
     bucket = PackBucket(nc)
@@ -160,7 +167,9 @@ class Worker:
         self._changed_packs: asyncio.Queue[set[str]] = asyncio.Queue()
         self._started_s = time.time()
         self._leases_updated_s = time.monotonic()
-        self._released_blocks = self._released_samples = self._released_faults = 0  # totals of released leases
+        self._released_blocks = self._released_samples = self._released_faults = self._released_dead_letters = (
+            0  # totals of released leases
+        )
         self._leaving = False
         # blocks are estimated one at a time; the event loop sends heartbeats between them
         self._step_lock = asyncio.Lock()
@@ -183,7 +192,7 @@ class Worker:
             _repeat(HEARTBEAT_S, self._send_heartbeat),
             _repeat(RENEW_S, self._update_leases),
             _repeat(CHECK_S, self._save),
-            _repeat(CHECK_S, self._send_hourly_summaries),
+            _repeat(CHECK_S, self._send_results),
             _repeat(REFUSAL_S, self._check_refused),
             self._bucket.follow(self._changed_packs.put_nowait),
             self._apply_table_changes(),
@@ -328,6 +337,7 @@ class Worker:
         self._released_blocks += lease.blocks
         self._released_samples += lease.samples
         self._released_faults += lease.faults
+        self._released_dead_letters += lease.dead_letters
         del self._lease_tasks[lease.number], self._releases[lease.number]
 
     async def _save(self) -> None:
@@ -338,10 +348,10 @@ class Worker:
                 lease.checkpoint_due_s = now_s + self._options.checkpoint_s
                 await self._try_to_store(lease, lease.save)
 
-    async def _send_hourly_summaries(self) -> None:
+    async def _send_results(self) -> None:
         for lease in self._leases:
-            if lease.waiting_summaries and self._nc.is_connected:
-                await self._try_to_store(lease, lease.send_summaries)
+            if (lease.waiting_summaries or lease.waiting_dead_letters) and self._nc.is_connected:
+                await self._try_to_store(lease, lease.send_results)
 
     async def _try_to_store(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:
         """Run ``action``. After an error of connection or server, the next periodic call tries again."""
@@ -349,7 +359,7 @@ class Worker:
             await action()
         except RETRYABLE_ERRORS as error:
             log.warning(
-                "a checkpoint or summary could not be stored; trying again",
+                "a checkpoint, summary or dead letter could not be stored; trying again",
                 partition=lease.number,
                 reason=error_text(error),
             )
@@ -373,6 +383,7 @@ class Worker:
         lags = [lease.lag_s for lease in owned_leases if lease.lag_s is not None]
         for lease in owned_leases:
             lease.lag_s = None  # a heartbeat has the largest lag since the previous heartbeat
+        dead_packs = {pack: reason for lease in owned_leases for pack, reason in lease.dead_packs.items()}
         usage = resource.getrusage(resource.RUSAGE_SELF)
         ages = [time.time() - checkpoint.made_s for lease in owned_leases if (checkpoint := lease.last_checkpoint)]
         return Heartbeat(
@@ -390,6 +401,8 @@ class Worker:
             blocks=self._released_blocks + sum(lease.blocks for lease in self._leases),
             samples=self._released_samples + sum(lease.samples for lease in self._leases),
             faults=self._released_faults + sum(lease.faults for lease in self._leases),
+            dead_letters=self._released_dead_letters + sum(lease.dead_letters for lease in self._leases),
+            dead_packs=dict(list(dead_packs.items())[-MAX_UNKNOWN:]),
             lag_s=max(lags, default=None),
             counters=dict(counters),
             unknown_count=len(unknown),

@@ -10,6 +10,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.worker.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.partition import PackLookup
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
@@ -115,7 +116,15 @@ async def _lease_after_first_blocks(nc: Client, table: PackLookup) -> tuple[Part
     """Run a lease of the only partition, and send it the first block of each pack. Return the lease and its task."""
     inbox = nc.new_inbox()
     lease = PartitionLease(
-        nc, 0, table, await _checkpoint_store(nc, "w"), inbox, asyncio.Lock(), partitions=1, is_busy=lambda: False
+        nc,
+        0,
+        table,
+        await _checkpoint_store(nc, "w"),
+        inbox,
+        asyncio.Lock(),
+        partitions=1,
+        checkpoint_format=lambda: FORMAT,
+        is_busy=lambda: False,
     )
     await _subscribe(nc, f"{inbox}.0.*", lease.receive)
     running_lease = asyncio.create_task(lease.run())

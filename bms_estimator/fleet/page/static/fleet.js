@@ -170,13 +170,14 @@ const KINDS = [
 	["soc", "Low SOC", (v) => `SOC ${f.percent(v)} %`],
 	["silent", "Silent", (v) => (f.isNumber(v) ? `not heard for ${duration(v)}` : "never heard")],
 	["clock", "Wrong clock", (v) => `its clock is ${duration(Math.abs(v))} ${v > 0 ? "ahead" : "behind"}`],
+	["dead", "Dead letters", (v) => `blocks could not be processed: ${v}`],
 	["unknown", "Unknown", (v) => `its blocks are held${v ? `: ${v}` : ""}`],
 ];
 const NOTES = {
 	all: "The worst packs of each kind.", margin: "Live packs, smallest margin first; counted below 5 %. The model is about to become invalid: stop discharging.",
 	suspects: "Input faults that the identifier suspected in the last hour.", uncertain: "Live packs, widest band first; counted above ± 10 %.",
 	soc: "Live packs, lowest SOC first; counted below 10 %.", silent: "No message for three minutes or more.", clock: "The clock of the pack's edge is wrong: its hourly summaries are quarantined.",
-	unknown: "Packs that send blocks but are not in the table.",
+	dead: "Packs with blocks that no worker could process; fleet dead-letters lists these blocks.", unknown: "Packs that send blocks but are not in the table.",
 };
 const beyond = (kind, c, v) => !("limit" in c) || (kind === "uncertain" ? v > c.limit : v < c.limit);
 

@@ -1,0 +1,80 @@
+"""Dead letters: blocks that workers could not process, stored in the stream ``DEAD`` with the reason.
+
+Each block has a subject of its own, made of its pack and its digest. Therefore a block that is sent again replaces its earlier
+dead letter.
+"""
+
+import hashlib
+from typing import NamedTuple, Self
+
+from nats.aio.client import Client
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.stream_reader import StoredMessage, read_stream
+
+REASON_HEADER, SEQUENCE_HEADER, WORKER_HEADER = "Bms-Reason", "Bms-Sequence", "Bms-Worker"
+TIME_HEADER = "Nats-Time-Stamp"
+"""Header of the server with the time of storage (RFC 3339)."""
+DIGEST_BYTES = 8
+"""Size of the digest of a block in its subject [bytes]."""
+
+
+class DeadLetter(NamedTuple):
+    """Block that a worker could not process."""
+
+    pack: str
+    sequence: int
+    """Sequence number of the block in the stream ``RAW``."""
+    reason: str
+    worker: str
+    """Name of the worker that stored the dead letter."""
+    data: bytes
+    """Bytes of the block."""
+    time: str = ""
+    """Time of storage (RFC 3339), set by the server."""
+
+    @property
+    def subject(self) -> str:
+        """Subject in the stream ``DEAD``."""
+        return subjects.dead(self.pack, hashlib.blake2b(self.data, digest_size=DIGEST_BYTES).hexdigest())
+
+    def headers(self) -> dict[str, str]:
+        """Return the headers of the stored message."""
+        reason = self.reason.replace("\r", " ").replace("\n", " ")
+        return {REASON_HEADER: reason, SEQUENCE_HEADER: str(self.sequence), WORKER_HEADER: self.worker}
+
+    @classmethod
+    def of(cls, message: StoredMessage) -> Self:
+        """Return the dead letter in a stored message."""
+        headers = message.headers
+        return cls(
+            pack=message.subject.split(".")[1],
+            sequence=int(headers.get(SEQUENCE_HEADER, 0)),
+            reason=headers.get(REASON_HEADER, ""),
+            worker=headers.get(WORKER_HEADER, ""),
+            data=message.data,
+            time=headers.get(TIME_HEADER, ""),
+        )
+
+
+async def read_dead_letters(nc: Client) -> list[DeadLetter]:
+    """Return all dead letters in the order of their blocks in the stream ``RAW``.
+
+    Raises:
+        StreamError: The server does not respond, or has no such stream.
+    """
+    letters = list[DeadLetter]()
+    async for batch in read_stream(nc, subjects.DEAD_STREAM, subjects.dead()):
+        letters += map(DeadLetter.of, batch)
+    return sorted(letters, key=lambda letter: letter.sequence)
+
+
+async def replay_letter(nc: Client, letter: DeadLetter) -> None:
+    """Send the block of a dead letter to the workers again, and remove the dead letter.
+
+    Raises:
+        nats.errors.Error: The server does not accept the block; the dead letter remains stored.
+    """
+    js = nc.jetstream()
+    await js.publish(subjects.raw(letter.pack), letter.data)
+    await js.purge_stream(subjects.DEAD_STREAM, subject=letter.subject)

@@ -1,0 +1,72 @@
+"""Detection of blocks that kill workers, in the replay of a partition whose last holders have died.
+
+A crash or an endless loop in native code gives a worker no chance to report the block. A worker that takes over a partition
+reads the stream from the last checkpoint, and therefore processes the block again. The claim counts the claims since the
+last checkpoint. From ``GUARDED_CLAIMS`` on, the worker writes down each block of the replay before it processes the block. The next
+holder finds the block in which the worker died. A block that was found ``MAX_DEATHS`` times is lethal. The worker skips it.
+"""
+
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim, ReplayRecord
+
+GUARDED_CLAIMS = 2
+"""Number of claims since the last checkpoint from which on a replay is guarded. The first claim is not, because a guarded replay
+waits for the server at each block, and most workers do not die because of a block."""
+MAX_DEATHS = 2
+"""Number of holders that died in a guarded replay of the same block, after which the block is lethal."""
+MAX_SUSPECTS = 16
+"""Maximum number of blocks whose deaths are counted; the newest ones."""
+
+
+class ReplayGuard:
+    """Guard of one partition.
+
+    Args:
+        checkpoints: Store of the checkpoints, which also stores the records.
+        partition: Number of the partition.
+    """
+
+    def __init__(self, checkpoints: CheckpointStore, partition: int) -> None:
+        self._checkpoints, self._partition = checkpoints, partition
+        self._end_sequence = 0
+        self._deaths: dict[int, int] = {}
+
+    async def begin(self, claim: Claim, end_sequence: int) -> None:
+        """Begin the replay after a claim.
+
+        Args:
+            claim: Claim of this worker.
+            end_sequence: Stream sequence number of the last message of the replay. Later blocks are not guarded.
+
+        Raises:
+            nats.errors.Error: The server does not respond.
+        """
+        self._end_sequence = 0
+        if claim.pointer.unsaved_claims < GUARDED_CLAIMS:
+            return
+        record = await self._checkpoints.read_replay(self._partition)
+        deaths = dict(record.deaths)
+        if record.sequence:
+            deaths[record.sequence] = deaths.get(record.sequence, 0) + 1
+        self._deaths = {sequence: deaths[sequence] for sequence in sorted(deaths)[-MAX_SUSPECTS:]}
+        self._end_sequence = end_sequence
+
+    async def is_lethal(self, sequence: int) -> bool:
+        """Return True if a block has killed its holders; otherwise write down that it is processed now.
+
+        Args:
+            sequence: Stream sequence number of the block.
+
+        Raises:
+            nats.errors.Error: The server does not respond; the block must not be processed.
+        """
+        if sequence > self._end_sequence:
+            return False
+        if self._deaths.get(sequence, 0) >= MAX_DEATHS:
+            return True
+        await self._checkpoints.write_replay(self._partition, ReplayRecord(sequence=sequence, deaths=self._deaths))
+        return False
+
+    async def end_block(self, sequence: int) -> None:
+        """Write down that the holder has survived a block. The server receives this before any later record."""
+        if sequence <= self._end_sequence:
+            await self._checkpoints.send_replay(self._partition, ReplayRecord(deaths=self._deaths))

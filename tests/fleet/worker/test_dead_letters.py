@@ -1,0 +1,120 @@
+"""Blocks that no worker can process: ones that kill their worker, and ones of a later version."""
+
+import sys
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import nats
+import numpy as np
+import pytest
+from nats.aio.client import Client
+
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import Block, encode
+from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.fleet.nats.dead_letters import read_dead_letters
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.worker.partition import LETHAL
+from tests.command_line import PROGRAM, running_program
+from tests.fleet.nats_cluster import NatsCluster, running
+from tests.fleet.worker import later_blocks, lethal_block
+from tests.fleet.worker.later_blocks import later_block
+from tests.fleet.workers import (
+    STORE_ID_NS,
+    Heartbeats,
+    Process,
+    block,
+    end_states,
+    estimated,
+    load_packs,
+    samples,
+    send,
+)
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
+    with running(tmp_path, partitions=1) as cluster:
+        yield cluster
+
+
+@pytest.fixture
+async def nc(cluster: NatsCluster) -> AsyncIterator[Client]:
+    async with await nats.connect(cluster.url) as nc:
+        await make_streams(nc, partitions=1)
+        yield nc
+
+
+@pytest.fixture
+async def heartbeats(nc: Client) -> AsyncIterator[Heartbeats]:
+    async with Heartbeats(nc) as heartbeats:
+        yield heartbeats
+
+
+async def fleet(cluster: NatsCluster, *command: object) -> tuple[int | None, str]:
+    """Run a command of ``fleet`` on the server. Return exit code and stdout."""
+    async with running_program(PROGRAM, "fleet", *command, "--server", cluster.url) as process:
+        out, _ = await process.communicate()
+    return process.returncode, out.decode()
+
+
+def lethal(pack: str, number: int) -> bytes:
+    """Return a block that kills the worker of ``lethal_block``."""
+    rows = samples(pack, number)
+    rows["temperature_c"] = lethal_block.TEMPERATURE_C
+    return encode(Block(store_created_ns=STORE_ID_NS, number=number, oldest=1, arrival_s=1.79e9, samples=rows))
+
+
+async def test_block_that_kills_its_workers_is_skipped_and_stored_as_a_dead_letter(
+    nc, cluster, heartbeats, tmp_path
+) -> None:
+    registry = await load_packs(nc, ["p1", "p2"])
+    for number in (1, 2, 3):
+        await send(nc, "p1", lethal("p1", 2) if number == 2 else block("p1", number))
+        await send(nc, "p2", block("p2", number))
+    worker = Process(tmp_path, cluster.url, "w", program=(sys.executable, Path(lethal_block.__file__)))
+    try:
+        await heartbeats.until(lambda last: "w" in last and last["w"].dead_packs == {"p1": LETHAL})
+        await heartbeats.until(lambda last: last["w"].counters.get("blocks") == 5)
+        assert await worker.end() == 0
+    finally:
+        worker.kill()
+    (letter,) = await read_dead_letters(nc)
+    assert (letter.pack, letter.data, letter.reason, letter.worker) == ("p1", lethal("p1", 2), LETHAL, "w")
+    assert len([line for line in worker.lines if line["event"] == "ready"]) == 5  # deaths: 2 unguarded, 2 guarded
+    code, out = await fleet(cluster, "dead-letters", "list")
+    assert (code, f"{letter.sequence}" in out, LETHAL in out) == (0, True, True)
+    partition = (await end_states(nc, registry, 1))[0]
+    assert partition.state("p2")["estimator"].tobytes() == estimated(registry, "p2", 3)
+    estimator = make_estimator(*registry("p1"))
+    estimator.run(np.concatenate([samples("p1", number) for number in (1, 3)]))
+    assert partition.state("p1")["estimator"].tobytes() == estimator.record.tobytes()
+
+
+async def test_blocks_of_a_later_version_are_processed_by_a_replay_after_the_upgrade_of_the_workers(
+    nc, cluster, heartbeats, tmp_path
+) -> None:
+    registry = await load_packs(nc, ["p1", "p2"])
+    old = Process(tmp_path, cluster.url, "old")
+    try:
+        for number in (1, 2, 1, 2):  # an edge sends a block again until a worker confirms it
+            await nc.jetstream().publish(subjects.raw("p1"), later_block(block("p1", number)))
+        await heartbeats.until(lambda last: "old" in last and "upgrade workers" in last["old"].dead_packs.get("p1", ""))
+        await heartbeats.until(lambda last: last["old"].dead_letters == 4)
+        code, out = await fleet(cluster, "workers", "--blocks", later_blocks.VERSION)
+        assert (code, "unreadable for old: upgrade these workers first" in out) == (1, True)
+        assert await old.end() == 0
+    finally:
+        old.kill()
+    new = Process(tmp_path, cluster.url, "new", program=(sys.executable, Path(later_blocks.__file__)))
+    try:
+        await heartbeats.until_held(1, "new")
+        assert (await fleet(cluster, "workers", "--blocks", later_blocks.VERSION))[0] == 0
+        assert await fleet(cluster, "dead-letters", "replay", "p1") == (0, "replayed 2 blocks of 1 packs: p1\n")
+        await heartbeats.until(lambda last: last["new"].blocks == 2)
+        assert await new.end() == 0
+    finally:
+        new.kill()
+    assert await read_dead_letters(nc) == []
+    partition = (await end_states(nc, registry, 1))[0]
+    assert partition.state("p1")["estimator"].tobytes() == estimated(registry, "p1", 2)
