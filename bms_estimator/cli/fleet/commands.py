@@ -17,8 +17,8 @@ COMMANDS = {
     "worker": LazyCommand(
         "bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."
     ),
-    "workers": LazyCommand(
-        "bms_estimator.cli.fleet.workers:workers", "List the workers, their versions and the partitions they refuse."
+    "status": LazyCommand(
+        "bms_estimator.cli.fleet.status:status", "List the workers, their versions and the partitions they refuse."
     ),
     "dead-letters": LazyCommand(
         "bms_estimator.cli.fleet.dead_letters:app", "List or replay blocks that workers could not process."

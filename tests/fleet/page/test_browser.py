@@ -17,6 +17,7 @@ from nats.aio.client import Client
 from playwright.async_api import Browser
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.heartbeat import RefusedPartition
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.page import packs
@@ -120,7 +121,16 @@ async def work(nc: Client) -> None:
             await publish_heartbeat(
                 nc, "alpha", range(4), packs=2, blocks=blocks, samples=60 * blocks, lag_s=0.42, unknown_count=1
             )
-            await publish_heartbeat(nc, "beta", range(4, PARTITIONS - 1), packs=1, lag_s=0.1, trouble="no checkpoint")
+            await publish_heartbeat(
+                nc,
+                "beta",
+                range(4, PARTITIONS - 1),
+                packs=1,
+                lag_s=0.1,
+                trouble="no checkpoint",
+                refused=(RefusedPartition(partition=PARTITIONS - 1, format=3),),
+                dead_packs={"home-1": "version 2"},
+            )
             for pack in PACKS:
                 await publish(nc, pack.name, pack.state)
             await nc.publish(subjects.unknown(MARKUP_NAME), b"no <b>row</b>")
@@ -143,9 +153,9 @@ async def open_page(browser: Browser, fleet: Fleet, fragment: str = "") -> Async
 async def test_overview_has_counts_and_distributions(browser: Browser, fleet: Fleet) -> None:
     async with open_page(browser, fleet) as browser_tab:
         await browser_tab.until_text("partitions", "of 8")
-        await browser_tab.until_text("attention", "3")
+        await browser_tab.until_text("attention", "4")
         await browser_tab.until_text("held", "7")
-        await browser_tab.until_text("unheld", "unheld: 7")
+        await browser_tab.until_text("unheld", "unreadable checkpoints: 7")
         await browser_tab.until_text("lag", "0.4 s")
         page = browser_tab.page
         await page.locator('[data-q="silent"]', has_text="1 not heard yet").wait_for()
@@ -164,7 +174,7 @@ async def test_overview_has_counts_and_distributions(browser: Browser, fleet: Fl
         await page.get_by_role("img", name="State of charge: 1 pack 90 to 95 %").wait_for()
         await browser_tab.until(
             "texts => texts.every((text) => document.getElementById('workers').innerText.includes(text))",
-            ["alpha\t4\t2\t0.4 s", "no checkpoint"],
+            ["alpha\t4\t2\t0.4 s", "no checkpoint", "refuses partition 7: checkpoint format 3, reads 1"],
         )
         assert browser_tab.errors == []
         assert all(url.startswith(fleet.url) for url in browser_tab.requests), browser_tab.requests
@@ -177,6 +187,7 @@ async def test_packs_with_concerns_are_ranked_and_names_are_escaped(browser: Bro
         expected = [
             "home-2 Small margin stability margin −1.3 % Low SOC SOC 4.1 %",  # noqa: RUF001 - as overview
             "van-1 Suspected offset Uncertain SOC known to ± 14.2 %",
+            "home-1 Dead letters blocks could not be processed: version 2",
             f"{MARKUP_NAME} Unknown its blocks are held: no <b>row</b>",
         ]
         rows: list[str] = []

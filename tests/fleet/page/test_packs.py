@@ -179,6 +179,20 @@ def test_partitions_without_a_worker_or_with_two_are_found_until_a_worker_is_dea
     assert workers.overview(400.0)["workers"] == []
 
 
+def test_partitions_that_all_workers_refuse_and_packs_with_dead_letters_are_named():
+    view = FleetView(2, 0.0)
+    refused = [{"partition": number, "format": 3} for number in range(2)]
+    old = heartbeat("old", refused=refused, dead_packs={"x": "version 2"})
+    view.receive_worker(old.model_dump_json().encode(), 0.0)
+    overview = view.overview(1.0, 0.0)
+    assert overview["refused"] == [0, 1]
+    assert overview["workers"][0]["refused"] == [[0, 3], [1, 3]]
+    assert overview["concerns"]["dead"] == {"count": 1, "packs": [("x", "version 2")]}
+    assert overview["attention"] == 1
+    view.receive_worker(heartbeat("later", 0).model_dump_json().encode(), 1.0)
+    assert view.overview(2.0, 0.0)["refused"] == [1]
+
+
 def test_rates_of_a_worker_are_those_of_the_last_seconds_and_unknown_after_its_restart():
     workers = FleetWorkers(1)
     for second in range(30):

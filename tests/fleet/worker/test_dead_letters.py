@@ -101,7 +101,7 @@ async def test_blocks_of_a_later_version_are_processed_by_a_replay_after_the_upg
             await nc.jetstream().publish(subjects.raw("p1"), later_block(block("p1", number)))
         await heartbeats.until(lambda last: "old" in last and "upgrade workers" in last["old"].dead_packs.get("p1", ""))
         await heartbeats.until(lambda last: last["old"].dead_letters == 4)
-        code, out = await fleet(cluster, "workers", "--blocks", later_blocks.VERSION)
+        code, out = await fleet(cluster, "status", "--blocks", later_blocks.VERSION)
         assert (code, "unreadable for old: upgrade these workers first" in out) == (1, True)
         assert await old.end() == 0
     finally:
@@ -109,7 +109,7 @@ async def test_blocks_of_a_later_version_are_processed_by_a_replay_after_the_upg
     new = Process(tmp_path, cluster.url, "new", program=(sys.executable, Path(later_blocks.__file__)))
     try:
         await heartbeats.until_held(1, "new")
-        assert (await fleet(cluster, "workers", "--blocks", later_blocks.VERSION))[0] == 0
+        assert (await fleet(cluster, "status", "--blocks", later_blocks.VERSION))[0] == 0
         assert await fleet(cluster, "dead-letters", "replay", "p1") == (0, "replayed 2 blocks of 1 packs: p1\n")
         await heartbeats.until(lambda last: last["new"].blocks == 2)
         assert await new.end() == 0

@@ -162,7 +162,7 @@ async def test_worker_refuses_checkpoints_of_an_unreadable_format_until_the_righ
     await heartbeats.until(lambda last: "old" in last and last["old"].refused == both)
     assert heartbeats.last["old"].partitions == ()
     await send_blocks(nc, 3)
-    async with running_program(PROGRAM, "fleet", "workers", "--server", cluster.url) as process:
+    async with running_program(PROGRAM, "fleet", "status", "--server", cluster.url) as process:
         out, _ = await process.communicate()
     assert "partition 1: old refuses it, because its checkpoint is of format 3" in out.decode()
     assert await pointers(nc) == saved  # neither replaced nor claimed

@@ -1,4 +1,4 @@
-"""``bms-estimator fleet workers``: table of the workers, their versions and the partitions that they refuse."""
+"""``bms-estimator fleet status``: table of the workers, their versions and the partitions that they refuse."""
 
 import asyncio
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 COLUMNS = ("worker", "version", "partitions", "packs", "lag s", "checkpoint formats", "block version")
 
 
-def workers(
+def status(
     server: Server = DEFAULT_SERVER,
     creds: Creds = None,
     ca: Ca = None,
@@ -62,7 +62,7 @@ def _row(heartbeat: "Heartbeat") -> tuple[object, ...]:
 
 
 def _check_block_version(heartbeats: "list[Heartbeat]", version: int) -> None:
-    """Print whether all workers read a version of blocks; end with exit code 1 if one does not, or if there is none."""
+    """Print whether all workers read a version of blocks; otherwise, or without a worker, end with exit code 1."""
     older = [each.id for each in heartbeats if each.block_version < version]
     if older:
         typer.echo(f"blocks of version {version} are unreadable for {', '.join(older)}: upgrade these workers first")
