@@ -21,7 +21,7 @@ from typing import NamedTuple
 import structlog
 from nats.aio.client import Client
 from nats.js.api import Header, ObjectInfo
-from nats.js.errors import BadObjectMetaError, KeyNotFoundError, KeyWrongLastSequenceError, NotFoundError
+from nats.js.errors import APIError, BadObjectMetaError, KeyNotFoundError, KeyWrongLastSequenceError, NotFoundError
 from nats.js.kv import MSG_ROLLUP_SUBJECT, KeyValue
 from nats.js.object_store import ObjectStore
 from nats.nuid import NUID
@@ -40,6 +40,8 @@ DAY_S = 86_400
 """Duration of a day [s]."""
 MESSAGE_BYTES = 128 << 10
 """Size of one message of an object [bytes]."""
+NO_SPACE = frozenset({10002, 10023, 10047, 10077})
+"""Error codes of the server for a full account, server, disk or stream."""
 _STREAM = f"OBJ_{subjects.STATES_BUCKET}"
 
 log = structlog.get_logger(__name__)
@@ -225,10 +227,17 @@ class CheckpointStore:
 
         Raises:
             FencedError: Another worker has taken the partition over; nothing was changed.
+            nats.js.errors.APIError: The server rejects the object. If it lacks space, half of the daily checkpoints
+                were removed, so that a later write succeeds.
         """
         claim = await self.confirm_claim(claim)
         pointer = claim.pointer
-        size = await self._write_object(pointer.next, chunks)
+        try:
+            size = await self._write_object(pointer.next, chunks)
+        except APIError as error:
+            if error.err_code in NO_SPACE and pointer.daily:
+                await self._remove_oldest_daily(claim)
+            raise
         info = CheckpointInfo(
             sequence=sequence, object=pointer.next, bytes=size, made_s=time.time(), format=file_format
         )
@@ -240,9 +249,7 @@ class CheckpointStore:
         except FencedError:
             await self._remove_object(pointer.next)
             raise
-        for old in pointer.checkpoints:
-            if old not in new_pointer.checkpoints:
-                await self._remove_object(old.object)
+        await self._remove_unreferenced(pointer, new_pointer)
         return claim
 
     async def replace(self, claim: Claim, old: CheckpointInfo, chunks: Iterator[bytes] | None) -> Claim:
@@ -267,8 +274,27 @@ class CheckpointStore:
         except FencedError:
             await self._remove_object(pointer.next)
             raise
-        await self._remove_object(old.object)
+        await self._remove_unreferenced(pointer, new_pointer)
         return claim
+
+    async def _remove_oldest_daily(self, claim: Claim) -> None:
+        """Remove the older half of the daily checkpoints of a partition, and the unfinished next object."""
+        pointer = claim.pointer
+        remaining = pointer.model_copy(update={"daily": pointer.daily[: len(pointer.daily) // 2]})
+        await self._write_pointer(claim.partition, claim.revision, remaining)
+        await self._remove_object(pointer.next)
+        await self._remove_unreferenced(pointer, remaining)
+        log.warning(
+            "the server lacks space: daily checkpoints were removed",
+            partition=claim.partition,
+            removed=len(pointer.daily) - len(remaining.daily),
+        )
+
+    async def _remove_unreferenced(self, before: Pointer, after: Pointer) -> None:
+        """Remove the objects that a new pointer does not name any more."""
+        for old in before.checkpoints:
+            if old not in after.checkpoints:
+                await self._remove_object(old.object)
 
     async def _read_pointer(self, partition: int) -> StoredPointer | None:
         """Return the pointer of a partition; None without one.

@@ -8,6 +8,7 @@ import nats
 import pytest
 from nats.aio.client import Client
 from nats.aio.subscription import Subscription
+from nats.js.errors import APIError
 from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
@@ -154,6 +155,26 @@ async def test_first_checkpoint_of_each_of_the_last_30_days_is_stored_beside_the
     last_days = [b"%d" % half_day for half_day in range(78, 18, -2)]
     assert await _load(store, await store.claim(10)) == [b"79", *last_days]
     assert len(await _objects(nc, 10)) == DAILY_CHECKPOINTS + 1  # the last but one is the first of its day
+
+
+async def test_daily_checkpoints_make_room_for_the_last_one_on_a_full_server(tmp_path, clock):
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await nats.connect(cluster.url)
+        await make_streams(nc, partitions=1)
+        store = await _checkpoint_store(nc, "a")
+        claim = await store.claim(0)
+        for _ in range(6):
+            clock.now_s += 86_400.0
+            claim = await store.write(claim, 1, iter([b"1" * CHECKPOINT_BYTES]), file_format=FORMAT)
+        js = nc.jetstream()
+        states = await js.stream_info(STATES_STREAM)
+        await js.update_stream(states.config, max_bytes=states.state.bytes + CHECKPOINT_BYTES // 2)
+        with capture_logs() as logs, pytest.raises(APIError, match="maximum bytes exceeded"):
+            await store.write(claim, 2, iter([b"2" * CHECKPOINT_BYTES]), file_format=FORMAT)
+        assert logs[0]["removed"] == 3
+        claim = await store.write(claim, 2, iter([b"2" * CHECKPOINT_BYTES]), file_format=FORMAT)
+        assert [each[:1] for each in await _load(store, claim)] == [b"2", b"1", b"1", b"1"]
+        await nc.close()
 
 
 async def test_claim_of_a_checkpoint_of_an_unreadable_format_fails_and_changes_nothing(nc):
