@@ -9,6 +9,7 @@ from functools import lru_cache
 
 from bms_estimator.fleet.packs.pack_row import PackSpec, decode_row, known_cells, model_of, settings_of
 from bms_estimator.fleet.packs.pack_type import type_estimator
+from bms_estimator.fleet.packs.table_change import PackSource
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
@@ -41,6 +42,19 @@ class PackRegistry:
     def __call__(self, pack: str) -> tuple[Settings, PackModel] | None:
         """Return settings and model; None if the pack is unknown. Packs with equal rows share these objects."""
         result = self._look_up(pack)
+        return None if isinstance(result, str) else result
+
+    def source(self, pack: str) -> PackSource | None:
+        """Return the row and the cell file of a pack; None if the pack is unknown."""
+        spec = self.parsed_row(pack)
+        if not isinstance(spec, PackSpec) or self(pack) is None:
+            return None
+        return PackSource(self._rows[pack].decode(), self.cell_file(spec.cell))
+
+    def resolve(self, source: PackSource) -> tuple[Settings, PackModel] | None:
+        """Return settings and model of a row and a cell file; None if they have an error."""
+        spec = self._parse(source.row.encode())
+        result = spec if isinstance(spec, str) else self._model(spec, source.cell_file)
         return None if isinstance(result, str) else result
 
     def reason(self, pack: str) -> str:

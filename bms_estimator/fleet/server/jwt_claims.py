@@ -69,6 +69,7 @@ _WORKER_PUBLISH = (
     "bms.>",
     "hours.*",
     "dead.*.*",
+    "raw.*",
     "fleet.>",
     "_INBOX.>",
 )

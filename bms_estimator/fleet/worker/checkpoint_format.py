@@ -6,7 +6,8 @@ Layout, little-endian::
     8  format   u2   FORMAT, or the format before it
     10 length   u4   of the header
     14 crc      u4   CRC-32 of the header
-    18 header        JSON: partition, sequence, counters, spans of deferred messages, record layouts, number of entries
+    18 header        JSON: partition, sequence, counters, spans of deferred messages, rows of the table in force, record
+                     layouts, number of entries
     .. chunks        length u4, CRC-32 u4, entries; the last has length 0
 
     entry:  layout u1, length of the name u2, of the data u4, name, data
@@ -29,6 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bms_estimator.fleet.packs.table_change import PackSource
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.pack_state import PACK_STATE
 from bms_estimator.kernels.packed_record import symmetry_map
@@ -45,9 +47,12 @@ class HeaderMigration(NamedTuple):
     """Return a header of the newer format as one of the older format."""
 
 
-FORMAT = 1
-"""Newest format that this version reads and writes."""
-PREVIOUS: HeaderMigration | None = None
+FORMAT = 2
+"""Newest format that this version reads and writes. Format 2 added the rows of the table that are in force."""
+PREVIOUS: HeaderMigration | None = HeaderMigration(
+    upgrade=lambda header: header | {"sources": [], "in_force": {}},
+    downgrade=lambda header: {name: value for name, value in header.items() if name not in ("sources", "in_force")},
+)
 """Migration between format ``FORMAT - 1`` and ``FORMAT``; None while ``FORMAT`` is the first format."""
 CHUNK_BYTES = 1 << 20
 """Size at which a chunk of entries is finished [bytes]."""
@@ -158,6 +163,7 @@ class PartitionCheckpoint:
         packs: Packed records in this version's layout, by pack.
         unmigrated: Packed records in the layout of another version, by pack.
         deferred: Deferred messages by pack, in the order in which the packs are served.
+        in_force: Row and cell file of each pack at this position of the stream, for packs with processed blocks.
     """
 
     number: int
@@ -166,6 +172,7 @@ class PartitionCheckpoint:
     packs: Mapping[str, bytes] = field(default_factory=dict)
     unmigrated: Mapping[str, PreviousLayoutState] = field(default_factory=dict)
     deferred: Mapping[str, Span] = field(default_factory=dict)
+    in_force: Mapping[str, PackSource] = field(default_factory=dict)
 
     def chunks(self, file_format: int | None = None) -> Iterator[bytes]:
         """Yield the checkpoint's bytes in chunks of about ``CHUNK_BYTES``.
@@ -177,11 +184,15 @@ class PartitionCheckpoint:
         layouts = list(dict.fromkeys([CURRENT_LAYOUT, *(each.layout for each in self.unmigrated.values())]))[
             :_MAX_LAYOUTS
         ]
+        sources = list(dict.fromkeys(self.in_force.values()))
+        indexes = {source: index for index, source in enumerate(sources)}
         header: Header = {
             "partition": self.number,
             "sequence": self.sequence,
             "counters": dict(self.counters),
             "deferred": dict(self.deferred),
+            "sources": sources,
+            "in_force": {pack: indexes[source] for pack, source in self.in_force.items()},
             "layouts": [json.loads(layout) for layout in layouts],
             "entries": len(self.packs) + len(self.unmigrated),
         }
@@ -262,7 +273,9 @@ def _read(data: memoryview) -> PartitionCheckpoint:
     if entries != header["entries"]:
         raise CheckpointError(f"the checkpoint is damaged: {entries} of {header['entries']} entries")
     counters = {str(name): int(count) for name, count in header["counters"].items()}
-    return PartitionCheckpoint(int(header["partition"]), sequence, counters, packs, unmigrated, deferred)
+    sources = [PackSource(str(row), cell if cell is None else str(cell)) for row, cell in header["sources"]]
+    in_force = {str(pack): sources[index] for pack, index in header["in_force"].items()}
+    return PartitionCheckpoint(int(header["partition"]), sequence, counters, packs, unmigrated, deferred, in_force)
 
 
 def _read_entries(data: memoryview, offset: int) -> Iterator[tuple[int, str, bytes]]:

@@ -118,15 +118,16 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
             checkpoint = read_checkpoint(data)
         except CheckpointError as error:
             raise UserError(f"partition {partition}: {error}") from None
-        found = counts.keys() & {*checkpoint.packs, *checkpoint.unmigrated, *checkpoint.deferred}
+        found = counts.keys() & {*checkpoint.packs, *checkpoint.unmigrated, *checkpoint.deferred, *checkpoint.in_force}
         if found:
             rest = replace(
                 checkpoint,
                 packs=_without(checkpoint.packs, found),
                 unmigrated=_without(checkpoint.unmigrated, found),
                 deferred=_without(checkpoint.deferred, found),
+                in_force=_without(checkpoint.in_force, found),
             )
-            claim = await store.replace(claim, info, rest.chunks())
+            claim = await store.replace(claim, info, rest.chunks(info.format))
         for pack in found:
             counts[pack] += 1
     for info in damaged:  # its content is unknown

@@ -7,7 +7,7 @@ bit-identical states. The module performs no I/O, and uses the clock only for pu
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, Self
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 import structlog
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bms_estimator.edge.block import Block, BlockError, decode, decode_header
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.packs.pack_type import PackType, PackTypes
+from bms_estimator.fleet.packs.table_change import PackSource, decode_change, encode_change, is_change
 from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
 from bms_estimator.fleet.worker.checkpoint_format import (
@@ -34,6 +35,17 @@ from bms_estimator.settings.pack import Settings
 
 PackLookup = Callable[[str], tuple[Settings, PackModel] | None]
 """Function that returns settings and model of a pack; None: the pack is unknown."""
+
+
+class PackSources(Protocol):
+    """Table of packs whose changes are applied in the order of the stream (``PackRegistry``)."""
+
+    def source(self, pack: str) -> PackSource | None:
+        """Return the present row and cell file of a pack; None if the pack is unknown."""
+
+    def resolve(self, source: PackSource) -> tuple[Settings, PackModel] | None:
+        """Return settings and model of a row and a cell file; None if they have an error."""
+
 
 LETHAL = "the workers that processed it have died"
 """Reason for the dead letter of a lethal block."""
@@ -72,6 +84,8 @@ class Partition:
     Args:
         number: Number of the partition.
         table: Settings and models of the packs.
+        sources: Rows of the same table, whose changes are applied in the order of the stream; None: a change takes effect
+            at once.
         wall: Wall clock for publish times [s since 1970].
 
     Attributes:
@@ -82,9 +96,17 @@ class Partition:
             listed from a block with an error until the end of this hour on its clock.
     """
 
-    def __init__(self, number: int, table: PackLookup, *, wall: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self,
+        number: int,
+        table: PackLookup,
+        *,
+        sources: PackSources | None = None,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
         self.number, self.sequence = number, 0
-        self._table = table
+        self._table, self._sources = table, sources
+        self._in_force: dict[str, PackSource] = {}  # of packs with processed blocks
         self._counters: Counter[str] = Counter()
         self._packs: dict[str, bytes] = {}
         self._unmigrated: dict[str, PreviousLayoutState] = {}  # packs whose record still has a previous layout
@@ -100,7 +122,15 @@ class Partition:
         self._processor = BlockProcessor(self._unpacked.record, self._counters, wall)
 
     @classmethod
-    def restore(cls, number: int, table: PackLookup, data: bytes, *, wall: Callable[[], float] = time.time) -> Self:
+    def restore(
+        cls,
+        number: int,
+        table: PackLookup,
+        data: bytes,
+        *,
+        sources: PackSources | None = None,
+        wall: Callable[[], float] = time.time,
+    ) -> Self:
         """Restore a partition from the bytes of a checkpoint.
 
         Raises:
@@ -109,7 +139,8 @@ class Partition:
         checkpoint = read_checkpoint(data)
         if checkpoint.number != number:
             raise CheckpointError(f"the checkpoint is of partition {checkpoint.number}, not of {number}")
-        partition = cls(number, table, wall=wall)
+        partition = cls(number, table, sources=sources, wall=wall)
+        partition._in_force.update(checkpoint.in_force)
         partition.sequence = checkpoint.sequence
         partition._counters.update(checkpoint.counters)
         partition._packs.update(checkpoint.packs)
@@ -126,6 +157,7 @@ class Partition:
             packs=dict(self._packs),
             unmigrated=dict(self._unmigrated),
             deferred=self.deferred.spans(),
+            in_force=dict(self._in_force),
         )
 
     @property
@@ -165,6 +197,8 @@ class Partition:
         if pack in self.deferred:
             return self.defer(pack, sequence)
         self.sequence = sequence
+        if is_change(data):
+            return self._apply_change(pack, data)
         pack_type = self._look_up(pack)
         if pack_type is None:
             is_block = isinstance(self._decode(data), Block)
@@ -189,11 +223,13 @@ class Partition:
         if pack_type is None or pack not in self.deferred:
             return BlockResult(pack)
         self.deferred.advance(pack, sequence)
+        if is_change(data):
+            return self._apply_change(pack, data)
         return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def is_known(self, pack: str) -> bool:
-        """Return True if the table contains the pack."""
-        return self._table(pack) is not None
+        """Return True if the pack has valid settings."""
+        return self._settings(pack) is not None
 
     def reject_misplaced(self, pack: str, sequence: int) -> BlockResult:
         """Skip and count a message of a pack that belongs to another partition."""
@@ -204,8 +240,41 @@ class Partition:
         return BlockResult(pack)
 
     def settings_changed(self, pack: str) -> None:
-        """Drop the cached settings of a pack, so that its next block reads them from the table."""
+        """Drop the cached settings of a pack, so that its next block looks them up again."""
         self._type_by_pack.pop(pack, None)
+
+    @property
+    def in_force(self) -> Mapping[str, PackSource]:
+        """Row and cell file of each pack at this position of the stream."""
+        return self._in_force
+
+    def table_change(self, pack: str) -> bytes | None:
+        """Return the message for the stream if the row of a pack in the table differs from the one in force; otherwise None."""
+        if self._sources is None or pack not in self._in_force:
+            return None
+        source = self._sources.source(pack)
+        return None if source == self._in_force[pack] else encode_change(source)
+
+    def _apply_change(self, pack: str, data: bytes) -> BlockResult:
+        """Set the row of a pack from here on."""
+        try:
+            source = decode_change(data)
+        except ValueError:
+            self._counters["damaged"] += 1
+            return BlockResult(pack)
+        self._counters["table_changes"] += 1
+        if source is None:
+            self._in_force.pop(pack, None)
+        else:
+            self._in_force[pack] = source
+        self.settings_changed(pack)
+        return BlockResult(pack)
+
+    def _settings(self, pack: str) -> tuple[Settings, PackModel] | None:
+        """Return the settings and the model in force; those of the table for a new pack, and for a row with an error."""
+        source = self._in_force.get(pack)
+        in_force = self._sources.resolve(source) if self._sources is not None and source else None
+        return in_force or self._table(pack)
 
     def _decode_and_take(
         self, pack: str, data: bytes, arrival: Arrival, pack_type: PackType, *, is_lethal: bool
@@ -229,9 +298,12 @@ class Partition:
         """Return the type of a pack; None if the pack is unknown."""
         pack_type = self._type_by_pack.get(pack)
         if pack_type is None:
-            entry = self._table(pack)
+            entry = self._settings(pack)
             if entry is None:
                 return None
+            source = self._sources.source(pack) if self._sources is not None else None
+            if source is not None:
+                self._in_force.setdefault(pack, source)
             pack_type = self._type_by_pack[pack] = self._types.of(*entry)
         return pack_type
 

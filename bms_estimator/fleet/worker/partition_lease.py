@@ -25,11 +25,12 @@ from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError
+from bms_estimator.fleet.packs.table_change import is_change
 from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
 from bms_estimator.fleet.worker.deferred import Span
-from bms_estimator.fleet.worker.partition import INTERNAL_ERROR, BlockResult, PackLookup, Partition
+from bms_estimator.fleet.worker.partition import INTERNAL_ERROR, BlockResult, PackLookup, PackSources, Partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
 from bms_estimator.fleet.worker.replay_guard import ReplayGuard
 from bms_estimator.process.tasks import until_first_ends
@@ -63,6 +64,7 @@ class PartitionLease:
         step_lock: Lock of the worker, held while a block is estimated. The event loop can send requests and heartbeats between
             two blocks.
         partitions: Number of partitions of the stream.
+        sources: Rows of the same table; their changes are sent to the stream. None: changes take effect at once.
         checkpoint_format: Returns the format in which checkpoints are written, which all live workers read.
         is_busy: Returns True while any partition of the worker has received messages that are not processed.
 
@@ -95,7 +97,10 @@ class PartitionLease:
         partitions: int,
         checkpoint_format: Callable[[], int],
         is_busy: Callable[[], bool],
+        sources: PackSources | None = None,
     ) -> None:
+        self._sources = sources
+        self._changed_packs = set[str]()  # packs whose rows may differ from those in force
         self._partitions, self._is_busy, self._budget = partitions, is_busy, CpuBudget()
         self._checkpoint_format = checkpoint_format
         self._nc, self.number, self._table, self._checkpoints = nc, number, table, checkpoints
@@ -117,6 +122,8 @@ class PartitionLease:
         self._silent = False  # the stream must be searched, because no message has arrived
         self._next_search_s = time.monotonic() + SILENCE_S  # monotonic clock of the next search of the stream
         self._wake_up, self._wake_up_deferred = asyncio.Event(), asyncio.Event()
+        self._wake_up_changes = asyncio.Event()
+        self._replay_end = 0  # sequence number of the last message of the partition at the claim
         self._state_lock = asyncio.Lock()  # held while ``partition`` and ``claim`` change
         self._summaries_lock = asyncio.Lock()
 
@@ -147,10 +154,11 @@ class PartitionLease:
             self._silent = True
             self._wake_up.set()
         self._wake_up_deferred.set()
+        self._wake_up_changes.set()
 
     async def run(self) -> None:
         """Process messages until cancelled."""
-        await until_first_ends(self._process_messages(), self._process_deferred())
+        await until_first_ends(self._process_messages(), self._process_deferred(), self._send_table_changes())
 
     async def _process_messages(self) -> None:
         while True:
@@ -249,8 +257,32 @@ class PartitionLease:
     def settings_changed(self, pack: str) -> None:
         """Handle a changed or new row of the table of packs."""
         if self.partition:
-            self.partition.settings_changed(pack)
+            if pack not in self.partition.in_force:
+                self.partition.settings_changed(pack)
+            self._changed_packs.add(pack)
+            self._wake_up_changes.set()
             self._wake_up_deferred.set()
+
+    async def _send_table_changes(self) -> None:
+        """Send changes of the table to the stream until cancelled.
+
+        After a takeover this begins at the end of the replay, which contains the changes that the former owner has sent.
+        """
+        while True:
+            self._wake_up_changes.clear()
+            while self._changed_packs and self.partition and self.partition.sequence >= self._replay_end:
+                pack = next(iter(self._changed_packs))
+                if await self._try(partial(self._send_table_change, self.partition, pack)):
+                    self._changed_packs.discard(pack)
+                else:
+                    await asyncio.sleep(RETRY_S)
+            await self._wake_up_changes.wait()
+
+    async def _send_table_change(self, partition: Partition, pack: str) -> None:
+        """Send the row of a pack to the stream if the row differs from the one in force."""
+        change = partition.table_change(pack)
+        if change is not None:
+            await self._nc.jetstream().publish(subjects.raw(pack), change)
 
     async def _process_deferred(self) -> None:
         """Process deferred messages until cancelled, one of each pack at a time."""
@@ -327,7 +359,7 @@ class PartitionLease:
         except NotFoundError:
             self._next_search_s = time.monotonic() + IDLE_SILENCE_S
         else:
-            await self._catch_up(partition, (await js.get_last_msg(subjects.RAW_STREAM, subject)).seq or 0)
+            await self._catch_up(partition, await self._last_partition_sequence())
 
     async def _take_over(self) -> Partition:
         """Claim the partition if necessary and return its state, possibly of an old checkpoint."""
@@ -336,12 +368,12 @@ class PartitionLease:
         if partition is None:
             claim = await self._checkpoints.claim(self.number)
             partition = await self._restore(claim)
-            last_sequence = await self._last_sequence()
-            await self._guard.begin(claim, last_sequence)
+            self._replay_end = await self._last_partition_sequence()
+            await self._guard.begin(claim, self._replay_end)
             self.partition, self.claim = partition, claim
+            self._changed_packs = set(partition.in_force)  # the former owner may not have sent the last changes
             self._wake_up_deferred.set()
-        else:
-            last_sequence = await self._last_sequence()
+        last_sequence = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
         if partition.sequence > last_sequence:
             log.warning(
                 "the stream ends before the checkpoint, because it was recreated or has lost its end: reading it from its beginning",
@@ -353,9 +385,13 @@ class PartitionLease:
             partition.deferred.clear()
         return partition
 
-    async def _last_sequence(self) -> int:
-        """Return the sequence number of the last message of the stream."""
-        return (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
+    async def _last_partition_sequence(self) -> int:
+        """Return the sequence number of the last message of the partition; 0 without a message."""
+        js, subject = self._nc.jetstream(), subjects.stored_raw(self.number)
+        try:
+            return (await js.get_last_msg(subjects.RAW_STREAM, subject)).seq or 0
+        except NotFoundError:
+            return 0
 
     async def _restore(self, claim: Claim) -> Partition:
         """Return the partition of the newest usable checkpoint; an empty one without a checkpoint.
@@ -366,7 +402,7 @@ class PartitionLease:
         async with aclosing(self._checkpoints.load(claim)) as checkpoints:
             async for checkpoint, data in checkpoints:
                 try:
-                    partition = Partition.restore(self.number, self._table, data)
+                    partition = Partition.restore(self.number, self._table, data, sources=self._sources)
                 except UnreadableFormatError:  # an earlier checkpoint, or none, would lose what was learned
                     raise
                 except ValueError as error:
@@ -380,7 +416,7 @@ class PartitionLease:
                     log.info("taken over", partition=self.number, sequence=checkpoint.sequence, bytes=len(data))
                     return partition
         log.info("taken over without a checkpoint: the stream is read from its beginning", partition=self.number)
-        return Partition(self.number, self._table)
+        return Partition(self.number, self._table, sources=self._sources)
 
     async def _catch_up(self, partition: Partition, sequence: int) -> None:
         """Process the stream up to a message. Only the last messages of each pack are published."""
@@ -440,7 +476,9 @@ class PartitionLease:
         self.waiting_dead_letters.append(letter)
 
     def _count_block(self, data: bytes) -> None:
-        """Count the block and its samples, and update the lag."""
+        """Count a block and its samples, and update the lag."""
+        if is_change(data):
+            return
         samples, arrival_s = peek_header(data)
         self.blocks += 1
         self.samples += samples

@@ -319,6 +319,7 @@ class Worker:
             self._step_lock,
             partitions=self._partitions,
             checkpoint_format=lambda: self._members.checkpoint_format(time.monotonic()),
+            sources=self._bucket.packs,
             is_busy=lambda: any(each.consumer.waiting for each in self._leases),
         )
         # spread the checkpoints of the partitions over the interval

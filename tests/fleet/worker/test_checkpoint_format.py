@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bms_estimator.fleet.packs.table_change import PackSource
 from bms_estimator.fleet.worker import checkpoint_format
 from bms_estimator.fleet.worker.block_order import MAX_EARLY_REPEATS
 from bms_estimator.fleet.worker.checkpoint_format import (
     CHUNK_BYTES,
     CURRENT_LAYOUT,
+    FORMAT,
     CheckpointError,
     PartitionCheckpoint,
     PreviousLayoutState,
@@ -43,6 +45,7 @@ snapshots = st.builds(
         names, st.builds(PreviousLayoutState, st.just(layout_of(np.dtype([("x", "<f8", (2,))]))), st.binary(max_size=9))
     ),
     st.dictionaries(names, st.builds(Span, st.integers(0, 2**63), st.integers(0, 2**63))),
+    st.dictionaries(names, st.builds(PackSource, names, st.none() | names)),
 )
 
 
@@ -130,10 +133,15 @@ def test_previous_format_is_upgraded_when_it_is_read_and_downgraded_when_it_is_w
 
 def test_error_of_an_unreadable_format_names_both_formats_and_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
-        later_version.set_format(checkpoint_format.FORMAT + 1, patched.setattr)
+        later_version.set_format(checkpoint_format.FORMAT + 2, patched.setattr)
         later = to_bytes(PartitionCheckpoint(3, 0))
-    with pytest.raises(UnreadableFormatError, match=r"is of format 2, this version reads 1: start a worker of the ver"):
+    with pytest.raises(UnreadableFormatError, match=r"is of format 4, this version reads 1 and 2: start a worker"):
         read_checkpoint(later)
+
+
+def test_rows_in_force_are_dropped_in_the_previous_format() -> None:
+    snapshot = PartitionCheckpoint(3, 7, packs={"a": b"12345678"}, in_force={"a": PackSource("{}", None)})
+    assert read_checkpoint(b"".join(snapshot.chunks(FORMAT - 1))) == replace(snapshot, in_force={})
 
 
 def test_all_live_workers_can_read_the_common_format_as_far_as_this_version_writes_it(later_format: int) -> None:

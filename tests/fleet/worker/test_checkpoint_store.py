@@ -15,7 +15,12 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import RefusedPartition
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker import checkpoint_store
-from bms_estimator.fleet.worker.checkpoint_format import FORMAT, PartitionCheckpoint, UnreadableFormatError
+from bms_estimator.fleet.worker.checkpoint_format import (
+    FORMAT,
+    PartitionCheckpoint,
+    UnreadableFormatError,
+    readable_text,
+)
 from bms_estimator.fleet.worker.checkpoint_store import (
     CHECKPOINTS_PER_PARTITION,
     DAILY_CHECKPOINTS,
@@ -181,7 +186,9 @@ async def test_claim_of_a_checkpoint_of_an_unreadable_format_fails_and_changes_n
     later_version, this_version = await _checkpoint_store(nc, "later"), await _checkpoint_store(nc, "this")
     claim = await later_version.write(await later_version.claim(11), 1, iter([b"1"]), file_format=FORMAT + 1)
     for _ in range(CHECKPOINTS_PER_PARTITION + 1):
-        with pytest.raises(UnreadableFormatError, match=f"of format {FORMAT + 1}, this version reads {FORMAT}"):
+        with pytest.raises(
+            UnreadableFormatError, match=f"of format {FORMAT + 1}, this version reads {readable_text()}"
+        ):
             await this_version.claim(11)
     assert await later_version.confirm_claim(claim) == claim
     assert await _load(later_version, claim) == [b"1"]

@@ -16,6 +16,7 @@ from bms_estimator.fleet.heartbeat import RefusedPartition
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
+from bms_estimator.fleet.worker.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint_store import Pointer
 from bms_estimator.fleet.worker.partition import Partition
 from tests.command_line import PROGRAM, running_program
@@ -28,7 +29,7 @@ from tests.patience import LONG_S
 PARTITIONS = 2
 PACKS = ["p1", "p2"]
 """One pack of each partition."""
-TWO_FORMATS, UNREADABLE_FORMAT = 2, 3
+TWO_FORMATS, UNREADABLE_FORMAT = FORMAT + 1, FORMAT + 2
 """Format of a version that also reads the format of this version, and of a version that does not."""
 
 
@@ -123,11 +124,11 @@ async def test_states_survive_a_rolling_upgrade_and_a_roll_back_while_blocks_arr
     registry = await load_packs(nc, PACKS)
     old = workers.start("old")
     await send_blocks(nc, 1)
-    await until_saved(nc, blocks=1, file_format=1)
+    await until_saved(nc, blocks=1, file_format=FORMAT)
     new = workers.start("new", TWO_FORMATS)
     await heartbeats.until_held(PARTITIONS, "old", "new")
     await send_blocks(nc, 2)
-    saved = await until_saved(nc, blocks=2, file_format=1)  # the format that both versions read
+    saved = await until_saved(nc, blocks=2, file_format=FORMAT)  # the format that both versions read
     assert sorted(each.worker for each in saved) == ["new", "old"]
     assert await old.end() == 0
     await heartbeats.until_held(PARTITIONS, "new")
@@ -135,13 +136,13 @@ async def test_states_survive_a_rolling_upgrade_and_a_roll_back_while_blocks_arr
     await until_saved(nc, blocks=3, file_format=TWO_FORMATS)
 
     old = workers.start("old-again")
-    await until_saved(nc, blocks=3, file_format=1)  # although no block has arrived
+    await until_saved(nc, blocks=3, file_format=FORMAT)  # although no block has arrived
     await heartbeats.until_held(PARTITIONS, "old-again", "new")
     await send_blocks(nc, 4)
     assert await new.end() == 0
     await heartbeats.until_held(PARTITIONS, "old-again")
     await send_blocks(nc, 5)
-    await until_saved(nc, blocks=5, file_format=1)
+    await until_saved(nc, blocks=5, file_format=FORMAT)
     assert await old.end() == 0
     partitions = await assert_bit_identical(nc, registry, 5)
     assert all(each.counters[UPGRADED] and each.counters[DOWNGRADED] for each in partitions)
@@ -164,7 +165,7 @@ async def test_worker_refuses_checkpoints_of_an_unreadable_format_until_the_righ
     await send_blocks(nc, 3)
     async with running_program(PROGRAM, "fleet", "status", "--server", cluster.url) as process:
         out, _ = await process.communicate()
-    assert "partition 1: old refuses it, because its checkpoint is of format 3" in out.decode()
+    assert f"partition 1: old refuses it, because its checkpoint is of format {UNREADABLE_FORMAT}" in out.decode()
     assert await pointers(nc) == saved  # neither replaced nor claimed
     assert len([line for line in old.lines if "refused" in line["event"]]) == PARTITIONS
 

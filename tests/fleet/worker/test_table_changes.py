@@ -1,0 +1,150 @@
+"""Changes of the table of packs in the order of the stream: a takeover meets old blocks with old rows."""
+
+from pathlib import Path
+
+import nats
+import numpy as np
+import pytest
+from nats.aio.client import Client
+from nats.js.errors import NotFoundError
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.packs.pack_bucket import write_bucket
+from bms_estimator.fleet.packs.pack_registry import PackRegistry
+from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
+from bms_estimator.fleet.packs.table_change import decode_change
+from bms_estimator.fleet.worker.partition import Partition
+from tests.fleet.nats_cluster import running
+from tests.fleet.workers import PACK_ROW, PERIOD_S, Heartbeats, Process, block, end_states, load_packs, send
+
+CHANGED_ROW = encode_row(PackSpec(cell="ncr18650", period_s=PERIOD_S, capacity_ah=2.5))
+BLOCKS = 3
+"""Number of blocks; the row changes before the last one."""
+
+
+def registry_of(row: bytes) -> PackRegistry:
+    """Return a table in which pack ``p1`` has a row."""
+    registry = PackRegistry()
+    registry.set_row("p1", row)
+    return registry
+
+
+def partition_of(registry: PackRegistry, checkpoint: bytes | None = None) -> Partition:
+    """Return a new partition, or the one of a checkpoint."""
+    if checkpoint is None:
+        return Partition(0, registry, sources=registry)
+    return Partition.restore(0, registry, checkpoint, sources=registry)
+
+
+def estimator_state(partition: Partition) -> bytes:
+    """Return the estimator's record of pack ``p1``."""
+    state = partition.state("p1")
+    assert state is not None
+    return np.ascontiguousarray(state["estimator"]).tobytes()
+
+
+@pytest.fixture(scope="module")
+def messages() -> list[bytes]:
+    """Return two blocks, a change of the row, and a block."""
+    registry = registry_of(PACK_ROW)
+    partition = partition_of(registry)
+    partition.take("p1", block("p1", 1), 1)
+    registry.set_row("p1", CHANGED_ROW)
+    change = partition.table_change("p1")
+    assert change is not None
+    return [block("p1", 1), block("p1", 2), change, block("p1", 3)]
+
+
+@pytest.fixture(scope="module")
+def expected(messages: list[bytes]) -> bytes:
+    """Return the state after all messages in one run."""
+    registry = registry_of(PACK_ROW)
+    partition = partition_of(registry)
+    for sequence, message in enumerate(messages, 1):
+        partition.take("p1", message, sequence)
+    return estimator_state(partition)
+
+
+@pytest.mark.parametrize("taken_over_after", [1, 2, 3])
+def test_state_after_a_takeover_does_not_depend_on_the_present_table(
+    messages: list[bytes], expected: bytes, taken_over_after: int
+) -> None:
+    partition = partition_of(registry_of(PACK_ROW))
+    for sequence, message in enumerate(messages[:taken_over_after], 1):
+        partition.take("p1", message, sequence)
+    successor = partition_of(registry_of(CHANGED_ROW), b"".join(partition.snapshot().chunks()))
+    for sequence, message in enumerate(messages[taken_over_after:], taken_over_after + 1):
+        successor.take("p1", message, sequence)
+    assert estimator_state(successor) == expected
+    assert successor.counters["table_changes"] == 1
+
+
+def test_changed_row_takes_effect_at_its_message_and_not_before(messages: list[bytes], expected: bytes) -> None:
+    registry = registry_of(PACK_ROW)
+    partition = partition_of(registry)
+    partition.take("p1", messages[0], 1)
+    registry.set_row("p1", CHANGED_ROW)
+    for sequence, message in enumerate(messages[1:], 2):
+        partition.take("p1", message, sequence)
+    assert estimator_state(partition) == expected
+    assert partition.table_change("p1") is None  # it is in force
+
+
+def test_removed_pack_is_unknown_from_its_message_on() -> None:
+    registry = registry_of(PACK_ROW)
+    partition = partition_of(registry)
+    partition.take("p1", block("p1", 1), 1)
+    registry.set_row("p1", None)
+    change = partition.table_change("p1")
+    assert change is not None
+    assert decode_change(change) is None
+    assert partition.is_known("p1")
+    partition.take("p1", change, 2)
+    partition.take("p1", block("p1", 2), 3)
+    assert partition.unknown == ("p1",)
+
+
+@pytest.mark.parametrize("damaged", [b"BMST", b"BMST{", b'BMST{"row": 1}', b"BMST[]"])
+def test_damaged_change_is_counted_and_skipped(damaged: bytes) -> None:
+    partition = partition_of(registry_of(PACK_ROW))
+    partition.take("p1", damaged, 1)
+    assert (partition.sequence, partition.counters["damaged"]) == (1, 1)
+
+
+async def test_successor_of_a_killed_worker_applies_a_changed_row_between_the_same_blocks(tmp_path: Path) -> None:
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await nats.connect(cluster.url)
+        await make_streams(nc, partitions=1)
+        await load_packs(nc, ["p1"])
+        async with Heartbeats(nc) as heartbeats:
+            await send(nc, "p1", block("p1", 1))
+            first = Process(tmp_path, cluster.url, "first")
+            await heartbeats.until(lambda last: "first" in last and last["first"].blocks == 1)
+            assert await first.end() == 0  # its checkpoint includes block 1
+            second = Process(tmp_path, cluster.url, "second")
+            await send(nc, "p1", block("p1", 2))
+            await heartbeats.until(lambda last: "second" in last and last["second"].blocks == 1)
+            await write_bucket(nc, subjects.PACKS_BUCKET, {"p1": CHANGED_ROW})
+            await heartbeats.until(lambda last: last["second"].counters.get("table_changes") == 1)
+            await send(nc, "p1", block("p1", BLOCKS))
+            await heartbeats.until(lambda last: last["second"].blocks == BLOCKS - 1)
+            second.kill()
+            third = Process(tmp_path, cluster.url, "third")
+            await heartbeats.until(lambda last: "third" in last and last["third"].blocks == BLOCKS - 1)
+            assert await third.end() == 0
+        registry = registry_of(PACK_ROW)
+        reference = partition_of(registry)
+        for sequence in range(1, BLOCKS + 2):
+            reference.take("p1", await message_of(nc, sequence), sequence)
+        restored = (await end_states(nc, registry, 1))[0]
+        assert estimator_state(restored) == estimator_state(reference)
+        assert restored.counters["table_changes"] == 1
+        with pytest.raises(NotFoundError):  # no change was sent twice
+            await message_of(nc, BLOCKS + 2)
+        await nc.close()
+
+
+async def message_of(nc: Client, sequence: int) -> bytes:
+    """Return a message of the stream of blocks."""
+    return (await nc.jetstream().get_msg(subjects.RAW_STREAM, sequence)).data or b""
