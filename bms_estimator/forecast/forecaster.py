@@ -12,6 +12,7 @@ from bms_estimator.forecast.capability import PowerLimits, cell_power_limits, pr
 from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastCurve, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import LoadHistory
+from bms_estimator.forecast.load_spread import load_spread
 from bms_estimator.forecast.past_minutes import MINUTE_S, PastMinutes
 from bms_estimator.forecast.projection import (
     Projection,
@@ -20,6 +21,7 @@ from bms_estimator.forecast.projection import (
     project_seen_load,
     project_trip,
     time_quantiles,
+    time_to_empty_s,
 )
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Records
@@ -166,7 +168,7 @@ class Forecaster:
             reason = self._missing_load()
         if reason is not None:
             return Forecast(time_s, values, reason, None)
-        pack = self._pack(load)
+        pack = self.projected_pack(load)
         projection = self._project(pack, load)
         if projection is None:
             return Forecast(time_s, values, "the load does not discharge the pack on average", None)
@@ -177,7 +179,23 @@ class Forecaster:
 
     def trip_curve(self, load: GivenLoad) -> ForecastCurve | None:
         """Return the curves from the present state until the end of a given load; None without a state."""
-        return None if self._missing_state() else project_trip(self._pack(load), load, self._seed())
+        return None if self._missing_state() else project_trip(self.projected_pack(load), load, self.seed)
+
+    def projected_pack(self, load: GivenLoad | None = None) -> Records:
+        """Return the present state of the pack under a load, shape (1,), dtype ``PROJECTED_PACK``.
+
+        Args:
+            load: Expected load; None: a load like the observed one.
+        """
+        largest_a = self._largest_a if load is None else load.largest_current_a(self.cutoff_v)
+        return projected_pack(self.estimator, self.cutoff_v, largest_a)
+
+    @property
+    def seed(self) -> int:
+        """Seed of the random numbers, by time and number of the last sample."""
+        state = self.estimator.state
+        time_bits = int(state["time_s"].view(np.uint64)[0])
+        return (time_bits * _HASH_FACTOR + int(state["samples"][0])) % _SEED_COUNT
 
     def _first_due(self, time_s: np.ndarray) -> int | None:
         """Return the index of the first sample at which a forecast is due; None without such a sample.
@@ -214,26 +232,18 @@ class Forecaster:
         """Largest current of the observed load [A], at least 0."""
         return float(self.load.max_a.max(initial=0.0))
 
-    def _pack(self, load: GivenLoad | None) -> Records:
-        """Return the present state of the pack under the given or the observed load, shape (1,), dtype ``PROJECTED_PACK``."""
-        largest_a = self._largest_a if load is None else load.largest_current_a(self.cutoff_v)
-        return projected_pack(self.estimator, self.cutoff_v, largest_a)
-
     def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:
         """Run the pack forward. Return None if the load does not discharge it."""
         if load is not None:
-            projection = project_given_load(pack, load, self._seed())
+            projection = project_given_load(pack, load, self.seed)
             return projection if np.isfinite(projection.time_s).all() else None
         mean_a, max_a = self.load.mean_and_max()
-        if not discharges(pack, float(mean_a.mean() - pack["offset_a"][0])):
+        current_a = mean_a - pack["offset_a"][0]
+        load_a = float(current_a.mean())
+        if not discharges(pack, load_a):
             return None
-        return project_seen_load(pack, mean_a, max_a, self._seed(), self.past.analogues(mean_a.size // MINUTE_S))
-
-    def _seed(self) -> int:
-        """Return the seed of the random numbers, by time and number of the last sample."""
-        state = self.estimator.state
-        time_bits = int(state["time_s"].view(np.uint64)[0])
-        return (time_bits * _HASH_FACTOR + int(state["samples"][0])) % _SEED_COUNT
+        spread = load_spread(current_a, time_to_empty_s(pack, load_a))
+        return project_seen_load(pack, mean_a, max_a, spread, self.seed, self.past.analogues(mean_a.size // MINUTE_S))
 
 
 def _interval_s(forecast: Forecast) -> float:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from bms_estimator.forecast.condensed_load import condense
 from bms_estimator.forecast.forecast import ForecastCurve
 from bms_estimator.forecast.given_load import GivenLoad
+from bms_estimator.forecast.load_spread import LoadSpread
 from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
-from bms_estimator.kernels.forecast.draws import DRAW, draw_packs
+from bms_estimator.kernels.forecast.draws import DRAW, draw_load_factors, draw_packs
 from bms_estimator.kernels.forecast.future_load import LOAD_PART, follow_given_load, set_decays
 from bms_estimator.kernels.forecast.seen_load import follow_seen_load, record_curves
 from bms_estimator.model.arrays import Floats, Records
@@ -71,7 +72,7 @@ class Projection:
 
 
 def project_seen_load(
-    pack: Records, mean_a: Floats, max_a: Floats, seed: int, analogues: Sequence[GivenLoad] = ()
+    pack: Records, mean_a: Floats, max_a: Floats, spread: LoadSpread, seed: int, analogues: Sequence[GivenLoad] = ()
 ) -> Projection:
     """Simulate the pack under loads drawn from the observed load.
 
@@ -79,18 +80,20 @@ def project_seen_load(
         pack: Shape (1,), dtype ``PROJECTED_PACK``.
         mean_a: Mean current of each second [A], with a mean above the offset of the sensor.
         max_a: Largest current of each second [A].
+        spread: Spread of the mean of the future load around that of the drawn one.
         seed: Seed of the random numbers, 0 to 2**64 - 1.
         analogues: Loads that followed similar loads of earlier discharges. Some of the draws follow them instead of drawn loads.
     """
     m = pack[0]
     load_a = float(mean_a.mean() - m["offset_a"])
-    horizon_s = HORIZON_RATIO * _time_to_empty_s(pack, load_a)
+    horizon_s = HORIZON_RATIO * time_to_empty_s(pack, load_a)
     block_s = min(max(BLOCK_S, math.ceil(horizon_s / MAX_STEPS)), max(mean_a.size // MIN_BLOCKS, 1))
     steps = min(math.ceil(horizon_s / block_s), MAX_STEPS)
     blocks = np.zeros(mean_a.size // block_s, LOAD_BLOCK)
     used = blocks.size * block_s
     tabulate_blocks(m, mean_a[-used:], max_a[-used:], block_s, blocks)
     draws = _draws(m, seed)
+    draw_load_factors(spread.std, spread.degrees, draws)
     follow_seen_load(m, blocks, float(block_s), steps, draws)
     parts_of_draws = list(_analogue_parts(pack, analogues, horizon_s))
     for chosen, parts in parts_of_draws:
@@ -134,7 +137,7 @@ def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:
     load_a = _mean_current(pack, load)
     if not discharges(pack, load_a):
         load_a = 0.0
-    horizon_s = HORIZON_RATIO * _time_to_empty_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
+    horizon_s = HORIZON_RATIO * time_to_empty_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
     parts = _parts(_prolonged(load, horizon_s), horizon_s)
     horizon_s = min(horizon_s, MAX_DRAW_STEPS * float(parts["duration_s"].mean()))
     draws = _draws(m, seed)[: _draw_count(parts, horizon_s)]
@@ -176,10 +179,10 @@ def project_trip(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
 
 def discharges(pack: Records, load_a: float) -> bool:
     """Return True if a load with a mean of ``load_a`` [A] discharges the pack within ``MAX_TIME_TO_EMPTY_S``."""
-    return load_a > 0.0 and _time_to_empty_s(pack, load_a) <= MAX_TIME_TO_EMPTY_S
+    return load_a > 0.0 and time_to_empty_s(pack, load_a) <= MAX_TIME_TO_EMPTY_S
 
 
-def _time_to_empty_s(pack: Records, load_a: float) -> float:
+def time_to_empty_s(pack: Records, load_a: float) -> float:
     """Return the time in which the mean load draws the whole remaining charge, at least 2 % of the capacity [s]."""
     return max(float(pack["soc"][0]), MIN_REMAINING_SOC) * float(pack["capacity_as"][0]) / load_a
 

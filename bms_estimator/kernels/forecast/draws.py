@@ -9,9 +9,12 @@ import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
 from bms_estimator.kernels.forecast.projected_pack import voltage_without_load
-from bms_estimator.kernels.forecast.random_numbers import generator_of_draw, normal
+from bms_estimator.kernels.forecast.random_numbers import generator_of_draw, normal, student_t
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
+
+MAX_LOAD_FACTOR = 10.0
+"""Maximum factor on the load, and the inverse of the minimum. It limits the long tails of Student's t distribution."""
 
 DRAW = np.dtype(
     [
@@ -37,7 +40,7 @@ DRAW = np.dtype(
 
 @njit(cache=True)
 def draw_packs(m: Record, seed: np.uint64, draws: Records) -> None:
-    """Draw pack and load factor of each draw.
+    """Draw the pack of each draw. The factor on the load is 1.
 
     Args:
         m: Record of PROJECTED_PACK.
@@ -50,10 +53,9 @@ def draw_packs(m: Record, seed: np.uint64, draws: Records) -> None:
 
 @njit(cache=True)
 def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
-    """Draw pack and load factor of one draw from its generator."""
+    """Draw the pack of one draw from its generator."""
     generator, soc_stds = normal(generator)
     generator, capacity_stds = normal(generator)
-    generator, load_stds = normal(generator)
     generator, voltage_stds = normal(generator)
     generator, resistance_stds = normal(generator)
     generator, weakest_stds = normal(generator)
@@ -61,10 +63,26 @@ def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
     d.begin_soc = m.soc - m.surface_soc + m.soc_std * soc_stds
     d.begin_soc -= weakest * max(1.0 - d.begin_soc, 0.0)
     d.capacity_as = m.capacity_as * math.exp(m.capacity_std * capacity_stds) / (1.0 + weakest)
-    d.load = math.exp(m.load_std * load_stds)
+    d.load = 1.0
     d.voltage_v = m.voltage_std_v * voltage_stds
     d.resistance = m.resistance_mean + m.resistance_std * resistance_stds
     d.first_generator = generator
+
+
+@njit(cache=True)
+def draw_load_factors(std: float, degrees: float, draws: Records) -> None:
+    """Draw the factor on the load of each draw.
+
+    Args:
+        std: Scale of Student's t distribution of ln factor.
+        degrees: Degrees of freedom of this distribution, above 0.
+        draws: Shape (n,), dtype DRAW, by ``draw_packs``; written.
+    """
+    limit = math.log(MAX_LOAD_FACTOR)
+    for n in range(draws.shape[0]):
+        d = draws[n]
+        d.first_generator, stds = student_t(d.first_generator, degrees)
+        d.load = math.exp(min(max(std * stds, -limit), limit))
 
 
 @njit(cache=True)

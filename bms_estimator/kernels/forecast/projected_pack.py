@@ -36,8 +36,6 @@ VOLTAGE_STD_V = 0.02
 """Std of the voltage error of one cell's model at 25 C, constant until the cut-off [V]."""
 VOLTAGE_STD_J = 22e3
 """Activation energy of ``VOLTAGE_STD_V`` squared [J/mol]."""
-LOAD_STD = 0.1
-"""Std of ln (future load / drawn load)."""
 RESISTANCE_MEAN = 1.05
 """Mean factor on the voltage drop of the present model."""
 RESISTANCE_STD = 0.05
@@ -71,7 +69,6 @@ PROJECTED_PACK = np.dtype(
         ("weakest_std", "f8"),  # std of the weakest cell's SOC below the mean, per unit of SOC discharged
         ("capacity_std", "f8"),  # std of ln capacity
         ("voltage_std_v", "f8"),
-        ("load_std", "f8"),  # std of ln (future load / drawn load)
         ("resistance_mean", "f8"),  # mean factor on the voltage drop
         ("resistance_std", "f8"),
         ("voltage_v", "f8", OCV_POINTS),  # voltage without load over SOC 0..1, after a discharge to that SOC [V]
@@ -104,7 +101,7 @@ def project_pack(m: Record, s: Record, p: Record, cutoff_v: float, peak_a: float
     m.weakest_std = p.cell_spread if p.series > 1.0 else 0.0
     m.capacity_std = CAPACITY_STD_FACTOR * math.sqrt(cov[LN_Q, LN_Q])
     m.voltage_std_v = VOLTAGE_STD_V * p.series * math.sqrt(arrhenius(VOLTAGE_STD_J, s.temperature_c))
-    m.load_std, m.resistance_mean, m.resistance_std = LOAD_STD, RESISTANCE_MEAN, RESISTANCE_STD
+    m.resistance_mean, m.resistance_std = RESISTANCE_MEAN, RESISTANCE_STD
     m.surface_soc = SURFACE_S * max(s.weak, 1.0) * max(peak_a, s.mean_a, 0.0) / m.capacity_as
     project_voltage(m, s, p)
     project_resistances(m, s, p)

@@ -44,3 +44,11 @@ def normal(state: np.uint64) -> tuple[np.uint64, float]:
     state, first = uniform(state)
     state, second = uniform(state)
     return state, math.sqrt(-2.0 * math.log(first)) * math.cos(2.0 * math.pi * second)
+
+
+@njit(cache=True)
+def student_t(state: np.uint64, degrees: float) -> tuple[np.uint64, float]:
+    """Return the next state, and a random number of Student's t distribution (Bailey, Mathematics of Computation 1994)."""
+    state, first = uniform(state)
+    state, second = uniform(state)
+    return state, math.sqrt(degrees * math.expm1(-2.0 / degrees * math.log(first))) * math.cos(2.0 * math.pi * second)

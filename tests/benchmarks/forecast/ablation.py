@@ -1,19 +1,19 @@
 """Ablation of the forecast: its scores without one part at a time, from one replay of each capture."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
-from bms_estimator.forecast.given_load import GivenLoad
-from bms_estimator.forecast.projection import Projection, project_seen_load
+from bms_estimator.forecast.load_spread import LoadSpread, load_spread
+from bms_estimator.forecast.projection import discharges, project_seen_load, time_quantiles, time_to_empty_s
 from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.forecast.projected_pack import FAST_RESISTANCES, growth_factor
 from bms_estimator.model.arrays import Floats, Records
 from bms_estimator.model.cell import CellModel
-from tests.benchmarks.forecast.baselines import quantiles_of
+from tests.benchmarks.forecast.baselines import UNKNOWN, Quantiles
 from tests.benchmarks.forecast.captures import Case
 from tests.benchmarks.forecast.measure import MAX_LEFT_S, outcome
 from tests.benchmarks.forecast.moments import moments_of
@@ -23,6 +23,8 @@ from tests.benchmarks.forecast.truth import Discharge
 SHUFFLED_S = 10
 """Length of the pieces of the load whose order is lost [s]."""
 SHUFFLE_SEED = 1
+NORMAL_DEGREES = 1e6
+"""Degrees of freedom with which Student's t distribution is practically normal."""
 
 SeenLoad = tuple[Floats, Floats]
 """Mean and largest current of each second [A]."""
@@ -51,6 +53,21 @@ def shuffled(seen: SeenLoad) -> SeenLoad:
     return mean_a, max_a
 
 
+def own_spread(spread: LoadSpread) -> LoadSpread:
+    """Return the spread as it is."""
+    return spread
+
+
+def no_spread(spread: LoadSpread) -> LoadSpread:
+    """Return the spread of a load whose future mean is known."""
+    return replace(spread, std=0.0)
+
+
+def fixed_spread(_: LoadSpread) -> LoadSpread:
+    """Return a spread of 10 % that does not depend on the load."""
+    return LoadSpread(0.1, NORMAL_DEGREES)
+
+
 @dataclass(frozen=True)
 class Part:
     """Part of the forecast, and what disables it."""
@@ -62,9 +79,11 @@ class Part:
     """False: the fast resistances do not grow towards empty."""
     load: Callable[[SeenLoad], SeenLoad] = unchanged
     """Function that changes the load that was seen."""
+    spread: Callable[[LoadSpread], LoadSpread] = own_spread
+    """Function that changes the spread of the mean load."""
 
 
-STDS = ("soc_std", "capacity_std", "voltage_std_v", "load_std", "resistance_std")
+STDS = ("soc_std", "capacity_std", "voltage_std_v", "resistance_std")
 """Fields of PROJECTED_PACK with the spread of the draws."""
 GROWTH = Part("growth of R towards empty", grows=False)
 GRADIENT = Part("SOC gradient in the particles", {"surface_soc": 0.0})
@@ -76,8 +95,10 @@ PARTS = (
     Part("peaks within a second", load=without_peaks),
     GROWTH,
     GRADIENT,
+    Part("spread: mean load", spread=no_spread),
+    Part("spread: mean load, but always 10 %", spread=fixed_spread),
     *(Part(f"spread: {name}", {name: 0.0}) for name in STDS),
-    Part("all spreads but the load's order", dict.fromkeys(STDS, 0.0)),
+    Part("all spreads but the load's order", dict.fromkeys(STDS, 0.0), spread=no_spread),
 )
 """Parts of the forecast."""
 
@@ -91,38 +112,24 @@ def disable(part: Part, pack: Records, estimator: Estimator) -> None:
         pack["ohm"][0, :FAST_RESISTANCES] /= [growth_factor(state, pack["soc"][0], soc) for soc in nodes]
 
 
-class PartForecaster(Forecaster):
-    """Forecaster with one part disabled.
-
-    Attributes:
-        part: The disabled part.
-    """
-
-    part = PARTS[0]
-
-    def _pack(self, load: GivenLoad | None) -> Records:
-        pack = super()._pack(load)
-        disable(self.part, pack, self.estimator)
-        return pack
-
-    def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:
-        if load is not None:
-            return super()._project(pack, load)
-        mean_a, max_a = self.part.load(self.load.mean_and_max())
-        if not mean_a.mean() > pack["offset_a"][0]:
-            return None
-        return project_seen_load(pack, mean_a, max_a, self._seed())
+def quantiles_without(part: Part, forecaster: Forecaster) -> Quantiles:
+    """Return the quantiles of a forecast from the present state without a part; unknown if the load discharges no pack."""
+    pack = forecaster.projected_pack()
+    disable(part, pack, forecaster.estimator)
+    mean_a, max_a = part.load(forecaster.load.mean_and_max())
+    current_a = mean_a - pack["offset_a"][0]
+    if not discharges(pack, float(current_a.mean())):
+        return UNKNOWN
+    spread = part.spread(load_spread(current_a, time_to_empty_s(pack, float(current_a.mean()))))
+    return Quantiles(*time_quantiles(project_seen_load(pack, mean_a, max_a, spread, forecaster.seed).time_s))
 
 
 def outcomes_without_parts(case: Case, discharge: Discharge, cell: CellModel, interval_s: float) -> Iterator[Outcome]:
     """Yield the outcomes of the forecast without each part, with the name of the part as method."""
     estimator = Estimator(cell)
-    forecaster = PartForecaster(estimator, estimator, cutoff_v=discharge.cutoff_v)
+    forecaster = Forecaster(estimator, estimator, cutoff_v=discharge.cutoff_v)
     for moment in moments_of(forecaster, discharge, interval_s):
-        if not min(moment.left_s, moment.value("time_to_cutoff_s")) < MAX_LEFT_S:
-            continue  # also without a forecast
+        if moment.forecast.reason or min(moment.left_s, moment.value("time_to_cutoff_s")) >= MAX_LEFT_S:
+            continue
         for part in PARTS:
-            forecaster.part = part
-            said = quantiles_of(forecaster.forecast())
-            yield outcome(part.name, said, case, discharge, cell, moment)
-        forecaster.part = PARTS[0]
+            yield outcome(part.name, quantiles_without(part, forecaster), case, discharge, cell, moment)
