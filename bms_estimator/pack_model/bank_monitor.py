@@ -90,6 +90,7 @@ class BankMonitor:
         if fit.is_exchanged and self._discharge is not None and self._discharge.fit.first_segment < fit.first_segment:
             self.reset()
             history.weak_cell_times.clear()
+        if fit.is_exchanged and history.first is not None and history.first.fit.first_segment < fit.first_segment:
             history.first = None
         rows = history.rows[history.rows["segment"] >= fit.first_segment]
         for end in range(max(rows.size - new, 0) + 1, rows.size + 1):

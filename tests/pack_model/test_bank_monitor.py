@@ -5,11 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.accumulators.history import HISTORY_ROW
-from bms_estimator.pack_model.bank_monitor import discharge_start, reference_rows
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW, ROW_SOC
+from bms_estimator.model.cell import load_cell
+from bms_estimator.pack_model.bank_monitor import BankMonitor, discharge_start, reference_rows
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.fit import SOC, PackFit
 from bms_estimator.pack_model.history import History, ReferenceDischarges, WeakCellTime
+from bms_estimator.pack_model.open_circuit import fitted_ocv
 from bms_estimator.pack_model.saved import history_arrays, history_of, neutral_fit
 from bms_estimator.pack_model.weakest_cell import WeakestCell
+from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 
 
 def rows_of(charge_as: list[float], segment: list[int] | None = None) -> np.ndarray:
@@ -41,6 +47,62 @@ def test_discharges_with_a_weak_cell_are_no_reference() -> None:
     rows = rows_of([0.0, 1.0, 2.0, 3.0, 4.0])
     kept = reference_rows(rows, [WeakCellTime(60.0, 120.0, 0.5), WeakCellTime(240.0, np.inf, 0.4)])
     assert kept["elapsed_s"].tolist() == [0.0, 120.0, 180.0]
+
+
+SERIES, ROWS = 6, 48
+CURVES = CellCurves(Estimator(load_cell("ncr18650").pack(SERIES, 1)).cell_file_settings)
+FIT = replace(neutral_fit(), mean=np.eye(neutral_fit().mean.size)[SOC])
+
+
+def discharge(number: int, capacity_ratio: float) -> np.ndarray:
+    """Return rows of a discharge from full to SOC 0.04 in which one cell has a lower capacity."""
+    soc = 1.0 - ROW_SOC * (np.arange(ROWS) + 0.5)
+    rows = rows_of(((1.0 - soc) * CURVES.capacity_as).tolist())
+    weak_soc = 1.0 - (1.0 - soc) / capacity_ratio
+    rows["voltage_v"] = (SERIES - 1) * fitted_ocv(CURVES, FIT, soc) + fitted_ocv(CURVES, FIT, weak_soc)
+    rows["elapsed_s"] += 1e5 * number
+    rows["soc"], rows["temperature_c"] = soc, 25.0
+    return rows
+
+
+def discharges(numbers: range, capacity_ratio: float) -> np.ndarray:
+    return np.concatenate([discharge(number, capacity_ratio) for number in numbers])
+
+
+def monitored(history: History, fit: PackFit = FIT) -> BankMonitor:
+    """Return a monitor that has compared the last row of a history."""
+    monitor = BankMonitor(CURVES)
+    monitor.add(history, 1, fit)
+    return monitor
+
+
+def test_a_cell_that_is_weak_in_all_rows_of_the_history_deviates_from_the_first_discharges() -> None:
+    rows, healthy = discharges(range(10, 14), 0.9), ReferenceDischarges(discharges(range(5), 1.0), FIT)
+    deviation = [monitored(History(rows, first=first)).weakest.deviation_std for first in (None, healthy)]
+    assert deviation[0] < 1.0
+    assert deviation[1] > WEAK_CELL_STD
+
+
+def test_first_discharges_do_not_change() -> None:
+    history = History(discharges(range(6), 1.0))
+    monitor = monitored(history)
+    first = history.first
+    assert first is not None
+    assert first.rows["elapsed_s"].max() < 1e5 * 5  # without the present discharge
+    history.append(discharge(6, 1.0), CURVES.capacity_as)
+    monitor.add(history, 1, FIT)
+    assert history.first is first
+
+
+def test_first_discharges_of_an_exchanged_pack_are_dropped_also_after_a_restart() -> None:
+    history = History(discharges(range(6), 1.0))
+    monitored(history)
+    assert history.first is not None
+    other = discharge(7, 1.0)
+    other["segment"] = 1.0
+    history.append(other, CURVES.capacity_as)
+    monitored(history, replace(FIT, first_segment=1.0, is_exchanged=True))
+    assert history.first is None
 
 
 def test_times_of_weak_cells_survive_a_restart() -> None:
