@@ -10,6 +10,8 @@ BLE     := .venv-ble
 AUDIT   := .venv-audit
 NODE    := .node
 ARGS    ?=
+# More than the cores of a small machine, because most tests wait for programs, servers or a board.
+WORKERS ?= 5
 INPUTS  ?= 20000
 KILLS   ?= 100
 NODES   ?= 1 3
@@ -46,10 +48,10 @@ check: venv ## style, import order of the layers, and types, in seconds
 	$(BIN)/mypy
 
 test: prepared ## style, types, firmware, and all tests except the redundant and longer ones
-	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile --no-loadscope-reorder -m "not thorough" $(ARGS)
+	$(BIN)/python -m pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder -m "not thorough" $(ARGS)
 
 test-all: prepared ## also the redundant and longer tests
-	$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile --no-loadscope-reorder $(ARGS)
+	$(BIN)/python -m pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder $(ARGS)
 
 prepared: apt venv
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant

@@ -132,7 +132,12 @@ def pack(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("phase", "hours", "begins_again"), [("rest", 1.0, False), ("discharge", 0.0, False), ("discharge", 1.0, True)]
+    ("phase", "hours", "begins_again"),
+    [
+        ("rest", 1.0, False),
+        pytest.param("discharge", 0.0, False, marks=pytest.mark.thorough),
+        ("discharge", 1.0, True),
+    ],
 )
 async def test_after_a_kill_the_test_continues_unless_charge_may_be_missing(
     pack, tmp_path, phase, hours, begins_again

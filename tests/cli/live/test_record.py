@@ -14,7 +14,7 @@ from bms_estimator.cli.main import main
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import MAGIC, read_capture, read_header
-from tests.command_line import PROGRAM
+from tests.command_line import PROGRAM, run
 from tests.patience import LONG_S
 from tests.serial_line import Line
 
@@ -185,13 +185,11 @@ def test_damaged_length_is_reported(capture, tmp_path, capsys):
     assert f"the last {unread:,} bytes are no complete record" in err
 
 
-def test_existing_file_is_not_overwritten(tmp_path):
+def test_existing_file_is_not_overwritten(tmp_path, capsys):
     out = tmp_path / "kept.bms"
     out.write_bytes(b"kept")
-    with program("record", out, "--port", "/dev/none") as process:
-        message, err = process.communicate(timeout=LONG_S)
-    assert (process.returncode, message) == (2, "")
-    assert err == f"error: {out}: exists already; a capture is never overwritten\n"
+    message = f"error: {out}: exists already; a capture is never overwritten\n"
+    assert run(capsys, "record", out, "--port", "/dev/none") == (2, "", message)
     assert out.read_bytes() == b"kept"
 
 

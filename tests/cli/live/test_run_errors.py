@@ -9,7 +9,6 @@ import pytest
 from bms_estimator import __version__
 from bms_estimator.cli.main import COMMANDS
 from tests.command_line import PROGRAM, run
-from tests.patience import LONG_S
 
 OUTPUTS = [
     (("config", "show"), ""),
@@ -22,24 +21,17 @@ OUTPUTS = [
 """Commands that write in different ways, and values of PYTHONUNBUFFERED."""
 
 
-def program(*arguments):
-    """Run the program until it exits."""
-    return subprocess.run([PROGRAM, *arguments], capture_output=True, text=True, timeout=LONG_S, check=False)
+def test_missing_pack_file_is_an_error(tmp_path, capsys):
+    message = f"error: {tmp_path / 'none.toml'}: cannot be read: No such file or directory\n"
+    assert run(capsys, "run", tmp_path / "none.toml") == (2, "", message)
 
 
-def test_missing_pack_file_is_an_error(tmp_path):
-    process = program("run", tmp_path / "none.toml")
-    assert (process.returncode, process.stdout) == (2, "")
-    assert process.stderr == f"error: {tmp_path / 'none.toml'}: cannot be read: No such file or directory\n"
-
-
-def test_existing_capture_is_not_overwritten(tmp_path):
+def test_existing_capture_is_not_overwritten(tmp_path, capsys):
     pack, capture = tmp_path / "pack.toml", tmp_path / "kept.bms"
     pack.write_text('[sensor]\nport = "/dev/none"\n')
     capture.write_bytes(b"kept")
-    process = program("run", pack, "--record", capture)
-    assert process.returncode == 2
-    assert process.stderr == f"error: {capture}: exists already; a capture is never overwritten\n"
+    message = f"error: {capture}: exists already; a capture is never overwritten\n"
+    assert run(capsys, "run", pack, "--record", capture) == (2, "", message)
     assert capture.read_bytes() == b"kept"
 
 
