@@ -20,17 +20,19 @@ def capture(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("command", "options", "out_name"),
+    ("command", "options", "out_name", "lines"),
     [
-        ("replay", ("--cell", "ncr18650"), "out.csv"),
-        ("ocv", ("--capacity-ah", "3"), "out.toml"),
-        ("identify", ("--cell", "ncr18650", "--keep-ocv"), "out.toml"),
+        ("replay", ("--cell", "ncr18650"), "out.csv", 600),
+        ("ocv", ("--capacity-ah", "3"), "out.toml", None),
+        ("identify", ("--cell", "ncr18650", "--keep-ocv"), "out.toml", None),
     ],
 )
-def test_existing_file_is_replaced_only_with_force(command, options, out_name, capture, tmp_path, capsys):
-    out = tmp_path / out_name
+def test_existing_file_is_replaced_only_with_force(command, options, out_name, lines, capture, tmp_path, capsys):
+    """``lines`` is the number of lines of the capture that the command needs; None: all."""
+    out, used = tmp_path / out_name, tmp_path / "capture.csv"
+    used.write_text("\n".join(capture.read_text().splitlines()[:lines]) + "\n")
     out.write_text("# measured in May\n")
-    arguments = [command, str(capture), *options, "--out", str(out)]
+    arguments = [command, str(used), *options, "--out", str(out)]
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2

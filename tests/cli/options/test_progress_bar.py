@@ -64,7 +64,7 @@ def test_a_bar_is_shown_while_a_long_file_is_read(
     assert labels[0][0].endswith("load.csv")
 
 
-@pytest.mark.parametrize("command", ["replay", "alarms"])
+@pytest.mark.parametrize("command", ["replay", pytest.param("alarms", marks=pytest.mark.thorough)])
 def test_a_pipe_receives_no_bar(command: str, capture: Path) -> None:
     arguments = [PROGRAM, command, capture, "--cell", "ncr18650"]
     assert subprocess.run(arguments, capture_output=True, check=True).stderr == b""
