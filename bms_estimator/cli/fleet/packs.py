@@ -205,6 +205,7 @@ def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> Non
         remaining.append("their rows in the Parquet files of `fleet collect`: end it and repeat with --folder FOLDER")
     remaining += [
         "blocks on their edges, which they send again: stop the edges, revoke their tokens, delete PACK.edge.sqlite",
+        "earlier checkpoints in the server's files, until nats-server compacts these",
         "last states on running fleet pages, until these are restarted",
         "backups of the server and of the Parquet files, files of `fleet capture`, logs of workers",
         "cell files of-PACK that `fleet identify --put` has uploaded",

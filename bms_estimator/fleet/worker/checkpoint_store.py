@@ -28,6 +28,7 @@ from nats.nuid import NUID
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError, is_readable
 from bms_estimator.model.clock import iso_utc
@@ -253,7 +254,7 @@ class CheckpointStore:
         return claim
 
     async def replace(self, claim: Claim, old: CheckpointInfo, chunks: Iterator[bytes] | None) -> Claim:
-        """Replace a stored checkpoint by one of the same messages, or remove it.
+        """Replace a stored checkpoint by one of the same messages, or remove it. The old one is overwritten on the disk.
 
         Args:
             claim: Claim that the last write returned.
@@ -274,6 +275,7 @@ class CheckpointStore:
         except FencedError:
             await self._remove_object(pointer.next)
             raise
+        await erase_messages(self._nc, _STREAM, _chunk_subject(old.object))
         await self._remove_unreferenced(pointer, new_pointer)
         return claim
 

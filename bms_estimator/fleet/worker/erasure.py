@@ -16,6 +16,7 @@ import nats.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer, partitions_of
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
@@ -73,9 +74,9 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
     for number in {subjects.partition_of(pack, partitions) for pack in packs}:
         members = {pack for pack in packs if subjects.partition_of(pack, partitions) == number}
         for pack in members:
-            blocks[pack] = await _purge(nc, subjects.RAW_STREAM, subjects.stored_raw(number, pack))
+            blocks[pack] = await erase_messages(nc, subjects.RAW_STREAM, subjects.stored_raw(number, pack))
         checkpoints |= await _erase_states(nc, number, members)
-    hours = {pack: await _purge(nc, subjects.HOURS_STREAM, subjects.hours(pack)) for pack in packs}
+    hours = {pack: await erase_messages(nc, subjects.HOURS_STREAM, subjects.hours(pack)) for pack in packs}
     remaining = await _remaining(nc, packs)
     return {pack: Erasure(blocks[pack], checkpoints[pack], hours[pack], remaining[pack]) for pack in packs}
 
@@ -138,11 +139,6 @@ def _without(part: Mapping[str, V], packs: Collection[str]) -> dict[str, V]:
     return {pack: value for pack, value in part.items() if pack not in packs}
 
 
-async def _purge(nc: Client, stream: str, subject: str) -> int:
-    """Remove the messages of a subject from a stream, and return their number."""
-    return int((await _api(nc, f"STREAM.PURGE.{stream}", {"filter": subject}))["purged"])
-
-
 async def _remaining(nc: Client, packs: Collection[str]) -> dict[str, dict[str, int]]:
     """Return the numbers of messages with a pack's name in their subject, by pack and stream."""
     remaining: dict[str, dict[str, int]] = {pack: {} for pack in packs}
@@ -165,7 +161,7 @@ async def _count_messages(nc: Client, stream: str, pack: str) -> int:
 
 
 async def _api(nc: Client, operation: str, request: dict[str, Any]) -> dict[str, Any]:
-    """Send a request to the JetStream API, because nats-py does not return the number of purged messages.
+    """Send a request to the JetStream API, because nats-py does not support filters of subjects.
 
     Raises:
         StreamError: The server rejects the request.

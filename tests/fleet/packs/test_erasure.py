@@ -76,6 +76,15 @@ async def test_erased_pack_is_in_no_stream_checkpoint_and_memory_and_the_other_p
         state = partition.state("p2")
         assert state["estimator"].tobytes() == estimated(registry, "p2", BLOCKS)
         await nc.close()
+        cluster.kill(0)
+        assert files_with(tmp_path, subjects.stored_raw(0, "p2"))
+        assert files_with(tmp_path, subjects.stored_raw(0, "p1")) == []
+        assert files_with(tmp_path, subjects.hours("p1")) == []
+
+
+def files_with(folder, text):
+    """Return the files of messages on the server's disk that contain ``text``."""
+    return [file for file in folder.rglob("*.blk") if text.encode() in file.read_bytes()]
 
 
 async def test_pack_without_a_worker_is_erased_and_messages_in_other_streams_are_reported(tmp_path, capsys):
