@@ -2,7 +2,9 @@
 
 ===========================  ================================================================================
 ``raw.<pack>``               blocks of an edge (module ``block``), received by the stream ``RAW``
-``p.<partition>.raw.<pack>`` these blocks as the stream ``RAW`` stores them; publishing to this subject has no effect
+``table.<pack>``             changes of a row of the table of packs, received by the stream ``RAW``
+``p.<partition>.raw.<pack>`` these blocks as the stream ``RAW`` stores them; publishing to this subject has no effect.
+                             Changes of the table are stored as ``p.<partition>.table.<pack>``
 ``edge.<pack>.awaits``       ``BlockRequest`` to the edge: the block that a worker awaits next
 ``bms.<pack>.<topic>``       estimates, in the format of the command ``run``
 ``dead.<pack>.<digest>``     a block that a worker could not process, stored in the stream ``DEAD``
@@ -29,14 +31,29 @@ def raw(pack: str) -> str:
     return f"raw.{pack}"
 
 
+def table_change(pack: str = "*") -> str:
+    """Return the subject on which a worker sends changes of a pack's row in the table."""
+    return f"table.{pack}"
+
+
 def stored_raw(partition: int, pack: str = "*") -> str:
     """Return the subject of a pack's blocks in the stream ``RAW``."""
     return f"p.{partition}.raw.{pack}"
 
 
+def stored(partition: int, pack: str = "*") -> str:
+    """Return the subject of a pack's blocks and changes of the table in the stream ``RAW``."""
+    return f"p.{partition}.*.{pack}"
+
+
+def is_table_change(stored_subject: str) -> bool:
+    """Return True if the stream ``RAW`` stores changes of the table under a subject."""
+    return stored_subject.split(".")[2] == "table"
+
+
 def mapping(partitions: int) -> tuple[str, str]:
     """Return source and destination of the subject transform that assigns packs to partitions in the stream ``RAW``."""
-    return "raw.*", f"p.{{{{partition({partitions},1)}}}}.raw.{{{{wildcard(1)}}}}"
+    return "*.*", f"p.{{{{partition({partitions},2)}}}}.{{{{wildcard(1)}}}}.{{{{wildcard(2)}}}}"
 
 
 def block_request(pack: str) -> str:

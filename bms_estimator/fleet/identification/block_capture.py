@@ -11,7 +11,6 @@ from nats.aio.client import Client
 from bms_estimator.edge.block import Block, BlockError, decode
 from bms_estimator.edge.subjects import RAW_STREAM
 from bms_estimator.fleet.nats.stream_reader import read_stream
-from bms_estimator.fleet.packs.table_change import is_change
 from bms_estimator.model.sample import SampleBlock
 
 AHEAD_S = 3600.0
@@ -142,6 +141,5 @@ async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: f
     first_s = None if since_s <= AHEAD_S else since_s - AHEAD_S
     async for batch in read_stream(nc, RAW_STREAM, f"p.*.raw.{pack}", since_s=first_s):
         for message in batch:
-            if not is_change(message.data):
-                capture.add(message.data)
+            capture.add(message.data)
     return capture

@@ -136,7 +136,8 @@ def _raw_stream(partitions: int, max_bytes: int, age_s: float) -> dict[str, Any]
     }
     return _stream(
         subjects.RAW_STREAM,
-        source,
+        subjects.raw("*"),
+        subjects.table_change(),
         subject_transform={"src": source, "dest": destination},
         metadata={PARTITIONS_KEY: str(partitions)},
         **limits,
@@ -192,7 +193,7 @@ async def _ensure_consumer(nc: Client, partition: int, replicas: int) -> None:
     name = consumer(partition)
     config = {
         "durable_name": name,
-        "filter_subject": subjects.stored_raw(partition),
+        "filter_subject": subjects.stored(partition),
         "ack_policy": "none",
         "priority_groups": [GROUP],
         "priority_policy": "pinned_client",

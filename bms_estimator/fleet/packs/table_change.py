@@ -9,6 +9,8 @@ The message consists of ``MAGIC`` and a JSON object with the fields of ``PackSou
 import json
 from typing import NamedTuple
 
+from bms_estimator.edge.subjects import is_table_change
+
 MAGIC = b"BMST"
 """First bytes of the message; those of a block differ."""
 
@@ -25,6 +27,14 @@ class PackSource(NamedTuple):
 def is_change(data: bytes) -> bool:
     """Return True if a message of the stream is a change of the table."""
     return data.startswith(MAGIC)
+
+
+def trusted_data(subject: str, data: bytes) -> bytes:
+    """Return the data of a stored message.
+
+    A change of the table that an edge has sent as a block returns empty data, which is no block.
+    """
+    return b"" if is_change(data) and not is_table_change(subject) else data
 
 
 def encode_change(source: PackSource | None) -> bytes:

@@ -69,7 +69,7 @@ _WORKER_PUBLISH = (
     "bms.>",
     "hours.*",
     "dead.*.*",
-    "raw.*",
+    "table.*",
     "fleet.>",
     "_INBOX.>",
 )

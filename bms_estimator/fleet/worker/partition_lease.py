@@ -25,7 +25,7 @@ from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError
-from bms_estimator.fleet.packs.table_change import is_change
+from bms_estimator.fleet.packs.table_change import is_change, trusted_data
 from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
@@ -282,7 +282,7 @@ class PartitionLease:
         """Send the row of a pack to the stream if the row differs from the one in force."""
         change = partition.table_change(pack)
         if change is not None:
-            await self._nc.jetstream().publish(subjects.raw(pack), change)
+            await self._nc.jetstream().publish(subjects.table_change(pack), change)
 
     async def _process_deferred(self) -> None:
         """Process deferred messages until cancelled, one of each pack at a time."""
@@ -300,7 +300,7 @@ class PartitionLease:
 
     async def _take_deferred(self, partition: Partition, pack: str, span: Span) -> None:
         """Process the next deferred message of a pack."""
-        js, subject = self._nc.jetstream(), subjects.stored_raw(self.number, pack)
+        js, subject = self._nc.jetstream(), subjects.stored(self.number, pack)
         try:
             message = await js.get_msg(subjects.RAW_STREAM, span.first, subject, next=True)
         except (
@@ -308,7 +308,7 @@ class PartitionLease:
         ):  # the stream has dropped the messages; the reply to the edge's next block requests them again
             partition.deferred.advance(pack, span.last)
             return
-        data, sequence = message.data or b"", message.seq or 0
+        data, sequence = trusted_data(message.subject or "", message.data or b""), message.seq or 0
         if sequence > span.last:  # the stream has dropped the deferred messages
             partition.deferred.advance(pack, span.last)
             return
@@ -353,7 +353,7 @@ class PartitionLease:
             return
         async with self._state_lock:
             partition = await self._take_over()
-        js, subject = self._nc.jetstream(), subjects.stored_raw(self.number)
+        js, subject = self._nc.jetstream(), subjects.stored(self.number)
         try:
             await js.get_msg(subjects.RAW_STREAM, partition.sequence + 1, subject, next=True)
         except NotFoundError:
@@ -387,7 +387,7 @@ class PartitionLease:
 
     async def _last_partition_sequence(self) -> int:
         """Return the sequence number of the last message of the partition; 0 without a message."""
-        js, subject = self._nc.jetstream(), subjects.stored_raw(self.number)
+        js, subject = self._nc.jetstream(), subjects.stored(self.number)
         try:
             return (await js.get_last_msg(subjects.RAW_STREAM, subject)).seq or 0
         except NotFoundError:
@@ -423,12 +423,13 @@ class PartitionLease:
         if partition.sequence >= sequence:
             return
         latest: dict[str, BlockResult] = {}
-        subject = subjects.stored_raw(self.number)
+        subject = subjects.stored(self.number)
         messages = read_messages(self._nc, subjects.RAW_STREAM, subject, partition.sequence + 1, sequence)
         async with aclosing(messages):
             async for message in messages:
                 pack = message.subject.rpartition(".")[2]
-                result = await self._take_or_defer(partition, pack, message)
+                trusted = message._replace(data=trusted_data(message.subject, message.data))
+                result = await self._take_or_defer(partition, pack, trusted)
                 latest[pack] = _merge(latest.get(pack), result)
         for result in latest.values():
             await self._publish(result)

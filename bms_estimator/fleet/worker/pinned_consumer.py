@@ -16,6 +16,7 @@ from nats.aio.msg import Msg
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import GROUP, PIN_S, RESPONSE_TIMEOUT_S, consumer
+from bms_estimator.fleet.packs.table_change import trusted_data
 
 RENEW_S = PIN_S / 4.0
 """Interval of requests [s]. A pin survives if the event loop is late by three intervals."""
@@ -150,10 +151,9 @@ class PinnedConsumer:
         follows = position.consumer_sequence == self._last_consumer_sequence + 1
         self._last_consumer_sequence = position.consumer_sequence
         pack = message.subject.rpartition(".")[2]
+        data = trusted_data(message.subject, message.data)
         self.waiting.append(
-            DeliveredMessage(
-                pack, message.data, position.stream_sequence, position.received_s, self._pin_count, follows
-            )
+            DeliveredMessage(pack, data, position.stream_sequence, position.received_s, self._pin_count, follows)
         )
 
 

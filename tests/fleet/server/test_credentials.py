@@ -240,6 +240,8 @@ async def test_worker_can_do_its_work_and_nothing_else(fleet: Fleet) -> None:
         revision = await checkpoints.put("any", b"1")
         await checkpoints.update("any", b"2", revision)
         assert (await js.publish(subjects.hours("p1"), b"{}", headers={"Nats-Msg-Id": "p1.1"})).seq
+        assert (await js.publish(subjects.table_change("p1"), b"BMSTnull")).seq
+        assert (await js.publish(subjects.dead("p1", "1"), b"block")).seq
         await nc.publish(subjects.worker("w1"), b"{}")
         inbox = await nc.subscribe(nc.new_inbox())
         for partition in range(4):

@@ -1,5 +1,6 @@
 """Changes of the table of packs in the order of the stream: a takeover meets old blocks with old rows."""
 
+import asyncio
 from pathlib import Path
 
 import nats
@@ -13,8 +14,9 @@ from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
-from bms_estimator.fleet.packs.table_change import decode_change
+from bms_estimator.fleet.packs.table_change import PackSource, decode_change, encode_change
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.fleet.worker.worker import Options, work
 from tests.fleet.nats_cluster import running
 from tests.fleet.workers import PACK_ROW, PERIOD_S, Heartbeats, Process, block, end_states, load_packs, send
 
@@ -142,6 +144,23 @@ async def test_successor_of_a_killed_worker_applies_a_changed_row_between_the_sa
         assert restored.counters["table_changes"] == 1
         with pytest.raises(NotFoundError):  # no change was sent twice
             await message_of(nc, BLOCKS + 2)
+        await nc.close()
+
+
+async def test_change_that_an_edge_sends_as_a_block_has_no_effect(tmp_path: Path) -> None:
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await nats.connect(cluster.url)
+        await make_streams(nc, partitions=1)
+        await load_packs(nc, ["p1"])
+        stop = asyncio.Event()
+        async with Heartbeats(nc) as heartbeats:
+            worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
+            await send(nc, "p1", block("p1", 1))
+            await send(nc, "p1", encode_change(PackSource(CHANGED_ROW.decode(), None)))
+            await heartbeats.until(lambda last: "w" in last and last["w"].counters.get("damaged") == 1)
+            assert "table_changes" not in heartbeats.last["w"].counters
+            stop.set()
+            await worker_task
         await nc.close()
 
 
