@@ -256,7 +256,7 @@ async def test_no_element_is_wider_than_the_screen(browser: Browser, fleet: Flee
     overflowing_elements = """width => [...document.querySelectorAll("body, header *, #fleet, .card, .card :not(.scroll *)")]
         .filter((e) => e.getBoundingClientRect().right > width + 0.5).map((e) => e.outerHTML.slice(0, 80))"""
     async with open_page(browser, fleet) as browser_tab:
-        await browser_tab.until("() => document.querySelectorAll('#concerns tr').length === 3")
+        await browser_tab.until("() => document.querySelectorAll('#concerns tr').length === 4")
         for width, height in ((320, 600), (390, 844), (768, 1024), (1920, 1080)):
             await browser_tab.page.set_viewport_size({"width": width, "height": height})
             assert await browser_tab.page.evaluate(overflowing_elements, width) == []
