@@ -21,7 +21,6 @@ from bms_estimator.forecast.projection import (
     project_seen_load,
     project_trip,
     time_quantiles,
-    time_to_empty_s,
 )
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Records
@@ -239,11 +238,10 @@ class Forecaster:
             return projection if np.isfinite(projection.time_s).all() else None
         mean_a, max_a = self.load.mean_and_max()
         current_a = mean_a - pack["offset_a"][0]
-        load_a = float(current_a.mean())
-        if not discharges(pack, load_a):
+        if not discharges(pack, float(current_a.mean())):
             return None
-        spread = load_spread(current_a, time_to_empty_s(pack, load_a))
-        return project_seen_load(pack, mean_a, max_a, spread, self.seed, self.past.analogues(mean_a.size // MINUTE_S))
+        analogues = self.past.analogues(mean_a.size // MINUTE_S)
+        return project_seen_load(pack, mean_a, max_a, load_spread(current_a), self.seed, analogues)
 
 
 def _interval_s(forecast: Forecast) -> float:

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.kernels.forecast.seen_load import MEAN_RUN_S
 from bms_estimator.model.arrays import Floats
 
-SHORT_BATCH_S, RUN_BATCH_S, TRIP_BATCH_S = 60, int(2.0 * MEAN_RUN_S), 1200
-"""Lengths of the batches whose mean currents are compared [s]. The bootstrap with its mean run reproduces the variation of batches of
-``RUN_BATCH_S``. ``TRIP_BATCH_S`` is the scale of a trip."""
+BATCHES_S = 60, 300, 1200
+"""Lengths of the batches whose mean currents are compared [s]. The last one is the scale of a trip."""
 PRIOR_DEGREES = 2
-"""Degrees of freedom with which the variation of the shorter batches counts as the prior for that of the longer ones."""
+"""Degrees of freedom with which the variation of shorter batches counts as the prior for that of longer ones."""
 
 
 @dataclass(frozen=True)
@@ -33,24 +31,21 @@ class LoadSpread:
     degrees: float
 
 
-def load_spread(current_a: Floats, horizon_s: float) -> LoadSpread:
-    """Return the spread of the mean load over a horizon.
+def load_spread(current_a: Floats) -> LoadSpread:
+    """Return the spread of the mean load: the standard error of the observed mean, divided by this mean.
 
-    The variance of the mean over t seconds is c / t. Its coefficient c is the product of the length of long batches and the
-    variance of their means. Two errors are added: that of the observed mean, and the variation of the future mean that the
-    bootstrap does not reproduce.
+    The variance of the mean over t seconds is c / t. The coefficient c is the length of a batch times the variance of the means of
+    batches, provided that the batches are independent. Each length of batches contributes with its degrees of freedom.
 
     Args:
         current_a: Current of each second [A], with a mean above 0.
-        horizon_s: Time until the mean load has drawn the remaining charge [s].
     """
-    short, _ = _coefficient(current_a, SHORT_BATCH_S)
-    by_run, degrees = _coefficient(current_a, RUN_BATCH_S)
-    run = _posterior(short, by_run, degrees)
-    by_trip, degrees = _coefficient(current_a, TRIP_BATCH_S)
-    trip = _posterior(run, by_trip, degrees)
-    variance = trip / current_a.size + max(trip - run, 0.0) / (horizon_s + TRIP_BATCH_S)
-    return LoadSpread(math.sqrt(variance) / float(current_a.mean()), float(PRIOR_DEGREES + degrees))
+    coefficient, degrees = _coefficient(current_a, BATCHES_S[0])
+    for batch_s in BATCHES_S[1:]:
+        observed, degrees = _coefficient(current_a, batch_s)
+        coefficient = (PRIOR_DEGREES * coefficient + degrees * observed) / (PRIOR_DEGREES + degrees)
+    std = math.sqrt(coefficient / current_a.size) / float(current_a.mean())
+    return LoadSpread(std, float(PRIOR_DEGREES + degrees))
 
 
 def _coefficient(current_a: Floats, batch_s: int) -> tuple[float, int]:
@@ -60,8 +55,3 @@ def _coefficient(current_a: Floats, batch_s: int) -> tuple[float, int]:
         return 0.0, 0
     means_a = current_a[-batches * batch_s :].reshape(batches, batch_s).mean(axis=1)
     return batch_s * float(np.var(means_a, ddof=1)), batches - 1
-
-
-def _posterior(prior: float, observed: float, degrees: int) -> float:
-    """Return the mean of a prior with ``PRIOR_DEGREES`` and an observation, weighted by their degrees of freedom."""
-    return (PRIOR_DEGREES * prior + degrees * observed) / (PRIOR_DEGREES + degrees)

@@ -86,7 +86,7 @@ def project_seen_load(
     """
     m = pack[0]
     load_a = float(mean_a.mean() - m["offset_a"])
-    horizon_s = HORIZON_RATIO * time_to_empty_s(pack, load_a)
+    horizon_s = HORIZON_RATIO * _time_to_empty_s(pack, load_a)
     block_s = min(max(BLOCK_S, math.ceil(horizon_s / MAX_STEPS)), max(mean_a.size // MIN_BLOCKS, 1))
     steps = min(math.ceil(horizon_s / block_s), MAX_STEPS)
     blocks = np.zeros(mean_a.size // block_s, LOAD_BLOCK)
@@ -137,7 +137,7 @@ def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:
     load_a = _mean_current(pack, load)
     if not discharges(pack, load_a):
         load_a = 0.0
-    horizon_s = HORIZON_RATIO * time_to_empty_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
+    horizon_s = HORIZON_RATIO * _time_to_empty_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
     parts = _parts(_prolonged(load, horizon_s), horizon_s)
     horizon_s = min(horizon_s, MAX_DRAW_STEPS * float(parts["duration_s"].mean()))
     draws = _draws(m, seed)[: _draw_count(parts, horizon_s)]
@@ -179,10 +179,10 @@ def project_trip(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
 
 def discharges(pack: Records, load_a: float) -> bool:
     """Return True if a load with a mean of ``load_a`` [A] discharges the pack within ``MAX_TIME_TO_EMPTY_S``."""
-    return load_a > 0.0 and time_to_empty_s(pack, load_a) <= MAX_TIME_TO_EMPTY_S
+    return load_a > 0.0 and _time_to_empty_s(pack, load_a) <= MAX_TIME_TO_EMPTY_S
 
 
-def time_to_empty_s(pack: Records, load_a: float) -> float:
+def _time_to_empty_s(pack: Records, load_a: float) -> float:
     """Return the time in which the mean load draws the whole remaining charge, at least 2 % of the capacity [s]."""
     return max(float(pack["soc"][0]), MIN_REMAINING_SOC) * float(pack["capacity_as"][0]) / load_a
 

@@ -11,8 +11,7 @@ from bms_estimator.kernels.forecast.draws import DRAW, MAX_LOAD_FACTOR, draw_loa
 from tests.estimator.simulated_cell import measured
 from tests.forecast.simulated_load import forecaster
 
-TRIP_S, HORIZON_S = 1200, 3600.0
-LEVEL_S = 20
+TRIP_S, LEVEL_S = 1200, 20
 
 
 def trip(mean_a: float, seed: int = 1) -> np.ndarray:
@@ -28,36 +27,36 @@ def trips(*means_a: float) -> np.ndarray:
 
 @given(st.floats(0.1, 2.0), st.floats(1.5, 10.0))
 def test_two_trips_of_different_mean_have_a_wider_spread_than_one_repeated(mean_a, ratio):
-    repeated = load_spread(trips(mean_a, mean_a), HORIZON_S)
-    different = load_spread(trips(mean_a, ratio * mean_a), HORIZON_S)
+    repeated = load_spread(trips(mean_a, mean_a))
+    different = load_spread(trips(mean_a, ratio * mean_a))
     assert different.std > repeated.std
 
 
 @given(st.integers(1, 12), st.integers(1, 4))
 def test_more_repetitions_of_a_trip_narrow_the_spread(count, more):
-    few, many = (load_spread(trips(*[1.0] * n), HORIZON_S) for n in (count, count + more))
+    few, many = (load_spread(trips(*[1.0] * n)) for n in (count, count + more))
     assert many.std < few.std
     assert many.degrees >= few.degrees
 
 
 @given(st.floats(0.1, 10.0), st.integers(300, 4000))
 def test_a_constant_load_has_no_spread(current_a, seconds):
-    assert load_spread(np.full(seconds, current_a), HORIZON_S).std == pytest.approx(0.0, abs=1e-6)
+    assert load_spread(np.full(seconds, current_a)).std == pytest.approx(0.0, abs=1e-6)
 
 
 @given(st.floats(0.01, 100.0))
 def test_the_unit_of_the_current_does_not_matter(factor):
     load = trips(1.0, 1.6, 0.8)
-    assert load_spread(factor * load, HORIZON_S).std == pytest.approx(load_spread(load, HORIZON_S).std)
+    assert load_spread(factor * load).std == pytest.approx(load_spread(load).std)
 
 
 def test_the_spread_contains_most_differences_between_observed_and_future_trips():
     rng = np.random.default_rng(1)
     inside = []
     for _ in range(400):
-        means_a = rng.uniform(0.5, 1.5, 8)
+        means_a = rng.uniform(0.5, 1.5, 16)
         observed, future = trips(*means_a[:4]), trips(*means_a[4:])
-        spread = load_spread(observed, float(future.size))
+        spread = load_spread(observed)
         limit = spread.std * stats.t.ppf(0.95, spread.degrees)
         inside.append(abs(np.log(future.mean() / observed.mean())) <= limit)
     assert 0.7 < np.mean(inside) < 0.95

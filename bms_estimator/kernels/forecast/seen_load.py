@@ -15,9 +15,8 @@ from bms_estimator.kernels.forecast.random_numbers import uniform
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
-MEAN_RUN_S = 150.0
-"""Mean time between two jumps of a draw [s]: the scale over which the order of the observed load is kept. The factor on the load
-of a draw contains the variation over longer times."""
+MEAN_RUN_S = 300.0
+"""Mean time between two jumps of a draw [s]: the scale over which the order of the observed load is kept."""
 
 NEGLIGIBLE_DIFFERENCE_C = 1e-3
 """Difference of an RC current below which it counts as zero, as a C-rate."""

@@ -8,7 +8,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.load_spread import LoadSpread, load_spread
-from bms_estimator.forecast.projection import discharges, project_seen_load, time_quantiles, time_to_empty_s
+from bms_estimator.forecast.projection import discharges, project_seen_load, time_quantiles
 from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.forecast.projected_pack import FAST_RESISTANCES, growth_factor
 from bms_estimator.model.arrays import Floats, Records
@@ -120,7 +120,7 @@ def quantiles_without(part: Part, forecaster: Forecaster) -> Quantiles:
     current_a = mean_a - pack["offset_a"][0]
     if not discharges(pack, float(current_a.mean())):
         return UNKNOWN
-    spread = part.spread(load_spread(current_a, time_to_empty_s(pack, float(current_a.mean()))))
+    spread = part.spread(load_spread(current_a))
     return Quantiles(*time_quantiles(project_seen_load(pack, mean_a, max_a, spread, forecaster.seed).time_s))
 
 
