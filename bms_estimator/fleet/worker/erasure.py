@@ -74,7 +74,7 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
     for number in {subjects.partition_of(pack, partitions) for pack in packs}:
         members = {pack for pack in packs if subjects.partition_of(pack, partitions) == number}
         for pack in members:
-            blocks[pack] = await erase_messages(nc, subjects.RAW_STREAM, subjects.stored_raw(number, pack))
+            blocks[pack] = await erase_messages(nc, subjects.RAW_STREAM, subjects.stored(number, pack))
         checkpoints |= await _erase_states(nc, number, members)
     hours = {pack: await erase_messages(nc, subjects.HOURS_STREAM, subjects.hours(pack)) for pack in packs}
     remaining = await _remaining(nc, packs)
