@@ -196,7 +196,8 @@ class Comparison:
         self.measured = OpenCircuit.of(cell, reference.fit, rows, soc)
         self.deviation_v: Floats = self.measured.error_v - np.interp(soc, BIN_SOC, reference.curve.error_v)
         self._cell, self._fit, self._filter_soc = cell, reference.fit, float(rows["soc"][-1])
-        self.covariance_factor: Floats = np.linalg.cholesky(_covariance(cell, reference, self.measured))
+        covariance = _covariance(cell, reference, self.measured)
+        self.covariance_factor: Floats = np.linalg.cholesky(covariance).astype(np.float64)
 
     def weakest(self, deviation_v: Floats | None = None) -> WeakestCell:
         """Return the estimate of the weakest cell by a deviation, shape (n,) [V]; default: ``deviation_v``."""

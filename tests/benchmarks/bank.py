@@ -71,14 +71,15 @@ def comparisons(recording: Recording, history: History, first_cycle: int = REFER
         history: History with the first discharges of the bank, if they are known; updated.
         first_cycle: Number of the first compared cycle.
     """
-    rows = max(step.rows for step in recording.steps if step.cycle < first_cycle)
     compared = (step for step in recording.steps if step.cycle >= first_cycle)
     for _, steps in itertools.groupby(compared, lambda step: step.cycle):
         monitor, latest = BankMonitor(recording.curves), None
         history.weak_cell_times.clear()
+        rows = None
         for step in steps:
             history.rows = recording.rows[: step.rows]
-            monitor.add(history, step.rows - rows, recording.fits[step.cycle - 1])
+            new = 1 if rows is None else step.rows - rows  # not the last row of the discharge before
+            monitor.add(history, new, recording.fits[step.cycle - 1])
             rows = step.rows
             if monitor.weakest is not None and monitor.weakest is not latest:
                 latest = monitor.weakest
