@@ -9,7 +9,7 @@ import asyncio
 import json
 from collections.abc import Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import nats.errors
@@ -20,7 +20,7 @@ from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer, partitions_of
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
-from bms_estimator.fleet.worker.checkpoint_format import CheckpointError, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint_format import CheckpointError, PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, FencedError
 from bms_estimator.model.errors import UserError
 
@@ -32,6 +32,8 @@ MAX_CLAIMS = 20
 """Maximum number of claims of a partition, because its worker may claim it again before its checkpoints are rewritten."""
 RETRY_S = 0.5
 """Delay before a partition is claimed again [s]."""
+MAX_TOKENS = 5
+"""Maximum position of a pack's name in a subject [tokens]."""
 V = TypeVar("V")
 
 
@@ -119,20 +121,21 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
             checkpoint = read_checkpoint(data)
         except CheckpointError as error:
             raise UserError(f"partition {partition}: {error}") from None
-        found = counts.keys() & {*checkpoint.packs, *checkpoint.unmigrated, *checkpoint.deferred, *checkpoint.in_force}
+        by_pack = _fields_by_pack(checkpoint)
+        found = {pack for pack in counts if any(pack in part for part in by_pack.values())}
         if found:
-            rest = replace(
-                checkpoint,
-                packs=_without(checkpoint.packs, found),
-                unmigrated=_without(checkpoint.unmigrated, found),
-                deferred=_without(checkpoint.deferred, found),
-                in_force=_without(checkpoint.in_force, found),
-            )
+            rest = replace(checkpoint, **{name: _without(part, found) for name, part in by_pack.items()})
             claim = await store.replace(claim, info, rest.chunks(info.format))
         for pack in found:
             counts[pack] += 1
     for info in damaged:  # its content is unknown
         claim = await store.replace(claim, info, None)
+
+
+def _fields_by_pack(checkpoint: PartitionCheckpoint) -> dict[str, Any]:
+    """Return the mappings of a checkpoint whose keys are names of packs."""
+    parts = {field.name: getattr(checkpoint, field.name) for field in fields(checkpoint)}
+    return {name: part for name, part in parts.items() if isinstance(part, Mapping) and name != "counters"}
 
 
 def _without(part: Mapping[str, V], packs: Collection[str]) -> dict[str, V]:
@@ -151,12 +154,13 @@ async def _remaining(nc: Client, packs: Collection[str]) -> dict[str, dict[str, 
 
 
 async def _count_messages(nc: Client, stream: str, pack: str) -> int:
-    """Return the number of a stream's messages with a pack's name as the last token of their subject."""
+    """Return the number of a stream's messages with a pack's name as a token of their subject."""
     count = 0
-    for leading_tokens in range(1, 5):
-        subject = ".".join(["*"] * leading_tokens + [pack])
-        info = await _api(nc, f"STREAM.INFO.{stream}", {"subjects_filter": subject})
-        count += sum((info["state"].get("subjects") or {}).values())
+    for leading_tokens in range(1, MAX_TOKENS):
+        for rest in ("", ".>"):
+            subject = ".".join(["*"] * leading_tokens + [pack]) + rest
+            info = await _api(nc, f"STREAM.INFO.{stream}", {"subjects_filter": subject})
+            count += sum((info["state"].get("subjects") or {}).values())
     return count
 
 

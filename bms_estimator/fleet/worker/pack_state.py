@@ -120,21 +120,24 @@ class UnpackedRecord:
         if not (are_words and unpack(np.frombuffer(packed, np.uint64), self._symmetric_words, self._words)):
             raise StateError(f"{len(packed)} bytes are not a packed record")
 
-    def load_previous_layout(self, dtype: np.dtype[Any], packed: bytes) -> Fields:
-        """Unpack a pack's record of another layout. Copy its fields that exist in this layout, except the estimator's.
+    def load_previous_layout(self, dtype: np.dtype[Any], packed: bytes) -> Fields | None:
+        """Unpack a pack's record of another layout. Copy its fields that exist in this layout.
+
+        The estimator's fields are copied only if the layout of the estimator is the same, because they depend on each other.
 
         Args:
             dtype: Dtype of the record.
             packed: The packed record.
 
         Returns:
-            The fields of the estimator by name.
+            The fields of the estimator by name; None if they were copied.
 
         Raises:
             ValueError: The bytes do not have this dtype, or no pack's record can have it.
         """
         previous = UnpackedRecord(dtype)
         previous.load(packed)
+        has_same_estimator = "estimator" in (dtype.names or ()) and dtype["estimator"] == PACK_STATE["estimator"]
         estimator_fields, other_fields = {}, {}
         for name, value in fields(previous.record):
             part, _, rest = name.partition(".")
@@ -144,7 +147,10 @@ class UnpackedRecord:
                 other_fields[name] = value
         self.clear()
         copy_known_fields(self.record, other_fields)
-        return estimator_fields
+        if not has_same_estimator:
+            return estimator_fields
+        self.record["estimator"] = previous.record["estimator"]
+        return None
 
     def count_lost(self, blocks: int) -> None:
         """Count blocks of this hour as lost."""

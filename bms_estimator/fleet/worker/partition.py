@@ -387,7 +387,7 @@ class Partition:
         """Load a pack into the unpacked record.
 
         Returns:
-            The estimator fields by name if the pack's record has a previous layout; otherwise None.
+            The estimator fields by name if the estimator's part of the record has a previous layout; otherwise None.
         """
         packed, unmigrated = self._packs.get(pack), self._unmigrated.get(pack)
         try:
@@ -395,7 +395,11 @@ class Partition:
                 self._unpacked.load(packed)
                 return None
             if unmigrated is not None:
-                return self._unpacked.load_previous_layout(dtype_of(unmigrated.layout), unmigrated.packed)
+                estimator_fields = self._unpacked.load_previous_layout(dtype_of(unmigrated.layout), unmigrated.packed)
+                if estimator_fields is None:
+                    self._packs[pack] = self._unpacked.packed_bytes()
+                    del self._unmigrated[pack]
+                return estimator_fields
         except ValueError:  # does not happen with a checkpoint whose checksums were correct
             self._counters["damaged_states"] += 1
         self._unpacked.clear()

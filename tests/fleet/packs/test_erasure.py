@@ -91,8 +91,8 @@ async def test_pack_without_a_worker_is_erased_and_messages_in_other_streams_are
     with running(tmp_path, partitions=1) as cluster:
         nc = await connected(cluster.urls)
         await make_streams(nc, partitions=1)
-        await nc.jetstream().add_stream(name="REJECTED", subjects=["rejected.*"])
-        await nc.jetstream().publish("rejected.p1", b"damaged")
+        await nc.jetstream().add_stream(name="REJECTED", subjects=["rejected.*.*"])
+        await nc.jetstream().publish("rejected.p1.damaged", b"damaged")
         await send(nc, "p1", block("p1", 1))
         command = ("fleet", "packs", "remove", "p1", "--erase", "--server", cluster.url)
         code, out, err = await asyncio.to_thread(run, capsys, *command)

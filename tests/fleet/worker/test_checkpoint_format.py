@@ -167,6 +167,29 @@ def samples():
     return pulses(soc=0.9, hours=1.0)[0]
 
 
+def test_state_is_bit_identical_after_an_upgrade_that_changed_no_field_of_the_estimator(samples) -> None:
+    stream, blocks = Stream(Partition(5, table)), blocks_of(samples)
+    deliver(stream, "a", blocks[:100])
+    state = stream.partition.state("a")
+    layout = [part for part in json.loads(CURRENT_LAYOUT) if part[0] != "cells"]
+    delivery = next(fields for name, fields, _ in layout if name == "delivery")
+    delivery[:] = [field for field in delivery if field[0] != "clock_error_s"]
+    previous = UnpackedRecord(np.dtype(checkpoint_format._dtype_fields(layout)))
+    for part in previous.record.dtype.names:
+        for name in previous.record.dtype[part].names:
+            previous.record[part][name] = state[part][name]
+    previous_state = PreviousLayoutState(layout_of(previous.record.dtype), previous.packed_bytes())
+    snapshot = replace(stream.partition.snapshot(), packs={}, unmigrated={"a": previous_state})
+    upgraded = Partition.restore(5, table, to_bytes(snapshot))
+    assert upgraded.take("a", blocks[98], upgraded.sequence + 1).state is None  # it was processed before
+    for data in blocks[100:]:
+        for partition in (stream.partition, upgraded):
+            partition.take("a", data, partition.sequence + 1)
+    assert upgraded.snapshot().unmigrated == {}
+    assert upgraded.state("a")["estimator"].tobytes() == stream.partition.state("a")["estimator"].tobytes()
+    assert upgraded.state("a")["hour"].tobytes() == stream.partition.state("a")["hour"].tobytes()
+
+
 class TestPreviousLayout:
     """Checkpoint with records of another layout: no ``fit_age_s``, one more counter, and another order of fields."""
 
