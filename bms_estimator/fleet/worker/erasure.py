@@ -124,7 +124,8 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
         by_pack = _fields_by_pack(checkpoint)
         found = {pack for pack in counts if any(pack in part for part in by_pack.values())}
         if found:
-            rest = replace(checkpoint, **{name: _without(part, found) for name, part in by_pack.items()})
+            parts: dict[str, Any] = {name: _without(part, found) for name, part in by_pack.items()}
+            rest = replace(checkpoint, **parts)
             claim = await store.replace(claim, info, rest.chunks(info.format))
         for pack in found:
             counts[pack] += 1
