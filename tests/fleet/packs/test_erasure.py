@@ -31,7 +31,7 @@ async def occurrences(nc, pack):
     js, found = nc.jetstream(), []
     for stream in STREAMS:
         state = (await js.stream_info(stream)).state
-        for sequence in range(state.first_seq, state.last_seq + 1):
+        for sequence in range(max(state.first_seq, 1), state.last_seq + 1):
             try:
                 message = await js.get_msg(stream, sequence)
             except nats.js.errors.NotFoundError:
