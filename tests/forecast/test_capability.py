@@ -211,6 +211,19 @@ def test_the_time_to_full_of_constant_current_and_constant_voltage_is_the_true_o
         assert to_full_s == pytest.approx(samples.size - moment, rel=0.15)
 
 
+@pytest.mark.parametrize("after_s", [300, 2600])
+def test_the_time_to_full_of_a_fast_charge_of_lfp_cells_includes_the_constant_voltage_phase(after_s: int) -> None:
+    """The simulated charge at 1C lasts for an hour, of which 20 min are at constant voltage."""
+    samples = Meter().samples(Charged("lfp", 0.3).charge(1.0, tail_c=0.05))
+    estimator = Estimator(load_cell("lfp", CAPACITY_AH).pack(SERIES, 1), initial_soc=0.3, voltage_resolution_v=0.01)
+    moment = int(np.argmax(samples["current_a"] < -1.0)) + after_s
+    estimator.run(samples[:moment])
+    state, settings = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
+    scratch, charge_a = np.empty(RESISTANCES + BRANCHES), charge_current(state, settings)
+    to_full_s = time_to_full(state, settings, charge_a, float(samples["voltage_v"].max()), 0.05 * CAPACITY_AH, scratch)
+    assert to_full_s == pytest.approx(samples.size - moment, rel=0.4)
+
+
 def test_a_charge_with_less_than_the_tail_current_ends_at_the_full_voltage() -> None:
     """With C/50 the overpotential is small, so that the charge ends close to SOC 1."""
     state, settings = ideal(rested(0.5))

@@ -1,5 +1,9 @@
 """Time until the charger ends the present charge: constant current, then constant voltage down to the tail current.
 
+At constant voltage the current decays about exponentially. Once it does, its measured time constant gives the time. Before that, the
+model is charged. In a cell whose OCV has a plateau, the surface of the particles is fuller than their mean during a charge, because
+the charge has to diffuse from the surface. The voltage is that of the surface.
+
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Currents are positive on discharge, so that the charge current is below 0.
 """
 
@@ -22,7 +26,16 @@ SOC_STEP = 0.0025
 MAX_STEPS = 800
 """Maximum number of steps, in which twice the SOC range would be charged."""
 CURRENT_PAIR = 2
-"""Index of the RC pair (30 s). The current filtered with its time constant counts as the present charge current."""
+"""Index of the RC pair (30 s) whose filtered current is the present charge current."""
+LEAD_PAIR = 4
+"""Index of the RC pair (500 s) whose filtered current is in proportion to the SOC by which the surface of the particles leads."""
+LEAD_S = 180.0
+"""Charge by which the surface of the particles is fuller than their mean, per ampere of that current [A s / A], in cells whose OCV has
+a plateau: charged with C/2 to 3.65 V, LFP cells accept another 2 to 3 % at this voltage."""
+FULL_TOLERANCE = 2e-3
+"""Relative distance from the voltage of the constant-voltage phase within which this phase is detected."""
+MAX_DECAY_RATIO = 0.97
+"""Maximum ratio of the currents filtered with 30 s and with 120 s at which the current counts as decaying."""
 
 
 @njit(cache=True)
@@ -48,12 +61,38 @@ def time_to_full(s: Record, p: Record, charge_a: float, full_v: float, tail_a: f
         tail_a: Charge current that ends this phase [A], above 0. A charge with a smaller current ends at ``full_v``.
         scratch: Scratch space of shape (RESISTANCES + BRANCHES,).
     """
+    decay_s = constant_voltage_time(s, full_v, tail_a)
+    if not math.isnan(decay_s):
+        return decay_s
     total = time_s = 0.0
     for q in range(s.count):
         weight = math.exp(s.ln_weight[q] - s.ln_weight[s.best])
         total += weight
         time_s += weight * _hypothesis_time_to_full(s, p, q, charge_a, full_v, tail_a, scratch)
     return time_s / total
+
+
+@njit(cache=True)
+def constant_voltage_time(s: Record, full_v: float, tail_a: float) -> float:
+    """Return the time until the constant-voltage phase ends [s]; NaN outside such a phase.
+
+    For a current I e^(-t/tau), the current filtered with tau_k is I e^(-t/tau) / (1 - tau_k/tau). The ratio of two of them gives tau.
+
+    Args:
+        s: Record of EKF_STATE.
+        full_v: Voltage of the constant-voltage phase [V].
+        tail_a: Charge current that ends this phase [A], above 0.
+    """
+    short_s, long_s = TAUS[CURRENT_PAIR], TAUS[TREND]
+    short_a = -s.x_a[CURRENT_PAIR] - s.mean[s.best, X + CURRENT_PAIR]
+    long_a = -s.x_a[TREND] - s.mean[s.best, X + TREND]
+    measured_v = s.voltage_v + s.innovation_v
+    if measured_v < (1.0 - FULL_TOLERANCE) * full_v or not 0.0 < short_a < MAX_DECAY_RATIO * long_a or tail_a <= 0.0:
+        return math.nan
+    ratio = short_a / long_a
+    tau_s = (long_s - short_s * ratio) / (1.0 - ratio)
+    present_a = short_a * (1.0 - short_s / tau_s)
+    return tau_s * math.log(max(present_a / tail_a, 1.0))
 
 
 @njit(cache=True)
@@ -110,10 +149,13 @@ def constant_voltage_current(
         x: Filtered currents of the RC pairs at the beginning of the step [A], shape (BRANCHES,).
         ohm: Scratch space of shape (RESISTANCES,).
     """
-    rise_soc = -guess_a * dt_s / hypothesis_capacity(s, p, q)
-    e_o_v = open_circuit_voltage(s, p, q, soc, elapsed_s + dt_s)
-    rise_v = open_circuit_voltage(s, p, q, soc + rise_soc, elapsed_s + dt_s) - e_o_v
-    scaled_resistances(s, p, q, soc + rise_soc, ohm)
+    capacity_as, lead_s = hypothesis_capacity(s, p, q), LEAD_S if p.learned == 0.0 else 0.0  # learned 0: a plateau
+    lead_decay = math.exp(-dt_s / TAUS[LEAD_PAIR])
+    surface_soc = soc - lead_s * lead_decay * x[LEAD_PAIR] / capacity_as
+    rise_soc = -guess_a * (dt_s + lead_s * (1.0 - lead_decay)) / capacity_as
+    e_o_v = open_circuit_voltage(s, p, q, surface_soc, elapsed_s + dt_s)
+    rise_v = open_circuit_voltage(s, p, q, surface_soc + rise_soc, elapsed_s + dt_s) - e_o_v
+    scaled_resistances(s, p, q, soc - guess_a * dt_s / capacity_as, ohm)
     remaining_v, total_ohm = e_o_v - voltage_v, ohm[0] - rise_v / guess_a
     for k in range(BRANCHES):
         decay = math.exp(-dt_s / TAUS[k])
