@@ -211,7 +211,7 @@ def test_the_time_to_full_of_constant_current_and_constant_voltage_is_the_true_o
         assert to_full_s == pytest.approx(samples.size - moment, rel=0.15)
 
 
-@pytest.mark.parametrize("after_s", [300, 2600])
+@pytest.mark.parametrize("after_s", [300, 3200])
 def test_the_time_to_full_of_a_fast_charge_of_lfp_cells_includes_the_constant_voltage_phase(after_s: int) -> None:
     """The simulated charge at 1C lasts for an hour, of which 20 min are at constant voltage."""
     samples = Meter().samples(Charged("lfp", 0.3).charge(1.0, tail_c=0.05))
