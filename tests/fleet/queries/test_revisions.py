@@ -49,11 +49,12 @@ def test_merged_file_has_each_hour_once_with_its_largest_revision(folder):
 
 
 def test_of_equal_revisions_the_row_with_more_samples_is_valid(tmp_path):
-    for samples in (900, 3600, 1800):
-        write(tmp_path, [make_hour("a", BEGIN, revision=1, samples=samples)])
+    files = [write(tmp_path, [make_hour("a", BEGIN, revision=1, samples=n)])[0] for n in (900, 3600)]
+    for names in (("batch-1", "batch-2"), ("batch-4", "batch-3")):
+        files = [file.rename(file.with_name(f"{name}.parquet")) for file, name in zip(files, names, strict=True)]
+        assert select(tmp_path, "SELECT samples FROM hours").rows == [(3600,)]
     (day,) = tmp_path.glob("date=*")
-    compact(day)
-    assert select(tmp_path, "SELECT samples FROM hours").rows == [(3600,)]
+    assert pq.read_table(compact(day), columns=["samples"]).to_pylist() == [{"samples": 3600}]
 
 
 def test_rows_that_arrive_after_the_merge_of_their_day_are_merged_within_an_hour(folder):
