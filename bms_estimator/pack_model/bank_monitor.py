@@ -24,9 +24,8 @@ from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_FRACTION, WEAK_C
 
 CHARGED_SOC = 0.05
 """Charge after which a discharge has ended, as a fraction of the capacity. Regeneration during a discharge is smaller."""
-
-FIRST_ROWS = 4 * MIN_REFERENCE_ROWS
-"""Number of rows of the first discharges that are kept as a reference: about four complete discharges."""
+FIRST_ROWS, MAX_FIRST_ROWS = 4 * MIN_REFERENCE_ROWS, 8 * MIN_REFERENCE_ROWS
+"""Minimum and maximum number of rows of the first discharges: about four and eight complete discharges."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ class BankMonitor:
         begin, earlier = rows[start : start + 1], reference_rows(rows[:start], weak)
         earlier["soc"] = row_soc(self._cell, fit_before, earlier)
         if history.first is None and earlier.size >= FIRST_ROWS:
-            history.first = ReferenceDischarges(earlier, fit_before)
+            history.first = ReferenceDischarges(earlier[:MAX_FIRST_ROWS], fit_before)
         return Discharge(
             start_s=float(begin["elapsed_s"][0]),
             fit=fit_before,
@@ -127,8 +126,10 @@ class BankMonitor:
     def _references(self, earlier: ReferenceDischarges, first: ReferenceDischarges | None) -> Iterator[Reference]:
         """Yield the references with enough rows."""
         for each, change in ((earlier, SINCE_EARLIER), (first, SINCE_FIRST)):
-            curve = each and ReferenceCurve.of(self._cell, each.fit, each.rows, each.rows["soc"])
-            if each and curve:
+            if each is None:
+                continue
+            curve = ReferenceCurve.of(self._cell, each.fit, each.rows, each.rows["soc"])
+            if curve is not None:
                 yield Reference(each.fit, curve, change)
 
     def _replace_result(self, result: WeakestCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:

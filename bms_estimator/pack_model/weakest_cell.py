@@ -34,7 +34,8 @@ PRIOR_ROWS = 4.0
 """Weight of the prior variance of a bin, in rows."""
 REPEAT_STD_V, REPEAT_STD_SOC = 1e-3, 0.003
 """Prior std of the difference of E_o of the mean cell between two discharges: a voltage error [V] and a SOC error. This and the
-following constants maximize the likelihood of simulated healthy banks within a factor of three (docs/pack/bank.md)."""
+following std are one to four times those that maximize the likelihood of simulated healthy banks, because a real bank has
+further errors."""
 INDEPENDENT_FRACTION = 0.2
 """Fraction of the variance of E_o between discharges that is independent from row to row. The rest is correlated over
 ``CORRELATED_SOC``."""
@@ -77,7 +78,7 @@ class CommonChange:
 
 
 SINCE_EARLIER = CommonChange(soc=0.003, capacity=0.003, drop=0.01)
-"""Change since the earlier discharges of the history."""
+"""Change since the earlier discharges of the history; chosen as ``REPEAT_STD_V``."""
 SINCE_FIRST = CommonChange(soc=0.005, capacity=0.05, drop=0.1)
 """Change since the first discharges. Two std are 10 % less capacity and 20 % more resistance by aging. Assumed."""
 
