@@ -228,8 +228,8 @@ class Forecaster:
 
     @property
     def _largest_a(self) -> float:
-        """Largest current of the observed load [A], at least 0."""
-        return float(self.load.max_a.max(initial=0.0))
+        """Largest mean current of a second of the observed load [A], at least 0. Shorter inrush currents do not count."""
+        return float(self.load.mean_a.max(initial=0.0))
 
     def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:
         """Run the pack forward. Return None if the load does not discharge it."""
