@@ -1,0 +1,77 @@
+"""Deaths of holders in a guarded replay, counted on the real server."""
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import nats
+import pytest
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.worker.checkpoint_format import FORMAT
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.replay_guard import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
+from tests.fleet.nats_cluster import running
+
+END_SEQUENCE = 9
+"""Sequence number of the last message of the replay."""
+
+
+@pytest.fixture
+async def store(tmp_path: Path) -> AsyncIterator[CheckpointStore]:
+    with running(tmp_path, partitions=1) as cluster:
+        async with await nats.connect(cluster.url) as nc:
+            await make_streams(nc, partitions=1)
+            js = nc.jetstream()
+            states = await js.object_store(subjects.STATES_BUCKET)
+            yield CheckpointStore(nc, "w", await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
+
+
+async def claim_after_a_death(store: CheckpointStore) -> ReplayGuard:
+    """Return the guard of a worker that claims the partition without a checkpoint of the former holder."""
+    guard = ReplayGuard(store, 0)
+    await guard.begin(await store.claim(0), END_SEQUENCE)
+    return guard
+
+
+async def claim_guarded(store: CheckpointStore) -> ReplayGuard:
+    """Return the guard of the first worker whose replay is guarded."""
+    for _ in range(GUARDED_CLAIMS):
+        await claim_after_a_death(store)
+    return await claim_after_a_death(store)
+
+
+async def test_block_in_which_several_holders_died_is_lethal(store: CheckpointStore) -> None:
+    guard = await claim_guarded(store)
+    for _ in range(MAX_DEATHS):
+        assert not await guard.is_lethal(5)
+        guard = await claim_after_a_death(store)
+    assert await guard.is_lethal(5)
+    assert not await guard.is_lethal(6)
+
+
+async def test_block_that_its_holders_survived_is_not_lethal(store: CheckpointStore) -> None:
+    guard = await claim_guarded(store)
+    for _ in range(MAX_DEATHS + 1):
+        assert not await guard.is_lethal(5)
+        await guard.end_block(5)  # the holder dies later, from another cause
+        guard = await claim_after_a_death(store)
+
+
+async def test_blocks_after_the_replay_are_not_written_down(store: CheckpointStore) -> None:
+    guard = await claim_guarded(store)
+    assert not await guard.is_lethal(END_SEQUENCE + 1)
+    assert (await store.read_replay(0)).sequence == 0
+
+
+@pytest.mark.parametrize("is_saved", [True, False], ids=["after a checkpoint", "after an orderly release"])
+async def test_replay_is_not_guarded(store: CheckpointStore, is_saved: bool) -> None:
+    await claim_guarded(store)
+    claim = await store.claim(0)
+    if is_saved:
+        await store.write(claim, 1, iter([b"1"]), file_format=FORMAT)
+    else:
+        await store.end_claim(claim)
+    guard = await claim_after_a_death(store)
+    assert not await guard.is_lethal(5)
+    assert (await store.read_replay(0)).sequence == 0
