@@ -107,5 +107,5 @@ def test_implausible_header_is_rejected(store: int, number: int, oldest: int, ar
 def test_block_of_a_later_version_is_rejected() -> None:
     data = bytearray(encode(BLOCK))
     data[4] = 3  # version, after the magic bytes
-    with pytest.raises(BlockError, match="version 3; this program reads versions 1 and 2"):
+    with pytest.raises(BlockError, match="version 3; this program reads versions 1 to 2: upgrade workers before edges"):
         decode(bytes(data))
