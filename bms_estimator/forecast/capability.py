@@ -10,7 +10,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.forecast.forecast import ForecastRows
-from bms_estimator.forecast.limiting_cells import full_cells, weak_cells
+from bms_estimator.forecast.limiting_cells import charge_limiting_states, discharge_limiting_states
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
 from bms_estimator.kernels.forecast.draws import DRAW
@@ -31,7 +31,7 @@ DURATIONS_S = 10.0, 60.0
 
 @dataclass(frozen=True)
 class PowerLimits:
-    """Limits of current and temperature of the available power.
+    """Limits of current and temperature that bound the available power.
 
     Attributes:
         discharge_a: Largest discharge current [A], above 0.
@@ -54,7 +54,7 @@ def cell_power_limits(cell: PackModel) -> PowerLimits:
 
 
 def power_limits(settings: Settings, cell: CellModel) -> PowerLimits:
-    """Return the limits by the pack's alarms. A current limit is never above that of the cell file.
+    """Return the limits that the pack's alarms set. A current limit is never above that of the cell file.
 
     If the alarm on a current is switched off, the limit of the cell file applies. If the alarm on charging below freezing is
     switched off, no temperature limits the charge.
@@ -82,7 +82,7 @@ def write_capability(
 ) -> None:
     """Write available power, usable capacity, remaining energy and time to full to ``values``.
 
-    With ``cells``, the cell that reaches its share of the voltage limit first limits power and capacity.
+    With ``cells``, power and capacity are those of the limiting cell: the one that reaches its share of the voltage limit first.
 
     The values stay unchanged before the first sample, without the identifier and for a fuel cell.
 
@@ -101,7 +101,10 @@ def write_capability(
     full_v, tail_a = float(anchors["charger_v"]), float(anchors["tail_a"])
     charge_a = limits.charge_a if state["temperature_c"] >= limits.charge_min_c else 0.0
     scratch = new_scratch()
-    states_by_name = {"discharge": [state, *weak_cells(state, cells)], "charge": [state, *full_cells(state, cells)]}
+    states_by_name = {
+        "discharge": [state, *discharge_limiting_states(state, cells)],
+        "charge": [state, *charge_limiting_states(state, cells)],
+    }
     for duration_s in DURATIONS_S:
         for name, limit_v, max_a in (("discharge", cutoff_v, limits.discharge_a), ("charge", full_v, -charge_a)):
             values[f"available_{name}_power_{duration_s:.0f}s_w"] = min(
@@ -125,25 +128,29 @@ def write_usable_charge(
         values: Shape (1,), dtype ``FORECAST``; written.
         estimator: Estimator of the pack; read only.
         cutoff_v: Terminal voltage at which the load is switched off [V].
-        largest_a: Largest current of the load [A]; below the mean current of ten minutes: this mean applies.
+        largest_a: Largest current of the load [A]. The mean current of the last ten minutes applies if it is larger.
         cells: Deviations of the single cells; None: unknown.
     """
     state = estimator.record[0]["filter"]
     if not state["started"]:
         return
     charge_as, energy_ws = usable_charge(state, estimator, cutoff_v, largest_a)
-    to_weakest_as = min(
-        [charge_as, *(usable_charge(s, estimator, cutoff_v, largest_a)[0] for s in weak_cells(state, cells))]
+    limited_as = min(
+        [
+            charge_as,
+            *(usable_charge(s, estimator, cutoff_v, largest_a)[0] for s in discharge_limiting_states(state, cells)),
+        ]
     )
-    values["usable_capacity_ah"] = to_weakest_as / 3600.0
-    values["remaining_energy_wh"] = energy_ws / 3600.0 * (to_weakest_as / charge_as if charge_as > 0.0 else 1.0)
+    values["usable_capacity_ah"] = limited_as / 3600.0
+    # energy is taken as proportional to charge: the mean voltage is assumed not to depend on the limiting cell
+    values["remaining_energy_wh"] = energy_ws / 3600.0 * (limited_as / charge_as if charge_as > 0.0 else 1.0)
 
 
 def usable_charge(state: np.void, estimator: Estimator, cutoff_v: float, largest_a: float) -> tuple[float, float]:
     """Return charge [A s] and energy at the terminals [W s] from a state of the filter to the cut-off.
 
     Args:
-        state: Record of EKF_STATE: that of the pack, or of one with cells like a single cell.
+        state: Record of EKF_STATE of the pack, or of a pack whose cells all equal one of its cells.
         estimator: Estimator of the pack; read only.
         cutoff_v: Terminal voltage at which the load is switched off [V].
         largest_a: Largest current of the load [A].

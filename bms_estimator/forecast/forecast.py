@@ -17,10 +17,7 @@ FORECAST = np.dtype(
         ("cutoff_within_15min", "f8"),  # probability of the cut-off within 900 s, 0..1
         ("time_to_full_s", "f8"),  # time until the charger ends the present charge [s]
         ("usable_capacity_ah", "f8"),  # charge to the cut-off at the present load and temperature [Ah]
-        (
-            "remaining_energy_wh",
-            "f8",
-        ),  # energy at the terminals to the cut-off at the present load and temperature [Wh]
+        ("remaining_energy_wh", "f8"),  # energy at the terminals to the cut-off at the present load [Wh]
         ("available_discharge_power_10s_w", "f8"),  # constant power that the pack supplies for 10 s [W]
         ("available_discharge_power_60s_w", "f8"),  # constant power that the pack supplies for 60 s [W]
         ("available_charge_power_10s_w", "f8"),  # constant power that the pack accepts for 10 s [W]

@@ -18,7 +18,7 @@ from bms_estimator.forecast.projection import (
     Projection,
     discharges,
     project_given_load,
-    project_seen_load,
+    project_observed_load,
     project_trip,
     time_quantiles,
 )
@@ -33,8 +33,8 @@ MAX_INTERVAL_S = 120.0
 """Maximum interval between two forecasts [s]."""
 RETRY_S = 30.0
 """Retry interval if no forecast could be made [s]."""
-INTERVAL_OF_TIME_LEFT = 1.0 / 60.0
-"""Interval between two forecasts as a fraction of the median time to the cut-off, between the limits above."""
+INTERVAL_FRACTION = 1.0 / 60.0
+"""Interval between two forecasts as a fraction of the median time to the cut-off, within the limits above."""
 MIN_LOAD_S = 300
 """Minimum length of the observed load for a forecast [s]."""
 MAX_REST_S = 900
@@ -118,9 +118,9 @@ class Forecaster:
             self._run_cells(block[start:end], cells_v[start:end], trace)
             self.load.add(trace)
             if start > 0 or end < block.size:
-                trace = trace.copy()
+                trace = trace.copy()  # the next call of the runner overwrites the array
             traces.append(trace)
-            before = trace.size if due is None else max(trace.size - 1, 0)
+            before = trace.size if due is None else max(trace.size - 1, 0)  # rows before the new forecast
             self._rows.append((self.latest.values, before))
             if due is not None:
                 self.past.add(self.load)
@@ -191,7 +191,7 @@ class Forecaster:
 
     @property
     def seed(self) -> int:
-        """Seed of the random numbers, by time and number of the last sample."""
+        """Seed of the random numbers, a hash of the time and the number of the last sample."""
         state = self.estimator.state
         time_bits = int(state["time_s"].view(np.uint64)[0])
         return (time_bits * _HASH_FACTOR + int(state["samples"][0])) % _SEED_COUNT
@@ -241,7 +241,7 @@ class Forecaster:
         if not discharges(pack, float(current_a.mean())):
             return None
         analogues = self.past.analogues(mean_a.size // MINUTE_S)
-        return project_seen_load(pack, mean_a, max_a, load_spread(current_a), self.seed, analogues)
+        return project_observed_load(pack, mean_a, max_a, load_spread(current_a), self.seed, analogues)
 
 
 def _interval_s(forecast: Forecast) -> float:
@@ -249,7 +249,7 @@ def _interval_s(forecast: Forecast) -> float:
     if forecast.reason is not None:
         return RETRY_S
     time_left_s = float(forecast.values["time_to_cutoff_s"][0])
-    return min(max(INTERVAL_OF_TIME_LEFT * time_left_s, MIN_INTERVAL_S), MAX_INTERVAL_S)
+    return min(max(INTERVAL_FRACTION * time_left_s, MIN_INTERVAL_S), MAX_INTERVAL_S)
 
 
 def _write_time_to_cutoff(values: ForecastRows, projection: Projection) -> None:

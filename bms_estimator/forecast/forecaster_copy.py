@@ -6,7 +6,7 @@ from bms_estimator.forecast.forecaster import Forecaster
 
 
 def copy_forecaster(forecaster: Forecaster) -> Forecaster:
-    """Return a forecaster in the same state. Later samples do not change its state, so that its forecasts are those of now."""
+    """Return a forecaster in the same state. Later samples do not change this state."""
     estimator = forecaster.estimator.bound_to_record(forecaster.estimator.record.copy())
     estimator.settings_record = estimator.settings_record.copy()  # the slow fit changes its curves
     estimator.settings = estimator.settings_record["observer"]

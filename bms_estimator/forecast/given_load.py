@@ -11,7 +11,7 @@ from bms_estimator.model.arrays import Floats
 class GivenLoad:
     """Future load, in parts with a constant current or power. It repeats after its last part.
 
-    The user gives it, or it is the load that followed a similar one in the past (``PastMinutes.analogues``).
+    The user gives it, or it is the load that followed a similar load in the past (``PastMinutes.analogues``).
 
     Attributes:
         duration_s: Duration of each part [s], shape (n,), above 0.
@@ -24,6 +24,6 @@ class GivenLoad:
     power_w: Floats
 
     def largest_current_a(self, voltage_v: float) -> float:
-        """Return the largest current [A], at least 0. A power draws its current at ``voltage_v``."""
+        """Return the largest current [A], at least 0. A power is converted to a current at ``voltage_v``."""
         current_a = np.where(np.isnan(self.current_a), self.power_w / voltage_v, self.current_a)
         return float(current_a.max(initial=0.0))

@@ -1,7 +1,7 @@
 """States of the filter for the single cells that limit power and capacity of a pack in series.
 
-A limit of the pack's voltage applies to each cell with its share. A pack whose cells all equal one cell reaches the limit when that
-cell reaches its share.
+Each cell has a share of a limit of the pack's voltage: the limit divided by the number of cells in series. A pack whose cells all
+equal one cell reaches the limit when this cell reaches its share.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0, SOC
 
 
-def weak_cells(state: np.void, cells: CellDeviations | None) -> list[np.void]:
+def discharge_limiting_states(state: np.void, cells: CellDeviations | None) -> list[np.void]:
     """Return states of packs whose cells all equal one of the cells that may limit a discharge.
 
     These are the cell with the least charge and the cell with the largest resistance.
@@ -21,7 +21,7 @@ def weak_cells(state: np.void, cells: CellDeviations | None) -> list[np.void]:
     return [state_of_cell(state, cells, i) for i in {int(least_charge), int(largest_r)}]
 
 
-def full_cells(state: np.void, cells: CellDeviations | None) -> list[np.void]:
+def charge_limiting_states(state: np.void, cells: CellDeviations | None) -> list[np.void]:
     """Return states of packs whose cells all equal one of the cells that may limit a charge.
 
     These are the cell with the highest SOC and the cell with the largest resistance.

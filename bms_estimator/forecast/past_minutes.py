@@ -14,7 +14,7 @@ MAX_MINUTES = 20_000
 COMPARED_MINUTES = 20
 """Length of the latest load that is compared with earlier ones [min]."""
 MAX_DIFFERENCE = 0.25
-"""Maximum mean absolute difference of an analogue from the latest load, as a fraction of the mean of the latter."""
+"""Maximum difference of an analogue from the latest load: mean absolute difference, relative to the mean of the latest load."""
 MIN_AHEAD_MINUTES = 30
 """Minimum length of the load that followed an analogue [min]. A forecast uses that load as the future one."""
 MAX_ANALOGUES = 10
@@ -68,6 +68,7 @@ class PastMinutes:
         while len(ends) < MAX_ANALOGUES and difference.min() <= MAX_DIFFERENCE:
             best = int(difference.argmin())
             ends.append(best + COMPARED_MINUTES)
+            # a window that overlaps this one is not another analogue
             difference[max(best - COMPARED_MINUTES, 0) : best + COMPARED_MINUTES] = np.inf
         return [self._load_after(end) for end in ends]
 

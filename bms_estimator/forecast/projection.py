@@ -13,8 +13,8 @@ from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_spread import LoadSpread
 from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
 from bms_estimator.kernels.forecast.draws import DRAW, draw_load_factors, draw_packs
-from bms_estimator.kernels.forecast.future_load import LOAD_PART, follow_given_load, set_decays
-from bms_estimator.kernels.forecast.seen_load import follow_seen_load, record_curves
+from bms_estimator.kernels.forecast.given_load import LOAD_PART, set_decays, simulate_given_load
+from bms_estimator.kernels.forecast.observed_load import record_curves, simulate_observed_load
 from bms_estimator.model.arrays import Floats, Records
 
 DRAWS = 1000
@@ -24,11 +24,11 @@ CURVE_DRAWS = 200
 CURVE_POINTS = 60
 """Maximum number of points of a curve."""
 DRAWN_LOADS = 3
-"""Weight of the randomly drawn loads: they get as many draws as this number of analogues."""
-BLOCK_S = 10
+"""Weight of the randomly drawn loads: as many draws have such a load as follow this number of analogues."""
+MIN_OBSERVED_BLOCK_S = 10
 """Minimum length of a block of the observed load [s]."""
 MAX_STEPS = 360
-"""Maximum number of blocks that a draw passes. For a longer horizon the blocks are longer, so that the cost is bounded."""
+"""Maximum number of blocks of a draw. For a longer horizon the blocks are longer, so that the cost is bounded."""
 MIN_BLOCKS = 10
 """Minimum number of blocks in the observed load. It limits the length of a block, so that the bootstrap has enough of them."""
 MAX_TIME_TO_EMPTY_S = 1e9
@@ -42,13 +42,13 @@ MIN_REMAINING_SOC = 0.02
 """Minimum SOC for the horizon. The true SOC of a draw may be higher than an estimate near 0."""
 END_TOLERANCE = 1e-9
 """Fraction by which a trip is shortened, so that rounding does not start a repetition of its load."""
-MIN_BLOCK_S = 1.0
+MIN_GIVEN_BLOCK_S = 1.0
 """Minimum length of a block of a given load [s]. Shorter parts are merged to mean and peak of a block."""
 MAX_BLOCKS = 2500
 """Maximum number of blocks of a given load within a horizon."""
 MAX_DRAW_STEPS = 20_000
-"""Maximum number of parts of a given load that a draw passes. A short load that discharges the pack slowly repeats more often,
-and is extrapolated from there."""
+"""Maximum number of parts of a given load in a draw. A short load that discharges the pack slowly would repeat more often. Its draws
+end there, and are extrapolated."""
 MAX_TOTAL_STEPS = 500_000
 """Maximum number of steps of all draws under a given load, unless there are only ``MIN_DRAWS``."""
 MIN_DRAWS = 100
@@ -71,7 +71,7 @@ class Projection:
     curve: ForecastCurve
 
 
-def project_seen_load(
+def project_observed_load(
     pack: Records, mean_a: Floats, max_a: Floats, spread: LoadSpread, seed: int, analogues: Sequence[GivenLoad] = ()
 ) -> Projection:
     """Simulate the pack under loads drawn from the observed load.
@@ -87,28 +87,28 @@ def project_seen_load(
     m = pack[0]
     load_a = float(mean_a.mean() - m["offset_a"])
     horizon_s = HORIZON_RATIO * _time_to_empty_s(pack, load_a)
-    block_s = min(max(BLOCK_S, math.ceil(horizon_s / MAX_STEPS)), max(mean_a.size // MIN_BLOCKS, 1))
+    block_s = min(max(MIN_OBSERVED_BLOCK_S, math.ceil(horizon_s / MAX_STEPS)), max(mean_a.size // MIN_BLOCKS, 1))
     steps = min(math.ceil(horizon_s / block_s), MAX_STEPS)
     blocks = np.zeros(mean_a.size // block_s, LOAD_BLOCK)
     used = blocks.size * block_s
     tabulate_blocks(m, mean_a[-used:], max_a[-used:], block_s, blocks)
     draws = _draws(m, seed)
     draw_load_factors(spread.std, spread.degrees, draws)
-    follow_seen_load(m, blocks, float(block_s), steps, draws)
+    simulate_observed_load(m, blocks, float(block_s), steps, draws)
     parts_of_draws = list(_analogue_parts(pack, analogues, horizon_s))
     for chosen, parts in parts_of_draws:
         followed, no_points = draws[chosen], np.empty((chosen.size, 0))
-        follow_given_load(m, parts, horizon_s, followed, math.inf, no_points, no_points)
+        simulate_given_load(m, parts, horizon_s, followed, math.inf, no_points, no_points)
         draws[chosen] = followed
     time_s, charge_as = _extrapolated(draws, load_a)
     curve_steps = min(math.ceil(CURVE_END * time_quantiles(time_s)[-1] / block_s), steps)
     stride = math.ceil(curve_steps / CURVE_POINTS)
     soc, voltage_v = np.empty((2, CURVE_DRAWS, math.ceil(curve_steps / stride)))
     record_curves(m, blocks, float(block_s), curve_steps, draws[:CURVE_DRAWS], stride, soc, voltage_v)
-    for drawn, parts in parts_of_draws:
-        chosen = drawn[drawn < CURVE_DRAWS]
+    for followers, parts in parts_of_draws:
+        chosen = followers[followers < CURVE_DRAWS]
         soc_points, voltage_points_v = np.empty((2, chosen.size, soc.shape[1]))
-        follow_given_load(
+        simulate_given_load(
             m, parts, curve_steps * block_s, draws[chosen], stride * block_s, soc_points, voltage_points_v
         )
         soc[chosen], voltage_v[chosen] = soc_points, voltage_points_v
@@ -136,18 +136,18 @@ def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:
     m = pack[0]
     load_a = _mean_current(pack, load)
     if not discharges(pack, load_a):
-        load_a = 0.0
+        load_a = 0.0  # the load is simulated once, because a peak may still reach the cut-off
     horizon_s = HORIZON_RATIO * _time_to_empty_s(pack, load_a) if load_a > 0.0 else float(load.duration_s.sum())
     parts = _parts(_prolonged(load, horizon_s), horizon_s)
     horizon_s = min(horizon_s, MAX_DRAW_STEPS * float(parts["duration_s"].mean()))
     draws = _draws(m, seed)[: _draw_count(parts, horizon_s)]
     no_points = np.empty((draws.size, 0))
-    follow_given_load(m, parts, horizon_s, draws, math.inf, no_points, no_points)
+    simulate_given_load(m, parts, horizon_s, draws, math.inf, no_points, no_points)
     time_s, charge_as = _extrapolated(draws, load_a)
     end_s = min(CURVE_END * time_quantiles(time_s)[-1], horizon_s)
     soc, voltage_v = np.empty((2, min(CURVE_DRAWS, draws.size), CURVE_POINTS))
-    step_s = max(end_s, 1.0) / (CURVE_POINTS - 1)
-    follow_given_load(m, parts, end_s, draws[:CURVE_DRAWS], step_s, soc, voltage_v)
+    step_s = max(end_s, 1.0) / (CURVE_POINTS - 1)  # above 0 also if the cut-off comes at once
+    simulate_given_load(m, parts, end_s, draws[:CURVE_DRAWS], step_s, soc, voltage_v)
     return Projection(
         time_s, charge_as, _curve(step_s * np.arange(CURVE_POINTS, dtype=np.float64), soc, voltage_v, time_s)
     )
@@ -172,7 +172,7 @@ def project_trip(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
     parts = _parts(load, end_s)
     draws = _draws(pack[0], seed)[: _draw_count(parts, end_s)]
     step_s, (soc, voltage_v) = horizon_s / (CURVE_POINTS - 1), np.empty((2, draws.size, CURVE_POINTS))
-    follow_given_load(pack[0], parts, horizon_s, draws, step_s, soc, voltage_v)
+    simulate_given_load(pack[0], parts, horizon_s, draws, step_s, soc, voltage_v)
     time_s = np.where(draws["ended"] == 1, draws["time_s"], math.inf)
     return _curve(step_s * np.arange(CURVE_POINTS, dtype=np.float64), soc, voltage_v, time_s)
 
@@ -196,8 +196,11 @@ def _mean_current(pack: Records, load: GivenLoad) -> float:
 
 
 def _prolonged(load: GivenLoad, horizon_s: float) -> GivenLoad:
-    """Return a load that repeats less often within a horizon: a constant one, and one shorter than ``MIN_BLOCK_S``."""
-    length_s, end_s = horizon_s if load.duration_s.size == 1 else MIN_BLOCK_S, float(load.duration_s.sum())
+    """Return a load with longer parts if it would repeat too often within the horizon, otherwise the load unchanged.
+
+    A constant load lasts for the whole horizon. A profile shorter than ``MIN_GIVEN_BLOCK_S`` is stretched to this length.
+    """
+    length_s, end_s = horizon_s if load.duration_s.size == 1 else MIN_GIVEN_BLOCK_S, float(load.duration_s.sum())
     return replace(load, duration_s=load.duration_s / end_s * length_s) if end_s < length_s else load
 
 
@@ -209,8 +212,8 @@ def _draw_count(parts: Records, horizon_s: float) -> int:
 
 def _parts(load: GivenLoad, horizon_s: float) -> Records:
     """Return the parts of a load for a horizon: long parts are divided, and short ones merged."""
-    load = condense(load, max(horizon_s / MAX_BLOCKS, MIN_BLOCK_S))
-    max_part_s = max(horizon_s / MAX_STEPS, MIN_BLOCK_S)
+    load = condense(load, max(horizon_s / MAX_BLOCKS, MIN_GIVEN_BLOCK_S))
+    max_part_s = max(horizon_s / MAX_STEPS, MIN_GIVEN_BLOCK_S)
     pieces = np.ceil(load.duration_s / max_part_s).astype(int)
     parts = np.zeros(int(pieces.sum()), LOAD_PART)
     parts["duration_s"] = np.repeat(load.duration_s / pieces, pieces)
@@ -236,12 +239,19 @@ def _extrapolated(draws: Records, load_a: float) -> tuple[Floats, Floats]:
         last_soc = float(np.median(end_soc[ended])) if ended.any() else 0.0
         end_soc[~ended] = np.minimum(end_soc[~ended], last_soc)
         left_as = (draws["soc"] - end_soc) * draws["capacity_as"]
-        time_s[~ended] += (left_as / (draws["load"] * load_a))[~ended] if load_a > 0.0 else math.inf
+        time_s[~ended] += (left_as / (draws["load_factor"] * load_a))[~ended] if load_a > 0.0 else math.inf
     return time_s, (draws["begin_soc"] - end_soc) * draws["capacity_as"]
 
 
 def _curve(elapsed_s: Floats, soc: Floats, voltage_v: Floats, time_s: Floats) -> ForecastCurve:
-    """Return the quantiles of the draws' curves, shapes (draws, points), and the fraction of draws without cut-off."""
+    """Return the curves of the quantiles over all draws, and of the fraction of draws without cut-off.
+
+    Args:
+        elapsed_s: Time of each point [s], shape (points,).
+        soc: SOC of each draw, shape (draws, points).
+        voltage_v: Terminal voltage of each draw [V], shape (draws, points).
+        time_s: Time to the cut-off of each draw [s].
+    """
     survival = 1.0 - np.searchsorted(np.sort(time_s), elapsed_s, side="right") / time_s.size
     socs, voltages_v = np.clip(np.quantile(soc, QUANTILES, axis=0), 0.0, 1.0), np.quantile(voltage_v, QUANTILES, axis=0)
     return ForecastCurve(

@@ -51,7 +51,7 @@ def test_the_slow_fit_as_runner_gives_a_row_for_each_trace_row(drive):
     assert np.isfinite(forecasts.rows["time_to_cutoff_s"][300 + int(MAX_INTERVAL_S) :]).all()
 
 
-def test_the_band_contains_the_true_time_under_a_load_like_the_one_seen(drive):
+def test_the_band_contains_the_true_time_under_a_load_like_the_observed_one(drive):
     end_s, forecasts = cutoff_s(drive), forecaster()
     forecasts.run(drive[drive["time_s"] < end_s - 900.0])
     true_s = end_s - forecasts.latest.time_s
@@ -88,7 +88,7 @@ def test_a_given_constant_current_gives_the_true_time_within_15_percent():
     assert values_of(given, "time_to_cutoff_s")[0] == pytest.approx(end_s - now_s, rel=0.15)
 
 
-def test_a_constant_load_that_was_seen_has_the_band_of_a_given_one():
+def test_an_observed_constant_load_has_the_band_of_a_given_one():
     forecasts = forecaster()
     forecasts.run(constant_load(1.5, 2000))
     given = forecasts.forecast(GivenLoad(np.array([60.0]), np.array([1.5]), np.array([np.nan])))
@@ -114,7 +114,7 @@ def test_a_power_that_the_pack_cannot_supply_reaches_the_cutoff_at_once():
     assert values_of(given, *BAND) == [0.0, 0.0, 0.0]
 
 
-def test_a_given_load_needs_no_load_seen_but_must_discharge():
+def test_a_given_load_needs_no_observed_load_but_must_discharge():
     forecasts = forecaster()
     forecasts.run(constant_load(0.0, 100))
     part = np.array([60.0, 60.0])
@@ -195,14 +195,14 @@ def test_a_time_stamp_whose_square_overflows_is_rejected(drive, time_s):
 )
 def test_the_cost_of_a_short_or_small_load_is_bounded(drive, monkeypatch, duration_s, current_a):
     steps = []
-    follow = projection.follow_given_load
+    simulate = projection.simulate_given_load
 
     def counted(m, parts, horizon_s, draws, *points):
         steps.append(draws.size * horizon_s / parts["duration_s"].mean())
         if steps[-1] < 1e7:
-            follow(m, parts, horizon_s, draws, *points)
+            simulate(m, parts, horizon_s, draws, *points)
 
-    monkeypatch.setattr(projection, "follow_given_load", counted)
+    monkeypatch.setattr(projection, "simulate_given_load", counted)
     forecasts = forecaster()
     forecasts.run(drive[:400])
     unknown = np.full(len(current_a), np.nan)

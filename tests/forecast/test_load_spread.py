@@ -67,15 +67,15 @@ def test_load_factors_have_the_quantiles_of_students_t_distribution():
     draws["first_generator"] = np.random.default_rng(1).integers(2**63, size=draws.size)
     draw_load_factors(0.2, 3.0, draws)
     levels = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
-    assert np.quantile(np.log(draws["load"]), levels) == pytest.approx(0.2 * stats.t.ppf(levels, 3.0), abs=0.02)
-    assert draws["load"].max() == pytest.approx(MAX_LOAD_FACTOR)
+    assert np.quantile(np.log(draws["load_factor"]), levels) == pytest.approx(0.2 * stats.t.ppf(levels, 3.0), abs=0.02)
+    assert draws["load_factor"].max() == pytest.approx(MAX_LOAD_FACTOR)
 
 
 def test_the_band_is_wider_after_two_different_trips_than_after_one_repeated_trip():
     bands = []
     for means_a in ((0.8, 0.8), (0.4, 1.2)):
-        seen = forecaster()
-        seen.run(measured(trips(*means_a), 0.9, np.random.default_rng(1))[0])
-        values = seen.forecast().values
+        forecasting = forecaster()
+        forecasting.run(measured(trips(*means_a), 0.9, np.random.default_rng(1))[0])
+        values = forecasting.forecast().values
         bands.append(np.log(values["time_to_cutoff_p95_s"] / values["time_to_cutoff_p05_s"]).item())
     assert bands[1] > 1.2 * bands[0]

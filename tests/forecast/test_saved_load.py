@@ -15,7 +15,7 @@ from bms_estimator.kernels.trace import TRACE
 CAPACITY_AS = 3.0 * 3600.0
 
 
-def seen_load(seconds: int, first_s: float = 0.0) -> LoadHistory:
+def observed_load(seconds: int, first_s: float = 0.0) -> LoadHistory:
     load = LoadHistory(CAPACITY_AS)
     load.add(drive(seconds, first_s))
     return load
@@ -31,7 +31,7 @@ def drive(seconds: int, first_s: float = 0.0) -> Any:
 
 @pytest.mark.parametrize("seconds", [2, 700, MAX_LOAD_S + 500])
 def test_restored_load_continues_like_the_saved_one(seconds: int) -> None:
-    load, past, restored, restored_past = seen_load(seconds), PastMinutes(), LoadHistory(CAPACITY_AS), PastMinutes()
+    load, past, restored, restored_past = observed_load(seconds), PastMinutes(), LoadHistory(CAPACITY_AS), PastMinutes()
     past.add(load)
     restore_load(restored, restored_past, load_arrays(load, past))
     assert restored_past.mean_a == pytest.approx(past.mean_a, rel=1e-6)
@@ -62,7 +62,7 @@ def test_restored_load_continues_like_the_saved_one(seconds: int) -> None:
     ],
 )
 def test_damaged_arrays_are_rejected_and_change_nothing(damage: Callable[[dict[str, Any]], object]) -> None:
-    arrays, load, past = load_arrays(seen_load(400), PastMinutes()), LoadHistory(CAPACITY_AS), PastMinutes()
+    arrays, load, past = load_arrays(observed_load(400), PastMinutes()), LoadHistory(CAPACITY_AS), PastMinutes()
     damage(arrays)
     empty = load.record.tobytes()
     with pytest.raises(ValueError, match=r"missing|must be equal|not finite|above the largest"):

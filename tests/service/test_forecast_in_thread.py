@@ -10,8 +10,8 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import Trip, constant_trip
-from bms_estimator.kernels.forecast.future_load import follow_given_load
-from bms_estimator.kernels.forecast.seen_load import follow_seen_load, record_curves
+from bms_estimator.kernels.forecast.given_load import simulate_given_load
+from bms_estimator.kernels.forecast.observed_load import record_curves, simulate_observed_load
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.service import forecast_request
@@ -63,7 +63,7 @@ async def test_a_forecast_in_a_thread_does_not_change_later_estimates(forecaster
 
 
 @pytest.mark.parametrize(
-    "kernel", [follow_seen_load, record_curves, follow_given_load], ids=lambda kernel: kernel.__name__
+    "kernel", [simulate_observed_load, record_curves, simulate_given_load], ids=lambda kernel: kernel.__name__
 )
 def test_simulation_of_the_draws_lets_other_threads_run(kernel: Any) -> None:
     assert kernel.targetoptions["nogil"]

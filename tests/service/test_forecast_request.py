@@ -30,7 +30,7 @@ def test_profiles_are_read_by_their_quantity() -> None:
     assert np.isnan(current.load.power_w).all()
 
 
-def test_without_a_load_the_seen_one_is_meant() -> None:
+def test_without_a_load_the_observed_one_is_used() -> None:
     assert requested_trip({"transaction": 1}) is None
 
 

@@ -14,8 +14,8 @@ from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
 PEAK_FRACTION = 0.35
-"""Fraction of a peak current within a second that the RC pair of 1 s follows: about the mean response of this pair to a current
-step over the first second, 1/e."""
+"""Response of the RC pair of 1 s to a peak shorter than a second, as a fraction of the peak. The mean step response of this pair over
+the first second is 1/e."""
 
 LOAD_BLOCK = np.dtype(
     [
@@ -23,9 +23,9 @@ LOAD_BLOCK = np.dtype(
         ("drop_v", "f8", GRID),  # largest voltage drop at each node of SOC 0..1 [V]
         ("peak_s", "f8"),  # time from the beginning to the largest drop [s]
         ("peak_decay", "f8", BRANCHES),  # decay factor of each RC pair until the largest drop
-        ("begin_a", "f8", BRANCHES),  # filtered currents at the beginning [A]
-        ("end_a", "f8", BRANCHES),  # filtered currents at the end [A]
-        ("mean_x_a", "f8", BRANCHES),  # mean filtered currents [A]
+        ("begin_a", "f8", BRANCHES),  # RC currents at the beginning [A]
+        ("end_a", "f8", BRANCHES),  # RC currents at the end [A]
+        ("mean_x_a", "f8", BRANCHES),  # mean RC currents [A]
     ],
     align=True,
 )
@@ -44,7 +44,9 @@ def tabulate_blocks(m: Record, mean_a: Floats, max_a: Floats, block_s: int, bloc
         blocks: Shape (n,), dtype LOAD_BLOCK; written.
     """
     x, decay, drop = np.empty(BRANCHES), np.exp(-1.0 / TAUS), np.empty(GRID)
-    present_node = round(min(max(m.soc, 0.0), 1.0) * (GRID - 1))  # its largest drop defines the time of the peak
+    present_node = round(
+        min(max(m.soc, 0.0), 1.0) * (GRID - 1)
+    )  # the time of the peak is that of the largest drop here
     x[:] = mean_a.mean() - m.offset_a  # the RC currents before the first second are unknown
     for n in range(blocks.shape[0]):
         row = blocks[n]

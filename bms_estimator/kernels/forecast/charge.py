@@ -1,7 +1,7 @@
 """Time until the charger ends the present charge: constant current, then constant voltage down to the tail current.
 
 At constant voltage the current decays about exponentially. Once it does, its measured time constant gives the time. Before that, the
-model is charged. In a cell whose OCV has a plateau, the surface of the particles is fuller than their mean during a charge, because
+charge is simulated with the filter's model. In a cell whose OCV has a plateau, the surface of the particles is fuller than their mean during a charge, because
 the charge has to diffuse from the surface. The voltage is that of the surface.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Currents are positive on discharge, so that the charge current is below 0.
@@ -28,10 +28,10 @@ MAX_STEPS = 800
 CURRENT_PAIR = 2
 """Index of the RC pair (30 s) whose filtered current is the present charge current."""
 LEAD_PAIR = 4
-"""Index of the RC pair (500 s) whose filtered current is in proportion to the SOC by which the surface of the particles leads."""
+"""Index of the RC pair (500 s) whose filtered current is proportional to the lead: SOC at the surface of the particles minus their mean."""
 LEAD_S = 180.0
-"""Charge by which the surface of the particles is fuller than their mean, per ampere of that current [A s / A], in cells whose OCV has
-a plateau: charged with C/2 to 3.65 V, LFP cells accept another 2 to 3 % at this voltage."""
+"""Lead as a charge, per ampere of the filtered current of ``LEAD_PAIR`` [A s / A], in cells whose OCV has a plateau. LFP cells that are
+charged with C/2 to 3.65 V accept another 2 to 3 % at this voltage."""
 FULL_TOLERANCE = 2e-3
 """Relative distance from the voltage of the constant-voltage phase within which this phase is detected."""
 MAX_DECAY_RATIO = 0.97
@@ -51,7 +51,7 @@ def charge_current(s: Record, p: Record) -> float:
 
 @njit(cache=True)
 def time_to_full(s: Record, p: Record, charge_a: float, full_v: float, tail_a: float, scratch: Floats) -> float:
-    """Return the time until the charger ends the charge [s], the weighted mean over the hypotheses; NaN if it never ends it.
+    """Return the time until the charger ends the charge [s], the weighted mean over the hypotheses; NaN if the charge never ends.
 
     Args:
         s: Record of EKF_STATE.
@@ -149,7 +149,8 @@ def constant_voltage_current(
         x: Filtered currents of the RC pairs at the beginning of the step [A], shape (BRANCHES,).
         ohm: Scratch space of shape (RESISTANCES,).
     """
-    capacity_as, lead_s = hypothesis_capacity(s, p, q), LEAD_S if p.learned == 0.0 else 0.0  # learned 0: a plateau
+    capacity_as = hypothesis_capacity(s, p, q)
+    lead_s = LEAD_S if p.learned == 0.0 else 0.0  # the filter learns no OCV error if the OCV has a plateau
     lead_decay = math.exp(-dt_s / TAUS[LEAD_PAIR])
     surface_soc = soc - lead_s * lead_decay * x[LEAD_PAIR] / capacity_as
     rise_soc = -guess_a * (dt_s + lead_s * (1.0 - lead_decay)) / capacity_as

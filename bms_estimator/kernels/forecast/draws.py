@@ -1,4 +1,4 @@
-"""Draws (Monte Carlo samples) of pack and load: the assumptions of each.
+"""Draws (Monte Carlo samples) of pack and load.
 
 ``d`` is a record of DRAW, ``m`` of PROJECTED_PACK.
 """
@@ -20,10 +20,10 @@ DRAW = np.dtype(
     [
         ("begin_soc", "f8"),  # SOC of the weakest cell at the beginning
         ("capacity_as", "f8"),  # capacity of the weakest cell [A s]
-        ("load", "f8"),  # factor on the load
-        ("voltage_v", "f8"),  # error of the voltage [V]
-        ("resistance", "f8"),  # factor on the voltage drop
-        ("first_generator", "u8"),  # state of the random generator after the assumptions were drawn
+        ("load_factor", "f8"),  # factor on the load
+        ("voltage_error_v", "f8"),  # error of the modeled voltage [V]
+        ("resistance_factor", "f8"),  # factor on the voltage drop
+        ("first_generator", "u8"),  # state of the random generator after pack and load factor were drawn
         ("generator", "u8"),  # present state of the random generator
         ("block", "i8"),  # index of the present block of the load
         ("run", "i8"),  # number of blocks until the next jump to a random block
@@ -35,7 +35,7 @@ DRAW = np.dtype(
     ],
     align=True,
 )
-"""Assumptions, present load and outcome of one draw."""
+"""Pack, load and outcome of one draw."""
 
 
 @njit(cache=True)
@@ -63,9 +63,9 @@ def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
     d.begin_soc = m.soc - m.surface_soc + m.soc_std * soc_stds
     d.begin_soc -= weakest * max(1.0 - d.begin_soc, 0.0)
     d.capacity_as = m.capacity_as * math.exp(m.capacity_std * capacity_stds) / (1.0 + weakest)
-    d.load = 1.0
-    d.voltage_v = m.voltage_std_v * voltage_stds
-    d.resistance = m.resistance_mean + m.resistance_std * resistance_stds
+    d.load_factor = 1.0
+    d.voltage_error_v = m.voltage_std_v * voltage_stds
+    d.resistance_factor = m.resistance_mean + m.resistance_std * resistance_stds
     d.first_generator = generator
 
 
@@ -82,10 +82,10 @@ def draw_load_factors(std: float, degrees: float, draws: Records) -> None:
     for n in range(draws.shape[0]):
         d = draws[n]
         d.first_generator, stds = student_t(d.first_generator, degrees)
-        d.load = math.exp(min(max(std * stds, -limit), limit))
+        d.load_factor = math.exp(min(max(std * stds, -limit), limit))
 
 
 @njit(cache=True)
 def loaded_voltage(d: Record, m: Record, soc: float, drop_v: float) -> float:
     """Return the terminal voltage at ``soc`` for the model's voltage drop ``drop_v`` [V]."""
-    return voltage_without_load(m, soc) + m.bias_v + d.voltage_v - d.resistance * drop_v
+    return voltage_without_load(m, soc) + m.bias_v + d.voltage_error_v - d.resistance_factor * drop_v

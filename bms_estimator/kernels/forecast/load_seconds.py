@@ -15,7 +15,7 @@ from bms_estimator.numba_cache import njit
 
 MAX_LOAD_S = 20_000
 """Capacity of the ring buffer [s]: about 5.5 hours of use, in 160 kB."""
-MAX_REST_S = 4000
+MAX_STORED_REST_S = 4000
 """Maximum length of a rest in the ring buffer [s]. Later seconds of the rest are not stored, because they would displace the load before it."""
 CHARGE_WEIGHT = 1.0 - math.exp(-1.0 / TAU_S[CHARGE])
 """Weight of a new second in the filtered current that distinguishes a charge from regeneration."""
@@ -25,7 +25,7 @@ LOAD = np.dtype(
         ("started", "i8"),  # 1: there is a previous row
         ("time_s", "f8"),  # time stamp of the previous row [s]
         ("current_a", "f8"),  # current of the previous row [A]
-        ("part_s", "f8"),  # elapsed time of the present second [s]
+        ("part_s", "f8"),  # elapsed part of the present second [s]
         ("part_as", "f8"),  # charge of the present second until now [A s]
         ("part_max_a", "f8"),  # largest current of the present second until now [A]
         ("filtered_a", "f8"),  # current, filtered with the time constant ``TAU_S[CHARGE]`` [A]
@@ -71,7 +71,11 @@ def begin_second(load: Record) -> None:
 
 @njit(cache=True)
 def add_step(load: Record, step_s: float, mean_a: float, end_a: float, one_c_a: float) -> None:
-    """Divide a step between two rows among the seconds that it spans. ``end_a`` is the current at its end [A]."""
+    """Divide a step between two rows among the seconds that it spans.
+
+    The mean current counts in all of them. The current at the end of the step, ``end_a`` [A], also counts in the second that
+    contains it.
+    """
     while load.part_s + step_s >= 1.0:
         part_s = 1.0 - load.part_s
         step_s -= part_s
@@ -97,7 +101,7 @@ def add_second(load: Record, mean_a: float, max_a: float, one_c_a: float) -> Non
         load.count = 0
         if mean_a > REST_C * one_c_a:
             load.filtered_a = 0.0
-    if load.rest_s > MAX_REST_S or (load.count == 0 and mean_a <= REST_C * one_c_a):
+    if load.rest_s > MAX_STORED_REST_S or (load.count == 0 and mean_a <= REST_C * one_c_a):
         return
     load.mean_a[load.next], load.max_a[load.next] = mean_a, max_a
     load.next = (load.next + 1) % MAX_LOAD_S

@@ -54,8 +54,8 @@ def discharge_to_cutoff(m: Record, s: Record, p: Record, largest_a: float, d: Re
 @njit(cache=True)
 def draw_without_errors(d: Record, m: Record) -> None:
     """Write the pack without random errors to the draw ``d``. Its weakest cell equals the mean of the cells."""
-    d.begin_soc, d.capacity_as, d.load = m.soc - m.surface_soc, m.capacity_as, 1.0
-    d.voltage_v, d.resistance = 0.0, m.resistance_mean
+    d.begin_soc, d.capacity_as, d.load_factor = m.soc - m.surface_soc, m.capacity_as, 1.0
+    d.voltage_error_v, d.resistance_factor = 0.0, m.resistance_mean
 
 
 @njit(cache=True)

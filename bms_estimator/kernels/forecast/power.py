@@ -60,13 +60,13 @@ def available_power(
         scratch: Scratch space of shape (RESISTANCES + STATES,).
     """
     direction = math.copysign(1.0, max_a)
-    at_rest_v = direction * (closest_voltage(s, p, 0.0, duration_s, direction, stds, scratch) - limit_v)
-    if max_a == 0.0 or at_rest_v <= 0.0:
+    rest_distance_v = direction * (closest_voltage(s, p, 0.0, duration_s, direction, stds, scratch) - limit_v)
+    if max_a == 0.0 or rest_distance_v <= 0.0:
         return 0.0
     current_a = max_a
-    at_max_v = direction * (closest_voltage(s, p, max_a, duration_s, direction, stds, scratch) - limit_v)
-    if at_max_v < 0.0:
-        current_a = current_at_limit(s, p, duration_s, limit_v, (max_a, at_rest_v, at_max_v), stds, scratch)
+    max_distance_v = direction * (closest_voltage(s, p, max_a, duration_s, direction, stds, scratch) - limit_v)
+    if max_distance_v < 0.0:
+        current_a = current_at_limit(s, p, duration_s, limit_v, (max_a, rest_distance_v, max_distance_v), stds, scratch)
     if direction > 0.0:
         return current_a * closest_voltage(s, p, current_a, duration_s, direction, stds, scratch)
     return -current_a * voltage_quantile(s, p, current_a, 0.0, 0.0, scratch)  # the voltage is lowest at the beginning

@@ -35,7 +35,7 @@ CAPACITY_STD_FACTOR = 0.5
 VOLTAGE_STD_V = 0.02
 """Std of the voltage error of one cell's model at 25 C, constant until the cut-off [V]."""
 VOLTAGE_STD_J = 22e3
-"""Activation energy of ``VOLTAGE_STD_V`` squared [J/mol]."""
+"""Activation energy of the variance of the voltage error [J/mol]."""
 RESISTANCE_MEAN = 1.05
 """Mean factor on the voltage drop of the present model."""
 RESISTANCE_STD = 0.05
@@ -55,12 +55,9 @@ large currents. The gradient increases with the Arrhenius factor of ``WEAK_J`` i
 
 PROJECTED_PACK = np.dtype(
     [
-        ("soc", "f8"),  # SOC by the filter
-        (
-            "surface_soc",
-            "f8",
-        ),  # SOC by which the surface of the particles is emptier than their mean at the peaks of the load
-        ("capacity_as", "f8"),  # capacity by the filter [A s]
+        ("soc", "f8"),  # SOC that the filter estimates
+        ("surface_soc", "f8"),  # mean SOC of the particles minus that of their surface, at the peaks of the load
+        ("capacity_as", "f8"),  # capacity that the filter estimates [A s]
         ("offset_a", "f8"),  # measured minus true current [A]
         ("x_a", "f8", BRANCHES),  # filtered currents of the RC pairs [A]
         ("bias_v", "f8"),  # present error of the model; near empty it is mainly a shift of the knee, which persists [V]
@@ -82,14 +79,14 @@ PROJECTED_PACK = np.dtype(
 
 @njit(cache=True)
 def project_pack(m: Record, s: Record, p: Record, cutoff_v: float, peak_a: float) -> None:
-    """Write the pack to ``m``, by the likeliest hypothesis of the filter.
+    """Write the pack to ``m``, as the most likely hypothesis of the filter estimates it.
 
     Args:
         m: Record of PROJECTED_PACK; written.
         s: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
         cutoff_v: Terminal voltage at which the load is switched off [V].
-        peak_a: Largest current of the expected load [A]; below the mean current of ten minutes: this mean applies.
+        peak_a: Largest current of the expected load [A]. The mean current of the last ten minutes applies if it is larger.
     """
     x, cov = s.mean[s.best], s.covariance[s.best]
     m.soc, m.cutoff_v, m.offset_a = x[SOC], cutoff_v, x[OFFSET]

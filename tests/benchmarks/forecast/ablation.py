@@ -8,7 +8,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.load_spread import LoadSpread, load_spread
-from bms_estimator.forecast.projection import discharges, project_seen_load, time_quantiles
+from bms_estimator.forecast.projection import discharges, project_observed_load, time_quantiles
 from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.forecast.projected_pack import FAST_RESISTANCES, growth_factor
 from bms_estimator.model.arrays import Floats, Records
@@ -26,30 +26,30 @@ SHUFFLE_SEED = 1
 NORMAL_DEGREES = 1e6
 """Degrees of freedom with which Student's t distribution is practically normal."""
 
-SeenLoad = tuple[Floats, Floats]
+ObservedLoad = tuple[Floats, Floats]
 """Mean and largest current of each second [A]."""
 
 
-def unchanged(seen: SeenLoad) -> SeenLoad:
+def unchanged(observed: ObservedLoad) -> ObservedLoad:
     """Return the load as it is."""
-    return seen
+    return observed
 
 
-def last_seconds(seconds: int) -> Callable[[SeenLoad], SeenLoad]:
+def last_seconds(seconds: int) -> Callable[[ObservedLoad], ObservedLoad]:
     """Return a function that returns the last ``seconds`` of a load."""
-    return lambda seen: (seen[0][-seconds:], seen[1][-seconds:])
+    return lambda observed: (observed[0][-seconds:], observed[1][-seconds:])
 
 
-def without_peaks(seen: SeenLoad) -> SeenLoad:
+def without_peaks(observed: ObservedLoad) -> ObservedLoad:
     """Return a load whose largest current of each second is its mean."""
-    return seen[0], seen[0]
+    return observed[0], observed[0]
 
 
-def shuffled(seen: SeenLoad) -> SeenLoad:
+def shuffled(observed: ObservedLoad) -> ObservedLoad:
     """Return a load whose pieces of ``SHUFFLED_S`` are in random order."""
-    pieces = seen[0].size // SHUFFLED_S
+    pieces = observed[0].size // SHUFFLED_S
     order = np.random.default_rng(SHUFFLE_SEED).permutation(pieces)
-    mean_a, max_a = (part[: pieces * SHUFFLED_S].reshape(pieces, SHUFFLED_S)[order].ravel() for part in seen)
+    mean_a, max_a = (part[: pieces * SHUFFLED_S].reshape(pieces, SHUFFLED_S)[order].ravel() for part in observed)
     return mean_a, max_a
 
 
@@ -77,8 +77,8 @@ class Part:
     """Fields of PROJECTED_PACK with the values that disable the part."""
     grows: bool = True
     """False: the fast resistances do not grow towards empty."""
-    load: Callable[[SeenLoad], SeenLoad] = unchanged
-    """Function that changes the load that was seen."""
+    load: Callable[[ObservedLoad], ObservedLoad] = unchanged
+    """Function that changes the observed load."""
     spread: Callable[[LoadSpread], LoadSpread] = own_spread
     """Function that changes the spread of the mean load."""
 
@@ -121,7 +121,7 @@ def quantiles_without(part: Part, forecaster: Forecaster) -> Quantiles:
     if not discharges(pack, float(current_a.mean())):
         return UNKNOWN
     spread = part.spread(load_spread(current_a))
-    return Quantiles(*time_quantiles(project_seen_load(pack, mean_a, max_a, spread, forecaster.seed).time_s))
+    return Quantiles(*time_quantiles(project_observed_load(pack, mean_a, max_a, spread, forecaster.seed).time_s))
 
 
 def outcomes_without_parts(case: Case, discharge: Discharge, cell: CellModel, interval_s: float) -> Iterator[Outcome]:

@@ -7,12 +7,12 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import MIN_INTERVAL_S, Forecaster
-from bms_estimator.forecast.projection import BLOCK_S, DRAWS
+from bms_estimator.forecast.projection import DRAWS, MIN_OBSERVED_BLOCK_S
 from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
 from bms_estimator.kernels.forecast.draws import DRAW, draw_packs
 from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
+from bms_estimator.kernels.forecast.observed_load import simulate_observed_load
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
-from bms_estimator.kernels.forecast.seen_load import follow_seen_load
 from bms_estimator.model.cell import load_cell
 from tests.benchmarks.load import CELL, pulses
 from tests.benchmarks.table import Row
@@ -34,16 +34,16 @@ def rows() -> Iterator[Row]:
     mean_a, max_a = forecaster.load.mean_and_max()
     pack, blocks, draws = (
         np.zeros(1, PROJECTED_PACK),
-        np.zeros(MAX_LOAD_S // BLOCK_S, LOAD_BLOCK),
+        np.zeros(MAX_LOAD_S // MIN_OBSERVED_BLOCK_S, LOAD_BLOCK),
         np.zeros(DRAWS, DRAW),
     )
     project_pack(
         pack[0], estimator.record[0]["filter"], estimator.settings_record[0]["filter"], NO_CUTOFF_V, float(max_a.max())
     )
     draw_packs(pack[0], np.uint64(1), draws)
-    table_ms = shortest_ms(lambda: tabulate_blocks(pack[0], mean_a, max_a, BLOCK_S, blocks))
-    steps = HOUR_S // BLOCK_S
-    draws_ms = shortest_ms(lambda: follow_seen_load(pack[0], blocks, float(BLOCK_S), steps, draws))
+    table_ms = shortest_ms(lambda: tabulate_blocks(pack[0], mean_a, max_a, MIN_OBSERVED_BLOCK_S, blocks))
+    steps = HOUR_S // MIN_OBSERVED_BLOCK_S
+    draws_ms = shortest_ms(lambda: simulate_observed_load(pack[0], blocks, float(MIN_OBSERVED_BLOCK_S), steps, draws))
     assert not draws["ended"].any()
     yield Row(f"{DRAWS} draws of an hour", "at most 10 ms", f"{draws_ms:.1f} ms", draws_ms <= 10.0)
     yield Row(f"  table of {MAX_LOAD_S} s of load", "-", f"{table_ms:.1f} ms", None)

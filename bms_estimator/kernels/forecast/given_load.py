@@ -1,4 +1,4 @@
-"""Simulation of draws under a load that the user gives."""
+"""Simulation of draws under a given load: parts with a constant current or power."""
 
 import math
 
@@ -30,7 +30,7 @@ def set_decays(parts: Records) -> None:
 
 
 @njit(cache=True, nogil=True)  # a request for a forecast runs in a thread, while the event loop reads samples
-def follow_given_load(
+def simulate_given_load(
     m: Record, parts: Records, horizon_s: float, draws: Records, curve_step_s: float, soc: Floats, voltage_v: Floats
 ) -> None:
     """Simulate each draw until the cut-off or the horizon, and write its curves.
@@ -45,11 +45,11 @@ def follow_given_load(
         voltage_v: Terminal voltage of each draw [V]; written.
     """
     for n in range(draws.shape[0]):
-        follow_draw(m, parts, horizon_s, draws[n], curve_step_s, soc[n], voltage_v[n])
+        simulate_draw(m, parts, horizon_s, draws[n], curve_step_s, soc[n], voltage_v[n])
 
 
 @njit(cache=True)
-def follow_draw(
+def simulate_draw(
     m: Record,
     parts: Records,
     horizon_s: float,
@@ -62,20 +62,20 @@ def follow_draw(
 
     After the cut-off, the points of its curve have the SOC at the cut-off and the cut-off voltage.
     """
-    x_a, ohm, at, point = m.x_a.copy(), np.empty(BRANCHES), 0, 0
+    x_a, ohm, index, point = m.x_a.copy(), np.empty(BRANCHES), 0, 0
     soc, elapsed_s, d.ended = d.begin_soc, 0.0, 0
     while elapsed_s < horizon_s:
-        part = parts[at]
+        part = parts[index]
         i, t = grid_position(soc)
-        factor = d.resistance
-        settled_ohm = m.ohm[0, i] + t * (m.ohm[0, i + 1] - m.ohm[0, i])
-        source_v = voltage_without_load(m, soc) + m.bias_v + d.voltage_v
+        factor = d.resistance_factor
+        total_ohm = m.ohm[0, i] + t * (m.ohm[0, i + 1] - m.ohm[0, i])
+        source_v = voltage_without_load(m, soc) + m.bias_v + d.voltage_error_v
         for k in range(BRANCHES):
             ohm[k] = m.ohm[1 + k, i] + t * (m.ohm[1 + k, i + 1] - m.ohm[1 + k, i])
-            settled_ohm += ohm[k] * (1.0 - part.decay[k])
+            total_ohm += ohm[k] * (1.0 - part.decay[k])
             source_v -= factor * ohm[k] * x_a[k] * part.decay[k]
-        current_a = part_current(part, source_v, factor * settled_ohm)
-        voltage_v = source_v - factor * settled_ohm * current_a
+        current_a = part_current(part, source_v, factor * total_ohm)
+        voltage_v = source_v - factor * total_ohm * current_a
         if not voltage_v > m.cutoff_v:  # also if the pack cannot supply the power
             d.ended = 1
             break
@@ -86,7 +86,7 @@ def follow_draw(
             x_a[k] = current_a + (x_a[k] - current_a) * part.decay[k]
         soc = min(soc - current_a * part.duration_s / d.capacity_as, 1.0)
         elapsed_s += part.duration_s
-        at = (at + 1) % parts.shape[0]
+        index = (index + 1) % parts.shape[0]
     d.time_s, d.soc = elapsed_s, soc
     for later in range(point, soc_points.size):
         soc_points[later], voltage_points_v[later] = soc, m.cutoff_v

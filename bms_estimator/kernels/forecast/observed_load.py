@@ -23,7 +23,7 @@ NEGLIGIBLE_DIFFERENCE_C = 1e-3
 
 
 @njit(cache=True, nogil=True)  # a request for a forecast runs in a thread, while the event loop reads samples
-def follow_seen_load(m: Record, blocks: Records, block_s: float, steps: int, draws: Records) -> None:
+def simulate_observed_load(m: Record, blocks: Records, block_s: float, steps: int, draws: Records) -> None:
     """Simulate each draw until the cut-off, or for ``steps`` blocks.
 
     Args:
@@ -35,7 +35,7 @@ def follow_seen_load(m: Record, blocks: Records, block_s: float, steps: int, dra
     """
     decay, no_points = np.exp(-block_s / TAUS), np.empty(0)
     for n in range(draws.shape[0]):
-        follow_draw(m, blocks, block_s, steps, draws[n], decay, 0, no_points, no_points)
+        simulate_draw(m, blocks, block_s, steps, draws[n], decay, 0, no_points, no_points)
 
 
 @njit(cache=True, nogil=True)  # a request for a forecast runs in a thread, while the event loop reads samples
@@ -49,18 +49,18 @@ def record_curves(
     soc: Floats,
     voltage_v: Floats,
 ) -> None:
-    """Simulate draws as ``follow_seen_load`` does, and write SOC and mean voltage at every ``stride``-th block.
+    """Simulate draws as ``simulate_observed_load`` does, and write SOC and mean voltage at every ``stride``-th block.
 
     After the cut-off, the points of a draw have the SOC at the cut-off and the cut-off voltage. ``soc`` and ``voltage_v`` have
     the shape (draws, points). The outcomes of the draws are overwritten.
     """
     decay = np.exp(-block_s / TAUS)
     for n in range(draws.shape[0]):
-        follow_draw(m, blocks, block_s, steps, draws[n], decay, stride, soc[n], voltage_v[n])
+        simulate_draw(m, blocks, block_s, steps, draws[n], decay, stride, soc[n], voltage_v[n])
 
 
 @njit(cache=True)
-def follow_draw(
+def simulate_draw(
     m: Record,
     blocks: Records,
     block_s: float,
@@ -71,21 +71,24 @@ def follow_draw(
     soc_points: Floats,
     voltage_points_v: Floats,
 ) -> None:
-    """Simulate one draw until the cut-off, or for ``steps`` blocks. With ``stride`` above 0, write its curve."""
+    """Simulate one draw until the cut-off, or for ``steps`` blocks. With ``stride`` above 0, write its curve.
+
+    ``decay`` is the decay factor of each RC pair over a block. The other arguments are those of ``record_curves``.
+    """
     begin_load(m, blocks, block_s, d)
     soc, d.ended, step = d.begin_soc, 0, 0
     while step < steps:
         row = blocks[d.block]
-        moved = d.load * row.mean_a * block_s / d.capacity_as
+        moved = d.load_factor * row.mean_a * block_s / d.capacity_as
         middle = min(soc - 0.5 * moved, 1.0)
         i, t = grid_position(middle)
         difference_v = difference_drop(m, d, row, i, t)
-        drop_v = d.load * (row.drop_v[i] + t * (row.drop_v[i + 1] - row.drop_v[i])) + difference_v
+        drop_v = d.load_factor * (row.drop_v[i] + t * (row.drop_v[i + 1] - row.drop_v[i])) + difference_v
         if loaded_voltage(d, m, middle, drop_v) <= m.cutoff_v:
             d.ended = 1
             break
         if stride > 0 and step % stride == 0:
-            mean_drop_v = d.load * mean_drop(m, row, i, t) + difference_v
+            mean_drop_v = d.load_factor * mean_drop(m, row, i, t) + difference_v
             soc_points[step // stride] = middle
             voltage_points_v[step // stride] = loaded_voltage(d, m, middle, mean_drop_v)
         soc = min(soc - moved, 1.0)
@@ -95,7 +98,7 @@ def follow_draw(
     if d.ended:
         row = blocks[d.block]
         d.time_s += row.peak_s
-        d.soc -= d.load * row.mean_a * row.peak_s / d.capacity_as
+        d.soc -= d.load_factor * row.mean_a * row.peak_s / d.capacity_as
     if stride > 0:
         for point in range((step + stride - 1) // stride, soc_points.size):
             soc_points[point], voltage_points_v[point] = d.soc, m.cutoff_v
@@ -107,7 +110,7 @@ def begin_load(m: Record, blocks: Records, block_s: float, d: Record) -> None:
     d.generator, d.first_pair = d.first_generator, 0
     jump(blocks, block_s, d)
     for k in range(BRANCHES):
-        d.difference_a[k] = m.x_a[k] - d.load * blocks[d.block].begin_a[k]
+        d.difference_a[k] = m.x_a[k] - d.load_factor * blocks[d.block].begin_a[k]
 
 
 @njit(cache=True)
@@ -127,7 +130,7 @@ def advance_load(blocks: Records, block_s: float, decay: Floats, d: Record) -> N
     if d.block != last + 1:
         d.first_pair = 0
         for k in range(BRANCHES):
-            d.difference_a[k] += d.load * (blocks[last].end_a[k] - blocks[d.block].begin_a[k])
+            d.difference_a[k] += d.load_factor * (blocks[last].end_a[k] - blocks[d.block].begin_a[k])
 
 
 @njit(cache=True)
