@@ -14,7 +14,7 @@ from bms_estimator.telemetry.alarms.message import AlarmMessage, Change, alarm_p
 from bms_estimator.telemetry.alarms.state import AlarmState, AlarmTransition, RaisedAlarm
 from bms_estimator.telemetry.alarms.unwatched import UnwatchedAlarms
 
-ALWAYS: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
+ALWAYS_WATCHED: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
 """Alarms that are watched even before the first sample."""
 
 
@@ -136,7 +136,7 @@ class AlarmList:
         """
         state, before = self.states.get(name), self._reasons.get(name, _NO_REASONS)
         if state is not None and suspects != before.suspects and (suspects or state.raised is None):
-            # a suspicion is the text of its fault, after numbers if there are any
+            # each sentence ends in the text of its fault; numbers may precede this text
             texts = tuple(text for text in suspicions for suspect in suspects if text.endswith(suspect.text))
             self._reasons[name] = Reasons(suspects, texts)
 
@@ -162,7 +162,7 @@ class AlarmList:
             if state.raised is None and name in unreported
             else self._payload(state)
             for name, state in self.states.items()
-            if state.has_value or state.raised is not None or name in self._unwatched.reasons or name in ALWAYS
+            if state.has_value or state.raised is not None or name in self._unwatched.reasons or name in ALWAYS_WATCHED
         )
 
     def restore(self, saved: Mapping[AlarmName, Any], unwatched: UnwatchedAlarms) -> None:

@@ -1,4 +1,4 @@
-"""Value and text of the alarm ``collapse_risk``: the probability of the cut-off within 5 min, by the forecast."""
+"""Value and text of the alarm ``collapse_risk``: the probability of the cut-off within 5 min that the forecast gives."""
 
 import numpy as np
 
@@ -20,6 +20,6 @@ def collapse_risks(forecasts: ForecastRows, is_charging: np.ndarray) -> Floats:
 
 
 def time_left_text(forecast: np.void) -> str:
-    """Return a sentence with the 90 % band of the time to the cut-off, from a record FORECAST."""
+    """Return a sentence with the 90 % band of the time to the cut-off, from a record of FORECAST."""
     early_min, late_min = (float(forecast[f"time_to_cutoff_{name}_s"]) / 60.0 for name in ("p05", "p95"))
     return f"the time left was {early_min:.0f} to {late_min:.0f} min (90 % band) when the alarm was raised"

@@ -81,7 +81,7 @@ class AlarmEvaluator:
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
         self._weak_cell_intervals = SampleIntervals(math.inf)  # no interval is a gap, because a weak cell remains weak
         self._cell_intervals = SampleIntervals(CELLS_GAP_S)
-        self._cell_kinds = CellFault(0.0).kinds  # faulty readings in the text of their alarm
+        self._cell_kinds = CellFault(0.0).kinds  # faults that the text of ``cell_sensor_fault`` describes
         self._buffer = SampleBuffer()
         self._faulty_fraction = FaultyFraction()
         self._at_s = 0.0  # time of the last sample
@@ -254,7 +254,9 @@ class AlarmEvaluator:
         passed_s, observed_s = self._sample_intervals.measure(times_s)
         for name, series in measured_values(samples, extremes_v, self._charging_a).items():
             self._alarms.update(name, times_s, observed_s, series, wall_offset_s)
-        gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # values hold for less than the interval only in a gap
+        gaps_s = np.where(
+            observed_s < passed_s, passed_s, 0.0
+        )  # 0 without a gap: a value then holds for the whole interval
         self._alarms.update("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
         counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
         cells = extremes_v[:, 2].astype(np.int64)

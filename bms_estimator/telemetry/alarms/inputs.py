@@ -27,9 +27,9 @@ class _Input:
     max_count: int = 0
     lost: bool = False
     _missing_s: float | None = None
-    """Time since the first of the latest samples without a value [s]; None: the last sample had all values."""
-    _back_s: float | None = None
-    """Time since the first value after a loss [s]; None: no value has arrived since."""
+    """Time since the beginning of the present series of samples without a value [s]; None: the last sample had all values."""
+    _restored_s: float | None = None
+    """Time since the first value after a loss [s]; None: no value has arrived since the loss."""
 
     def update(self, times_s: Floats, steps_s: Floats, counts: Counts, lost_s: float) -> list[float]:
         """Process the number of values in each sample. Return the times at which the quantity was lost or measured again [s]."""
@@ -47,10 +47,10 @@ class _Input:
         was_lost = self.lost
         self._missing_s = None if present else 0.0 if self._missing_s is None else self._missing_s + step_s
         if self._missing_s is not None and self._missing_s >= lost_s:
-            self.lost, self._back_s = True, None
-        elif self.lost and (present or self._back_s is not None):
-            self._back_s = 0.0 if self._back_s is None else self._back_s + step_s
-            self.lost = self._back_s < lost_s
+            self.lost, self._restored_s = True, None
+        elif self.lost and (present or self._restored_s is not None):
+            self._restored_s = 0.0 if self._restored_s is None else self._restored_s + step_s
+            self.lost = self._restored_s < lost_s
         return self.lost != was_lost
 
 

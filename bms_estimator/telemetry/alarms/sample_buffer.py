@@ -44,8 +44,8 @@ class SampleBuffer:
         """Remove and return all rows.
 
         Returns:
-            Samples with a finite time stamp; trace; forecast at each row of the trace; and for each of these samples the minimum and maximum cell voltage [V]
-            and the number of cell voltages, shape (n, 3).
+            Samples with a finite time stamp; their trace; the forecast at each row of the trace; and the minimum cell voltage [V],
+            maximum cell voltage [V] and number of cell voltages of each sample, shape (n, 3).
         """
         samples, trace, forecasts = self._samples.take(), self._traces.take(), self._forecasts.take()
         extremes_v, has_time = self._extremes.take(), np.isfinite(samples["time_s"])

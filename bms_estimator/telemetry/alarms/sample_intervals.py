@@ -9,7 +9,7 @@ from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.arrays import Floats
 
 RECENT_STEPS = 4.0
-"""Maximum time between two long intervals that count as regular, in multiples of the longer interval."""
+"""Maximum time between two intervals above ``gap_s`` that count as regular, in multiples of the longer interval."""
 
 
 @dataclass
@@ -25,7 +25,9 @@ class SampleIntervals:
 
     gap_s: float
     _last_s: float = math.nan
+    """Time of the last sample [s]."""
     _step_s: float = math.inf
+    """Last interval above 0 [s]."""
     _longest_s: float = 0.0
     """Longest recent interval [s]."""
     _longest_at_s: float = -math.inf

@@ -43,7 +43,7 @@ def estimated_values(trace: TraceBlock, is_mismatch: NDArray[np.bool_]) -> dict[
 
     Args:
         trace: Shape (n,), dtype TRACE.
-        is_mismatch: True at estimates for which the filter suspects that the cell model is wrong, or the observer is out of lock; shape (n,).
+        is_mismatch: True where the filter suspects a wrong cell model, or the observer is out of lock; shape (n,).
     """
     std = trace["soc_std"]
     return {
