@@ -62,8 +62,8 @@ class Projection:
 
     Attributes:
         time_s: Time to the cut-off of each draw [s]; infinite if the load never discharges the pack.
-        charge_as: Charge until then [A s].
-        curve: Quantiles of SOC and voltage over time.
+        charge_as: Charge until the cut-off of each draw [A s].
+        curve: Quantiles of SOC and voltage over time, and the probability that the cut-off is still ahead.
     """
 
     time_s: Floats

@@ -97,7 +97,7 @@ def current_at_limit(
         scratch: Scratch space of shape (RESISTANCES + STATES,).
     """
     outside_a, inside_v, outside_v = bracket
-    inside_a, last = 0.0, 0
+    inside_a, last_side = 0.0, 0  # side of the limit in the last iteration; 1: inside, -1: outside
     direction = math.copysign(1.0, outside_a)
     for _ in range(MAX_ITERATIONS):
         middle_a = (inside_a * outside_v - outside_a * inside_v) / (outside_v - inside_v)
@@ -106,12 +106,12 @@ def current_at_limit(
             return middle_a
         if distance_v > 0.0:
             inside_a, inside_v = middle_a, distance_v
-            outside_v *= 0.5 if last == 1 else 1.0
-            last = 1
+            outside_v *= 0.5 if last_side == 1 else 1.0
+            last_side = 1
         else:
             outside_a, outside_v = middle_a, distance_v
-            inside_v *= 0.5 if last == -1 else 1.0
-            last = -1
+            inside_v *= 0.5 if last_side == -1 else 1.0
+            last_side = -1
     return inside_a
 
 

@@ -132,8 +132,9 @@ class AlarmEvaluator:
         """
         # a silence restored from an earlier run lasts until the first sample of this run
         is_restored = bool(self._silence_reason) and not self._has_samples
-        if (silent_s >= self._silence_limit_s or is_restored) != bool(self._silence_reason):
-            self._silence_reason = "" if self._silence_reason else reason or "no samples arrive"
+        is_silent = silent_s >= self._silence_limit_s or is_restored
+        if is_silent != bool(self._silence_reason):
+            self._silence_reason = (reason or "no samples arrive") if is_silent else ""
             self._update_unwatched(self._at_s)
             self._save_state()
         state = self._alarms.states.get("link_lost")

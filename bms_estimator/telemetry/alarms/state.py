@@ -103,13 +103,13 @@ class AlarmState:
 
     def _is_due(self, signed: float, step_s: float, sign: float) -> bool:
         """Return True if the condition of the next state has held long enough."""
-        ends_next = self.raised is not None and not self.cause_cleared
-        holds = signed < sign * self.definition.clear if ends_next else signed >= sign * self.definition.limit
+        waits_for_end = self.raised is not None and not self.cause_cleared
+        holds = signed < sign * self.definition.clear if waits_for_end else signed >= sign * self.definition.limit
         if not holds:
             self._held_s = None
             return False
         self._held_s = 0.0 if self._held_s is None else self._held_s + step_s
-        if self._held_s < (self.definition.clear_delay_s if ends_next else self.definition.delay_s):
+        if self._held_s < (self.definition.clear_delay_s if waits_for_end else self.definition.delay_s):
             return False
         self._held_s = None
         return True
