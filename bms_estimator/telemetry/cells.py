@@ -29,6 +29,9 @@ class CellFault(NamedTuple):
     """Index and fault of each faulty cell; the texts also contain numbers, which change."""
 
 
+NO_CELL_FAULT = CellFault(0.0)
+
+
 class CellFaults(NamedTuple):
     """Faults of the cells at one time."""
 
@@ -48,7 +51,7 @@ def cell_faults(cells: CellDeviations) -> CellFaults:
     faulty = [i for i, fault in enumerate(cells.fault) if fault]
     return CellFaults(
         cells.at_s,
-        CellFault(max(float(proven_a[i]), 0.0), (short_text,)) if proven_a[i] > 0.0 else CellFault(0.0),
+        CellFault(max(float(proven_a[i]), 0.0), (short_text,)) if proven_a[i] > 0.0 else NO_CELL_FAULT,
         CellFault(
             float(cells.reading_error_v.max()),
             tuple(_reading_text(cells, i) for i in faulty),

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bms_estimator.kernels.cells.records import ReadingFault
 from bms_estimator.kernels.trace import TRACE
-from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
@@ -24,6 +25,7 @@ from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.state import AlarmState
+from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
 from tests.telemetry.alarm_captures import PACK, WALL_S, Line, ReplayResult, knee_lines, record, replayed, settings
 
 NAN = math.nan
@@ -296,15 +298,24 @@ async def test_a_raised_alarm_survives_a_restart_and_ends_with_its_cause(tmp_pat
     assert json.loads(after.saved_state).keys() & {"pack_under_voltage"} == set()
 
 
-def make_evaluator(alarms: dict[str, Any] | None = None) -> AlarmEvaluator:
-    """Return an evaluator for ``PACK`` with these settings of the alarms. A silence of 10 s raises link_lost."""
+def make_evaluator(alarms: dict[str, Any] | None = None, cell: CellModel = PACK) -> AlarmEvaluator:
+    """Return an evaluator for a pack with these settings of the alarms. A silence of 10 s raises link_lost."""
     return AlarmEvaluator(
-        monitored_alarms(settings(alarms), PACK),
+        monitored_alarms(settings(alarms), cell),
         charging_a=0.2,
         gap_s=5.0,
         inputs=Inputs(lost_s=10.0, series=2),
         silence_limit_s=10.0,
     )
+
+
+def test_text_of_a_raised_reading_fault_stays_while_only_its_numbers_change() -> None:
+    alarms = make_evaluator({"cell_sensor_fault": {"delay_s": 0.0}}, load_cell("nmc", 10.0).pack(3, 1))
+    for at_s, text in enumerate(["cell 2 is off by 0.1 V", "cell 2 is off by 0.1 V", "cell 2 is off by 0.2 V"]):
+        fault = CellFault(0.1, (text,), ((1, ReadingFault.OFFSET),))
+        alarms.evaluate_cells(CellFaults(float(at_s), NO_CELL_FAULT, fault), WALL_S)
+    (text,) = [alarm.text for alarm in alarms.report() if alarm.name == "cell_sensor_fault"]
+    assert "cell 2 is off by 0.1 V" in text
 
 
 async def test_a_saturated_current_exceeds_any_limit() -> None:

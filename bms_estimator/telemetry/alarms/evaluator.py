@@ -30,7 +30,7 @@ from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
 from bms_estimator.telemetry.alarms.state import RaisedAlarm
 from bms_estimator.telemetry.alarms.unwatched import find_unwatched
 from bms_estimator.telemetry.alarms.values import estimated_values, measured_values
-from bms_estimator.telemetry.cells import CellFault, CellFaults
+from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
 
 SENSOR_SUSPECTS = (
     InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
@@ -81,7 +81,7 @@ class AlarmEvaluator:
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
         self._weak_cell_intervals = SampleIntervals(math.inf)  # no interval is a gap, because a weak cell remains weak
         self._cell_intervals = SampleIntervals(CELLS_GAP_S)
-        self._cell_kinds = CellFault(0.0).kinds  # faults that the text of ``cell_sensor_fault`` describes
+        self._described: dict[AlarmName, CellFault] = {}  # fault that the text of an alarm of the cells describes
         self._buffer = SampleBuffer()
         self._faulty_fraction = FaultyFraction()
         self._at_s = 0.0  # time of the last sample
@@ -188,9 +188,10 @@ class AlarmEvaluator:
         for name, fault in values.items():
             state = self._alarms.states.get(name)
             # the text of a raised alarm changes only with the kinds of its faults, because its numbers change often
-            if state is not None and (state.raised is None or (fault.kinds and fault.kinds != self._cell_kinds)):
+            described = self._described.get(name, NO_CELL_FAULT)
+            if state is not None and (state.raised is None or (fault.kinds and fault.kinds != described.kinds)):
                 self._alarms.set_reasons(name, *fault.texts)
-                self._cell_kinds = fault.kinds
+                self._described[name] = fault
             self._alarms.update(name, times_s, observed_s, np.array([fault.value]), arrival_s - faults.at_s)
         self._save_state()
 
