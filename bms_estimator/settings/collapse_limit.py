@@ -8,14 +8,15 @@ import numpy as np
 USE_H_PER_MONTH = 60.0
 """Hours of use in a month, at two hours a day."""
 FALSE_ALARMS = (
-    (0.3, 0.70),
-    (0.6, 0.66),
-    (1.2, 0.58),
-    (2.1, 0.46),
-    (4.3, 0.30),
-    (7.0, 0.18),
-    (13.7, 0.10),
-    (19.2, 0.05),
+    (0.3, 0.66),
+    (1.2, 0.62),
+    (1.5, 0.54),
+    (2.4, 0.50),
+    (4.6, 0.38),
+    (8.5, 0.26),
+    (13.1, 0.18),
+    (22.0, 0.10),
+    (39.1, 0.05),
 )
 """Pairs of the number of false alarms in 100 h of use and the limit: points of the measured curve of all discharges
 (``make collapse``, docs/theory/collapse.md)."""
