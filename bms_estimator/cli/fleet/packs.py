@@ -73,7 +73,7 @@ def remove(
     creds: Creds = None,
     ca: Ca = None,
     erase: Annotated[
-        bool, typer.Option("--erase", help="also erase their blocks, states and hourly summaries from the server")
+        bool, typer.Option("--erase", help="also erase their blocks, dead letters, states and hourly summaries")
     ] = False,
     folder: Annotated[
         Path | None,
@@ -224,8 +224,8 @@ async def _erase_from_server(packs: list[str], address: ServerAddress) -> "dict[
 def _print_erasures(erasures: "dict[str, Erasure]") -> None:
     for pack, erasure in erasures.items():
         typer.echo(
-            f"{pack}: {erasure.blocks} blocks, {erasure.hours} hourly summaries and the state in {erasure.checkpoints} "
-            "checkpoints erased"
+            f"{pack}: {erasure.blocks} blocks, {erasure.dead_letters} dead letters, {erasure.hours} hourly summaries and "
+            f"the state in {erasure.checkpoints} checkpoints erased"
         )
         for stream, count in erasure.remaining.items():
             if stream != f"KV_{PACKS_BUCKET}":

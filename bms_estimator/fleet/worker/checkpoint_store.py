@@ -136,7 +136,10 @@ class CheckpointStore:
         self._last_sent: dict[int, Pointer] = {}  # by partition; its response may have been lost
 
     async def claim(self, partition: int) -> Claim:
-        """Take over a partition from its present owner, if any.
+        """Take over a partition from its present owner, if any, and remove its objects that the pointer does not name.
+
+        Such objects remain after a write that a worker did not finish, and after a roll-back to a version that does not
+        know daily checkpoints, because such a version leaves them out of the pointer.
 
         Raises:
             FencedError: Another worker has claimed it at the same time.
@@ -146,9 +149,13 @@ class CheckpointStore:
         if stored is None:
             return await self._write_pointer(partition, 0, Pointer())  # revision 0: the key must not exist
         _check_format(stored.pointer)
+        # listed before the claim: later objects may be those of a worker that claims the partition next
+        objects = await self._stored_objects(partition)
         counted = stored.pointer.model_copy(update={"unsaved_claims": stored.pointer.unsaved_claims + 1})
         claim = await self._write_pointer(partition, stored.revision, counted)
-        await self._remove_object(stored.pointer.next)
+        named = {checkpoint.object for checkpoint in claim.pointer.checkpoints}
+        for name in (objects | {stored.pointer.next}) - named:
+            await self._remove_object(name)
         return claim
 
     async def confirm_claim(self, claim: Claim) -> Claim:
@@ -282,9 +289,9 @@ class CheckpointStore:
     async def _remove_oldest_daily(self, claim: Claim) -> None:
         """Remove the older half of the daily checkpoints of a partition, and the unfinished next object."""
         pointer = claim.pointer
+        await self._remove_object(pointer.next)  # first, because the new pointer also needs space
         remaining = pointer.model_copy(update={"daily": pointer.daily[: len(pointer.daily) // 2]})
         await self._write_pointer(claim.partition, claim.revision, remaining)
-        await self._remove_object(pointer.next)
         await self._remove_unreferenced(pointer, remaining)
         log.warning(
             "the server lacks space: daily checkpoints were removed",
@@ -319,7 +326,7 @@ class CheckpointStore:
         Raises:
             FencedError: The stored pointer has another revision.
         """
-        next_object = f"p{partition}-{self._object_names.next().decode()}"
+        next_object = _object_name(partition, self._object_names.next().decode())
         pointer = pointer.model_copy(update={"worker": self.worker, "next": next_object})
         self._last_sent[partition] = pointer
         try:
@@ -356,6 +363,13 @@ class CheckpointStore:
         metadata = json.dumps(info.as_dict()).encode()
         await self._js.publish(_metadata_subject(name), metadata, headers={Header.ROLLUP: MSG_ROLLUP_SUBJECT})
         return size
+
+    async def _stored_objects(self, partition: int) -> set[str]:
+        """Return the names of the objects of a partition, with unfinished ones."""
+        filter_subject = _chunk_subject("*")
+        found = (await self._js.stream_info(_STREAM, subjects_filter=filter_subject)).state.subjects or {}
+        prefix = _chunk_subject(_object_name(partition, ""))
+        return {subject.rpartition(".")[2] for subject in found if subject.startswith(prefix)}
 
     async def _read_object(self, name: str) -> bytes | None:
         """Return the bytes of an object; None if some are missing or the digest differs."""
@@ -412,6 +426,11 @@ class _ChunkReader(io.RawIOBase):
         buffer[:count] = self._rest[:count]
         self._rest = self._rest[count:]
         return count
+
+
+def _object_name(partition: int, unique_id: str) -> str:
+    """Return the name of a checkpoint in the object store."""
+    return f"p{partition}-{unique_id}"
 
 
 def _chunk_subject(name: str) -> str:

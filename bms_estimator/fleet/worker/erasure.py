@@ -1,4 +1,4 @@
-"""Erasure of packs from the server: blocks, states in checkpoints and in the memory of workers, and hourly rows.
+"""Erasure of packs from the server: blocks, dead letters, states in checkpoints and in the memory of workers, hourly rows.
 
 The erasure claims the partition of a pack as a worker does. The owner is thereby fenced out, drops the partition from its
 memory, and takes it over again from the rewritten checkpoint. The other packs of the partition lose nothing, because their
@@ -20,7 +20,12 @@ from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer, partitions_of
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
-from bms_estimator.fleet.worker.checkpoint_format import CheckpointError, PartitionCheckpoint, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint_format import (
+    CheckpointError,
+    PartitionCheckpoint,
+    UnreadableFormatError,
+    read_checkpoint,
+)
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, FencedError
 from bms_estimator.model.errors import UserError
 
@@ -42,13 +47,15 @@ class Erasure:
     """Numbers of erased items of one pack, and remaining messages.
 
     Attributes:
-        blocks: Number of messages in the stream ``RAW``.
+        blocks: Number of blocks in the stream ``RAW``.
+        dead_letters: Number of messages in the stream ``DEAD``.
         checkpoints: Number of checkpoints that contained the pack.
         hours: Number of messages in the stream ``HOURS``.
         remaining: Numbers of messages with the pack's name in their subject in the other streams of the tenant, by stream.
     """
 
     blocks: int
+    dead_letters: int
     checkpoints: int
     hours: int
     remaining: Mapping[str, int]
@@ -62,32 +69,57 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
         packs: Names of the packs.
 
     Raises:
-        UserError: The server has no streams, or a checkpoint is of another version of this program.
+        UserError: The server has no streams, or the last checkpoint of a partition is of a version that this one cannot
+            read; then nothing is erased.
         StreamError: The server rejects a request.
     """
     partitions = await partitions_of(nc)
     if partitions is None:
         raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
+    store = await _open_checkpoints(nc)
+    numbers = {subjects.partition_of(pack, partitions) for pack in packs}
+    for number in numbers:
+        await _check_readable(store, number)
     listed = packs & (await read_bucket(nc, subjects.PACKS_BUCKET)).keys()
     if listed:
         await remove_keys(nc, subjects.PACKS_BUCKET, listed)
         await asyncio.sleep(TABLE_S)  # otherwise a worker may process a new block with the former settings
     blocks, checkpoints = dict[str, int](), dict[str, int]()
-    for number in {subjects.partition_of(pack, partitions) for pack in packs}:
+    for number in numbers:
         members = {pack for pack in packs if subjects.partition_of(pack, partitions) == number}
         for pack in members:
-            blocks[pack] = await erase_messages(nc, subjects.RAW_STREAM, subjects.stored(number, pack))
-        checkpoints |= await _erase_states(nc, number, members)
+            blocks[pack] = await erase_messages(nc, subjects.RAW_STREAM, subjects.stored_raw(number, pack))
+            await erase_messages(nc, subjects.RAW_STREAM, subjects.stored(number, pack))  # changes of its row
+        checkpoints |= await _erase_states(nc, store, number, members)
+    dead_letters = {pack: await erase_messages(nc, subjects.DEAD_STREAM, subjects.dead(pack)) for pack in packs}
     hours = {pack: await erase_messages(nc, subjects.HOURS_STREAM, subjects.hours(pack)) for pack in packs}
     remaining = await _remaining(nc, packs)
-    return {pack: Erasure(blocks[pack], checkpoints[pack], hours[pack], remaining[pack]) for pack in packs}
+    return {
+        pack: Erasure(blocks[pack], dead_letters[pack], checkpoints[pack], hours[pack], remaining[pack])
+        for pack in packs
+    }
 
 
-async def _erase_states(nc: Client, partition: int, packs: Collection[str]) -> dict[str, int]:
-    """Erase packs from all checkpoints of a partition and from its worker's memory. Return numbers of checkpoints by pack."""
+async def _open_checkpoints(nc: Client) -> CheckpointStore:
     js = nc.jetstream()
     checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
-    store = CheckpointStore(nc, WORKER_NAME, checkpoints, await js.object_store(subjects.STATES_BUCKET))
+    return CheckpointStore(nc, WORKER_NAME, checkpoints, await js.object_store(subjects.STATES_BUCKET))
+
+
+async def _check_readable(store: CheckpointStore, partition: int) -> None:
+    """Check that the last checkpoint of a partition can be rewritten.
+
+    Raises:
+        UserError: It is of a version that this one cannot read.
+    """
+    try:
+        await store.check_format(partition)
+    except UnreadableFormatError as error:
+        raise UserError(f"partition {partition}: {error}, and erase with that version") from None
+
+
+async def _erase_states(nc: Client, store: CheckpointStore, partition: int, packs: Collection[str]) -> dict[str, int]:
+    """Erase packs from all checkpoints of a partition and from its worker's memory. Return numbers of checkpoints by pack."""
     counts = dict.fromkeys(packs, 0)
     for _ in range(MAX_CLAIMS):
         try:
@@ -95,6 +127,8 @@ async def _erase_states(nc: Client, partition: int, packs: Collection[str]) -> d
             break
         except FencedError:
             await asyncio.sleep(RETRY_S)
+        except UnreadableFormatError:  # a worker has written it since the check
+            await _check_readable(store, partition)
     else:
         raise UserError(
             f"partition {partition}: its worker claims it at each attempt; end the workers and repeat the command"
@@ -107,20 +141,22 @@ async def _erase_states(nc: Client, partition: int, packs: Collection[str]) -> d
 
 
 async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: dict[str, int]) -> None:
-    """Rewrite the checkpoints that contain one of the packs of ``counts``, and count them there. Remove damaged ones.
+    """Rewrite the checkpoints that contain one of the packs of ``counts``, and count them there.
+
+    Damaged checkpoints are removed, and earlier ones of a version that this one cannot read.
 
     Raises:
         FencedError: A worker has claimed the partition meanwhile.
-        UserError: A checkpoint is of another version of this program.
+        UnreadableFormatError: The last checkpoint is of a version that this one cannot read.
     """
     claim = await store.claim(partition)
-    damaged = set(claim.pointer.checkpoints)
+    unreadable = set(claim.pointer.checkpoints)
     async for info, data in store.load(claim):
-        damaged.discard(info)
         try:
             checkpoint = read_checkpoint(data)
-        except CheckpointError as error:
-            raise UserError(f"partition {partition}: {error}") from None
+        except CheckpointError:
+            continue
+        unreadable.discard(info)
         by_pack = _fields_by_pack(checkpoint)
         found = {pack for pack in counts if any(pack in part for part in by_pack.values())}
         if found:
@@ -129,7 +165,7 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
             claim = await store.replace(claim, info, rest.chunks(info.format))
         for pack in found:
             counts[pack] += 1
-    for info in damaged:  # its content is unknown
+    for info in unreadable:  # its content is unknown
         claim = await store.replace(claim, info, None)
 
 

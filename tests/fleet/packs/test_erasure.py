@@ -60,7 +60,7 @@ async def test_erased_pack_is_in_no_stream_checkpoint_and_memory_and_the_other_p
                 command = ("fleet", "packs", "remove", "p1", "--erase", "--server", cluster.url)
                 code, out, err = await asyncio.to_thread(run, capsys, *command)
                 assert (code, err) == (0, "")
-                assert out.startswith(f"p1: {BLOCKS - 1} blocks, 1 hourly summaries and the state in ")
+                assert out.startswith(f"p1: {BLOCKS - 1} blocks, 0 dead letters, 1 hourly summaries and the state in ")
                 assert "0 checkpoints" not in out
                 assert "remaining:\n  their names in the table of packs" in out
                 assert await occurrences(nc, "p1") == []
@@ -97,7 +97,9 @@ async def test_pack_without_a_worker_is_erased_and_messages_in_other_streams_are
         command = ("fleet", "packs", "remove", "p1", "--erase", "--server", cluster.url)
         code, out, err = await asyncio.to_thread(run, capsys, *command)
         assert (code, err) == (0, "")
-        assert out.startswith("p1: 1 blocks, 0 hourly summaries and the state in 0 checkpoints erased\n")
+        assert out.startswith(
+            "p1: 1 blocks, 0 dead letters, 0 hourly summaries and the state in 0 checkpoints erased\n"
+        )
         assert "p1: 1 messages remain in the stream REJECTED\n" in out
         await nc.close()
 

@@ -1,0 +1,163 @@
+"""``fleet packs remove --erase`` with checkpoints of several days and formats, dead letters and changes of the table."""
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import nats
+import pytest
+from nats.aio.client import Client
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters
+from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.packs.pack_bucket import read_bucket
+from bms_estimator.fleet.packs.table_change import PackSource, encode_change
+from bms_estimator.fleet.worker import checkpoint_store
+from bms_estimator.fleet.worker.checkpoint_format import FORMAT, PartitionCheckpoint, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim
+from tests.command_line import run
+from tests.fleet.nats_cluster import NatsCluster, running
+from tests.fleet.workers import PACK_ROW, block, load_packs, send
+
+DAY_S = 86_400.0
+STATES_STREAM = f"OBJ_{subjects.STATES_BUCKET}"
+
+
+class Clock:
+    """Wall clock of the checkpoints."""
+
+    now_s = 1.79e9
+
+    def time(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(checkpoint_store, "time", clock)
+    return clock
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
+    with running(tmp_path, partitions=1) as cluster:
+        yield cluster
+
+
+@pytest.fixture
+async def nc(cluster: NatsCluster) -> AsyncIterator[Client]:
+    async with await nats.connect(cluster.url) as nc:
+        await make_streams(nc, partitions=1)
+        yield nc
+
+
+@pytest.fixture
+async def store(nc: Client) -> CheckpointStore:
+    js = nc.jetstream()
+    states = await js.object_store(subjects.STATES_BUCKET)
+    return CheckpointStore(nc, "w", await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
+
+
+async def erase(capsys: pytest.CaptureFixture[str], cluster: NatsCluster, pack: str) -> tuple[int, str, str]:
+    """Erase a pack with the command. Return exit code, stdout and stderr."""
+    command = ("fleet", "packs", "remove", pack, "--erase", "--server", cluster.url)
+    return await asyncio.to_thread(run, capsys, *command)
+
+
+async def write(store: CheckpointStore, claim: Claim, file_format: int, sequence: int = 1) -> Claim:
+    """Write a checkpoint of two packs."""
+    source = PackSource(PACK_ROW.decode(), None)
+    checkpoint = PartitionCheckpoint(
+        0, sequence, packs={"p1": b"first", "p2": b"second"}, in_force={"p1": source, "p2": source}
+    )
+    chunks = checkpoint.chunks(min(file_format, FORMAT))
+    return await store.write(claim, sequence, chunks, file_format=file_format)
+
+
+async def stored_objects(nc: Client) -> set[str]:
+    """Return the names of all objects with stored chunks or metadata."""
+    objects = await (await nc.jetstream().object_store(subjects.STATES_BUCKET)).list(ignore_deletes=True)
+    found = (await nc.jetstream().stream_info(STATES_STREAM, subjects_filter=">")).state.subjects or {}
+    return {str(each.name) for each in objects} | {name.rpartition(".")[2] for name in found if ".C." in name}
+
+
+async def test_pack_is_erased_from_daily_checkpoints_of_both_formats_and_the_other_pack_stays(
+    nc, cluster, store, clock, capsys
+) -> None:
+    claim = await store.claim(0)
+    for file_format in (FORMAT - 1, FORMAT - 1, FORMAT, FORMAT):
+        clock.now_s += DAY_S
+        claim = await write(store, claim, file_format)
+    code, out, err = await erase(capsys, cluster, "p1")
+    assert (code, err) == (0, "")
+    assert "the state in 4 checkpoints erased" in out
+    claim = await store.claim(0)
+    loaded = [(info.format, read_checkpoint(data)) async for info, data in store.load(claim)]
+    assert [file_format for file_format, _ in loaded] == [FORMAT, FORMAT, FORMAT - 1, FORMAT - 1]
+    assert [dict(each.packs) for _, each in loaded] == 4 * [{"p2": b"second"}]
+    assert [list(each.in_force) for _, each in loaded] == [["p2"], ["p2"], [], []]
+
+
+async def test_dead_letters_and_table_changes_of_the_pack_are_erased(nc, cluster, capsys) -> None:
+    for pack in ("p1", "p2"):
+        letter = DeadLetter(pack, 1, "damaged", "w", b"a damaged block")
+        await nc.jetstream().publish(letter.subject, letter.data, headers=letter.headers())
+        await nc.jetstream().publish(subjects.table_change(pack), encode_change(None))
+    code, out, err = await erase(capsys, cluster, "p1")
+    assert (code, err) == (0, "")
+    assert "1 dead letters" in out
+    assert "remain in the stream" not in out
+    assert [letter.pack for letter in await read_dead_letters(nc)] == ["p2"]
+    remaining = (await nc.jetstream().stream_info(subjects.RAW_STREAM, subjects_filter=">")).state.subjects
+    assert list(remaining or {}) == [subjects.stored(0, "p2").replace("*", "table")]
+
+
+async def test_nothing_is_erased_while_the_last_checkpoint_is_of_a_later_version(nc, cluster, store, capsys) -> None:
+    await load_packs(nc, ["p1"])
+    await send(nc, "p1", block("p1", 1))
+    claim = await write(store, await store.claim(0), FORMAT + 1)
+    code, out, err = await erase(capsys, cluster, "p1")
+    assert (code, out) == (2, "")
+    assert f"partition 0: the checkpoint is of format {FORMAT + 1}" in err
+    assert await store.confirm_claim(claim) == claim
+    assert "p1" in await read_bucket(nc, subjects.PACKS_BUCKET)
+    assert (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.messages == 1
+
+
+async def test_earlier_checkpoints_of_a_later_version_are_removed_because_they_cannot_be_rewritten(
+    nc, cluster, store, clock, capsys
+) -> None:
+    claim = await store.claim(0)
+    data = bytearray(b"".join(PartitionCheckpoint(0, 1, packs={"p1": b"first"}).chunks()))
+    data[8] = FORMAT + 1  # the format's offset in a checkpoint
+    claim = await store.write(claim, 1, iter([bytes(data)]), file_format=FORMAT + 1)
+    clock.now_s += DAY_S
+    claim = await write(store, claim, FORMAT, sequence=2)
+    code, _, err = await erase(capsys, cluster, "p1")
+    assert (code, err) == (0, "")
+    claim = await store.claim(0)
+    assert [info.sequence async for info, _ in store.load(claim)] == [2]
+    assert await stored_objects(nc) == {info.object for info in claim.pointer.checkpoints}
+
+
+async def forget_daily_checkpoints(store: CheckpointStore, nc: Client, claim: Claim) -> None:
+    """Replace the pointer as a worker of a version without daily checkpoints does."""
+    bucket = await nc.jetstream().key_value(subjects.CHECKPOINTS_BUCKET)
+    await bucket.put("p0", claim.pointer.model_dump_json(exclude={"daily", "unsaved_claims"}).encode())
+
+
+async def test_daily_checkpoints_that_a_rolled_back_worker_forgot_are_removed_by_the_next_claim(
+    nc, store, clock
+) -> None:
+    claim = await store.claim(0)
+    for _ in range(4):
+        clock.now_s += DAY_S
+        claim = await write(store, claim, FORMAT)
+    other = await write(store, await store.claim(10), FORMAT)  # another partition, whose number begins alike
+    await forget_daily_checkpoints(store, nc, claim)
+    claim = await store.claim(0)
+    expected = {info.object for info in (*claim.pointer.checkpoints, *other.pointer.checkpoints)}
+    assert await stored_objects(nc) == expected
+    assert len(claim.pointer.checkpoints) == 2
