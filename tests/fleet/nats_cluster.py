@@ -30,6 +30,7 @@ class NatsCluster:
         partitions: Number of partitions of the fleet.
         accounts: Accounts of the tenants; None: clients need no credentials.
         tls: Certificates of the server; None: no TLS.
+        disk_bytes: Disk space of each node [bytes].
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class NatsCluster:
         partitions: int = 64,
         accounts: Accounts | None = None,
         tls: Tls | None = None,
+        disk_bytes: int = 100 << 30,
     ) -> None:
         routes = tuple(f"127.0.0.1:{free_port()}" for _ in range(nodes))
         self._folder = folder
@@ -54,7 +56,7 @@ class NatsCluster:
                 tls=tls,
                 accounts=accounts,
                 partitions=partitions,
-                disk_bytes=100 << 30,
+                disk_bytes=disk_bytes,
                 memory_bytes=1 << 30,
             )
             for i in range(nodes)

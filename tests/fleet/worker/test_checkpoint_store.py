@@ -24,6 +24,7 @@ from bms_estimator.fleet.worker.checkpoint_format import (
 from bms_estimator.fleet.worker.checkpoint_store import (
     CHECKPOINTS_PER_PARTITION,
     DAILY_CHECKPOINTS,
+    MESSAGE_BYTES,
     CheckpointStore,
     Claim,
     FencedError,
@@ -180,6 +181,39 @@ async def test_daily_checkpoints_make_room_for_the_last_one_on_a_full_server(tmp
         claim = await store.write(claim, 2, iter([b"2" * CHECKPOINT_BYTES]), file_format=FORMAT)
         assert [each[:1] for each in await _load(store, claim)] == [b"2", b"1", b"1", b"1"]
         await nc.close()
+
+
+async def test_daily_checkpoints_make_room_although_the_last_attempts_filled_the_disk_limit_of_the_server(
+    tmp_path, clock
+):
+    with running(tmp_path, partitions=1, disk_bytes=24 << 20) as cluster:
+        nc = await nats.connect(cluster.url)
+        await make_streams(nc, partitions=1, raw_bytes=1 << 20)
+        store = await _checkpoint_store(nc, "a")
+        claim = await store.claim(0)
+        for _ in range(6):
+            clock.now_s += 86_400.0
+            claim = await store.write(claim, 1, iter([b"1" * CHECKPOINT_BYTES]), file_format=FORMAT)
+        await nc.jetstream().add_stream(name="OTHER", subjects=["other"], discard="new")
+        for size in (MESSAGE_BYTES, MESSAGE_BYTES // 8, MESSAGE_BYTES // 64, 256, 1):
+            with pytest.raises(APIError):
+                while True:
+                    await nc.jetstream().publish("other", bytes(size))
+        await nc.jetstream().purge_stream("OTHER", keep=(await _messages(nc, "OTHER")) - 2)
+        written = None
+        for _ in range(4):
+            try:
+                written = await store.write(claim, 2, iter([b"2" * CHECKPOINT_BYTES]), file_format=FORMAT)
+            except APIError:
+                claim = await store.confirm_claim(claim)
+        assert written is not None
+        assert (await _load(store, written))[0][:1] == b"2"
+        await nc.close()
+
+
+async def _messages(nc: Client, stream: str) -> int:
+    """Return the number of messages in a stream."""
+    return (await nc.jetstream().stream_info(stream)).state.messages
 
 
 async def test_claim_of_a_checkpoint_of_an_unreadable_format_fails_and_changes_nothing(nc):
