@@ -74,7 +74,7 @@ class PartitionLease:
         claim: Claim of this worker; None while it has none.
         waiting_summaries: Summaries that the server has not acknowledged yet: (message id, pack, row).
         waiting_dead_letters: Dead letters that the server has not acknowledged yet.
-        dead_packs: Reason of the last dead letter of each pack, since this lease began.
+        dead_packs: Reason of the last dead letter of each pack, since the claim.
         lag_s: Largest lag since it was last reset to None [s].
         blocks, samples: Number of blocks and samples processed by this lease.
         faults: Number of blocks skipped because of an internal error.
@@ -466,6 +466,9 @@ class PartitionLease:
             self._record_result(result)
             if result.dead:
                 self._record_dead_letter(DeadLetter(pack, sequence, result.dead, self._checkpoints.worker, data))
+            if is_change(data):  # the table may have changed again since this change was sent
+                self._changed_packs.add(pack)
+                self._wake_up_changes.set()
             await self._guard.end_block(sequence)
         if is_lethal:
             await self.save()  # the next owner must not meet the block again
@@ -518,6 +521,7 @@ class PartitionLease:
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
         self.partition = self.claim = None
         self._pin, self._is_gapless = 0, False
+        self.dead_packs.clear()  # an erasure claims the partition to remove its packs from the memory, too
         self.waiting_dead_letters.clear()
         self.waiting_summaries.clear()  # the owner of the partition computes them from the last checkpoint on
 

@@ -82,6 +82,46 @@ async def test_erased_pack_is_in_no_stream_checkpoint_and_memory_and_the_other_p
         assert files_with(tmp_path, subjects.hours("p1")) == []
 
 
+@pytest.mark.parametrize("has_worker", [True, False], ids=["with a worker", "without a worker"])
+async def test_pack_that_is_added_again_after_its_erasure_begins_anew(tmp_path, capsys, has_worker):
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=1)
+        await load_packs(nc, ["p1", "p2"])
+        worker = Process(tmp_path, cluster.url, "w1")
+        try:
+            async with Heartbeats(nc) as heartbeats:
+                await send(nc, "p1", block("p1", 1))
+                await send(nc, "p1", b"not a block")
+                await send(nc, "p2", block("p2", 1))
+                await heartbeats.until(lambda last: "w1" in last and last["w1"].packs == 2)
+                await heartbeats.until(lambda last: list(last["w1"].dead_packs) == ["p1"])
+                if not has_worker:
+                    assert await worker.end() == 0
+                command = ("fleet", "packs", "remove", "p1", "--erase", "--server", cluster.url)
+                code, out, err = await asyncio.to_thread(run, capsys, *command)
+                assert (code, err) == (0, "")
+                assert out.startswith("p1: 2 blocks, 1 dead letters,")
+                if not has_worker:
+                    worker = Process(tmp_path, cluster.url, "w1")
+                heartbeats.clear()
+                await heartbeats.until(lambda last: "w1" in last and last["w1"].packs == 1)
+                assert "p1" not in heartbeats.last["w1"].model_dump_json()
+                registry = await load_packs(nc, ["p1"])
+                for number in range(1, BLOCKS):  # the edge sends its stored blocks again, with the former numbers
+                    await nc.jetstream().publish(subjects.raw("p1"), block("p1", number))
+                await heartbeats.until(lambda last: last["w1"].packs == 2)
+                await heartbeats.until(lambda last: last["w1"].counters.get("blocks", 0) >= BLOCKS)
+            assert await worker.end() == 0
+        finally:
+            worker.kill()
+        state = (await end_states(nc, registry, 1))[0].state("p1")
+        assert state["estimator"].tobytes() == estimated(registry, "p1", BLOCKS - 1)
+        hours = (await nc.jetstream().stream_info(subjects.HOURS_STREAM, subjects_filter=subjects.hours("p1"))).state
+        assert hours.subjects == {subjects.hours("p1"): 1}
+        await nc.close()
+
+
 def files_with(folder, text):
     """Return the files of messages on the server's disk that contain ``text``."""
     return [file for file in folder.rglob("*.blk") if text.encode() in file.read_bytes()]

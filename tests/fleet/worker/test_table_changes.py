@@ -164,6 +164,29 @@ async def test_change_that_an_edge_sends_as_a_block_has_no_effect(tmp_path: Path
         await nc.close()
 
 
+async def test_change_that_the_table_has_withdrawn_before_it_was_applied_is_followed_by_the_present_row(
+    tmp_path: Path,
+) -> None:
+    with running(tmp_path, partitions=1) as cluster:
+        nc = await nats.connect(cluster.url)
+        await make_streams(nc, partitions=1)
+        await load_packs(nc, ["p1"])
+        stop = asyncio.Event()
+        async with Heartbeats(nc) as heartbeats:
+            worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
+            await send(nc, "p1", block("p1", 1))
+            await heartbeats.until(lambda last: "w" in last and last["w"].blocks == 1)
+            # as sent by a worker while the table had this row, and then deferred or read by the next owner
+            change = encode_change(PackSource(CHANGED_ROW.decode(), None))
+            await nc.jetstream().publish(subjects.table_change("p1"), change)
+            await heartbeats.until(lambda last: last["w"].counters.get("table_changes") == 2)
+            stop.set()
+            await worker_task
+        restored = (await end_states(nc, registry_of(PACK_ROW), 1))[0]
+        assert restored.in_force == {"p1": PackSource(PACK_ROW.decode(), None)}
+        await nc.close()
+
+
 async def message_of(nc: Client, sequence: int) -> bytes:
     """Return a message of the stream of blocks."""
     return (await nc.jetstream().get_msg(subjects.RAW_STREAM, sequence)).data or b""
