@@ -1,4 +1,4 @@
-"""``bms-estimator fleet status``: table of the workers, their versions and the partitions that they refuse."""
+"""``bms-estimator fleet status``: table of the workers and their versions, refused partitions, dead letters, wrong clocks."""
 
 import asyncio
 from typing import TYPE_CHECKING, Annotated
@@ -27,11 +27,11 @@ def status(
         ),
     ] = None,
 ) -> None:
-    """List the workers with their versions, and the partitions that they refuse."""
+    """List the workers with their versions, the partitions that they refuse, and packs with dead letters or a wrong clock."""
     heartbeats = asyncio.run(_receive_heartbeats((server, creds, ca)))
     print_table(COLUMNS, [_row(each) for each in heartbeats])
     for heartbeat in heartbeats:
-        for line in refusals(heartbeat):
+        for line in (*_refusals(heartbeat), *_dead_letters(heartbeat), *_clock_errors(heartbeat)):
             typer.echo(line)
     if not heartbeats:
         typer.echo("no worker")
@@ -39,13 +39,35 @@ def status(
         _check_block_version(heartbeats, blocks)
 
 
-def refusals(heartbeat: "Heartbeat") -> list[str]:
+def _refusals(heartbeat: "Heartbeat") -> list[str]:
     """Return a line for each partition that a worker refuses."""
     return [
         f"partition {each.partition}: {heartbeat.id} refuses it, because its checkpoint is of format "
         f"{each.format or 'unknown'}: start a worker of the version that wrote it"
         for each in heartbeat.refused
     ]
+
+
+def _dead_letters(heartbeat: "Heartbeat") -> list[str]:
+    """Return a line for each listed pack with dead letters."""
+    return [
+        f"{pack}: dead letter: {reason}; `fleet dead-letters list` lists all"
+        for pack, reason in sorted(heartbeat.dead_packs.items())
+    ]
+
+
+def _clock_errors(heartbeat: "Heartbeat") -> list[str]:
+    """Return a line for each listed pack whose edge's clock is wrong, the largest error first."""
+    from bms_estimator.fleet.hour_row import HOUR_S  # noqa: PLC0415 - loading takes time
+
+    largest = sorted(heartbeat.clock_errors.items(), key=lambda each: -abs(each[1]))
+    lines = [
+        f"{pack}: the clock of its edge is {abs(error_s) / HOUR_S:,.1f} h {'ahead' if error_s > 0.0 else 'behind'}: its hours "
+        "are quarantined; `fleet ask clocks` lists them"
+        for pack, error_s in largest
+    ]
+    more = heartbeat.clock_error_count - len(largest)
+    return [*lines, f"{heartbeat.id}: {more} more packs with a wrong clock"] if more > 0 else lines
 
 
 def _row(heartbeat: "Heartbeat") -> tuple[object, ...]:
@@ -72,16 +94,25 @@ def _check_block_version(heartbeats: "list[Heartbeat]", version: int) -> None:
 
 
 async def _receive_heartbeats(address: ServerAddress) -> "list[Heartbeat]":
-    """Return the newest heartbeat of each worker, sorted by name, after two intervals."""
+    """Return the newest heartbeat of each worker, sorted by name, after two intervals. Report unreadable ones."""
+    from pydantic import ValidationError  # noqa: PLC0415 - loading takes time
+
     from bms_estimator.edge import subjects  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.heartbeat import HEARTBEAT_S, Heartbeat  # noqa: PLC0415
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
 
-    newest = dict[str, Heartbeat]()
+    newest, unreadable = dict[str, Heartbeat](), set[str]()
     async with connected(*address) as nc:
         subscription = await nc.subscribe(subjects.worker())
         await asyncio.sleep(2.0 * HEARTBEAT_S)
         while subscription.pending_msgs:
-            heartbeat = Heartbeat.model_validate_json((await subscription.next_msg()).data)
-            newest[heartbeat.id] = heartbeat
+            message = await subscription.next_msg()
+            try:
+                heartbeat = Heartbeat.model_validate_json(message.data)
+            except ValidationError:
+                unreadable.add(message.subject)
+            else:
+                newest[heartbeat.id] = heartbeat
+    for subject in sorted(unreadable):
+        typer.echo(f"warning: the heartbeat on {subject} is unreadable: is this worker of a later version?", err=True)
     return [newest[name] for name in sorted(newest) if not newest[name].leaving]

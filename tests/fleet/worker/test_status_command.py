@@ -1,0 +1,103 @@
+"""``fleet status`` with heartbeats of workers of several versions."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import nats
+import pytest
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.process.tasks import end
+from tests.command_line import run
+from tests.fleet.nats_cluster import NatsCluster, running
+
+HOUR_S = 3600.0
+OLD_HEARTBEAT = {
+    "id": "old",
+    "started_s": 1.79e9,
+    "leaving": False,
+    "partitions": [0, 1],
+    "packs": 7,
+    "blocks": 70,
+    "samples": 4200,
+    "faults": 0,
+    "lag_s": None,
+    "counters": {"packs": 7},
+    "unknown_count": 0,
+    "unknown": [],
+    "waiting": 0,
+    "hours_waiting": 0,
+    "checkpoint_age_s": 12.5,
+    "cpu_s": 3.0,
+    "rss_mib": 200.0,
+    "trouble": "",
+}
+"""Heartbeat of a version without formats, refusals, dead letters and clock errors."""
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsCluster]:
+    with running(tmp_path_factory.mktemp("cluster"), partitions=2) as cluster:
+        yield cluster
+
+
+@asynccontextmanager
+async def sending(url: str, *heartbeats: bytes) -> AsyncIterator[None]:
+    """Publish heartbeats ten times a second."""
+
+    async def send(nc: nats.NATS) -> None:
+        while True:
+            for number, data in enumerate(heartbeats):
+                await nc.publish(subjects.worker(f"w{number}"), data)
+            await asyncio.sleep(0.1)
+
+    async with await nats.connect(url) as nc:
+        task = asyncio.create_task(send(nc))
+        yield
+        await end(task)
+
+
+async def status(capsys: pytest.CaptureFixture[str], url: str, *options: object) -> tuple[int, str, str]:
+    return await asyncio.to_thread(run, capsys, "fleet", "status", "--server", url, *options)
+
+
+async def test_worker_of_a_version_without_formats_is_listed_as_one_of_the_first_formats(cluster, capsys) -> None:
+    new = Heartbeat(id="new", started_s=1.79e9, version="9.9", checkpoint_format=2, block_version=2).model_dump_json()
+    async with sending(cluster.url, json.dumps(OLD_HEARTBEAT).encode(), new.encode()):
+        code, out, err = await status(capsys, cluster.url, "--blocks", 2)
+    assert (code, err) == (1, "")
+    assert [line.split() for line in out.splitlines() if line.strip().startswith(("new", "old"))] == [
+        ["new", "9.9", "0", "0", "1,", "2", "2"],
+        ["old", "2", "7", "1", "1"],
+    ]
+    assert "blocks of version 2 are unreadable for old" in out
+
+
+async def test_dead_letters_and_clock_errors_are_listed_with_their_packs(cluster, capsys, tmp_path: Path) -> None:
+    heartbeat = Heartbeat(
+        id="w",
+        started_s=1.79e9,
+        dead_packs={"p1": "version 3"},
+        clock_error_count=3,
+        clock_errors={"p2": 2.0 * HOUR_S, "p3": -9000.0 * HOUR_S},
+    )
+    async with sending(cluster.url, heartbeat.model_dump_json().encode()):
+        code, out, _ = await status(capsys, cluster.url)
+    assert code == 0
+    lines = [line for line in out.splitlines() if line.startswith("p") or "more packs" in line]
+    assert [line.partition(":")[0] for line in lines] == ["p1", "p3", "p2", "w"]
+    assert "dead letter: version 3" in lines[0]
+    assert "is 9,000.0 h behind" in lines[1]
+    assert "is 2.0 h ahead" in lines[2]
+    assert lines[3] == "w: 1 more packs with a wrong clock"
+
+
+async def test_unreadable_heartbeat_is_reported_and_the_others_are_listed(cluster, capsys) -> None:
+    async with sending(cluster.url, b"{}", json.dumps(OLD_HEARTBEAT).encode()):
+        code, out, err = await status(capsys, cluster.url)
+    assert (code, "old" in out) == (0, True)
+    assert err.startswith("warning: the heartbeat on fleet.worker.w0 is unreadable")
