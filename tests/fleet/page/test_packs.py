@@ -11,6 +11,7 @@ from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.fleet.page.workers import FleetWorkers
 from bms_estimator.model.input_faults import InputFault
 from tests.fleet.published_states import HOME, make_packs, state
+from tests.fleet.workers import OLD_HEARTBEAT
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 
@@ -261,3 +262,13 @@ def test_new_connection_clears_workers_but_not_packs():
 def test_type_name_has_cell_layout_and_capacity():
     assert type_name(HOME) == "lfp 16s1p 280 Ah"
     assert type_name("series: must be above 0") == "wrong rows"
+
+
+def test_worker_of_a_version_without_formats_and_dead_letters_is_listed():
+    view = FleetView(2, 0.0)
+    view.receive_worker(json.dumps(OLD_HEARTBEAT).encode(), 0.0)
+    overview = view.overview(0.0, 0.0)
+    (worker,) = overview["workers"]
+    assert (worker["id"], worker["checkpoint_formats"], worker["refused"]) == ("old", [1, 1], [])
+    assert (overview["holders"], overview["refused"], overview["damaged"]) == ([0, 0], [], 0)
+    assert (overview["concerns"]["dead"]["count"], overview["concerns"]["clock"]["count"]) == (0, 0)

@@ -53,6 +53,21 @@ def test_clock_within_the_limits_and_late_delivery_are_no_error(ahead_s):
     assert row.received_hour == int(STORE_S + 4000.0 - ahead_s) // 3600
 
 
+@pytest.mark.parametrize("lethal", [1, 2], ids=["first block", "later block"])
+def test_lethal_block_of_an_edge_with_a_wrong_clock_is_skipped_and_the_hour_is_quarantined(lethal):
+    partition, ahead_s = Partition(0, table), YEAR_2040_S - STORE_S
+    hours, dead = [], []
+    for number, last_s in enumerate((2000.0, 3000.0, 3500.0, 4000.0), 1):
+        data, received_s = one_block(samples_until(last_s), number), round(STORE_S + last_s - ahead_s)
+        result = partition.take("a", data, number, received_s, is_lethal=number == lethal)
+        hours += result.hours
+        dead += [number] if result.dead else []
+    ((_, row),) = hours
+    assert dead == [lethal]
+    assert Hour.model_validate_json(row).clock_error_s == ahead_s
+    assert partition.clock_errors == {"a": ahead_s}
+
+
 @pytest.mark.parametrize("ahead_s", [MAX_AHEAD_S + 1.0, -MAX_BEHIND_S - 1.0], ids=["ahead", "behind"])
 def test_error_beyond_a_limit_is_in_the_row_and_names_the_pack(ahead_s):
     partition = Partition(0, table)

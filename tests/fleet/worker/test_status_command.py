@@ -14,29 +14,9 @@ from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.process.tasks import end
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, running
+from tests.fleet.workers import OLD_HEARTBEAT
 
 HOUR_S = 3600.0
-OLD_HEARTBEAT = {
-    "id": "old",
-    "started_s": 1.79e9,
-    "leaving": False,
-    "partitions": [0, 1],
-    "packs": 7,
-    "blocks": 70,
-    "samples": 4200,
-    "faults": 0,
-    "lag_s": None,
-    "counters": {"packs": 7},
-    "unknown_count": 0,
-    "unknown": [],
-    "waiting": 0,
-    "hours_waiting": 0,
-    "checkpoint_age_s": 12.5,
-    "cpu_s": 3.0,
-    "rss_mib": 200.0,
-    "trouble": "",
-}
-"""Heartbeat of a version without formats, refusals, dead letters and clock errors."""
 
 
 @pytest.fixture(scope="module")

@@ -93,6 +93,22 @@ def test_changed_row_takes_effect_at_its_message_and_not_before(messages: list[b
     assert partition.table_change("p1") is None  # it is in force
 
 
+@pytest.mark.parametrize("saved_after", [1, 2, 3])
+def test_change_between_deferred_blocks_takes_effect_between_them(
+    messages: list[bytes], expected: bytes, saved_after: int
+) -> None:
+    partition = partition_of(registry_of(PACK_ROW))
+    for sequence in range(1, len(messages) + 1):
+        partition.defer("p1", sequence)
+    for sequence, message in enumerate(messages[:saved_after], 1):
+        partition.take_deferred("p1", message, sequence)
+    successor = partition_of(registry_of(CHANGED_ROW), b"".join(partition.snapshot().chunks()))
+    for sequence, message in enumerate(messages[saved_after:], saved_after + 1):
+        successor.take_deferred("p1", message, sequence)
+    assert estimator_state(successor) == expected
+    assert not successor.deferred
+
+
 def test_removed_pack_is_unknown_from_its_message_on() -> None:
     registry = registry_of(PACK_ROW)
     partition = partition_of(registry)
