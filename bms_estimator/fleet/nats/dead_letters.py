@@ -32,6 +32,8 @@ class DeadLetter(NamedTuple):
     """Bytes of the block."""
     time: str = ""
     """Time of storage (RFC 3339), set by the server."""
+    stored_sequence: int = 0
+    """Sequence number of the dead letter in the stream ``DEAD``, set by the server."""
 
     @property
     def subject(self) -> str:
@@ -54,6 +56,7 @@ class DeadLetter(NamedTuple):
             worker=headers.get(WORKER_HEADER, ""),
             data=message.data,
             time=headers.get(TIME_HEADER, ""),
+            stored_sequence=message.sequence,
         )
 
 
@@ -72,9 +75,11 @@ async def read_dead_letters(nc: Client) -> list[DeadLetter]:
 async def replay_letter(nc: Client, letter: DeadLetter) -> None:
     """Send the block of a dead letter to the workers again, and remove the dead letter.
 
+    A dead letter that a worker stores of the block meanwhile remains.
+
     Raises:
         nats.errors.Error: The server does not accept the block; the dead letter remains stored.
     """
     js = nc.jetstream()
     await js.publish(subjects.raw(letter.pack), letter.data)
-    await js.purge_stream(subjects.DEAD_STREAM, subject=letter.subject)
+    await js.purge_stream(subjects.DEAD_STREAM, subject=letter.subject, seq=letter.stored_sequence + 1)

@@ -12,7 +12,7 @@ from nats.aio.client import Client
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator
-from bms_estimator.fleet.nats.dead_letters import read_dead_letters
+from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters, replay_letter
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.partition import LETHAL
 from tests.command_line import PROGRAM, running_program
@@ -118,3 +118,15 @@ async def test_blocks_of_a_later_version_are_processed_by_a_replay_after_the_upg
     assert await read_dead_letters(nc) == []
     partition = (await end_states(nc, registry, 1))[0]
     assert partition.state("p1")["estimator"].tobytes() == estimated(registry, "p1", 2)
+
+
+async def test_replay_keeps_the_dead_letter_that_a_worker_stores_of_the_replayed_block(nc) -> None:
+    letter = DeadLetter("p1", 1, "damaged", "w", b"a damaged block")
+    await nc.jetstream().publish(letter.subject, letter.data, headers=letter.headers())
+    (stored,) = await read_dead_letters(nc)
+    again = letter._replace(sequence=2)
+    await nc.jetstream().publish(again.subject, again.data, headers=again.headers())
+    await replay_letter(nc, stored)
+    assert [each.sequence for each in await read_dead_letters(nc)] == [2]
+    await replay_letter(nc, (await read_dead_letters(nc))[0])
+    assert await read_dead_letters(nc) == []
