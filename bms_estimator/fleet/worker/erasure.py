@@ -26,7 +26,7 @@ from bms_estimator.fleet.worker.checkpoint_format import (
     UnreadableFormatError,
     read_checkpoint,
 )
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, FencedError
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, FencedError
 from bms_estimator.model.errors import UserError
 
 WORKER_NAME = "packs-remove"
@@ -115,7 +115,11 @@ async def _check_readable(store: CheckpointStore, partition: int) -> None:
     try:
         await store.check_format(partition)
     except UnreadableFormatError as error:
-        raise UserError(f"partition {partition}: {error}, and erase with that version") from None
+        raise _later_version_error(partition, error) from None
+
+
+def _later_version_error(partition: int, error: UnreadableFormatError) -> UserError:
+    return UserError(f"partition {partition}: {error}, and erase with that version")
 
 
 async def _erase_states(nc: Client, store: CheckpointStore, partition: int, packs: Collection[str]) -> dict[str, int]:
@@ -127,8 +131,8 @@ async def _erase_states(nc: Client, store: CheckpointStore, partition: int, pack
             break
         except FencedError:
             await asyncio.sleep(RETRY_S)
-        except UnreadableFormatError:  # a worker has written it since the check
-            await _check_readable(store, partition)
+        except UnreadableFormatError as error:
+            raise _later_version_error(partition, error) from None
     else:
         raise UserError(
             f"partition {partition}: its worker claims it at each attempt; end the workers and repeat the command"
@@ -143,20 +147,25 @@ async def _erase_states(nc: Client, store: CheckpointStore, partition: int, pack
 async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: dict[str, int]) -> None:
     """Rewrite the checkpoints that contain one of the packs of ``counts``, and count them there.
 
-    Damaged checkpoints are removed, and earlier ones of a version that this one cannot read.
+    Damaged checkpoints are removed, and those of a version that this one cannot read, except the newest intact one.
 
     Raises:
         FencedError: A worker has claimed the partition meanwhile.
-        UnreadableFormatError: The last checkpoint is of a version that this one cannot read.
+        UnreadableFormatError: The newest intact checkpoint is of a version that this one cannot read.
     """
     claim = await store.claim(partition)
-    unreadable = set(claim.pointer.checkpoints)
+    checkpoints = claim.pointer.checkpoints
+    readable = set[CheckpointInfo]()
     async for info, data in store.load(claim):
         try:
             checkpoint = read_checkpoint(data)
+        except UnreadableFormatError:
+            if not readable:  # its removal would lose what was learned
+                raise
+            continue
         except CheckpointError:
             continue
-        unreadable.discard(info)
+        readable.add(info)
         by_pack = _fields_by_pack(checkpoint)
         found = {pack for pack in counts if any(pack in part for part in by_pack.values())}
         if found:
@@ -165,8 +174,9 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
             claim = await store.replace(claim, info, rest.chunks(info.format))
         for pack in found:
             counts[pack] += 1
-    for info in unreadable:  # its content is unknown
-        claim = await store.replace(claim, info, None)
+    for info in checkpoints:
+        if info not in readable:  # its content is unknown
+            claim = await store.replace(claim, info, None)
 
 
 def _fields_by_pack(checkpoint: PartitionCheckpoint) -> dict[str, Any]:

@@ -126,13 +126,29 @@ async def test_nothing_is_erased_while_the_last_checkpoint_is_of_a_later_version
     assert (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.messages == 1
 
 
+def later_checkpoint() -> bytes:
+    """Return a checkpoint of a later version."""
+    data = bytearray(b"".join(PartitionCheckpoint(0, 1, packs={"p1": b"first"}).chunks()))
+    data[8] = FORMAT + 1  # the format's offset in a checkpoint
+    return bytes(data)
+
+
+async def test_newest_intact_checkpoint_of_a_later_version_stays_although_its_pointer_names_a_readable_format(
+    nc, cluster, store, capsys
+) -> None:
+    claim = await store.write(await store.claim(0), 1, iter([later_checkpoint()]), file_format=FORMAT)
+    code, out, err = await erase(capsys, cluster, "p1")
+    assert (code, out) == (2, "")
+    assert f"partition 0: the checkpoint is of format {FORMAT + 1}" in err
+    assert [data async for _, data in store.load(await store.claim(0))] == [later_checkpoint()]
+    assert claim.pointer.kept == (await store.claim(0)).pointer.kept
+
+
 async def test_earlier_checkpoints_of_a_later_version_are_removed_because_they_cannot_be_rewritten(
     nc, cluster, store, clock, capsys
 ) -> None:
     claim = await store.claim(0)
-    data = bytearray(b"".join(PartitionCheckpoint(0, 1, packs={"p1": b"first"}).chunks()))
-    data[8] = FORMAT + 1  # the format's offset in a checkpoint
-    claim = await store.write(claim, 1, iter([bytes(data)]), file_format=FORMAT + 1)
+    claim = await store.write(claim, 1, iter([later_checkpoint()]), file_format=FORMAT + 1)
     clock.now_s += DAY_S
     claim = await write(store, claim, FORMAT, sequence=2)
     code, _, err = await erase(capsys, cluster, "p1")
