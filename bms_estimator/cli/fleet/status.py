@@ -1,6 +1,7 @@
 """``bms-estimator fleet status``: table of the workers and their versions, refused partitions, dead letters, wrong clocks."""
 
 import asyncio
+from datetime import timedelta
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -58,12 +59,10 @@ def _dead_letters(heartbeat: "Heartbeat") -> list[str]:
 
 def _clock_errors(heartbeat: "Heartbeat") -> list[str]:
     """Return a line for each listed pack whose edge's clock is wrong, the largest error first."""
-    from bms_estimator.fleet.hour_row import HOUR_S  # noqa: PLC0415 - loading takes time
-
     largest = sorted(heartbeat.clock_errors.items(), key=lambda each: -abs(each[1]))
     lines = [
-        f"{pack}: the clock of its edge is {abs(error_s) / HOUR_S:,.1f} h {'ahead' if error_s > 0.0 else 'behind'}: its hours "
-        "are quarantined; `fleet ask clocks` lists them"
+        f"{pack}: the clock of its edge is {timedelta(seconds=round(abs(error_s)))} "
+        f"{'ahead' if error_s > 0.0 else 'behind'}: its hours are quarantined; `fleet ask clocks` lists them"
         for pack, error_s in largest
     ]
     more = heartbeat.clock_error_count - len(largest)

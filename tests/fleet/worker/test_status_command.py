@@ -71,8 +71,8 @@ async def test_dead_letters_and_clock_errors_are_listed_with_their_packs(cluster
     lines = [line for line in out.splitlines() if line.startswith("p") or "more packs" in line]
     assert [line.partition(":")[0] for line in lines] == ["p1", "p3", "p2", "w"]
     assert "dead letter: version 3" in lines[0]
-    assert "is 9,000.0 h behind" in lines[1]
-    assert "is 2.0 h ahead" in lines[2]
+    assert "is 375 days, 0:00:00 behind" in lines[1]
+    assert "is 2:00:00 ahead" in lines[2]
     assert lines[3] == "w: 1 more packs with a wrong clock"
 
 
