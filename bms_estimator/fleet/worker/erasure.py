@@ -201,14 +201,32 @@ async def _remaining(nc: Client, packs: Collection[str]) -> dict[str, dict[str, 
 
 
 async def _count_messages(nc: Client, stream: str, pack: str) -> int:
-    """Return the number of a stream's messages with a pack's name as a token of their subject."""
+    """Return the number of a stream's messages with a pack's name in their subject."""
     count = 0
-    for leading_tokens in range(1, MAX_TOKENS):
-        for rest in ("", ".>"):
-            subject = ".".join(["*"] * leading_tokens + [pack]) + rest
-            info = await _api(nc, f"STREAM.INFO.{stream}", {"subjects_filter": subject})
-            count += sum((info["state"].get("subjects") or {}).values())
+    for subject in _pack_subjects(stream, pack):
+        info = await _api(nc, f"STREAM.INFO.{stream}", {"subjects_filter": subject})
+        count += sum((info["state"].get("subjects") or {}).values())
     return count
+
+
+def _pack_subjects(stream: str, pack: str) -> list[str]:
+    """Return the subjects of a stream with a pack's name, with wildcards; for a stream of another program at any position.
+
+    In the other streams of the fleet, a pack's name may also be that of a partition, such as ``p0``.
+    """
+    fleet_subjects = {
+        subjects.RAW_STREAM: [f"p.*.*.{pack}"],
+        subjects.HOURS_STREAM: [subjects.hours(pack)],
+        subjects.DEAD_STREAM: [subjects.dead(pack)],
+        f"KV_{subjects.PACKS_BUCKET}": [f"$KV.{subjects.PACKS_BUCKET}.{pack}"],
+        f"KV_{subjects.CELLS_BUCKET}": [],
+        f"KV_{subjects.CHECKPOINTS_BUCKET}": [],
+        f"OBJ_{subjects.STATES_BUCKET}": [],
+    }
+    if stream in fleet_subjects:
+        return fleet_subjects[stream]
+    leading = [".".join(["*"] * tokens) for tokens in range(1, MAX_TOKENS)]
+    return [f"{each}.{pack}{rest}" for each in leading for rest in ("", ".>")]
 
 
 async def _api(nc: Client, operation: str, request: dict[str, Any]) -> dict[str, Any]:

@@ -177,3 +177,14 @@ async def test_daily_checkpoints_that_a_rolled_back_worker_forgot_are_removed_by
     expected = {info.object for info in (*claim.pointer.checkpoints, *other.pointer.checkpoints)}
     assert await stored_objects(nc) == expected
     assert len(claim.pointer.checkpoints) == 2
+
+
+@pytest.mark.parametrize("pack", ["p0", "raw"])
+async def test_pack_that_is_named_like_a_partition_or_another_part_of_a_subject_does_not_seem_to_remain(
+    nc, cluster, store, capsys, pack
+) -> None:
+    await write(store, await store.claim(0), FORMAT)
+    await send(nc, "p2", block("p2", 1))
+    code, out, err = await erase(capsys, cluster, pack)
+    assert (code, err) == (0, "")
+    assert "remain in the stream" not in out
