@@ -8,6 +8,7 @@ import pytest
 from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.cli.captures.replay_summary import Summary
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.fuel_cell import load_fuel_cell
@@ -145,7 +146,8 @@ def test_a_replay_prints_numbers_or_none(state_value: float, printed: float | No
     estimator = Estimator(PEM)
     estimator.run(simulate_model(np.ones(PARAMETERS), 2.0))
     estimator.state["a"][0, 1] = state_value
-    r_ohm = Summary().result(estimator, None, None, 1, 1.0).parameters["r_ohm"]
+    result = Summary().result(estimator, None, None, CellEstimator(estimator), math.inf, 1, 1.0)
+    r_ohm = result.parameters["r_ohm"]
     assert (r_ohm.value, r_ohm.std) == (printed, printed)
 
 
