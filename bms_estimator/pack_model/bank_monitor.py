@@ -1,4 +1,4 @@
-"""Monitor that compares each discharge of a bank with its reference discharges, row by row."""
+"""Monitor of a bank: comparison of each discharge with reference discharges of the same bank, after each row."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from bms_estimator.pack_model.weakest_cell import (
 from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_FRACTION, WEAK_CELL_STD
 
 CHARGED_SOC = 0.05
-"""Charge after which a discharge has ended, as a fraction of the capacity. Regeneration during a discharge is smaller."""
+"""Charge that ends a discharge, as a fraction of the capacity. A smaller charge counts as regeneration within the discharge."""
 FIRST_ROWS, MAX_FIRST_ROWS = 4 * MIN_REFERENCE_ROWS, 8 * MIN_REFERENCE_ROWS
 """Minimum and maximum number of rows of the first discharges: about four and eight complete discharges."""
 
@@ -37,14 +37,21 @@ class Discharge:
     fit: PackFit
     """Fit from before the discharge. A later fit would absorb the weak cell."""
     references: list[Reference]
-    """Earlier and first discharges of the bank; empty: too few rows."""
+    """References from the earlier and the first discharges of the bank; those with too few rows are missing."""
     start_soc: float
     """SOC at its first row."""
     start_as: float
     """Charge counter at its first row [A s]."""
 
     def weakest(self, cell: CellCurves, rows: NDArray[np.void]) -> list[WeakestCell]:
-        """Return the estimates from rows of the discharge by each reference. The SOC is that of the counted charge."""
+        """Return an estimate for each reference.
+
+        The SOC of a row is the SOC at the start minus the charge drawn since.
+
+        Args:
+            cell: Curves of the cell file.
+            rows: Rows of this discharge with a voltage, shape (n,), dtype HISTORY_ROW.
+        """
         drawn_as = rows["charge_as"] - self.start_as
         return [
             Comparison(cell, each, rows, self.start_soc - drawn_soc(cell, each.fit, drawn_as)).weakest()
@@ -55,8 +62,9 @@ class Discharge:
 class BankMonitor:
     """Monitor of the weakest cell of one bank.
 
-    A later discharge replaces the result as soon as it shows a weak cell. If it shows none, it replaces the result only when its
-    SOC has fallen as low as in the earlier discharge. Discharges with a weak cell do not become part of the reference.
+    A discharge that shows a weak cell replaces the result of an earlier discharge at once. A discharge that shows no weak cell
+    replaces it only when its SOC is as low as that of the earlier discharge, because a weak cell shows near its empty end.
+    Discharges with a weak cell do not become part of the reference.
 
     Args:
         cell: Curves of the cell file.
@@ -72,14 +80,12 @@ class BankMonitor:
     def reset(self) -> None:
         """Discard all results, as for a new bank."""
         self.weakest: WeakestCell | None = None
-        self._result_start_s, self._result_soc = (
-            -np.inf,
-            np.inf,
-        )  # start of the discharge of ``weakest``, and its lowest SOC
+        self._result_start_s = -np.inf  # time of the first row of the discharge that gave ``weakest`` [s]
+        self._result_soc = np.inf  # SOC of the other cells at the last evaluated row of that discharge
         self._discharge: Discharge | None = None
 
     def add(self, history: History, new: int, fit: PackFit) -> None:
-        """Evaluate the last ``new`` rows of a history, one by one.
+        """Evaluate the last ``new`` rows of a history, one by one. If the bank was exchanged, discard the results of the former bank.
 
         Args:
             history: History of the bank; times of weak cells are added.
@@ -97,18 +103,21 @@ class BankMonitor:
                 self._evaluate(rows[:end], history, fit)
 
     def _evaluate(self, rows: NDArray[np.void], history: History, fit: PackFit) -> None:
-        """Compare the discharge of the last row with its references. The one from which it deviates most decides."""
+        """Compare the discharge of the last row with its references. The result is that of the reference with the largest deviation."""
         start = discharge_start(rows, CHARGED_SOC * self._cell.capacity_as)
         if self._discharge is None or self._discharge.start_s != rows["elapsed_s"][start]:
-            self._discharge = self._begin(rows, start, history, fit)
+            self._discharge = self._new_discharge(rows, start, history, fit)
         discharge, measured = self._discharge, rows[start:][is_discharge(rows[start:])]
         if not discharge.references or measured.size < MIN_ROWS:
             return
         result = max(discharge.weakest(self._cell, measured), key=lambda each: each.deviation_std)
-        self._replace_result(result, history.weak_cell_times, discharge.start_s, float(rows["elapsed_s"][-1]))
+        self._update_result(result, history.weak_cell_times, discharge.start_s, float(rows["elapsed_s"][-1]))
 
-    def _begin(self, rows: NDArray[np.void], start: int, history: History, fit: PackFit) -> Discharge:
-        """Return the discharge that begins with the row ``start``. While a cell is weak, the earlier fit is kept."""
+    def _new_discharge(self, rows: NDArray[np.void], start: int, history: History, fit: PackFit) -> Discharge:
+        """Return the discharge that begins with the row ``start``.
+
+        While a cell is weak, the fit of the previous discharge is used, because the latest fit has absorbed the weak cell.
+        """
         weak = history.weak_cell_times
         fit_before = self._discharge.fit if is_weak_now(weak) and self._discharge is not None else fit
         begin, earlier = rows[start : start + 1], reference_rows(rows[:start], weak)
@@ -124,7 +133,7 @@ class BankMonitor:
         )
 
     def _references(self, earlier: ReferenceDischarges, first: ReferenceDischarges | None) -> Iterator[Reference]:
-        """Yield the references with enough rows."""
+        """Yield the references that have enough rows, from the earlier and the first discharges."""
         for each, change in ((earlier, SINCE_EARLIER), (first, SINCE_FIRST)):
             if each is None:
                 continue
@@ -132,8 +141,18 @@ class BankMonitor:
             if curve is not None:
                 yield Reference(each.fit, curve, change)
 
-    def _replace_result(self, result: WeakestCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
-        """Replace the present result if the discharge from ``start_s`` shows a weak cell, is as deep, or gave that result."""
+    def _update_result(self, result: WeakestCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
+        """Replace the present result by that of a discharge, and update the times of weak cells, unless the discharge is too shallow.
+
+        A discharge replaces the result if it shows a weak cell, is as deep as the discharge of the present result, or is that
+        discharge.
+
+        Args:
+            result: Result of the discharge.
+            weak: Times with a weak cell; updated.
+            start_s: Time of the first row of the discharge [s].
+            now_s: Time of its last row [s].
+        """
         was_weak, is_same = is_weak_now(weak), start_s == self._result_start_s
         is_weak = result.deviation_std >= WEAK_CELL_STD * (WEAK_CELL_CLEAR_FRACTION if was_weak else 1.0)
         if not (is_same or is_weak or result.soc <= (weak[-1].soc if was_weak else self._result_soc)):
@@ -153,7 +172,7 @@ def is_weak_now(weak: list[WeakCellTime]) -> bool:
 
 
 def reference_rows(rows: NDArray[np.void], weak: list[WeakCellTime]) -> NDArray[np.void]:
-    """Return the rows of discharges without a weak cell."""
+    """Return the rows of discharges, without those of the times with a weak cell."""
     is_reference = is_discharge(rows)
     for time in weak:
         is_reference &= (rows["elapsed_s"] < time.start_s) | (rows["elapsed_s"] >= time.end_s)
@@ -161,12 +180,12 @@ def reference_rows(rows: NDArray[np.void], weak: list[WeakCellTime]) -> NDArray[
 
 
 def is_discharge(rows: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Return True for each row of a discharge with a voltage."""
+    """Return True for each row that belongs to a discharge and has a voltage."""
     return np.asarray((rows["direction"] > 0.0) & (rows["duration_s"] > 0.0))
 
 
 def discharge_start(rows: NDArray[np.void], charged_as: float) -> int:
-    """Return the first row of the discharge that the last row belongs to: the row with the lowest charge counter.
+    """Return the index of the first row of the present discharge: the row with the lowest charge counter since the last charge.
 
     Args:
         rows: Shape (n,), dtype HISTORY_ROW, in order of time.

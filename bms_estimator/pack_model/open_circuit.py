@@ -1,4 +1,7 @@
-"""Open-circuit voltage E_o of history rows: measured voltages, corrected for load, hysteresis and temperature by a fit."""
+"""Open-circuit voltage E_o of history rows.
+
+E_o is the measured voltage, corrected for load, hysteresis and temperature with the parameters of a fit.
+"""
 
 import math
 from dataclasses import dataclass
@@ -9,37 +12,40 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.bank_simulation import COLLAPSE_V
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
 from bms_estimator.model.arrays import Floats
-from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition, arrhenius
+from bms_estimator.pack_model.cell_curves import (
+    SECANT_HALF_WIDTH_SOC,
+    SOC_GRID,
+    CellCurves,
+    NodePosition,
+    arrhenius,
+)
 from bms_estimator.pack_model.fit import LN_Q, OFFSET, SOC, PackFit
 from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS
-
-HALF_ROW_SOC = 0.01
-"""Half width of the secant for the slope of the OCV. A row of the history covers 2 % of SOC, and so does the secant."""
 
 
 @dataclass(frozen=True)
 class OpenCircuit:
-    """Open-circuit voltages of n rows. Voltages are of the mean cell."""
+    """Open-circuit voltages of n rows, as differences from the fitted OCV. All voltages are those of the mean cell."""
 
     soc: Floats
     """SOC of the mean cell."""
     error_v: Floats
     """E_o minus the fitted OCV at ``soc`` [V]."""
     drop_v: Floats
-    """Overpotential by which the voltage was corrected, positive on discharge [V]."""
+    """Overpotential that was added to the measured voltage, positive on discharge [V]."""
     temperature_c: Floats
     """Temperature [degC]."""
     overpotential: "Overpotential"
-    """Overpotential of the rows at any SOC."""
+    """Overpotential as a function of SOC, under the currents of the rows."""
 
     @classmethod
     def of(cls, cell: CellCurves, fit: PackFit, rows: NDArray[np.void], soc: Floats) -> "OpenCircuit":
-        """Return the open-circuit voltages of rows with a voltage.
+        """Return the open-circuit voltages of rows.
 
         Args:
             cell: Curves of the cell file.
             fit: Fit of the history; the rows may be later than its last row.
-            rows: Shape (n,), dtype HISTORY_ROW.
+            rows: Rows with a measured voltage, shape (n,), dtype HISTORY_ROW.
             soc: SOC of the rows, shape (n,).
         """
         temperature_c = rows["temperature_c"]
@@ -54,7 +60,7 @@ class OpenCircuit:
 
 
 class Overpotential:
-    """Overpotential of a cell under the currents of n rows, at any SOC, by the fitted resistances.
+    """Overpotential of the mean cell as a function of SOC, under the currents of n rows and with the fitted resistances.
 
     Args:
         cell: Curves of the cell file.
@@ -78,9 +84,10 @@ class Overpotential:
 
 
 def row_soc(cell: CellCurves, fit: PackFit, rows: NDArray[np.void]) -> Floats:
-    """Return the SOC of rows: the fitted SOC up to the last fitted row, then its value minus the charge drawn since.
+    """Return the SOC of rows.
 
-    Rows after a gap since the fit have the SOC of the filter.
+    Up to the last row of the fit, it is the fitted SOC. For later rows, it is the SOC at the end of the fit minus the charge drawn
+    since then. If a gap separates a row from the fit, it is the SOC of the filter.
     """
     since_fit = drawn_soc(cell, fit, rows["charge_as"] - fit.charge_as)
     counted = np.where(rows["segment"] == fit.segment, fit.mean[SOC] - since_fit, rows["soc"])
@@ -96,12 +103,12 @@ def drawn_soc(cell: CellCurves, fit: PackFit, charge_as: Floats) -> Floats:
 
 
 def fitted_ocv(cell: CellCurves, fit: PackFit, soc: Floats) -> Floats:
-    """Return the fitted OCV of the mean cell [V]. Below SOC 0 it falls by ``COLLAPSE_V``, but not below 0 V."""
+    """Return the fitted OCV of the mean cell [V]. Below SOC 0 it falls with the slope ``COLLAPSE_V`` to 0 V."""
     ocv_v = cell.ocv(np.maximum(soc, 0.0)) + np.interp(soc, SOC_GRID, fit.curve_v) + COLLAPSE_V * np.minimum(soc, 0.0)
     return np.asarray(np.maximum(ocv_v, 0.0))
 
 
 def fitted_slope(cell: CellCurves, fit: PackFit, soc: Floats) -> Floats:
     """Return the slope of the fitted OCV as a secant over the SOC range of a row [V per unit SOC]."""
-    above_v, below_v = (fitted_ocv(cell, fit, soc + shift) for shift in (HALF_ROW_SOC, -HALF_ROW_SOC))
-    return np.asarray((above_v - below_v) / (2.0 * HALF_ROW_SOC))
+    above_v, below_v = (fitted_ocv(cell, fit, soc + shift) for shift in (SECANT_HALF_WIDTH_SOC, -SECANT_HALF_WIDTH_SOC))
+    return np.asarray((above_v - below_v) / (2.0 * SECANT_HALF_WIDTH_SOC))

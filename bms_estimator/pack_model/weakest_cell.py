@@ -33,8 +33,8 @@ MIN_ROWS = 4
 PRIOR_ROWS = 4.0
 """Weight of the prior variance of a bin, in rows."""
 REPEAT_STD_V, REPEAT_STD_SOC = 1e-3, 0.003
-"""Prior std of the difference of E_o of the mean cell between two discharges: a voltage error [V] and a SOC error. This and the
-following std are one to four times those that maximize the likelihood of simulated healthy banks, because a real bank has
+"""Prior std of the difference of E_o of the mean cell between two discharges: a voltage error [V] and an SOC error. The std of this
+module are one to four times the values that maximize the likelihood of simulated healthy banks, because a real bank has
 further errors."""
 INDEPENDENT_FRACTION = 0.2
 """Fraction of the variance of E_o between discharges that is independent from row to row. The rest is correlated over
@@ -42,19 +42,20 @@ INDEPENDENT_FRACTION = 0.2
 CORRELATED_SOC = 0.4
 """Correlation length of the difference of E_o between two discharges [SOC]."""
 COMMON_DROP_STD_PER_K = 0.002
-"""Increase of the relative std of the overpotential that all cells and rows share per kelvin of temperature difference from the
-reference [1/K]. The temperature dependence of a generic cell file is that of another cell."""
+"""Relative std of the overpotential, per kelvin of temperature difference from the reference [1/K]. All cells and rows share this
+error. Its cause is the temperature dependence of a generic cell file, which was measured on another cell."""
 LOAD_DROP_STD = 0.02
-"""Error std of the overpotential, as a fraction of its difference from the mean overpotential of the reference; independent
-from row to row. The RC pairs are less exact for loads that differ from the usual ones."""
+"""Std of the overpotential's error, as a fraction of its difference from the mean overpotential of the reference. The error is
+independent from row to row. Its cause is that the fitted RC pairs are less exact for loads that differ from the usual ones."""
 MAX_ERROR_RATIO = 3.0
-"""Maximum factor on the std. A bank whose errors are larger than assumed has a larger std, by the RMS of the errors that remain
-under the best hypothesis. They also remain if several cells are weak, which must not prevent the alarm."""
+"""Maximum factor by which the std of all errors is increased. The factor is the RMS of the normalized residuals of the best
+hypothesis, because a real bank may have larger errors than assumed. It is limited, because several weak cells also cause
+residuals, and must still raise the alarm."""
 SHIFTS, SHRINKS = np.linspace(0.0, 0.4, 21), np.linspace(0.0, 0.6, 25)
 """Tested values of ``shift`` and ``shrink``."""
 SHIFT_STD, SHRINK_STD = 0.03, Noise.cell_spread
-"""Std of the prior of ``shift`` (assumed) and ``shrink``. The prior of ``shrink`` equals the spread of the cells
-in the published ``soc_std``."""
+"""Std of the priors of ``shift`` (assumed) and ``shrink``. The prior of ``shrink`` is the cell imbalance that the filter assumes for
+the published ``soc_std``."""
 MIN_DIFFERENCE_STD = 0.01
 """Minimum std of the difference between the SOCs of the weak cell and of the others, added in quadrature: half the step of
 ``SHIFTS``."""
@@ -78,9 +79,9 @@ class CommonChange:
 
 
 SINCE_EARLIER = CommonChange(soc=0.003, capacity=0.003, drop=0.01)
-"""Change since the earlier discharges of the history; chosen as ``REPEAT_STD_V``."""
+"""Change since the earlier discharges of the history. The values were chosen in the same way as ``REPEAT_STD_V``."""
 SINCE_FIRST = CommonChange(soc=0.005, capacity=0.05, drop=0.1)
-"""Change since the first discharges. Two std are 10 % less capacity and 20 % more resistance by aging. Assumed."""
+"""Change since the first discharges of the bank. Two std are 10 % less capacity and 20 % more resistance by aging. Assumed."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +91,10 @@ class WeakestCell:
     soc: float
     """SOC of the other cells at the last row."""
     filter_soc: float
-    """SOC of the bank by the filter at the last row."""
+    """SOC of the bank at the last row, as estimated by the filter."""
     deviation_std: float
-    """Significance of a weak cell: square root of twice the log-likelihood ratio, without the row that supports it most [std].
-    It is 1 or less in most discharges of a healthy bank."""
+    """Significance of a weak cell: square root of twice the log-likelihood ratio of a weak cell and no weak cell [std]. The row that
+    supports the weak cell most is left out. The value is 1 or less in most discharges of a healthy bank."""
     mean: Floats
     """Mean of ``shift`` and ``shrink``."""
     covariance: Floats
@@ -116,7 +117,8 @@ class WeakestCell:
     def weakest_soc(self, filter_soc: float) -> tuple[float, float]:
         """Return mean and std of the weakest cell's SOC when the filter's SOC of the bank is ``filter_soc``.
 
-        The std contains only the uncertainty of the difference from the other cells. The SOC of an over-discharged cell is 0.
+        The std is that of the difference from the other cells. It does not contain the std of the filter's SOC. An over-discharged cell has
+        an SOC of 0.
         """
         soc = self.others_soc(filter_soc)
         weights = np.array([1.0, 1.0 - soc])
@@ -139,7 +141,7 @@ class ReferenceCurve:
 
     @classmethod
     def of(cls, cell: CellCurves, fit: PackFit, rows: NDArray[np.void], soc: Floats) -> "ReferenceCurve | None":
-        """Return the curve of reference rows of discharges; None if there are too few.
+        """Return the curve of the reference rows; None if there are fewer than ``MIN_REFERENCE_ROWS``.
 
         Args:
             cell: Curves of the cell file.
@@ -150,14 +152,14 @@ class ReferenceCurve:
         if rows.size < MIN_REFERENCE_ROWS:
             return None
         measured = OpenCircuit.of(cell, fit, rows, soc)
-        at = np.clip((measured.soc * BINS).astype(np.intp), 0, BINS - 1)
-        count = np.bincount(at, minlength=BINS)
-        mean_v = np.bincount(at, measured.error_v, BINS) / np.maximum(count, 1)
-        squares_v2 = np.bincount(at, (measured.error_v - mean_v[at]) ** 2, BINS)
+        bins = np.clip((measured.soc * BINS).astype(np.intp), 0, BINS - 1)
+        count = np.bincount(bins, minlength=BINS)
+        mean_v = np.bincount(bins, measured.error_v, BINS) / np.maximum(count, 1)
+        squares_v2 = np.bincount(bins, (measured.error_v - mean_v[bins]) ** 2, BINS)
         prior_v2 = REPEAT_STD_V**2 + (REPEAT_STD_SOC * fitted_slope(cell, fit, BIN_SOC)) ** 2
         variance_v2 = (squares_v2 + PRIOR_ROWS * prior_v2) / (count + PRIOR_ROWS)
         is_known = count > 1
-        # a bin without reference has the error of the cell file's OCV
+        # in a bin with fewer than two reference rows, the error of the cell file's OCV is added
         unknown_v2 = np.where(is_known, 0.0, np.interp(BIN_SOC, SOC_GRID, cell.ocv_std_v) ** 2)
         return cls(
             error_v=np.interp(BIN_SOC, BIN_SOC[is_known], mean_v[is_known]) if is_known.any() else np.zeros(BINS),
@@ -169,11 +171,13 @@ class ReferenceCurve:
 
 @dataclass(frozen=True)
 class Reference:
-    """Reference of a bank, and the model with which a discharge is compared with it."""
+    """Reference curve of a bank, with the model for comparisons with it."""
 
     fit: PackFit
+    """Fit by which E_o is computed from the voltages of the discharge."""
     curve: ReferenceCurve
     common: CommonChange
+    """Std of the changes since the reference."""
 
 
 class Comparison:
@@ -201,13 +205,17 @@ class Comparison:
         self.covariance_factor: Floats = np.linalg.cholesky(covariance).astype(np.float64)
 
     def weakest(self, deviation_v: Floats | None = None) -> WeakestCell:
-        """Return the estimate of the weakest cell by a deviation, shape (n,) [V]; default: ``deviation_v``."""
+        """Return the estimate of the weakest cell.
+
+        Args:
+            deviation_v: Deviations of E_o of the mean cell, shape (n,) [V]; None: those of the discharge.
+        """
         whitened = np.linalg.solve(self.covariance_factor, self.deviation_v if deviation_v is None else deviation_v)
-        templates = np.linalg.solve(self.covariance_factor, self.by_weak_cell(SHIFT, SHRINK))
+        templates = np.linalg.solve(self.covariance_factor, self.weak_cell_deviations(SHIFT, SHRINK))
         ln_by_row = templates * whitened[:, None] - 0.5 * templates**2
-        remaining = whitened - templates[:, ln_by_row.sum(axis=0).argmax()]
-        ln_by_row /= np.clip(np.mean(remaining**2), 1.0, MAX_ERROR_RATIO**2)
-        # without the row that supports a hypothesis most, because a single wrong row must not raise the alarm
+        residuals = whitened - templates[:, ln_by_row.sum(axis=0).argmax()]
+        ln_by_row /= np.clip(np.mean(residuals**2), 1.0, MAX_ERROR_RATIO**2)
+        # the row that supports a hypothesis most is left out, because a single wrong row must not raise the alarm
         ln_likelihood = ln_by_row.sum(axis=0) - np.maximum(ln_by_row.max(axis=0), 0.0)
         ln_weight = LN_PRIOR + LIKELIHOOD_EXPONENT * ln_likelihood
         weight = np.exp(ln_weight - ln_weight.max())
@@ -220,11 +228,11 @@ class Comparison:
             covariance=np.cov(values, aweights=weight, ddof=0).astype(np.float64),
         )
 
-    def by_weak_cell(self, shift: Floats, shrink: Floats) -> Floats:
-        """Return the deviations of E_o of the mean cell for m hypothetical weak cells, shape (n, m) [V].
+    def weak_cell_deviations(self, shift: Floats, shrink: Floats) -> Floats:
+        """Return the deviations of E_o of the mean cell that m hypothetical weak cells would cause, shape (n, m) [V].
 
         Args:
-            shift: SOC of each weak cell below the others when these are full, shape (m,).
+            shift: Difference between the SOC of the full cells and that of the weak cell, shape (m,).
             shrink: Capacity of the others relative to that of the weak cell, minus 1, shape (m,).
         """
         soc = self.measured.soc[:, None]

@@ -25,7 +25,7 @@ class BankCells:
     ohm_factor: Floats
     """Resistances relative to those of the cell file."""
     leak_ohm: Floats
-    """Resistance of an internal short across the cell [ohm]; infinite: none."""
+    """Resistance of an internal short across the cell [ohm]; infinite without a short."""
     warmer_k: Floats
     """Temperature of the cell above that of the bank [K]."""
 
@@ -72,7 +72,7 @@ class BankCells:
         Args:
             cell: Number of the weak cell, from 0.
             capacity_ratio: Factor on its capacity.
-            soc_below: Amount by which its SOC at time 0 is lower.
+            soc_below: Amount subtracted from its SOC at time 0.
         """
         capacity_ah, soc = self.capacity_ah.copy(), self.soc.copy()
         capacity_ah[cell] *= capacity_ratio
@@ -116,12 +116,12 @@ class BankHistory:
 
 
 class SimulatedBank:
-    """Bank that can be simulated in several runs. Its cells have the RC pairs, OCV and hysteresis of a cell file.
+    """Bank that is simulated in one or more successive runs. Its cells have the RC pairs, OCV and hysteresis of a cell file.
 
     Args:
         cell: Cell model of one cell.
         cells: Properties of the cells.
-        full_v: Voltage of the bank at which the charger limits the current [V]. It ends the charge at ``TAPER_C``.
+        full_v: Voltage of the bank at which the charger limits the current [V]. The charge ends at the current ``TAPER_C``.
         cutoff_v: Voltage of the bank below which the load is disconnected until the next charge [V].
 
     Attributes:
@@ -137,7 +137,7 @@ class SimulatedBank:
         self._limits_v = np.array([cutoff_v, full_v])
         self._state = np.zeros(cells.soc.size, STATE)
         self._state["soc"] = cells.soc
-        self._stopped = np.zeros(1)
+        self._stopped = np.zeros(1)  # direction of the current that a limit has switched off (``simulate``)
 
     @property
     def soc(self) -> Floats:
@@ -145,7 +145,7 @@ class SimulatedBank:
         return self._state["soc"].copy()
 
     def discharge_cell(self, cell: int, soc: float) -> None:
-        """Lower the SOC of one cell by ``soc``, as after an internal short."""
+        """Subtract ``soc`` from the SOC of one cell, for example as the effect of an internal short."""
         self._state["soc"][cell] -= soc
 
     def run(self, current_a: Floats, step_s: float = 1.0, temperature_c: float | Floats = 25.0) -> BankHistory:
@@ -153,7 +153,7 @@ class SimulatedBank:
 
         Args:
             current_a: Requested current [A], positive on discharge, shape (n,).
-            step_s: Interval between two times [s].
+            step_s: Duration of a step [s].
             temperature_c: Temperature of the bank [degC], one value or one for each current.
         """
         n, c = current_a.size, self.cells

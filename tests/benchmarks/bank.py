@@ -27,20 +27,20 @@ SERIES = 3, 6, 12
 WORKERS = 2
 """Number of processes."""
 REFERENCE_CYCLES = 2
-"""Number of cycles of which no discharge is compared, because they are the first reference."""
+"""Number of cycles at the beginning that are not compared, because they are the first reference."""
 WEAK_AFTER = 6, 12
-"""Numbers of cycles after which a cell becomes weak for one cycle."""
+"""Numbers of healthy cycles before the cycle with a weak cell. Each fault is simulated after each of them."""
 FADE, FADE_CYCLES = 0.012, 18
 """Loss of capacity of a slowly weakening cell in each cycle, and number of cycles."""
 LIMITS_STD = 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0
-"""Limits of which the false alarms are counted."""
+"""Limits of the deviation for which the false alarms are counted [std]."""
 MODEL_ERROR_V = 8e-3
 """Model error of a cell in the idealized bound [V]."""
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Result after one row of a discharge."""
+class RowResult:
+    """Estimate of the weakest cell after one row of a discharge, with the true values."""
 
     step: Step
     weakest: WeakestCell
@@ -57,18 +57,18 @@ class Comparison:
 
     @property
     def _estimate(self) -> tuple[float, float]:
-        """SOC of the weakest cell and its std. The filter's SOC is that of the middle of the row."""
+        """Estimated SOC of the weakest cell, and its std. The SOC of a row is that of its middle, and the true value that of its end."""
         return self.weakest.weakest_soc(self.weakest.filter_soc - 0.5 * ROW_SOC)
 
 
-def comparisons(recording: Recording, history: History, first_cycle: int = REFERENCE_CYCLES) -> Iterator[Comparison]:
-    """Yield the comparisons of a recorded bank from a cycle on.
+def compare(recording: Recording, history: History, first_cycle: int = REFERENCE_CYCLES) -> Iterator[RowResult]:
+    """Yield the results of a recorded bank, from the cycle ``first_cycle`` on.
 
-    Each discharge gets its own monitor, because a monitor keeps the result of a deeper discharge.
+    Each discharge is compared by a new monitor, because a monitor does not replace the result of a deeper discharge.
 
     Args:
         recording: Recording of the bank.
-        history: History with the first discharges of the bank, if they are known; updated.
+        history: History of the bank, empty or with its first discharges; updated.
         first_cycle: Number of the first compared cycle.
     """
     compared = (step for step in recording.steps if step.cycle >= first_cycle)
@@ -78,17 +78,17 @@ def comparisons(recording: Recording, history: History, first_cycle: int = REFER
         rows = None
         for step in steps:
             history.rows = recording.rows[: step.rows]
-            new = 1 if rows is None else step.rows - rows  # not the last row of the discharge before
+            new = 1 if rows is None else step.rows - rows  # the first step has no row of the previous discharge
             monitor.add(history, new, recording.fits[step.cycle - 1])
             rows = step.rows
             if monitor.weakest is not None and monitor.weakest is not latest:
                 latest = monitor.weakest
-                yield Comparison(step, latest)
+                yield RowResult(step, latest)
 
 
 @dataclass(frozen=True)
 class HealthyResult:
-    """Comparisons of a healthy bank."""
+    """Results of a healthy bank."""
 
     deviations: list[float]
     """Largest deviation of each discharge [std]."""
@@ -100,18 +100,19 @@ class HealthyResult:
 
 @dataclass(frozen=True)
 class WeakResult:
-    """Comparisons in the discharge of a weak cell from the first one at the limit on; empty if it was not found."""
+    """Results of a bank with a weak cell."""
 
-    found: list[Comparison]
+    detections: list[RowResult]
+    """Results at or above the limit of the alarm; empty if the weak cell was not found."""
 
 
 def evaluate(chemistry: str, series: int, seed: int) -> tuple[HealthyResult, list[WeakResult]]:
-    """Return the results of one bank: healthy, and with each of ``WEAK_CELLS`` after each of ``WEAK_AFTER``."""
+    """Return the results of one bank without a fault, and with each of ``WEAK_CELLS`` after each of ``WEAK_AFTER``."""
     healthy, *faults = recordings(chemistry, series, seed, WEAK_CELLS, WEAK_AFTER)
     largest: dict[int, float] = {}
     errors: list[float] = []
     history = History()
-    for each in comparisons(healthy, history):
+    for each in compare(healthy, history):
         number = each.step.cycle
         largest[number] = max(largest.get(number, 0.0), each.weakest.deviation_std)
         errors.append(each.error_std)
@@ -119,25 +120,32 @@ def evaluate(chemistry: str, series: int, seed: int) -> tuple[HealthyResult, lis
     compared = healthy.rows[last:]
     hours = float(compared["duration_s"][is_discharge(compared)].sum()) / 3600.0
     return HealthyResult(list(largest.values()), errors, hours), [
-        WeakResult(at_limit(recording, history, recording.steps[-1].cycle)) for recording in faults
+        WeakResult(detections(recording, history, recording.steps[-1].cycle)) for recording in faults
     ]
 
 
-def at_limit(recording: Recording, history: History, first_cycle: int) -> list[Comparison]:
-    """Return the comparisons at or above the limit of the alarm."""
-    compared = comparisons(recording, history, first_cycle)
-    return [each for each in compared if each.weakest.deviation_std >= WEAK_CELL_STD]
+def detections(recording: Recording, history: History, first_cycle: int) -> list[RowResult]:
+    """Return the results at or above the limit of the alarm, from the cycle ``first_cycle`` on."""
+    return [each for each in compare(recording, history, first_cycle) if each.weakest.deviation_std >= WEAK_CELL_STD]
 
 
 def evaluate_fade(series: int, seed: int) -> float:
-    """Return the capacity of a slowly weakening NCA cell when it is found, relative to its first; NaN if it is not found."""
+    """Return the capacity of a slowly weakening NCA cell at its detection, relative to its initial capacity.
+
+    The aging of all cells is not included. NaN: the cell was not found.
+    """
     (recording,) = recordings("NCA", series, seed, (), (FADE_CYCLES,), FADE)
-    found = at_limit(recording, History(), REFERENCE_CYCLES)
+    found = detections(recording, History(), REFERENCE_CYCLES)
     return (1.0 - FADE) ** found[0].step.cycle if found else np.nan
 
 
 def bound(series: int, capacity_ratio: float) -> float:
-    """Return the charge drawn at which the weak cell's deviation reaches three std of the sum of the model errors."""
+    """Return the charge drawn at which the effect of a weak cell on the bank's voltage exceeds 3 std of the sum of the model errors.
+
+    Args:
+        series: Number of cells in series.
+        capacity_ratio: Capacity of the weak cell relative to the others.
+    """
     ocv_v = ocv_grid(CELL)[0]
     soc = np.linspace(0.0, 1.0, ocv_v.size)
     drawn = np.linspace(0.0, capacity_ratio, 2000)
@@ -173,10 +181,10 @@ def print_weak(results: dict[tuple[str, int], list[list[WeakResult]]]) -> None:
     """Print the charge drawn at detection."""
     print_row("cells", "weak cell", "found", "charge drawn", "bound", "SOC of the weak cell", "RMS error of its SOC")
     for (chemistry, series), banks in results.items():
-        for kind, weak in enumerate(WEAK_CELLS):
-            each = [result.found for bank in banks for result in bank[kind :: len(WEAK_CELLS)]]
-            first = [found[0].step for found in each if found]
-            errors = [comparison.error for found in each for comparison in found]
+        for i, weak in enumerate(WEAK_CELLS):
+            by_bank = [result.detections for bank in banks for result in bank[i :: len(WEAK_CELLS)]]
+            first = [rows[0].step for rows in by_bank if rows]
+            errors = [row.error for rows in by_bank for row in rows]
             fault = (
                 f"capacity {weak.capacity_ratio:.0%}" if weak.capacity_ratio < 1.0 else f"SOC {weak.soc_below:g} lower"
             )
@@ -184,7 +192,7 @@ def print_weak(results: dict[tuple[str, int], list[list[WeakResult]]]) -> None:
             print_row(
                 f"{series} {chemistry}",
                 fault,
-                f"{len(first)} of {len(each)}",
+                f"{len(first)} of {len(by_bank)}",
                 quantiles([step.drawn for step in first]),
                 f"{bound(series, weak.capacity_ratio):.2f}" if has_bound else "",
                 quantiles([step.weakest_soc for step in first]),

@@ -1,7 +1,7 @@
 """Recordings of simulated banks for ``tests.benchmarks.bank``: history rows, fits and true values, cached on disk.
 
 The capacities and resistances of the cells have a spread and age, the temperature follows a season, and loads, depths and rests
-change from cycle to cycle. The estimator has another cell file than the bank, and a wrong capacity.
+change from cycle to cycle. The cell file of the estimator differs from the simulated cells, and its capacity is wrong.
 """
 
 import copy
@@ -34,7 +34,7 @@ STEP_S = 5.0
 BLOCK = 12
 """Number of samples of a block."""
 NOISE_V, RESOLUTION_V = 2e-3, 5e-3
-"""Std of the noise of a voltage sample per root of the number of cells, and resolution of the bank's voltage [V]."""
+"""Noise and resolution of the bank's voltage [V]. The std of the noise is ``NOISE_V`` times the square root of the number of cells."""
 FILE_CAPACITY_RATIO = 1.03
 """Capacity of the cell file relative to the true mean."""
 MAX_GRADIENT_K = 5.0
@@ -45,11 +45,10 @@ short, so that few cycles contain all seasons."""
 PARTIAL_CHARGE_CYCLES = 3
 """Number of cycles from one charge that ends early to the next."""
 FIT_CYCLES = 3
-"""Number of cycles between two fits. The service fits each hour, which takes most of the time of a simulation."""
+"""Number of cycles between two fits. The service fits each hour; here this would take most of the time of a simulation."""
 MAX_FADE, MAX_GROWTH, FADE_SPREAD = 1e-3, 2e-3, 0.2
-"""Maximum loss of capacity and growth of resistance in a cycle, and relative std between cells. The loss is about three times
-that of a cell which lasts 600 cycles to 80 %."""
-
+"""Maximum relative loss of capacity and growth of resistance in a cycle, and their relative std between cells. The maximum loss is
+about three times that of a cell that has 80 % of its capacity after 600 cycles."""
 AXIS_STD_SOC = 0.02
 """Std of the deformation of the SOC axis of a true LFP cell at SOC 0.5."""
 
@@ -74,7 +73,7 @@ def nca() -> Chemistry:
 
 
 def lfp(rng: np.random.Generator) -> Chemistry:
-    """Return a cell of 3 Ah with a random deformation of the SOC axis of the generic file ``lfp``, with this file."""
+    """Return a cell of 3 Ah, whose OCV curve is that of the generic file ``lfp`` with a random deformation of the SOC axis."""
     cell, file = load_cell("lfp", 3.0), load_cell("lfp", FILE_CAPACITY_RATIO * 3.0)
     assert isinstance(cell.ocv, TableOcv)
     soc = np.array(cell.ocv.soc)
@@ -93,24 +92,25 @@ class WeakCell:
     """Fault of one cell."""
 
     capacity_ratio: float = 1.0
-    """Capacity of the weak cell relative to what it was."""
+    """Factor on the capacity of the cell."""
     soc_below: float = 0.0
-    """SOC that it loses."""
+    """Amount subtracted from the SOC of the cell."""
 
 
 HEALTHY = WeakCell()
 """No fault."""
 WEAK_CELLS = WeakCell(0.9), WeakCell(0.8), WeakCell(soc_below=0.1)
-"""Faults of which each bank gets one at a time."""
+"""Simulated faults. Each continuation of a bank has one of them."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """Completed rows of a discharge, and the true values at their end."""
+    """Point of a discharge at which a row of the history was completed, with the true values."""
 
     cycle: int
+    """Number of the cycle, from 0."""
     rows: int
-    """Number of rows of the history up to here."""
+    """Number of completed rows of the history."""
     drawn: float
     """Charge drawn in the discharge, as a fraction of the nominal capacity."""
     weakest_soc: float
@@ -122,14 +122,17 @@ class Recording:
     """Recorded history of a bank."""
 
     curves: CellCurves
+    """Curves of the estimator's cell file."""
     rows: NDArray[np.void]
+    """Rows of the history, dtype HISTORY_ROW."""
     fits: list[PackFit]
-    """Latest fit after each cycle that is not the last one of a fault."""
+    """Latest fit after each cycle without a fault."""
     steps: list[Step]
+    """Points of all discharges, in order of time."""
 
 
 class RecordedBank:
-    """Bank that is simulated and recorded from its first discharge on.
+    """Simulated bank with the slow fit of its estimator, recorded from the first discharge on.
 
     Args:
         chemistry: Name in ``CHEMISTRIES``.
@@ -164,7 +167,10 @@ class RecordedBank:
             self._fits = [*self._fits, slow_fit.saved_fit]
 
     def recording(self, weak: WeakCell = HEALTHY) -> Recording:
-        """Return the recording, continued by a cycle with a fault. The bank does not change."""
+        """Return the recording, followed by a cycle with a fault of the first cell unless ``weak`` is ``HEALTHY``.
+
+        The fault is simulated on a copy of the bank.
+        """
         bank = self
         if weak != HEALTHY:
             bank = copy.deepcopy(self)
@@ -189,7 +195,7 @@ class RecordedBank:
         self._number += 1
 
     def _measure(self, history: BankHistory, *, is_discharge: bool) -> None:
-        """Process the samples of one run, and record the steps of a discharge."""
+        """Process the samples of one run in blocks. Record a step after each block in which a row of a discharge was completed."""
         series = history.cell_soc.shape[1]
         samples = history.samples(self._rng, NOISE_V * np.sqrt(series), RESOLUTION_V)
         drawn = np.cumsum(history.current_a) * STEP_S / 3600.0 / self._one_c

@@ -33,7 +33,7 @@ def comparison() -> Comparison:
 
 
 def by_weak_cell(comparison: Comparison, capacity_ratio: float) -> Floats:
-    return comparison.by_weak_cell(np.zeros(1), np.array([1.0 / capacity_ratio - 1.0]))[:, 0]
+    return comparison.weak_cell_deviations(np.zeros(1), np.array([1.0 / capacity_ratio - 1.0]))[:, 0]
 
 
 def test_a_healthy_discharge_deviates_by_about_one_std(comparison: Comparison) -> None:
