@@ -1,4 +1,4 @@
-"""Columns of the cells in a table of estimates, such as that of ``replay --out``."""
+"""Columns of single cells in a table of estimates, such as that of ``replay --out``."""
 
 import itertools
 import math
@@ -16,20 +16,20 @@ CELL_COLUMNS = np.dtype(
         ("weakest_cell", "f8"),  # number of the cell with the lowest SOC, from 1
         ("weakest_cell_soc", "f8"),  # its SOC, 0..1
         ("weakest_cell_soc_std", "f8"),  # standard deviation of this SOC
-        ("cell_soc_spread", "f8"),  # highest less lowest SOC of the cells
-        ("cell_r_spread", "f8"),  # highest less lowest resistance, relative to the median
+        ("cell_soc_spread", "f8"),  # highest minus lowest SOC of the cells
+        ("cell_r_spread", "f8"),  # highest minus lowest resistance, relative to the median
     ]
 )
 """Values of a row; NaN before the first estimate of the cells."""
 INTERVAL_S = 10.0
-"""Interval at which the values change [s]."""
+"""Interval at which the values are updated [s]. It equals the averaging window of the cell estimator."""
 
 
 class CellColumns:
-    """Estimators of the single cells of a pack, with their values at each row of the trace.
+    """Collector of the columns of single cells, one row for each row of the trace.
 
     Args:
-        cells: The estimators.
+        cells: Estimator of the single cells of the pack.
     """
 
     def __init__(self, cells: CellEstimator) -> None:
@@ -43,7 +43,13 @@ class CellColumns:
         return self._cells.deviations
 
     def run(self, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
-        """Process a block like ``CellEstimator.run``, in parts of ``INTERVAL_S``."""
+        """Process a block with ``CellEstimator.run`` in parts of ``INTERVAL_S``, and append the values after each part to its rows.
+
+        Args:
+            samples: Samples of the block, including rejected ones.
+            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
+            trace: Estimates of the accepted samples.
+        """
         columns, accepted = np.empty(trace.size, CELL_COLUMNS), _accepted_indices(samples, trace)
         edges = [0, *(np.flatnonzero(np.diff(trace["time_s"] // INTERVAL_S)) + 1).tolist(), trace.size]
         for first, last in itertools.pairwise(edges):
@@ -53,14 +59,14 @@ class CellColumns:
         self._parts.append(columns)
 
     def take_rows(self, count: int) -> tuple[Records, ...]:
-        """Return the values at each row processed since the last call, and forget them.
+        """Return the values of the rows processed since the last call, and clear them.
 
         Args:
-            count: Number of rows. Rows before the first block with cell voltages have no values.
+            count: Number of rows of the table. Rows before the first block with cell voltages are NaN.
 
         Returns:
-            An array of dtype ``CELL_COLUMNS``, shape (count,), as the only item; empty if the first rows had no cell voltages,
-            because a table has the same columns throughout.
+            A tuple with one array of dtype ``CELL_COLUMNS``, shape (count,). If the first call finds no cell voltages, the tuple is
+            empty in all calls, because all rows of a table have the same columns.
         """
         parts, self._parts = self._parts, []
         if self._has_columns is None:
@@ -85,6 +91,7 @@ def _accepted_indices(samples: SampleBlock, trace: TraceBlock) -> np.ndarray[tup
 
 
 def _values(cells: CellEstimator) -> tuple[float, ...]:
+    """Return the present values in the order of ``CELL_COLUMNS``."""
     names = CELL_COLUMNS.names or ()
     if cells.deviations is None:
         return (math.nan,) * len(names)

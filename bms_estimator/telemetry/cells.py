@@ -1,4 +1,4 @@
-"""Payload of topic ``cells``, and faults of single cells as inputs of alarms."""
+"""Payload of the topic ``cells``, and faults of single cells as inputs of the alarms."""
 
 from typing import NamedTuple
 
@@ -19,14 +19,14 @@ _FAULT_NAMES: dict[ReadingFault, CellFaultName] = {
 
 
 class CellFault(NamedTuple):
-    """Largest fault of a kind among all cells."""
+    """Input of one alarm: the largest value of all cells, and the faulty cells."""
 
     value: float
-    """Value in the unit of the alarm."""
+    """Largest value of all cells, in the unit of the alarm's limit."""
     texts: tuple[str, ...] = ()
-    """Faulty cells, one sentence each."""
+    """Description of each faulty cell, one sentence each."""
     kinds: tuple[tuple[int, ReadingFault], ...] = ()
-    """Index and fault of each faulty cell; the texts also contain numbers, which change."""
+    """Index and fault of each faulty cell. They show whether the faults have changed; ``texts`` also change with the measured values."""
 
 
 NO_CELL_FAULT = CellFault(0.0)
@@ -38,13 +38,13 @@ class CellFaults(NamedTuple):
     at_s: float
     """Time on the samples' clock [s]."""
     short: CellFault
-    """Self-discharge current that is proven for a cell [A]."""
+    """Largest lower bound of a cell's self-discharge current [A]; 0 if no self-discharge is significant."""
     reading: CellFault
     """Error of a reading [V]."""
 
 
 def cell_faults(cells: CellDeviations) -> CellFaults:
-    """Return the faults of the cells."""
+    """Return the faults of the cells as inputs of the alarms."""
     proven_a = cells.proven_self_discharge_a
     i = int(np.argmax(proven_a))
     short_text = f"cell {i + 1} discharges itself by {cells.self_discharge_a[i]:.3g} A more than the other cells"
@@ -78,7 +78,7 @@ def make_cells_payload(cells: CellDeviations, short_limit_a: float, now_s: float
 
     Args:
         cells: Deviations of the cells.
-        short_limit_a: Proven self-discharge current from which a cell counts as shorted [A].
+        short_limit_a: Minimum ``proven_self_discharge_a`` of a cell with an internal short [A].
         now_s: Wall clock [s since 1970].
     """
     is_short = cells.proven_self_discharge_a >= short_limit_a
@@ -105,7 +105,7 @@ def make_cells_payload(cells: CellDeviations, short_limit_a: float, now_s: float
 
 
 def weakest_cell_fields(cells: CellDeviations) -> dict[str, float | int | None]:
-    """Return the fields of ``Estimate`` about estimates of single cells (``NO_CELL_FIELDS``)."""
+    """Return the fields of ``Estimate`` that summarize the estimates of the single cells."""
     i = cells.weakest
     return {
         "weakest_cell": i + 1,

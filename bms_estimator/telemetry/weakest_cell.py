@@ -31,7 +31,7 @@ def weakest_cell_values(model: SlowFit | None) -> WeakestCellValues:
     """Return the values of the weakest cell, from the last comparison and the filter's present SOC.
 
     Args:
-        model: Slow fit of the bank; read only. None: the pack has no slow fit.
+        model: Slow fit of the bank, which is not changed; None for a pack without a slow fit.
     """
     if model is None or model.bank is None or model.bank.weakest is None or math.isnan(model.estimator.soc):
         return UNKNOWN
@@ -46,7 +46,7 @@ def weakest_cell_values(model: SlowFit | None) -> WeakestCellValues:
 
 
 def bank_fields(values: WeakestCellValues) -> dict[str, float | int | None]:
-    """Return the fields of ``Estimate`` about the weakest cell of a bank."""
+    """Return the fields of ``Estimate`` that describe the weakest cell of a bank without cell voltages."""
     fields = values._asdict()
     del fields["deviation_std"]  # only the alarm uses it
     return {name: finite(value) for name, value in fields.items()}
