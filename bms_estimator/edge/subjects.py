@@ -5,7 +5,7 @@
 ``table.<pack>``             changes of a row of the table of packs, received by the stream ``RAW``
 ``p.<partition>.raw.<pack>`` these blocks as the stream ``RAW`` stores them; publishing to this subject has no effect.
                              Changes of the table are stored as ``p.<partition>.table.<pack>``
-``edge.<pack>.awaits``       ``BlockRequest`` to the edge: the block that a worker awaits next
+``edge.<pack>.awaits``       ``BlockRequest`` to the edge: the first block that no saved checkpoint includes
 ``bms.<pack>.<topic>``       estimates, in the format of the command ``run``
 ``dead.<pack>.<digest>``     a block that a worker could not process, stored in the stream ``DEAD``
 ``hours.<pack>``             one-hour summaries by a worker, stored in the stream ``HOURS``
@@ -95,7 +95,7 @@ def partition_of(pack: str, partitions: int) -> int:
 
 
 class BlockRequest(BaseModel):
-    """Message to an edge that all blocks of ``store`` before ``number`` are stored safely and may be deleted."""
+    """Message to an edge that a saved checkpoint includes all blocks of ``store`` before ``number``, which may be deleted."""
 
     model_config = ConfigDict(frozen=True)
 

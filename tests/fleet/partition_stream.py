@@ -58,6 +58,11 @@ class Stream:
             results.append(self.partition.take_deferred(pack, data, sequence))
         return results
 
+    def save(self) -> None:
+        """Save a checkpoint, as the worker does at intervals."""
+        self.partition.snapshot()
+        self.partition.mark_saved()
+
     def take_over(self) -> None:
         """Restore the partition from a snapshot, as another worker does."""
         partition = self.partition

@@ -1,7 +1,7 @@
 """Order of a pack's blocks, and replies to its edge. Both depend only on the received blocks.
 
-A reply names the awaited block and confirms all earlier ones, which the edge may then delete. On request, the edge resends
-the awaited block and all later blocks. Therefore late, repeated and early blocks can be dropped.
+A reply names the first block that no saved checkpoint includes. It confirms all earlier ones, which the edge may then delete.
+On request, the edge resends the named block and all later blocks. Therefore late, repeated and early blocks can be dropped.
 """
 
 from enum import Enum
@@ -11,6 +11,7 @@ import numpy as np
 from bms_estimator.edge.block import Block
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.worker.pack_state import MAX_LOST_BLOCKS
+from bms_estimator.fleet.worker.unsaved_positions import BlockPosition
 
 CONFIRM_EVERY = 10
 """Number of blocks between two replies that confirm all earlier blocks."""
@@ -90,19 +91,27 @@ def _await_block(d: np.void, number: int) -> int:
     return number
 
 
-def edge_reply(order: BlockOrder, d: np.void, block: Block, *, is_first: bool) -> BlockRequest | None:
+def position(d: np.void) -> BlockPosition:
+    """Return the position of a pack, from its record of dtype ``DELIVERY``."""
+    return BlockPosition(int(d["store"]), int(d["awaited"]))
+
+
+def edge_reply(
+    order: BlockOrder, early_blocks: int, block: Block, saved: BlockPosition, *, is_first: bool
+) -> BlockRequest | None:
     """Return the reply to a block's edge; None if no reply is due.
 
     Args:
         order: Result of ``classify_block``.
-        d: The pack's record of dtype ``DELIVERY``, after the block.
+        early_blocks: Number of blocks that have arrived before the awaited one, including this one.
         block: The received block.
+        saved: Position of the pack in the last saved checkpoint.
         is_first: True for the first block of this pack since the worker took over the partition.
     """
-    store, number = int(d["store"]), int(d["awaited"])
+    store, number = saved
     if order is BlockOrder.AHEAD:
         # the first early block requests the missing one at once
-        due = is_first or int(d["ahead"]) % REQUEST_EVERY == 1
+        due = is_first or early_blocks % REQUEST_EVERY == 1
         return BlockRequest(store=store, number=number, resend=True) if due else None
     if is_first or block.number % CONFIRM_EVERY == 0:
         return BlockRequest(store=store, number=number, resend=False)

@@ -17,7 +17,7 @@ from bms_estimator.edge.block import Block, BlockError, decode, decode_header
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.packs.pack_type import PackType, PackTypes
 from bms_estimator.fleet.packs.table_change import PackSource, decode_change, encode_change, is_change
-from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken
+from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken, position
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
 from bms_estimator.fleet.worker.checkpoint_format import (
     CheckpointError,
@@ -30,6 +30,7 @@ from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
 from bms_estimator.fleet.worker.density import density_fault
 from bms_estimator.fleet.worker.edge_clock import Arrival
 from bms_estimator.fleet.worker.pack_state import Fields, UnpackedRecord
+from bms_estimator.fleet.worker.unsaved_positions import UnsavedPositions
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
 
@@ -115,6 +116,7 @@ class Partition:
         self.deferred = Deferred()
         self.clock_errors: dict[str, float] = {}
         self._type_by_pack: dict[str, PackType] = {}
+        self._unsaved = UnsavedPositions()
         self._replied: set[str] = set()  # packs whose edge has had a reply from this worker
         self._logged_rejections: set[str] = set()
         self._unpacked = UnpackedRecord()
@@ -150,6 +152,7 @@ class Partition:
 
     def snapshot(self) -> PartitionCheckpoint:
         """Return a snapshot of the partition. Records are not copied, because they are immutable bytes."""
+        self._unsaved.begin_save()
         return PartitionCheckpoint(
             number=self.number,
             sequence=self.sequence,
@@ -159,6 +162,10 @@ class Partition:
             deferred=self.deferred.spans(),
             in_force=dict(self._in_force),
         )
+
+    def mark_saved(self) -> None:
+        """Record that the last snapshot was saved, so that replies confirm its blocks to the edges."""
+        self._unsaved.end_save()
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -313,6 +320,7 @@ class Partition:
         d = self._unpacked.delivery
         stored_lost = int(d["lost_blocks"])
         self._restore_unmigrated_delivery(pack)
+        self._unsaved.add(pack, position(d))
         order = classify_block(d, block)
         newly_lost = int(d["lost_blocks"]) - stored_lost  # since the record was stored
         self._unpacked.count_lost(newly_lost)
@@ -344,7 +352,8 @@ class Partition:
             self._packs[pack] = self._unpacked.packed_bytes()
         is_first = pack not in self._replied
         self._replied.add(pack)
-        return result._replace(reply=edge_reply(order, d, block, is_first=is_first))
+        saved = self._unsaved.saved(pack, position(d))
+        return result._replace(reply=edge_reply(order, int(d["ahead"]), block, saved, is_first=is_first))
 
     def _update_clock_error(self, pack: str, error_s: float) -> None:
         """List a pack with the error of its edge's clock, and log a new error; 0 removes the pack from the list."""

@@ -200,6 +200,7 @@ class PartitionLease:
                 file_format = self._checkpoint_format()
                 chunks = snapshot.chunks(file_format)
                 self.claim = await self._checkpoints.write(claim, snapshot.sequence, chunks, file_format=file_format)
+                partition.mark_saved()
             except _FENCED as error:
                 self._drop_ownership(error)
             except BaseException:

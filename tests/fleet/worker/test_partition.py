@@ -143,26 +143,54 @@ def test_processed_message_is_not_processed_again(samples) -> None:
 class TestReplies:
     """Replies of a partition to the edge of a pack."""
 
-    def test_first_and_each_tenth_block_are_confirmed(self, stream, samples) -> None:
+    def test_first_and_each_tenth_block_are_answered(self, stream, samples) -> None:
         blocks = blocks_of(samples[:600])
         replies = {number: stream.send("a", data).reply for number, data in enumerate(blocks, 1)}
         assert [number for number, reply in replies.items() if reply] == [1, *range(CONFIRM_EVERY, 31, CONFIRM_EVERY)]
-        assert (replies[20].store, replies[20].number, replies[20].resend) == (STORE_ID_NS, 21, False)
+        assert not any(reply.resend for reply in replies.values() if reply)
+
+    def test_only_blocks_of_the_last_saved_checkpoint_are_confirmed(self, stream, samples) -> None:
+        blocks = blocks_of(samples[:1000])
+        numbers = []
+        for number, data in enumerate(blocks, 1):
+            if reply := stream.send("a", data).reply:
+                numbers.append((number, reply.number))
+            if number == 15:
+                stream.save()
+            if number == 35:
+                stream.partition.snapshot()  # whose save fails
+        assert numbers == [(1, 1), (10, 1), (20, 16), (30, 16), (40, 16), (50, 16)]
         stream.take_over()
-        assert stream.send("a", one_block(samples[600:620], 31)).reply.number == 32
+        assert stream.send("a", blocks[-1]).reply.number == 51
+
+    def test_blocks_that_arrive_while_a_checkpoint_is_saved_are_not_confirmed(self, stream, samples) -> None:
+        blocks = blocks_of(samples[:200])
+        deliver(stream, "a", blocks[:4])
+        stream.partition.snapshot()
+        deliver(stream, "a", blocks[4:9], first=5)
+        stream.partition.mark_saved()
+        assert stream.send("a", blocks[9]).reply.number == 5
 
     def test_missing_block_is_requested_at_the_gap_and_at_each_fifth_block_after_it(self, stream, samples) -> None:
         blocks = blocks_of(samples[:400])
         stream.send("a", blocks[0])
+        stream.save()
         replies = [stream.send("a", data).reply for data in blocks[4:16]]  # blocks 2 to 4 are missing
         assert [index for index, reply in enumerate(replies) if reply] == [0, REQUEST_EVERY, 2 * REQUEST_EVERY]
         assert all(reply.resend and reply.number == 2 for reply in replies if reply)
 
     def test_block_of_a_former_store_is_answered_with_the_present_store(self, stream, samples) -> None:
         stream.send("a", one_block(samples[:20], 1, STORE_ID_NS + 1))
+        stream.save()
         reply = stream.send("a", one_block(samples[:20], 10, STORE_ID_NS)).reply
         assert (reply.store, reply.number) == (STORE_ID_NS + 1, 2)
         assert stream.partition.counters["former_store"] == 1
+
+    def test_saved_blocks_of_a_former_store_confirm_none_of_the_new_store(self, stream, samples) -> None:
+        deliver(stream, "a", blocks_of(samples[:100]))
+        stream.save()
+        replies = [stream.send("a", data).reply for data in blocks_of(samples[:200], STORE_ID_NS + 1)]
+        assert (replies[-1].store, replies[-1].number) == (STORE_ID_NS + 1, 1)
 
 
 class TestNewStore:
@@ -204,8 +232,10 @@ class TestNewStore:
 def test_blocks_that_the_edge_no_longer_has_count_as_lost(stream, samples) -> None:
     blocks = blocks_of(samples[:400])
     deliver(stream, "a", blocks[:5])
+    stream.save()
     later_blocks = blocks_of(samples[200:400], oldest=11)
-    assert stream.send("a", later_blocks[3]).reply.number == 11  # the edge announces 11 as its oldest block
+    reply = stream.send("a", later_blocks[3]).reply  # the edge announces 11 as its oldest block
+    assert (reply.number, reply.resend) == (6, True)
     deliver(stream, "a", later_blocks, first=11)
     estimator = make_estimator(SETTINGS, CELL)
     estimator.run(samples[:100])
@@ -219,6 +249,7 @@ def test_blocks_that_the_edge_no_longer_has_count_as_lost(stream, samples) -> No
 def test_block_that_never_arrives_or_is_rejected_each_time_counts_as_lost(stream, samples, rejected_block) -> None:
     blocks = blocks_of(samples[:400])
     deliver(stream, "a", blocks[:5])
+    stream.save()
     block_after_gap = blocks[6]
     reply = stream.send("a", block_after_gap).reply
     assert (reply.number, reply.resend) == (6, True)
@@ -334,7 +365,7 @@ class TestUnknownPack:
             stream.send("a", data)
         packs["a"] = SETTINGS, CELL
         stream.send("a", blocks[-1])
-        assert stream.take_deferred()[-1].reply.number == len(blocks) + 1
+        assert stream.take_deferred()[-1].reply.number == 1
         assert_state_equals(stream, "a", record_of_one_run(samples[:200]))
 
     def test_number_of_deferred_packs_is_limited(self, monkeypatch: pytest.MonkeyPatch, samples) -> None:
@@ -347,7 +378,7 @@ class TestUnknownPack:
         assert stream.partition.unknown == ("pack0", "pack1", "pack2")
         assert stream.partition.counters["not_deferred"] == 2
         packs["pack4"] = SETTINGS, CELL
-        assert stream.send("pack4", data).reply.number == 2
+        assert stream.send("pack4", data).reply
 
 
 class TestDeferredPack:
@@ -472,11 +503,12 @@ class TestInvalidBlocks:
 
         blocks = blocks_of(samples[:400])
         deliver(stream, "a", blocks[:9])
+        stream.save()
         with monkeypatch.context() as patched, capture_logs() as logs:
             patched.setattr(BlockProcessor, "_state_payload", fail)  # after the estimator has processed the samples
             result = stream.send("a", blocks[9])
             stream.send("new", blocks[0])
-        assert (result.state, result.failed, result.reply.number, result.reply.resend) == (None, 1, 11, False)
+        assert (result.state, result.failed, result.reply.number, result.reply.resend) == (None, 1, 10, False)
         assert [(line["event"], line["pack"], line["number"]) for line in logs] == [
             ("a block is skipped", "a", 10),
             ("a block is skipped", "new", 1),

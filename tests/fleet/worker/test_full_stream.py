@@ -1,0 +1,99 @@
+"""Stream that overflows while no worker runs: the edges resend all blocks that no checkpoint includes."""
+
+import asyncio
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from bms_estimator.edge import subjects
+from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.nats.streams import RAW_BYTES, make_streams
+from bms_estimator.fleet.packs.csv_table import read_table
+from bms_estimator.fleet.packs.pack_bucket import PackBucket, write_bucket
+from bms_estimator.fleet.simulation.block_publisher import run_edges
+from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
+from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
+from bms_estimator.settings.mqtt import MqttSettings
+from tests.fleet.nats_cluster import connected, running
+from tests.fleet.workers import Heartbeats, Process, end_states
+from tests.patience import LONG_S
+
+PACKS, PARTITIONS = 2, 1
+BLOCKS_PER_S = 20.0
+"""Rate of the blocks of all edges [1/s]."""
+SAVED, UNSAVED, OVERFLOW, AFTERWARDS = 12, 25, 10, 6
+"""Numbers of blocks of each edge: before the last checkpoint, after it, without a worker, and with the next worker.
+An edge gets a reply at every tenth block."""
+SMALL_BYTES = 4096
+"""Size of the stream while it overflows [bytes]: a few blocks."""
+NEVER_S = 3600
+"""Checkpoint interval that does not end during the test [s]."""
+
+
+async def test_no_block_is_lost_if_the_stream_overflows_without_a_worker(tmp_path: Path) -> None:
+    with running(tmp_path, 1, partitions=PARTITIONS) as cluster, ExitStack() as stack:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=PARTITIONS)
+        fleet = SimulatedFleet(PACKS, seed=1, begin_ns=time.time_ns() - 86_400 * 10**9)  # the packs are fast
+        (tmp_path / "packs.csv").write_text(fleet.table())
+        rows = {pack: row.data for pack, row in read_table(tmp_path / "packs.csv").packs.items()}
+        await write_bucket(nc, subjects.PACKS_BUCKET, rows)
+        bucket = PackBucket(nc)
+        await bucket.refresh()
+
+        def start_worker(name: str) -> Process:
+            worker = Process(tmp_path, cluster.url, name, "--checkpoint-s", NEVER_S)
+            stack.callback(worker.kill)
+            return worker
+
+        async def until_processed(heartbeats: Heartbeats, name: str, blocks: int) -> None:
+            """Wait until the partition has processed or lost a number of blocks of each edge."""
+
+            def is_processed(last: Mapping[str, Heartbeat]) -> bool:
+                counters = last[name].counters if name in last else {}
+                return counters.get("blocks", 0) + counters.get("lost_blocks", 0) >= PACKS * blocks
+
+            await heartbeats.until(is_processed)
+
+        edges = SimulatedEdges(fleet, start_s=time.time(), speed=BLOCKS_PER_S * BLOCK_S / PACKS, last=SAVED)
+        settings, stop = MqttSettings(url=(f"mqtt://127.0.0.1:{cluster.mqtt_port}",)), asyncio.Event()
+        publisher = asyncio.create_task(
+            run_edges(fleet, edges, settings, connections=1, stop=stop, report=lambda _: None, quiet_s=LONG_S)
+        )
+        async with Heartbeats(nc) as heartbeats:
+            saving_worker = start_worker("saving")
+            await until_processed(heartbeats, "saving", SAVED)
+            assert await saving_worker.end() == 0
+            killed_worker = start_worker("killed")
+            await heartbeats.until_held(PARTITIONS, "killed")
+            edges.last = SAVED + UNSAVED
+            await until_processed(heartbeats, "killed", edges.last)
+            killed_worker.kill()
+            await make_streams(nc, partitions=PARTITIONS, raw_bytes=SMALL_BYTES)
+            edges.last += OVERFLOW
+            stream_end = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq + PACKS * OVERFLOW
+            while (state := (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state).last_seq < stream_end:  # noqa: ASYNC110 - the stream has no notifications
+                await asyncio.sleep(0.02)
+            assert state.messages < PACKS * OVERFLOW  # the stream has dropped all blocks since the checkpoint
+            await make_streams(nc, partitions=PARTITIONS, raw_bytes=RAW_BYTES)
+            next_worker = start_worker("next")
+            await heartbeats.until_held(PARTITIONS, "next")
+            edges.last += AFTERWARDS
+            await until_processed(heartbeats, "next", edges.last)
+        stop.set()
+        await publisher
+        assert await next_worker.end() == 0
+        partition = (await end_states(nc, bucket.packs, PARTITIONS))[0]
+        for i, pack in enumerate(fleet.names):
+            state = partition.state(pack)
+            assert state is not None
+            assert (state["delivery"]["awaited"][0], state["delivery"]["lost_blocks"][0]) == (edges.last + 1, 0)
+            estimator = make_estimator(*bucket.packs(pack))
+            for samples in fleet.samples(np.full(edges.last, i), np.arange(1, edges.last + 1)):
+                estimator.run(samples)
+            assert state["estimator"].tobytes() == estimator.record.tobytes()
+        await nc.close()
