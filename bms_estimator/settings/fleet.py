@@ -10,7 +10,17 @@ from bms_estimator.settings.pack import DeviceName
 from bms_estimator.settings.page import ListenAddress, parse_listen
 
 Gigabytes = Annotated[float, Field(gt=0, le=1e6)]
+PackCount = Annotated[int, Field(ge=1, le=10_000_000)]
+Days = Annotated[float, Field(gt=0, le=3660)]
 TenantName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
+
+
+def _reject_raw_limits(table: object) -> object:
+    """Reject the former limits of the stream of blocks."""
+    former = {"raw_gb", "raw_days"}.intersection(table if isinstance(table, dict) else ())
+    if former:
+        raise ValueError(f"{min(former)}: replaced by packs and outage_days, from which the size is computed")
+    return table
 
 
 def _validate_listen(text: str) -> str:
@@ -38,20 +48,22 @@ class ServerSettings(Strict):
         default=64,
         description="number of partitions of packs, which the workers divide among themselves; cannot be changed after the streams were created",
     )
-    raw_gb: Gigabytes = Field(
-        default=8.0,
-        description="maximum size of the stored blocks of samples, for each tenant; 100,000 packs at 1 Hz send 100 GB a day",
+    packs: PackCount = Field(
+        default=1000, description="number of packs of each tenant, from which the sizes of the streams are computed"
     )
-    raw_days: Annotated[float, Field(gt=0, le=3660)] = Field(
-        default=7.0, description="maximum age of stored blocks [days]"
+    outage_days: Days = Field(
+        default=7.0,
+        description="time without workers after which the server still has all blocks [days]; older blocks are dropped",
     )
     disk_gb: Gigabytes | None = Field(
-        default=None, description="maximum size of all streams; default: three quarters of the free space"
+        default=None, description="maximum size of all streams; default: three quarters of the free space at the start"
     )
     sync_s: Annotated[float, Field(ge=0, le=3600)] = Field(
         default=10.0,
         description="interval between fsyncs; a power failure loses messages since the last fsync, unless another node has them; 0: fsync after each message",
     )
+
+    _raw_limits = model_validator(mode="before")(_reject_raw_limits)
 
     @model_validator(mode="after")
     def _check_that_monitor_is_local(self) -> Self:
@@ -78,9 +90,9 @@ class TlsSettings(Strict):
 class TenantSettings(Strict):
     """A tenant with separate streams, workers and packs."""
 
-    raw_gb: Gigabytes | None = Field(default=None, description="maximum size of stored blocks; default: server.raw_gb")
-    raw_days: Annotated[float, Field(gt=0, le=3660)] | None = Field(
-        default=None, description="maximum age of stored blocks [days]; default: server.raw_days"
+    packs: PackCount | None = Field(default=None, description="number of packs; default: server.packs")
+    outage_days: Days | None = Field(
+        default=None, description="time without workers that must be bridged [days]; default: server.outage_days"
     )
     disk_gb: Gigabytes | None = Field(
         default=None, description="maximum size of all streams of the tenant, including replicas; default: no limit"
@@ -89,6 +101,8 @@ class TenantSettings(Strict):
         default={},
         description="revocation times by pack; tokens of a pack that were issued before its time are rejected, for example after a theft",
     )
+
+    _raw_limits = model_validator(mode="before")(_reject_raw_limits)
 
 
 class FleetSettings(Strict):

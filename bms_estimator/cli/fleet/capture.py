@@ -58,7 +58,7 @@ def capture(
 ) -> None:
     """Write a pack's stored samples to a file that `replay`, `identify`, `validate` and `capacity` can read.
 
-    The server stores samples for some days (setting `server.raw_days`). They are written in the order in which the edge sent them.
+    The server stores samples for some days (setting `server.outage_days`). They are written in the order in which the edge sent them.
     To reproduce the workers' estimates, run `replay` with the settings that `fleet packs show PACK --out FOLDER` writes.
     """
     check_output_file(out, [], force=force)
@@ -101,7 +101,7 @@ def no_samples_reason(pack: str, fetched: "BlockCapture") -> str:
     damaged = f"; {fetched.damaged} of its messages are damaged" if fetched.damaged else ""
     return (
         f"{pack}: the server has no samples of this pack in this period{damaged}; check its name, and whether its edge sends "
-        "(`fleet packs list` prints the names; server.raw_days limits the age of stored samples)"
+        "(`fleet packs list` prints the names; server.outage_days limits the age of stored samples)"
     )
 
 

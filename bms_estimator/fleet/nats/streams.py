@@ -25,6 +25,8 @@ RAW_BYTES = 8 << 30
 """Default maximum size of the stream ``RAW`` [bytes]."""
 RAW_AGE_S = 7 * 86_400.0
 """Default maximum age of a message in the stream ``RAW`` [s]."""
+UNLIMITED = -1
+"""Size of a stream that only the server's disk space limits."""
 HOURS_FRACTION = 1 / 16
 """Maximum size of the stream ``HOURS`` as a fraction of the maximum size of ``RAW``."""
 HOURS_AGE_S = 30 * 86_400.0
@@ -69,6 +71,7 @@ async def make_streams(
     replicas: int = 1,
     raw_bytes: int = RAW_BYTES,
     raw_age_s: float = RAW_AGE_S,
+    states_bytes: int = UNLIMITED,
 ) -> None:
     """Create missing streams and consumers, and set limits and replicas as configured. The function is idempotent.
 
@@ -78,6 +81,7 @@ async def make_streams(
         replicas: Number of replicas: 1, or 3 in a cluster of three.
         raw_bytes: Maximum size of ``RAW`` [bytes]; beyond it the oldest messages are dropped.
         raw_age_s: Maximum age of messages in ``RAW`` [s].
+        states_bytes: Maximum size of the checkpoints [bytes]; beyond it the workers remove daily ones.
 
     Raises:
         UserError: The streams have another number of partitions, or the server has too little disk space.
@@ -93,7 +97,7 @@ async def make_streams(
         _raw_stream(partitions, raw_bytes, raw_age_s),
         _hours_stream(raw_bytes),
         _dead_stream(raw_bytes),
-        *_bucket_streams(),
+        *_bucket_streams(states_bytes),
     )
     for stream in streams:
         await _retry(_ensure_stream, nc, stream | {"num_replicas": replicas})
@@ -165,7 +169,7 @@ def _dead_stream(raw_bytes: int) -> dict[str, Any]:
     return _stream(subjects.DEAD_STREAM, subjects.dead(), **limits)
 
 
-def _bucket_streams() -> list[dict[str, Any]]:
+def _bucket_streams(states_bytes: int) -> list[dict[str, Any]]:
     common = {"discard": "new", "allow_rollup_hdrs": True, "allow_direct": True}
     states = subjects.STATES_BUCKET
     return [
@@ -173,7 +177,7 @@ def _bucket_streams() -> list[dict[str, Any]]:
             _stream(f"KV_{name}", f"$KV.{name}.>", max_msgs_per_subject=1, deny_delete=True, **common)
             for name in (subjects.PACKS_BUCKET, subjects.CELLS_BUCKET, subjects.CHECKPOINTS_BUCKET)
         ),
-        _stream(f"OBJ_{states}", f"$O.{states}.C.>", f"$O.{states}.M.>", **common),
+        _stream(f"OBJ_{states}", f"$O.{states}.C.>", f"$O.{states}.M.>", max_bytes=states_bytes, **common),
     ]
 
 

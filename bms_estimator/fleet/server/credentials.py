@@ -18,6 +18,7 @@ from datetime import datetime
 from pathlib import Path
 
 from bms_estimator.fleet.server import jwt_claims
+from bms_estimator.fleet.server.disk_space import GB
 from bms_estimator.fleet.server.jwt_claims import ACCOUNT, BEARERS, OPERATOR, Key, Role, Tenant
 from bms_estimator.fleet.server.nats_config import Accounts
 from bms_estimator.model.errors import UserError
@@ -30,8 +31,6 @@ _MAX_KEY_BYTES = 200
 """Maximum size of a key file [bytes]."""
 _MAX_CLAIMS_BYTES = 64 << 20
 """Maximum size of ``claims.json`` [bytes]."""
-GB = 1_000_000_000
-"""Gigabyte [bytes]."""
 
 
 def has_keys(folder: Path) -> bool:

@@ -9,7 +9,7 @@ import functools
 import signal
 import ssl
 from collections.abc import AsyncIterator, Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import aiohttp
@@ -21,6 +21,7 @@ from nats.errors import Error as NatsError
 from bms_estimator.fleet.nats.connection import AUTH_TIMEOUT_S, close
 from bms_estimator.fleet.nats.streams import NoAnswerError, make_streams
 from bms_estimator.fleet.server import credentials
+from bms_estimator.fleet.server.disk_space import GB, check_disk_space, sizes_of, usable_bytes
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_config import Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.fleet.server.server_binary import find_server
@@ -55,16 +56,29 @@ class NodeLocation:
         folder: Folder of streams and keys.
         number: Number of the node, from 1.
         nodes: Cluster addresses of all nodes, host:port; empty for a single node.
+        usable_bytes: Space that the streams may use without ``server.disk_gb`` [bytes]. The server cannot change it at a
+            reload. None: not known before the start.
     """
 
     folder: Path
     number: int = 1
     nodes: tuple[str, ...] = ()
+    usable_bytes: int | None = None
 
     @property
     def keys(self) -> Path:
         """Folder of the keys."""
         return self.folder / "keys"
+
+    @property
+    def streams(self) -> Path:
+        """Folder of the streams."""
+        return self.folder / "streams"
+
+    @property
+    def replicas(self) -> int:
+        """Number of replicas of each stream."""
+        return min(len(self.nodes), MAX_REPLICAS) or 1
 
 
 @dataclass(frozen=True)
@@ -86,7 +100,7 @@ def node_of(place: NodeLocation, spec: ServerSpec) -> Node:
     own_address = place.nodes[place.number - 1] if place.nodes else ""
     return Node(
         name=f"n{place.number}",
-        store=place.folder / "streams",
+        store=place.streams,
         nats=server.listen,
         mqtt=server.mqtt,
         monitor=server.monitor,
@@ -94,7 +108,7 @@ def node_of(place: NodeLocation, spec: ServerSpec) -> Node:
         tls=_tls(tls) if tls else None,
         accounts=spec.accounts,
         partitions=server.partitions,
-        disk_bytes=None if server.disk_gb is None else round(credentials.GB * server.disk_gb),
+        disk_bytes=place.usable_bytes if server.disk_gb is None else round(GB * server.disk_gb),
         sync_s=server.sync_s or None,
     )
 
@@ -125,6 +139,16 @@ def _check_tls_files(tls: Tls) -> None:
         raise UserError(f"tls.cert_file = {tls.cert}, tls.key_file = {tls.key}: {error.reason or error}") from None
 
 
+def _check_disk_space(place: NodeLocation, spec: ServerSpec) -> None:
+    """Check that the streams of all tenants fit (``disk_space.check_disk_space``).
+
+    Raises:
+        UserError: They do not fit.
+    """
+    copies_per_node = place.replicas / (len(place.nodes) or 1)
+    check_disk_space(spec.settings, place.streams, place.usable_bytes or 0, copies_per_node)
+
+
 async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Callable[[str], None]) -> int:
     """Run a node until it ends. SIGHUP reloads its settings: tenants, limits, revoked users.
 
@@ -137,9 +161,11 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
         The server's exit code; 0 after a requested end.
 
     Raises:
-        UserError: The server is missing or too old, settings are invalid, or the server rejects the streams.
+        UserError: The server is missing or too old, settings are invalid, the disk is too small, or the server rejects the streams.
     """
     binary, spec = find_server(), read()
+    place = replace(place, usable_bytes=usable_bytes(place.streams))
+    _check_disk_space(place, spec)
     node = node_of(place, spec)
     if node.tls:
         _check_tls_files(node.tls)
@@ -176,6 +202,7 @@ async def _reload_on_signal(
         requested.clear()
         try:
             spec = read()
+            _check_disk_space(place, spec)
             node = node_of(place, spec)
             async with asyncio.timeout(RELOAD_TIMEOUT_S):
                 varz_before = await _wait_for_monitor(node, "varz", bool)
@@ -253,7 +280,7 @@ async def _make_all_streams(place: NodeLocation, spec: ServerSpec, report: Calla
 
 
 async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant: TenantSettings) -> None:
-    node, server = node_of(place, spec), spec.settings.server
+    node, server, sizes = node_of(place, spec), spec.settings.server, sizes_of(spec.settings, tenant)
     try:
         nc = await connect(node, credentials.credentials_file(place.keys, name, Role.ADMIN) if name else None)
     except TimeoutError:
@@ -264,15 +291,16 @@ async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant
         await make_streams(
             nc,
             partitions=node.partitions,
-            replicas=min(len(place.nodes), MAX_REPLICAS) or 1,
-            raw_bytes=round(credentials.GB * (tenant.raw_gb or server.raw_gb)),
-            raw_age_s=86_400.0 * (tenant.raw_days or server.raw_days),
+            replicas=place.replicas,
+            raw_bytes=sizes.raw,
+            raw_age_s=86_400.0 * (tenant.outage_days or server.outage_days),
+            states_bytes=sizes.states,
         )
     except NoAnswerError:
         raise
     except UserError as error:
         hint = (
-            ": reduce raw_gb or increase disk_gb, of this tenant or of the server"
+            ": reduce packs or outage_days, or increase disk_gb, of this tenant or of the server"
             if "insufficient" in str(error)
             else ""
         )

@@ -53,7 +53,8 @@ listen = "127.0.0.1:{listen}"
 mqtt = "127.0.0.1:{mqtt}"
 monitor = "127.0.0.1:{monitor}"
 partitions = 4
-raw_gb = 0.1
+packs = 100
+outage_days = 0.1
 disk_gb = 10
 [tls]
 cert_file = "{certificate}"
@@ -168,9 +169,9 @@ async def test_tenant_is_added_without_a_restart(serve: tuple[ServeProcess, Path
     server, folder = serve
     file, context = folder / "fleet.toml", ssl.create_default_context(cafile=str(authority.certificate))
     valid_settings = file.read_text()
-    file.write_text(valid_settings + "[tenants.wrong]\nraw_gb = -1\n")
+    file.write_text(valid_settings + "[tenants.wrong]\npacks = -1\n")
     server.process.send_signal(signal.SIGHUP)
-    await until(lambda: "tenants.wrong.raw_gb = -1" in server.errors())
+    await until(lambda: "tenants.wrong.packs = -1" in server.errors())
     file.write_text(valid_settings + "[tenants.later]\n")
     server.process.send_signal(signal.SIGHUP)
     await asyncio.to_thread(server.wait, "tenant later: streams ready")
@@ -194,7 +195,7 @@ def test_second_server_on_the_same_ports_fails_and_sigterm_ends_the_first(serve:
 async def test_nats_server_ends_when_fleet_serve_is_killed(tmp_path: Path) -> None:
     listen, mqtt, monitor = free_port(), free_port(), free_port()
     addresses = f'listen = "127.0.0.1:{listen}"\nmqtt = "127.0.0.1:{mqtt}"\nmonitor = "127.0.0.1:{monitor}"\n'
-    (tmp_path / "fleet.toml").write_text(f"[server]\npartitions = 4\nraw_gb = 0.1\n{addresses}")
+    (tmp_path / "fleet.toml").write_text(f"[server]\npartitions = 4\noutage_days = 0.1\n{addresses}")
     for _ in range(2):  # the second process starts with the streams of the killed one
         server = ServeProcess(tmp_path / "fleet.toml", tmp_path / "state")
         await asyncio.to_thread(server.wait, "streams ready")
@@ -317,6 +318,24 @@ def test_missing_certificate_or_another_key_is_rejected(
     (tmp_path / "fleet.toml").write_text(text)
     code, _, err = run(capsys, "fleet", "serve", tmp_path / "fleet.toml", "--folder", tmp_path / "state")
     assert (code, err) == (2, f"error: {message.format(folder=folder)}\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("packs = 10_000_000\noutage_days = 365", "streams: the streams need 427432.0 GB, but may use only "),
+        ("packs = 10_000\ndisk_gb = 90", "server.disk_gb = 90: the streams need 93.9 GB: increase disk_gb"),
+        ("raw_gb = 8", "server: raw_gb: replaced by packs and outage_days"),
+    ],
+)
+def test_server_refuses_to_start_if_the_streams_do_not_fit(
+    text: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "fleet.toml").write_text(f"[server]\n{text}\n")
+    code, _, err = run(capsys, "fleet", "serve", tmp_path / "fleet.toml", "--folder", tmp_path)
+    assert code == 2
+    assert reason in err
+    assert not (tmp_path / "nats-server.conf").exists()
 
 
 def test_every_setting_is_documented() -> None:

@@ -1,0 +1,58 @@
+"""Sizes of a tenant's streams, from the number of packs and the days without workers that the streams must bridge.
+
+The sizes of a block, an hourly summary and a pack's state were measured with simulated packs at 1 Hz without cell voltages
+(``tests/fleet/nats/test_stream_sizes.py`` prints them).
+"""
+
+from dataclasses import dataclass
+
+from bms_estimator.fleet.nats.streams import (
+    DEAD_FRACTION,
+    HOURS_FRACTION,
+    MAX_BLOCK_BYTES,
+    PACK_FRACTION,
+)
+
+DAY_BLOCKS = 1440
+"""Number of minute blocks of a pack-day."""
+BLOCK_BYTES = 800
+"""Size of a block of 60 samples in ``RAW``, with the server's overhead [bytes]."""
+HOUR_ROW_BYTES = 1900
+"""Size of an hourly summary in ``HOURS``, with the server's overhead [bytes]."""
+STATE_BYTES = 42_000
+"""Maximum size of a pack in a checkpoint [bytes]."""
+DAILY_STATE_BYTES = 19_000
+"""Size of a pack in a checkpoint after 24 h [bytes], which is nearly that of a daily checkpoint."""
+LAST_CHECKPOINTS, DAILY_CHECKPOINTS = 3, 30
+"""Number of checkpoints of a partition: the last two with the one that is being written, and the daily ones."""
+MIN_STATES_BYTES = 256 << 20
+"""Minimum size of the checkpoints' stream [bytes]: 64 partitions without packs, each with all its checkpoints."""
+
+
+@dataclass(frozen=True)
+class StreamSizes:
+    """Maximum sizes of a tenant's streams [bytes]."""
+
+    raw: int
+    """Stream ``RAW``."""
+    states: int
+    """Stream ``OBJ_states``."""
+
+    @property
+    def total(self) -> int:
+        """All streams, including ``HOURS`` and ``DEAD``, whose sizes are fractions of that of ``RAW``."""
+        return round(self.raw * (1.0 + HOURS_FRACTION + DEAD_FRACTION)) + self.states
+
+
+def stream_sizes(packs: int, outage_days: float) -> StreamSizes:
+    """Return the sizes of the streams for a number of packs.
+
+    Args:
+        packs: Number of packs of the tenant.
+        outage_days: Days without workers after which ``RAW`` still has all blocks, even if one pack sends blocks of the
+            maximum size.
+    """
+    fleet_bytes = packs * outage_days * DAY_BLOCKS * BLOCK_BYTES
+    one_pack_bytes = outage_days * DAY_BLOCKS * MAX_BLOCK_BYTES / PACK_FRACTION
+    states_bytes = packs * (LAST_CHECKPOINTS * STATE_BYTES + DAILY_CHECKPOINTS * DAILY_STATE_BYTES)
+    return StreamSizes(raw=round(max(fleet_bytes, one_pack_bytes)), states=max(states_bytes, MIN_STATES_BYTES))

@@ -1,0 +1,64 @@
+"""Disk space that the streams of a node need, and that its file system has."""
+
+import shutil
+from pathlib import Path
+
+from bms_estimator.fleet.nats.stream_sizes import StreamSizes, stream_sizes
+from bms_estimator.model.errors import UserError
+from bms_estimator.settings.fleet import FleetSettings, TenantSettings
+
+GB = 1_000_000_000
+"""Gigabyte [bytes]."""
+BLOCK_BYTES = 512
+"""Unit of ``st_blocks`` [bytes]."""
+USABLE_FRACTION = 0.75
+"""Fraction of the file system's space, without that of other files, that the streams may use."""
+
+
+def usable_bytes(folder: Path) -> int:
+    """Return the space that the streams of a folder may use, including the space that they use already [bytes]."""
+    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    stored = sum(_stored_bytes(file) for file in folder.rglob("*"))
+    return round(USABLE_FRACTION * (shutil.disk_usage(existing).free + stored))
+
+
+def _stored_bytes(path: Path) -> int:
+    """Return the space that a file takes on the disk [bytes]; 0 if it was removed meanwhile."""
+    try:
+        return path.stat().st_blocks * BLOCK_BYTES
+    except OSError:
+        return 0
+
+
+def sizes_of(settings: FleetSettings, tenant: TenantSettings) -> StreamSizes:
+    """Return the sizes of a tenant's streams."""
+    server = settings.server
+    return stream_sizes(tenant.packs or server.packs, tenant.outage_days or server.outage_days)
+
+
+def check_disk_space(settings: FleetSettings, folder: Path, usable: int, copies_per_node: float) -> None:
+    """Check that the streams of all tenants fit.
+
+    Args:
+        settings: Settings of the fleet.
+        folder: Folder of the streams, for the error.
+        usable: Space that the streams may use [bytes].
+        copies_per_node: Mean number of copies of a stream on this node, at most 1.
+
+    Raises:
+        UserError: They are larger than ``server.disk_gb`` or the usable space.
+    """
+    tenants = settings.tenants or {"": TenantSettings()}
+    needed = copies_per_node * sum(sizes_of(settings, tenant).total for tenant in tenants.values())
+    limit_gb = settings.server.disk_gb
+    if limit_gb is not None and needed > GB * limit_gb:
+        raise UserError(
+            f"server.disk_gb = {limit_gb:g}: the streams need {needed / GB:.1f} GB: "
+            "increase disk_gb, or reduce packs or outage_days, of the server or of a tenant"
+        )
+    if limit_gb is None and needed > usable:
+        raise UserError(
+            f"{folder}: the streams need {needed / GB:.1f} GB, but may use only {usable / GB:.1f} GB, "
+            f"{USABLE_FRACTION:.0%} of the free space: choose a larger disk by --folder, "
+            "or reduce packs or outage_days, of the server or of a tenant"
+        )
