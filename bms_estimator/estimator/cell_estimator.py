@@ -18,8 +18,10 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.settings.alarm_limits import MIN_CELLS, balancing_voltage_v
 
-LEAK_STDS = 3.0
-"""Minimum excess of a cell's self-discharge over that of the reference cell that counts as a short [std]."""
+LEAK_STDS = 2.5
+"""Minimum excess of a cell's self-discharge over that of the median cell that counts as a short [std]."""
+HYPOTHESIS_FIELDS = {"response", "score", "information"}
+"""Fields of CELL that older checkpoints do not have. Without them the hypotheses start again."""
 
 CONSTANT_FRACTION = 0.5
 """Fraction of ``BIAS_V`` that is constant, such as the offset of a converter."""
@@ -70,8 +72,9 @@ class CellDeviations:
 
     @property
     def proven_self_discharge_a(self) -> Floats:
-        """Lower bound of ``self_discharge_a``, by ``LEAK_STDS`` standard deviations [A]."""
-        return self.self_discharge_a - LEAK_STDS * self.self_discharge_std_a
+        """``self_discharge_a`` where it exceeds ``LEAK_STDS`` standard deviations, otherwise 0 [A]."""
+        significant = self.self_discharge_a >= LEAK_STDS * self.self_discharge_std_a
+        return np.where(significant, self.self_discharge_a, 0.0)
 
 
 class CellEstimator:
@@ -185,14 +188,16 @@ class CellEstimator:
         if not saved or not self._enabled:
             return ""
         cells, bank = saved.get("cells"), saved.get("bank")
-        if cells is None or bank is None or (cells.dtype, bank.dtype) != (CELL, BANK) or bank.shape != (1,):
+        if cells is None or bank is None or not _has_state(cells) or bank.dtype != BANK or bank.shape != (1,):
             return "it was saved by another version"
         if cells.shape != (self._series,):
             return f"it has {cells.size} cells, and the pack has {self._series} in series"
         if reason := _invalid_reason(cells, bank):
             return reason
         self._start(self._series)
-        self.cells[...], self.bank[...] = cells, bank
+        for name in set(CELL.names or ()) & set(cells.dtype.names or ()):
+            self.cells[name] = cells[name]
+        self.bank[...] = bank
         self.resume(unseen_s)
         return ""
 
@@ -200,6 +205,13 @@ class CellEstimator:
         """Prepare for samples with another time base, after a gap of ``unseen_s`` [s]; infinite if unknown."""
         self.bank["time_s"] = np.inf
         self.bank["unseen_s"] = unseen_s if math.isfinite(unseen_s) else 0.0
+
+
+def _has_state(cells: Records) -> bool:
+    """Return True if the fields of ``cells`` are those of CELL, possibly without those of the hypotheses of former versions."""
+    fields, saved = dict(CELL.fields or {}), dict(cells.dtype.fields or {})
+    required = fields.keys() - HYPOTHESIS_FIELDS
+    return required <= saved.keys() and all(saved[name][0] == fields[name][0] for name in saved.keys() & fields.keys())
 
 
 def _invalid_reason(cells: Records, bank: Records) -> str:

@@ -1,4 +1,4 @@
-"""Figures of the estimators of single cells: detection of shorts, false alarms. ``make cells``; docs/pack/cells.md.
+"""Figures of the estimators of single cells: detection of shorts, false alarms, balancers. ``make cells``; docs/pack/cells.md.
 
 Three detectors of the field see the same cell voltages and are calibrated on the same healthy packs: the Shannon entropy of the cell
 voltages, the difference of a cell from the mean cell, and a CUSUM of this difference.
@@ -19,7 +19,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.settings.alarm_limits import MIN_READING_ERROR_V, MIN_SHORT_C
+from bms_estimator.settings.alarm_limits import MIN_READING_ERROR_V, MIN_SHORT_C, balancing_voltage_v
 from bms_estimator.settings.sampling import BOARD
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 
@@ -40,6 +40,14 @@ HEALTHY_CYCLES = 20
 """Number of cycles before a short appears."""
 SAFETY = 1.2
 """Factor of a detector's threshold on its largest value in healthy packs."""
+BALANCED_CELLS, BALANCED_AH, BALANCED_CYCLES = 6, 20.0, 12
+"""Number of cells of a pack with a balancer, their capacity [Ah], and the number of its cycles."""
+BALANCED_STEP_S, BALANCED_BLOCK = 10.0, 30
+"""Interval of the samples of this pack [s], and the number of samples in a block."""
+BALANCER_C = (0.0, 1 / 500, 1 / 200, 1 / 100, 1 / 50)
+"""Currents of the balancers, as C-rates [1/h]."""
+FULL_SOC, FULL_V = {"nmc": 0.9, "lfp": 0.98}, 3.55
+"""Mean SOC at which a charge ends, and voltage of a cell of LFP at which it ends [V]."""
 CUSUM_SLACK = 1.0
 """Slack of the CUSUM in std of a cell's deviation."""
 
@@ -49,6 +57,8 @@ class Hour:
     """Mean deviations of the cells in one hour, and the results of the estimators at its end."""
 
     time_h: float
+    cycles: float
+    """Number of cycles until then."""
     deviation_v: Floats
     """Voltage of each cell less the mean, mean over the hour [V], shape (cells,)."""
     cells_v: Floats
@@ -99,6 +109,7 @@ def hours(chemistry: str, seed: int, cycles: int, short_ohm: float = np.inf) -> 
         true = bank.soc - bank.soc.mean()
         yield Hour(
             block / BLOCKS,
+            turns / 2,
             np.mean(deviations_v[-BLOCKS:], axis=0),
             cells_v[-1],
             bank.soc,
@@ -206,12 +217,75 @@ def delays(chemistry: str, healthy: list[list[Hour]], seeds: int, cycles: int, f
         for seed in range(seeds):
             limit = cycles if ohm > 50.0 else max(cycles // 4, 4)
             course = list(hours(chemistry, first_seed + 500 + seed, HEALTHY_CYCLES + limit, ohm))
-            begin = len(list(hours(chemistry, first_seed + 500 + seed, HEALTHY_CYCLES)))
+            begin = next(i for i, hour in enumerate(course) if hour.cycles >= HEALTHY_CYCLES)
             found["cell_short"].append(delay_h(course, own_scores(course), 1.0, begin))
             for name, score in DETECTORS.items():
                 found[name].append(delay_h(course, score(course), thresholds[name], begin))
         rows.append(("none" if np.isinf(ohm) else f"{ohm:g}", *(_hours_text(found[name]) for name in found)))
     print_table(("short [ohm]", "cell_short [h]", *(f"{name} [h]" for name in DETECTORS)), rows)
+
+
+def balanced_scores(chemistry: str, seed: int, current_c: float, *, highest: bool) -> Floats:
+    """Simulate a pack with a balancer. Return the largest proven self-discharge of each block, relative to the limit.
+
+    The balancer is active while the pack does not discharge and a cell's voltage is above ``balancing_voltage_v``.
+
+    Args:
+        chemistry: Name of a generic cell file.
+        seed: Seed of the random numbers.
+        current_c: Current of the balancer, as a C-rate [1/h].
+        highest: True if the balancer drains the cell with the highest SOC, False if it always drains the same cell.
+    """
+    rng, cell = np.random.default_rng(seed), load_cell(chemistry, BALANCED_AH)
+    bank = SimulatedBank(cell, BankCells.drawn(rng, BALANCED_CELLS, BALANCED_AH, 0.9, soc_std=0.03))
+    model = cell.pack(BALANCED_CELLS, 1)
+    estimator = Estimator(model, voltage_resolution_v=0.01, sampling=BOARD)
+    estimators, offset_v = CellEstimator(estimator), OFFSET_V * rng.standard_normal(BALANCED_CELLS)
+    scores, highest_v, begin_v = list[float](), 0.0, balancing_voltage_v(model)
+
+    def run(rate_c: float) -> None:
+        nonlocal highest_v
+        leaks = np.full(BALANCED_CELLS, np.inf)
+        if rate_c <= 0.0 and highest_v >= begin_v and current_c:
+            drained = int(np.argmax(bank.soc)) if highest else SHORTED_CELL
+            leaks[drained] = begin_v / (current_c * BALANCED_AH)
+        bank.cells = replace(bank.cells, leak_ohm=leaks)
+        relative = max(1.0 + 0.3 * float(rng.standard_normal()), 0.0)
+        history = bank.run(np.full(BALANCED_BLOCK, relative * rate_c * BALANCED_AH), BALANCED_STEP_S)
+        noise_v = NOISE_V * rng.standard_normal(history.cell_v.shape)
+        cells_v = np.round((history.cell_v + offset_v + noise_v) / RESOLUTION_V) * RESOLUTION_V
+        samples = history.samples(rng, 2e-3, 0.01)
+        estimators.run(samples, cells_v, estimator.run(samples))
+        highest_v = float(cells_v[-1].max())
+        if (d := estimators.deviations) is not None:
+            scores.append(float(d.proven_self_discharge_a.max()) / (MIN_SHORT_C * BALANCED_AH))
+
+    hour = round(3600.0 / (BALANCED_STEP_S * BALANCED_BLOCK))
+    for _ in range(2 * hour):
+        run(0.2)
+    for _ in range(BALANCED_CYCLES):
+        while bank.soc.mean() < FULL_SOC[chemistry] and not (chemistry == "lfp" and highest_v >= FULL_V):
+            run(-0.2)
+        for _ in range(hour):
+            run(-0.002)
+        for _ in range(3 * hour):
+            run(0.2)
+    return np.array(scores)
+
+
+def balancers(chemistry: str, packs: int, first_seed: int) -> None:
+    """Print the number of packs in which a balancer raises ``cell_short``."""
+    rows = []
+    for highest in (True, False):
+        counts = []
+        for current_c in BALANCER_C:
+            scores = [
+                balanced_scores(chemistry, first_seed + 100 + seed, current_c, highest=highest) for seed in range(packs)
+            ]
+            counts.append(f"{sum(bool((each >= 1.0).any()) for each in scores)} of {packs}")
+        rows.append(("the cell with the highest SOC" if highest else "always one cell", *counts))
+    header = ("none" if current_c == 0.0 else f"C/{1 / current_c:.0f}" for current_c in BALANCER_C)
+    print_table(("the balancer drains", *header), rows)
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -240,6 +314,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     healthy = false_alarms(options.chemistry, options.cycles, options.packs, options.first_seed)
     delays(options.chemistry, healthy, options.short_packs, options.short_cycles, options.first_seed)
+    balancers(options.chemistry, options.packs, options.first_seed)
 
 
 if __name__ == "__main__":

@@ -73,15 +73,20 @@ def ocv_and_slope(p: Record, soc: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
+def advance(x: Floats, b: Record) -> None:
+    """Advance a state or an error of a state, shape (STATES,), over the window ``b``: F x."""
+    x[SOC] += b.change * x[CAPACITY] - b.elapsed_s / HOUR_S * x[LEAK]
+    x[BIAS] *= math.exp(-b.throughput / BIAS_SOC)
+
+
+@njit(cache=True)
 def predict_cell(c: Record, b: Record, balancing_variance: float) -> None:
     """Advance a cell's state over the window ``b``.
 
     ``balancing_variance`` is the variance of the SOC that a balancer may have changed.
     """
-    x, cov, hours = c.mean, c.covariance, b.elapsed_s / HOUR_S
-    x[SOC] += b.change * x[CAPACITY] - hours * x[LEAK]
-    kept = math.exp(-b.throughput / BIAS_SOC)
-    x[BIAS] *= kept
+    cov, hours, kept = c.covariance, b.elapsed_s / HOUR_S, math.exp(-b.throughput / BIAS_SOC)
+    advance(c.mean, b)
     # F has a unit diagonal except for BIAS, and two entries in the row of the SOC
     for j in range(STATES):
         cov[SOC, j] += b.change * cov[CAPACITY, j] - hours * cov[LEAK, j]
@@ -97,8 +102,8 @@ def predict_cell(c: Record, b: Record, balancing_variance: float) -> None:
 
 
 @njit(cache=True)
-def deviation_v(c: Record, p: Record, soc: float, drop_v: float) -> tuple[float, float, float]:
-    """Return the predicted deviation of a cell's voltage, its derivative by the cell's SOC, and that by the pack's SOC [V].
+def deviation_v(c: Record, p: Record, soc: float, drop_v: float) -> tuple[float, float]:
+    """Return the predicted deviation of a cell's voltage, and its derivative by the cell's SOC [V].
 
     Args:
         c: The cell.
@@ -107,8 +112,14 @@ def deviation_v(c: Record, p: Record, soc: float, drop_v: float) -> tuple[float,
         drop_v: Overpotential of the reference cell [V].
     """
     cell_v, cell_slope_v = ocv_and_slope(p, soc + c.mean[SOC])
-    reference_v, slope_v = ocv_and_slope(p, soc)
-    return cell_v - reference_v - c.mean[RESISTANCE] * drop_v + c.mean[BIAS], cell_slope_v, cell_slope_v - slope_v
+    reference_v = ocv_and_slope(p, soc)[0]
+    return cell_v - reference_v - c.mean[RESISTANCE] * drop_v + c.mean[BIAS], cell_slope_v
+
+
+@njit(cache=True)
+def expected_v(x: Floats, slope_v: float, drop_v: float) -> float:
+    """Return the deviation of the voltage by a small state, shape (STATES,): H x [V]."""
+    return slope_v * x[SOC] - drop_v * x[RESISTANCE] + x[BIAS]
 
 
 @njit(cache=True)
@@ -116,8 +127,8 @@ def write_ph(c: Record, slope_v: float, drop_v: float, ph: Floats) -> float:
     """Write P H' to ``ph``, shape (STATES,), and return H P H' [V^2]."""
     cov = c.covariance
     for i in range(STATES):
-        ph[i] = slope_v * cov[i, SOC] - drop_v * cov[i, RESISTANCE] + cov[i, BIAS]
-    return slope_v * ph[SOC] - drop_v * ph[RESISTANCE] + ph[BIAS]
+        ph[i] = expected_v(cov[i], slope_v, drop_v)
+    return expected_v(ph, slope_v, drop_v)
 
 
 @njit(cache=True)
@@ -131,16 +142,22 @@ def correct_cell(c: Record, innovation_v: float, variance_v2: float, ph: Floats)
 
 
 @njit(cache=True)
-def measurement_variance(drop_v: float, by_pack_v: float, soc_std: float, curve_v: float) -> float:
-    """Return R [V^2].
+def noise_variance(drop_v: float) -> float:
+    """Return the part of R that differs in each window, for an overpotential ``drop_v`` [V] of the reference cell [V^2]."""
+    return READING_V**2 + (DROP_ERROR * drop_v) ** 2
+
+
+@njit(cache=True)
+def curve_variance(c: Record, p: Record, soc: float, soc_std: float) -> float:
+    """Return the part of R by the shape of the OCV curve, which is similar in successive windows [V^2].
 
     Args:
-        drop_v: Overpotential of the reference cell [V].
-        by_pack_v: Derivative of the deviation by the pack's SOC [V].
-        soc_std: Std of the pack's SOC.
-        curve_v: Error of the tangent to the OCV curve (``curve_range_v``) [V].
+        c: The cell.
+        p: Settings of the pack's filter.
+        soc: SOC of the reference cell.
+        soc_std: Std of this SOC.
     """
-    return READING_V**2 + (DROP_ERROR * drop_v) ** 2 + (by_pack_v * soc_std) ** 2 + (0.5 * curve_v) ** 2
+    return (curve_range_v(c, p, soc) ** 2 + pack_range_v(c, p, soc, soc_std) ** 2) / CURVE_STDS**2
 
 
 @njit(cache=True)
@@ -151,3 +168,16 @@ def curve_range_v(c: Record, p: Record, soc: float) -> float:
     above_v = ocv_and_slope(p, soc + c.mean[SOC] + half)[0]
     below_v = ocv_and_slope(p, soc + c.mean[SOC] - half)[0]
     return max(abs(above_v - middle_v - slope_v * half), abs(middle_v - below_v - slope_v * half))
+
+
+@njit(cache=True)
+def pack_range_v(c: Record, p: Record, soc: float, soc_std: float) -> float:
+    """Return the largest change of the cell's deviation within ``CURVE_STDS`` std of the pack's SOC [V].
+
+    At the end of a charge of LFP, the deviation of the voltage grows tenfold within a few percent of SOC.
+    """
+    half = CURVE_STDS * math.sqrt(soc_std**2 + KNEE_SOC**2)
+    middle_v = deviation_v(c, p, soc, 0.0)[0]
+    return max(
+        abs(deviation_v(c, p, soc + half, 0.0)[0] - middle_v), abs(deviation_v(c, p, soc - half, 0.0)[0] - middle_v)
+    )

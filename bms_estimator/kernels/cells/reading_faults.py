@@ -68,8 +68,7 @@ def is_jump(c: Record, innovation_v: float, variance_v2: float, curve_v: float) 
         c: The cell.
         innovation_v: Innovation [V].
         variance_v2: Its variance S [V^2].
-        curve_v: Error of the tangent to the OCV curve within the uncertainty of the cell's SOC [V], which is large near
-            empty.
+        curve_v: Largest error by the shape of the OCV curve [V], which is large near full and empty.
     """
     is_large = abs(innovation_v) > max(GATE_V, GATE_STD * math.sqrt(variance_v2), curve_v)
     return is_large and abs(innovation_v - c.innovation_v) > JUMP_FRACTION * abs(innovation_v)

@@ -23,6 +23,10 @@ STATES = 5
 """Number of states of a cell."""
 SUM_1, SUM_A, SUM_A2, SUM_V, SUM_AV = range(5)
 """Indices in ``sums``: weight, current, squared current, innovation, current times innovation."""
+RISE, FALL, DRAIN = range(3)
+"""Hypotheses of a change: the self-discharge rises; it falls; a balancer drains the cell while it may be active."""
+HYPOTHESES = 3
+"""Number of hypotheses."""
 
 
 class ReadingFault(IntEnum):
@@ -46,8 +50,9 @@ CELL = np.dtype(
         ("sum_v", "f8"),  # sum of the voltages in the window [V]
         ("samples", "i8"),  # number of voltages in the window
         ("innovation_v", "f8"),  # measured less predicted deviation from the other cells, mean over two minutes [V]
-        ("fast_trend", "f8"),  # mean of the normalized innovation over minutes
-        ("slow_trend", "f8"),  # mean of the normalized innovation over hours
+        ("response", "f8", (HYPOTHESES, STATES)),  # error of the state for a change by 1/h that began at the restart
+        ("score", "f8", HYPOTHESES),  # expected times measured innovation over the variance, sum since the restart
+        ("information", "f8", HYPOTHESES),  # squared expected innovation over the variance, sum since the restart
         ("held_v", "f8"),  # voltage at its last change [V]
         ("held_reference_v", "f8"),  # median voltage of the cells at that time [V]
         ("sums", "f8", 5),  # decaying sums since a jump of the innovation

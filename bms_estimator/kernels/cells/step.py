@@ -5,14 +5,20 @@ import math
 from bms_estimator.kernels.cells.cell_filter import (
     BALANCING_C,
     BALANCING_SPREAD_V,
+    CURVE_STDS,
     HOUR_S,
     correct_cell,
-    curve_range_v,
+    curve_variance,
     deviation_v,
     initialize_cell,
-    measurement_variance,
+    noise_variance,
     predict_cell,
     write_ph,
+)
+from bms_estimator.kernels.cells.change_detection import (
+    apply_changes,
+    predict_hypotheses,
+    update_hypotheses,
 )
 from bms_estimator.kernels.cells.reading_faults import (
     ALIVE_V,
@@ -24,7 +30,7 @@ from bms_estimator.kernels.cells.reading_faults import (
     mark_sense_wires,
     unanswered_v,
 )
-from bms_estimator.kernels.cells.records import CAPACITY, LEAK, SOC, STATES, ReadingFault
+from bms_estimator.kernels.cells.records import SOC, STATES, ReadingFault
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
@@ -34,25 +40,8 @@ MAX_STEP_S = 60.0
 """Maximum time between two samples over which the current counts as measured [s]."""
 MAX_GAP_S = 1e9
 """Time between two samples from which the clock counts as another one [s]: 30 years."""
-FAST_MEMORY = 0.9
-"""Fraction of ``fast_trend`` that remains after a window."""
-SLOW_MEMORY = 0.997
-"""Fraction of ``slow_trend`` that remains after a window: a time constant of about an hour."""
-MAX_FAST_TREND = 1.0
-"""Maximum of ``fast_trend``. For white innovations it is 4 std."""
-MAX_SLOW_TREND = 0.1
-"""Maximum of ``slow_trend``: seven times the largest value of simulated healthy cells in 60 h."""
-INFLATION = 100.0
-"""Factor on the variance of the self-discharge after a trend exceeds its maximum, because a short may have appeared. A
-larger short exceeds it several times."""
-SOC_CHANGE = 0.01
-"""Std of a cell's SOC that a short may have drained before a trend exceeds its maximum."""
-CAPACITY_CHANGE = 0.01
-"""Std by which the relative capacity of a cell may have changed before a trend exceeds its maximum."""
 MIN_CELL_SOC, MAX_CELL_SOC = -0.2, 1.2
 """Range of the SOC of a cell that is over-discharged or overcharged."""
-MAX_LEAK_STD = 1.0
-"""Maximum std of the self-discharge [1/h]."""
 _NONE, _STUCK = int(ReadingFault.NONE), int(ReadingFault.STUCK)
 
 
@@ -146,21 +135,22 @@ def update_cells(
         voltages_v[i] = c.sum_v / c.samples if c.samples else math.nan
         if c.samples and c.fault == _NONE:
             lowest_v, highest_v = min(lowest_v, voltages_v[i]), max(highest_v, voltages_v[i])
-    balancing_variance = balancing_soc_variance(b, highest_v >= balancing_v and current_a <= 0.0)
+    balancing = highest_v >= balancing_v and current_a <= 0.0
+    balancing_variance = balancing_soc_variance(b, balancing)
     for i in range(m):
         may_be_drained = voltages_v[i] > lowest_v + BALANCING_SPREAD_V
         predict_cell(cells[i], b, balancing_variance if may_be_drained else 0.0)
+        predict_hypotheses(cells[i], b, balancing)
         errors_v[i] = voltages_v[i] - deviation_v(cells[i], p, soc, drop_v)[0]
     reference_v, median_v = median(errors_v, cells), median(voltages_v, cells)
     for i in range(m):
         if math.isfinite(voltages_v[i]) and math.isfinite(reference_v):
-            _, slope_v, by_pack_v = deviation_v(cells[i], p, soc, drop_v)
-            curve_v = curve_range_v(cells[i], p, soc)
-            noise_v2 = measurement_variance(drop_v, by_pack_v, soc_std, curve_v)
-            variance_v2 = noise_v2 + write_ph(cells[i], slope_v, drop_v, ph)
+            slope_v = deviation_v(cells[i], p, soc, drop_v)[1]
+            curve_v2 = curve_variance(cells[i], p, soc, soc_std)
+            variance_v2 = noise_variance(drop_v) + curve_v2 + write_ph(cells[i], slope_v, drop_v, ph)
             innovation_v = errors_v[i] - reference_v
             ignored_v = unanswered_v(cells[i], voltages_v[i], median_v)
-            update_cell(cells[i], b, innovation_v, variance_v2, curve_v, current_a, ph, ignored_v)
+            update_cell(cells[i], b, slope_v, drop_v, innovation_v, variance_v2, curve_v2, current_a, ph, ignored_v)
         if not math.isfinite(cells[i].mean.sum() + cells[i].covariance.sum()):
             initialize_cell(cells[i])
         cells[i].mean[SOC] = min(max(cells[i].mean[SOC], MIN_CELL_SOC - soc), MAX_CELL_SOC - soc)
@@ -175,9 +165,11 @@ def update_cells(
 def update_cell(
     c: Record,
     b: Record,
+    slope_v: float,
+    drop_v: float,
     innovation_v: float,
     variance_v2: float,
-    curve_v: float,
+    curve_v2: float,
     current_a: float,
     ph: Floats,
     ignored_v: float,
@@ -187,9 +179,11 @@ def update_cell(
     Args:
         c: The cell; updated.
         b: Window, dtype BANK.
+        slope_v: Derivative of the deviation by the cell's SOC [V].
+        drop_v: Overpotential of the reference cell [V].
         innovation_v: Innovation [V].
         variance_v2: Its variance S [V^2].
-        curve_v: Error of the tangent to the OCV curve within the uncertainty of the cell's SOC [V].
+        curve_v2: Part of R by the shape of the OCV curve [V^2].
         current_a: Mean current of the window [A].
         ph: P H', shape (STATES,).
         ignored_v: Change of the other cells' voltage to which the reading has not responded [V].
@@ -199,20 +193,13 @@ def update_cell(
         return
     if c.fault == _STUCK:
         end_fault(c)
-    if c.suspect_s > 0.0 or (is_jump(c, innovation_v, variance_v2, curve_v) and not b.gap):
+    if c.suspect_s > 0.0 or (is_jump(c, innovation_v, variance_v2, CURVE_STDS * math.sqrt(curve_v2)) and not b.gap):
         examine_reading(c, innovation_v, current_a, b.elapsed_s, variance_v2, ignored_v < ALIVE_V)
         return
     c.innovation_v += (1.0 - math.exp(-b.elapsed_s / JUMP_S)) * (innovation_v - c.innovation_v)
-    normalized = innovation_v / math.sqrt(variance_v2)
-    c.fast_trend += (1.0 - FAST_MEMORY) * (normalized - c.fast_trend)
-    c.slow_trend += (1.0 - SLOW_MEMORY) * (normalized - c.slow_trend)
-    if abs(c.fast_trend) > MAX_FAST_TREND or abs(c.slow_trend) > MAX_SLOW_TREND:
-        c.fast_trend = c.slow_trend = 0.0
-        c.covariance[LEAK, LEAK] = min(INFLATION * c.covariance[LEAK, LEAK], MAX_LEAK_STD**2)
-        c.covariance[SOC, SOC] += SOC_CHANGE**2
-        c.covariance[CAPACITY, CAPACITY] += CAPACITY_CHANGE**2
-        return
+    update_hypotheses(c, slope_v, drop_v, innovation_v, variance_v2, curve_v2, ph)
     correct_cell(c, innovation_v, variance_v2, ph)
+    apply_changes(c)
 
 
 @njit(cache=True)
