@@ -27,8 +27,8 @@ RESISTANCE_DRIFT = 0.05
 """Q: relative change of a cell's resistance in one hour, because the cells warm up differently."""
 LEAK_DRIFT = 5e-7
 """Q: change of the self-discharge in one hour [1/h]."""
-SHORT_DRIFT_H = 30.0
-"""Q: change of the current of a short in one hour, over its square [h]. A short of 10 mA/Ah changes by a third."""
+SHORT_DRIFT_H, SHORT_DRIFT = 10.0, 0.1
+"""Q: change of the self-discharge in one hour, over its square [h], and its maximum relative to the self-discharge."""
 GAP_STD = 0.003
 """Q: std of a cell's SOC after a gap, in which a balancer may have been active."""
 BALANCING_C = 0.002
@@ -99,7 +99,8 @@ def predict_cell(c: Record, b: Record, balancing_variance: float) -> None:
     cov[SOC, SOC] += CHARGE_STD**2 * b.throughput + balancing_variance + (GAP_STD**2 if b.gap else 0.0)
     drift = RESISTANCE_DRIFT**2 * hours
     cov[RESISTANCE, RESISTANCE] = min(cov[RESISTANCE, RESISTANCE] + drift, MAX_RESISTANCE_STD**2)
-    cov[LEAK, LEAK] += (LEAK_DRIFT + SHORT_DRIFT_H * c.mean[LEAK] ** 2) ** 2 * hours
+    leak_drift = max(LEAK_DRIFT, min(SHORT_DRIFT_H * c.mean[LEAK] ** 2, SHORT_DRIFT * abs(c.mean[LEAK])))
+    cov[LEAK, LEAK] += leak_drift**2 * hours
     cov[BIAS, BIAS] += BIAS_V**2 * (1.0 - kept * kept)
 
 
