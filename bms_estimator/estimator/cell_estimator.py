@@ -20,8 +20,8 @@ from bms_estimator.settings.alarm_limits import MIN_CELLS, balancing_voltage_v
 
 LEAK_STDS = 2.5
 """Minimum excess of a cell's self-discharge over that of the median cell that counts as a short [std]."""
-HYPOTHESIS_FIELDS = {"response", "score", "information"}
-"""Fields of CELL that older checkpoints do not have. Without them the hypotheses start again."""
+NEW_FIELDS = {"response", "score", "information", "near_full_soc"}
+"""Fields of CELL and BANK that older checkpoints do not have. They begin at zero, so that the hypotheses start again."""
 
 CONSTANT_FRACTION = 0.5
 """Fraction of ``BIAS_V`` that is constant, such as the offset of a converter."""
@@ -188,16 +188,22 @@ class CellEstimator:
         if not saved or not self._enabled:
             return ""
         cells, bank = saved.get("cells"), saved.get("bank")
-        if cells is None or bank is None or not _has_state(cells) or bank.dtype != BANK or bank.shape != (1,):
+        if (
+            cells is None
+            or bank is None
+            or not _has_state(cells, CELL)
+            or not _has_state(bank, BANK)
+            or bank.shape != (1,)
+        ):
             return "it was saved by another version"
         if cells.shape != (self._series,):
             return f"it has {cells.size} cells, and the pack has {self._series} in series"
         if reason := _invalid_reason(cells, bank):
             return reason
         self._start(self._series)
-        for name in set(CELL.names or ()) & set(cells.dtype.names or ()):
-            self.cells[name] = cells[name]
-        self.bank[...] = bank
+        for records, saved_records in ((self.cells, cells), (self.bank, bank)):
+            for name in set(records.dtype.names or ()) & set(saved_records.dtype.names or ()):
+                records[name] = saved_records[name]
         self.resume(unseen_s)
         return ""
 
@@ -207,11 +213,11 @@ class CellEstimator:
         self.bank["unseen_s"] = unseen_s if math.isfinite(unseen_s) else 0.0
 
 
-def _has_state(cells: Records) -> bool:
-    """Return True if the fields of ``cells`` are those of CELL, possibly without those of the hypotheses of former versions."""
-    fields, saved = dict(CELL.fields or {}), dict(cells.dtype.fields or {})
-    required = fields.keys() - HYPOTHESIS_FIELDS
-    return required <= saved.keys() and all(saved[name][0] == fields[name][0] for name in saved.keys() & fields.keys())
+def _has_state(saved: Records, dtype: np.dtype[Any]) -> bool:
+    """Return True if the fields of ``saved`` are those of ``dtype``, possibly without ``NEW_FIELDS``."""
+    present, found = dict(dtype.fields or {}), dict(saved.dtype.fields or {})
+    common = present.keys() & found.keys()
+    return present.keys() - NEW_FIELDS <= common and all(found[name][0] == present[name][0] for name in common)
 
 
 def _invalid_reason(cells: Records, bank: Records) -> str:
@@ -221,7 +227,7 @@ def _invalid_reason(cells: Records, bank: Records) -> str:
         cells["mean"],
         cells["covariance"],
         cells["sums"],
-        *(bank[name] for name in BANK.names or () if name != "time_s"),
+        *(bank[name] for name in bank.dtype.names or () if name in (BANK.names or ()) and name != "time_s"),
     )
     if not all(np.isfinite(values).all() for values in numbers if values.dtype.kind == "f"):
         return "a value is not finite"

@@ -46,8 +46,10 @@ BALANCED_STEP_S, BALANCED_BLOCK = 10.0, 30
 """Interval of the samples of this pack [s], and the number of samples in a block."""
 BALANCER_C = (0.0, 1 / 500, 1 / 200, 1 / 100, 1 / 50)
 """Currents of the balancers, as C-rates [1/h]."""
-FULL_SOC, FULL_V = {"nmc": 0.9, "lfp": 0.98}, 3.55
-"""Mean SOC at which a charge ends, and voltage of a cell of LFP at which it ends [V]."""
+FULL_SOC, FULL_V = 0.98, {"nmc": 4.2, "lfp": 3.55}
+"""Mean SOC at which a charge ends, and voltage of the highest cell at which it ends [V]."""
+FULL_PACKS = 20
+"""Number of healthy packs that are charged to full."""
 CUSUM_SLACK = 1.0
 """Slack of the CUSUM in std of a cell's deviation."""
 
@@ -264,13 +266,21 @@ def balanced_scores(chemistry: str, seed: int, current_c: float, *, highest: boo
     for _ in range(2 * hour):
         run(0.2)
     for _ in range(BALANCED_CYCLES):
-        while bank.soc.mean() < FULL_SOC[chemistry] and not (chemistry == "lfp" and highest_v >= FULL_V):
+        while bank.soc.mean() < FULL_SOC and highest_v < FULL_V[chemistry]:
             run(-0.2)
         for _ in range(hour):
             run(-0.002)
         for _ in range(3 * hour):
             run(0.2)
     return np.array(scores)
+
+
+def full_packs(chemistry: str, first_seed: int) -> None:
+    """Print the number of healthy packs without a balancer in which charging to full raises ``cell_short``."""
+    scores = [balanced_scores(chemistry, first_seed + 2000 + seed, 0.0, highest=True) for seed in range(FULL_PACKS)]
+    alarms = sum(bool((each >= 1.0).any()) for each in scores)
+    rows = [("charged to full", str(BALANCED_CYCLES * FULL_PACKS), f"{alarms} of {FULL_PACKS}")]
+    print_table(("healthy packs", "cycles", "packs with cell_short"), rows)
 
 
 def balancers(chemistry: str, packs: int, first_seed: int) -> None:
@@ -313,6 +323,7 @@ def main(arguments: list[str]) -> None:
     )
     options = parser.parse_args(arguments)
     healthy = false_alarms(options.chemistry, options.cycles, options.packs, options.first_seed)
+    full_packs(options.chemistry, options.first_seed)
     delays(options.chemistry, healthy, options.short_packs, options.short_cycles, options.first_seed)
     balancers(options.chemistry, options.packs, options.first_seed)
 

@@ -8,7 +8,7 @@ from numpy.lib import recfunctions as rfn
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import HYPOTHESIS_FIELDS, CellEstimator
+from bms_estimator.estimator.cell_estimator import NEW_FIELDS, CellEstimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.service.restored_pack import restore_pack
 from bms_estimator.settings.pack import Settings
@@ -56,7 +56,7 @@ def test_a_state_without_hypotheses_of_a_former_version_is_restored(tmp_path: Pa
     pack = SimulatedPack()
     pack.run(1)
     saved = dict(pack.cells.saved_state)
-    former = [name for name in saved["cells"].dtype.names if name not in HYPOTHESIS_FIELDS]
+    former = [name for name in saved["cells"].dtype.names if name not in NEW_FIELDS]
     saved["cells"] = rfn.repack_fields(saved["cells"][former])
     file = CheckpointFile(tmp_path, Settings(), pack.model)
     file.save(pack.estimator.record, RunCounters(0, new_totals(0.0)), cells=saved)

@@ -43,6 +43,12 @@ MAX_RESISTANCE_STD = 0.3
 """Maximum of the relative std of a cell's resistance after a time without a load."""
 CURVE_STDS = 2.0
 """Range of a cell's SOC in which its OCV counts as possible, in std."""
+CURVE_WINDOWS = 30.0
+"""Number of successive windows in which the error by the shape of the OCV curve is similar, so that their mean has the same error."""
+FLAT_SOC = (0.1, 0.9)
+"""SOC range of the mean slope of the OCV curve, without its steep ends."""
+STEEP_RATIO = 4.0
+"""Minimum slope of the OCV curve near full, relative to the mean slope, which LFP exceeds (by 100 times) and NMC does not (2 times)."""
 KNEE_SOC = 0.02
 """Std of the SOC at which the OCV curve of a single cell falls near empty."""
 HOUR_S = 3600.0
@@ -184,3 +190,16 @@ def pack_range_v(c: Record, p: Record, soc: float, soc_std: float) -> float:
     return max(
         abs(deviation_v(c, p, soc + half, 0.0)[0] - middle_v), abs(deviation_v(c, p, soc - half, 0.0)[0] - middle_v)
     )
+
+
+@njit(cache=True)
+def is_steep_near_full(p: Record) -> bool:
+    """Return True if the OCV curve is much steeper near full than in its middle, as that of LFP.
+
+    There, an error of the pack's SOC changes the voltage of the fullest cell relative to the others as much as a large short.
+    ``p`` is a record of EKF_SETTINGS.
+    """
+    last = p.ocv_v.size - 1
+    low, high = round(FLAT_SOC[0] * last), round(FLAT_SOC[1] * last)
+    mean_slope_v = (p.ocv_v[high] - p.ocv_v[low]) / (FLAT_SOC[1] - FLAT_SOC[0])
+    return (p.ocv_v[last] - p.ocv_v[last - 1]) * last > STEEP_RATIO * mean_slope_v

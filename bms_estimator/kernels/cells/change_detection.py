@@ -21,8 +21,10 @@ MIN_CHANGE_FRACTION = 0.3
 """Minimum change relative to the present self-discharge. Old hypotheses would otherwise hide the end of a short."""
 THRESHOLD_STD = 4.0
 """Minimum significance of a change, in std."""
-MAX_CURVE_V = 0.003
-"""Maximum error by the shape of the OCV curve [V]. Beyond it, as near full and empty, successive innovations have the same error."""
+END_STD = 2.0
+"""Minimum significance of a fall, which ends an alarm and never raises one, in std."""
+MIN_INFORMATION = 1e4
+"""Minimum information [h^2]: the change has a std of at most C/100. A shorter observation would take one wrong innovation for a large short."""
 MARGIN = 9.0
 """Minimum excess of the likelihood ratio (twice its logarithm) of a self-discharge over that of a balancer."""
 
@@ -47,7 +49,7 @@ def predict_hypotheses(c: Record, b: Record, balancing: bool) -> None:
 
 @njit(cache=True)
 def update_hypotheses(
-    c: Record, slope_v: float, drop_v: float, innovation_v: float, variance_v2: float, curve_v2: float, ph: Floats
+    c: Record, slope_v: float, drop_v: float, innovation_v: float, variance_v2: float, balancing: bool, ph: Floats
 ) -> None:
     """Add an innovation, which also corrects the filter, to the likelihoods of the hypotheses.
 
@@ -57,27 +59,29 @@ def update_hypotheses(
         drop_v: Overpotential of the reference cell [V].
         innovation_v: Innovation [V].
         variance_v2: Its variance S [V^2].
-        curve_v2: Part of this variance by the shape of the OCV curve [V^2].
+        balancing: True if a balancer may be active: its current is not yet known.
         ph: P H', shape (STATES,).
     """
     min_change_c = max(MIN_CHANGE_C, MIN_CHANGE_FRACTION * abs(c.mean[LEAK]))
-    is_white = curve_v2 <= MAX_CURVE_V**2
     for h in range(HYPOTHESES):
         f = c.response[h]
         change_v = expected_v(f, slope_v, drop_v)
-        if is_white:
+        if not balancing:
             c.score[h] += change_v * innovation_v / variance_v2
             c.information[h] += change_v * change_v / variance_v2
         for i in range(STATES):
             f[i] -= ph[i] / variance_v2 * change_v
-        if not c.score[h] > min_change_c * c.information[h]:  # also if it is not finite
+        if balancing and h == DRAIN:
+            continue
+        is_too_small = not c.score[h] > min_change_c * c.information[h]  # also if it is not finite
+        if is_too_small or (h == FALL and c.mean[LEAK] < MIN_CHANGE_C):  # without a self-discharge nothing can fall
             restart_hypothesis(c, h)
 
 
 @njit(cache=True)
 def significance(c: Record, h: int) -> float:
     """Return the significance of a hypothesis [std]."""
-    return c.score[h] / math.sqrt(c.information[h]) if c.information[h] > 0.0 else 0.0
+    return c.score[h] / math.sqrt(c.information[h]) if c.information[h] > MIN_INFORMATION else 0.0
 
 
 @njit(cache=True)
@@ -89,7 +93,8 @@ def apply_changes(c: Record) -> None:
         best = DRAIN
     elif fall > rise:
         best = FALL
-    if max(rise, fall, drain) < THRESHOLD_STD or (best == RISE and rise**2 - drain**2 < MARGIN):
+    threshold = END_STD if best == FALL else THRESHOLD_STD
+    if max(rise, fall, drain) < threshold or (best == RISE and rise**2 - drain**2 < MARGIN):
         return
     f, change = c.response[best], c.score[best] / c.information[best]
     for i in range(STATES):

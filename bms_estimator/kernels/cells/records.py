@@ -85,6 +85,10 @@ BANK = np.dtype(
         ("sum_a", "f8"),  # sum of the currents in the window [A]
         ("sum_drop_v", "f8"),  # sum of the overpotentials of one cell in the window [V]
         ("gap", "i8"),  # 1: samples are missing in the window
+        (
+            "near_full_soc",
+            "f8",
+        ),  # remaining throughput for which the cells are not compared after one was nearly full [SOC]
         ("balancing_s", "f8"),  # duration for which a balancer may have been active [s]
     ],
     align=True,

@@ -6,11 +6,13 @@ from bms_estimator.kernels.cells.cell_filter import (
     BALANCING_C,
     BALANCING_SPREAD_V,
     CURVE_STDS,
+    CURVE_WINDOWS,
     HOUR_S,
     correct_cell,
     curve_variance,
     deviation_v,
     initialize_cell,
+    is_steep_near_full,
     noise_variance,
     predict_cell,
     write_ph,
@@ -18,6 +20,7 @@ from bms_estimator.kernels.cells.cell_filter import (
 from bms_estimator.kernels.cells.change_detection import (
     apply_changes,
     predict_hypotheses,
+    restart_hypothesis,
     update_hypotheses,
 )
 from bms_estimator.kernels.cells.reading_faults import (
@@ -30,7 +33,7 @@ from bms_estimator.kernels.cells.reading_faults import (
     mark_sense_wires,
     unanswered_v,
 )
-from bms_estimator.kernels.cells.records import SOC, STATES, ReadingFault
+from bms_estimator.kernels.cells.records import FALL, RISE, SOC, STATES, ReadingFault
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
@@ -40,6 +43,10 @@ MAX_STEP_S = 60.0
 """Maximum time between two samples over which the current counts as measured [s]."""
 MAX_GAP_S = 1e9
 """Time between two samples from which the clock counts as another one [s]: 30 years."""
+NEAR_FULL_SOC = 0.1
+"""Charge throughput for which the cells are not compared after one of them was nearly full [SOC], if the OCV curve is steep there."""
+NEAR_FULL_STD = 0.03
+"""Minimum std of a cell's SOC after this throughput."""
 MIN_CELL_SOC, MAX_CELL_SOC = -0.2, 1.2
 """Range of the SOC of a cell that is over-discharged or overcharged."""
 _NONE, _STUCK = int(ReadingFault.NONE), int(ReadingFault.STUCK)
@@ -136,6 +143,10 @@ def update_cells(
         if c.samples and c.fault == _NONE:
             lowest_v, highest_v = min(lowest_v, voltages_v[i]), max(highest_v, voltages_v[i])
     balancing = highest_v >= balancing_v and current_a <= 0.0
+    b.near_full_soc = max(b.near_full_soc - b.throughput, 0.0)
+    if highest_v >= balancing_v and is_steep_near_full(p):
+        b.near_full_soc = NEAR_FULL_SOC
+    near_full = b.near_full_soc > 0.0
     balancing_variance = balancing_soc_variance(b, balancing)
     for i in range(m):
         may_be_drained = voltages_v[i] > lowest_v + BALANCING_SPREAD_V
@@ -147,10 +158,23 @@ def update_cells(
         if math.isfinite(voltages_v[i]) and math.isfinite(reference_v):
             slope_v = deviation_v(cells[i], p, soc, drop_v)[1]
             curve_v2 = curve_variance(cells[i], p, soc, soc_std)
-            variance_v2 = noise_variance(drop_v) + curve_v2 + write_ph(cells[i], slope_v, drop_v, ph)
+            variance_v2 = noise_variance(drop_v) + CURVE_WINDOWS * curve_v2 + write_ph(cells[i], slope_v, drop_v, ph)
             innovation_v = errors_v[i] - reference_v
             ignored_v = unanswered_v(cells[i], voltages_v[i], median_v)
-            update_cell(cells[i], b, slope_v, drop_v, innovation_v, variance_v2, curve_v2, current_a, ph, ignored_v)
+            update_cell(
+                cells[i],
+                b,
+                slope_v,
+                drop_v,
+                innovation_v,
+                variance_v2,
+                curve_v2,
+                balancing,
+                near_full,
+                current_a,
+                ph,
+                ignored_v,
+            )
         if not math.isfinite(cells[i].mean.sum() + cells[i].covariance.sum()):
             initialize_cell(cells[i])
         cells[i].mean[SOC] = min(max(cells[i].mean[SOC], MIN_CELL_SOC - soc), MAX_CELL_SOC - soc)
@@ -170,6 +194,8 @@ def update_cell(
     innovation_v: float,
     variance_v2: float,
     curve_v2: float,
+    balancing: bool,
+    near_full: bool,
     current_a: float,
     ph: Floats,
     ignored_v: float,
@@ -184,6 +210,8 @@ def update_cell(
         innovation_v: Innovation [V].
         variance_v2: Its variance S [V^2].
         curve_v2: Part of R by the shape of the OCV curve [V^2].
+        balancing: True if a balancer may be active.
+        near_full: True if the cells are not compared, because one was nearly full.
         current_a: Mean current of the window [A].
         ph: P H', shape (STATES,).
         ignored_v: Change of the other cells' voltage to which the reading has not responded [V].
@@ -193,11 +221,17 @@ def update_cell(
         return
     if c.fault == _STUCK:
         end_fault(c)
-    if c.suspect_s > 0.0 or (is_jump(c, innovation_v, variance_v2, CURVE_STDS * math.sqrt(curve_v2)) and not b.gap):
-        examine_reading(c, innovation_v, current_a, b.elapsed_s, variance_v2, ignored_v < ALIVE_V)
+    window_v2 = variance_v2 - (CURVE_WINDOWS - 1.0) * curve_v2
+    if c.suspect_s > 0.0 or (is_jump(c, innovation_v, window_v2, CURVE_STDS * math.sqrt(curve_v2)) and not b.gap):
+        examine_reading(c, innovation_v, current_a, b.elapsed_s, window_v2, ignored_v < ALIVE_V)
         return
     c.innovation_v += (1.0 - math.exp(-b.elapsed_s / JUMP_S)) * (innovation_v - c.innovation_v)
-    update_hypotheses(c, slope_v, drop_v, innovation_v, variance_v2, curve_v2, ph)
+    if near_full:
+        c.covariance[SOC, SOC] = max(c.covariance[SOC, SOC], NEAR_FULL_STD**2)
+        restart_hypothesis(c, RISE)
+        restart_hypothesis(c, FALL)
+        return
+    update_hypotheses(c, slope_v, drop_v, innovation_v, variance_v2, balancing, ph)
     correct_cell(c, innovation_v, variance_v2, ph)
     apply_changes(c)
 
