@@ -56,8 +56,9 @@ def test_a_state_without_hypotheses_of_a_former_version_is_restored(tmp_path: Pa
     pack = SimulatedPack()
     pack.run(1)
     saved = dict(pack.cells.saved_state)
-    former = [name for name in saved["cells"].dtype.names if name not in NEW_FIELDS]
-    saved["cells"] = rfn.repack_fields(saved["cells"][former])
+    for key, records in saved.items():
+        former = [name for name in records.dtype.names or () if name not in NEW_FIELDS]
+        saved[key] = rfn.repack_fields(records[former])
     file = CheckpointFile(tmp_path, Settings(), pack.model)
     file.save(pack.estimator.record, RunCounters(0, new_totals(0.0)), cells=saved)
     cells = restarted(CheckpointFile(tmp_path, Settings(), pack.model), pack)

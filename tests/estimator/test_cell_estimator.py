@@ -7,6 +7,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.simulation.simulated_bank import BankCells
+from tests.benchmarks.cells import balanced_scores
 from tests.simulated_pack import CAPACITY_AH, CELLS, SimulatedPack
 
 
@@ -151,3 +152,8 @@ def test_a_short_of_a_stored_pack_is_found_after_a_gap() -> None:
     assert pack.cells.deviations
     true = pack.bank.soc - pack.bank.soc.mean()
     assert np.abs(pack.cells.deviations.soc_deviation - true).max() < 0.05
+
+
+def test_a_healthy_pack_of_lfp_that_is_charged_to_full_has_no_self_discharge() -> None:
+    """The fullest cell leaves the others by hundreds of millivolts, and returns when the discharge begins."""
+    assert balanced_scores("lfp", 102, 0.0, highest=True).max() == 0.0
