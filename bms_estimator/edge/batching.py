@@ -32,7 +32,9 @@ class Batcher:
     def __init__(self, block_s: float, max_samples: int = MAX_SAMPLES) -> None:
         self._block_s, self._max_samples = block_s, max_samples
         self._parts: list[SampleBlock] = []
-        self._cell_parts: list[CellBlock] = []  # of the same samples, with any number of cells
+        self._cell_parts: list[
+            CellBlock
+        ] = []  # cell voltages of the same samples; the number of cells may differ between parts
         self._count, self._arrival_s = 0, 0.0  # samples in the open block, and arrival of the last one
         self._end_s = 0.0  # sample time at which the open block ends
 

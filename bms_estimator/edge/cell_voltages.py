@@ -1,10 +1,10 @@
-"""Compact form of the cell voltages in a block: the mean of the cells, and the difference of each cell to it.
+"""Compact form of the cell voltages in a block: the mean of the cells, and the difference of each cell from it.
 
 Layout, little-endian, before compression::
 
     stride  u2               every stride-th sample of the block has cell voltages
     means   u4 x rows        mean of the cells, in units of 0.2 mV, as differences of successive rows
-    cells   u2 x rows, m     cell less mean, in units of 0.2 mV, as differences of successive rows, cell after cell
+    cells   u2 x rows, m     cell minus mean, in units of 0.2 mV, as differences of successive rows, cell after cell
 
 Differences wrap around. The cells of a pack differ little and slowly, so that most of these numbers are 0 and compress well.
 A multiple of 0.2 mV, as reported by battery management systems, is restored exactly.
@@ -20,8 +20,8 @@ from bms_estimator.model.sample import CellBlock
 MAX_CELLS = 255
 """Maximum number of cells in series."""
 MAX_BYTES = 8192
-"""Maximum size before compression [bytes]. A block of ``batching.MAX_SAMPLES`` incompressible samples stays below the
-server's limit with it. Blocks with more voltages keep only every second, third ... sample of them."""
+"""Maximum size before compression [bytes]. With this size, a block of ``batching.MAX_SAMPLES`` incompressible samples stays below
+the server's limit. If the voltages of all samples would be larger, only every second (third, ...) sample has them."""
 MAX_V = 100.0
 """Maximum magnitude of a voltage [V]; a larger one is not sent."""
 UNITS_PER_V = 5000.0

@@ -22,8 +22,8 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DeviceName
 
 PAST_BLOCKS = 30 * 24 * 60
-"""Number of blocks before the present at which packs start that are faster than real time and send blocks without end:
-30 days."""
+"""Number of blocks by which the first sample is before the present, if packs are faster than real time and the number of blocks is
+not limited. It is 30 days."""
 MAX_PACKS = 999_999
 """Maximum number of packs, because their names end in a number of six digits."""
 

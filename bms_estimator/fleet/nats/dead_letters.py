@@ -75,7 +75,7 @@ async def read_dead_letters(nc: Client) -> list[DeadLetter]:
 async def replay_letter(nc: Client, letter: DeadLetter) -> None:
     """Send the block of a dead letter to the workers again, and remove the dead letter.
 
-    A dead letter that a worker stores of the block meanwhile remains.
+    If a worker rejects the block again before the removal, the new dead letter remains.
 
     Raises:
         nats.errors.Error: The server does not accept the block; the dead letter remains stored.

@@ -16,7 +16,7 @@ MAGIC = b"BMST"
 
 
 class PackSource(NamedTuple):
-    """Texts that settings and model of a pack are made from."""
+    """Row and cell file from which the settings and the model of a pack are built."""
 
     row: str
     """Row of the table (JSON)."""
@@ -30,15 +30,23 @@ def is_change(data: bytes) -> bool:
 
 
 def trusted_data(subject: str, data: bytes) -> bytes:
-    """Return the data of a stored message.
+    """Return the data of a stored message, or empty data if an edge has sent a change of the table in place of a block.
 
-    A change of the table that an edge has sent as a block returns empty data, which is no block.
+    Only workers may send changes of the table. Empty data are rejected as a damaged block.
+
+    Args:
+        subject: Subject under which the stream ``RAW`` stores the message.
+        data: Data of the message.
     """
     return b"" if is_change(data) and not is_table_change(subject) else data
 
 
 def encode_change(source: PackSource | None) -> bytes:
-    """Encode the change of a pack to a source; None: the pack is not in the table any more."""
+    """Encode a change of the table.
+
+    Args:
+        source: New row and cell file of the pack; None if the pack was removed from the table.
+    """
     return MAGIC + json.dumps(None if source is None else source._asdict()).encode()
 
 

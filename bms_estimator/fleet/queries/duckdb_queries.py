@@ -242,7 +242,7 @@ def _present_hour(database: duckdb.DuckDBPyConnection, files: Iterable[list[Path
 
 
 def _last_days(by_day: Mapping[Path, list[Path]], now_hour: int, days: int | None) -> dict[Path, list[Path]]:
-    """Return the files of the days up to the day of ``now_hour``, all or the last ``days``; and those of the next hour."""
+    """Return the files of the last ``days`` days up to the hour after ``now_hour``; those of all days if ``days`` is None."""
     last = _day_name(now_hour + 1)
     first = "" if days is None else _day_name(now_hour - 24 * (days - 1))
     return {day: files for day, files in by_day.items() if first <= day.name <= last}

@@ -35,8 +35,8 @@ ROW_GROUP = 100_000
 DAY_CLOSE_DELAY_S = 2 * HOUR_S
 """Time after the end of a day at which its files are merged [s], because most late blocks have arrived by then."""
 LATE_DELAY_S = HOUR_S
-"""Maximum time that a file of a day that was merged before waits to be merged too [s]. Until then, other late rows of
-the day are collected, because each merge writes the whole day."""
+"""Minimum age of a file with late rows, for which a merged day is merged again [s]. The delay collects further late rows, because
+each merge writes the whole day."""
 MERGE_MEMORY = "500MB"
 """Memory limit of a merge. A day of 100,000 packs is larger. DuckDB then sorts it in parts on the disk."""
 _MAGIC = b"PAR1"
@@ -80,11 +80,11 @@ def write(folder: Path, rows: Iterable[Hour]) -> list[Path]:
 
 def write_table(folder: Path, table: pa.Table) -> list[Path]:
     """Write a table with the columns of ``SCHEMA``. Result and errors are those of ``write``."""
-    is_dated = pc.is_null(table["clock_error_s"])
-    dated, quarantined = table.filter(is_dated), table.filter(pc.invert(is_dated))
+    is_clock_valid = pc.is_null(table["clock_error_s"])
+    valid, quarantined = table.filter(is_clock_valid), table.filter(pc.invert(is_clock_valid))
     arrivals = pc.coalesce(quarantined["received_hour"], quarantined["hour"].cast(pa.int64()))
     return [
-        *_write_days(folder, dated, dated["hour"]),
+        *_write_days(folder, valid, valid["hour"]),
         *_write_days(folder / QUARANTINE_FOLDER, quarantined, arrivals),
     ]
 

@@ -24,7 +24,7 @@ def erase_rows(folder: Path, packs: Collection[str]) -> int:
         packs: Names of the packs.
 
     Raises:
-        OSError: A file cannot be written. It then has all its rows, and a repetition continues.
+        OSError: A file cannot be written. This file is unchanged, and a repeated call continues with it.
     """
     days = [day for root in (folder, folder / QUARANTINE_FOLDER) for day in sorted(root.glob(f"{DAY_FOLDER_PREFIX}*"))]
     return sum(_erase_from_file(file, packs) for day in days for file in complete_files(day))

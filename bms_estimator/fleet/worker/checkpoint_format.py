@@ -12,7 +12,7 @@ Layout, little-endian::
 
     entry:  layout u1, length of the name u2, of the data u4, name, data
 
-A version reads its own format and, by ``PREVIOUS``, the format before it. It writes either of the two. A worker writes the
+A version reads its own format and the format before it (``PREVIOUS``). It writes either of the two. A worker writes the
 newest format that all live workers read, so that workers of two versions can take over partitions from each other. A reader of
 a format that it does not know raises ``UnreadableFormatError``, and the worker then leaves the partition to others.
 

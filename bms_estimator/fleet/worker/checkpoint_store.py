@@ -81,7 +81,7 @@ class Pointer(BaseModel):
     kept: tuple[CheckpointInfo, ...] = ()
     """Last checkpoints, newest first."""
     daily: tuple[CheckpointInfo, ...] = ()
-    """First checkpoints of the last days, newest first. The last of them may also be in ``kept``."""
+    """First checkpoint of each of the last days, newest first. The newest ones may also be in ``kept``."""
 
     unsaved_claims: int = 0
     """Number of claims since the last checkpoint or the last orderly release."""
@@ -365,7 +365,7 @@ class CheckpointStore:
         return size
 
     async def _stored_objects(self, partition: int) -> set[str]:
-        """Return the names of the objects of a partition, with unfinished ones."""
+        """Return the names of the objects of a partition, including unfinished ones."""
         filter_subject = _chunk_subject("*")
         found = (await self._js.stream_info(_STREAM, subjects_filter=filter_subject)).state.subjects or {}
         prefix = _chunk_subject(_object_name(partition, ""))

@@ -32,7 +32,7 @@ from bms_estimator.model.errors import UserError
 WORKER_NAME = "packs-remove"
 """Name with which the erasure claims a partition."""
 TABLE_S = 3.0 * POLL_S
-"""Time after which workers have removed a pack from their copies of the table [s]."""
+"""Waiting time until all workers have removed a pack from their copies of the table [s]."""
 MAX_CLAIMS = 20
 """Maximum number of claims of a partition, because its worker may claim it again before its checkpoints are rewritten."""
 RETRY_S = 0.5

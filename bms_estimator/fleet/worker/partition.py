@@ -67,7 +67,7 @@ class BlockResult(NamedTuple):
         hours: Message ids and rows of finished hours. The message id of a row is equal for all workers, so that the server
             drops repeated rows.
         failed: Number of blocks that were skipped because of an internal error.
-        dead: Reason for which the block becomes a dead letter; empty for a block that does not.
+        dead: Reason why the block becomes a dead letter; empty if it does not become one.
     """
 
     pack: str
@@ -263,7 +263,7 @@ class Partition:
         return None if source == self._in_force[pack] else encode_change(source)
 
     def _apply_change(self, pack: str, data: bytes) -> BlockResult:
-        """Set the row of a pack from here on."""
+        """Apply a change of a pack's row to the following blocks of the pack."""
         try:
             source = decode_change(data)
         except ValueError:

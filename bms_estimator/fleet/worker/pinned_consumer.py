@@ -72,7 +72,7 @@ class PinnedConsumer:
         self.trouble = ""
         self._pin = ""
         self._pin_count = 0
-        self._last_consumer_sequence = -1  # of the last message; before the first message, no number is the next one
+        self._last_consumer_sequence = -1  # of the last message; initially a value that no message follows
         self._taken_since_request = 0  # messages taken since the last request
 
     @property

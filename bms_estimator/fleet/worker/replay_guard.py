@@ -1,20 +1,21 @@
-"""Detection of blocks that kill workers, in the replay of a partition whose last holders have died.
+"""Detection of blocks that kill workers, during the replay of a partition whose last owners have died.
 
 A crash or an endless loop in native code gives a worker no chance to report the block. A worker that takes over a partition
 reads the stream from the last checkpoint, and therefore processes the block again. The claim counts the claims since the
-last checkpoint. From ``GUARDED_CLAIMS`` on, the worker writes down each block of the replay before it processes the block. The next
-holder finds the block in which the worker died. A block that was found ``MAX_DEATHS`` times is lethal. The worker skips it.
+last checkpoint. From the claim number ``GUARDED_CLAIMS`` on, the worker stores the sequence number of each block of the replay on
+the server before it processes the block. If the worker dies, the next owner thereby finds the block that was being processed. A
+block that was found ``MAX_DEATHS`` times is lethal, and is skipped.
 """
 
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim, ReplayRecord
 
 GUARDED_CLAIMS = 2
-"""Number of claims since the last checkpoint from which on a replay is guarded. The first claim is not, because a guarded replay
-waits for the server at each block, and most workers do not die because of a block."""
+"""Number of claims since the last checkpoint from which a replay is guarded. The replay after the first claim is not guarded,
+because a guarded replay waits for the server at each block, and most workers do not die because of a block."""
 MAX_DEATHS = 2
-"""Number of holders that died in a guarded replay of the same block, after which the block is lethal."""
+"""Number of owners that must die while they process the same block in a guarded replay, until the block is lethal."""
 MAX_SUSPECTS = 16
-"""Maximum number of blocks whose deaths are counted; the newest ones."""
+"""Maximum number of blocks for which deaths are counted. The newest blocks are kept."""
 
 
 class ReplayGuard:
@@ -51,7 +52,7 @@ class ReplayGuard:
         self._end_sequence = end_sequence
 
     async def is_lethal(self, sequence: int) -> bool:
-        """Return True if a block has killed its holders; otherwise write down that it is processed now.
+        """Return True if a block is lethal; otherwise store on the server that it is being processed.
 
         Args:
             sequence: Stream sequence number of the block.
@@ -67,6 +68,6 @@ class ReplayGuard:
         return False
 
     async def end_block(self, sequence: int) -> None:
-        """Write down that the holder has survived a block. The server receives this before any later record."""
+        """Store on the server that a block was processed. The server receives this record before any later one."""
         if sequence <= self._end_sequence:
             await self._checkpoints.send_replay(self._partition, ReplayRecord(deaths=self._deaths))

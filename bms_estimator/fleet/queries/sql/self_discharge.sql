@@ -18,7 +18,7 @@ terms AS (
 lines AS (
     SELECT *, (tv - t_on_s * sv) / nullif(tt - t_on_s * ts, 0) AS slope, tt - t_on_s * ts AS information FROM terms
 ),
--- lower bound of the residual variance: a hundredth of a millivolt
+-- the standard deviation of the residuals is at least 0.01 mV
 trends AS (
     SELECT
         pack, cell, n, last_day - first_day + 1 AS days, slope,
