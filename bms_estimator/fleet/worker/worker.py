@@ -24,8 +24,9 @@ from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.checkpoint_format import FORMAT, UnreadableFormatError, oldest_format
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.membership import Membership
-from bms_estimator.fleet.worker.partition_lease import RETRY_S, RETRYABLE_ERRORS, PartitionLease
+from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
+from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import end, until_first_ends
@@ -335,10 +336,10 @@ class Worker:
         async with self._release_slots:
             if self._nc.is_connected:
                 await lease.release()
-        self._released_blocks += lease.blocks
-        self._released_samples += lease.samples
-        self._released_faults += lease.faults
-        self._released_dead_letters += lease.dead_letters
+        self._released_blocks += lease.runner.blocks
+        self._released_samples += lease.runner.samples
+        self._released_faults += lease.runner.faults
+        self._released_dead_letters += lease.runner.dead_letters
         del self._lease_tasks[lease.number], self._releases[lease.number]
 
     async def _save(self) -> None:
@@ -351,8 +352,8 @@ class Worker:
 
     async def _send_results(self) -> None:
         for lease in self._leases:
-            if (lease.waiting_summaries or lease.waiting_dead_letters) and self._nc.is_connected:
-                await self._try_to_store(lease, lease.send_results)
+            if lease.results.is_waiting and self._nc.is_connected:
+                await self._try_to_store(lease, lease.results.send_queued)
 
     async def _try_to_store(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:
         """Run ``action``. After an error of connection or server, the next periodic call tries again."""
@@ -381,10 +382,10 @@ class Worker:
                 counters.update(lease.partition.counters)
                 unknown += lease.partition.unknown
                 clock_errors |= lease.partition.clock_errors
-        lags = [lease.lag_s for lease in owned_leases if lease.lag_s is not None]
+        lags = [lease.runner.lag_s for lease in owned_leases if lease.runner.lag_s is not None]
         for lease in owned_leases:
-            lease.lag_s = None  # a heartbeat has the largest lag since the previous heartbeat
-        dead_packs = {pack: reason for lease in owned_leases for pack, reason in lease.dead_packs.items()}
+            lease.runner.lag_s = None  # a heartbeat has the largest lag since the previous heartbeat
+        dead_packs = {pack: reason for lease in owned_leases for pack, reason in lease.runner.dead_packs.items()}
         usage = resource.getrusage(resource.RUSAGE_SELF)
         ages = [time.time() - checkpoint.made_s for lease in owned_leases if (checkpoint := lease.last_checkpoint)]
         return Heartbeat(
@@ -399,10 +400,10 @@ class Worker:
             partitions=tuple(lease.number for lease in owned_leases),
             packs=counters["packs"],
             # totals over all leases: they must not fall when a partition is no longer owned
-            blocks=self._released_blocks + sum(lease.blocks for lease in self._leases),
-            samples=self._released_samples + sum(lease.samples for lease in self._leases),
-            faults=self._released_faults + sum(lease.faults for lease in self._leases),
-            dead_letters=self._released_dead_letters + sum(lease.dead_letters for lease in self._leases),
+            blocks=self._released_blocks + sum(lease.runner.blocks for lease in self._leases),
+            samples=self._released_samples + sum(lease.runner.samples for lease in self._leases),
+            faults=self._released_faults + sum(lease.runner.faults for lease in self._leases),
+            dead_letters=self._released_dead_letters + sum(lease.runner.dead_letters for lease in self._leases),
             dead_packs=dict(list(dead_packs.items())[-MAX_UNKNOWN:]),
             lag_s=max(lags, default=None),
             counters=dict(counters),
@@ -411,7 +412,7 @@ class Worker:
             clock_error_count=len(clock_errors),
             clock_errors=dict(nlargest(MAX_CLOCK_ERRORS, clock_errors.items(), key=lambda each: abs(each[1]))),
             waiting=sum(len(lease.consumer.waiting) for lease in self._leases),
-            hours_waiting=sum(len(lease.waiting_summaries) for lease in self._leases),
+            hours_waiting=sum(len(lease.results.waiting_summaries) for lease in self._leases),
             checkpoint_age_s=max(ages, default=None),
             cpu_s=usage.ru_utime + usage.ru_stime,
             rss_mib=_rss_mib(),

@@ -70,7 +70,7 @@ async def test_block_with_an_internal_error_is_skipped_and_counted_as_a_fault(tm
             return registry(pack)
 
         lease, running_lease = await _lease_after_first_blocks(nc, table)
-        assert lease.faults == 1
+        assert lease.runner.faults == 1
         assert lease.partition
         assert lease.partition.counters["blocks"] == len(PACKS) - 1
         await end(running_lease)
@@ -96,7 +96,7 @@ async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_t
         with capture_logs() as logs:
             await until(is_fenced, lambda: logs)
             # the checkpoint has no block yet, so that the first block of each pack is processed again
-            await until(lambda: lease.blocks >= 2 * len(PACKS), lambda: lease.blocks)
+            await until(lambda: lease.runner.blocks >= 2 * len(PACKS), lambda: lease.runner.blocks)
         assert lease.partition
         assert lease.partition.counters["blocks"] == len(PACKS)
         for pack in PACKS:
@@ -131,7 +131,7 @@ async def _lease_after_first_blocks(nc: Client, table: PackLookup) -> tuple[Part
     for pack in PACKS:
         await send(nc, pack, block(pack, 1))
     await lease.consumer.renew()
-    await until(lambda: lease.blocks >= len(PACKS), lambda: lease.blocks)
+    await until(lambda: lease.runner.blocks >= len(PACKS), lambda: lease.runner.blocks)
     return lease, running_lease
 
 

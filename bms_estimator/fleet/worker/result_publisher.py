@@ -1,0 +1,99 @@
+"""Publication of the results of one partition.
+
+Estimates and replies are dropped without a connection, because later ones replace them. Hourly summaries and dead letters are
+queued until the server acknowledges them.
+"""
+
+import asyncio
+from collections import deque
+from itertools import islice
+
+from nats.aio.client import Client
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.dead_letters import DeadLetter
+from bms_estimator.fleet.worker.partition import BlockResult
+
+MAX_PENDING_SUMMARIES = 128
+"""Maximum number of published summaries that wait for the server's acknowledgment."""
+
+
+class ResultPublisher:
+    """Publisher of the results of one partition.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+
+    Attributes:
+        waiting_summaries: Summaries that the server has not acknowledged yet: (message id, pack, row).
+        waiting_dead_letters: Dead letters that the server has not acknowledged yet.
+    """
+
+    def __init__(self, nc: Client) -> None:
+        self._nc = nc
+        self.waiting_summaries: deque[tuple[str, str, bytes]] = deque()
+        self.waiting_dead_letters: deque[DeadLetter] = deque()
+        self._send_lock = asyncio.Lock()
+
+    @property
+    def is_waiting(self) -> bool:
+        """True if the server has not acknowledged all summaries and dead letters."""
+        return bool(self.waiting_summaries or self.waiting_dead_letters)
+
+    def queue_summaries(self, result: BlockResult) -> None:
+        """Queue the hourly summaries of a result."""
+        self.waiting_summaries.extend((message_id, result.pack, row) for message_id, row in result.hours)
+
+    def queue_dead_letter(self, letter: DeadLetter) -> None:
+        """Queue a dead letter."""
+        self.waiting_dead_letters.append(letter)
+
+    def clear(self) -> None:
+        """Drop the queued summaries and dead letters."""
+        self.waiting_summaries.clear()
+        self.waiting_dead_letters.clear()
+
+    async def send_queued(self) -> None:
+        """Publish the queued summaries and dead letters, and await the server's acknowledgment.
+
+        Raises:
+            nats.errors.Error: Some were not acknowledged; they remain queued.
+        """
+        js = self._nc.jetstream()
+
+        async def send(message_id: str, pack: str, row: bytes) -> None:
+            await js.publish(subjects.hours(pack), row, headers={"Nats-Msg-Id": message_id})
+
+        async with self._send_lock:
+            while self.waiting_summaries:
+                rows = list(islice(self.waiting_summaries, MAX_PENDING_SUMMARIES))
+                await asyncio.gather(*(send(*row) for row in rows))
+                for row in rows:  # the queue was cleared meanwhile if the ownership was lost
+                    if self.waiting_summaries and self.waiting_summaries[0] is row:
+                        self.waiting_summaries.popleft()
+            while self.waiting_dead_letters:
+                letter = self.waiting_dead_letters[0]
+                await js.publish(letter.subject, letter.data, headers=letter.headers())
+                if self.waiting_dead_letters and self.waiting_dead_letters[0] is letter:
+                    self.waiting_dead_letters.popleft()
+
+    async def publish(self, result: BlockResult) -> None:
+        """Publish reply and estimates of a result, unless the connection is interrupted."""
+        if not self._nc.is_connected:
+            return
+        if result.reply is not None:
+            await self._nc.publish(subjects.block_request(result.pack), result.reply.model_dump_json().encode())
+        for topic, payload in (("state", result.state), ("parameters", result.parameters)):
+            if payload is not None:
+                await self._nc.publish(subjects.published(result.pack, topic), payload)
+
+
+def merge(before: BlockResult | None, result: BlockResult) -> BlockResult:
+    """Merge two successive results of one pack: the newest reply, state and parameters."""
+    if before is None:
+        return result
+    return result._replace(
+        reply=result.reply or before.reply,
+        state=result.state or before.state,
+        parameters=result.parameters or before.parameters,
+    )
