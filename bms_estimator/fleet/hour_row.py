@@ -84,30 +84,33 @@ class Hour(Payload):
     suspects: int = Field(description="bits of model.input_faults.InputFault")
     cell_spread_v: float | None = Field(
         default=None,
-        description="mean difference between the highest and the lowest series cell [V]; null without cell voltages, as are "
-        "the following three values",
+        description="mean difference between the highest and the lowest series cell [V]; null without cell voltages",
     )
     weakest_cell: int | None = Field(
-        default=None, description="number of the series cell with the lowest mean voltage, from 1"
+        default=None,
+        description="number of the series cell with the lowest mean voltage, from 1; null without cell voltages",
     )
     weakest_cell_v: float | None = Field(
-        default=None, description="mean deviation of this cell from the mean of the cells [V]"
+        default=None,
+        description="mean deviation of the weakest cell from the mean of the cells [V]; null without cell voltages",
     )
     cells_rest_v: list[float] | None = Field(
         default=None,
-        description="mean deviation of each series cell from the mean of the cells while the pack rests [V]; null without a "
-        "rest",
+        description="mean deviation of each series cell from the mean of the cells while the pack rests [V]; null without "
+        "cell voltages or without a rest",
     )
     revision: int | None = Field(
         default=None,
         description="stream sequence number of the block that finished the row; of two rows of one hour the one with the "
-        "larger revision is valid; null from an older worker, as are the following values",
+        "larger revision is valid; null from an older worker",
     )
     received_hour: int | None = Field(
         default=None,
-        description="hour on the server's clock in which the block arrived that finished the row, in hours since 1970 UTC",
+        description="hour on the server's clock in which the block that finished the row arrived, in hours since 1970 UTC; null "
+        "from an older worker",
     )
     clock_error_s: float | None = Field(
         default=None,
-        description="error of the edge's clock, positive if ahead [s]; null within the limits; other rows are quarantined",
+        description="error of the edge's clock, positive if ahead [s]; null within the limits; a row "
+        "with an error is quarantined",
     )
