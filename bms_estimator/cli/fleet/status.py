@@ -1,4 +1,4 @@
-"""``bms-estimator fleet status``: table of the workers and their versions, refused partitions, dead letters, wrong clocks."""
+"""``bms-estimator fleet status``: table of the workers and their versions, refused partitions, dead letters, wrong clocks, unsaved blocks."""
 
 import asyncio
 from datetime import timedelta
@@ -28,14 +28,17 @@ def status(
         ),
     ] = None,
 ) -> None:
-    """List the workers with their versions, the partitions that they refuse, and packs with dead letters or a wrong clock."""
+    """List the workers with their versions, the partitions that they refuse, packs with dead letters or a wrong clock, and a warning if blocks fill the server that no checkpoint includes."""
     heartbeats = asyncio.run(_receive_heartbeats((server, creds, ca)))
+    warning = asyncio.run(_unsaved_warning((server, creds, ca)))
     print_table(COLUMNS, [_row(each) for each in heartbeats])
     for heartbeat in heartbeats:
         for line in (*_refusals(heartbeat), *_dead_letters(heartbeat), *_clock_errors(heartbeat)):
             typer.echo(line)
     if not heartbeats:
         typer.echo("no worker")
+    if warning:
+        typer.echo(warning)
     if blocks is not None:
         _check_block_version(heartbeats, blocks)
 
@@ -90,6 +93,17 @@ def _check_block_version(heartbeats: "list[Heartbeat]", version: int) -> None:
     if older or not heartbeats:
         raise typer.Exit(1)
     typer.echo(f"all workers read blocks of version {version}: edges that send them can start")
+
+
+async def _unsaved_warning(address: ServerAddress) -> str:
+    """Return a warning if the stream is more than half full of blocks that no checkpoint includes."""
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.nats.streams import partitions_of  # noqa: PLC0415
+    from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning  # noqa: PLC0415
+
+    async with connected(*address) as nc:
+        partitions = await partitions_of(nc)
+        return unsaved_warning(await unsaved_share(nc, range(partitions))) if partitions is not None else ""
 
 
 async def _receive_heartbeats(address: ServerAddress) -> "list[Heartbeat]":

@@ -20,6 +20,7 @@ from nats.errors import Error as NatsError
 
 from bms_estimator.fleet.nats.connection import AUTH_TIMEOUT_S, close
 from bms_estimator.fleet.nats.streams import NoAnswerError, make_streams
+from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.disk_space import GB, check_disk_space, sizes_of, usable_bytes
 from bms_estimator.fleet.server.jwt_claims import Role
@@ -33,6 +34,8 @@ from bms_estimator.settings.fleet import FleetSettings, TenantSettings, TlsSetti
 
 log = structlog.get_logger(__name__)
 
+UNSAVED_S = 60.0
+"""Interval between two checks how much of the streams is unsaved [s]."""
 POLL_S = 0.1
 """Poll interval for a state of the server [s]."""
 MONITOR_TIMEOUT_S = 5.0
@@ -173,7 +176,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
     async with _running(binary, place.folder / CONFIGURATION) as (process, end_requested):
         ended = asyncio.create_task(process.wait())
         streams_ready = asyncio.create_task(_make_ready(place, spec, process.pid, report))
-        reloading = asyncio.create_task(_reload_on_signal(place, read, process, streams_ready, report))
+        reloading = asyncio.create_task(_supervise(place, spec, read, process, streams_ready, report))
         try:
             await asyncio.wait((ended, streams_ready), return_when=asyncio.FIRST_COMPLETED)
             if streams_ready.done() and not ended.done():
@@ -186,19 +189,25 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
         return 0 if end_requested.is_set() else code
 
 
-async def _reload_on_signal(
+async def _supervise(
     place: NodeLocation,
+    spec: ServerSpec,
     read: Callable[[], ServerSpec],
     process: asyncio.subprocess.Process,
     streams_ready: asyncio.Task[None],
     report: Callable[[str], None],
 ) -> None:
-    """Reload the server's configuration at SIGHUP. Invalid settings are logged and change nothing."""
+    """Reload the server's configuration at SIGHUP, and warn of unsaved blocks. Invalid settings are logged and change nothing."""
     requested = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, requested.set)
     await streams_ready
     while True:
-        await requested.wait()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(UNSAVED_S):
+                await requested.wait()
+        if not requested.is_set():
+            await _warn_of_unsaved_blocks(place, spec)
+            continue
         requested.clear()
         try:
             spec = read()
@@ -267,16 +276,20 @@ async def _make_ready(place: NodeLocation, spec: ServerSpec, pid: int, report: C
 
 
 async def _make_all_streams(place: NodeLocation, spec: ServerSpec, report: Callable[[str], None]) -> None:
-    """Create the streams of all tenants. Only the node with the keys does this; without accounts, the first node."""
+    """Create the streams of all tenants, on the node that does this."""
     node = node_of(place, spec)
-    makes_streams = place.number == 1 if node.accounts is None else credentials.has_keys(place.keys)
-    if not makes_streams:
+    if not _makes_streams(place, node):
         report("ready; streams are made by the node that has the keys, the first")
         return
     for name, tenant in (spec.settings.tenants or {"": TenantSettings()}).items():
         await _make_streams(place, spec, name, tenant)
         keys = f"; its keys: {place.keys / name}" if name else ""
         report(f"{f'tenant {name}: ' if name else ''}streams ready, {node.partitions} partitions{keys}")
+
+
+def _makes_streams(place: NodeLocation, node: Node) -> bool:
+    """Return True if this node creates the streams: the node with the keys; without accounts, the first node."""
+    return place.number == 1 if node.accounts is None else credentials.has_keys(place.keys)
 
 
 async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant: TenantSettings) -> None:
@@ -307,6 +320,25 @@ async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant
         raise UserError(f"{f'tenant {name}: ' if name else ''}{error}{hint}") from None
     finally:
         await close(nc)
+
+
+async def _warn_of_unsaved_blocks(place: NodeLocation, spec: ServerSpec) -> None:
+    """Log a warning for each tenant whose stream is more than half full of blocks that no checkpoint includes."""
+    node = node_of(place, spec)
+    if not _makes_streams(place, node):
+        return
+    for name in spec.settings.tenants or {"": None}:
+        try:
+            nc = await connect(node, credentials.credentials_file(place.keys, name, Role.ADMIN) if name else None)
+            try:
+                share = await unsaved_share(nc, range(node.partitions))
+            finally:
+                await close(nc)
+        except (NatsError, OSError) as error:
+            log.warning("the stream cannot be checked", tenant=name, reason=str(error))
+            continue
+        if warning := unsaved_warning(share):
+            log.warning("the stream fills with blocks that no checkpoint includes", tenant=name, reason=warning)
 
 
 async def connect(node: Node, credentials_file: Path | None) -> Client:

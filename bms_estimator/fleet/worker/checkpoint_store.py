@@ -28,6 +28,7 @@ from nats.nuid import NUID
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer, pointer_key
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError, is_readable
@@ -50,46 +51,6 @@ log = structlog.get_logger(__name__)
 
 class FencedError(Exception):
     """Another worker has taken the partition over."""
-
-
-class CheckpointInfo(BaseModel):
-    """Metadata of a stored checkpoint."""
-
-    model_config = ConfigDict(frozen=True)
-
-    sequence: int
-    """Stream sequence number of the last included message."""
-    object: str
-    """Name in the object store ``states``."""
-    bytes: int
-    """Size [bytes]."""
-    made_s: float
-    """Wall clock at which the checkpoint was written [s since 1970]."""
-    format: int = 1
-    """Format of the bytes (``checkpoint_format.FORMAT``); versions without this field wrote format 1."""
-
-
-class Pointer(BaseModel):
-    """Entry of a partition in the checkpoint bucket."""
-
-    model_config = ConfigDict(frozen=True)
-
-    worker: str = ""
-    """Name of the owning worker."""
-    next: str = ""
-    """Name of the object that this worker writes next. The object may already exist in part."""
-    kept: tuple[CheckpointInfo, ...] = ()
-    """Last checkpoints, newest first."""
-    daily: tuple[CheckpointInfo, ...] = ()
-    """First checkpoint of each of the last days, newest first. The newest ones may also be in ``kept``."""
-
-    unsaved_claims: int = 0
-    """Number of claims since the last checkpoint or the last orderly release."""
-
-    @property
-    def checkpoints(self) -> tuple[CheckpointInfo, ...]:
-        """All stored checkpoints without repetitions, the last ones first."""
-        return tuple(dict.fromkeys((*self.kept, *self.daily)))
 
 
 class ReplayRecord(BaseModel):
@@ -312,7 +273,7 @@ class CheckpointStore:
             UnreadableFormatError: The pointer is not one of this version.
         """
         try:
-            entry = await self._checkpoints.get(_key(partition))
+            entry = await self._checkpoints.get(pointer_key(partition))
         except KeyNotFoundError:
             return None
         try:
@@ -331,7 +292,7 @@ class CheckpointStore:
         self._last_sent[partition] = pointer
         try:
             data = pointer.model_dump_json().encode()
-            return Claim(partition, await self._checkpoints.update(_key(partition), data, revision), pointer)
+            return Claim(partition, await self._checkpoints.update(pointer_key(partition), data, revision), pointer)
         except KeyWrongLastSequenceError:
             stored = await self._read_pointer(partition)
             if stored and stored.pointer == pointer:  # the write succeeded, but its response was lost
@@ -445,10 +406,6 @@ def _metadata_subject(name: str) -> str:
 
 def _digest(sha256: bytes) -> str:
     return f"SHA-256={base64.urlsafe_b64encode(sha256).decode()}"
-
-
-def _key(partition: int) -> str:
-    return f"p{partition}"
 
 
 def _replay_key(partition: int) -> str:

@@ -16,6 +16,7 @@ import nats.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer, partitions_of
@@ -26,7 +27,7 @@ from bms_estimator.fleet.worker.checkpoint_format import (
     UnreadableFormatError,
     read_checkpoint,
 )
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, FencedError
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, FencedError
 from bms_estimator.model.errors import UserError
 
 WORKER_NAME = "packs-remove"

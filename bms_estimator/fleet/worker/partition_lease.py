@@ -17,13 +17,14 @@ from nats.aio.msg import Msg
 from nats.js.errors import NotFoundError
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.packs.table_change import trusted_data
 from bms_estimator.fleet.worker.block_runner import BlockRunner
 from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointInfo, CheckpointStore, Claim, FencedError
+from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.deferred_reader import DeferredReader
 from bms_estimator.fleet.worker.partition import BlockResult, PackLookup, PackSources, Partition
 from bms_estimator.fleet.worker.partition_restore import restore_partition

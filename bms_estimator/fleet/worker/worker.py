@@ -20,6 +20,7 @@ from bms_estimator.edge.block import VERSION as BLOCK_VERSION
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
 from bms_estimator.fleet.nats.connection import close, connect, error_text
 from bms_estimator.fleet.nats.streams import partitions_of
+from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.checkpoint_format import FORMAT, UnreadableFormatError, oldest_format
 from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
@@ -41,6 +42,8 @@ CHECK_S = 0.5
 """Interval between two checks for a due checkpoint or waiting summaries [s]."""
 REFUSAL_S = 10.0
 """Interval between two checks whether the checkpoint of a refused partition has become readable [s]."""
+UNSAVED_S = 30.0
+"""Interval between two checks how much of the stream is unsaved [s]."""
 MAX_UNKNOWN = 20
 """Maximum number of unknown packs, and of packs with dead letters, that a heartbeat names."""
 MAX_CLOCK_ERRORS = 20
@@ -176,6 +179,7 @@ class Worker:
         self._step_lock = asyncio.Lock()
         self._release_slots = asyncio.Semaphore(MAX_RELEASES)
         self._reported_unknown: set[str] = set()
+        self._unsaved_warning = ""
 
     async def run(self) -> None:
         """Claim and process partitions until cancelled.
@@ -195,6 +199,7 @@ class Worker:
             _repeat(CHECK_S, self._save),
             _repeat(CHECK_S, self._send_results),
             _repeat(REFUSAL_S, self._check_refused),
+            _repeat(UNSAVED_S, self._check_unsaved),
             self._bucket.follow(self._changed_packs.put_nowait),
             self._apply_table_changes(),
         )
@@ -303,6 +308,20 @@ class Worker:
             else:
                 log.info("the checkpoint of a refused partition has become readable", partition=number)
                 del self._members.refused[number]
+
+    async def _check_unsaved(self) -> None:
+        """Warn if blocks that no checkpoint includes fill more than half of the stream."""
+        if not self._nc.is_connected:
+            return
+        try:
+            owned = [lease.number for lease in self._leases if lease.is_owned]
+            warning = unsaved_warning(await unsaved_share(self._nc, owned))
+        except RETRYABLE_ERRORS as error:
+            log.warning("the stream cannot be checked", reason=error_text(error))
+            return
+        if warning and not self._unsaved_warning:
+            log.warning("the stream fills with blocks that no checkpoint includes", reason=warning)
+        self._unsaved_warning = warning
 
     async def _send_requests(self) -> None:
         if self._nc.is_connected:
@@ -416,7 +435,8 @@ class Worker:
             checkpoint_age_s=max(ages, default=None),
             cpu_s=usage.ru_utime + usage.ru_stime,
             rss_mib=_rss_mib(),
-            trouble=next((lease.trouble for lease in self._leases if lease.trouble), self._bucket.fault),
+            trouble=next((lease.trouble for lease in self._leases if lease.trouble), self._bucket.fault)
+            or self._unsaved_warning,
         )
 
 

@@ -19,11 +19,11 @@ from nats.errors import Error as NatsError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
+from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
 from bms_estimator.fleet.nats.streams import consumer, make_streams
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_config import Accounts, configuration
-from bms_estimator.fleet.worker.checkpoint_store import Pointer
 from bms_estimator.fleet.worker.worker import Options, work
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE

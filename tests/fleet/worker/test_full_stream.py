@@ -7,17 +7,21 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from bms_estimator.edge import subjects
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer, pointer_key
 from bms_estimator.fleet.nats.streams import RAW_BYTES, make_streams
+from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share
 from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.packs.pack_bucket import PackBucket, write_bucket
 from bms_estimator.fleet.simulation.block_publisher import run_edges
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.settings.mqtt import MqttSettings
+from tests.command_line import run
 from tests.fleet.nats_cluster import connected, running
 from tests.fleet.workers import Heartbeats, Process, end_states
 from tests.patience import LONG_S
@@ -96,4 +100,28 @@ async def test_no_block_is_lost_if_the_stream_overflows_without_a_worker(tmp_pat
             for samples in fleet.samples(np.full(edges.last, i), np.arange(1, edges.last + 1)):
                 estimator.run(samples)
             assert state["estimator"].tobytes() == estimator.record.tobytes()
+        await nc.close()
+
+
+async def test_status_warns_when_unsaved_blocks_fill_half_of_the_stream(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with running(tmp_path, 1, partitions=PARTITIONS) as cluster:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=PARTITIONS, raw_bytes=1 << 20)
+        js = nc.jetstream()
+        data = bytes(100 << 10)
+        warnings = []
+        for messages in (5, 1):
+            for _ in range(messages):
+                await js.publish(subjects.raw("p1"), data)
+            code, out, _ = await asyncio.to_thread(run, capsys, "fleet", "status", "--server", cluster.url)
+            assert code == 0
+            warnings.append(" of the stream RAW are blocks that no checkpoint includes" in out)
+        assert warnings == [False, True]
+        pointer = Pointer(kept=(CheckpointInfo(sequence=3, object="p0.1", bytes=1, made_s=1.79e9),))
+        bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
+        await bucket.put(pointer_key(0), pointer.model_dump_json().encode())
+        share = await unsaved_share(nc, range(PARTITIONS))
+        assert share == pytest.approx(0.3, abs=0.01)
         await nc.close()
