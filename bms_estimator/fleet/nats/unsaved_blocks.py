@@ -46,8 +46,9 @@ async def unsaved_share(nc: Client, partitions: Iterable[int]) -> float:
         oldest_sequence = min(oldest_sequence, message.seq or oldest_sequence)
     mean_bytes = raw.state.bytes / max(1, raw.state.messages)
     unsaved_bytes = mean_bytes * (raw.state.last_seq + 1 - oldest_sequence)
-    by_size = unsaved_bytes / raw.config.max_bytes if (raw.config.max_bytes or 0) > 0 else 0.0
-    by_age = (time.time() - oldest_s) / raw.config.max_age if raw.config.max_age else 0.0
+    max_bytes, max_age_s = raw.config.max_bytes or 0, raw.config.max_age or 0.0
+    by_size = unsaved_bytes / max_bytes if max_bytes > 0 else 0.0
+    by_age = (time.time() - oldest_s) / max_age_s if max_age_s > 0.0 else 0.0
     return min(1.0, max(by_size, by_age))
 
 

@@ -327,7 +327,7 @@ async def _warn_of_unsaved_blocks(place: NodeLocation, spec: ServerSpec) -> None
     node = node_of(place, spec)
     if not _makes_streams(place, node):
         return
-    for name in spec.settings.tenants or {"": None}:
+    for name in spec.settings.tenants or ("",):
         try:
             nc = await connect(node, credentials.credentials_file(place.keys, name, Role.ADMIN) if name else None)
             try:

@@ -17,6 +17,7 @@ from pathlib import Path
 import aiomqtt
 import nats
 import pytest
+from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import NoAnswerError
@@ -232,6 +233,27 @@ async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_an
     task = asyncio.create_task(serve_node(NodeLocation(tmp_path), lambda: spec, lines.append))
     await until(lambda: "streams ready, 4 partitions" in lines or task.done())
     assert len(calls) == 2
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_server_logs_a_warning_when_unsaved_blocks_fill_half_of_the_stream(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nats_server, "UNSAVED_S", 0.1)
+    ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
+    # a stream of 2.3 MB
+    spec = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4, packs=1, outage_days=0.002)))
+    lines: list[str] = []
+    with capture_logs() as logs:
+        task = asyncio.create_task(serve_node(NodeLocation(tmp_path), lambda: spec, lines.append))
+        await until(lambda: any("streams ready" in line for line in lines) or task.done())
+        nc = await nats.connect(f"nats://{ports['listen']}")
+        for _ in range(16):
+            await nc.jetstream().publish(subjects.raw("a"), bytes(100 << 10))
+        await nc.close()
+        await until(lambda: any("no checkpoint includes" in line.get("reason", "") for line in logs) or task.done())
+    assert not task.done()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
 

@@ -20,6 +20,7 @@ from bms_estimator.fleet.packs.pack_bucket import PackBucket, write_bucket
 from bms_estimator.fleet.simulation.block_publisher import run_edges
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
+from bms_estimator.fleet.worker import worker as worker_module
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.command_line import run
 from tests.fleet.nats_cluster import connected, running
@@ -124,4 +125,22 @@ async def test_status_warns_when_unsaved_blocks_fill_half_of_the_stream(
         await bucket.put(pointer_key(0), pointer.model_dump_json().encode())
         share = await unsaved_share(nc, range(PARTITIONS))
         assert share == pytest.approx(0.3, abs=0.01)
+        await nc.close()
+
+
+async def test_heartbeat_warns_when_unsaved_blocks_fill_half_of_the_stream(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_module, "UNSAVED_S", 0.1)
+    with running(tmp_path, 1, partitions=PARTITIONS) as cluster:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=PARTITIONS, raw_bytes=1 << 20)
+        for _ in range(6):
+            await nc.jetstream().publish(subjects.raw("p1"), bytes(100 << 10))
+        stop = asyncio.Event()
+        work = asyncio.create_task(worker_module.work(worker_module.Options(cluster.url, "w"), stop))
+        async with Heartbeats(nc) as heartbeats:
+            await heartbeats.until(lambda last: "w" in last and "no checkpoint includes" in last["w"].trouble)
+        stop.set()
+        await work
         await nc.close()
