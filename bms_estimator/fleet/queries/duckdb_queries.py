@@ -242,7 +242,7 @@ def _present_hour(database: duckdb.DuckDBPyConnection, files: Iterable[list[Path
 
 
 def _last_days(by_day: Mapping[Path, list[Path]], now_hour: int, days: int | None) -> dict[Path, list[Path]]:
-    """Return the files of the last ``days`` days up to the hour after ``now_hour``; those of all days if ``days`` is None."""
+    """Return the files of the days up to the hour after ``now_hour``: of the last ``days`` days, or of all days without this limit."""
     last = _day_name(now_hour + 1)
     first = "" if days is None else _day_name(now_hour - 24 * (days - 1))
     return {day: files for day, files in by_day.items() if first <= day.name <= last}
@@ -261,25 +261,24 @@ def _create_quarantined_view(database: duckdb.DuckDBPyConnection, files: Mapping
 
 
 def _create_hours_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
-    """Create the view ``hours``. A day with a single, merged file has one row of each hour already.
+    """Create the view ``hours``. Only days with files that were not merged can have several rows of one hour.
 
     Raises:
         UserError: The files have other columns.
     """
-    unique, with_duplicates = list[str](), list[str]()
+    merged, unmerged = list[str](), list[str]()
     for day_files in files.values():
         is_merged = len(day_files) == 1 and day_files[0].name.startswith(MERGED_PREFIX)
-        (unique if is_merged else with_duplicates).extend(str(file) for file in day_files)
+        (merged if is_merged else unmerged).extend(str(file) for file in day_files)
     database.register("all_columns", SCHEMA.empty_table())  # because files of other versions may lack some columns
-    for name, paths in (("once", unique), ("maybe_twice", with_duplicates)):
+    for name, paths in (("merged_rows", merged), ("unmerged_rows", unmerged)):
         read = database.read_parquet(paths, union_by_name=True, hive_partitioning=False) if paths else None
         if read is not None and not {"pack", "hour"} <= set(read.columns):
             raise UserError(
                 f"{Path(paths[0]).parent}: its files lack the columns pack and hour: they are not from `fleet collect`"
             )
         (database.table("all_columns") if read is None else read).create_view(name)
-    repeated = "SELECT * FROM all_columns UNION ALL BY NAME SELECT * FROM maybe_twice"
-    database.execute(f"CREATE TEMP VIEW rows AS {repeated}")
+    database.execute("CREATE TEMP VIEW rows AS SELECT * FROM all_columns UNION ALL BY NAME SELECT * FROM unmerged_rows")
     database.execute(f"CREATE TEMP VIEW valid_rows AS {VALID_ROWS}")
     database.execute(_sql("hours"))
 
