@@ -77,12 +77,12 @@ class BlockRunner:
                 result = take(pack, data, sequence, is_lethal=is_lethal)
             except Exception:  # an internal error with one pack, which would otherwise end one worker after another
                 log.exception("a block is skipped", partition=self._number, pack=pack, sequence=sequence)
-                result = BlockResult(pack, failed=1, dead=INTERNAL_ERROR)
+                result = BlockResult(pack, failed=1, dead_reason=INTERNAL_ERROR)
             self.budget.charge(pack, time.thread_time() - begin_s)
             self.faults += result.failed
             self._results.queue_summaries(result)
-            if result.dead:
-                self._add_dead_letter(DeadLetter(pack, sequence, result.dead, self._worker, data))
+            if result.dead_reason:
+                self._add_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
             if is_change(data):  # the table may have changed again since this change was sent
                 self._changes.add(pack)
             await self._guard.end_block(sequence)

@@ -67,7 +67,7 @@ class BlockResult(NamedTuple):
         hours: Message ids and rows of finished hours. The message id of a row is equal for all workers, so that the server
             drops repeated rows.
         failed: Number of blocks that were skipped because of an internal error.
-        dead: Reason why the block becomes a dead letter; empty if it does not become one.
+        dead_reason: Reason why the block becomes a dead letter; empty if it does not become one.
     """
 
     pack: str
@@ -76,7 +76,7 @@ class BlockResult(NamedTuple):
     parameters: bytes | None = None
     hours: tuple[tuple[str, bytes], ...] = ()
     failed: int = 0
-    dead: str = ""
+    dead_reason: str = ""
 
 
 class Partition:
@@ -107,7 +107,7 @@ class Partition:
     ) -> None:
         self.number, self.sequence = number, 0
         self._table, self._sources = table, sources
-        self._in_force: dict[str, PackSource] = {}  # of packs with processed blocks
+        self._in_force: dict[str, PackSource] = {}  # row and cell file of each pack with processed blocks
         self._counters: Counter[str] = Counter()
         self._packs: dict[str, bytes] = {}
         self._unmigrated: dict[str, PreviousLayoutState] = {}  # packs whose record still has a previous layout
@@ -290,7 +290,7 @@ class Partition:
         block = self._decode(data, decode_header if is_lethal else decode)
         if isinstance(block, BlockError):
             self._log_rejection(pack, str(block))
-            return BlockResult(pack, dead=str(block))
+            return BlockResult(pack, dead_reason=str(block))
         return self._take(pack, block, arrival, pack_type, is_lethal=is_lethal)
 
     def _decode(self, data: bytes, decode_block: Callable[[bytes], Block] = decode) -> Block | BlockError:
@@ -337,8 +337,8 @@ class Partition:
                 classify_block(d, block)
                 self._unpacked.count_lost(newly_lost)
                 self._counters["lethal" if is_lethal else "too_dense" if fault else "failed"] += 1
-            dead = LETHAL if is_lethal else "" if fault else INTERNAL_ERROR
-            result = stepped or BlockResult(pack, failed=int(not fault), dead=dead)
+            dead_reason = LETHAL if is_lethal else "" if fault else INTERNAL_ERROR
+            result = stepped or BlockResult(pack, failed=int(not fault), dead_reason=dead_reason)
             mark_taken(d)
             self._update_clock_error(pack, float(d["clock_error_s"]))
             self._unmigrated.pop(pack, None)

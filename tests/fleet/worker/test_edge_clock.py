@@ -61,7 +61,7 @@ def test_lethal_block_of_an_edge_with_a_wrong_clock_is_skipped_and_the_hour_is_q
         data, received_s = one_block(samples_until(last_s), number), round(STORE_S + last_s - ahead_s)
         result = partition.take("a", data, number, received_s, is_lethal=number == lethal)
         hours += result.hours
-        dead += [number] if result.dead else []
+        dead += [number] if result.dead_reason else []
     ((_, row),) = hours
     assert dead == [lethal]
     assert Hour.model_validate_json(row).clock_error_s == ahead_s
