@@ -12,14 +12,14 @@ GB = 1_000_000_000
 BLOCK_BYTES = 512
 """Unit of ``st_blocks`` [bytes]."""
 USABLE_FRACTION = 0.75
-"""Fraction of the file system's space, without that of other files, that the streams may use."""
+"""Fraction of the available space that the streams may use without ``server.disk_gb``."""
 
 
-def usable_bytes(folder: Path) -> int:
-    """Return the space that the streams of a folder may use, including the space that they use already [bytes]."""
+def available_bytes(folder: Path) -> int:
+    """Return the space that a folder of streams can use, including the space that it uses already [bytes]."""
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     stored = sum(_stored_bytes(file) for file in folder.rglob("*"))
-    return round(USABLE_FRACTION * (shutil.disk_usage(existing).free + stored))
+    return shutil.disk_usage(existing).free + stored
 
 
 def _stored_bytes(path: Path) -> int:
@@ -36,17 +36,17 @@ def sizes_of(settings: FleetSettings, tenant: TenantSettings) -> StreamSizes:
     return stream_sizes(tenant.packs or server.packs, tenant.outage_days or server.outage_days)
 
 
-def check_disk_space(settings: FleetSettings, folder: Path, usable: int, copies_per_node: float) -> None:
+def check_disk_space(settings: FleetSettings, folder: Path, available: int, copies_per_node: float) -> None:
     """Check that the streams of all tenants fit.
 
     Args:
         settings: Settings of the fleet.
         folder: Folder of the streams, for the error.
-        usable: Space that the streams may use [bytes].
+        available: Space that the folder can use [bytes].
         copies_per_node: Mean number of copies of a stream on this node, at most 1.
 
     Raises:
-        UserError: They are larger than ``server.disk_gb`` or the usable space.
+        UserError: They are larger than ``server.disk_gb`` or the available space.
     """
     tenants = settings.tenants or {"": TenantSettings()}
     needed = copies_per_node * sum(sizes_of(settings, tenant).total for tenant in tenants.values())
@@ -56,9 +56,10 @@ def check_disk_space(settings: FleetSettings, folder: Path, usable: int, copies_
             f"server.disk_gb = {limit_gb:g}: the streams need {needed / GB:.1f} GB: "
             "increase disk_gb, or reduce packs or outage_days, of the server or of a tenant"
         )
-    if limit_gb is None and needed > usable:
+    fraction = USABLE_FRACTION if limit_gb is None else 1.0
+    if needed > fraction * available:
         raise UserError(
-            f"{folder}: the streams need {needed / GB:.1f} GB, but may use only {usable / GB:.1f} GB, "
-            f"{USABLE_FRACTION:.0%} of the free space: choose a larger disk by --folder, "
+            f"{folder}: the streams need {needed / GB:.1f} GB, but may use only {fraction * available / GB:.1f} GB, "
+            f"{fraction:.0%} of the free space: choose a larger disk by --folder, "
             "or reduce packs or outage_days, of the server or of a tenant"
         )

@@ -22,7 +22,7 @@ from bms_estimator.fleet.nats.connection import AUTH_TIMEOUT_S, close
 from bms_estimator.fleet.nats.streams import NoAnswerError, make_streams
 from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning
 from bms_estimator.fleet.server import credentials
-from bms_estimator.fleet.server.disk_space import GB, check_disk_space, sizes_of, usable_bytes
+from bms_estimator.fleet.server.disk_space import GB, USABLE_FRACTION, available_bytes, check_disk_space, sizes_of
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_config import Accounts, Cluster, Node, Tls, configuration
 from bms_estimator.fleet.server.server_binary import find_server
@@ -59,14 +59,14 @@ class NodeLocation:
         folder: Folder of streams and keys.
         number: Number of the node, from 1.
         nodes: Cluster addresses of all nodes, host:port; empty for a single node.
-        usable_bytes: Space that the streams may use without ``server.disk_gb`` [bytes]. The server cannot change it at a
-            reload. None: not known before the start.
+        available_bytes: Space that the streams could use at the start [bytes]; None before the start. It is not updated,
+            because the server cannot change its limit at a reload.
     """
 
     folder: Path
     number: int = 1
     nodes: tuple[str, ...] = ()
-    usable_bytes: int | None = None
+    available_bytes: int | None = None
 
     @property
     def keys(self) -> Path:
@@ -111,9 +111,16 @@ def node_of(place: NodeLocation, spec: ServerSpec) -> Node:
         tls=_tls(tls) if tls else None,
         accounts=spec.accounts,
         partitions=server.partitions,
-        disk_bytes=place.usable_bytes if server.disk_gb is None else round(GB * server.disk_gb),
+        disk_bytes=_disk_bytes(place, server.disk_gb),
         sync_s=server.sync_s or None,
     )
+
+
+def _disk_bytes(place: NodeLocation, disk_gb: float | None) -> int | None:
+    """Return the limit of the size of all streams [bytes]; None before the start, unless it is configured."""
+    if disk_gb is not None:
+        return round(GB * disk_gb)
+    return None if place.available_bytes is None else round(USABLE_FRACTION * place.available_bytes)
 
 
 def _tls(settings: TlsSettings) -> Tls:
@@ -149,7 +156,7 @@ def _check_disk_space(place: NodeLocation, spec: ServerSpec) -> None:
         UserError: They do not fit.
     """
     copies_per_node = place.replicas / (len(place.nodes) or 1)
-    check_disk_space(spec.settings, place.streams, place.usable_bytes or 0, copies_per_node)
+    check_disk_space(spec.settings, place.streams, place.available_bytes or 0, copies_per_node)
 
 
 async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Callable[[str], None]) -> int:
@@ -167,7 +174,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
         UserError: The server is missing or too old, settings are invalid, the disk is too small, or the server rejects the streams.
     """
     binary, spec = find_server(), read()
-    place = replace(place, usable_bytes=usable_bytes(place.streams))
+    place = replace(place, available_bytes=available_bytes(place.streams))
     _check_disk_space(place, spec)
     node = node_of(place, spec)
     if node.tls:

@@ -346,6 +346,7 @@ def test_missing_certificate_or_another_key_is_rejected(
     ("text", "reason"),
     [
         ("packs = 10_000_000\noutage_days = 365", "streams: the streams need 4540260.0 GB, but may use only "),
+        ("packs = 10_000_000\ndisk_gb = 1e6", "streams: the streams need 93900.0 GB, but may use only "),
         ("packs = 10_000\ndisk_gb = 90", "server.disk_gb = 90: the streams need 93.9 GB: increase disk_gb"),
         ("raw_gb = 8", "server: raw_gb: replaced by packs and outage_days"),
     ],
