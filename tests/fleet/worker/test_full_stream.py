@@ -84,6 +84,7 @@ async def test_no_block_is_lost_if_the_stream_overflows_without_a_worker(tmp_pat
             while (state := (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state).last_seq < stream_end:  # noqa: ASYNC110 - the stream has no notifications
                 await asyncio.sleep(0.02)
             assert state.messages < PACKS * OVERFLOW  # the stream has dropped all blocks since the checkpoint
+            assert edges.confirmed_below.tolist() == [SAVED + 1] * PACKS
             await make_streams(nc, partitions=PARTITIONS, raw_bytes=RAW_BYTES)
             next_worker = start_worker("next")
             await heartbeats.until_held(PARTITIONS, "next")
