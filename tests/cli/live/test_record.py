@@ -61,15 +61,23 @@ def complete_reads(path):
     return [read for batch in read_capture(path) for read in batch]
 
 
+def count_samples(reads):
+    """Return the number of samples in reads from the beginning of a capture."""
+    decoder = FrameDecoder()
+    return sum(decoder.feed(arrival_s, data).size for arrival_s, data in reads)
+
+
 def sample_count(path):
     """Return the number of samples in all complete reads."""
-    decoder = FrameDecoder()
-    return sum(decoder.feed(arrival_s, data).size for arrival_s, data in complete_reads(path))
+    return count_samples(complete_reads(path))
 
 
 def has_a_second(path):
-    """Return True if a growing capture contains the samples of a second."""
-    return size_bytes(path) > 1_000 and sample_count(path) >= 100
+    """Return True if a growing capture contains the samples of a second, and several of them in the first half of its reads."""
+    if size_bytes(path) <= 1_000:
+        return False
+    reads = complete_reads(path)
+    return count_samples(reads) >= 100 and count_samples(reads[: len(reads) // 2]) > 10
 
 
 def replay(capsys, path):
