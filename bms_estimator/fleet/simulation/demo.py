@@ -34,6 +34,8 @@ SPEED = 10.0
 """Simulated seconds per second: an edge sends a block of a simulated minute every 6 s."""
 SEED = 7
 """Seed of the simulated packs."""
+OUTAGE_DAYS = 1
+"""Outage for which the streams have space [days], much longer than the demo, so that a small disk suffices."""
 OBSERVED_PACKS = 100
 """Number of packs whose estimates are compared with the true SOC."""
 PROGRESS_S = 5.0
@@ -129,6 +131,7 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
     config.write_text(
         f'[server]\nfolder = "{demo.folder}/server"\nlisten = "{LOOPBACK}:{nats_port}"\n'
         f'mqtt = "{LOOPBACK}:{mqtt_port}"\nmonitor = "{LOOPBACK}:{monitor_port}"\n'
+        f"packs = {demo.packs}\noutage_days = {OUTAGE_DAYS}\n"
     )
     # the edges are faster than real time, and their clocks must not get ahead of the server's
     begin_s = int(time.time() - SPEED * (demo.seconds + TIMEOUT_S)) - BLOCK_S
