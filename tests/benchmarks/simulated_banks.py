@@ -11,12 +11,14 @@ import pickle
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+import bms_estimator
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.pack_model.cell_curves import CellCurves
@@ -28,7 +30,9 @@ from tests.pack_model.bank_cycles import cycle
 T = TypeVar("T")
 
 CACHE = Path(tempfile.gettempdir()) / "bank_cache"
-"""Folder of recorded banks. Delete it after a change of the simulation, the filter or the fit."""
+"""Folder of recorded banks."""
+DETECTOR = {"weakest_cell.py", "bank_monitor.py", "open_circuit.py"}
+"""Files of ``pack_model`` that compare recordings. The recordings do not depend on them."""
 STEP_S = 5.0
 """Interval between two samples [s]."""
 BLOCK = 12
@@ -235,9 +239,20 @@ def recordings(
     return cached(f"{chemistry}-{series}-{seed}-{weak}-{cycles}-{fade}", simulate)
 
 
+@cache
+def source_digest() -> bytes:
+    """Return a hash of the sources of simulation, filter and fit, so that a change of them gives new recordings."""
+    package, digest = Path(bms_estimator.__file__).parent, hashlib.sha256(Path(__file__).read_bytes())
+    for room in ("kernels", "estimator", "simulation", "model", "pack_model"):
+        for source in sorted((package / room).rglob("*.py")):
+            if source.name not in DETECTOR:
+                digest.update(source.read_bytes())
+    return digest.digest()
+
+
 def cached(key: str, simulate: Callable[[], T]) -> T:
-    """Return the result of an earlier simulation with the same key."""
-    path = CACHE / hashlib.sha256(key.encode()).hexdigest()
+    """Return the result of an earlier simulation with the same key and the same sources."""
+    path = CACHE / hashlib.sha256(source_digest() + key.encode()).hexdigest()
     if path.exists():
         result: T = pickle.loads(path.read_bytes())
         return result
