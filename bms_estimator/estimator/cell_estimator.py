@@ -19,7 +19,7 @@ from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.settings.alarm_limits import MIN_CELLS, balancing_voltage_v
 
 LEAK_STDS = 2.5
-"""Minimum excess of a cell's self-discharge over that of the median cell that counts as a short [std]."""
+"""Minimum difference between the self-discharges of a cell and of the median cell that counts as a short [std]."""
 NEW_FIELDS = {"response", "score", "information", "near_full_soc"}
 """Fields of CELL and BANK that older checkpoints do not have. They begin at zero, so that the hypotheses start again."""
 

@@ -54,7 +54,7 @@ def cell_power_limits(cell: PackModel) -> PowerLimits:
 
 
 def power_limits(settings: Settings, cell: CellModel) -> PowerLimits:
-    """Return the limits that the pack's alarms set. A current limit is never above that of the cell file.
+    """Return the limits that the pack's alarms set. A current limit is never above the limit of the cell file.
 
     If the alarm on a current is switched off, the limit of the cell file applies. If the alarm on charging below freezing is
     switched off, no temperature limits the charge.
@@ -82,7 +82,7 @@ def write_capability(
 ) -> None:
     """Write available power, usable capacity, remaining energy and time to full to ``values``.
 
-    With ``cells``, power and capacity are those of the limiting cell: the one that reaches its share of the voltage limit first.
+    With ``cells``, the cell that first reaches its share of the voltage limit determines power and capacity.
 
     The values stay unchanged before the first sample, without the identifier and for a fuel cell.
 

@@ -25,7 +25,7 @@ FORECAST = np.dtype(
     ],
     align=True,
 )
-"""Values of a forecast; NaN if unknown. The names are those of the published fields."""
+"""Values of a forecast; NaN if unknown. The published fields have the same names."""
 
 ForecastRows = NDArray[np.void]
 """Shape (n,), dtype ``FORECAST``."""

@@ -72,7 +72,7 @@ class Forecaster:
         estimator: Estimator of the pack.
         runner: The estimator, or the slow fit that runs it.
         cutoff_v: Terminal voltage at which the load is switched off [V].
-        limits: Limits of the available power; None: those of the cell file.
+        limits: Limits of the available power; None: the limits of the cell file.
         cells: Estimators of the single cells, which ``run`` also runs; None: no cell voltages.
 
     Attributes:

@@ -53,7 +53,7 @@ class PastMinutes:
         self.mean_a, self.max_a, self._next = mean_a, max_a, int(load.record["next"][0])
 
     def analogues(self, present_minutes: int) -> list[GivenLoad]:
-        """Return the loads that followed the analogues in earlier discharges, that of the most similar one first.
+        """Return the loads that followed the analogues in earlier discharges, the load after the most similar one first.
 
         Args:
             present_minutes: Number of the last minutes that belong to the present discharge.

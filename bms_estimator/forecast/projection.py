@@ -80,7 +80,7 @@ def project_observed_load(
         pack: Shape (1,), dtype ``PROJECTED_PACK``.
         mean_a: Mean current of each second [A], with a mean above the offset of the sensor.
         max_a: Largest current of each second [A].
-        spread: Spread of the mean of the future load around that of the drawn one.
+        spread: Spread of the mean future load around the mean of the drawn load.
         seed: Seed of the random numbers, 0 to 2**64 - 1.
         analogues: Loads that followed similar loads of earlier discharges. Some of the draws follow them instead of drawn loads.
     """

@@ -22,7 +22,7 @@ from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.sample import SAMPLE
 from tests.command_line import PROGRAM

@@ -18,7 +18,7 @@ from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
-    from bms_estimator.fleet.worker.erasure import Erasure
+    from bms_estimator.fleet.worker.checkpoint.erasure import Erasure
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -215,7 +215,7 @@ def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> Non
 
 async def _erase_from_server(packs: list[str], address: ServerAddress) -> "dict[str, Erasure]":
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-    from bms_estimator.fleet.worker.erasure import erase_packs  # noqa: PLC0415
+    from bms_estimator.fleet.worker.checkpoint.erasure import erase_packs  # noqa: PLC0415
 
     async with connected(*address) as nc:
         return await erase_packs(nc, set(packs))

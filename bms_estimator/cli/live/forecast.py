@@ -110,7 +110,7 @@ def forecast(
 ) -> None:
     """Forecast the time to cut-off under an expected load, from the state of a pack or from the end of a capture.
 
-    The state is that of the last checkpoint of the pack's service, which may be running. If no load is given, a load like
+    The state comes from the last checkpoint of the pack's service, which may be running. If no load is given, a load like
     the observed one is expected.
     """
     if pack is None and capture is None:

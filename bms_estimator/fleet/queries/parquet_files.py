@@ -1,7 +1,7 @@
 """Hourly rows of packs in Parquet files ``date=YYYY-MM-DD/*.parquet``, written atomically and merged by day.
 
-A file is written under a name that no query reads, synced to the disk, and renamed. An hour may be in several files; its
-valid row is that of the largest revision. The module needs pyarrow and duckdb.
+A file is written under a name that no query reads, synced to the disk, and renamed. An hour may be in several files; the
+row with the largest revision is valid. The module needs pyarrow and duckdb.
 """
 
 import os

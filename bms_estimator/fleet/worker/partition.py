@@ -19,7 +19,7 @@ from bms_estimator.fleet.packs.pack_type import PackType, PackTypes
 from bms_estimator.fleet.packs.table_change import PackSource, decode_change, encode_change, is_change
 from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken, position
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
-from bms_estimator.fleet.worker.checkpoint_format import (
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CheckpointError,
     PartitionCheckpoint,
     PreviousLayoutState,
@@ -278,7 +278,7 @@ class Partition:
         return BlockResult(pack)
 
     def _settings(self, pack: str) -> tuple[Settings, PackModel] | None:
-        """Return the settings and the model in force; those of the table for a new pack, and for a row with an error."""
+        """Return the settings and the model in force. For a new pack, and for a row with an error, the table is read."""
         source = self._in_force.get(pack)
         in_force = self._sources.resolve(source) if self._sources is not None and source else None
         return in_force or self._table(pack)

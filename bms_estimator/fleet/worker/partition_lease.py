@@ -23,8 +23,8 @@ from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.packs.table_change import trusted_data
 from bms_estimator.fleet.worker.block_runner import BlockRunner
-from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim, FencedError
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, Claim, FencedError
 from bms_estimator.fleet.worker.deferred_reader import DeferredReader
 from bms_estimator.fleet.worker.partition import BlockResult, PackLookup, PackSources, Partition
 from bms_estimator.fleet.worker.partition_restore import restore_partition

@@ -4,8 +4,8 @@ from contextlib import aclosing
 
 import structlog
 
-from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, Claim
 from bms_estimator.fleet.worker.partition import PackLookup, PackSources, Partition
 
 log = structlog.get_logger(__name__)

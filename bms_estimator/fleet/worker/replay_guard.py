@@ -7,7 +7,7 @@ the server before it processes the block. If the worker dies, the next owner the
 block that was found ``MAX_DEATHS`` times is lethal, and is skipped.
 """
 
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim, ReplayRecord
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, Claim, ReplayRecord
 
 GUARDED_CLAIMS = 2
 """Number of claims since the last checkpoint from which a replay is guarded. The replay after the first claim is not guarded,

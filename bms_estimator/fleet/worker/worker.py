@@ -22,8 +22,8 @@ from bms_estimator.fleet.nats.connection import close, connect, error_text
 from bms_estimator.fleet.nats.streams import partitions_of
 from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
-from bms_estimator.fleet.worker.checkpoint_format import FORMAT, UnreadableFormatError, oldest_format
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, UnreadableFormatError, oldest_format
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S

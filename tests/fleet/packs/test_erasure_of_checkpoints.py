@@ -13,9 +13,9 @@ from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.packs.table_change import PackSource, encode_change
-from bms_estimator.fleet.worker import checkpoint_store
-from bms_estimator.fleet.worker.checkpoint_format import FORMAT, PartitionCheckpoint, read_checkpoint
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, Claim
+from bms_estimator.fleet.worker.checkpoint import checkpoint_store
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, PartitionCheckpoint, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, Claim
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.workers import PACK_ROW, block, load_packs, send

@@ -6,8 +6,8 @@ The first argument is the newest format of this version. The migrations count th
 import sys
 from collections.abc import Callable
 
-from bms_estimator.fleet.worker import checkpoint_format
-from bms_estimator.fleet.worker.checkpoint_format import Header, HeaderMigration
+from bms_estimator.fleet.worker.checkpoint import checkpoint_format
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import Header, HeaderMigration
 
 UPGRADED, DOWNGRADED = "upgraded", "downgraded"
 """Names of the counters of converted checkpoints."""

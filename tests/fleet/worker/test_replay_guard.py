@@ -8,8 +8,8 @@ import pytest
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.checkpoint_format import FORMAT
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.replay_guard import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
 from tests.fleet.nats_cluster import running
 

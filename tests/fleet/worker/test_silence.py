@@ -10,8 +10,8 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.checkpoint_format import FORMAT
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.partition import PackLookup
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer

@@ -21,13 +21,13 @@ from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer, partitions_of
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
-from bms_estimator.fleet.worker.checkpoint_format import (
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CheckpointError,
     PartitionCheckpoint,
     UnreadableFormatError,
     read_checkpoint,
 )
-from bms_estimator.fleet.worker.checkpoint_store import CheckpointStore, FencedError
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, FencedError
 from bms_estimator.model.errors import UserError
 
 WORKER_NAME = "packs-remove"

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bms_estimator.fleet.packs.table_change import PackSource
-from bms_estimator.fleet.worker import checkpoint_format
 from bms_estimator.fleet.worker.block_order import MAX_EARLY_REPEATS
-from bms_estimator.fleet.worker.checkpoint_format import (
+from bms_estimator.fleet.worker.checkpoint import checkpoint_format
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CHUNK_BYTES,
     CURRENT_LAYOUT,
     FORMAT,

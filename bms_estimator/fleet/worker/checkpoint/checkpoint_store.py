@@ -31,7 +31,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer, pointer_key
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stored_messages import read_messages
-from bms_estimator.fleet.worker.checkpoint_format import UnreadableFormatError, is_readable
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError, is_readable
 from bms_estimator.model.clock import iso_utc
 
 CHECKPOINTS_PER_PARTITION = 2

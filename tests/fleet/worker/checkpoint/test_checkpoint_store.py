@@ -15,14 +15,14 @@ from structlog.testing import capture_logs
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import RefusedPartition
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker import checkpoint_store
-from bms_estimator.fleet.worker.checkpoint_format import (
+from bms_estimator.fleet.worker.checkpoint import checkpoint_store
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     FORMAT,
     PartitionCheckpoint,
     UnreadableFormatError,
     readable_text,
 )
-from bms_estimator.fleet.worker.checkpoint_store import (
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import (
     CHECKPOINTS_PER_PARTITION,
     DAILY_CHECKPOINTS,
     MESSAGE_BYTES,
