@@ -30,8 +30,8 @@ DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
 LOAD_SAVE_S = 300.0
 """Interval between two saves of the observed load [s]. A crash loses at most the load of this time."""
-FINAL_SAVE_S = 5.0
-"""Timeout of the save at shutdown [s]; systemd waits 90 s before it kills a service."""
+FINAL_SAVE_S = 20.0
+"""Timeout of the save at shutdown [s]. A busy SD card may take several seconds. systemd waits 90 s before it kills a service."""
 
 log = structlog.get_logger(__name__)
 

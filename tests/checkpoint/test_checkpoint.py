@@ -494,18 +494,22 @@ async def test_an_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch
 
 
 async def test_the_state_is_saved_when_an_error_ends_the_loop(tmp_path: Path) -> None:
+    class SensorError(Exception):
+        pass
+
     class FailingSource(ScriptedSource):
         async def __aiter__(self) -> AsyncIterator[Any]:
             async for block in super().__aiter__():
                 yield block
-            raise ZeroDivisionError
+            raise SensorError
 
     source, file = FailingSource(), CheckpointFile(tmp_path, SETTINGS, CELL)
     source.give((0.0, 0.1, 3.8))
     source.finish()
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(SensorError):
         await run_estimation_loop(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=file)
     content = file.load()
+    assert content.reason == ""
     assert content.state["observer.samples"] == 1
     assert content.counters.total.crashes == 1
 
