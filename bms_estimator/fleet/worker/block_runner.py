@@ -58,13 +58,7 @@ class BlockRunner:
         self.lag_s: float | None = None
 
     async def run(self, pack: str, data: bytes, sequence: int, take: Callable[..., BlockResult]) -> BlockResult:
-        """Process a message while no other block is processed, and charge the processor time to its pack.
-
-        Args:
-            pack: Name of the pack.
-            data: Bytes of the message.
-            sequence: Stream sequence number of the message.
-            take: ``Partition.take`` or ``Partition.take_deferred``.
+        """Process a message while no other block is processed. ``run_unguarded`` describes the arguments.
 
         Raises:
             nats.errors.Error: The server does not respond.
@@ -72,22 +66,37 @@ class BlockRunner:
         async with self._step_lock:
             await asyncio.sleep(0)  # lets the event loop send heartbeats between two blocks
             is_lethal = await self._guard.is_lethal(sequence)
-            begin_s = time.thread_time()
-            try:
-                result = take(pack, data, sequence, is_lethal=is_lethal)
-            except Exception:  # an internal error with one pack, which would otherwise end one worker after another
-                log.exception("a block is skipped", partition=self._number, pack=pack, sequence=sequence)
-                result = BlockResult(pack, failed=1, dead_reason=INTERNAL_ERROR)
-            self.budget.charge(pack, time.thread_time() - begin_s)
-            self.faults += result.failed
-            self._results.queue_summaries(result)
-            if result.dead_reason:
-                self._add_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
-            if is_change(data):  # the table may have changed again since this change was sent
-                self._changes.add(pack)
+            result = self.run_unguarded(pack, data, sequence, take, is_lethal=is_lethal)
             await self._guard.end_block(sequence)
         if is_lethal:
             await self._save()  # the next owner must not process the block again
+        return result
+
+    def run_unguarded(
+        self, pack: str, data: bytes, sequence: int, take: Callable[..., BlockResult], *, is_lethal: bool = False
+    ) -> BlockResult:
+        """Process a message, and charge the processor time to its pack.
+
+        Args:
+            pack: Name of the pack.
+            data: Bytes of the message.
+            sequence: Stream sequence number of the message.
+            take: ``Partition.take`` or ``Partition.take_deferred``.
+            is_lethal: True if the block has killed workers.
+        """
+        begin_s = time.thread_time()
+        try:
+            result = take(pack, data, sequence, is_lethal=is_lethal)
+        except Exception:  # an internal error with one pack, which would otherwise end one worker after another
+            log.exception("a block is skipped", partition=self._number, pack=pack, sequence=sequence)
+            result = BlockResult(pack, failed=1, dead_reason=INTERNAL_ERROR)
+        self.budget.charge(pack, time.thread_time() - begin_s)
+        self.faults += result.failed
+        self._results.queue_summaries(result)
+        if result.dead_reason:
+            self._add_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
+        if is_change(data):  # the table may have changed again since this change was sent
+            self._changes.add(pack)
         return result
 
     def count_block(self, data: bytes) -> None:

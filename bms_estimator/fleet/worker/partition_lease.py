@@ -22,6 +22,7 @@ from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.packs.table_change import trusted_data
+from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.block_runner import BlockRunner
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, Claim, FencedError
@@ -55,8 +56,7 @@ class PartitionLease:
         table: Settings and models of the packs.
         checkpoints: Store of the checkpoints.
         inbox: Prefix of the subject for responses (``PinnedConsumer``).
-        step_lock: Lock of the worker, held while a block is estimated. The event loop can send requests and heartbeats between
-            two blocks.
+        block_loop: Loop of the worker, which processes the delivered messages that need no request to the server.
         partitions: Number of partitions of the stream.
         sources: Rows of the same table; their changes are sent to the stream. None: changes take effect at once.
         checkpoint_format: Returns the format in which checkpoints are written, which all live workers read.
@@ -81,7 +81,7 @@ class PartitionLease:
         table: PackLookup,
         checkpoints: CheckpointStore,
         inbox: str,
-        step_lock: asyncio.Lock,
+        block_loop: BlockLoop,
         *,
         partitions: int,
         checkpoint_format: Callable[[], int],
@@ -89,12 +89,12 @@ class PartitionLease:
         sources: PackSources | None = None,
     ) -> None:
         self._nc, self.number, self._table, self._sources, self._partitions = nc, number, table, sources, partitions
-        self._checkpoints, self._checkpoint_format = checkpoints, checkpoint_format
+        self._checkpoints, self._checkpoint_format, self._block_loop = checkpoints, checkpoint_format, block_loop
         self._guard = ReplayGuard(checkpoints, number)
         self._changes = TableChangeSender(nc, lambda: self.partition, self._try)
         self.results = ResultPublisher(nc)
         self.runner = BlockRunner(
-            number, checkpoints.worker, step_lock, self._guard, self.results, self._changes, self.save
+            number, checkpoints.worker, block_loop.step_lock, self._guard, self.results, self._changes, self.save
         )
         self._deferred = DeferredReader(
             nc, lambda: self.partition, self.runner, self.results, is_busy=is_busy, attempt=self._try
@@ -110,6 +110,10 @@ class PartitionLease:
         self._silent = False  # the stream must be searched, because no message has arrived
         self._next_search_s = time.monotonic() + SILENCE_S  # monotonic clock of the next search of the stream
         self._wake_up = asyncio.Event()
+        self._is_idle = (
+            False  # the task of this lease waits for ``_wake_up``, so that the block loop may process messages
+        )
+        self._unpublished: list[BlockResult] = []
         self._state_lock = asyncio.Lock()  # held while ``partition`` and ``claim`` change
 
     @property
@@ -131,7 +135,44 @@ class PartitionLease:
         """Process a message or status from the server."""
         if self.consumer.receive(message):
             self._pin_lapsed, self._next_search_s = True, time.monotonic() + SILENCE_S
-        self._wake_up.set()
+        self._block_loop.add(self)
+
+    def process_next(self) -> None:
+        """Process the next delivered message, or wake up the task of this lease if a request to the server is necessary."""
+        partition, delivered = self.partition, self.consumer.waiting[0] if self.consumer.waiting else None
+        if partition is None or delivered is None or not self._is_next(delivered):
+            self._wake_up.set()
+            return
+        self.consumer.pop()
+        self._next_search_s = time.monotonic() + SILENCE_S
+        if delivered.sequence <= partition.sequence:
+            return
+        pack, data, sequence = delivered.pack, delivered.data, delivered.sequence
+        result = self._reject_or_defer(partition, pack, sequence)
+        if result is None:
+            take = partial(partition.take, received_s=delivered.received_s)
+            result = self.runner.run_unguarded(pack, data, sequence, take)
+            self._count(partition, pack, data)
+        self._unpublished.append(result)
+
+    def _is_next(self, delivered: DeliveredMessage) -> bool:
+        """Return True if the state includes all messages before a delivered one, and no request to the server is necessary."""
+        is_gapless = self._is_gapless and delivered.follows and delivered.pin == self._pin
+        return is_gapless and self._is_idle and not self._pin_lapsed and not self._guard.is_guarded(delivered.sequence)
+
+    async def publish(self) -> None:
+        """Publish the results of ``process_next``, and request further messages."""
+        results, self._unpublished = self._unpublished, []
+        if not results:
+            return
+
+        async def publish_all() -> None:
+            for result in results:
+                await self.results.publish(result)
+            await self.consumer.request_taken()
+
+        if not await self._try(publish_all):
+            self._is_gapless = False
 
     def check_silence(self) -> None:
         """Request a search of the stream after silence, and a check of deferred packs and of changes of the table.
@@ -153,7 +194,8 @@ class PartitionLease:
             self._wake_up.clear()
             if self._pin_lapsed:
                 await self._try(self._check_ownership)
-            delivered = await self.consumer.take()
+            await self.consumer.request_taken()
+            delivered = self.consumer.pop()
             if delivered is not None:
                 await self._process_delivered(delivered)
                 self._next_search_s = time.monotonic() + SILENCE_S
@@ -161,7 +203,11 @@ class PartitionLease:
                 self._silent, self._next_search_s = False, time.monotonic() + SILENCE_S
                 await self._try(self._read_undelivered)
             else:
-                await self._wake_up.wait()
+                self._is_idle = True
+                try:
+                    await self._wake_up.wait()
+                finally:
+                    self._is_idle = False
 
     async def save(self) -> None:
         """Write a checkpoint if the state has changed since the last one, or if a live worker cannot read the last one.
@@ -324,17 +370,27 @@ class PartitionLease:
     ) -> BlockResult:
         """Process a message, or defer it if its pack has exhausted its budget or has deferred messages."""
         data, sequence = message.data, message.sequence
+        result = self._reject_or_defer(partition, pack, sequence)
+        if result is not None:
+            await asyncio.sleep(0)  # lets the event loop send heartbeats while many messages are deferred
+            return result
+        result = await self.runner.run(pack, data, sequence, partial(partition.take, received_s=message.received_s))
+        self._count(partition, pack, data)
+        return result
+
+    def _reject_or_defer(self, partition: Partition, pack: str, sequence: int) -> BlockResult | None:
+        """Return None if a message can be processed now. Otherwise reject or defer it."""
         if subjects.partition_of(pack, self._partitions) != self.number:
             return partition.reject_misplaced(pack, sequence)
-        if pack in partition.deferred or self.runner.budget.is_exhausted(pack):
-            await asyncio.sleep(0)  # lets the event loop send heartbeats while many messages are deferred
-            partition.defer(pack, sequence)
-            self._deferred.wake_up()
-            return BlockResult(pack)
-        result = await self.runner.run(pack, data, sequence, partial(partition.take, received_s=message.received_s))
+        if pack not in partition.deferred and not self.runner.budget.is_exhausted(pack):
+            return None
+        self._deferred.wake_up()
+        return partition.defer(pack, sequence)
+
+    def _count(self, partition: Partition, pack: str, data: bytes) -> None:
+        """Count a message that was processed and not deferred."""
         if pack not in partition.deferred:
             self.runner.count_block(data)
-        return result
 
     async def _check_ownership(self) -> None:
         """Check the ownership after the pin has lapsed."""

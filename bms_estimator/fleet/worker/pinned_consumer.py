@@ -101,14 +101,17 @@ class PinnedConsumer:
         """
         await self._request(BATCH if len(self.waiting) < BATCH else 1)
 
-    async def take(self) -> DeliveredMessage | None:
+    def pop(self) -> DeliveredMessage | None:
         """Return the next queued message; None without one."""
         if not self.waiting:
             return None
         self._taken_since_request += 1
-        if self._taken_since_request >= BATCH // 2 and len(self.waiting) < BATCH:  # request before the queue is empty
-            await self._request(self._taken_since_request)
         return self.waiting.popleft()
+
+    async def request_taken(self) -> None:
+        """Request as many messages as were taken, before the queue is empty."""
+        if self._taken_since_request >= BATCH // 2 and len(self.waiting) < BATCH:
+            await self._request(self._taken_since_request)
 
     def receive(self, message: Msg) -> bool:
         """Process a message or status from the server. Return True if the status ends this worker's pin."""

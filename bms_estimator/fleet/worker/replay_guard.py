@@ -51,6 +51,10 @@ class ReplayGuard:
         self._deaths = {sequence: deaths[sequence] for sequence in sorted(deaths)[-MAX_SUSPECTS:]}
         self._end_sequence = end_sequence
 
+    def is_guarded(self, sequence: int) -> bool:
+        """Return True if a block belongs to the guarded replay."""
+        return sequence <= self._end_sequence
+
     async def is_lethal(self, sequence: int) -> bool:
         """Return True if a block is lethal; otherwise store on the server that it is being processed.
 
@@ -60,7 +64,7 @@ class ReplayGuard:
         Raises:
             nats.errors.Error: The server does not respond; the block must not be processed.
         """
-        if sequence > self._end_sequence:
+        if not self.is_guarded(sequence):
             return False
         if self._deaths.get(sequence, 0) >= MAX_DEATHS:
             return True
@@ -69,5 +73,5 @@ class ReplayGuard:
 
     async def end_block(self, sequence: int) -> None:
         """Store on the server that a block was processed. The server receives this record before any later one."""
-        if sequence <= self._end_sequence:
+        if self.is_guarded(sequence):
             await self._checkpoints.send_replay(self._partition, ReplayRecord(deaths=self._deaths))

@@ -22,6 +22,7 @@ from bms_estimator.fleet.nats.connection import close, connect, error_text
 from bms_estimator.fleet.nats.streams import partitions_of
 from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
+from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, UnreadableFormatError, oldest_format
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.membership import Membership
@@ -175,8 +176,7 @@ class Worker:
             0  # totals of released leases
         )
         self._leaving = False
-        # blocks are estimated one at a time; the event loop sends heartbeats between them
-        self._step_lock = asyncio.Lock()
+        self._block_loop = BlockLoop()
         self._release_slots = asyncio.Semaphore(MAX_RELEASES)
         self._reported_unknown: set[str] = set()
         self._unsaved_warning = ""
@@ -202,6 +202,7 @@ class Worker:
             _repeat(UNSAVED_S, self._check_unsaved),
             self._bucket.follow(self._changed_packs.put_nowait),
             self._apply_table_changes(),
+            self._block_loop.run(),
         )
 
     async def end(self) -> None:
@@ -336,7 +337,7 @@ class Worker:
             self._bucket.packs,
             self._checkpoints,
             self._inbox,
-            self._step_lock,
+            self._block_loop,
             partitions=self._partitions,
             checkpoint_format=lambda: self._members.checkpoint_format(time.monotonic()),
             sources=self._bucket.packs,

@@ -10,12 +10,14 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.partition import PackLookup
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.worker import Options, work
+from bms_estimator.process.tasks import until_first_ends
 from tests.fleet.nats_cluster import running
 from tests.fleet.workers import Heartbeats, block, end_states, estimated, load_packs, send, until
 from tests.patience import end
@@ -115,19 +117,20 @@ def _pack_count(partition: int) -> int:
 async def _lease_after_first_blocks(nc: Client, table: PackLookup) -> tuple[PartitionLease, asyncio.Task[None]]:
     """Run a lease of the only partition, and send it the first block of each pack. Return the lease and its task."""
     inbox = nc.new_inbox()
+    block_loop = BlockLoop()
     lease = PartitionLease(
         nc,
         0,
         table,
         await _checkpoint_store(nc, "w"),
         inbox,
-        asyncio.Lock(),
+        block_loop,
         partitions=1,
         checkpoint_format=lambda: FORMAT,
         is_busy=lambda: False,
     )
     await _subscribe(nc, f"{inbox}.0.*", lease.receive)
-    running_lease = asyncio.create_task(lease.run())
+    running_lease = asyncio.create_task(until_first_ends(lease.run(), block_loop.run()))
     for pack in PACKS:
         await send(nc, pack, block(pack, 1))
     await lease.consumer.renew()
