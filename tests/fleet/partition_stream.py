@@ -58,10 +58,15 @@ class Stream:
             results.append(self.partition.take_deferred(pack, data, sequence))
         return results
 
-    def save(self) -> None:
+    def save(self, *, is_whole: bool = True) -> None:
         """Save a checkpoint, as the worker does at intervals."""
         self.partition.snapshot()
-        self.partition.mark_saved()
+        self.partition.mark_saved(is_whole=is_whole)
+
+    def save_twice(self) -> None:
+        """Save two whole checkpoints, so that all processed blocks are safe."""
+        self.save()
+        self.save()
 
     def take_over(self) -> None:
         """Restore the partition from a snapshot, as another worker does."""

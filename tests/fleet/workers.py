@@ -22,7 +22,7 @@ from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.sample import SAMPLE
 from tests.command_line import PROGRAM
@@ -183,9 +183,7 @@ async def until(condition: Callable[[], Any], description: Callable[[], object])
 
 async def end_states(nc: Client, registry: PackRegistry, partitions: int) -> dict[int, Partition]:
     """Return each partition by its number, restored from its last checkpoint."""
-    js = nc.jetstream(timeout=LONG_S)
-    checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
-    store = CheckpointStore(nc, "test", checkpoints, await js.object_store(subjects.STATES_BUCKET))
+    store = await open_checkpoints(nc, "test")
     partitions_by_number = {}
     for number in range(partitions):
         async with aclosing(store.load(await store.claim(number))) as stored_checkpoints:

@@ -11,13 +11,22 @@ class CheckpointInfo(BaseModel):
     sequence: int
     """Stream sequence number of the last included message."""
     object: str
-    """Name in the object store ``states``."""
+    """Name of the whole checkpoint in the object store ``states``."""
     bytes: int
-    """Size [bytes]."""
+    """Size of this object [bytes]."""
     made_s: float
-    """Wall clock at which the checkpoint was written [s since 1970]."""
+    """Wall clock at which the last of the objects was written [s since 1970]."""
     format: int = 1
     """Format of the bytes (``checkpoint_format.FORMAT``); versions without this field wrote format 1."""
+    increments: tuple[str, ...] = ()
+    """Names of further objects, each of which contains the packs that were changed since the object before it."""
+    increment_bytes: int = 0
+    """Total size of the increments [bytes]."""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of all objects of the checkpoint, in order."""
+        return (self.object, *self.increments)
 
 
 class Pointer(BaseModel):
@@ -30,9 +39,10 @@ class Pointer(BaseModel):
     next: str = ""
     """Name of the object that this worker writes next. The object may already exist in part."""
     kept: tuple[CheckpointInfo, ...] = ()
-    """Last checkpoints, newest first."""
+    """Last checkpoint, and the previous one, with which it shares no object."""
     daily: tuple[CheckpointInfo, ...] = ()
-    """First checkpoint of each of the last days, newest first. The newest ones may also be in ``kept``."""
+    """First checkpoint of each of the last days, newest first, without increments. The objects of the newest ones may also be
+    in ``kept``."""
 
     unsaved_claims: int = 0
     """Number of claims since the last checkpoint or the last orderly release."""
@@ -41,6 +51,11 @@ class Pointer(BaseModel):
     def checkpoints(self) -> tuple[CheckpointInfo, ...]:
         """All stored checkpoints without repetitions, the last ones first."""
         return tuple(dict.fromkeys((*self.kept, *self.daily)))
+
+    @property
+    def objects(self) -> frozenset[str]:
+        """Names of the objects of all checkpoints."""
+        return frozenset(name for checkpoint in self.checkpoints for name in checkpoint.objects)
 
 
 def pointer_key(partition: int) -> str:

@@ -1,6 +1,7 @@
 """Order of a pack's blocks, and replies to its edge. Both depend only on the received blocks.
 
-A reply names the first block that no saved checkpoint includes. It confirms all earlier ones, which the edge may then delete.
+A reply names the first block that is not safe (``unsaved_positions``). It confirms all earlier ones, which the edge may then
+delete.
 On request, the edge resends the named block and all later blocks. Therefore late, repeated and early blocks can be dropped.
 """
 
@@ -97,7 +98,7 @@ def position(d: np.void) -> BlockPosition:
 
 
 def edge_reply(
-    order: BlockOrder, early_blocks: int, block: Block, saved: BlockPosition, *, is_first: bool
+    order: BlockOrder, early_blocks: int, block: Block, safe: BlockPosition, *, is_first: bool
 ) -> BlockRequest | None:
     """Return the reply to a block's edge; None if no reply is due.
 
@@ -105,10 +106,10 @@ def edge_reply(
         order: Result of ``classify_block``.
         early_blocks: Number of blocks that have arrived before the awaited one, including this one.
         block: The received block.
-        saved: Position of the pack in the last saved checkpoint.
+        safe: Position of the pack before which all blocks are safe.
         is_first: True for the first block of this pack since the worker took over the partition.
     """
-    store, number = saved
+    store, number = safe
     if order is BlockOrder.AHEAD:
         # the first early block requests the missing one at once
         due = is_first or early_blocks % REQUEST_EVERY == 1

@@ -22,10 +22,9 @@ from bms_estimator.fleet.worker.block_processor import BlockProcessor
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CheckpointError,
     PartitionCheckpoint,
-    PreviousLayoutState,
-    dtype_of,
     read_checkpoint,
 )
+from bms_estimator.fleet.worker.checkpoint.record_layout import PreviousLayoutState, dtype_of
 from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
 from bms_estimator.fleet.worker.density import density_fault
 from bms_estimator.fleet.worker.edge_clock import Arrival
@@ -152,7 +151,7 @@ class Partition:
 
     def snapshot(self) -> PartitionCheckpoint:
         """Return a snapshot of the partition. Records are not copied, because they are immutable bytes."""
-        self._unsaved.begin_save()
+        changed = self._unsaved.begin_save()
         return PartitionCheckpoint(
             number=self.number,
             sequence=self.sequence,
@@ -161,11 +160,16 @@ class Partition:
             unmigrated=dict(self._unmigrated),
             deferred=self.deferred.spans(),
             in_force=dict(self._in_force),
+            changed=changed,
         )
 
-    def mark_saved(self) -> None:
-        """Record that the last snapshot was saved, so that replies confirm its blocks to the edges."""
-        self._unsaved.end_save()
+    def mark_saved(self, *, is_whole: bool) -> None:
+        """Record that the last snapshot was saved, so that replies confirm safe blocks to the edges.
+
+        Args:
+            is_whole: True for a whole checkpoint; False for an increment of the last one.
+        """
+        self._unsaved.end_save(is_whole=is_whole)
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -352,8 +356,8 @@ class Partition:
             self._packs[pack] = self._unpacked.packed_bytes()
         is_first = pack not in self._replied
         self._replied.add(pack)
-        saved = self._unsaved.saved(pack, position(d))
-        return result._replace(reply=edge_reply(order, int(d["ahead"]), block, saved, is_first=is_first))
+        safe = self._unsaved.safe(pack, position(d))
+        return result._replace(reply=edge_reply(order, int(d["ahead"]), block, safe, is_first=is_first))
 
     def _update_clock_error(self, pack: str, error_s: float) -> None:
         """List a pack with the error of its edge's clock, and log a new error; 0 removes the pack from the list."""

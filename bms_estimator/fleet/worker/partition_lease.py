@@ -25,7 +25,8 @@ from bms_estimator.fleet.packs.table_change import trusted_data
 from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.block_runner import BlockRunner
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, Claim, FencedError
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.claims import Claim, FencedError
 from bms_estimator.fleet.worker.deferred_reader import DeferredReader
 from bms_estimator.fleet.worker.partition import BlockResult, PackLookup, PackSources, Partition
 from bms_estimator.fleet.worker.partition_restore import restore_partition
@@ -90,7 +91,7 @@ class PartitionLease:
     ) -> None:
         self._nc, self.number, self._table, self._sources, self._partitions = nc, number, table, sources, partitions
         self._checkpoints, self._checkpoint_format, self._block_loop = checkpoints, checkpoint_format, block_loop
-        self._guard = ReplayGuard(checkpoints, number)
+        self._guard = ReplayGuard(checkpoints.replays, number)
         self._changes = TableChangeSender(nc, lambda: self.partition, self._try)
         self.results = ResultPublisher(nc)
         self.runner = BlockRunner(
@@ -232,9 +233,8 @@ class PartitionLease:
                 # again.
                 await self.results.send_queued()
                 file_format = self._checkpoint_format()
-                chunks = snapshot.chunks(file_format)
-                self.claim = await self._checkpoints.write(claim, snapshot.sequence, chunks, file_format=file_format)
-                partition.mark_saved()
+                self.claim = await self._checkpoints.write(claim, snapshot, file_format=file_format)
+                partition.mark_saved(is_whole=not self.claim.pointer.kept[0].increments)
             except _FENCED as error:
                 self._drop_ownership(error)
             except BaseException:
@@ -246,7 +246,7 @@ class PartitionLease:
         try:
             await self.save()
             if self.claim:
-                await self._checkpoints.end_claim(self.claim)
+                await self._checkpoints.claims.end(self.claim)
         except FencedError as error:
             self._drop_ownership(error)
         except RETRYABLE_ERRORS as error:
@@ -402,7 +402,7 @@ class PartitionLease:
         """Confirm this worker's claim, if any; the caller holds ``_state_lock``."""
         if self.claim:
             try:
-                self.claim = await self._checkpoints.confirm_claim(self.claim)
+                self.claim = await self._checkpoints.claims.confirm(self.claim)
             except _FENCED as error:
                 self._drop_ownership(error)
 

@@ -5,7 +5,8 @@ from contextlib import aclosing
 import structlog
 
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, Claim
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.claims import Claim
 from bms_estimator.fleet.worker.partition import PackLookup, PackSources, Partition
 
 log = structlog.get_logger(__name__)
@@ -41,7 +42,7 @@ async def restore_partition(
                     reason=str(error),
                 )
             else:
-                log.info("taken over", partition=number, sequence=checkpoint.sequence, bytes=len(data))
+                log.info("taken over", partition=number, sequence=partition.sequence, bytes=len(data))
                 return partition
     log.info("taken over without a checkpoint: the stream is read from its beginning", partition=number)
     return Partition(number, table, sources=sources)

@@ -7,7 +7,8 @@ the server before it processes the block. If the worker dies, the next owner the
 block that was found ``MAX_DEATHS`` times is lethal, and is skipped.
 """
 
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, Claim, ReplayRecord
+from bms_estimator.fleet.worker.checkpoint.claims import Claim
+from bms_estimator.fleet.worker.checkpoint.replay_records import ReplayRecord, ReplayRecords
 
 GUARDED_CLAIMS = 2
 """Number of claims since the last checkpoint from which a replay is guarded. The replay after the first claim is not guarded,
@@ -22,12 +23,12 @@ class ReplayGuard:
     """Guard of one partition.
 
     Args:
-        checkpoints: Store of the checkpoints, which also stores the records.
+        records: Records of the replays.
         partition: Number of the partition.
     """
 
-    def __init__(self, checkpoints: CheckpointStore, partition: int) -> None:
-        self._checkpoints, self._partition = checkpoints, partition
+    def __init__(self, records: ReplayRecords, partition: int) -> None:
+        self._records, self._partition = records, partition
         self._end_sequence = 0
         self._deaths: dict[int, int] = {}
 
@@ -44,7 +45,7 @@ class ReplayGuard:
         self._end_sequence = 0
         if claim.pointer.unsaved_claims < GUARDED_CLAIMS:
             return
-        record = await self._checkpoints.read_replay(self._partition)
+        record = await self._records.read(self._partition)
         deaths = dict(record.deaths)
         if record.sequence:
             deaths[record.sequence] = deaths.get(record.sequence, 0) + 1
@@ -68,10 +69,10 @@ class ReplayGuard:
             return False
         if self._deaths.get(sequence, 0) >= MAX_DEATHS:
             return True
-        await self._checkpoints.write_replay(self._partition, ReplayRecord(sequence=sequence, deaths=self._deaths))
+        await self._records.write(self._partition, ReplayRecord(sequence=sequence, deaths=self._deaths))
         return False
 
     async def end_block(self, sequence: int) -> None:
         """Store on the server that a block was processed. The server receives this record before any later one."""
         if self.is_guarded(sequence):
-            await self._checkpoints.send_replay(self._partition, ReplayRecord(deaths=self._deaths))
+            await self._records.send(self._partition, ReplayRecord(deaths=self._deaths))

@@ -301,7 +301,7 @@ class Worker:
             if number in self._lease_tasks or not self._nc.is_connected:
                 continue
             try:
-                await self._checkpoints.check_format(number)
+                await self._checkpoints.claims.check_format(number)
             except UnreadableFormatError as error:
                 self._members.refused[number] = error.found
             except RETRYABLE_ERRORS as error:

@@ -1,63 +1,21 @@
 """``fleet packs remove --erase`` with checkpoints of several days and formats, dead letters and changes of the table."""
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
-from pathlib import Path
 
-import nats
 import pytest
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters
-from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.packs.table_change import PackSource, encode_change
-from bms_estimator.fleet.worker.checkpoint import checkpoint_store
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, PartitionCheckpoint, read_checkpoint
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, Claim
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.claims import Claim
 from tests.command_line import run
-from tests.fleet.nats_cluster import NatsCluster, running
+from tests.fleet.checkpoints import DAY_S, raw, stored_objects
+from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.workers import PACK_ROW, block, load_packs, send
-
-DAY_S = 86_400.0
-STATES_STREAM = f"OBJ_{subjects.STATES_BUCKET}"
-
-
-class Clock:
-    """Wall clock of the checkpoints."""
-
-    now_s = 1.79e9
-
-    def time(self) -> float:
-        return self.now_s
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(checkpoint_store, "time", clock)
-    return clock
-
-
-@pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
-    with running(tmp_path, partitions=1) as cluster:
-        yield cluster
-
-
-@pytest.fixture
-async def nc(cluster: NatsCluster) -> AsyncIterator[Client]:
-    async with await nats.connect(cluster.url) as nc:
-        await make_streams(nc, partitions=1)
-        yield nc
-
-
-@pytest.fixture
-async def store(nc: Client) -> CheckpointStore:
-    js = nc.jetstream()
-    states = await js.object_store(subjects.STATES_BUCKET)
-    return CheckpointStore(nc, "w", await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
 
 
 async def erase(capsys: pytest.CaptureFixture[str], cluster: NatsCluster, pack: str) -> tuple[int, str, str]:
@@ -72,15 +30,7 @@ async def write(store: CheckpointStore, claim: Claim, file_format: int, sequence
     checkpoint = PartitionCheckpoint(
         0, sequence, packs={"p1": b"first", "p2": b"second"}, in_force={"p1": source, "p2": source}
     )
-    chunks = checkpoint.chunks(min(file_format, FORMAT))
-    return await store.write(claim, sequence, chunks, file_format=file_format)
-
-
-async def stored_objects(nc: Client) -> set[str]:
-    """Return the names of all objects with stored chunks or metadata."""
-    objects = await (await nc.jetstream().object_store(subjects.STATES_BUCKET)).list(ignore_deletes=True)
-    found = (await nc.jetstream().stream_info(STATES_STREAM, subjects_filter=">")).state.subjects or {}
-    return {str(each.name) for each in objects} | {name.rpartition(".")[2] for name in found if ".C." in name}
+    return await store.write(claim, checkpoint, file_format=file_format)
 
 
 async def test_pack_is_erased_from_daily_checkpoints_of_both_formats_and_the_other_pack_stays(
@@ -97,7 +47,7 @@ async def test_pack_is_erased_from_daily_checkpoints_of_both_formats_and_the_oth
     loaded = [(info.format, read_checkpoint(data)) async for info, data in store.load(claim)]
     assert [file_format for file_format, _ in loaded] == [FORMAT, FORMAT, FORMAT - 1, FORMAT - 1]
     assert [dict(each.packs) for _, each in loaded] == 4 * [{"p2": b"second"}]
-    assert [list(each.in_force) for _, each in loaded] == [["p2"], ["p2"], [], []]
+    assert [list(each.in_force) for _, each in loaded] == 4 * [["p2"]]
 
 
 async def test_dead_letters_and_table_changes_of_the_pack_are_erased(nc, cluster, capsys) -> None:
@@ -121,7 +71,7 @@ async def test_nothing_is_erased_while_the_last_checkpoint_is_of_a_later_version
     code, out, err = await erase(capsys, cluster, "p1")
     assert (code, out) == (2, "")
     assert f"partition 0: the checkpoint is of format {FORMAT + 1}" in err
-    assert await store.confirm_claim(claim) == claim
+    assert await store.claims.confirm(claim) == claim
     assert "p1" in await read_bucket(nc, subjects.PACKS_BUCKET)
     assert (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.messages == 1
 
@@ -136,7 +86,7 @@ def later_checkpoint() -> bytes:
 async def test_newest_intact_checkpoint_of_a_later_version_stays_although_its_pointer_names_a_readable_format(
     nc, cluster, store, capsys
 ) -> None:
-    claim = await store.write(await store.claim(0), 1, iter([later_checkpoint()]), file_format=FORMAT)
+    claim = await store.write(await store.claim(0), raw(1, later_checkpoint()), file_format=FORMAT)
     code, out, err = await erase(capsys, cluster, "p1")
     assert (code, out) == (2, "")
     assert f"partition 0: the checkpoint is of format {FORMAT + 1}" in err
@@ -148,7 +98,7 @@ async def test_earlier_checkpoints_of_a_later_version_are_removed_because_they_c
     nc, cluster, store, clock, capsys
 ) -> None:
     claim = await store.claim(0)
-    claim = await store.write(claim, 1, iter([later_checkpoint()]), file_format=FORMAT + 1)
+    claim = await store.write(claim, raw(1, later_checkpoint()), file_format=FORMAT + 1)
     clock.now_s += DAY_S
     claim = await write(store, claim, FORMAT, sequence=2)
     code, _, err = await erase(capsys, cluster, "p1")

@@ -1,27 +1,21 @@
 """Blocks that no worker can process: ones that kill their worker, and ones of a later version."""
 
 import sys
-from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
-import nats
 import numpy as np
-import pytest
-from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters, replay_letter
-from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.partition import LETHAL
 from tests.command_line import PROGRAM, running_program
-from tests.fleet.nats_cluster import NatsCluster, running
+from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.worker import later_blocks, lethal_block
 from tests.fleet.worker.later_blocks import later_block
 from tests.fleet.workers import (
     STORE_ID_NS,
-    Heartbeats,
     Process,
     block,
     end_states,
@@ -30,25 +24,6 @@ from tests.fleet.workers import (
     samples,
     send,
 )
-
-
-@pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
-    with running(tmp_path, partitions=1) as cluster:
-        yield cluster
-
-
-@pytest.fixture
-async def nc(cluster: NatsCluster) -> AsyncIterator[Client]:
-    async with await nats.connect(cluster.url) as nc:
-        await make_streams(nc, partitions=1)
-        yield nc
-
-
-@pytest.fixture
-async def heartbeats(nc: Client) -> AsyncIterator[Heartbeats]:
-    async with Heartbeats(nc) as heartbeats:
-        yield heartbeats
 
 
 async def fleet(cluster: NatsCluster, *command: object) -> tuple[int | None, str]:

@@ -149,46 +149,57 @@ class TestReplies:
         assert [number for number, reply in replies.items() if reply] == [1, *range(CONFIRM_EVERY, 31, CONFIRM_EVERY)]
         assert not any(reply.resend for reply in replies.values() if reply)
 
-    def test_only_blocks_of_the_last_saved_checkpoint_are_confirmed(self, stream, samples) -> None:
-        blocks = blocks_of(samples[:1000])
+    def test_only_blocks_of_two_checkpoints_without_a_common_object_are_confirmed(self, stream, samples) -> None:
+        blocks = blocks_of(samples[:1600])
+        is_whole_by_block = {15: True, 25: False, 35: True, 45: False, 55: True}
         numbers = []
         for number, data in enumerate(blocks, 1):
             if reply := stream.send("a", data).reply:
                 numbers.append((number, reply.number))
-            if number == 15:
-                stream.save()
-            if number == 35:
+            if number in is_whole_by_block:
+                stream.save(is_whole=is_whole_by_block[number])
+            if number == 65:
                 stream.partition.snapshot()  # whose save fails
-        assert numbers == [(1, 1), (10, 1), (20, 16), (30, 16), (40, 16), (50, 16)]
+        assert numbers == [(1, 1), (10, 1), (20, 1), (30, 1), (40, 26), (50, 26), (60, 46), (70, 46), (80, 46)]
+
+    def test_worker_confirms_only_after_its_first_checkpoint(self, stream, samples) -> None:
+        blocks = blocks_of(samples[:400])
+        deliver(stream, "a", blocks[:5])
+        stream.save_twice()
         stream.take_over()
-        assert stream.send("a", blocks[-1]).reply.number == 51
+        deliver(stream, "a", blocks[5:9], first=6)
+        assert stream.send("a", blocks[9]).reply.number == 1
+        stream.save()
+        deliver(stream, "a", blocks[10:19], first=11)
+        assert stream.send("a", blocks[19]).reply.number == 6
 
     def test_blocks_that_arrive_while_a_checkpoint_is_saved_are_not_confirmed(self, stream, samples) -> None:
         blocks = blocks_of(samples[:200])
         deliver(stream, "a", blocks[:4])
-        stream.partition.snapshot()
-        deliver(stream, "a", blocks[4:9], first=5)
-        stream.partition.mark_saved()
+        for _ in range(2):
+            stream.partition.snapshot()
+            deliver(stream, "a", blocks[4:9], first=5)
+            stream.partition.mark_saved(is_whole=True)
         assert stream.send("a", blocks[9]).reply.number == 5
 
     def test_missing_block_is_requested_at_the_gap_and_at_each_fifth_block_after_it(self, stream, samples) -> None:
         blocks = blocks_of(samples[:400])
         stream.send("a", blocks[0])
-        stream.save()
+        stream.save_twice()
         replies = [stream.send("a", data).reply for data in blocks[4:16]]  # blocks 2 to 4 are missing
         assert [index for index, reply in enumerate(replies) if reply] == [0, REQUEST_EVERY, 2 * REQUEST_EVERY]
         assert all(reply.resend and reply.number == 2 for reply in replies if reply)
 
     def test_block_of_a_former_store_is_answered_with_the_present_store(self, stream, samples) -> None:
         stream.send("a", one_block(samples[:20], 1, STORE_ID_NS + 1))
-        stream.save()
+        stream.save_twice()
         reply = stream.send("a", one_block(samples[:20], 10, STORE_ID_NS)).reply
         assert (reply.store, reply.number) == (STORE_ID_NS + 1, 2)
         assert stream.partition.counters["former_store"] == 1
 
     def test_saved_blocks_of_a_former_store_confirm_none_of_the_new_store(self, stream, samples) -> None:
         deliver(stream, "a", blocks_of(samples[:100]))
-        stream.save()
+        stream.save_twice()
         replies = [stream.send("a", data).reply for data in blocks_of(samples[:200], STORE_ID_NS + 1)]
         assert (replies[-1].store, replies[-1].number) == (STORE_ID_NS + 1, 1)
 
@@ -232,7 +243,7 @@ class TestNewStore:
 def test_blocks_that_the_edge_no_longer_has_count_as_lost(stream, samples) -> None:
     blocks = blocks_of(samples[:400])
     deliver(stream, "a", blocks[:5])
-    stream.save()
+    stream.save_twice()
     later_blocks = blocks_of(samples[200:400], oldest=11)
     reply = stream.send("a", later_blocks[3]).reply  # the edge announces 11 as its oldest block
     assert (reply.number, reply.resend) == (6, True)
@@ -249,7 +260,7 @@ def test_blocks_that_the_edge_no_longer_has_count_as_lost(stream, samples) -> No
 def test_block_that_never_arrives_or_is_rejected_each_time_counts_as_lost(stream, samples, rejected_block) -> None:
     blocks = blocks_of(samples[:400])
     deliver(stream, "a", blocks[:5])
-    stream.save()
+    stream.save_twice()
     block_after_gap = blocks[6]
     reply = stream.send("a", block_after_gap).reply
     assert (reply.number, reply.resend) == (6, True)
@@ -503,7 +514,7 @@ class TestInvalidBlocks:
 
         blocks = blocks_of(samples[:400])
         deliver(stream, "a", blocks[:9])
-        stream.save()
+        stream.save_twice()
         with monkeypatch.context() as patched, capture_logs() as logs:
             patched.setattr(BlockProcessor, "_state_payload", fail)  # after the estimator has processed the samples
             result = stream.send("a", blocks[9])

@@ -1,35 +1,19 @@
 """Deaths of holders in a guarded replay, counted on the real server."""
 
-from collections.abc import AsyncIterator
-from pathlib import Path
-
-import nats
 import pytest
 
-from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.replay_guard import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
-from tests.fleet.nats_cluster import running
+from tests.fleet.checkpoints import raw
 
 END_SEQUENCE = 9
 """Sequence number of the last message of the replay."""
 
 
-@pytest.fixture
-async def store(tmp_path: Path) -> AsyncIterator[CheckpointStore]:
-    with running(tmp_path, partitions=1) as cluster:
-        async with await nats.connect(cluster.url) as nc:
-            await make_streams(nc, partitions=1)
-            js = nc.jetstream()
-            states = await js.object_store(subjects.STATES_BUCKET)
-            yield CheckpointStore(nc, "w", await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
-
-
 async def claim_after_a_death(store: CheckpointStore) -> ReplayGuard:
     """Return the guard of a worker that claims the partition without a checkpoint of the former holder."""
-    guard = ReplayGuard(store, 0)
+    guard = ReplayGuard(store.replays, 0)
     await guard.begin(await store.claim(0), END_SEQUENCE)
     return guard
 
@@ -61,7 +45,7 @@ async def test_block_that_its_holders_survived_is_not_lethal(store: CheckpointSt
 async def test_blocks_after_the_replay_are_not_written_down(store: CheckpointStore) -> None:
     guard = await claim_guarded(store)
     assert not await guard.is_lethal(END_SEQUENCE + 1)
-    assert (await store.read_replay(0)).sequence == 0
+    assert (await store.replays.read(0)).sequence == 0
 
 
 @pytest.mark.parametrize("is_saved", [True, False], ids=["after a checkpoint", "after an orderly release"])
@@ -69,9 +53,9 @@ async def test_replay_is_not_guarded(store: CheckpointStore, is_saved: bool) -> 
     await claim_guarded(store)
     claim = await store.claim(0)
     if is_saved:
-        await store.write(claim, 1, iter([b"1"]), file_format=FORMAT)
+        await store.write(claim, raw(1, b"1"), file_format=FORMAT)
     else:
-        await store.end_claim(claim)
+        await store.claims.end(claim)
     guard = await claim_after_a_death(store)
     assert not await guard.is_lethal(5)
-    assert (await store.read_replay(0)).sequence == 0
+    assert (await store.replays.read(0)).sequence == 0

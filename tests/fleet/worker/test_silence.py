@@ -12,7 +12,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
 from bms_estimator.fleet.worker.partition import PackLookup
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
@@ -88,7 +88,7 @@ async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_t
         registry = await load_packs(nc, PACKS)
         lease, running_lease = await _lease_after_first_blocks(nc, registry)
         # another worker claims the partition and dies, so that its pin lapses
-        other_store = await _checkpoint_store(nc, "other")
+        other_store = await open_checkpoints(nc, "other")
         await other_store.claim(0)
 
         def is_fenced() -> object:
@@ -122,7 +122,7 @@ async def _lease_after_first_blocks(nc: Client, table: PackLookup) -> tuple[Part
         nc,
         0,
         table,
-        await _checkpoint_store(nc, "w"),
+        await open_checkpoints(nc, "w"),
         inbox,
         block_loop,
         partitions=1,
@@ -155,9 +155,3 @@ async def _subscribe(nc: Client, subject: str, receive) -> None:
         receive(message)
 
     await nc.subscribe(subject, cb=on_message)
-
-
-async def _checkpoint_store(nc: Client, worker: str) -> CheckpointStore:
-    js = nc.jetstream()
-    states = await js.object_store(subjects.STATES_BUCKET)
-    return CheckpointStore(nc, worker, await js.key_value(subjects.CHECKPOINTS_BUCKET), states)

@@ -23,7 +23,7 @@ from tests.command_line import PROGRAM, running_program
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.worker import later_version
 from tests.fleet.worker.later_version import DOWNGRADED, UPGRADED
-from tests.fleet.workers import Heartbeats, Process, block, end_states, estimated, load_packs, send
+from tests.fleet.workers import Process, block, end_states, estimated, load_packs, send
 from tests.patience import LONG_S
 
 PARTITIONS = 2
@@ -44,12 +44,6 @@ async def nc(cluster: NatsCluster) -> AsyncIterator[Client]:
     async with await nats.connect(cluster.url) as nc:
         await make_streams(nc, partitions=PARTITIONS)
         yield nc
-
-
-@pytest.fixture
-async def heartbeats(nc: Client) -> AsyncIterator[Heartbeats]:
-    async with Heartbeats(nc) as heartbeats:
-        yield heartbeats
 
 
 class Workers:

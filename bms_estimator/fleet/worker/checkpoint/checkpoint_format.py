@@ -6,34 +6,33 @@ Layout, little-endian::
     8  format   u2   FORMAT, or the format before it
     10 length   u4   of the header
     14 crc      u4   CRC-32 of the header
-    18 header        JSON: partition, sequence, counters, spans of deferred messages, rows of the table in force, record
-                     layouts, number of entries
+    18 header        JSON: number of the increment, partition, sequence, counters, spans of deferred messages, rows of the
+                     table in force, record layouts, number of entries
     .. chunks        length u4, CRC-32 u4, entries; the last has length 0
 
     entry:  layout u1, length of the name u2, of the data u4, name, data
+
+A whole checkpoint contains all packs. An increment contains only the packs that were changed since the checkpoint before it,
+and a complete header. A whole checkpoint and its increments, concatenated in order, are again a checkpoint.
 
 A version reads its own format and the format before it (``PREVIOUS``). It writes either of the two. A worker writes the
 newest format that all live workers read, so that workers of two versions can take over partitions from each other. A reader of
 a format that it does not know raises ``UnreadableFormatError``, and the worker then leaves the partition to others.
 
 An entry is one pack's packed record; its layout is an index into the header's layouts. A layout names each field of a record,
-so that a version with other fields can restore the state. Layout 255 is not an index: an earlier version stored blocks of
-unknown packs here. The messages of such a pack are read from the stream again.
+so that a version with other fields can restore the state.
 """
 
 import json
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from bms_estimator.fleet.packs.table_change import PackSource
+from bms_estimator.fleet.worker.checkpoint.record_layout import CURRENT_LAYOUT, PreviousLayoutState, dtype_of
 from bms_estimator.fleet.worker.deferred import Span
-from bms_estimator.fleet.worker.pack_state import PACK_STATE
-from bms_estimator.kernels.packed_record import symmetry_map
 
 Header = dict[str, Any]
 
@@ -47,27 +46,40 @@ class HeaderMigration(NamedTuple):
     """Return a header of the newer format as one of the older format."""
 
 
-FORMAT = 2
-"""Newest format that this version reads and writes. Format 2 added the rows of the table that are in force."""
-PREVIOUS: HeaderMigration | None = HeaderMigration(
-    upgrade=lambda header: header | {"sources": [], "in_force": {}},
-    downgrade=lambda header: {name: value for name, value in header.items() if name not in ("sources", "in_force")},
-)
-"""Migration between format ``FORMAT - 1`` and ``FORMAT``; None while ``FORMAT`` is the first format."""
+FORMAT = 3
+"""Newest format that this version reads and writes. Format 3 added increments."""
+INCREMENT_FORMAT = 3
+"""First format with increments."""
 CHUNK_BYTES = 1 << 20
 """Size at which a chunk of entries is finished [bytes]."""
 _FILE_HEAD, _CHUNK_HEAD, _ENTRY_HEAD = struct.Struct("<8sHII"), struct.Struct("<II"), struct.Struct("<BHI")
 _MAGIC = b"BMSFLEET"
-_STORED_BLOCK = 255
-"""Layout number of a block of an unknown pack, which an earlier version stored."""
-_MAX_LAYOUTS = 255
-"""Maximum number of layouts, whose indexes are below ``_STORED_BLOCK``."""
-_MAX_RECORD_BYTES = 1 << 24
-"""Maximum size of a record that a layout from a checkpoint may describe [bytes]."""
+_MAX_LAYOUTS = 256
+"""Maximum number of layouts, because an index has one byte."""
 
 
 class CheckpointError(ValueError):
     """Unreadable checkpoint; the message gives the reason and a remedy."""
+
+
+def _without_increments(header: Header) -> Header:
+    """Return a header of format 3 as one of format 2."""
+    return {name: value for name, value in header.items() if name != "increment"}
+
+
+def _with_increments(header: Header) -> Header:
+    """Return a header of format 2 as one of format 3.
+
+    Raises:
+        CheckpointError: The header is not of format 2.
+    """
+    if "increment" in header:
+        raise CheckpointError("the checkpoint is damaged: its format is not the one of its header")
+    return header | {"increment": 0}
+
+
+PREVIOUS: HeaderMigration | None = HeaderMigration(upgrade=_with_increments, downgrade=_without_increments)
+"""Migration between format ``FORMAT - 1`` and ``FORMAT``; None while ``FORMAT`` is the first format."""
 
 
 class UnreadableFormatError(CheckpointError):
@@ -107,51 +119,6 @@ def common_format(newest_formats: Iterable[int]) -> int:
     return max(oldest_format(), min([FORMAT, *newest_formats]))
 
 
-class PreviousLayoutState(NamedTuple):
-    """A pack's record in the layout of another version."""
-
-    layout: str
-    packed: bytes
-
-
-def layout_of(dtype: np.dtype[Any]) -> str:
-    """Return the fields of a record dtype as JSON text."""
-    return json.dumps(_layout_fields(dtype), separators=(",", ":"))
-
-
-def dtype_of(layout: str) -> np.dtype[Any]:
-    """Return the dtype that ``layout_of`` describes.
-
-    Raises:
-        ValueError: The text does not describe a record.
-    """
-    try:
-        dtype = np.dtype(_dtype_fields(json.loads(layout)))
-    except (TypeError, KeyError, IndexError, RecursionError, OverflowError) as error:
-        raise ValueError(f"no layout of a record: {error}") from None
-    if dtype.itemsize > _MAX_RECORD_BYTES:
-        raise ValueError(f"{dtype.itemsize} bytes: no layout of a pack's record")
-    symmetry_map(dtype)  # raises ValueError if the record does not consist of whole words
-    return dtype
-
-
-def _layout_fields(dtype: np.dtype[Any]) -> list[Any]:
-    return [
-        [name, _layout_fields(part.base) if part.base.names else part.base.str, list(part.shape)]
-        for name, (part, *_) in (dtype.fields or {}).items()
-    ]
-
-
-def _dtype_fields(layout: Any) -> list[Any]:
-    return [
-        (name, _dtype_fields(part) if isinstance(part, list) else part, tuple(shape)) for name, part, shape in layout
-    ]
-
-
-CURRENT_LAYOUT = layout_of(PACK_STATE)
-"""Layout of a pack's record in this version."""
-
-
 @dataclass(frozen=True)
 class PartitionCheckpoint:
     """Snapshot of a partition.
@@ -164,6 +131,8 @@ class PartitionCheckpoint:
         unmigrated: Packed records in the layout of another version, by pack.
         deferred: Deferred messages by pack, in the order in which the packs are served.
         in_force: Row and cell file of each pack at this position of the stream, for packs with processed blocks.
+        increment: 0 if the records of all packs are contained; otherwise the number of the increment.
+        changed: Packs that were changed since the last saved checkpoint; None: unknown.
     """
 
     number: int
@@ -173,6 +142,32 @@ class PartitionCheckpoint:
     unmigrated: Mapping[str, PreviousLayoutState] = field(default_factory=dict)
     deferred: Mapping[str, Span] = field(default_factory=dict)
     in_force: Mapping[str, PackSource] = field(default_factory=dict)
+    increment: int = 0
+    changed: Collection[str] | None = field(default=None, compare=False)
+
+    def to_increment(self, number: int) -> "PartitionCheckpoint":
+        """Return the increment with the changed packs.
+
+        Args:
+            number: Number of the increment, counted from 1 after a whole checkpoint.
+        """
+        changed = self.changed or ()
+        return replace(
+            self,
+            increment=number,
+            packs={pack: self.packs[pack] for pack in changed if pack in self.packs},
+            unmigrated={pack: self.unmigrated[pack] for pack in changed if pack in self.unmigrated},
+        )
+
+    def with_increment(self, increment: "PartitionCheckpoint") -> "PartitionCheckpoint":
+        """Return the checkpoint of an increment and of the checkpoint before it, which is this one."""
+        unmigrated = {pack: state for pack, state in self.unmigrated.items() if pack not in increment.packs}
+        return replace(
+            increment,
+            increment=0,
+            packs={**self.packs, **increment.packs},
+            unmigrated=unmigrated | {**increment.unmigrated},
+        )
 
     def chunks(self, file_format: int | None = None) -> Iterator[bytes]:
         """Yield the checkpoint's bytes in chunks of about ``CHUNK_BYTES``.
@@ -187,6 +182,7 @@ class PartitionCheckpoint:
         sources = list(dict.fromkeys(self.in_force.values()))
         indexes = {source: index for index, source in enumerate(sources)}
         header: Header = {
+            "increment": self.increment,
             "partition": self.number,
             "sequence": self.sequence,
             "counters": dict(self.counters),
@@ -229,21 +225,32 @@ def _framed_chunk(entries: list[bytes]) -> tuple[bytes, bytes]:
 
 
 def read_checkpoint(data: bytes) -> PartitionCheckpoint:
-    """Read a whole checkpoint written by ``PartitionCheckpoint.chunks``.
+    """Read a whole checkpoint and its increments, written by ``PartitionCheckpoint.chunks`` and concatenated.
 
     Raises:
         UnreadableFormatError: The checkpoint has a format that this version cannot read.
         CheckpointError: The bytes are damaged or not a checkpoint.
     """
     try:
-        return _read(memoryview(data))
+        checkpoint, offset = _read(memoryview(data))
+        increments = 0
+        while offset < len(data):
+            increment, size = _read(memoryview(data)[offset:])
+            offset, increments = offset + size, increments + 1
+            if (checkpoint.increment, increment.increment) != (0, increments):
+                raise CheckpointError(f"the checkpoint is damaged: increment {increments} is missing")
+            checkpoint = checkpoint.with_increment(increment)
     except (LookupError, TypeError, ValueError, AttributeError, struct.error, RecursionError) as error:
         if isinstance(error, CheckpointError):
             raise
         raise CheckpointError(f"a checkpoint of {len(data)} bytes is damaged: {error}") from None
+    if checkpoint.increment:
+        raise CheckpointError("the checkpoint is damaged: its packs without changes are missing")
+    return checkpoint
 
 
-def _read(data: memoryview) -> PartitionCheckpoint:
+def _read(data: memoryview) -> tuple[PartitionCheckpoint, int]:
+    """Read one whole checkpoint or increment at the beginning of ``data``. Return it and its size [bytes]."""
     magic, version, length, crc = _FILE_HEAD.unpack_from(data)
     if magic != _MAGIC:
         raise CheckpointError("not a checkpoint: its first bytes differ")
@@ -259,43 +266,47 @@ def _read(data: memoryview) -> PartitionCheckpoint:
             dtype_of(layout)
     packs: dict[str, bytes] = {}
     unmigrated: dict[str, PreviousLayoutState] = {}
-    sequence = int(header["sequence"])
-    deferred = {str(pack): Span(int(first), int(last)) for pack, (first, last) in header.get("deferred", {}).items()}
-    entries = 0
-    for layout_index, pack, content in _read_entries(data, header_end):
-        entries += 1
-        if layout_index == _STORED_BLOCK:
-            deferred[pack] = Span(1, sequence)  # all messages of the pack are read from the stream again
-        elif layouts[layout_index] == CURRENT_LAYOUT:
-            packs[pack] = content
-        else:
-            unmigrated[pack] = PreviousLayoutState(layouts[layout_index], content)
+    entries, offset = 0, header_end
+    while chunk := _read_chunk(data, offset):
+        offset += _CHUNK_HEAD.size + len(chunk)
+        for layout_index, pack, packed in _read_entries(chunk):
+            entries += 1
+            if layouts[layout_index] == CURRENT_LAYOUT:
+                packs[pack] = packed
+            else:
+                unmigrated[pack] = PreviousLayoutState(layouts[layout_index], packed)
     if entries != header["entries"]:
         raise CheckpointError(f"the checkpoint is damaged: {entries} of {header['entries']} entries")
-    counters = {str(name): int(count) for name, count in header["counters"].items()}
     sources = [PackSource(str(row), cell if cell is None else str(cell)) for row, cell in header["sources"]]
-    in_force = {str(pack): sources[index] for pack, index in header["in_force"].items()}
-    return PartitionCheckpoint(int(header["partition"]), sequence, counters, packs, unmigrated, deferred, in_force)
+    checkpoint = PartitionCheckpoint(
+        number=int(header["partition"]),
+        sequence=int(header["sequence"]),
+        counters={str(name): int(count) for name, count in header["counters"].items()},
+        packs=packs,
+        unmigrated=unmigrated,
+        deferred={str(pack): Span(int(first), int(last)) for pack, (first, last) in header["deferred"].items()},
+        in_force={str(pack): sources[index] for pack, index in header["in_force"].items()},
+        increment=int(header["increment"]),
+    )
+    return checkpoint, offset + _CHUNK_HEAD.size
 
 
-def _read_entries(data: memoryview, offset: int) -> Iterator[tuple[int, str, bytes]]:
-    """Yield layout index, pack and record of each entry; the chunks begin at ``offset``."""
-    while True:
-        length, crc = _CHUNK_HEAD.unpack_from(data, offset)
-        offset += _CHUNK_HEAD.size
-        if length == 0:
-            if offset != len(data) or crc:
-                raise CheckpointError(f"the checkpoint is damaged: its end is at {offset} of {len(data)} bytes")
-            return
-        chunk = _verify(data[offset : offset + length], length, crc)
-        offset += length
-        begin = 0  # of the entry in the chunk
-        while begin < length:
-            layout_index, name_bytes, data_bytes = _ENTRY_HEAD.unpack_from(chunk, begin)
-            name_begin = begin + _ENTRY_HEAD.size
-            data_begin = name_begin + name_bytes
-            begin = data_begin + data_bytes
-            yield layout_index, str(chunk[name_begin:data_begin], "utf-8"), bytes(chunk[data_begin:begin])
+def _read_chunk(data: memoryview, offset: int) -> bytes:
+    """Return the entries of the chunk at ``offset``; the last chunk has none."""
+    length, crc = _CHUNK_HEAD.unpack_from(data, offset)
+    begin = offset + _CHUNK_HEAD.size
+    return _verify(data[begin : begin + length], length, crc)
+
+
+def _read_entries(chunk: bytes) -> Iterator[tuple[int, str, bytes]]:
+    """Yield layout index, pack and record of each entry of a chunk."""
+    offset = 0
+    while offset < len(chunk):
+        layout_index, name_bytes, data_bytes = _ENTRY_HEAD.unpack_from(chunk, offset)
+        name_begin = offset + _ENTRY_HEAD.size
+        data_begin = name_begin + name_bytes
+        offset = data_begin + data_bytes
+        yield layout_index, str(chunk[name_begin:data_begin], "utf-8"), chunk[data_begin:offset]
 
 
 def _verify(part: memoryview, length: int, crc: int) -> bytes:

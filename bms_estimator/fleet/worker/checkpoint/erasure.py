@@ -27,7 +27,8 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     UnreadableFormatError,
     read_checkpoint,
 )
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, FencedError
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
+from bms_estimator.fleet.worker.checkpoint.claims import FencedError
 from bms_estimator.model.errors import UserError
 
 WORKER_NAME = "packs-remove"
@@ -77,7 +78,7 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
     partitions = await partitions_of(nc)
     if partitions is None:
         raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
-    store = await _open_checkpoints(nc)
+    store = await open_checkpoints(nc, WORKER_NAME)
     numbers = {subjects.partition_of(pack, partitions) for pack in packs}
     for number in numbers:
         await _check_readable(store, number)
@@ -101,12 +102,6 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
     }
 
 
-async def _open_checkpoints(nc: Client) -> CheckpointStore:
-    js = nc.jetstream()
-    checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
-    return CheckpointStore(nc, WORKER_NAME, checkpoints, await js.object_store(subjects.STATES_BUCKET))
-
-
 async def _check_readable(store: CheckpointStore, partition: int) -> None:
     """Check that the last checkpoint of a partition can be rewritten.
 
@@ -114,7 +109,7 @@ async def _check_readable(store: CheckpointStore, partition: int) -> None:
         UserError: It is of a version that this one cannot read.
     """
     try:
-        await store.check_format(partition)
+        await store.claims.check_format(partition)
     except UnreadableFormatError as error:
         raise _later_version_error(partition, error) from None
 
@@ -169,7 +164,7 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
         readable.add(info)
         by_pack = _fields_by_pack(checkpoint)
         found = {pack for pack in counts if any(pack in part for part in by_pack.values())}
-        if found:
+        if found or store.is_damaged(info):  # the content of a damaged increment is unknown
             parts: dict[str, Any] = {name: _without(part, found) for name, part in by_pack.items()}
             rest = replace(checkpoint, **parts)
             claim = await store.replace(claim, info, rest.chunks(info.format))

@@ -11,19 +11,21 @@ from hypothesis import strategies as st
 
 from bms_estimator.fleet.packs.table_change import PackSource
 from bms_estimator.fleet.worker.block_order import MAX_EARLY_REPEATS
-from bms_estimator.fleet.worker.checkpoint import checkpoint_format
+from bms_estimator.fleet.worker.checkpoint import checkpoint_format, record_layout
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CHUNK_BYTES,
-    CURRENT_LAYOUT,
     FORMAT,
     CheckpointError,
     PartitionCheckpoint,
-    PreviousLayoutState,
     UnreadableFormatError,
     common_format,
+    read_checkpoint,
+)
+from bms_estimator.fleet.worker.checkpoint.record_layout import (
+    CURRENT_LAYOUT,
+    PreviousLayoutState,
     dtype_of,
     layout_of,
-    read_checkpoint,
 )
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.pack_state import PACK_STATE, UnpackedRecord
@@ -57,6 +59,26 @@ def to_bytes(snapshot: PartitionCheckpoint) -> bytes:
 @given(snapshots)
 def test_checkpoint_is_read_as_it_was_written(snapshot: PartitionCheckpoint) -> None:
     assert read_checkpoint(to_bytes(snapshot)) == snapshot
+
+
+@given(snapshots, snapshots, st.data())
+def test_increments_replace_the_records_of_the_changed_packs(before, after, data) -> None:
+    after = replace(after, packs={**before.packs, **after.packs}, unmigrated={})
+    changed = {pack for pack, packed in after.packs.items() if before.packs.get(pack) != packed}
+    unchanged = data.draw(st.sets(st.sampled_from([*after.packs, "another"])))
+    increment = replace(after, changed=changed | unchanged | before.unmigrated.keys()).to_increment(1)
+    expected = replace(after, unmigrated={p: s for p, s in before.unmigrated.items() if p not in after.packs})
+    assert increment.packs.keys() >= changed
+    assert read_checkpoint(to_bytes(replace(before, increment=0)) + to_bytes(increment)) == expected
+
+
+def test_checkpoint_with_a_missing_increment_or_without_the_whole_one_is_rejected() -> None:
+    whole = PartitionCheckpoint(0, 1, packs={"a": b"12345678"}, changed={"a"})
+    first, second = (to_bytes(whole.to_increment(number)) for number in (1, 2))
+    assert read_checkpoint(to_bytes(whole) + first + second) == whole
+    for parts in ((first,), (first, second), (to_bytes(whole), second), (to_bytes(whole), first, first)):
+        with pytest.raises(CheckpointError, match="damaged"):
+            read_checkpoint(b"".join(parts))
 
 
 def test_checkpoint_of_many_packs_is_split_into_chunks() -> None:
@@ -94,17 +116,6 @@ def test_each_single_changed_byte_is_detected() -> None:
             read_checkpoint(intact[:position] + bytes([intact[position] ^ 1]) + intact[position + 1 :])
 
 
-def test_blocks_stored_by_an_earlier_version_are_read_from_the_stream_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    layout_index, stored_block = 0, 255  # an earlier version stored the blocks of unknown packs themselves
-    entries = [
-        checkpoint_format._entry(layout_index, "known", b"12345678"),
-        checkpoint_format._entry(stored_block, "unknown", b"block"),
-    ]
-    monkeypatch.setattr(PartitionCheckpoint, "_entries", lambda *_: iter(entries))
-    checkpoint = read_checkpoint(to_bytes(PartitionCheckpoint(3, 7, packs={"known": b"", "unknown": b""})))
-    assert (checkpoint.packs, checkpoint.deferred) == ({"known": b"12345678"}, {"unknown": Span(1, 7)})
-
-
 @pytest.mark.parametrize("data", [b"", b"BMSFLEET", b"x" * 100])
 def test_bytes_that_are_no_checkpoint_are_rejected(data: bytes) -> None:
     with pytest.raises(CheckpointError, match="checkpoint"):
@@ -135,13 +146,13 @@ def test_error_of_an_unreadable_format_names_both_formats_and_a_remedy(monkeypat
     with monkeypatch.context() as patched:
         later_version.set_format(checkpoint_format.FORMAT + 2, patched.setattr)
         later = to_bytes(PartitionCheckpoint(3, 0))
-    with pytest.raises(UnreadableFormatError, match=r"is of format 4, this version reads 1 and 2: start a worker"):
+    with pytest.raises(UnreadableFormatError, match=r"is of format 5, this version reads 2 and 3: start a worker"):
         read_checkpoint(later)
 
 
-def test_rows_in_force_are_dropped_in_the_previous_format() -> None:
+def test_whole_checkpoint_is_equal_in_the_previous_format() -> None:
     snapshot = PartitionCheckpoint(3, 7, packs={"a": b"12345678"}, in_force={"a": PackSource("{}", None)})
-    assert read_checkpoint(b"".join(snapshot.chunks(FORMAT - 1))) == replace(snapshot, in_force={})
+    assert read_checkpoint(b"".join(snapshot.chunks(FORMAT - 1))) == snapshot
 
 
 def test_all_live_workers_can_read_the_common_format_as_far_as_this_version_writes_it(later_format: int) -> None:
@@ -174,7 +185,7 @@ def test_state_is_bit_identical_after_an_upgrade_that_changed_no_field_of_the_es
     layout = [part for part in json.loads(CURRENT_LAYOUT) if part[0] != "cells"]
     delivery = next(fields for name, fields, _ in layout if name == "delivery")
     delivery[:] = [field for field in delivery if field[0] != "clock_error_s"]
-    previous = UnpackedRecord(np.dtype(checkpoint_format._dtype_fields(layout)))
+    previous = UnpackedRecord(np.dtype(record_layout._dtype_fields(layout)))
     for part in previous.record.dtype.names:
         for name in previous.record.dtype[part].names:
             previous.record[part][name] = state[part][name]
@@ -203,7 +214,7 @@ class TestPreviousLayout:
         fields_of = {name: fields for name, fields, _ in layout}
         fields_of["estimator"][:] = [each for each in reversed(fields_of["estimator"]) if each[0] != "fit_age_s"]
         fields_of["delivery"].append(["once_known", "<i8", []])
-        dtype = np.dtype(checkpoint_format._dtype_fields(layout))
+        dtype = np.dtype(record_layout._dtype_fields(layout))
         work = UnpackedRecord(dtype)
         for part in dtype.names:
             for name in set(dtype[part].names) & set(PACK_STATE[part].names):
@@ -234,6 +245,8 @@ class TestPreviousLayout:
         partition = Partition.restore(5, table, data)
         blocks = blocks_of(samples)
         assert partition.take("a", blocks[3], partition.sequence + 1).state is None  # it was processed before
+        partition.snapshot()
+        partition.mark_saved(is_whole=True)
         assert partition.take("a", blocks[155], partition.sequence + 1).reply.number == 3000 // SAMPLES + 1
         assert partition.counters["packs"] == 1
         assert partition.snapshot().unmigrated == read_checkpoint(data).unmigrated

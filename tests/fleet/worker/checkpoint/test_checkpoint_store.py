@@ -15,47 +15,34 @@ from structlog.testing import capture_logs
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import RefusedPartition
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.checkpoint import checkpoint_store
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     FORMAT,
     PartitionCheckpoint,
     UnreadableFormatError,
     readable_text,
 )
+from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import MESSAGE_BYTES
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import (
     CHECKPOINTS_PER_PARTITION,
     DAILY_CHECKPOINTS,
-    MESSAGE_BYTES,
-    CheckpointStore,
-    Claim,
-    FencedError,
+    open_checkpoints,
 )
+from bms_estimator.fleet.worker.checkpoint.claims import FencedError
 from bms_estimator.fleet.worker.worker import Options, work
+from tests.fleet.checkpoints import STATES_STREAM, Clock, chunk_subject, load, raw
 from tests.fleet.nats_cluster import running
 from tests.fleet.workers import PERIOD_S, SAMPLES, Heartbeats, block, end_states, estimated, load_packs, send, until
 from tests.patience import LONG_S
 
-STATES_STREAM = f"OBJ_{subjects.STATES_BUCKET}"
 CHECKPOINT_BYTES = 300_000
 """Size of a checkpoint, which the object store splits into several messages [bytes]."""
 FORMAT_OFFSET = 8
 """Offset of the format in a checkpoint [bytes]."""
 
 
-class Clock:
-    """Wall clock of the checkpoints, which stands still at noon, so that a test does not span two days."""
-
-    now_s = 1.79e9 // 86_400 * 86_400 + 43_200
-
-    def time(self) -> float:
-        return self.now_s
-
-
 @pytest.fixture(autouse=True)
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(checkpoint_store, "time", clock)
-    return clock
+def noon(clock: Clock) -> None:
+    """Set the clock of all checkpoints."""
 
 
 @pytest.fixture(scope="module")
@@ -71,23 +58,6 @@ async def nc(url) -> AsyncIterator[Client]:
         yield nc
 
 
-async def _checkpoint_store(nc: Client, worker: str) -> CheckpointStore:
-    js = nc.jetstream()
-    states = await js.object_store(subjects.STATES_BUCKET)
-    return CheckpointStore(nc, worker, await js.key_value(subjects.CHECKPOINTS_BUCKET), states)
-
-
-async def _load(store: CheckpointStore, claim: Claim) -> list[bytes]:
-    """Return the intact checkpoints, the newest first."""
-    return [data async for _, data in store.load(claim)]
-
-
-async def _chunk_subject(nc: Client, name: str) -> str:
-    """Return the subject of an object's chunks."""
-    info = await (await nc.jetstream().object_store(subjects.STATES_BUCKET)).get_info(name)
-    return f"$O.{subjects.STATES_BUCKET}.C.{info.nuid}"
-
-
 async def _objects(nc: Client, partition: int) -> set[str]:
     """Return the names of the stored checkpoints of a partition."""
     return {
@@ -98,69 +68,67 @@ async def _objects(nc: Client, partition: int) -> set[str]:
 
 
 async def test_last_two_checkpoints_and_the_first_of_the_day_are_stored_and_damaged_ones_are_logged_and_skipped(nc):
-    store = await _checkpoint_store(nc, "a")
+    store = await open_checkpoints(nc, "a")
     claim = await store.claim(7)
     written = [bytes([i]) * CHECKPOINT_BYTES for i in range(3)]
     for i, data in enumerate(written):
-        claim = await store.write(claim, i, iter([data[:1], b"", data[1:]]), file_format=FORMAT)
-    assert await _load(store, claim) == [written[2], written[1], written[0]]
+        claim = await store.write(claim, raw(i, data[:1], b"", data[1:]), file_format=FORMAT)
+    assert await load(store, claim) == [written[2], written[1], written[0]]
     newest, previous = claim.pointer.kept
 
-    subject = await _chunk_subject(nc, newest.object)
+    subject = await chunk_subject(nc, newest.object)
     await nc.jetstream().purge_stream(STATES_STREAM, subject=subject, keep=1)  # only the last chunk remains
     with capture_logs() as logs:
-        assert await _load(store, claim) == [written[1], written[0]]
+        assert await load(store, claim) == [written[1], written[0]]
     assert logs[0]["event"].startswith("a checkpoint is damaged")
     assert logs[0]["object"] == newest.object
-    subject = await _chunk_subject(nc, previous.object)
+    subject = await chunk_subject(nc, previous.object)
     await nc.jetstream().purge_stream(STATES_STREAM, subject=subject)  # all chunks are replaced
     await nc.jetstream().publish(subject, b"x" * CHECKPOINT_BYTES)
-    assert await _load(store, claim) == [written[0]]  # the first one of the day
+    assert await load(store, claim) == [written[0]]  # the first one of the day
 
 
 async def test_worker_whose_partition_another_one_claimed_cannot_write_and_leaves_no_object(nc):
-    former, owner = await _checkpoint_store(nc, "former"), await _checkpoint_store(nc, "owner")
-    claim = await former.write(await former.claim(8), 1, iter([b"1"]), file_format=FORMAT)
+    former, owner = await open_checkpoints(nc, "former"), await open_checkpoints(nc, "owner")
+    claim = await former.write(await former.claim(8), raw(1, b"1"), file_format=FORMAT)
     other_claim = await owner.claim(8)
-    assert await owner.confirm_claim(other_claim) == other_claim
+    assert await owner.claims.confirm(other_claim) == other_claim
     with pytest.raises(FencedError, match="owner"):
-        await former.confirm_claim(claim)
+        await former.claims.confirm(claim)
     with pytest.raises(FencedError, match="owner"):
-        await former.write(claim, 2, iter([b"2"]), file_format=FORMAT)
+        await former.write(claim, raw(2, b"2"), file_format=FORMAT)
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
-    assert await _load(owner, other_claim) == [b"1"]
+    assert await load(owner, other_claim) == [b"1"]
     # a worker was killed between two chunks of an object; the next claim removes them
     await nc.jetstream().publish(f"$O.{subjects.STATES_BUCKET}.C.{other_claim.pointer.next}", b"3")
-    assert await _load(former, await former.claim(8)) == [b"1"]
+    assert await load(former, await former.claim(8)) == [b"1"]
     assert await _objects(nc, 8) == {claim.pointer.kept[0].object}
     remaining_subjects = (await nc.jetstream().stream_info(STATES_STREAM, subjects_filter=">")).state.subjects
     assert sum(".C.p8-" in subject for subject in remaining_subjects) == 1
 
 
 async def test_own_write_whose_response_was_lost_does_not_count_as_one_of_another_worker(nc):
-    store, other = await _checkpoint_store(nc, "a"), await _checkpoint_store(nc, "b")
+    store, other = await open_checkpoints(nc, "a"), await open_checkpoints(nc, "b")
     claim = await store.claim(9)
-    await store.write(claim, 1, iter([b"1"]), file_format=FORMAT)
-    written = await store.write(
-        claim, 2, iter([b"2"]), file_format=FORMAT
-    )  # with the old claim, as after a lost response
-    assert await _load(store, written) == [b"2", b"1"]
+    await store.write(claim, raw(1, b"1"), file_format=FORMAT)
+    written = await store.write(claim, raw(2, b"2"), file_format=FORMAT)  # with the old claim, as after a lost response
+    assert await load(store, written) == [b"2", b"1"]
     assert await _objects(nc, 9) == {each.object for each in written.pointer.checkpoints}
-    await store.write(written, 3, iter([b"3"]), file_format=FORMAT)
+    await store.write(written, raw(3, b"3"), file_format=FORMAT)
     other_claim = await other.claim(9)
     with pytest.raises(FencedError, match="b"):
-        await store.write(written, 4, iter([b"4"]), file_format=FORMAT)
-    assert await _load(other, other_claim) == [b"3", b"2", b"1"]
+        await store.write(written, raw(4, b"4"), file_format=FORMAT)
+    assert await load(other, other_claim) == [b"3", b"2", b"1"]
 
 
 async def test_first_checkpoint_of_each_of_the_last_30_days_is_stored_beside_the_last_two(nc, clock):
-    store = await _checkpoint_store(nc, "a")
+    store = await open_checkpoints(nc, "a")
     claim = await store.claim(10)
     for half_day in range(80):
         clock.now_s += 43_200.0
-        claim = await store.write(claim, half_day, iter([b"%d" % half_day]), file_format=FORMAT)
+        claim = await store.write(claim, raw(half_day, b"%d" % half_day), file_format=FORMAT)
     last_days = [b"%d" % half_day for half_day in range(78, 18, -2)]
-    assert await _load(store, await store.claim(10)) == [b"79", *last_days]
+    assert await load(store, await store.claim(10)) == [b"79", *last_days]
     assert len(await _objects(nc, 10)) == DAILY_CHECKPOINTS + 1  # the last but one is the first of its day
 
 
@@ -168,19 +136,19 @@ async def test_daily_checkpoints_make_room_for_the_last_one_on_a_full_server(tmp
     with running(tmp_path, partitions=1) as cluster:
         nc = await nats.connect(cluster.url)
         await make_streams(nc, partitions=1)
-        store = await _checkpoint_store(nc, "a")
+        store = await open_checkpoints(nc, "a")
         claim = await store.claim(0)
         for _ in range(6):
             clock.now_s += 86_400.0
-            claim = await store.write(claim, 1, iter([b"1" * CHECKPOINT_BYTES]), file_format=FORMAT)
+            claim = await store.write(claim, raw(1, b"1" * CHECKPOINT_BYTES), file_format=FORMAT)
         js = nc.jetstream()
         states = await js.stream_info(STATES_STREAM)
         await js.update_stream(states.config, max_bytes=states.state.bytes + CHECKPOINT_BYTES // 2)
         with capture_logs() as logs, pytest.raises(APIError, match="maximum bytes exceeded"):
-            await store.write(claim, 2, iter([b"2" * CHECKPOINT_BYTES]), file_format=FORMAT)
+            await store.write(claim, raw(2, b"2" * CHECKPOINT_BYTES), file_format=FORMAT)
         assert logs[0]["removed"] == 3
-        claim = await store.write(claim, 2, iter([b"2" * CHECKPOINT_BYTES]), file_format=FORMAT)
-        assert [each[:1] for each in await _load(store, claim)] == [b"2", b"1", b"1", b"1"]
+        claim = await store.write(claim, raw(2, b"2" * CHECKPOINT_BYTES), file_format=FORMAT)
+        assert [each[:1] for each in await load(store, claim)] == [b"2", b"1", b"1", b"1"]
         await nc.close()
 
 
@@ -190,11 +158,11 @@ async def test_daily_checkpoints_make_room_although_the_last_attempts_filled_the
     with running(tmp_path, partitions=1, disk_bytes=24 << 20) as cluster:
         nc = await nats.connect(cluster.url)
         await make_streams(nc, partitions=1, raw_bytes=1 << 20)
-        store = await _checkpoint_store(nc, "a")
+        store = await open_checkpoints(nc, "a")
         claim = await store.claim(0)
         for _ in range(6):
             clock.now_s += 86_400.0
-            claim = await store.write(claim, 1, iter([b"1" * CHECKPOINT_BYTES]), file_format=FORMAT)
+            claim = await store.write(claim, raw(1, b"1" * CHECKPOINT_BYTES), file_format=FORMAT)
         await nc.jetstream().add_stream(name="OTHER", subjects=["other"], discard="new")
         for size in (MESSAGE_BYTES, MESSAGE_BYTES // 8, MESSAGE_BYTES // 64, 256, 1):
             await _fill(nc, size)
@@ -203,11 +171,11 @@ async def test_daily_checkpoints_make_room_although_the_last_attempts_filled_the
         written = None
         for _ in range(4):
             try:
-                written = await store.write(claim, 2, iter([b"2" * CHECKPOINT_BYTES]), file_format=FORMAT)
+                written = await store.write(claim, raw(2, b"2" * CHECKPOINT_BYTES), file_format=FORMAT)
             except APIError:
-                claim = await store.confirm_claim(claim)
+                claim = await store.claims.confirm(claim)
         assert written is not None
-        assert (await _load(store, written))[0][:1] == b"2"
+        assert (await load(store, written))[0][:1] == b"2"
         await nc.close()
 
 
@@ -219,32 +187,32 @@ async def _fill(nc: Client, size: int) -> None:
 
 
 async def test_claim_of_a_checkpoint_of_an_unreadable_format_fails_and_changes_nothing(nc):
-    later_version, this_version = await _checkpoint_store(nc, "later"), await _checkpoint_store(nc, "this")
-    claim = await later_version.write(await later_version.claim(11), 1, iter([b"1"]), file_format=FORMAT + 1)
+    later_version, this_version = await open_checkpoints(nc, "later"), await open_checkpoints(nc, "this")
+    claim = await later_version.write(await later_version.claim(11), raw(1, b"1"), file_format=FORMAT + 1)
     for _ in range(CHECKPOINTS_PER_PARTITION + 1):
         with pytest.raises(
             UnreadableFormatError, match=f"of format {FORMAT + 1}, this version reads {readable_text()}"
         ):
             await this_version.claim(11)
-    assert await later_version.confirm_claim(claim) == claim
-    assert await _load(later_version, claim) == [b"1"]
+    assert await later_version.claims.confirm(claim) == claim
+    assert await load(later_version, claim) == [b"1"]
 
 
 async def test_pointer_of_another_version_is_not_replaced(nc):
     bucket = await nc.jetstream().key_value(subjects.CHECKPOINTS_BUCKET)
     revision = await bucket.put("p12", b'{"worker": "later", "next": {}}')
-    store = await _checkpoint_store(nc, "a")
+    store = await open_checkpoints(nc, "a")
     with pytest.raises(UnreadableFormatError, match="pointer to the checkpoints is unreadable"):
         await store.claim(12)
     assert (await bucket.get("p12")).revision == revision
 
 
 async def test_worker_refuses_a_partition_whose_bytes_are_of_another_format_than_its_pointer_says(nc, url):
-    store = await _checkpoint_store(nc, "later")
+    store = await open_checkpoints(nc, "later")
     data = bytearray(b"".join(PartitionCheckpoint(0, 1).chunks()))
     data[FORMAT_OFFSET] = FORMAT + 1
-    await store.write(await store.claim(0), 1, iter([b"an earlier checkpoint"]), file_format=FORMAT)
-    claim = await store.write(await store.claim(0), 1, iter([bytes(data)]), file_format=FORMAT)
+    await store.write(await store.claim(0), raw(1, b"an earlier checkpoint"), file_format=FORMAT)
+    claim = await store.write(await store.claim(0), raw(1, bytes(data)), file_format=FORMAT)
     stop = asyncio.Event()
     async with Heartbeats(nc) as heartbeats:
         worker_task = asyncio.create_task(work(Options(url, "w"), stop))
@@ -278,11 +246,11 @@ async def test_worker_waits_for_streams_and_table_rows_and_continues_from_the_ne
         late_states = await nc.subscribe(subjects.published("p2", "state"))
         registry = await load_packs(nc, ["p1", "p2"])
         number = 1
-        for damaged_count in range(4):
+        for damaged_count in range(3):
             number += 1
-            store = await _checkpoint_store(nc, "test")
+            store = await open_checkpoints(nc, "test")
             for checkpoint in (await store.claim(0)).pointer.checkpoints[:damaged_count]:
-                await nc.jetstream().purge_stream(STATES_STREAM, subject=await _chunk_subject(nc, checkpoint.object))
+                await nc.jetstream().purge_stream(STATES_STREAM, subject=await chunk_subject(nc, checkpoint.object))
             stop = asyncio.Event()
             with capture_logs() as logs:
                 worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
@@ -292,7 +260,7 @@ async def test_worker_waits_for_streams_and_table_rows_and_continues_from_the_ne
                 await worker_task
             # a damaged checkpoint may be logged again when the worker is fenced and starts again
             assert len({line["object"] for line in logs if "is damaged" in line["event"]}) == damaged_count
-            assert any("from its beginning" in line["event"] for line in logs) == (damaged_count == 3)
+            assert any("from its beginning" in line["event"] for line in logs) == (damaged_count == 2)
         await _until_block(late_states, 1)  # although no block arrived after the pack became known
         state = (await end_states(nc, registry, 1))[0].state("p1")
         assert state is not None

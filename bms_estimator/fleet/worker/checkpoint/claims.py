@@ -1,0 +1,132 @@
+"""Claims of partitions by workers: pointers to checkpoints, which are replaced by compare-and-set on their revision.
+
+A worker that takes over a partition first writes its own name into the pointer. Therefore the next checkpoint of a slow or
+suspended former owner fails.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from nats.js.errors import KeyNotFoundError, KeyWrongLastSequenceError
+from nats.js.kv import KeyValue
+from nats.nuid import NUID
+from pydantic import ValidationError
+
+from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError, is_readable
+from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import object_name
+
+
+class FencedError(Exception):
+    """Another worker has taken the partition over."""
+
+
+class StoredPointer(NamedTuple):
+    """Pointer as read from the bucket."""
+
+    revision: int
+    pointer: Pointer
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Claim of a partition: the pointer that this worker wrote last, and its revision."""
+
+    partition: int
+    revision: int
+    pointer: Pointer
+
+
+class Claims:
+    """Claims of one worker.
+
+    Args:
+        worker: Name of the worker.
+        bucket: Key-value bucket of the pointers.
+    """
+
+    def __init__(self, worker: str, bucket: KeyValue) -> None:
+        self._worker, self._bucket = worker, bucket
+        self._object_names = NUID()
+        self._last_sent: dict[int, Pointer] = {}  # by partition; its response may have been lost
+
+    async def check_format(self, partition: int) -> None:
+        """Check that the last checkpoint of a partition can be read.
+
+        Raises:
+            UnreadableFormatError: It has a format that this version cannot read.
+        """
+        await self.read(partition)
+
+    async def read(self, partition: int) -> StoredPointer | None:
+        """Return the pointer of a partition, whose last checkpoint can be read; None without a pointer.
+
+        Raises:
+            UnreadableFormatError: The pointer is not one of this version, or the last checkpoint has a format that this version
+                cannot read.
+        """
+        stored = await self._read(partition)
+        if stored and stored.pointer.kept and not is_readable(stored.pointer.kept[0].format):
+            raise UnreadableFormatError(stored.pointer.kept[0].format)
+        return stored
+
+    async def confirm(self, claim: Claim) -> Claim:
+        """Read the claim again, because the last write may have succeeded without a response.
+
+        Raises:
+            FencedError: Another worker has taken the partition over.
+        """
+        stored = await self._read(claim.partition)
+        if stored is None or stored.revision <= claim.revision:  # a lower revision comes from a lagging node
+            return claim
+        if stored.pointer == self._last_sent.get(claim.partition):
+            return Claim(claim.partition, stored.revision, stored.pointer)
+        raise FencedError(stored.pointer.worker)
+
+    async def end(self, claim: Claim) -> None:
+        """Record an orderly release of a partition whose last checkpoint is up to date.
+
+        Raises:
+            FencedError: Another worker has taken the partition over.
+        """
+        if claim.pointer.unsaved_claims:
+            pointer = claim.pointer.model_copy(update={"unsaved_claims": 0})
+            await self.write(claim.partition, claim.revision, pointer)
+
+    async def write(self, partition: int, revision: int, pointer: Pointer) -> Claim:
+        """Write a pointer with the name of this worker and of its next object.
+
+        Args:
+            partition: Number of the partition.
+            revision: Revision of the pointer to replace; 0 if none exists.
+            pointer: New pointer.
+
+        Raises:
+            FencedError: The stored pointer has another revision.
+        """
+        next_object = object_name(partition, self._object_names.next().decode())
+        pointer = pointer.model_copy(update={"worker": self._worker, "next": next_object})
+        self._last_sent[partition] = pointer
+        try:
+            data = pointer.model_dump_json().encode()
+            return Claim(partition, await self._bucket.update(pointer_key(partition), data, revision), pointer)
+        except KeyWrongLastSequenceError:
+            stored = await self._read(partition)
+            if stored and stored.pointer == pointer:  # the write succeeded, but its response was lost
+                return Claim(partition, stored.revision, pointer)
+            raise FencedError(stored.pointer.worker if stored else "") from None
+
+    async def _read(self, partition: int) -> StoredPointer | None:
+        """Return the pointer of a partition; None without one.
+
+        Raises:
+            UnreadableFormatError: The pointer is not one of this version.
+        """
+        try:
+            entry = await self._bucket.get(pointer_key(partition))
+        except KeyNotFoundError:
+            return None
+        try:
+            return StoredPointer(entry.revision or 0, Pointer.model_validate_json(entry.value or b""))
+        except ValidationError as error:
+            raise UnreadableFormatError(0) from error
