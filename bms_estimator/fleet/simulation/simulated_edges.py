@@ -70,15 +70,12 @@ class SimulatedEdges:
         i = self._index.get(pack)
         if i is None or reply.store != self._fleet.store[i]:
             return False
-        confirmed_before = self.confirmed_below[i]
-        self.confirmed_below[i] = max(confirmed_before, reply.number)
+        number = self.confirmed_below[i] = max(self.confirmed_below[i], reply.number)
         if reply.resend:
             self.resends += 1
-            if reply.number >= confirmed_before and (
-                reply.number != self._requested[i] or now_s - self._requested_s[i] >= RESEND_S
-            ):
-                self.next_number[i] = min(self.next_number[i], reply.number)
-                self._requested[i], self._requested_s[i] = reply.number, now_s
+            if number != self._requested[i] or now_s - self._requested_s[i] >= RESEND_S:
+                self.next_number[i] = min(self.next_number[i], number)
+                self._requested[i], self._requested_s[i] = number, now_s
         else:  # skip blocks that an earlier run has sent
             self.next_number[i] = max(self.next_number[i], reply.number)
         return True

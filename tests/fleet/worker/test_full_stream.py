@@ -1,4 +1,4 @@
-"""Stream that overflows while no worker runs: the edges resend all blocks that no checkpoint includes."""
+"""Stream that overflows while no worker runs, and a damaged last checkpoint: the edges resend all missing blocks."""
 
 import asyncio
 import time
@@ -21,25 +21,28 @@ from bms_estimator.fleet.simulation.block_publisher import run_edges
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker import worker as worker_module
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.command_line import run
+from tests.fleet.checkpoints import damage
 from tests.fleet.nats_cluster import connected, running
-from tests.fleet.workers import Heartbeats, Process, end_states
+from tests.fleet.workers import Heartbeats, Process, end_states, until
 from tests.patience import LONG_S
 
 PACKS, PARTITIONS = 2, 1
 BLOCKS_PER_S = 20.0
 """Rate of the blocks of all edges [1/s]."""
-SAVED, UNSAVED, OVERFLOW, AFTERWARDS = 12, 25, 10, 6
-"""Numbers of blocks of each edge: before the last checkpoint, after it, without a worker, and with the next worker.
-An edge gets a reply at every tenth block."""
+SAVED, OVERFLOW, AFTERWARDS = 12, 10, 6
+"""Numbers of blocks of each edge: before the first checkpoint, without a worker, and with the next worker."""
 SMALL_BYTES = 4096
 """Size of the stream while it overflows [bytes]: a few blocks."""
-NEVER_S = 3600
-"""Checkpoint interval that does not end during the test [s]."""
+CHECKPOINT_S = 1
+"""Checkpoint interval of the workers [s]."""
 
 
-async def test_no_block_is_lost_if_the_stream_overflows_without_a_worker(tmp_path: Path) -> None:
+async def test_no_block_is_lost_if_the_stream_overflows_without_a_worker_and_the_last_checkpoint_is_damaged(
+    tmp_path: Path,
+) -> None:
     with running(tmp_path, 1, partitions=PARTITIONS) as cluster, ExitStack() as stack:
         nc = await connected(cluster.urls)
         await make_streams(nc, partitions=PARTITIONS)
@@ -51,7 +54,7 @@ async def test_no_block_is_lost_if_the_stream_overflows_without_a_worker(tmp_pat
         await bucket.refresh()
 
         def start_worker(name: str) -> Process:
-            worker = Process(tmp_path, cluster.url, name, "--checkpoint-s", NEVER_S)
+            worker = Process(tmp_path, cluster.url, name, "--checkpoint-s", CHECKPOINT_S)
             stack.callback(worker.kill)
             return worker
 
@@ -75,16 +78,19 @@ async def test_no_block_is_lost_if_the_stream_overflows_without_a_worker(tmp_pat
             assert await saving_worker.end() == 0
             killed_worker = start_worker("killed")
             await heartbeats.until_held(PARTITIONS, "killed")
-            edges.last = SAVED + UNSAVED
-            await until_processed(heartbeats, "killed", edges.last)
+            edges.last = None
+            await until(lambda: edges.confirmed_below.min() > SAVED, lambda: edges.confirmed_below)
             killed_worker.kill()
             await make_streams(nc, partitions=PARTITIONS, raw_bytes=SMALL_BYTES)
-            edges.last += OVERFLOW
-            stream_end = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq + PACKS * OVERFLOW
-            while (state := (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state).last_seq < stream_end:  # noqa: ASYNC110 - the stream has no notifications
+            edges.last = int(edges.next_number.max()) + OVERFLOW
+            await until(lambda: edges.done, lambda: edges.next_number)
+            store = await open_checkpoints(nc, "test")
+            last, previous = (await store.claim(0)).pointer.kept
+            await damage(nc, last.object)
+            js = nc.jetstream()
+            while (state := (await js.stream_info(subjects.RAW_STREAM)).state).first_seq <= last.sequence:  # noqa: ASYNC110 - the stream has no notifications
                 await asyncio.sleep(0.02)
-            assert state.messages < PACKS * OVERFLOW  # the stream has dropped all blocks since the checkpoint
-            assert edges.confirmed_below.tolist() == [SAVED + 1] * PACKS
+            assert previous.sequence < last.sequence < state.first_seq
             await make_streams(nc, partitions=PARTITIONS, raw_bytes=RAW_BYTES)
             next_worker = start_worker("next")
             await heartbeats.until_held(PARTITIONS, "next")

@@ -29,6 +29,8 @@ from tests.patience import LONG_S
 PARTITIONS = 2
 PACKS = ["p1", "p2"]
 """One pack of each partition."""
+IDLE_PACKS = [f"p{number}" for number in range(3, 11)]
+"""Packs of both partitions that send only one block."""
 TWO_FORMATS, UNREADABLE_FORMAT = FORMAT + 1, FORMAT + 2
 """Format of a version that also reads the format of this version, and of a version that does not."""
 
@@ -74,8 +76,8 @@ def workers(tmp_path: Path, cluster: NatsCluster):
 
 
 async def send_blocks(nc: Client, number: int) -> None:
-    """Send block ``number`` of each pack."""
-    for pack in PACKS:
+    """Send block ``number`` of each pack, before the first ones those of the idle packs."""
+    for pack in (*IDLE_PACKS, *PACKS) if number == 1 else PACKS:
         await send(nc, pack, block(pack, number))
 
 
@@ -90,10 +92,12 @@ async def until_saved(nc: Client, *, blocks: int, file_format: int) -> list[Poin
 
     Args:
         nc: Connection to the server.
-        blocks: Number of blocks that each pack has sent. The last two messages of the stream are of both partitions.
+        blocks: Number of blocks that each pack except the idle ones has sent. The last two messages of the stream are of both
+            partitions.
         file_format: Format of the last checkpoints.
     """
-    last_sequences = {blocks * len(PACKS) - 1, blocks * len(PACKS)}
+    last_sequence = len(IDLE_PACKS) + blocks * len(PACKS)
+    last_sequences = {last_sequence - 1, last_sequence}
     deadline = time.monotonic() + LONG_S
     while time.monotonic() < deadline:
         found = await pointers(nc)
@@ -107,23 +111,25 @@ async def until_saved(nc: Client, *, blocks: int, file_format: int) -> list[Poin
 async def assert_bit_identical(nc: Client, registry: PackRegistry, blocks: int) -> list[Partition]:
     """Check that each pack's state is that of one run over all its blocks, and return the partitions."""
     partitions = await end_states(nc, registry, PARTITIONS)
-    for pack in PACKS:
+    for pack in (*PACKS, *IDLE_PACKS):
         state = partitions[subjects.partition_of(pack, PARTITIONS)].state(pack)
         assert state is not None
-        assert state["estimator"].tobytes() == estimated(registry, pack, blocks)
+        assert state["estimator"].tobytes() == estimated(registry, pack, blocks if pack in PACKS else 1)
     return list(partitions.values())
 
 
 async def test_states_survive_a_rolling_upgrade_and_a_roll_back_while_blocks_arrive(nc, heartbeats, workers) -> None:
-    registry = await load_packs(nc, PACKS)
+    registry = await load_packs(nc, PACKS + IDLE_PACKS)
     old = workers.start("old")
     await send_blocks(nc, 1)
-    await until_saved(nc, blocks=1, file_format=FORMAT)
+    first_saved = await until_saved(nc, blocks=1, file_format=FORMAT)
     new = workers.start("new", TWO_FORMATS)
     await heartbeats.until_held(PARTITIONS, "old", "new")
     await send_blocks(nc, 2)
     saved = await until_saved(nc, blocks=2, file_format=FORMAT)  # the format that both versions read
     assert sorted(each.worker for each in saved) == ["new", "old"]
+    old_partition = next(index for index, each in enumerate(saved) if each.worker == "old")
+    assert any(each[old_partition].kept[0].increments for each in (first_saved, saved))
     assert await old.end() == 0
     await heartbeats.until_held(PARTITIONS, "new")
     await send_blocks(nc, 3)
@@ -145,7 +151,7 @@ async def test_states_survive_a_rolling_upgrade_and_a_roll_back_while_blocks_arr
 async def test_worker_refuses_checkpoints_of_an_unreadable_format_until_the_right_version_takes_them(
     nc, heartbeats, workers, cluster, monkeypatch
 ) -> None:
-    registry = await load_packs(nc, PACKS)
+    registry = await load_packs(nc, PACKS + IDLE_PACKS)
     later = workers.start("later", UNREADABLE_FORMAT)
     await send_blocks(nc, 1)
     saved = await until_saved(nc, blocks=1, file_format=UNREADABLE_FORMAT)
