@@ -23,8 +23,9 @@ STATE_BYTES = 42_000
 """Maximum size of a pack in a checkpoint [bytes]."""
 DAILY_STATE_BYTES = 19_000
 """Size of a pack in a checkpoint after 24 h [bytes], which is nearly that of a daily checkpoint."""
-LAST_CHECKPOINTS, DAILY_CHECKPOINTS = 3, 30
-"""Number of checkpoints of a partition: the last two with the one that is being written, and the daily ones."""
+LAST_CHECKPOINTS, DAILY_CHECKPOINTS = 4, 30
+"""Number of whole checkpoints of a partition: the last two, whose increments have at most half of their size, with the one that
+is being written; and the daily ones."""
 MIN_STATES_BYTES = 256 << 20
 """Minimum size of the checkpoints' stream [bytes]: 64 partitions without packs, each with all its checkpoints."""
 

@@ -37,7 +37,7 @@ SETTINGS, CELL_MODEL = Settings(), load_cell(CELL)
 def rows() -> Iterator[Row]:
     """Measure CPU time in total and by part; each part is the minimum of some rounds."""
     samples = pulses(MINUTES * SAMPLES, rate_hz=1)
-    blocks = [_block(samples, minute) for minute in range(MINUTES)]
+    blocks = [encoded_block(samples, minute) for minute in range(MINUTES)]
     partition = Partition(0, lambda _: (SETTINGS, CELL_MODEL))
     block_us = _block_us(partition, blocks)
     yield Row(
@@ -59,7 +59,7 @@ def rows() -> Iterator[Row]:
     yield Row("  to read it", "-", f"{1e6 * read_s / PACKS:.0f} us", None)
 
 
-def _block(samples: SampleBlock, minute: int) -> bytes:
+def encoded_block(samples: SampleBlock, minute: int) -> bytes:
     """Return the encoded block of one minute."""
     part = samples[minute * SAMPLES : (minute + 1) * SAMPLES]
     arrival_s = STORE_ID / 1e9 + float(part["time_s"][-1])

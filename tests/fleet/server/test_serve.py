@@ -345,9 +345,9 @@ def test_missing_certificate_or_another_key_is_rejected(
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("packs = 10_000_000\noutage_days = 365", "streams: the streams need 4540260.0 GB, but may use only "),
-        ("packs = 10_000_000\ndisk_gb = 1e6", "streams: the streams need 93900.0 GB, but may use only "),
-        ("packs = 10_000\ndisk_gb = 90", "server.disk_gb = 90: the streams need 93.9 GB: increase disk_gb"),
+        ("packs = 10_000_000\noutage_days = 365", "streams: the streams need 4540680.0 GB, but may use only "),
+        ("packs = 10_000_000\ndisk_gb = 1e6", "streams: the streams need 94320.0 GB, but may use only "),
+        ("packs = 10_000\ndisk_gb = 90", "server.disk_gb = 90: the streams need 94.3 GB: increase disk_gb"),
         ("raw_gb = 8", "server: raw_gb: replaced by packs and outage_days"),
     ],
 )

@@ -100,12 +100,11 @@ def test_edges_resend_from_the_requested_block() -> None:
     resent = [edges.due(100.0, 10) for _ in range(3)]
     assert [list(zip(due.packs, due.numbers, strict=True)) for due in resent] == [[(1, 3)], [(1, 4)], []]
     assert (edges.repeated, edges.resends, edges.confirmed_below[1]) == (2, 1, 3)
-    # A request is ignored if its block was resent recently, or is confirmed.
+    # A request is ignored if its block was resent recently. Confirmed blocks are not resent.
     edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S / 2.0)
-    edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=2, resend=True), RESEND_S)
     assert edges.done
-    edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), RESEND_S)
-    assert not edges.done
+    edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=2, resend=True), RESEND_S)
+    assert edges.next_number.tolist() == [5, 3]
 
 
 def test_edge_does_not_send_confirmed_blocks() -> None:
