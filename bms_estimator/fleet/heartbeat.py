@@ -58,6 +58,9 @@ class Heartbeat(BaseModel):
     processing of the block. None without a block."""
     counters: dict[str, int] = Field(default_factory=dict)
     """Counters of the partitions by name: resends, gaps, lost blocks, damaged blocks and others."""
+    events: dict[str, int] = Field(default_factory=dict)
+    """The same counters except blocks, samples and packs, since the worker's start: those of former partitions included,
+    those from before the claim of a partition excluded."""
     unknown_count: int = 0
     """Number of packs with deferred blocks that are missing in the table of packs."""
     unknown: tuple[str, ...] = ()
@@ -70,11 +73,17 @@ class Heartbeat(BaseModel):
     """Number of messages that were received from the server and not processed yet."""
     hours_waiting: int = 0
     """Number of summaries that the server has not acknowledged yet."""
-    checkpoint_age_s: float | None = None
-    """Largest age of the last checkpoints of the partitions [s]; None without a checkpoint."""
+    unsaved_s: float = 0.0
+    """Largest time for which a partition has had blocks that its last checkpoint does not include [s]."""
+    checkpoint_s: float | None = None
+    """Duration of the last written checkpoint [s]; None without one."""
     cpu_s: float = 0.0
     """CPU time of the process since its start [s]."""
+    estimation_s: float = 0.0
+    """CPU time of the estimation of blocks since the worker's start [s]; part of ``cpu_s``."""
     rss_mib: float = 0.0
     """Memory of the process [MiB]."""
+    reconnects: int = 0
+    """Number of reconnections to the server since the worker's start."""
     trouble: str = ""
     """Description of the present error; empty without an error."""

@@ -44,6 +44,10 @@ class ServerSettings(Strict):
         default="127.0.0.1:8222",
         description="host:port of the server's monitoring, which must be on the loopback interface",
     )
+    metrics: Address | None = Field(
+        default=None,
+        description="host:port at which Prometheus reads metrics of server, streams and workers; every client that can connect to it can read them; default: no metrics",
+    )
     partitions: Annotated[int, Field(ge=1, le=256)] = Field(
         default=64,
         description="number of partitions of packs, which the workers divide among themselves; cannot be changed after the streams were created",

@@ -10,7 +10,7 @@ import pytest
 
 from bms_estimator.cli.fleet.serve import _nodes
 from bms_estimator.fleet.server.nats_config import Accounts, configuration
-from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec, node_of
+from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_of
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.settings.fleet import FleetSettings
 from tests.deploy.test_unit import MAX_EXPOSURE, verify

@@ -11,8 +11,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.nats_config import CLUSTER_PORT, Accounts
-from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.nats_server import serve as run_node
+from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.model.config_file import error_reason, read_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs, flush_logs
@@ -41,6 +41,10 @@ def serve(
         str | None, typer.Option(help="host:port for workers; default: server.listen of the settings")
     ] = None,
     mqtt: Annotated[str | None, typer.Option(help="host:port for edges; default: server.mqtt of the settings")] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option(help="host:port of the metrics for Prometheus; default: server.metrics of the settings"),
+    ] = None,
     node: Annotated[int, typer.Option(min=1, max=5, help="position of this node in the list of --cluster, from 1")] = 1,
     cluster: Annotated[
         str | None,
@@ -58,11 +62,11 @@ def serve(
     """
     if former_cluster is not None:
         raise UserError(f"--of: renamed; write --cluster {former_cluster}")
-    settings = _settings(settings_file, listen=listen, mqtt=mqtt)
+    settings = _settings(settings_file, listen=listen, mqtt=mqtt, metrics=metrics)
     location = NodeLocation(_folder(settings, folder), node, _nodes(settings, node, cluster))
 
     def read_spec() -> ServerSpec:
-        settings = _settings(settings_file, listen=listen, mqtt=mqtt)
+        settings = _settings(settings_file, listen=listen, mqtt=mqtt, metrics=metrics)
         return ServerSpec(settings, _accounts(settings, location))
 
     configure_logs()

@@ -6,9 +6,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from bms_estimator.fleet.fleet_workers import RATE_S, FleetWorkers
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.page.packs import MAX_LISTED, FleetPacks
-from bms_estimator.fleet.page.workers import RATE_S, FleetWorkers
 from bms_estimator.model.clock import iso_utc
 
 MAX_UNKNOWN = 1000

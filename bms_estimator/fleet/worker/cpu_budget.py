@@ -19,10 +19,14 @@ class CpuBudget:
 
     Args:
         clock: Monotonic clock [s].
+
+    Attributes:
+        total_s: Processor time of all packs [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
+        self.total_s = 0.0
         # level of each pack's bucket [s], and the time at which the level was computed [s]
         self._levels: dict[str, tuple[float, float]] = {}
 
@@ -32,6 +36,7 @@ class CpuBudget:
 
     def charge(self, pack: str, cpu_s: float) -> None:
         """Count processor time that a pack has used [s]."""
+        self.total_s += cpu_s
         self._levels[pack] = self._level_s(pack) + min(cpu_s, MAX_CHARGE_S), self._clock()
         if len(self._levels) > MAX_PACKS:
             self._levels = {name: level for name, level in self._levels.items() if self._level_s(name)}

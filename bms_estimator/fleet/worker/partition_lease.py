@@ -7,7 +7,7 @@ some time without a delivery, because the server does not redeliver messages tha
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import aclosing
 from functools import partial
 
@@ -68,6 +68,7 @@ class PartitionLease:
         results: Publisher of the results.
         runner: Runner of the messages, with the counters of this lease.
         partition: State of the packs; None while the partition is not taken over.
+        restored_counters: Counters of the partition at its claim.
         claim: Claim of this worker; None while it has none.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
         trouble: Text of the present error; empty without one.
@@ -102,6 +103,7 @@ class PartitionLease:
         )
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
         self.partition: Partition | None = None
+        self.restored_counters: Mapping[str, int] = {}
         self.claim: Claim | None = None
         self.trouble, self.checkpoint_due_s = "", 0.0
         self.refused_format: int | None = None
@@ -326,7 +328,7 @@ class PartitionLease:
             partition = await restore_partition(self._checkpoints, claim, self.number, self._table, self._sources)
             replay_end = await self._last_partition_sequence()
             await self._guard.begin(claim, replay_end)
-            self.partition, self.claim = partition, claim
+            self.partition, self.claim, self.restored_counters = partition, claim, partition.counters
             self._changes.begin(partition.in_force, replay_end)
             self._deferred.wake_up()
         last_sequence = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq

@@ -1,12 +1,9 @@
 """Worker process, which processes its share of the partitions on one connection."""
 
 import asyncio
-import resource
 import time
-from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from heapq import nlargest
 from pathlib import Path
 
 import structlog
@@ -16,23 +13,23 @@ from nats.js.errors import NotFoundError
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
-from bms_estimator.edge.block import VERSION as BLOCK_VERSION
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
 from bms_estimator.fleet.nats.connection import close, connect, error_text
 from bms_estimator.fleet.nats.streams import partitions_of
-from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.block_loop import BlockLoop
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, UnreadableFormatError, oldest_format
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.heartbeat_report import HeartbeatReport
 from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
+from bms_estimator.fleet.worker.periodic_storage import PeriodicStorage
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
 from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
+from bms_estimator.fleet.worker.unsaved_check import UnsavedCheck
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import end, until_first_ends
-from bms_estimator.version import __version__
 
 CHECKPOINT_S = 300.0
 """Default interval between two checkpoints of a partition [s]."""
@@ -45,10 +42,6 @@ REFUSAL_S = 10.0
 """Interval between two checks whether the checkpoint of a refused partition has become readable [s]."""
 UNSAVED_S = 30.0
 """Interval between two checks how much of the stream is unsaved [s]."""
-MAX_UNKNOWN = 20
-"""Maximum number of unknown packs, and of packs with dead letters, that a heartbeat names."""
-MAX_CLOCK_ERRORS = 20
-"""Maximum number of packs with a wrong clock that a heartbeat names."""
 MAX_RELEASES = 8
 """Maximum number of partitions that are saved and released concurrently."""
 
@@ -170,16 +163,14 @@ class Worker:
         self._lease_tasks: dict[int, tuple[PartitionLease, asyncio.Task[None]]] = {}
         self._releases: dict[int, asyncio.Task[None]] = {}
         self._changed_packs: asyncio.Queue[set[str]] = asyncio.Queue()
-        self._started_s = time.time()
         self._leases_updated_s = time.monotonic()
-        self._released_blocks = self._released_samples = self._released_faults = self._released_dead_letters = (
-            0  # totals of released leases
-        )
         self._leaving = False
         self._block_loop = BlockLoop()
         self._release_slots = asyncio.Semaphore(MAX_RELEASES)
         self._reported_unknown: set[str] = set()
-        self._unsaved_warning = ""
+        self._report = HeartbeatReport(options.name)
+        self._storage = PeriodicStorage(nc, options.checkpoint_s, partitions)
+        self._unsaved = UnsavedCheck(nc)
 
     async def run(self) -> None:
         """Claim and process partitions until cancelled.
@@ -196,10 +187,10 @@ class Worker:
         await until_first_ends(
             _repeat(HEARTBEAT_S, self._send_heartbeat),
             _repeat(RENEW_S, self._update_leases),
-            _repeat(CHECK_S, self._save),
-            _repeat(CHECK_S, self._send_results),
+            _repeat(CHECK_S, lambda: self._storage.save(self._leases)),
+            _repeat(CHECK_S, lambda: self._storage.send_results(self._leases)),
             _repeat(REFUSAL_S, self._check_refused),
-            _repeat(UNSAVED_S, self._check_unsaved),
+            _repeat(UNSAVED_S, lambda: self._unsaved.run([lease.number for lease in self._leases if lease.is_owned])),
             self._bucket.follow(self._changed_packs.put_nowait),
             self._apply_table_changes(),
             self._block_loop.run(),
@@ -232,7 +223,11 @@ class Worker:
         except ValidationError as error:
             log.warning("invalid heartbeat of a worker", subject=message.subject, reason=str(error.errors()[0]["msg"]))
             return
-        if heartbeat.id == self._options.name and heartbeat.started_s != self._started_s and not heartbeat.leaving:
+        if (
+            heartbeat.id == self._options.name
+            and heartbeat.started_s != self._report.started_s
+            and not heartbeat.leaving
+        ):
             log.warning("another worker has the same name: give each worker a different --name", worker=heartbeat.id)
         now_s = time.monotonic()
         if self._members.on_heartbeat(heartbeat, now_s):
@@ -310,20 +305,6 @@ class Worker:
                 log.info("the checkpoint of a refused partition has become readable", partition=number)
                 del self._members.refused[number]
 
-    async def _check_unsaved(self) -> None:
-        """Warn if blocks that no checkpoint includes fill more than half of the stream."""
-        if not self._nc.is_connected:
-            return
-        try:
-            owned = [lease.number for lease in self._leases if lease.is_owned]
-            warning = unsaved_warning(await unsaved_share(self._nc, owned))
-        except RETRYABLE_ERRORS as error:
-            log.warning("the stream cannot be checked", reason=error_text(error))
-            return
-        if warning and not self._unsaved_warning:
-            log.warning("the stream fills with blocks that no checkpoint includes", reason=warning)
-        self._unsaved_warning = warning
-
     async def _send_requests(self) -> None:
         if self._nc.is_connected:
             for lease in self._leases:
@@ -343,8 +324,7 @@ class Worker:
             sources=self._bucket.packs,
             is_busy=lambda: any(each.consumer.waiting for each in self._leases),
         )
-        # spread the checkpoints of the partitions over the interval
-        lease.checkpoint_due_s = now_s + self._options.checkpoint_s * (number + 1) / self._partitions
+        lease.checkpoint_due_s = self._storage.first_due_s(number, now_s)
         self._lease_tasks[number] = lease, asyncio.create_task(lease.run())
 
     def _start_release(self, number: int) -> None:
@@ -356,35 +336,8 @@ class Worker:
         async with self._release_slots:
             if self._nc.is_connected:
                 await lease.release()
-        self._released_blocks += lease.runner.blocks
-        self._released_samples += lease.runner.samples
-        self._released_faults += lease.runner.faults
-        self._released_dead_letters += lease.runner.dead_letters
+        self._report.totals.update(self._leases)
         del self._lease_tasks[lease.number], self._releases[lease.number]
-
-    async def _save(self) -> None:
-        """Write the due checkpoints, and replace those that a live worker cannot read."""
-        for lease in sorted(self._leases, key=lambda each: each.checkpoint_due_s):
-            now_s = time.monotonic()
-            if (lease.checkpoint_due_s <= now_s or lease.is_checkpoint_too_new) and self._nc.is_connected:
-                lease.checkpoint_due_s = now_s + self._options.checkpoint_s
-                await self._try_to_store(lease, lease.save)
-
-    async def _send_results(self) -> None:
-        for lease in self._leases:
-            if lease.results.is_waiting and self._nc.is_connected:
-                await self._try_to_store(lease, lease.results.send_queued)
-
-    async def _try_to_store(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:
-        """Run ``action``. After an error of connection or server, the next periodic call tries again."""
-        try:
-            await action()
-        except RETRYABLE_ERRORS as error:
-            log.warning(
-                "a checkpoint, summary or dead letter could not be stored; trying again",
-                partition=lease.number,
-                reason=error_text(error),
-            )
 
     async def _apply_table_changes(self) -> None:
         """Notify partitions of changed and new rows of the table of packs."""
@@ -395,49 +348,14 @@ class Worker:
                     entry[0].settings_changed(pack)
 
     def _heartbeat(self) -> Heartbeat:
-        owned_leases = [lease for lease in self._leases if lease.is_owned]
-        counters, unknown, clock_errors = Counter[str](), list[str](), dict[str, float]()
-        for lease in owned_leases:
-            if lease.partition:
-                counters.update(lease.partition.counters)
-                unknown += lease.partition.unknown
-                clock_errors |= lease.partition.clock_errors
-        lags = [lease.runner.lag_s for lease in owned_leases if lease.runner.lag_s is not None]
-        for lease in owned_leases:
-            lease.runner.lag_s = None  # a heartbeat has the largest lag since the previous heartbeat
-        dead_packs = {pack: reason for lease in owned_leases for pack, reason in lease.runner.dead_packs.items()}
-        usage = resource.getrusage(resource.RUSAGE_SELF)
-        ages = [time.time() - checkpoint.made_s for lease in owned_leases if (checkpoint := lease.last_checkpoint)]
-        return Heartbeat(
-            id=self._options.name,
-            started_s=self._started_s,
-            version=__version__,
-            checkpoint_format=FORMAT,
-            oldest_checkpoint_format=oldest_format(),
-            block_version=BLOCK_VERSION,
-            refused=self._members.refused_partitions(),
+        lease_trouble = next((lease.trouble for lease in self._leases if lease.trouble), "")
+        return self._report.make(
+            self._leases,
+            self._members.refused_partitions(),
             leaving=self._leaving,
-            partitions=tuple(lease.number for lease in owned_leases),
-            packs=counters["packs"],
-            # totals over all leases: they must not fall when a partition is no longer owned
-            blocks=self._released_blocks + sum(lease.runner.blocks for lease in self._leases),
-            samples=self._released_samples + sum(lease.runner.samples for lease in self._leases),
-            faults=self._released_faults + sum(lease.runner.faults for lease in self._leases),
-            dead_letters=self._released_dead_letters + sum(lease.runner.dead_letters for lease in self._leases),
-            dead_packs=dict(list(dead_packs.items())[-MAX_UNKNOWN:]),
-            lag_s=max(lags, default=None),
-            counters=dict(counters),
-            unknown_count=len(unknown),
-            unknown=tuple(sorted(unknown)[:MAX_UNKNOWN]),
-            clock_error_count=len(clock_errors),
-            clock_errors=dict(nlargest(MAX_CLOCK_ERRORS, clock_errors.items(), key=lambda each: abs(each[1]))),
-            waiting=sum(len(lease.consumer.waiting) for lease in self._leases),
-            hours_waiting=sum(len(lease.results.waiting_summaries) for lease in self._leases),
-            checkpoint_age_s=max(ages, default=None),
-            cpu_s=usage.ru_utime + usage.ru_stime,
-            rss_mib=_rss_mib(),
-            trouble=next((lease.trouble for lease in self._leases if lease.trouble), self._bucket.fault)
-            or self._unsaved_warning,
+            reconnects=self._nc.stats["reconnects"],
+            checkpoint_s=self._storage.checkpoint_s,
+            trouble=lease_trouble or self._bucket.fault or self._unsaved.warning,
         )
 
 
@@ -446,8 +364,3 @@ async def _repeat(period_s: float, action: Callable[[], Awaitable[None]]) -> Non
     while True:
         await action()
         await asyncio.sleep(period_s)
-
-
-def _rss_mib() -> float:
-    resident_pages = int(Path("/proc/self/statm").read_text().split()[1])  # second field
-    return resident_pages * resource.getpagesize() / 2**20

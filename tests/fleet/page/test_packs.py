@@ -4,11 +4,11 @@ import json
 
 import pytest
 
+from bms_estimator.fleet.fleet_workers import FleetWorkers
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.page.nats_feed import type_name
 from bms_estimator.fleet.page.packs import ALIVE_S, MAX_LISTED, OTHER, UNLISTED, FleetPacks
 from bms_estimator.fleet.page.view import FleetView
-from bms_estimator.fleet.page.workers import FleetWorkers
 from bms_estimator.model.input_faults import InputFault
 from tests.fleet.published_states import HOME, make_packs, state
 from tests.fleet.workers import OLD_HEARTBEAT

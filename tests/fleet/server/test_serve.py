@@ -21,10 +21,10 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import NoAnswerError
-from bms_estimator.fleet.server import credentials, nats_server
+from bms_estimator.fleet.server import credentials, tenant_streams, tenant_watch
 from bms_estimator.fleet.server.jwt_claims import Role
-from bms_estimator.fleet.server.nats_server import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.nats_server import serve as serve_node
+from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
@@ -218,7 +218,7 @@ async def until(condition: Callable[[], bool]) -> None:
 async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_answer_at_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calls, original_make_streams = [], nats_server.make_streams
+    calls, original_make_streams = [], tenant_streams.make_streams
 
     async def fail_once(nc, **options) -> None:
         calls.append(options)
@@ -226,7 +226,7 @@ async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_an
             raise NoAnswerError("no answer")
         await original_make_streams(nc, **options)
 
-    monkeypatch.setattr(nats_server, "make_streams", fail_once)
+    monkeypatch.setattr(tenant_streams, "make_streams", fail_once)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
     spec = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4)))
     lines: list[str] = []
@@ -240,7 +240,7 @@ async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_an
 async def test_server_logs_a_warning_when_unsaved_blocks_fill_half_of_the_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(nats_server, "UNSAVED_S", 0.1)
+    monkeypatch.setattr(tenant_watch, "UNSAVED_S", 0.1)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
     # a stream of 2.3 MB
     spec = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4, packs=1, outage_days=0.002)))

@@ -1,4 +1,4 @@
-"""Workers of a fleet for its page: live workers, their partitions and their lag. No I/O."""
+"""Workers of a fleet by their heartbeats: live workers, their partitions and their lag. No I/O."""
 
 from collections import deque
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from bms_estimator.fleet.heartbeat import Heartbeat
 
 ALIVE_S = 5.0
-"""Time without a heartbeat after which the page shows a worker as lost [s]. It exceeds the 3 s after which other workers
+"""Time without a heartbeat after which a worker counts as lost [s]. It exceeds the 3 s after which other workers
 take over."""
 LISTED_S = 300.0
 """Time for which a lost worker stays listed [s]."""
@@ -50,6 +50,13 @@ class FleetWorkers:
     def clear(self) -> None:
         """Remove all heartbeats, after a time without a connection."""
         self._by_worker.clear()
+
+    def heartbeats(self, now_s: float) -> list[Heartbeat]:
+        """Return the last heartbeat of each live worker, with its largest recent lag."""
+        return [
+            received[-1].heartbeat.model_copy(update={"lag_s": _max_lag_s(received)})
+            for received in self._alive(now_s).values()
+        ]
 
     def unknown(self, now_s: float) -> tuple[int, list[str]]:
         """Return the number of unknown packs, and some of their names."""
@@ -132,7 +139,6 @@ def _worker_overview(received: deque[_Received], now_s: float, alive: bool) -> d
         "blocks_per_s": rate(heartbeat.blocks, first.heartbeat.blocks),
         "samples_per_s": rate(heartbeat.samples, first.heartbeat.samples),
         "waiting": heartbeat.waiting,
-        "checkpoint_age_s": heartbeat.checkpoint_age_s,
         "rss_mib": heartbeat.rss_mib,
         "cpu": rate(heartbeat.cpu_s, first.heartbeat.cpu_s),
         "trouble": heartbeat.trouble,

@@ -1,0 +1,153 @@
+"""Names and meanings of all metrics of a fleet, and their values from its state. A name with ``_total`` is a counter."""
+
+from collections.abc import Callable, Mapping
+from typing import Generic, NamedTuple, TypeVar
+
+from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.metrics.states import NodeState, StreamState, TenantState
+
+S = TypeVar("S")
+Value = float | Mapping[str, float] | None
+"""Value of a metric, or its values by the metric's own label; None: the metric has no sample."""
+MIB = 1 << 20
+"""Mebibyte [bytes]."""
+MQTT_SESSIONS_STREAM = "$MQTT_sess"
+"""Stream of nats-server with one message for each MQTT session, also of a disconnected client."""
+
+
+class Definition(NamedTuple, Generic[S]):
+    """Metric of a state of type ``S``."""
+
+    name: str
+    meaning: str
+    read: Callable[[S], Value]
+    label: str = ""
+    """Label of the values, if there are several."""
+
+
+def _of_streams(read: Callable[[StreamState], int | None]) -> Callable[[TenantState], Value]:
+    """Return a function that reads a number of each stream."""
+
+    def values(state: TenantState) -> Mapping[str, float]:
+        numbers = {name: read(stream) for name, stream in (state.streams or {}).items()}
+        return {name: number for name, number in numbers.items() if number is not None}
+
+    return values
+
+
+def _mqtt_sessions(state: TenantState) -> Value:
+    if state.streams is None:
+        return None
+    sessions = state.streams.get(MQTT_SESSIONS_STREAM)
+    return sessions.messages if sessions else 0.0
+
+
+NODE: tuple[Definition[NodeState], ...] = (
+    Definition("bms_fleet_server_up", "1 while nats-server and its streams are available", lambda s: s.is_healthy),
+    Definition(
+        "bms_fleet_server_connections", "Open connections, including MQTT", lambda s: s.monitored("connections")
+    ),
+    Definition(
+        "bms_fleet_server_connections_opened_total",
+        "Connections since the start of nats-server",
+        lambda s: s.monitored("total_connections"),
+    ),
+    Definition(
+        "bms_fleet_server_slow_consumers_total",
+        "Clients that nats-server disconnected because they read too slowly",
+        lambda s: s.monitored("slow_consumers"),
+    ),
+    Definition(
+        "bms_fleet_server_resident_memory_bytes", "Resident memory of nats-server", lambda s: s.monitored("mem")
+    ),
+    Definition(
+        "bms_fleet_server_storage_bytes",
+        "Size of all streams on this node",
+        lambda s: s.monitored("jetstream", "stats", "storage"),
+    ),
+    Definition(
+        "bms_fleet_server_storage_max_bytes",
+        "Maximum size of all streams on this node",
+        lambda s: s.monitored("jetstream", "config", "max_storage"),
+    ),
+    Definition("bms_fleet_disk_bytes", "Size of the file system with the streams", lambda s: s.disk_bytes),
+    Definition("bms_fleet_disk_free_bytes", "Free space of this file system", lambda s: s.disk_free_bytes),
+)
+"""Metrics of the node."""
+
+TENANT: tuple[Definition[TenantState], ...] = (
+    Definition("bms_fleet_workers", "Workers with a heartbeat in the last 5 s", lambda s: len(s.heartbeats)),
+    Definition(
+        "bms_fleet_unowned_partitions",
+        "Partitions with undelivered messages that no worker owns",
+        lambda s: None if s.unowned is None else len(s.unowned),
+    ),
+    Definition(
+        "bms_fleet_refused_partitions",
+        "Partitions that no worker owns because a worker cannot read the checkpoint",
+        lambda s: len(s.refused),
+    ),
+    Definition(
+        "bms_fleet_undelivered_messages",
+        "Messages of RAW that the server has not delivered to a worker yet",
+        lambda s: None if s.undelivered is None else sum(s.undelivered.values()),
+    ),
+    Definition(
+        "bms_fleet_unsaved_ratio",
+        "Part of RAW that no checkpoint includes, by size or age, whichever is larger; computed once a minute",
+        lambda s: s.unsaved_share,
+    ),
+    Definition("bms_fleet_mqtt_sessions", "MQTT sessions, including those of disconnected edges", _mqtt_sessions),
+    Definition("bms_fleet_stream_messages", "Stored messages of a stream", _of_streams(lambda s: s.messages), "stream"),
+    Definition("bms_fleet_stream_bytes", "Size of a stream", _of_streams(lambda s: s.stored_bytes), "stream"),
+    Definition("bms_fleet_stream_max_bytes", "Limit of the size", _of_streams(lambda s: s.max_bytes), "stream"),
+)
+"""Metrics of a tenant."""
+
+WORKER: tuple[Definition[Heartbeat], ...] = (
+    Definition("bms_fleet_worker_info", "Version of the worker; always 1", lambda h: {h.version: 1.0}, "version"),
+    Definition("bms_fleet_worker_start_time_seconds", "Start of the worker, since 1970", lambda h: h.started_s),
+    Definition("bms_fleet_worker_partitions", "Claimed partitions", lambda h: len(h.partitions)),
+    Definition("bms_fleet_worker_refused_partitions", "Refused partitions", lambda h: len(h.refused)),
+    Definition("bms_fleet_worker_packs", "Packs in the claimed partitions", lambda h: h.packs),
+    Definition("bms_fleet_worker_unknown_packs", "Packs that are missing in the table", lambda h: h.unknown_count),
+    Definition(
+        "bms_fleet_worker_clock_error_packs", "Packs whose edge's clock is wrong", lambda h: h.clock_error_count
+    ),
+    Definition("bms_fleet_worker_blocks_total", "Processed blocks", lambda h: h.blocks),
+    Definition("bms_fleet_worker_samples_total", "Processed samples", lambda h: h.samples),
+    Definition("bms_fleet_worker_faults_total", "Blocks skipped because of an internal error", lambda h: h.faults),
+    Definition("bms_fleet_worker_dead_letters_total", "Blocks that became dead letters", lambda h: h.dead_letters),
+    Definition("bms_fleet_worker_events_total", "Events by kind", lambda h: h.events, "event"),
+    Definition(
+        "bms_fleet_worker_lag_seconds",
+        "Largest time from the last sample of a block to its estimate, over the last 10 s",
+        lambda h: h.lag_s,
+    ),
+    Definition(
+        "bms_fleet_worker_waiting_messages", "Received messages that are not processed yet", lambda h: h.waiting
+    ),
+    Definition(
+        "bms_fleet_worker_waiting_summaries",
+        "Hourly summaries that are not acknowledged yet",
+        lambda h: h.hours_waiting,
+    ),
+    Definition(
+        "bms_fleet_worker_unsaved_seconds",
+        "Largest time for which a partition has had blocks that its last checkpoint does not include",
+        lambda h: h.unsaved_s,
+    ),
+    Definition(
+        "bms_fleet_worker_checkpoint_duration_seconds", "Duration of the last checkpoint", lambda h: h.checkpoint_s
+    ),
+    Definition("bms_fleet_worker_cpu_seconds_total", "CPU time of the process", lambda h: h.cpu_s),
+    Definition("bms_fleet_worker_estimation_seconds_total", "CPU time of the estimation", lambda h: h.estimation_s),
+    Definition("bms_fleet_worker_resident_memory_bytes", "Memory of the process", lambda h: MIB * h.rss_mib),
+    Definition("bms_fleet_worker_reconnects_total", "Reconnections to the server", lambda h: h.reconnects),
+    Definition(
+        "bms_fleet_worker_trouble",
+        "1 while the worker reports an error, which status and page show",
+        lambda h: bool(h.trouble),
+    ),
+)
+"""Metrics of a worker, since its start."""
