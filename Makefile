@@ -17,13 +17,14 @@ KILLS   ?= 100
 NODES   ?= 1 3
 HOME_ASSISTANT ?= 2025.2.5
 CYCLONEDX := 7.5.0
+PROMETHEUS_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-prometheus
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
 # Programs that the tests run: compiler and simulator of the board, a broker, systemd's checks.
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank cells observability power collapse resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations payloads cell-schema notebook lock
+.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank cells observability power collapse resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -54,7 +55,7 @@ test-all: prepared ## also the redundant and longer tests
 	$(BIN)/python -m pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder $(ARGS)
 
 prepared: apt venv
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant prometheus
 
 demo: $(CORE) ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@$(BIN)/bms-estimator demo $(ARGS)
@@ -71,6 +72,9 @@ fleet-kills: venv ## workers and server nodes killed 100 times, with one node an
 
 nats: venv ## a node of a NATS cluster killed while messages arrive, in each of its roles: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/mqtt/test_nats_server.py $(ARGS)
+
+prometheus:
+	@.ci/prometheus "$(PROMETHEUS_FOLDER)" || echo "no Prometheus here: its tests are skipped"
 
 real-home-assistant:
 	@.ci/home-assistant "$(HOME_ASSISTANT)" "$(HA_FOLDER)" || echo "no real Home Assistant here: its tests are skipped"
@@ -167,10 +171,10 @@ firmware: ## the board's firmware and its simulator, if the compilers are instal
 	@if .ci/can-simulate; then $(MAKE) --no-print-directory -C firmware all sim; \
 	else echo "firmware not built: it needs $(filter %avr %avr-dev avr-libc libelf-dev,$(APT))"; fi
 
-integrations: apt venv ## tests with the real Node-RED, AsyncAPI parser, InfluxDB and promtool; installs the first two in .node
+integrations: apt venv prometheus ## tests with the real Node-RED, AsyncAPI parser, InfluxDB and Prometheus; installs the first two in .node
 	@[ -d $(NODE)/node_modules/node-red ] || npm install --prefix $(NODE) --no-audit --no-fund --ignore-scripts node-red@4.1.15 @asyncapi/parser@3.6.3
 	$(BIN)/python -m pytest tests/deploy/test_node_red.py tests/deploy/test_asyncapi.py tests/deploy/test_grafana.py \
-		tests/deploy/test_telegraf.py tests/sinks/exports/test_influx.py tests/sinks/exports/test_prometheus.py $(ARGS)
+		tests/deploy/test_telegraf.py tests/sinks/exports/test_influx.py tests/sinks/exports/test_prometheus.py tests/fleet/server/test_metrics.py $(ARGS)
 
 deb: venv ## the Debian package in build/deb, with the program and the packages that it requires: three minutes
 	@$(BIN)/python deploy/debian/build.py build/deb

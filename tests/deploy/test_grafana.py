@@ -1,4 +1,4 @@
-"""Grafana dashboard: its layout, and its queries on a real InfluxDB with a state and an alarm."""
+"""Grafana dashboards: their layout, and the queries of a pack's dashboard on a real InfluxDB with a state and an alarm."""
 
 import itertools
 import json
@@ -15,7 +15,8 @@ from bms_estimator.sinks.exports.line_protocol import ALARM, STATE, lines
 from tests.influxdb import INFLUXD, InfluxDB
 from tests.sinks.snapshots import CELL_SNAPSHOT, SOC_LOW_ALARM
 
-DASHBOARD = json.loads((Path(__file__).parents[2] / "deploy/grafana/bms.json").read_text(encoding="utf-8"))
+FOLDER = Path(__file__).parents[2] / "deploy" / "grafana"
+DASHBOARD = json.loads((FOLDER / "bms.json").read_text(encoding="utf-8"))
 TARGETS = [(panel["title"], target) for panel in DASHBOARD["panels"] for target in panel["targets"]]
 MODEL_OF_MEASUREMENT = {STATE: Estimate, ALARM: Alarm}
 GRID_COLUMNS = 24
@@ -71,9 +72,11 @@ def test_every_query_returns_a_value_from_a_real_influxdb(influxdb: InfluxDB) ->
         assert any(value is not None for value in values), f"{title}: {query}"
 
 
-def test_panels_do_not_overlap_and_use_the_selected_source() -> None:
-    assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
-    for first, second in itertools.combinations([panel["gridPos"] for panel in DASHBOARD["panels"]], 2):
+@pytest.mark.parametrize("file", sorted(FOLDER.glob("*.json")), ids=lambda file: file.stem)
+def test_panels_do_not_overlap_and_use_the_selected_source(file: Path) -> None:
+    panels = json.loads(file.read_text(encoding="utf-8"))["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    for first, second in itertools.combinations([panel["gridPos"] for panel in panels], 2):
         is_separate = [
             a[position] + a[size] <= b[position]
             for a, b in ((first, second), (second, first))
@@ -81,6 +84,9 @@ def test_panels_do_not_overlap_and_use_the_selected_source() -> None:
         ]
         assert any(is_separate)
         assert first["x"] + first["w"] <= GRID_COLUMNS
+    assert {target["datasource"]["uid"] for panel in panels for target in panel["targets"]} == {"${source}"}
+
+
+def test_every_query_selects_pack_and_time() -> None:
     for _, target in TARGETS:
-        assert target["datasource"]["uid"] == "${source}"
         assert "\"device\" = '$device' AND $timeFilter" in target["query"]

@@ -24,7 +24,7 @@ from bms_estimator.fleet.server.nats_config import Node
 
 UNSAVED_S = 60.0
 """Interval between two checks how much of the stream is unsaved [s]."""
-RETRY_S = 5.0
+RETRY_S = 1.0
 """Delay before the next connection [s]."""
 
 log = structlog.get_logger(__name__)

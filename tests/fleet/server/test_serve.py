@@ -6,14 +6,13 @@ import shutil
 import signal
 import socket
 import ssl
-import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+import aiohttp
 import aiomqtt
 import nats
 import pytest
@@ -30,11 +29,10 @@ from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from tests.command_line import run
+from tests.fleet.serve_process import ServeProcess
 from tests.free_port import free_port
 from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
-
-PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +51,7 @@ def settings_text(authority: Authority, options: str = "", ports: tuple[int, ...
 listen = "127.0.0.1:{listen}"
 mqtt = "127.0.0.1:{mqtt}"
 monitor = "127.0.0.1:{monitor}"
+metrics = "127.0.0.1:{free_port()}"
 partitions = 4
 packs = 100
 outage_days = 0.1
@@ -64,49 +63,6 @@ ca_file = "{authority.certificate}"
 [tenants.acme]
 {options}
 """
-
-
-class ServeProcess:
-    """Process of ``fleet serve FILE``, which starts at once."""
-
-    def __init__(self, file: Path, folder: Path) -> None:
-        self._errors = folder.with_suffix(".err")
-        with self._errors.open("w") as errors:
-            self.process = subprocess.Popen(
-                [PROGRAM, "fleet", "serve", file, "--folder", folder],
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                text=True,
-            )
-
-    def wait(self, text: str) -> None:
-        """Wait for a line on stdout that contains ``text``."""
-        assert self.process.stdout
-        timeout = threading.Timer(LONG_S, self.process.kill)
-        timeout.start()
-        try:
-            for line in self.process.stdout:
-                if text in line:
-                    return
-        finally:
-            timeout.cancel()
-        raise AssertionError(f"ended without {text!r}: {self.errors()}")
-
-    def errors(self) -> str:
-        """Return its stderr."""
-        return self._errors.read_text()
-
-    def end(self) -> int:
-        """Send SIGTERM and return the exit code."""
-        self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(LONG_S)
-
-    def close(self) -> None:
-        """Kill the process if it still runs, and close its pipe."""
-        self.process.kill()
-        self.process.wait(LONG_S)
-        assert self.process.stdout
-        self.process.stdout.close()
 
 
 @pytest.fixture(scope="module")
@@ -181,9 +137,29 @@ async def test_tenant_is_added_without_a_restart(serve: tuple[ServeProcess, Path
     assert await count_blocks(folder, context) == 1
 
 
+async def test_metrics_are_those_of_the_present_tenants(serve: tuple[ServeProcess, Path], authority: Authority) -> None:
+    server, folder = serve
+    await send_block(folder, ssl.create_default_context(cafile=str(authority.certificate)))
+
+    async def scrape_until(*lines: str) -> None:
+        address, text = settings_of(folder).server.metrics, ""
+        async with asyncio.timeout(LONG_S), aiohttp.ClientSession() as session:
+            while not all(line in text for line in lines):
+                async with session.get(f"http://{address}/metrics") as response:
+                    text = await response.text()
+
+    await scrape_until('bms_fleet_unowned_partitions{tenant="acme"} 1.0', 'bms_fleet_mqtt_sessions{tenant="acme"}')
+    with (folder / "fleet.toml").open("a") as file:
+        file.write("[tenants.latest]\n")
+    server.process.send_signal(signal.SIGHUP)
+    await scrape_until('bms_fleet_unowned_partitions{tenant="latest"} 0.0', 'bms_fleet_unsaved_ratio{tenant="acme"}')
+
+
 def test_second_server_on_the_same_ports_fails_and_sigterm_ends_the_first(serve: tuple[ServeProcess, Path]) -> None:
     server, folder = serve
-    second = ServeProcess(folder / "fleet.toml", folder / "second")
+    without_metrics = [line for line in (folder / "fleet.toml").read_text().splitlines() if "metrics" not in line]
+    (folder / "second.toml").write_text("\n".join(without_metrics))
+    second = ServeProcess(folder / "second.toml", folder / "second")
     try:
         assert second.process.wait(LONG_S) == 1
         assert "address already in use" in second.errors()

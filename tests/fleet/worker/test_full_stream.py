@@ -148,6 +148,7 @@ async def test_heartbeat_warns_when_unsaved_blocks_fill_half_of_the_stream(
         work = asyncio.create_task(worker_module.work(worker_module.Options(cluster.url, "w"), stop))
         async with Heartbeats(nc) as heartbeats:
             await heartbeats.until(lambda last: "w" in last and "no checkpoint includes" in last["w"].trouble)
+            await heartbeats.until(lambda last: last["w"].unsaved_s > 0.0)
         stop.set()
         await work
         await nc.close()

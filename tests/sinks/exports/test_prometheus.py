@@ -1,9 +1,7 @@
 """Prometheus sink: real scrapes, parsed by the library and checked by promtool if installed."""
 
 import asyncio
-import shutil
 import socket
-import subprocess
 import threading
 import urllib.request
 from typing import Any
@@ -17,6 +15,7 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.exports import PrometheusSettings
 from tests.free_port import free_port
 from tests.patience import LONG_S
+from tests.prometheus import PROMTOOL, promtool
 from tests.sinks.snapshots import CELL_SNAPSHOT, SNAPSHOT_WITHOUT_SAMPLES, SOC_LOW_ALARM, STACK_SNAPSHOT, snapshot
 
 pytest.importorskip("prometheus_client", reason="prometheus-client is not installed: pip install prometheus-client")
@@ -29,8 +28,6 @@ from bms_estimator.sinks.exports.prometheus_metrics import (
     LIST_ITEMS,
     name_and_factor,
 )
-
-PROMTOOL = shutil.which("promtool")
 
 
 def snapshot_with_all_values() -> Snapshot:
@@ -85,9 +82,7 @@ async def test_a_scrape_has_the_values_in_base_units() -> None:
     assert "# TYPE bms_energy_out_joules_total counter" in text
     assert "positive on discharge" in text
     if PROMTOOL:
-        command = [PROMTOOL, "check", "metrics"]
-        check = await asyncio.to_thread(subprocess.run, command, input=text, capture_output=True, text=True)
-        assert (check.returncode, check.stderr) == (0, "")
+        assert await asyncio.to_thread(promtool, "check", "metrics", text=text) == (0, "")
 
 
 async def test_unknown_and_stale_values_have_no_metrics() -> None:

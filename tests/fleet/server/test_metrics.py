@@ -1,0 +1,179 @@
+"""Metrics of a real server and worker, read by a real Prometheus with the alert rules, and the queries of the dashboard."""
+
+import asyncio
+import json
+import re
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import nats
+import pytest
+
+from bms_estimator.fleet.metrics.definitions import NODE, TENANT, WORKER
+from tests.command_line import run
+from tests.fleet.serve_process import ServeProcess
+from tests.fleet.workers import PERIOD_S, SAMPLES, Process, block, load_packs, send
+from tests.free_port import free_port
+from tests.patience import LONG_S
+from tests.prometheus import PROMETHEUS, PROMTOOL, Prometheus, promtool
+
+pytest.importorskip("prometheus_client", reason="prometheus-client is not installed: pip install prometheus-client")
+
+from prometheus_client.parser import text_string_to_metric_families
+
+ROOT = Path(__file__).parents[3]
+RULES = ROOT / "deploy" / "prometheus" / "fleet.rules.yml"
+DASHBOARD = json.loads((ROOT / "deploy" / "grafana" / "fleet.json").read_text(encoding="utf-8"))
+BLOCKS = 12
+"""Number of blocks of pack ``p1``: more than an hour, so that a summary is stored."""
+needs_promtool = pytest.mark.skipif(PROMTOOL is None, reason="promtool is not installed (make prometheus)")
+needs_prometheus = pytest.mark.skipif(PROMETHEUS is None, reason="prometheus is not installed (make prometheus)")
+
+
+class Fleet:
+    """Server with metrics and one worker, which has processed the blocks of one pack and a damaged block."""
+
+    def __init__(self, folder: Path) -> None:
+        self.metrics = f"127.0.0.1:{free_port()}"
+        ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
+        self.url = f"nats://{ports['listen']}"
+        settings = "\n".join(f'{name} = "{address}"' for name, address in (ports | {"metrics": self.metrics}).items())
+        file = folder / "fleet.toml"
+        file.write_text(f"[server]\npartitions = 1\noutage_days = 0.1\n{settings}\n")
+        self.server = ServeProcess(file, folder / "state")
+        self.server.wait("streams ready")
+        self.worker = Process(folder, self.url, "w", "--checkpoint-s", 1)
+
+    def scrape(self) -> str:
+        with urllib.request.urlopen(f"http://{self.metrics}/metrics", timeout=LONG_S) as response:
+            return response.read().decode()
+
+    def values(self) -> dict[tuple[str, ...], float]:
+        """Return the values of a scrape by the metric's name and its labels other than ``tenant`` and ``worker``."""
+        return {
+            (
+                sample.name,
+                *(text for label, text in sorted(sample.labels.items()) if label not in {"tenant", "worker"}),
+            ): (sample.value)
+            for family in text_string_to_metric_families(self.scrape())
+            for sample in family.samples
+        }
+
+    def wait(self, condition: Callable[[dict[tuple[str, ...], float]], object]) -> dict[tuple[str, ...], float]:
+        """Wait until the values fulfill a condition, and return them."""
+        deadline = time.monotonic() + LONG_S
+        while not condition(values := self.values()):
+            assert time.monotonic() < deadline, values
+            time.sleep(0.05)
+        return values
+
+    def send(self, *numbers: int, damaged: bytes = b"") -> None:
+        """Send blocks of pack ``p1``, whose last sample arrives now, and then a damaged block."""
+
+        async def publish() -> None:
+            async with await nats.connect(self.url) as nc:
+                await load_packs(nc, ["p1"])
+                for number in numbers:
+                    await send(nc, "p1", block("p1", number, time.time()))
+                if damaged:
+                    await send(nc, "p1", damaged)
+
+        asyncio.run(publish())
+
+    def close(self) -> None:
+        self.worker.kill()
+        self.server.end()
+        self.server.close()
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    fleet = Fleet(tmp_path_factory.mktemp("fleet"))
+    try:
+        fleet.send(*range(1, BLOCKS + 1), damaged=b"a damaged block")
+        fleet.wait(
+            lambda values: (
+                values.get(("bms_fleet_worker_blocks_total",)) == BLOCKS + 1
+                and values.get(("bms_fleet_stream_messages", "DEAD")) == 1
+                and ("bms_fleet_worker_checkpoint_duration_seconds",) in values
+                and values["bms_fleet_worker_unsaved_seconds",] == 0.0
+            )
+        )
+        yield fleet
+    finally:
+        fleet.close()
+
+
+@pytest.fixture(scope="module")
+def prometheus(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Prometheus]:
+    """Start a server with the alert rules, which fire as soon as their condition is true."""
+    rules = re.sub(r"(?m)^( *for:) .*", r"\1 0s", RULES.read_text())
+    with Prometheus(tmp_path_factory.mktemp("prometheus"), fleet.metrics, rules) as prometheus:
+        prometheus.wait("bms_fleet_worker_blocks_total")
+        yield prometheus
+
+
+def test_a_scrape_has_a_value_of_every_metric(fleet: Fleet) -> None:
+    values = fleet.values()
+    assert {each.name for each in (*NODE, *TENANT, *WORKER)} <= {name for name, *_ in values}
+    assert values["bms_fleet_server_up",] == 1.0
+    assert values["bms_fleet_workers",] == 1.0
+    assert values["bms_fleet_unowned_partitions",] == 0.0
+    assert values["bms_fleet_worker_packs",] == 1.0
+    assert values["bms_fleet_worker_samples_total",] >= BLOCKS * SAMPLES
+    assert values["bms_fleet_worker_events_total", "damaged"] == 1.0
+    assert values["bms_fleet_worker_dead_letters_total",] == 1.0
+    assert values["bms_fleet_stream_messages", "RAW"] == BLOCKS + 1
+    assert values["bms_fleet_stream_messages", "HOURS"] == BLOCKS * SAMPLES * PERIOD_S // 3600.0
+    assert 0.0 < values["bms_fleet_stream_bytes", "RAW"] < values["bms_fleet_stream_max_bytes", "RAW"]
+    assert 0.0 < values["bms_fleet_worker_estimation_seconds_total",] < values["bms_fleet_worker_cpu_seconds_total",]
+    assert 0.0 < values["bms_fleet_disk_free_bytes",] < values["bms_fleet_disk_bytes",]
+
+
+@needs_promtool
+def test_promtool_accepts_metrics_and_rules(fleet: Fleet) -> None:
+    assert promtool("check", "metrics", text=fleet.scrape()) == (0, "")
+    assert promtool("check", "rules", RULES)[0] == 0
+    code, output = promtool("test", "rules", ROOT / "tests" / "deploy" / "fleet.rules.test.yml")
+    assert code == 0, output
+
+
+def test_every_alert_rule_has_a_unit_test() -> None:
+    alerts = re.findall(r"alert: (\w+)", RULES.read_text())
+    tests = (ROOT / "tests" / "deploy" / "fleet.rules.test.yml").read_text()
+    assert len(alerts) >= 5
+    assert [alert for alert in alerts if f'alertname="{alert}"' not in tests] == []
+
+
+def test_rules_and_dashboard_use_only_existing_metrics() -> None:
+    names = {each.name for each in (*NODE, *TENANT, *WORKER)}
+    expressions = [target["expr"] for panel in DASHBOARD["panels"] for target in panel["targets"]]
+    used = set(re.findall(r"bms_fleet_\w+", " ".join([*expressions, *re.findall(r"expr: (.*)", RULES.read_text())])))
+    assert used <= names
+
+
+@needs_prometheus
+def test_every_query_of_the_dashboard_has_a_result(prometheus: Prometheus) -> None:
+    for panel in DASHBOARD["panels"]:
+        for target in panel["targets"]:
+            # Grafana replaces these variables
+            prometheus.wait(target["expr"].replace("$tenant", ".*").replace("$__rate_interval", "1m"))
+
+
+@needs_prometheus
+def test_alert_fires_when_the_worker_is_killed_and_its_pack_sends(fleet: Fleet, prometheus: Prometheus) -> None:
+    alert = 'ALERTS{alertname="FleetPartitionsWithoutWorker", alertstate="firing"}'
+    dead_letters = 'ALERTS{alertname="FleetPacksNeedRepair", alertstate="firing", stream="DEAD"}'
+    prometheus.wait(dead_letters)
+    assert prometheus.query(alert) == []
+    fleet.worker.kill()
+    fleet.send(BLOCKS + 1)
+    assert len(prometheus.wait(alert)) == 1
+    assert fleet.values()["bms_fleet_undelivered_messages",] == 1.0
+
+
+def test_occupied_address_is_an_error(fleet: Fleet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, "fleet", "serve", "--metrics", fleet.metrics, "--folder", tmp_path)
+    assert (code, err) == (2, f"error: server.metrics = {fleet.metrics}: Address already in use\n")
