@@ -11,6 +11,7 @@ from mkdocs.structure.files import File, Files
 
 from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
 from bms_estimator.cli.main import COMMANDS
+from bms_estimator.fleet.metrics import definitions as fleet_definitions
 from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.forecast import ForecastReport
@@ -37,7 +38,13 @@ PAYLOADS: dict[str, type[Payload]] = {
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages to the site."""
     tables = ["# The thesis\n"] if "WITHOUT_THESIS" in os.environ else thesis_tables()  # half a minute
-    pages = {"settings": settings(), "commands": commands(), "payloads": payloads(), "thesis-tables": tables}
+    pages = {
+        "settings": settings(),
+        "commands": commands(),
+        "payloads": payloads(),
+        "fleet-metrics": fleet_metrics(),
+        "thesis-tables": tables,
+    }
     for name, lines in pages.items():
         files.append(File.generated(config, f"reference/{name}.md", content="\n".join(lines) + "\n"))
     return files
@@ -117,6 +124,22 @@ def command(title: str, target: object, summary: str) -> Iterator[str]:
             names = ", ".join(f"`{each}`" for each in (*option.opts, *option.secondary_opts))
             yield row([names, getattr(option, "help", "") or ""])
         yield ""
+
+
+def fleet_metrics() -> Iterator[str]:
+    """Yield the page of the metrics of a fleet, with their labels and the kinds of events."""
+    yield "# Metrics of a fleet\n\n[Metrics](../fleet/metrics.md) explains where Prometheus reads them.\n"
+    for title, labels, metrics in (
+        ("Node of the server", [], fleet_definitions.NODE),
+        ("Tenant", ["tenant"], fleet_definitions.TENANT),
+        ("Worker, since its start", ["tenant", "worker"], fleet_definitions.WORKER),
+    ):
+        yield f"## {title}\n\n| metric | labels | meaning |\n|---|---|---|"
+        for each in metrics:
+            yield row([f"`{each.name}`", ", ".join([*labels, *([each.label] if each.label else [])]), each.meaning])
+        yield ""
+    yield "## Events\n\nValues of the label `event`:\n\n| event | number of |\n|---|---|"
+    yield from (row([f"`{name}`", meaning]) for name, meaning in fleet_definitions.EVENTS.items())
 
 
 def thesis_tables() -> Iterator[str]:

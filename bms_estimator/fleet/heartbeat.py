@@ -57,10 +57,10 @@ class Heartbeat(BaseModel):
     """Largest lag since the previous heartbeat [s]: time from the arrival of a block's last sample at the edge to the
     processing of the block. None without a block."""
     counters: dict[str, int] = Field(default_factory=dict)
-    """Counters of the partitions by name: resends, gaps, lost blocks, damaged blocks and others."""
+    """Counters of the claimed partitions over all their workers, by name: resends, gaps, lost blocks, damaged blocks and others."""
     events: dict[str, int] = Field(default_factory=dict)
-    """The same counters except blocks, samples and packs, since the worker's start: those of former partitions included,
-    those from before the claim of a partition excluded."""
+    """Numbers of the events that this worker has counted since its start, by name. Unlike ``counters``, they include former
+    partitions, and exclude the time before the claim of a partition."""
     unknown_count: int = 0
     """Number of packs with deferred blocks that are missing in the table of packs."""
     unknown: tuple[str, ...] = ()

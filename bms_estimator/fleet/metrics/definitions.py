@@ -14,6 +14,33 @@ MIB = 1 << 20
 MQTT_SESSIONS_STREAM = "$MQTT_sess"
 """Stream of nats-server with one message for each MQTT session, also of a disconnected client."""
 
+EVENTS = {
+    "resends": "blocks that were already processed, because the edge sent them again",
+    "gaps": "blocks that arrived before an earlier one",
+    "lost_blocks": "blocks that no longer arrive",
+    "former_store": "blocks of a store that the edge has replaced",
+    "damaged": "messages that cannot be decoded",
+    "deferred": "messages that wait for the table of packs or for the pack's share of the CPU",
+    "not_deferred": "messages of unknown packs that were skipped, because too many wait",
+    "misplaced": "rejected blocks that are in the wrong partition",
+    "too_dense": "rejected blocks with too many samples",
+    "failed": "blocks skipped because of an internal error",
+    "lethal": "blocks skipped because workers died in them",
+    "repeated": "messages that the stream delivered again",
+    "dropped_samples": "samples that the estimator rejected",
+    "time_steps_back": "samples whose time decreased",
+    "no_time": "samples with an implausible time",
+    "no_arrival": "blocks with an implausible arrival time",
+    "clock_ahead": "blocks whose edge's clock is ahead",
+    "clock_behind": "blocks whose edge's clock is behind",
+    "table_changes": "changed rows of the table of packs",
+    "taken_over": "packs whose state was adapted to other settings or another version",
+    "not_taken_over": "packs whose estimator began again, because its state did not fit",
+    "begun_anew": "packs whose state was dropped, because their settings changed",
+    "damaged_states": "states that could not be restored",
+}
+"""Meaning of the events that ``bms_fleet_worker_events_total`` counts."""
+
 
 class Definition(NamedTuple, Generic[S]):
     """Metric of a state of type ``S``."""

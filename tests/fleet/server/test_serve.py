@@ -152,6 +152,7 @@ async def test_metrics_are_those_of_the_present_tenants(serve: tuple[ServeProces
     with (folder / "fleet.toml").open("a") as file:
         file.write("[tenants.latest]\n")
     server.process.send_signal(signal.SIGHUP)
+    await asyncio.to_thread(server.wait, "tenant latest: streams ready")
     await scrape_until('bms_fleet_unowned_partitions{tenant="latest"} 0.0', 'bms_fleet_unsaved_ratio{tenant="acme"}')
 
 
