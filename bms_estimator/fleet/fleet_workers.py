@@ -70,11 +70,6 @@ class FleetWorkers:
         errors = {pack: error_s for heartbeat in heartbeats for pack, error_s in heartbeat.clock_errors.items()}
         return sum(heartbeat.clock_error_count for heartbeat in heartbeats), errors
 
-    def dead_packs(self, now_s: float) -> dict[str, str]:
-        """Return the reason of the last dead letter of some packs."""
-        alive = self._alive(now_s)
-        return {pack: reason for name in sorted(alive) for pack, reason in alive[name][-1].heartbeat.dead_packs.items()}
-
     def overview(self, now_s: float) -> dict[str, Any]:
         """Return an overview of the workers.
 

@@ -51,8 +51,6 @@ class Heartbeat(BaseModel):
     """Blocks skipped because of an internal error since the worker's start; the log has the tracebacks."""
     dead_letters: int = 0
     """Number of blocks that became dead letters since the worker's start (``nats.dead_letters``)."""
-    dead_packs: dict[str, str] = Field(default_factory=dict)
-    """Reason of the last dead letter of some packs in the claimed partitions, since the worker claimed them."""
     lag_s: float | None = None
     """Largest lag since the previous heartbeat [s]: time from the arrival of a block's last sample at the edge to the
     processing of the block. None without a block."""

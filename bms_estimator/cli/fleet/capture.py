@@ -10,6 +10,7 @@ import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.cli.options.capture_options import Force, check_output_file
+from bms_estimator.cli.options.counted import counted
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.sinks.trace_file import table_sink
@@ -73,7 +74,9 @@ def capture(
             sink.write(block)
             rows += block.size
     first_s, last_s = fetched.span_s
-    typer.echo(f"{out}: {rows} samples in {fetched.blocks} blocks of {pack}, {iso_utc(first_s)} to {iso_utc(last_s)}")
+    typer.echo(
+        f"{out}: {counted(rows, 'sample')} in {counted(fetched.blocks, 'block')} of {pack}, {iso_utc(first_s)} to {iso_utc(last_s)}"
+    )
     for line in _warnings(fetched, since_s):
         typer.echo(f"warning: {pack}: {line}", err=True)
 
@@ -112,9 +115,8 @@ def _warnings(fetched: "BlockCapture", since_s: float) -> list[str]:
         lines.append(f"the stored samples begin at {iso_utc(first_s)}, after the requested {iso_utc(since_s)}")
     if fetched.missing:
         gaps = ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in fetched.missing[:MAX_SHOWN_GAPS])
-        more = (
-            f" and {len(fetched.missing) - MAX_SHOWN_GAPS} more gaps" if len(fetched.missing) > MAX_SHOWN_GAPS else ""
-        )
+        more_count = len(fetched.missing) - MAX_SHOWN_GAPS
+        more = f" and {counted(more_count, 'more gap')}" if more_count > 0 else ""
         lines.append(f"missing blocks: {gaps}{more}; they are lost, or the edge has yet to send them again")
     if fetched.damaged:
         lines.append(f"damaged messages, which were skipped: {fetched.damaged}")

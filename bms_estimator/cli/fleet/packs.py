@@ -10,6 +10,7 @@ import tomlkit
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.options.counted import counted
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.csv_table import CELL_FILE_SUFFIX, PackTable, check_models, read_table, table_lines
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
@@ -178,10 +179,11 @@ async def _load(path: Path, table: PackTable, files: dict[str, str], address: Se
         "unchanged": packs.same,
         "removed": packs.removed,
         "not in the table (--remove removes them)": packs.left,
-        "cell files written": cells.new + cells.changed,
     }
-    changes = ", ".join(f"{count} {change}" for change, count in counts.items() if count)
-    return f"{path}: {len(rows)} packs of {spec_count} kinds: {changes}"
+    changes = [f"{count} {change}" for change, count in counts.items() if count]
+    if written := cells.new + cells.changed:
+        changes.append(f"{counted(written, 'cell file')} written")
+    return f"{path}: {counted(len(rows), 'pack')} of {counted(spec_count, 'kind')}: {', '.join(changes)}"
 
 
 def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> None:
@@ -197,7 +199,7 @@ def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> Non
         with only_collector(folder):  # before anything is erased
             _print_erasures(asyncio.run(_erase_from_server(packs, address)))
             try:
-                typer.echo(f"{folder}: {erase_rows(folder, packs)} rows erased")
+                typer.echo(f"{folder}: {counted(erase_rows(folder, packs), 'row')} erased")
             except OSError as error:
                 raise UserError(f"--folder {folder}: cannot be written, repeat the command: {error.strerror}") from None
     remaining = ["their names in the table of packs, as marks of their removal"]
@@ -224,12 +226,13 @@ async def _erase_from_server(packs: list[str], address: ServerAddress) -> "dict[
 def _print_erasures(erasures: "dict[str, Erasure]") -> None:
     for pack, erasure in erasures.items():
         typer.echo(
-            f"{pack}: {erasure.blocks} blocks, {erasure.dead_letters} dead letters, {erasure.hours} hourly summaries and "
-            f"the state in {erasure.checkpoints} checkpoints erased"
+            f"{pack}: {counted(erasure.blocks, 'block')}, {counted(erasure.dead_letters, 'dead letter')}, "
+            f"{counted(erasure.hours, 'hourly summary', 'hourly summaries')} and "
+            f"the state in {counted(erasure.checkpoints, 'checkpoint')} erased"
         )
         for stream, count in erasure.remaining.items():
             if stream != f"KV_{PACKS_BUCKET}":
-                typer.echo(f"{pack}: {count} messages remain in the stream {stream}")
+                typer.echo(f"{pack}: remaining messages in the stream {stream}: {count}")
 
 
 async def _remove(packs: set[str], address: ServerAddress) -> None:

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.options.counted import counted
 from bms_estimator.cli.options.table import print_table
 
 if TYPE_CHECKING:
     from bms_estimator.fleet.heartbeat import Heartbeat
+    from bms_estimator.fleet.nats.dead_packs import DeadPacks
 
 COLUMNS = ("worker", "version", "partitions", "packs", "lag s", "checkpoint formats", "block version")
 
@@ -30,11 +32,13 @@ def status(
 ) -> None:
     """List the workers with their versions, the partitions that they refuse, packs with dead letters or a wrong clock, and a warning if blocks fill the server that no checkpoint includes."""
     heartbeats = asyncio.run(_receive_heartbeats((server, creds, ca)))
-    warning = asyncio.run(_unsaved_warning((server, creds, ca)))
+    warning, dead_packs = asyncio.run(_read_streams((server, creds, ca)))
     print_table(COLUMNS, [_row(each) for each in heartbeats])
     for heartbeat in heartbeats:
-        for line in (*_refusals(heartbeat), *_dead_letters(heartbeat), *_clock_errors(heartbeat)):
+        for line in (*_refusals(heartbeat), *_clock_errors(heartbeat)):
             typer.echo(line)
+    for line in _dead_letters(dead_packs):
+        typer.echo(line)
     if not heartbeats:
         typer.echo("no worker")
     if warning:
@@ -52,12 +56,13 @@ def _refusals(heartbeat: "Heartbeat") -> list[str]:
     ]
 
 
-def _dead_letters(heartbeat: "Heartbeat") -> list[str]:
+def _dead_letters(dead_packs: "DeadPacks") -> list[str]:
     """Return a line for each listed pack with dead letters."""
-    return [
-        f"{pack}: dead letter: {reason}; `fleet dead-letters list` lists all"
-        for pack, reason in sorted(heartbeat.dead_packs.items())
+    lines = [
+        f"{pack}: dead letter: {reason}; `fleet dead-letters list` lists all" for pack, reason in dead_packs.reasons
     ]
+    more = dead_packs.packs - len(lines)
+    return [*lines, f"{counted(more, 'more pack')} with dead letters"] if more else lines
 
 
 def _clock_errors(heartbeat: "Heartbeat") -> list[str]:
@@ -69,7 +74,7 @@ def _clock_errors(heartbeat: "Heartbeat") -> list[str]:
         for pack, error_s in largest
     ]
     more = heartbeat.clock_error_count - len(largest)
-    return [*lines, f"{heartbeat.id}: {more} more packs with a wrong clock"] if more > 0 else lines
+    return [*lines, f"{heartbeat.id}: {counted(more, 'more pack')} with a wrong clock"] if more > 0 else lines
 
 
 def _row(heartbeat: "Heartbeat") -> tuple[object, ...]:
@@ -95,15 +100,17 @@ def _check_block_version(heartbeats: "list[Heartbeat]", version: int) -> None:
     typer.echo(f"all workers read blocks of version {version}: edges that send them can start")
 
 
-async def _unsaved_warning(address: ServerAddress) -> str:
-    """Return a warning if the stream is more than half full of blocks that no checkpoint includes."""
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
+async def _read_streams(address: ServerAddress) -> "tuple[str, DeadPacks]":
+    """Return a warning if the stream is more than half full of blocks that no checkpoint includes, and packs with dead letters."""
+    from bms_estimator.fleet.nats.dead_packs import DeadPackReader  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
     from bms_estimator.fleet.nats.streams import partitions_of  # noqa: PLC0415
     from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning  # noqa: PLC0415
 
     async with connected(*address) as nc:
         partitions = await partitions_of(nc)
-        return unsaved_warning(await unsaved_share(nc, range(partitions))) if partitions is not None else ""
+        warning = unsaved_warning(await unsaved_share(nc, range(partitions))) if partitions is not None else ""
+        return warning, await DeadPackReader(nc).read()
 
 
 async def _receive_heartbeats(address: ServerAddress) -> "list[Heartbeat]":

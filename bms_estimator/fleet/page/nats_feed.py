@@ -1,4 +1,4 @@
-"""Feed of the fleet's page: states, parameters, hours, heartbeats, unknown packs, and the table of packs."""
+"""Feed of the fleet's page: states, parameters, hours, heartbeats, unknown packs, dead letters, and the table of packs."""
 
 import asyncio
 import time
@@ -14,6 +14,7 @@ from nats.aio.msg import Msg
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.connection import check_credentials_file, close, connect, tls_context
+from bms_estimator.fleet.nats.dead_packs import DeadPackReader
 from bms_estimator.fleet.nats.stream_reader import StreamError, read_stream
 from bms_estimator.fleet.nats.streams import partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
@@ -23,7 +24,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.tasks import end
 
 TABLE_S = 2.0
-"""Poll interval for changes of the table of packs, and retry interval [s]."""
+"""Poll interval for changes of the table of packs and of the dead letters, and retry interval [s]."""
 HOURS_S = 3900.0
 """Maximum age of hourly summaries that are read at the start [s]: an hour, and five minutes of delay."""
 MAX_BYTES = 1 << 16
@@ -140,14 +141,15 @@ class FleetFeed:
         }
 
     async def _follow_table(self, nc: Client) -> None:
-        """Follow the table of packs, and set the types of its packs."""
-        bucket, view = PackBucket(nc), self._view
+        """Follow the table of packs and the dead letters."""
+        bucket, dead_packs, view = PackBucket(nc), DeadPackReader(nc), self._view
 
         async def refresh() -> None:
             view.workers.partitions = await partitions_of(nc) or view.workers.partitions
             for pack in await bucket.refresh():
                 spec = bucket.packs.parsed_row(pack)
                 view.set_type(pack, None if spec is None else type_name(spec))
+            view.dead_packs = await dead_packs.read()
 
         while True:
             await self._retry(refresh)

@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from bms_estimator.fleet.fleet_workers import RATE_S, FleetWorkers
 from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.nats.dead_packs import DeadPacks
 from bms_estimator.fleet.page.packs import MAX_LISTED, FleetPacks
 from bms_estimator.model.clock import iso_utc
 
@@ -25,6 +26,8 @@ class FleetView:
 
     def __init__(self, partitions: int, now_s: float) -> None:
         self.packs, self.workers = FleetPacks(), FleetWorkers(partitions)
+        self.dead_packs = DeadPacks()
+        """Packs with dead letters."""
         self._unknown: dict[str, str] = {}
         self._since_s = now_s
         self._state_counts = deque([(now_s, 0)])
@@ -71,9 +74,8 @@ class FleetView:
         result = self.packs.overview(now_s, self._since_s) | self.workers.overview(now_s)
         result["concerns"]["unknown"] = unknown = self._unknown_packs(now_s)
         result["concerns"]["clock"] = clock = self._packs_with_clock_error(now_s)
-        dead = self.workers.dead_packs(now_s)
-        result["concerns"]["dead"] = {"count": len(dead), "packs": sorted(dead.items())[:MAX_LISTED]}
-        result["attention"] += unknown["count"] + clock["count"] + len(dead)
+        result["concerns"]["dead"] = {"count": self.dead_packs.packs, "packs": self.dead_packs.reasons[:MAX_LISTED]}
+        result["attention"] += unknown["count"] + clock["count"] + self.dead_packs.packs
         return result | {
             "time": iso_utc(wall_s),
             "listening_s": round(now_s - self._since_s, 1),

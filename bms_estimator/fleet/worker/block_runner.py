@@ -36,7 +36,6 @@ class BlockRunner:
         blocks, samples: Number of processed blocks and samples.
         faults: Number of blocks skipped because of an internal error.
         dead_letters: Number of dead letters.
-        dead_packs: Reason of the last dead letter of each pack, since the claim.
         lag_s: Largest lag since it was last reset to None [s].
     """
 
@@ -54,7 +53,6 @@ class BlockRunner:
         self._guard, self._results, self._changes, self._save = guard, results, changes, save
         self.budget = CpuBudget()
         self.blocks = self.samples = self.faults = self.dead_letters = 0
-        self.dead_packs: dict[str, str] = {}
         self.lag_s: float | None = None
 
     async def run(self, pack: str, data: bytes, sequence: int, take: Callable[..., BlockResult]) -> BlockResult:
@@ -110,5 +108,4 @@ class BlockRunner:
 
     def _add_dead_letter(self, letter: DeadLetter) -> None:
         self.dead_letters += 1
-        self.dead_packs[letter.pack] = letter.reason
         self._results.queue_dead_letter(letter)

@@ -15,7 +15,7 @@ from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.version import __version__
 
 MAX_LISTED = 20
-"""Maximum number of packs of each kind that a heartbeat names: unknown packs, packs with dead letters or a wrong clock."""
+"""Maximum number of packs of each kind that a heartbeat names: unknown packs, packs with a wrong clock."""
 
 
 class HeartbeatReport:
@@ -62,7 +62,6 @@ class HeartbeatReport:
                 counters.update(lease.partition.counters)
                 unknown += lease.partition.unknown
                 clock_errors |= lease.partition.clock_errors
-        dead_packs = {pack: reason for lease in owned_leases for pack, reason in lease.runner.dead_packs.items()}
         usage = resource.getrusage(resource.RUSAGE_SELF)
         return Heartbeat(
             id=self._name,
@@ -77,7 +76,6 @@ class HeartbeatReport:
             packs=counters["packs"],
             **self.totals.processed(),
             events=self.totals.events(),
-            dead_packs=dict(list(dead_packs.items())[-MAX_LISTED:]),
             lag_s=_take_lag_s(owned_leases),
             counters=dict(counters),
             unknown_count=len(unknown),

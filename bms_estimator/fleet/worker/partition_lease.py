@@ -413,7 +413,6 @@ class PartitionLease:
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
         self.partition = self.claim = None
         self._pin, self._is_gapless = 0, False
-        self.runner.dead_packs.clear()  # the claim may be that of an erasure, which also removes packs from the memory
         self.results.clear()  # the owner of the partition computes them from the last checkpoint on
 
     def _refuse(self, error: UnreadableFormatError) -> None:

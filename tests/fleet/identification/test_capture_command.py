@@ -59,7 +59,7 @@ def test_time_span_is_limited_and_missing_samples_are_reported(cluster, tmp_path
     last = datetime.fromtimestamp(STORE_ID_NS * 1e-9 + 100.0, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     arguments = ["fleet", "capture", "house", out, "--from", first, "--to", last, "--server", cluster.url]
     code, stdout, err = run(capsys, *arguments)
-    assert (code, stdout.startswith(f"{out}: 40 samples in 1 blocks of house")) == (0, True)
+    assert (code, stdout.startswith(f"{out}: 40 samples in 1 block of house")) == (0, True)
     assert "the stored samples begin at 2023-11-14T22:14:20.000Z" in err
     code, _, err = run(capsys, "fleet", "capture", "nobody", tmp_path / "no.csv", "--server", cluster.url)
     assert (code, "nobody: the server has no samples of this pack in this period" in err) == (2, True)

@@ -60,7 +60,7 @@ def test_rows_are_removed_with_option_remove_or_by_name(url, table, capsys):
     smaller_table = table.with_name("smaller_table.csv")
     smaller_table.write_text("pack,cell\nshed,ncr18650\n")
     out = run(capsys, "fleet", "packs", "load", smaller_table, "--server", url)[1]
-    assert out == f"{smaller_table}: 1 packs of 1 kinds: 1 new, 2 not in the table (--remove removes them)\n"
+    assert out == f"{smaller_table}: 1 pack of 1 kind: 1 new, 2 not in the table (--remove removes them)\n"
     assert run(capsys, "fleet", "packs", "load", smaller_table, "--remove", "--server", url)[1].endswith(
         "1 unchanged, 2 removed\n"
     )

@@ -57,7 +57,7 @@ async def test_dead_letters_and_table_changes_of_the_pack_are_erased(nc, cluster
         await nc.jetstream().publish(subjects.table_change(pack), encode_change(None))
     code, out, err = await erase(capsys, cluster, "p1")
     assert (code, err) == (0, "")
-    assert "1 dead letters" in out
+    assert "1 dead letter," in out
     assert "remain in the stream" not in out
     assert [letter.pack for letter in await read_dead_letters(nc)] == ["p2"]
     remaining = (await nc.jetstream().stream_info(subjects.RAW_STREAM, subjects_filter=">")).state.subjects

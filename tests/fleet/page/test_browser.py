@@ -18,9 +18,10 @@ from playwright.async_api import Browser
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import RefusedPartition
+from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters, replay_letter
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
-from bms_estimator.fleet.page import packs
+from bms_estimator.fleet.page import nats_feed, packs
 from bms_estimator.fleet.page.fleet_page import FILES, STATIC, fleet_page
 from bms_estimator.fleet.page.nats_feed import FleetFeed, Server
 from bms_estimator.fleet.page.view import FleetView
@@ -101,6 +102,7 @@ async def fleet(cluster: NatsCluster, hours: Path) -> AsyncIterator[Fleet]:
     nc = await connected(cluster.url)
     await make_streams(nc, partitions=PARTITIONS)
     await load(nc, [*PACKS, LISTED_ONLY])
+    await store_dead_letter(nc, "home-1")
     settings = PageSettings(listen="127.0.0.1:0")
     async with fleet_page(Server(cluster.url), settings, hours, step_s=STEP_S) as url:
         publisher_task = asyncio.create_task(work(nc))
@@ -110,6 +112,11 @@ async def fleet(cluster: NatsCluster, hours: Path) -> AsyncIterator[Fleet]:
         publisher_task.cancel()
         await asyncio.gather(publisher_task, return_exceptions=True)
     await nc.close()
+
+
+async def store_dead_letter(nc: Client, pack: str) -> None:
+    letter = DeadLetter(pack, 1, "version 2", "beta", b"a block")
+    await nc.jetstream().publish(letter.subject, letter.data, headers=letter.headers())
 
 
 async def work(nc: Client) -> None:
@@ -129,7 +136,6 @@ async def work(nc: Client) -> None:
                 lag_s=0.1,
                 trouble="no checkpoint",
                 refused=(RefusedPartition(partition=PARTITIONS - 1, format=3),),
-                dead_packs={"home-1": "version 2"},
             )
             for pack in PACKS:
                 await publish(nc, pack.name, pack.state)
@@ -387,3 +393,22 @@ async def test_hour_rows_published_before_the_start_of_the_page_are_read(fleet: 
             await asyncio.sleep(0.01)
     overview = view.overview(0.0, 0.0)
     assert ["early-1", "ocv"] in overview["concerns"]["suspects"]["packs"]
+
+
+@in_module
+async def test_pack_has_a_dead_letter_on_the_page_until_it_is_replayed(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nats_feed, "TABLE_S", 0.05)
+    view = FleetView(1, 0.0)
+    connection = await nats.connect(fleet.cluster.url)
+    await store_dead_letter(connection, "van-1")
+    async with FleetFeed(Server(fleet.cluster.url), view, lambda _: None), asyncio.timeout(LONG_S):
+        for names in (["home-1", "van-1"], ["home-1"]):
+            while [pack for pack, _ in view.dead_packs.reasons] != names:  # noqa: ASYNC110 - the view has no notifications
+                await asyncio.sleep(0.01)
+            assert view.dead_packs.packs == len(names)
+            for letter in await read_dead_letters(connection):
+                if letter.pack == "van-1":
+                    await replay_letter(connection, letter)
+    await connection.close()

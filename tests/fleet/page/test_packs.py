@@ -6,6 +6,7 @@ import pytest
 
 from bms_estimator.fleet.fleet_workers import FleetWorkers
 from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.nats.dead_packs import DeadPacks
 from bms_estimator.fleet.page.nats_feed import type_name
 from bms_estimator.fleet.page.packs import ALIVE_S, MAX_LISTED, OTHER, UNLISTED, FleetPacks
 from bms_estimator.fleet.page.view import FleetView
@@ -183,13 +184,14 @@ def test_partitions_without_a_worker_or_with_two_are_found_until_a_worker_is_dea
 def test_partitions_that_all_workers_refuse_and_packs_with_dead_letters_are_named():
     view = FleetView(2, 0.0)
     refused = [{"partition": number, "format": 3} for number in range(2)]
-    old = heartbeat("old", refused=refused, dead_packs={"x": "version 2"})
+    old = heartbeat("old", refused=refused)
+    view.dead_packs = DeadPacks(2, (("x", "version 2"),))
     view.receive_worker(old.model_dump_json().encode(), 0.0)
     overview = view.overview(1.0, 0.0)
     assert overview["refused"] == [0, 1]
     assert overview["workers"][0]["refused"] == [[0, 3], [1, 3]]
-    assert overview["concerns"]["dead"] == {"count": 1, "packs": [("x", "version 2")]}
-    assert overview["attention"] == 1
+    assert overview["concerns"]["dead"] == {"count": 2, "packs": (("x", "version 2"),)}
+    assert overview["attention"] == 2
     view.receive_worker(heartbeat("later", 0).model_dump_json().encode(), 1.0)
     assert view.overview(2.0, 0.0)["refused"] == [1]
 
