@@ -11,7 +11,7 @@ take over."""
 LISTED_S = 300.0
 """Time for which a lost worker stays listed [s]."""
 RATE_S = 10.0
-"""Averaging time of rates [s]."""
+"""Default averaging time of rates [s]."""
 MAX_WORKERS = 256
 """Maximum number of workers. Heartbeats of further workers are ignored."""
 NO_WORKER = -1
@@ -30,10 +30,11 @@ class FleetWorkers:
 
     Args:
         partitions: Number of partitions.
+        window_s: Time over which rates are averaged and the largest lag is found [s].
     """
 
-    def __init__(self, partitions: int) -> None:
-        self.partitions = partitions
+    def __init__(self, partitions: int, window_s: float = RATE_S) -> None:
+        self.partitions, self._window_s = partitions, window_s
         self._by_worker: dict[str, deque[_Received]] = {}
 
     def receive(self, heartbeat: Heartbeat, now_s: float) -> None:
@@ -44,7 +45,7 @@ class FleetWorkers:
         if received and heartbeat.blocks < received[-1].heartbeat.blocks:
             received.clear()  # the worker has restarted
         received.append(_Received(now_s, heartbeat))
-        while received[0].at_s < now_s - RATE_S:
+        while received[0].at_s < now_s - self._window_s:
             received.popleft()
 
     def clear(self) -> None:

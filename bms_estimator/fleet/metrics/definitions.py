@@ -148,7 +148,7 @@ WORKER: tuple[Definition[Heartbeat], ...] = (
     Definition("bms_fleet_worker_events_total", "Events by kind", lambda h: h.events, "event"),
     Definition(
         "bms_fleet_worker_lag_seconds",
-        "Largest time from the last sample of a block to its estimate, over the last 10 s",
+        "Largest time from the last sample of a block to its estimate, in the last minute",
         lambda h: h.lag_s,
     ),
     Definition(

@@ -24,6 +24,8 @@ from bms_estimator.fleet.server.nats_config import Node
 
 UNSAVED_S = 60.0
 """Interval between two checks how much of the stream is unsaved [s]."""
+LAG_S = 60.0
+"""Time over which the largest lag is found [s], at least the usual interval of scrapes."""
 RETRY_S = 1.0
 """Delay before the next connection [s]."""
 
@@ -41,7 +43,7 @@ class TenantWatch:
 
     def __init__(self, name: str, node: Node, credentials_file: Path | None) -> None:
         self._name, self._node, self._credentials_file = name, node, credentials_file
-        self._workers = FleetWorkers(node.partitions)
+        self._workers = FleetWorkers(node.partitions, LAG_S)
         self._nc: Client | None = None
         self._unsaved_share: float | None = None
 
