@@ -23,6 +23,12 @@ COMMANDS = {
     "dead-letters": LazyCommand(
         "bms_estimator.cli.fleet.dead_letters:app", "List or replay blocks that workers could not process."
     ),
+    "backup": LazyCommand(
+        "bms_estimator.cli.fleet.backup:backup", "Write a backup of a tenant's streams while they are in use."
+    ),
+    "restore": LazyCommand(
+        "bms_estimator.cli.fleet.backup:restore", "Restore a tenant's streams from a backup on a new server."
+    ),
     "packs": LazyCommand("bms_estimator.cli.fleet.packs:app", "Upload, list, show or remove the settings of packs."),
     "capture": LazyCommand(
         "bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a CSV or Parquet file."
