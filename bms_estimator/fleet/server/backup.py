@@ -147,7 +147,7 @@ def _check_fit(backup: BackupList, configs: dict[str, dict[str, Any]]) -> None:
     """Check that the streams of a backup can be restored with the configurations of the new server.
 
     Raises:
-        UserError: They have another number of partitions, or are larger.
+        UserError: They have another number of partitions, more replicas, or are larger.
     """
     partitions = _partitions(configs[subjects.RAW_STREAM])
     if backup.partitions != partitions:
@@ -156,6 +156,11 @@ def _check_fit(backup: BackupList, configs: dict[str, dict[str, Any]]) -> None:
             f"set server.partitions = {backup.partitions}, and start the server with an empty folder"
         )
     for name, snapshot in backup.streams.items():
+        replicas, server_replicas = (int(config["num_replicas"]) for config in (snapshot.config, configs[name]))
+        if replicas > server_replicas:  # the server would reject the consumers of the backup
+            raise UserError(
+                f"{name}: the backup has {replicas} copies, the server {server_replicas}: restore it on three nodes"
+            )
         limit = configs[name].get("max_bytes", -1)
         if 0 < limit < snapshot.state["bytes"]:
             raise UserError(

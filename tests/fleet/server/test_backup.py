@@ -211,9 +211,10 @@ def damage_snapshot(backup: Path) -> None:
     file.write_bytes(data)
 
 
-def grow_stream(backup: Path) -> None:
+def edit_raw(backup: Path, part: str, **fields: object) -> None:
+    """Change fields of the configuration or of the state of ``RAW``."""
     streams = json.loads((backup / "backup.json").read_text())["streams"]
-    streams["RAW"]["state"]["bytes"] = 1 << 60
+    streams["RAW"][part] |= fields
     edit_list(backup, streams=streams)
 
 
@@ -226,7 +227,8 @@ def grow_stream(backup: Path) -> None:
         (lambda backup: (backup / "backup.json").unlink(), "no complete backup, because backup.json is missing"),
         (lambda backup: edit_list(backup, version=2), "backup.json: version: Input should be 1"),
         (lambda backup: edit_list(backup, partitions=8), "the backup has 8 partitions, the server 2"),
-        (grow_stream, "RAW: the backup has 1,152,921,504,606,846,976 bytes, the server's limit is"),
+        (lambda backup: edit_raw(backup, "config", num_replicas=3), "RAW: the backup has 3 copies, the server 1"),
+        (lambda backup: edit_raw(backup, "state", bytes=10**18), "RAW: the backup has 1,000,000,000,000,000,000 bytes"),
     ],
 )
 def test_invalid_backup_is_refused_and_the_server_is_unchanged(
