@@ -78,7 +78,7 @@ class CellDeviations:
 
 
 class CellEstimator:
-    """Estimators of all cells of one pack. They start with the first sample that has all cell voltages.
+    """Estimators of all cells of one pack. They start with the first sample that has a cell voltage.
 
     Args:
         estimator: Estimator of the pack; read only. Without its identifier there is no estimate of the cells.
@@ -101,6 +101,23 @@ class CellEstimator:
         self.cells: Records = np.zeros(count, CELL)
         self.bank: Records = np.zeros(1, BANK)
         self._scratch = np.zeros(2 * count + STATES)
+
+    @property
+    def estimated_cells(self) -> int:
+        """Number of cells whose voltages are needed; 0 if this pack has no estimators of single cells."""
+        return self._series if self._enabled else 0
+
+    def use_state(self, cells: Records, bank: Records) -> None:
+        """Continue with the state of another pack of the same type. ``run`` then updates these records.
+
+        Args:
+            cells: Shape (series,), dtype CELL.
+            bank: Shape (1,), dtype BANK.
+        """
+        if cells.size != self.cells.size:
+            self._start(cells.size)
+        self.cells, self.bank = cells, bank
+        self._deviations, self._deviations_window = None, 0
 
     def run(self, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
         """Process a block of samples.

@@ -99,6 +99,21 @@ class Hour(Payload):
         description="mean deviation of each series cell from the mean of the cells while the pack rests [V]; null without "
         "cell voltages or without a rest",
     )
+    weakest_cell_soc_deviation: float | None = Field(
+        default=None,
+        description="SOC of weakest_cell less the mean SOC of the cells; null before an estimate of the single cells, as are the "
+        "following three",
+    )
+    weakest_cell_resistance_ratio: float | None = Field(
+        default=None, description="resistance of weakest_cell relative to the median of the cells"
+    )
+    self_discharge_cell: int | None = Field(
+        default=None, description="number of the series cell with the most significant self-discharge, from 1"
+    )
+    self_discharge_a: float | None = Field(
+        default=None, description="self-discharge current of self_discharge_cell above the median of the cells [A]"
+    )
+    self_discharge_std_a: float | None = Field(default=None, description="standard deviation of self_discharge_a [A]")
     revision: int | None = Field(
         default=None,
         description="stream sequence number of the block that finished the row; of two rows of one hour the one with the "

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import pack_identity
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.charge_limits import NO_LIMITS
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
@@ -36,6 +38,8 @@ class PackType:
         config_digest: Digest of the configuration of the estimator. A state of another digest is migrated.
         state_digest: Digest of the configuration that a state depends on. A state of another digest is reset.
         estimator: Estimator bound to the unpacked record of the partition.
+        cells: Estimators of the single cells. They use the state of the pack whose block is processed.
+        short_limit_a: Minimum proven self-discharge of a cell with an internal short [A].
         meter: Charge and energy meter bound to the unpacked record.
         capacity_ah: Rated capacity of a pack [Ah]; None for a fuel cell.
         cutoff_v: Voltage at which the load of a pack is switched off [V]; NaN for a fuel cell.
@@ -45,6 +49,8 @@ class PackType:
     config_digest: Digest
     state_digest: Digest
     estimator: Estimator
+    cells: CellEstimator
+    short_limit_a: float
     meter: ChargeEnergyMeter
     capacity_ah: float | None
     cutoff_v: float
@@ -119,6 +125,8 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> 
         config_digest=digest,
         state_digest=_digest(bytes.fromhex(pack_identity(settings, cell))),
         estimator=estimator,
+        cells=CellEstimator(estimator),
+        short_limit_a=short_limit_a(settings, cell),
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
         cutoff_v=load_cutoff_v(settings, cell) if isinstance(cell, CellModel) else math.nan,

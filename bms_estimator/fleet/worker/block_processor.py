@@ -17,7 +17,15 @@ from bms_estimator.fleet.packs.pack_type import Digest, PackType
 from bms_estimator.fleet.worker import cell_summary, hour_summary
 from bms_estimator.fleet.worker.density import MAX_TIMESTAMP_S
 from bms_estimator.fleet.worker.edge_clock import Arrival, clock_error_s
-from bms_estimator.fleet.worker.pack_state import CONFIG_DIGEST, LAST_STORE_NS, PACK_STATE, STATE_DIGEST, Fields
+from bms_estimator.fleet.worker.pack_state import (
+    CONFIG_DIGEST,
+    LAST_STORE_NS,
+    PACK_STATE,
+    STATE_DIGEST,
+    Fields,
+    UnpackedRecord,
+)
+from bms_estimator.fleet.worker.single_cells import SingleCells
 from bms_estimator.forecast.capability import write_usable_charge
 from bms_estimator.forecast.forecast import Forecast, unknown_values
 from bms_estimator.model.clock import iso_utc
@@ -38,22 +46,23 @@ NO_PEAK_A = 0.0
 """Peak current for ``write_usable_charge`` [A]. A worker does not store the peaks of the load; with 0, the mean current is used."""
 NO_FORECAST_REASON = "a fleet worker makes no forecasts"
 
-Publications = tuple[bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
-"""Payloads of the topics ``state`` and ``parameters``, and message ids and rows of finished hours."""
+Publications = tuple[bytes | None, bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
+"""Payloads of the topics ``state``, ``parameters`` and ``cells``, and message ids and rows of finished hours."""
 
 
 class BlockProcessor:
     """Processor of blocks, which all packs of a partition share.
 
     Args:
-        record: Record of shape (1,) and dtype ``PACK_STATE``. The caller loads the state of a pack into it before each
-            ``step``.
+        unpacked: Record of dtype ``PACK_STATE``. The caller loads the state of a pack into it before each ``step``.
         counters: Counters of the partition; updated.
         wall: Wall clock for publish times [s since 1970].
     """
 
-    def __init__(self, record: NDArray[np.void], counters: Counter[str], wall: Callable[[], float]) -> None:
+    def __init__(self, unpacked: UnpackedRecord, counters: Counter[str], wall: Callable[[], float]) -> None:
+        record = unpacked.record
         self._record, self._counters, self._wall = record, counters, wall
+        self._single_cells = SingleCells(unpacked)
         self._delivery, self._charge_energy, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
         self._observer = record[0]["estimator"]["observer"]
         self._window = Window()
@@ -72,6 +81,7 @@ class BlockProcessor:
         """
         self._check_times(block.samples)
         self._restore_or_reset(pack_type, unmigrated_fields, block)
+        self._single_cells.begin(pack_type.cells)
         rows, is_new_hour = self._roll_over_hour(pack, block, arrival, pack_type)
         self._check_clock(block, arrival)
         self._resume_after_store_change(pack_type.estimator, block)
@@ -84,7 +94,8 @@ class BlockProcessor:
         parameters = None
         if is_new_hour and state is not None:
             parameters = self._parameters_payload(pack_type.estimator, arrival_s, now_s)
-        return state, parameters, rows
+        cells = self._single_cells.payload(pack_type.short_limit_a, now_s)
+        return state, parameters, None if cells is None else _json(cells), rows
 
     def reset_window(self) -> None:
         """Drop the samples of a failed block from the publish window."""
@@ -104,7 +115,9 @@ class BlockProcessor:
             record["estimator"] = np.zeros((), PACK_STATE["estimator"])
             # the observer's state also depends on settings outside ``STATE_DIGEST``; other states do not
             valid = saved if is_same_config else without_observer(saved)
-            error = restore_state(pack_type.estimator, valid, self._gap_s(block))
+            gap_s = self._gap_s(block)
+            error = restore_state(pack_type.estimator, valid, gap_s)
+            self._single_cells.restore(pack_type.cells, gap_s, is_valid=not error)
             # the restored estimator has no last sample, and its counters begin at 0
             self._charge_energy["sums"]["counted"] = 0
             self._hour["outliers_before"] = self._hour["searches_before"] = 0
@@ -113,6 +126,7 @@ class BlockProcessor:
             for name in ("flow", "hour", "cells", "estimator"):
                 record[name] = np.zeros((), PACK_STATE[name])
             d[LAST_STORE_NS] = d["hour"] = d["clock_error_s"] = 0
+            self._single_cells.reset()
             self._counters["begun_anew"] += has_state
         d[CONFIG_DIGEST], d[STATE_DIGEST] = pack_type.config_digest, pack_type.state_digest
 
@@ -127,7 +141,9 @@ class BlockProcessor:
         # infinite if ``_restore_or_reset`` has already resumed the estimator
         has_time_base = math.isfinite(self._observer["time_s"])
         if self._observer["started"] and has_time_base:
-            estimator.resume(self._gap_s(block))
+            gap_s = self._gap_s(block)
+            estimator.resume(gap_s)
+            self._single_cells.resume(gap_s)
 
     def _estimate(self, block: Block, pack_type: PackType, arrival_s: float) -> None:
         """Estimate the samples; add the estimates to the hour, the charge and energy meter and the publish window."""
@@ -140,7 +156,8 @@ class BlockProcessor:
             trace = pack_type.estimator.run(part.samples)
             hour_summary.add(self._record["hour"], trace, part, pack_type.estimator)
             pack_type.meter.add(trace)
-            self._window.add(trace, arrival_s)
+            self._window.add(trace, arrival_s, part.cells_v)
+            self._single_cells.run(part, trace)
         cell_summary.add(self._record[0]["cells"], block, hour_summary.rest_current_a(pack_type.estimator))
         counters["blocks"] += 1
         counters["samples"] += block.samples.size
@@ -160,7 +177,18 @@ class BlockProcessor:
         write_usable_charge(values, pack_type.estimator, pack_type.cutoff_v, NO_PEAK_A)
         forecast = Forecast(float(window.last["time_s"]), values, NO_FORECAST_REASON, None)
         remaining_ah = remaining_capacity_ah(pack_type.estimator)
-        return _json(make_state_payload(window, remaining_ah, forecast, counters, now_s, totals, pack_type.capacity_ah))
+        return _json(
+            make_state_payload(
+                window,
+                remaining_ah,
+                forecast,
+                counters,
+                now_s,
+                totals,
+                pack_type.capacity_ah,
+                self._single_cells.state_fields(),
+            )
+        )
 
     def _parameters_payload(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
         """Return the payload of topic ``parameters``. Its ages refer to the arrival time of the samples."""
@@ -203,8 +231,11 @@ class BlockProcessor:
         if current:
             settings = pack_type.settings.model_copy(update={"name": pack})
             row = hour_summary.row(settings, current, self._record["hour"], pack_type.estimator)
-            row = row.model_copy(update=cell_summary.values(self._record[0]["cells"]) | self._origin(arrival))
-            rows = ((f"{pack}.{current}.{arrival.sequence}", _json(row)),)
+            cells = cell_summary.values(self._record[0]["cells"])
+            cells |= self._single_cells.row_fields(cells.get("weakest_cell"))
+            row = row.model_copy(update=cells | self._origin(arrival))
+            # the collector sets missing values to null, so that a pack without cell voltages has a shorter row
+            rows = ((f"{pack}.{current}.{arrival.sequence}", row.model_dump_json(exclude_defaults=True).encode()),)
         hour_summary.begin(self._record["hour"], self._record[0]["estimator"])
         self._record[0]["cells"] = np.zeros((), PACK_STATE["cells"])
         self._delivery["hour"], self._delivery["clock_error_s"] = hour, 0.0
@@ -242,7 +273,8 @@ def _parts(block: Block) -> Iterator[Block]:
         yield block
         return
     for first in range(0, block.samples.size, MAX_PART_SAMPLES):
-        yield replace(block, samples=block.samples[first : first + MAX_PART_SAMPLES])
+        part = slice(first, first + MAX_PART_SAMPLES)
+        yield replace(block, samples=block.samples[part], cells_v=block.cells_v[part])
 
 
 def _finite_times_s(samples: SampleBlock) -> NDArray[np.float64]:

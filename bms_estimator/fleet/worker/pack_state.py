@@ -1,10 +1,11 @@
-"""State of one pack in a worker: awaited block, totals, sums of the hour, estimator record.
+"""State of one pack in a worker: awaited block, totals, sums of the hour, estimator record, and estimators of single cells.
 
-The record is stored packed (``kernels.packed_record``) in immutable bytes, so that a snapshot of a partition needs no
+The estimators of single cells follow the record of dtype ``PACK_STATE`` only if the pack's blocks have cell voltages. The record is stored packed (``kernels.packed_record``) in immutable bytes, so that a snapshot of a partition needs no
 copy. An edge's store is identified by its creation time [ns since 1970]; see ``edge.block``.
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.checkpoint.restore import copy_known_fields
-from bms_estimator.fleet.worker.cell_summary import CELL_SUMS
+from bms_estimator.fleet.worker.cell_summary import CELL_SUMS, MAX_CELLS
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
+from bms_estimator.kernels.cells.records import BANK, CELL
 from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 
@@ -80,6 +82,17 @@ PACK_STATE = np.dtype(
     ],
     align=True,
 )
+BANK_FIELD, CELLS = "cell_bank", "single_cells"
+"""Names of the fields of the single cells; checkpoints contain these names, so that they cannot be changed."""
+
+
+@lru_cache(maxsize=MAX_CELLS + 1)
+def pack_dtype(cells: int) -> np.dtype[Any]:
+    """Return the dtype of a pack's record with the estimators of ``cells`` single cells; ``PACK_STATE`` for 0."""
+    if not cells:
+        return PACK_STATE
+    parts = [(name, PACK_STATE[name]) for name in PACK_STATE.names or ()]
+    return np.dtype([*parts, (BANK_FIELD, BANK), (CELLS, CELL, (cells,))], align=True)
 
 
 class StateError(ValueError):
@@ -89,16 +102,45 @@ class StateError(ValueError):
 class UnpackedRecord:
     """Unpacked record into which the packs of a partition are loaded in turn.
 
+    Args:
+        dtype: Dtype of a record of another layout; default: ``PACK_STATE``, with up to ``MAX_CELLS`` single cells.
+
     Attributes:
-        record: Shape (1,), dtype ``PACK_STATE``.
+        record: Shape (1,), dtype ``PACK_STATE`` or the given dtype.
+        cell_count: Number of single cells with an estimator; 0 without cell voltages.
     """
 
-    def __init__(self, dtype: np.dtype[Any] = PACK_STATE) -> None:
-        self.record: NDArray[np.void] = np.zeros(1, dtype)
-        self._words = self.record.view(np.uint64)
+    def __init__(self, dtype: np.dtype[Any] | None = None) -> None:
+        dtype, largest = (PACK_STATE, pack_dtype(MAX_CELLS)) if dtype is None else (dtype, dtype)
+        self._all_words = np.zeros(largest.itemsize // WORD_BYTES, np.uint64)
+        self._buffer = packed_buffer(self._all_words.size)
+        self._base_dtype = dtype
+        self._set_cell_count(0)
+        self.record: NDArray[np.void] = self._words.view(dtype)
+
+    def _set_cell_count(self, cells: int) -> None:
+        dtype = pack_dtype(cells) if cells else self._base_dtype
+        self.cell_count = cells
+        self._words = self._all_words[: dtype.itemsize // WORD_BYTES]
         # Words below the diagonal of a covariance usually equal their mirror words and are then not stored.
         self._symmetric_words = symmetry_map(dtype)
-        self._buffer = packed_buffer(self._words.size)
+
+    @property
+    def bank(self) -> NDArray[np.void]:
+        """State that the single cells share, shape (1,), dtype ``BANK``."""
+        bank: NDArray[np.void] = self._words.view(pack_dtype(self.cell_count))[BANK_FIELD]
+        return bank
+
+    @property
+    def cells(self) -> NDArray[np.void]:
+        """States of the single cells, shape (cell_count,), dtype ``CELL``."""
+        cells: NDArray[np.void] = self._words.view(pack_dtype(self.cell_count))[CELLS][0]
+        return cells
+
+    def start_cells(self, cells: int) -> None:
+        """Add the initial state of ``cells`` single cells; 0 removes the single cells."""
+        self._set_cell_count(cells)
+        self._words[PACK_STATE.itemsize // WORD_BYTES :] = 0
 
     @property
     def delivery(self) -> np.void:
@@ -108,14 +150,17 @@ class UnpackedRecord:
 
     def clear(self) -> None:
         """Set all fields to zero, the state of a new pack."""
+        self._set_cell_count(0)
         self._words.fill(0)
 
-    def load(self, packed: bytes) -> None:
-        """Unpack a pack's record into this one.
+    def load(self, packed: bytes, cells: int = 0) -> None:
+        """Unpack a pack's record with ``cells`` single cells into this one.
 
         Raises:
             StateError: The bytes do not have this layout.
         """
+        if cells != self.cell_count:
+            self._set_cell_count(cells)
         are_words = len(packed) % WORD_BYTES == 0
         if not (are_words and unpack(np.frombuffer(packed, np.uint64), self._symmetric_words, self._words)):
             raise StateError(f"{len(packed)} bytes are not a packed record")
@@ -123,7 +168,8 @@ class UnpackedRecord:
     def load_previous_layout(self, dtype: np.dtype[Any], packed: bytes) -> Fields | None:
         """Unpack a pack's record of another layout. Copy its fields that exist in this layout.
 
-        The estimator's fields are copied only if the layout of the estimator is the same, because they depend on each other.
+        The estimator's fields are copied only if the layout of the estimator is the same, because they depend on each other. The
+        same applies to the single cells.
 
         Args:
             dtype: Dtype of the record.
@@ -147,10 +193,21 @@ class UnpackedRecord:
                 other_fields[name] = value
         self.clear()
         copy_known_fields(self.record, other_fields)
+        self._copy_cells(previous.record)
         if not has_same_estimator:
             return estimator_fields
         self.record["estimator"] = previous.record["estimator"]
         return None
+
+    def _copy_cells(self, previous: NDArray[np.void]) -> None:
+        """Copy the single cells of a record of another layout, if their own layout is the same."""
+        names = previous.dtype.names or ()
+        if not {BANK_FIELD, CELLS} <= set(names):
+            return
+        bank, cells = previous[BANK_FIELD], previous[CELLS]
+        if bank.dtype == BANK and cells.dtype == CELL and cells.ndim == 2 and 0 < cells.shape[1] <= MAX_CELLS:
+            self.start_cells(cells.shape[1])
+            self.bank[...], self.cells[...] = bank, cells[0]
 
     def count_lost(self, blocks: int) -> None:
         """Count blocks of this hour as lost."""

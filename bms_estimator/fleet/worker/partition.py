@@ -19,6 +19,7 @@ from bms_estimator.fleet.packs.pack_type import PackType, PackTypes
 from bms_estimator.fleet.packs.table_change import PackSource, decode_change, encode_change, is_change
 from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken, position
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
+from bms_estimator.fleet.worker.checkpoint.cell_layouts import cell_count, cell_layout
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CheckpointError,
     PartitionCheckpoint,
@@ -30,6 +31,7 @@ from bms_estimator.fleet.worker.density import density_fault
 from bms_estimator.fleet.worker.edge_clock import Arrival
 from bms_estimator.fleet.worker.pack_state import Fields, UnpackedRecord
 from bms_estimator.fleet.worker.unsaved_positions import UnsavedPositions
+from bms_estimator.kernels.cells.records import CELL
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.pack import Settings
 
@@ -63,6 +65,7 @@ class BlockResult(NamedTuple):
         reply: Reply to the edge; None if no reply is due.
         state: Payload of topic ``state``; None without one.
         parameters: Payload of topic ``parameters``; None without one.
+        cells: Payload of topic ``cells``; None without one.
         hours: Message ids and rows of finished hours. The message id of a row is equal for all workers, so that the server
             drops repeated rows.
         failed: Number of blocks that were skipped because of an internal error.
@@ -73,9 +76,22 @@ class BlockResult(NamedTuple):
     reply: BlockRequest | None = None
     state: bytes | None = None
     parameters: bytes | None = None
+    cells: bytes | None = None
     hours: tuple[tuple[str, bytes], ...] = ()
     failed: int = 0
     dead_reason: str = ""
+
+
+class CellPack(NamedTuple):
+    """Packed record of a pack with single cells.
+
+    Attributes:
+        cells: Number of single cells.
+        packed: The packed record.
+    """
+
+    cells: int
+    packed: bytes
 
 
 class Partition:
@@ -108,7 +124,8 @@ class Partition:
         self._table, self._sources = table, sources
         self._in_force: dict[str, PackSource] = {}  # row and cell file of each pack with processed blocks
         self._counters: Counter[str] = Counter()
-        self._packs: dict[str, bytes] = {}
+        self._packs: dict[str, bytes] = {}  # packs without single cells
+        self._cell_packs: dict[str, CellPack] = {}
         self._unmigrated: dict[str, PreviousLayoutState] = {}  # packs whose record still has a previous layout
         # delivery records of these packs, which only this process has updated since it restored the partition
         self._unmigrated_deliveries: dict[str, np.void] = {}
@@ -120,7 +137,7 @@ class Partition:
         self._logged_rejections: set[str] = set()
         self._unpacked = UnpackedRecord()
         self._types = PackTypes(self._unpacked.record)
-        self._processor = BlockProcessor(self._unpacked.record, self._counters, wall)
+        self._processor = BlockProcessor(self._unpacked, self._counters, wall)
 
     @classmethod
     def restore(
@@ -145,19 +162,26 @@ class Partition:
         partition.sequence = checkpoint.sequence
         partition._counters.update(checkpoint.counters)
         partition._packs.update(checkpoint.packs)
-        partition._unmigrated.update(checkpoint.unmigrated)
+        for pack, state in checkpoint.unmigrated.items():
+            if cells := cell_count(state.layout):
+                partition._cell_packs[pack] = CellPack(cells, state.packed)
+            else:
+                partition._unmigrated[pack] = state
         partition.deferred = Deferred(checkpoint.deferred)
         return partition
 
     def snapshot(self) -> PartitionCheckpoint:
         """Return a snapshot of the partition. Records are not copied, because they are immutable bytes."""
         changed = self._unsaved.begin_save()
+        with_cells = {
+            pack: PreviousLayoutState(cell_layout(cells), packed) for pack, (cells, packed) in self._cell_packs.items()
+        }
         return PartitionCheckpoint(
             number=self.number,
             sequence=self.sequence,
             counters=dict(self._counters),
             packs=dict(self._packs),
-            unmigrated=dict(self._unmigrated),
+            unmigrated=self._unmigrated | with_cells,
             deferred=self.deferred.spans(),
             in_force=dict(self._in_force),
             changed=changed,
@@ -174,7 +198,11 @@ class Partition:
     @property
     def counters(self) -> Mapping[str, int]:
         """Counters since the partition was created, over all its workers."""
-        return {**self._counters, "packs": len(self._packs) + len(self._unmigrated), "unknown": len(self.unknown)}
+        return {
+            **self._counters,
+            "packs": len(self._packs) + len(self._cell_packs) + len(self._unmigrated),
+            "unknown": len(self.unknown),
+        }
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -183,11 +211,17 @@ class Partition:
 
     def state(self, pack: str) -> NDArray[np.void] | None:
         """Return a copy of a pack's record, shape (1,), dtype ``PACK_STATE``; None if it has another layout or does not exist."""
-        packed = self._packs.get(pack)
-        if packed is None:
+        if pack not in self._packs and pack not in self._cell_packs:
             return None
-        self._unpacked.load(packed)
+        self._load(pack)
         return self._unpacked.record.copy()
+
+    def cells(self, pack: str) -> NDArray[np.void]:
+        """Return a copy of the states of a pack's single cells, shape (m,), dtype ``CELL``; m is 0 without any."""
+        if pack not in self._cell_packs:
+            return np.zeros(0, CELL)
+        self._load(pack)
+        return self._unpacked.cells.copy()
 
     def take(
         self, pack: str, data: bytes, sequence: int, received_s: int | None = None, *, is_lethal: bool = False
@@ -353,7 +387,7 @@ class Partition:
                 self._unmigrated_deliveries[pack] = d.copy()
         if order is BlockOrder.NEXT or unmigrated_fields is None:
             self._counters["lost_blocks"] += newly_lost
-            self._packs[pack] = self._unpacked.packed_bytes()
+            self._store(pack)
         is_first = pack not in self._replied
         self._replied.add(pack)
         safe = self._unsaved.safe(pack, position(d))
@@ -389,12 +423,22 @@ class Partition:
     ) -> BlockResult | None:
         """Estimate the next block; None after an internal error."""
         try:
-            state, parameters, hours = self._processor.step(pack, block, arrival, pack_type, unmigrated_fields)
-            return BlockResult(pack, state=state, parameters=parameters, hours=hours)
+            state, parameters, cells, hours = self._processor.step(pack, block, arrival, pack_type, unmigrated_fields)
+            return BlockResult(pack, state=state, parameters=parameters, cells=cells, hours=hours)
         except Exception:  # an internal error with one block must not stop the pack
             log.exception("a block is skipped", partition=self.number, pack=pack, number=block.number)
         self._processor.reset_window()
         return None
+
+    def _store(self, pack: str) -> None:
+        """Store the unpacked record as the state of a pack."""
+        packed, cells = self._unpacked.packed_bytes(), self._unpacked.cell_count
+        if cells:
+            self._cell_packs[pack] = CellPack(cells, packed)
+            self._packs.pop(pack, None)
+        else:
+            self._packs[pack] = packed
+            self._cell_packs.pop(pack, None)
 
     def _load(self, pack: str) -> Fields | None:
         """Load a pack into the unpacked record.
@@ -402,15 +446,18 @@ class Partition:
         Returns:
             The estimator fields by name if the estimator's part of the record has a previous layout; otherwise None.
         """
-        packed, unmigrated = self._packs.get(pack), self._unmigrated.get(pack)
+        packed = self._packs.get(pack)
         try:
             if packed is not None:
                 self._unpacked.load(packed)
                 return None
-            if unmigrated is not None:
+            if (cell_pack := self._cell_packs.get(pack)) is not None:
+                self._unpacked.load(cell_pack.packed, cell_pack.cells)
+                return None
+            if (unmigrated := self._unmigrated.get(pack)) is not None:
                 estimator_fields = self._unpacked.load_previous_layout(dtype_of(unmigrated.layout), unmigrated.packed)
                 if estimator_fields is None:
-                    self._packs[pack] = self._unpacked.packed_bytes()
+                    self._store(pack)
                     del self._unmigrated[pack]
                 return estimator_fields
         except ValueError:  # does not happen with a checkpoint whose checksums were correct

@@ -83,17 +83,18 @@ class ResultPublisher:
             return
         if result.reply is not None:
             await self._nc.publish(subjects.block_request(result.pack), result.reply.model_dump_json().encode())
-        for topic, payload in (("state", result.state), ("parameters", result.parameters)):
+        for topic, payload in (("state", result.state), ("parameters", result.parameters), ("cells", result.cells)):
             if payload is not None:
                 await self._nc.publish(subjects.published(result.pack, topic), payload)
 
 
 def merge(before: BlockResult | None, result: BlockResult) -> BlockResult:
-    """Merge two successive results of one pack: the newest reply, state and parameters."""
+    """Merge two successive results of one pack: the newest reply and payloads."""
     if before is None:
         return result
     return result._replace(
         reply=result.reply or before.reply,
         state=result.state or before.state,
         parameters=result.parameters or before.parameters,
+        cells=result.cells or before.cells,
     )

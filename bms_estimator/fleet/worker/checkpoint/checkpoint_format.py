@@ -128,7 +128,7 @@ class PartitionCheckpoint:
         sequence: Stream sequence number of the last included message.
         counters: Counts by name.
         packs: Packed records in this version's layout, by pack.
-        unmigrated: Packed records in the layout of another version, by pack.
+        unmigrated: Packed records in the layout of another version, or with single cells, by pack.
         deferred: Deferred messages by pack, in the order in which the packs are served.
         in_force: Row and cell file of each pack at this position of the stream, for packs with processed blocks.
         increment: 0 if the records of all packs are contained; otherwise the number of the increment.
@@ -161,11 +161,12 @@ class PartitionCheckpoint:
 
     def with_increment(self, increment: "PartitionCheckpoint") -> "PartitionCheckpoint":
         """Return the checkpoint of an increment and of the checkpoint before it, which is this one."""
+        packs = {pack: packed for pack, packed in self.packs.items() if pack not in increment.unmigrated}
         unmigrated = {pack: state for pack, state in self.unmigrated.items() if pack not in increment.packs}
         return replace(
             increment,
             increment=0,
-            packs={**self.packs, **increment.packs},
+            packs=packs | {**increment.packs},
             unmigrated=unmigrated | {**increment.unmigrated},
         )
 

@@ -1,0 +1,210 @@
+"""Estimators of single cells in a worker: as in ``replay``, over takeovers, versions and packs without cell voltages."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bms_estimator.edge.block import Block, decode, encode
+from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.fleet.hour_row import Hour
+from bms_estimator.fleet.worker import partition as partition_module
+from bms_estimator.fleet.worker.checkpoint.cell_layouts import cell_count, cell_layout
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import CURRENT_LAYOUT
+from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import NO_CELLS
+from bms_estimator.settings.pack import PackSettings, Settings
+from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
+from tests.fleet.partition_stream import STORE_ID_NS
+
+CELLS, CAPACITY_AH, WEAK = 4, 20.0, 2
+MINUTES = 70
+PACKS = ("a", "b")
+CELL = load_cell("nmc", CAPACITY_AH)
+MODEL = CELL.pack(CELLS, 1)
+SETTINGS = Settings(pack=PackSettings(cell="nmc", capacity_ah=CAPACITY_AH, series=CELLS))
+
+
+def table(_pack):
+    return SETTINGS, MODEL
+
+
+def minutes(seed, count=MINUTES):
+    """Return a block of each minute of a simulated pack with a weak cell."""
+    rng = np.random.default_rng(seed)
+    drawn = BankCells.drawn(rng, CELLS, CAPACITY_AH, 0.8).with_weak_cell(WEAK, soc_below=0.1)
+    bank, blocks = SimulatedBank(CELL, drawn), []
+    for number in range(1, count + 1):
+        history = bank.run(CAPACITY_AH * 0.2 * (1.0 + 0.5 * np.sin(np.arange(60.0) / 7.0)))
+        samples, cells_v = history.samples(rng, 2e-3), np.round(history.cell_v, 3)
+        arrival_s = STORE_ID_NS / 1e9 + float(samples["time_s"][-1])
+        blocks.append(Block(STORE_ID_NS, number, 1, arrival_s, samples, cells_v))
+    return blocks
+
+
+@pytest.fixture(scope="module")
+def blocks():
+    """Return the blocks of each pack; some of pack a have no cell voltages, or those of fewer cells."""
+    of_pack = {pack: minutes(seed) for seed, pack in enumerate(PACKS)}
+    for index, cells in ((0, 0), (5, 0), (9, CELLS - 1), (10, 0)):
+        block = of_pack["a"][index]
+        of_pack["a"][index] = replace(block, cells_v=block.cells_v[:, :cells] if cells else NO_CELLS)
+    of_pack["b"][3].cells_v[7] = math.nan
+    of_pack["b"][4].cells_v[:, 1] = math.nan
+    return of_pack
+
+
+def run(partition, blocks, *, take_over=False):
+    """Process the blocks of all packs in turn. Return the partition and all results."""
+    results, sequence = [], 0
+    for row in zip(*blocks.values(), strict=True):
+        for pack, block in zip(blocks, row, strict=True):
+            sequence += 1
+            results.append(partition.take(pack, encode(block), sequence))
+        if take_over:
+            partition = restored(partition)
+    return partition, results
+
+
+def restored(partition):
+    return Partition.restore(0, table, b"".join(partition.snapshot().chunks()))
+
+
+def replayed(blocks):
+    """Return the estimators of the pack and of its cells after a replay of all samples, as ``fleet capture`` writes them."""
+    samples = np.concatenate([block.samples for block in blocks])
+    cells_v = np.concatenate(
+        [
+            block.cells_v if block.cells_v.shape[1] == CELLS else np.full((block.samples.size, CELLS), math.nan)
+            for block in (decode(encode(block)) for block in blocks)
+        ]
+    )
+    estimator = make_estimator(SETTINGS, MODEL)
+    cells = CellEstimator(estimator)
+    cells.run(samples, cells_v, estimator.run(samples))
+    return estimator, cells
+
+
+@pytest.mark.parametrize("take_over", [False, True])
+def test_states_of_cells_are_bit_identical_to_those_of_a_replay(blocks, take_over):
+    partition, _ = run(Partition(0, table), blocks, take_over=take_over)
+    for pack in PACKS:
+        estimator, cells = replayed(blocks[pack])
+        assert cells.bank["windows"][0] > 0
+        assert partition.cells(pack).tobytes() == cells.cells.tobytes()
+        assert partition.state(pack)["estimator"].tobytes() == estimator.record.tobytes()
+
+
+def test_worker_publishes_the_weakest_cell_and_all_cells_once_a_minute(blocks):
+    _, results = run(Partition(0, table), {"b": blocks["b"]})
+    state = json.loads(results[-1].state)
+    _, cells = replayed(blocks["b"])
+    assert state["cells_v"] == blocks["b"][-1].cells_v[-1].tolist()
+    assert (state["weakest_cell"], state["weakest_cell_soc"]) == (WEAK + 1, cells.deviations.soc[WEAK])
+    report = json.loads(results[-1].cells)
+    assert [cell["soc"] for cell in report["cells"]] == cells.deviations.soc.tolist()
+    assert all(result.cells for result in results[1:])
+
+
+def test_short_blocks_do_not_publish_the_cells_more_often():
+    parts = [
+        replace(block, number=6 * (block.number - 1) + n + 1, samples=block.samples[10 * n : 10 * n + 10],
+                cells_v=block.cells_v[10 * n : 10 * n + 10])
+        for block in minutes(1, 10) for n in range(6)
+    ]  # fmt: skip
+    _, results = run(Partition(0, table), {"a": parts})
+    assert all(result.state for result in results)
+    assert 9 <= sum(result.cells is not None for result in results) <= 11
+
+
+def test_hourly_row_has_the_estimates_of_the_weakest_and_of_the_leaking_cell(blocks):
+    _, results = run(Partition(0, table), {"b": blocks["b"]})
+    ((_, data),) = [hour for result in results for hour in result.hours]
+    row = Hour.model_validate_json(data)
+    _, cells = replayed(blocks["b"][: row.samples // 60])
+    assert row.weakest_cell == WEAK + 1
+    assert row.weakest_cell_soc_deviation == cells.deviations.soc_deviation[WEAK]
+    assert row.weakest_cell_resistance_ratio == cells.deviations.resistance_ratio[WEAK]
+    leaking = row.self_discharge_cell - 1
+    assert row.self_discharge_a == cells.deviations.self_discharge_a[leaking]
+    assert row.self_discharge_std_a == cells.deviations.self_discharge_std_a[leaking]
+
+
+def test_pack_without_cell_voltages_stores_and_publishes_nothing_of_cells(blocks):
+    without = [replace(block, cells_v=NO_CELLS) for block in blocks["b"]]
+    partition, results = run(Partition(0, table), {"a": without, "b": blocks["b"]})
+    assert partition.cells("a").size == 0
+    snapshot = partition.snapshot()
+    assert (set(snapshot.packs), set(snapshot.unmigrated)) == ({"a"}, {"b"})
+    assert not any(result.cells for result in results if result.pack == "a")
+    ((_, data),) = [hour for result in results if result.pack == "a" for hour in result.hours]
+    assert b"cell_spread_v" not in data
+    assert b"self_discharge" not in data
+
+
+def test_earlier_version_drops_the_cells_and_keeps_the_estimator(blocks, monkeypatch):
+    first, last = ({pack: of_pack[part] for pack, of_pack in blocks.items()} for part in (slice(60), slice(60, None)))
+    partition, _ = run(Partition(0, table), first)
+    # an earlier version reads the record with cells by the names of its fields
+    with monkeypatch.context() as earlier:
+        earlier.setattr(partition_module, "cell_count", lambda _: 0)
+        earlier.setattr("bms_estimator.fleet.worker.pack_state.UnpackedRecord._copy_cells", lambda *_: None)
+        earlier.setattr(CellEstimator, "estimated_cells", 0)
+        older = restored(partition)
+        for number, pack in enumerate(PACKS, 1 + partition.sequence):
+            older.take(pack, encode(last[pack][0]), number)
+        data = b"".join(older.snapshot().chunks())
+    assert older.snapshot().unmigrated == {}
+    partition = Partition.restore(0, table, data)
+    for offset in range(1, 10):
+        for pack in PACKS:
+            partition.take(pack, encode(last[pack][offset]), partition.sequence + 1)
+    for pack in PACKS:
+        estimator, _ = replayed(blocks[pack])
+        assert partition.state(pack)["estimator"].tobytes() == estimator.record.tobytes()
+        assert partition.cells(pack)["samples"].size == CELLS  # the estimators of the cells have begun anew
+
+
+def test_later_version_with_other_fields_keeps_the_cells(blocks, monkeypatch):
+    partition, _ = run(Partition(0, table), blocks)
+    monkeypatch.setattr(partition_module, "cell_count", lambda _: 0)  # the layout is not that of the later version
+    later = restored(partition)
+    assert set(later.snapshot().unmigrated) == set(PACKS)
+    before = {pack: partition.cells(pack).tobytes() for pack in PACKS}
+    for pack in PACKS:  # a repeated block migrates the record
+        later.take(pack, encode(blocks[pack][-1]), later.sequence + 1)
+        assert later.cells(pack).tobytes() == before[pack]
+
+
+def test_cells_are_kept_with_another_tuning_and_begin_anew_with_another_capacity(blocks):
+    packs = {"b": blocks["b"][:20]}
+    partition, _ = run(Partition(0, table), packs)
+    windows_before = partition.cells("b")["covariance"].copy()
+    data, block = b"".join(partition.snapshot().chunks()), blocks["b"][20]
+    tuned = SETTINGS.model_copy(update={"identifier": SETTINGS.identifier.model_copy(update={"soc_std": 0.2})})
+    larger = load_cell("nmc", 2 * CAPACITY_AH).pack(CELLS, 1)
+    stds = []
+    for entry in ((tuned, MODEL), (SETTINGS, larger)):
+        partition = Partition.restore(0, lambda _, entry=entry: entry, data)
+        partition.take("b", encode(block), partition.sequence + 1)
+        stds.append(partition.cells("b")["covariance"][0, 0, 0])
+    assert stds[0] < 1.5 * windows_before[0, 0, 0] < stds[1]
+
+
+def test_gap_at_a_new_store_does_not_count_as_time_of_the_former_store(blocks):
+    packs = {"b": blocks["b"][:20]}
+    partition, _ = run(Partition(0, table), packs)
+    new_store = STORE_ID_NS + 7200 * 10**9
+    block = replace(blocks["b"][0], store_created_ns=new_store, number=1, arrival_s=new_store / 1e9 + 60.0)
+    result = partition.take("b", encode(block), partition.sequence + 1)
+    assert json.loads(result.state)["weakest_cell"] == WEAK + 1
+    assert json.loads(result.cells)["cells"][WEAK]["fault"] is None
+
+
+def test_layouts_of_other_records_are_not_taken_for_those_of_cells():
+    assert [cell_count(layout) for layout in (CURRENT_LAYOUT, cell_layout(3), cell_layout(128))] == [0, 3, 128]
+    assert cell_count(cell_layout(3).replace("sum_v", "sum_x")) == 0
