@@ -160,6 +160,11 @@ def peek_header(data: bytes) -> tuple[int, float]:
     return count, arrival_s if math.isfinite(arrival_s) else math.inf
 
 
+def peek_cells(data: bytes) -> int:
+    """Return the number of cells whose voltages an encoded block has."""
+    return data[5] if data[4] > _VERSION_WITHOUT_CELLS else 0
+
+
 def _decode_body(body: bytes, count: int, cells: int) -> tuple[SampleBlock, CellBlock]:
     size = count * _SAMPLE_BYTES
     max_size = size + (cell_voltages.MAX_BYTES if cells else 0)

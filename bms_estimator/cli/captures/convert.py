@@ -17,10 +17,11 @@ from bms_estimator.cli.options.capture_options import (
     check_output_file,
 )
 from bms_estimator.conversion.bdf import bdf_rows, is_bdf_name
+from bms_estimator.model.cell_voltage_columns import cell_voltage_columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.sinks.trace_file import SINKS, CsvSink, TableSink, table_sink
+from bms_estimator.sinks.trace_file import SINKS, CsvSink, TableSink, join_columns, table_sink
 from bms_estimator.sources.captures.replay import Capture, open_capture
 
 SUFFIXES_HELP = ".csv, .csv.gz or .parquet; Battery Data Format: .bdf, .bdf.gz, .bdf.csv, .bdf.csv.gz or .bdf.parquet"
@@ -84,20 +85,29 @@ def _own_blocks(reopen: Callable[[], Capture], progress: Progress) -> Iterator[N
         reopen: Function that opens the capture for one pass.
         progress: Receives the fraction of the file that has been converted.
     """
-    columns = _columns_with_values(reopen())
-    for block in _blocks(reopen(), progress):
-        yield block[columns]
+    columns, cells = _columns_with_values(reopen())
+    capture = reopen()
+    for block in _blocks(capture, progress):
+        samples = block[columns]
+        yield join_columns(samples, cell_voltage_columns(capture.cells, block.size, cells)) if cells else samples
 
 
-def _columns_with_values(capture: Capture) -> list[str]:
-    """Return the columns of a capture's samples. A file with a status needs all, because captures with fewer have none."""
+def _columns_with_values(capture: Capture) -> tuple[list[str], int]:
+    """Return the columns of a capture's samples, and the number of cells with a voltage.
+
+    A file with a status needs all columns, because captures with fewer have no status.
+    """
     *columns, temperature, _ = SAMPLE.names or ()
-    has_temperature = False
+    has_temperature = has_status = False
+    cells = 0
     for block in capture:
-        if block["status"].any():
-            return [*(SAMPLE.names or ())]
+        has_status |= bool(block["status"].any())
         has_temperature |= bool(np.isfinite(block["temperature_c"]).any())
-    return [*columns, temperature] if has_temperature else columns
+        if np.isfinite(capture.cells).any():
+            cells = max(cells, capture.cells.shape[1])
+    if has_status:
+        return [*(SAMPLE.names or ())], cells
+    return ([*columns, temperature] if has_temperature else columns), cells
 
 
 def _bdf_blocks(reopen: Callable[[], Capture], progress: Progress) -> Iterator[NDArray[np.void]]:

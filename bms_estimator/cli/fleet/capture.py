@@ -11,9 +11,10 @@ import typer
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.cli.options.capture_options import Force, check_output_file
 from bms_estimator.cli.options.counted import counted
+from bms_estimator.model.cell_voltage_columns import cell_voltage_columns
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
-from bms_estimator.sinks.trace_file import table_sink
+from bms_estimator.sinks.trace_file import join_columns, table_sink
 
 if TYPE_CHECKING:
     from bms_estimator.fleet.identification.block_capture import BlockCapture
@@ -59,6 +60,7 @@ def capture(
 ) -> None:
     """Write a pack's stored samples to a file that `replay`, `identify`, `validate` and `capacity` can read.
 
+    Cell voltages, if the edge sends them, are in the columns cell_1_v, cell_2_v and so on.
     The server stores samples for some days (setting `server.outage_days`). They are written in the order in which the edge sent them.
     To reproduce the workers' estimates, run `replay` with the settings that `fleet packs show PACK --out FOLDER` writes.
     """
@@ -70,9 +72,9 @@ def capture(
         raise UserError(no_samples_reason(pack, fetched))
     rows = 0
     with sink:
-        for block in fetched.samples():
-            sink.write(block)
-            rows += block.size
+        for samples, cells_v in fetched.samples_with_cells():
+            sink.write(join_columns(samples, cell_voltage_columns(cells_v, samples.size, fetched.cells)))
+            rows += samples.size
     first_s, last_s = fetched.span_s
     typer.echo(
         f"{out}: {counted(rows, 'sample')} in {counted(fetched.blocks, 'block')} of {pack}, {iso_utc(first_s)} to {iso_utc(last_s)}"

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from nats.aio.client import Client
 
-from bms_estimator.edge.block import Block, BlockError, decode
+from bms_estimator.edge.block import Block, BlockError, decode, peek_cells
 from bms_estimator.edge.subjects import RAW_STREAM
 from bms_estimator.fleet.nats.stream_reader import read_stream
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import CellBlock, SampleBlock
 
 AHEAD_S = 3600.0
 """Maximum lead of an edge's clock over the server's clock [s]. A block may be stored this long before the time of its
@@ -82,27 +82,38 @@ class BlockCapture:
             if store == next_store and next_number > number + 1
         ]
 
+    @property
+    def cells(self) -> int:
+        """Number of cells of the newest block with cell voltages; 0 without any."""
+        counts = (peek_cells(self._blocks[key]) for key in sorted(self._blocks, reverse=True))
+        return next(filter(None, counts), 0)
+
     def samples(self) -> Iterator[SampleBlock]:
-        """Yield all samples.
+        """Yield all samples; ``samples_with_cells`` describes their times."""
+        return (samples for samples, _ in self.samples_with_cells())
+
+    def samples_with_cells(self) -> Iterator[tuple[SampleBlock, CellBlock]]:
+        """Yield all samples and their cell voltages, shape (n, ``cells``); NaN for a block with another number of cells.
 
         ``time_s`` counts from the creation of the first store. Samples of a later store follow by the edge's wall clock,
         or immediately after the last sample if that clock was set back.
         """
-        parts, count = list[SampleBlock](), 0
-        for part in self._parts():
+        parts, rows, cells = list[tuple[SampleBlock, CellBlock]](), 0, self.cells
+        for part in self._parts(cells):
             parts.append(part)
-            count += part.size
-            if count >= MIN_YIELDED_SAMPLES:
-                yield np.concatenate(parts)
-                parts, count = [], 0
+            rows += part[0].size
+            if rows >= MIN_YIELDED_SAMPLES:
+                yield _concatenated(parts)
+                parts, rows = [], 0
         if parts:
-            yield np.concatenate(parts)
+            yield _concatenated(parts)
 
-    def _parts(self) -> Iterator[SampleBlock]:
+    def _parts(self, cells: int) -> Iterator[tuple[SampleBlock, CellBlock]]:
         store, first_store, offset_s, last_s = 0, 0, 0.0, 0.0  # store 0: none yet
         for key in sorted(self._blocks):
             block = self._block(key)
-            samples = block.samples[self._in_span(block)]
+            in_span = self._in_span(block)
+            samples = block.samples[in_span]
             if not samples.size:
                 continue
             first_store = first_store or block.store_created_ns
@@ -111,7 +122,8 @@ class BlockCapture:
             store = block.store_created_ns
             samples["time_s"] += offset_s
             last_s = float(samples["time_s"][-1])
-            yield samples
+            has_cells = block.cells_v.shape[1] == cells
+            yield samples, block.cells_v[in_span] if cells and has_cells else np.full((samples.size, cells), np.nan)
 
     def _in_span(self, block: Block) -> np.ndarray:
         wall_s = block.store_created_ns * 1e-9 + block.samples["time_s"]
@@ -119,6 +131,11 @@ class BlockCapture:
 
     def _block(self, key: tuple[int, int]) -> Block:
         return decode(self._blocks[key])
+
+
+def _concatenated(parts: list[tuple[SampleBlock, CellBlock]]) -> tuple[SampleBlock, CellBlock]:
+    samples, cells_v = zip(*parts, strict=True)
+    return np.concatenate(samples), np.concatenate(cells_v)
 
 
 def _wall_s(block: Block, sample: int) -> float:

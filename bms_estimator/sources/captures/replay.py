@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress, no_progress
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, CurrentSign, SampleBlock
+from bms_estimator.model.sample import SAMPLE, CellBlock, CurrentSign, SampleBlock
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
@@ -39,6 +39,10 @@ class Capture(Protocol):
     @property
     def implausible(self) -> int:
         """Number of implausible readings, which were replaced by NaN."""
+
+    @property
+    def cells(self) -> CellBlock:
+        """Cell voltages of the last block; empty without any."""
 
     @property
     def note(self) -> str:
@@ -103,6 +107,11 @@ class RawCapture:
     def implausible(self) -> int:
         """Number of implausible values counted by the decoder."""
         return self.decoder.counters["implausible"]
+
+    @property
+    def cells(self) -> CellBlock:
+        """Cell voltages of the last block; empty without any."""
+        return self.decoder.cells
 
     def __iter__(self) -> Iterator[SampleBlock]:
         """Yield blocks of samples."""
@@ -178,7 +187,7 @@ class Replay:
 
     async def _unpaced(self) -> AsyncIterator[ReceivedSamples]:
         for block in self.capture:
-            cells = self._cells()
+            cells = self.capture.cells
             before = self.fraction
             for part in _parts(block["time_s"], self._max_block_s):
                 self._advance(before, part.stop / block.size)
@@ -187,10 +196,6 @@ class Replay:
     def _advance(self, before: float, fraction_of_block: float) -> None:
         """Set ``fraction`` within a block, which began at the fraction ``before``."""
         self.fraction = before + (self.capture.fraction - before) * fraction_of_block
-
-    def _cells(self) -> CellBlock:
-        """Return the cell voltages of the capture's last block."""
-        return self._decoder.cells if self._decoder else NO_CELLS
 
     async def _paced(self, speed: float) -> AsyncIterator[ReceivedSamples]:
         """Yield each sample when it is due; the first one immediately."""
@@ -203,7 +208,7 @@ class Replay:
                 end = int(np.searchsorted(due_s, now_s, side="right"))
                 if end > first:
                     self._advance(before, end / block.size)
-                    yield ReceivedSamples(block[first:end], self._cells()[first:end])
+                    yield ReceivedSamples(block[first:end], self.capture.cells[first:end])
                     first = end
                 else:
                     await asyncio.sleep(min((due_s[first] - now_s) / speed + PACED_INTERVAL_S, 1.0))

@@ -81,3 +81,14 @@ def test_a_capture_without_cell_voltages_has_no_values_of_cells(
     assert "weakest_cell" not in out.read_text().splitlines()[0]
     assert json.loads(text)["cells"] == []
     assert json.loads(text)["weakest_cell"] is None
+
+
+@pytest.mark.parametrize("name", ["cells.csv", "cells.parquet"])
+def test_a_converted_capture_gives_the_same_estimates_of_the_cells(
+    pack: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    capture = recorded(tmp_path, with_cells=True)
+    assert run(capsys, "convert", capture, "--out", tmp_path / name)[0] == 0
+    _, recorded_text, _ = run(capsys, "replay", capture, "--pack", pack, "--json")
+    _, converted_text, _ = run(capsys, "replay", tmp_path / name, "--pack", pack, "--json")
+    assert json.loads(converted_text)["cells"] == json.loads(recorded_text)["cells"] != []

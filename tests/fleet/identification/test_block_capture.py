@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.identification.block_capture import BlockCapture
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.sample import NO_CELLS, SAMPLE
 
 STORE_ID_NS = 1_700_000_000 * 10**9
 """Creation time of the edge's block store, which identifies it [ns since 1970]."""
@@ -21,11 +21,12 @@ def samples(first_s, count=60):
     return block
 
 
-def encoded_block(number, store=STORE_ID_NS):
+def encoded_block(number, store=STORE_ID_NS, cells=0):
     """Return a block of 60 samples, which begins ``number`` minutes after the creation of the store."""
     rows = samples(60.0 * number)
     arrival_s = store * 1e-9 + rows["time_s"][-1]
-    return encode(Block(store_created_ns=store, number=number, oldest=1, arrival_s=arrival_s, samples=rows))
+    cells_v = 3.7 + 0.001 * np.tile(np.arange(float(cells)), (60, 1)) if cells else NO_CELLS
+    return encode(Block(store, number, 1, arrival_s, rows, cells_v))
 
 
 def make_capture(*blocks, **span):
@@ -68,6 +69,17 @@ def test_time_of_a_new_store_follows_from_its_creation_and_never_steps_back(crea
     assert (time_s.size, time_s[119], time_s[120]) == (180, 179.0, expected_first_s)
     assert capture.repeated == 1  # block 3 of the former store
     assert (np.diff(time_s) >= 0.0).all()
+
+
+def test_cell_voltages_stand_beside_their_samples_and_other_blocks_have_none():
+    blocks = (encoded_block(1), encoded_block(2, cells=3), encoded_block(3, cells=4), encoded_block(4, cells=4))
+    capture = make_capture(*blocks, since_s=STORE_ID_NS * 1e-9 + 90.0, until_s=STORE_ID_NS * 1e-9 + 270.0)
+    ((rows, cells_v),) = capture.samples_with_cells()
+    assert (capture.cells, cells_v.shape) == (4, (180, 4))
+    assert np.isnan(
+        cells_v[rows["time_s"] < 180.0]
+    ).all()  # blocks without cell voltages, or of another number of cells
+    np.testing.assert_allclose(cells_v[rows["time_s"] >= 180.0], np.tile([3.7, 3.701, 3.702, 3.703], (90, 1)))
 
 
 def test_capture_without_blocks_has_no_samples_and_no_span():

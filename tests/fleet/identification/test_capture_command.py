@@ -1,6 +1,7 @@
 """``fleet capture`` of blocks that edges have sent to the real server over MQTT."""
 
 import asyncio
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import aiomqtt
@@ -8,12 +9,21 @@ import nats
 import numpy as np
 import pytest
 
+from bms_estimator.edge.block import encode
+from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.sources.captures.replay import load_capture
+from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.sample import NO_CELLS
+from bms_estimator.sources.captures.replay import Replay, load_capture, open_capture
 from tests.command_line import run
 from tests.fleet.identification.test_block_capture import STORE_ID_NS, encoded_block, samples
 from tests.fleet.nats_cluster import running
+from tests.fleet.worker.test_single_cells import MODEL, SETTINGS, minutes, table
 from tests.patience import LONG_S
+
+CELL_BLOCKS = [encode(replace(block, cells_v=NO_CELLS) if block.number in (1, 4) else block) for block in minutes(3, 6)]
+"""Blocks with cell voltages, two of which have none."""
 
 
 async def send_blocks(cluster):
@@ -25,6 +35,8 @@ async def send_blocks(cluster):
             await client.publish("raw/house", encoded_block(number), qos=1)
             await client.publish("raw/other", encoded_block(number), qos=1)
         await client.publish("raw/house", b"no block", qos=1)
+        for data in CELL_BLOCKS:
+            await client.publish("raw/cells", data, qos=1)
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +76,21 @@ def test_time_span_is_limited_and_missing_samples_are_reported(cluster, tmp_path
     code, _, err = run(capsys, "fleet", "capture", "nobody", tmp_path / "no.csv", "--server", cluster.url)
     assert (code, "nobody: the server has no samples of this pack in this period" in err) == (2, True)
     assert "must end in" in run(capsys, "fleet", "capture", "house", tmp_path / "no.xls", "--server", cluster.url)[2]
+
+
+@pytest.mark.parametrize("name", ["cells.parquet", "cells.csv.gz"])
+async def test_replay_of_captured_cell_voltages_gives_the_states_of_the_worker_bit_for_bit(
+    cluster, tmp_path, capsys, name
+):
+    out = tmp_path / name
+    code, *_ = await asyncio.to_thread(run, capsys, "fleet", "capture", "cells", out, "--server", cluster.url)
+    assert code == 0
+    estimator = make_estimator(SETTINGS, MODEL)
+    cells = CellEstimator(estimator)
+    async for received in Replay(open_capture(out)):
+        cells.run(received.samples, received.cells_v, estimator.run(received.samples))
+    partition = Partition(0, table)
+    for sequence, data in enumerate(CELL_BLOCKS, 1):
+        partition.take("cells", data, sequence)
+    assert partition.cells("cells").tobytes() == cells.cells.tobytes()
+    assert partition.state("cells")["estimator"].tobytes() == estimator.record.tobytes()

@@ -7,7 +7,7 @@ import json
 from functools import lru_cache
 
 from bms_estimator.fleet.worker.cell_summary import MAX_CELLS
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import layout_of
+from bms_estimator.fleet.worker.checkpoint.record_layout import layout_of
 from bms_estimator.fleet.worker.pack_state import CELLS, pack_dtype
 
 

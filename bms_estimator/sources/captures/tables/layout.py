@@ -5,11 +5,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.cell_voltage_columns import present_columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.tables.cell_values import CellKind
@@ -57,7 +58,20 @@ class Role(Enum):
     STATUS = "status"
 
 
-RawBlock = dict[Role, NDArray[np.float64]]
+class CellVoltage(NamedTuple):
+    """Meaning of a column with the voltage of a single cell."""
+
+    number: int
+    """Number of the cell, from 1."""
+
+    @property
+    def value(self) -> str:
+        """Name of the quantity."""
+        return f"cell {self.number}"
+
+
+ColumnRole = Role | CellVoltage
+RawBlock = dict[ColumnRole, NDArray[np.float64]]
 """Columns of a block of rows, in the units of the table."""
 
 
@@ -90,7 +104,12 @@ class Layout:
     """
 
     dialect: Dialect | None
-    columns: Mapping[Role, Column]
+    columns: Mapping[ColumnRole, Column]
+
+    @property
+    def cells(self) -> tuple[CellVoltage, ...]:
+        """Cells with a voltage column, in order."""
+        return tuple(role for role in self.columns if isinstance(role, CellVoltage))
 
 
 class LayoutFinder:
@@ -145,7 +164,7 @@ class LayoutFinder:
         cells = [cell.strip() for cell in header]
         if not set(self._map.values()) <= set(cells):
             return None
-        columns = {}
+        columns = dict[ColumnRole, Column]()
         for quantity, name in self._map.items():
             if cells.count(name) > 1:
                 raise UserError(f"{self._path}: {cells.count(name)} columns are named {name}: rename all but one")
@@ -155,24 +174,23 @@ class LayoutFinder:
     def _apply_dialect(self, dialect: Dialect, header: Sequence[str], names: Sequence[ColumnName]) -> Layout | None:
         """Return the layout of a dialect; None if the header lacks a required column."""
         cells = [cell.strip() for cell in header]
-        columns = {}
+        columns = dict[ColumnRole, Column]()
         for quantity in QUANTITIES:
             index = self._find_index(getattr(dialect, quantity), cells, names)
             if index is not None:
                 columns[Role(quantity)] = self._column(quantity, index, cells, names[index])
             elif quantity in REQUIRED:
                 return None
-        # ``fleet capture`` writes exactly the columns of a sample; the status of another table has another meaning
-        if dialect is OWN and set(cells) == set(SAMPLE.names or ()):
-            columns[Role.STATUS] = Column(cells.index("status"), "status", Unit(""))
+        if dialect is OWN:
+            columns |= _own_columns(cells)
         current_name = names[columns[Role.CURRENT].index].name
         return Layout(dialect, columns | self._sign_columns(dialect, cells, names, current_name))
 
     def _sign_columns(
         self, dialect: Dialect, cells: Sequence[str], names: Sequence[ColumnName], current_name: str
-    ) -> dict[Role, Column]:
+    ) -> dict[ColumnRole, Column]:
         """Return the optional columns that determine the sign of the current."""
-        columns = {}
+        columns = dict[ColumnRole, Column]()
         state = self._find_index(dialect.state, cells, names)
         if state is not None:
             columns[Role.STATE] = Column(state, cells[state], Unit(""), kind=CellKind.DIRECTION)
@@ -206,6 +224,21 @@ class LayoutFinder:
                 f"convert it, or name other columns by {MAP_HELP}"
             )
         return Column(index, cells[index], unit)
+
+
+def _own_columns(header: Sequence[str]) -> dict[ColumnRole, Column]:
+    """Return the columns that only tables of this project have: cell voltages and the status.
+
+    ``fleet capture`` writes exactly the columns of a sample and of the cells; the status of another table has another meaning.
+    """
+    cells = present_columns(header)
+    columns: dict[ColumnRole, Column] = {
+        CellVoltage(number): Column(header.index(name), name, SI_UNITS["voltage"])
+        for number, name in enumerate(cells, 1)
+    }
+    if {*header} - {*cells} == {*(SAMPLE.names or ())}:
+        columns[Role.STATUS] = Column(header.index("status"), "status", Unit(""))
+    return columns
 
 
 def with_units(layout: Layout, units_row: Sequence[str]) -> Layout | None:

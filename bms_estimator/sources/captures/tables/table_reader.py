@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import MAX_C, MIN_C, SAMPLE, SampleBlock, remove_implausible
+from bms_estimator.model.sample import MAX_C, MIN_C, NO_CELLS, SAMPLE, CellBlock, SampleBlock, remove_implausible
 from bms_estimator.sources.captures.tables.cell_values import CellKind
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
 from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction, voltage_response
@@ -65,13 +65,14 @@ class Table:
 
     Attributes:
         implausible: Number of implausible temperatures in the rows read so far.
+        cells: Cell voltages of the last block.
         note: Description of dialect, columns and sign; empty for a table with this project's columns.
         warning: Contradiction between the sign of the current and the voltage; empty without one.
     """
 
     def __init__(self, reader: TableReader, configured: Sign) -> None:
         self._reader, self._layout = reader, reader.layout
-        self.implausible = 0
+        self.implausible, self.cells = 0, NO_CELLS
         response = None if configured.option else voltage_response(self._first_rows())
         self._direction = find_direction(self._layout, configured, response)
         self.note = "" if self._layout.dialect is OWN else _note(reader, self._direction.text)
@@ -99,6 +100,7 @@ class Table:
             if self._layout.dialect is not OWN:  # this project's tables hold the time stamps that a source delivered
                 before = _separate_steps(before, samples)
             self.implausible += remove_implausible(samples["temperature_c"], MIN_C, MAX_C)
+            self.cells = _cell_voltages(raw, self._layout)
             yield samples
 
     def _blocks_as_signed_in_table(self) -> Iterator[tuple[RawBlock, SampleBlock]]:
@@ -136,6 +138,12 @@ def _samples(raw: RawBlock, layout: Layout) -> SampleBlock:
     if Role.STATUS in values:
         samples["status"] = np.nan_to_num(values[Role.STATUS]).clip(0.0, np.iinfo(np.uint32).max)
     return samples
+
+
+def _cell_voltages(raw: RawBlock, layout: Layout) -> CellBlock:
+    """Return the cell voltages of a block; empty for a table without them."""
+    cells = layout.cells
+    return np.column_stack([raw[cell] for cell in cells]) if cells else NO_CELLS
 
 
 def _separate_steps(before: SampleBlock, samples: SampleBlock) -> SampleBlock:

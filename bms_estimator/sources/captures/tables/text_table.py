@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind, parser
-from bms_estimator.sources.captures.tables.layout import BLOCK_ROWS, REQUIRED, Column, LayoutFinder, RawBlock, Role
+from bms_estimator.sources.captures.tables.layout import (
+    BLOCK_ROWS,
+    REQUIRED,
+    Column,
+    ColumnRole,
+    LayoutFinder,
+    RawBlock,
+    Role,
+)
 from bms_estimator.sources.captures.tables.text_file import TextFile
 from bms_estimator.sources.captures.tables.text_format import SEPARATORS, TextFormat, find_format, is_data, split_cells
 
@@ -163,7 +171,7 @@ class _RowParser:
             )
         return [self._value(role, column, cells, line) for role, column in self._format.layout.columns.items()]
 
-    def _value(self, role: Role, column: Column, cells: Sequence[str], line: int) -> float:
+    def _value(self, role: ColumnRole, column: Column, cells: Sequence[str], line: int) -> float:
         cell = cells[column.index]
         if not cell.strip():
             return float("nan")
