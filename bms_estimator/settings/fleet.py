@@ -12,6 +12,7 @@ from bms_estimator.settings.page import ListenAddress, parse_listen
 Gigabytes = Annotated[float, Field(gt=0, le=1e6)]
 PackCount = Annotated[int, Field(ge=1, le=10_000_000)]
 Days = Annotated[float, Field(gt=0, le=3660)]
+CellCount = Annotated[int, Field(ge=0, le=255)]
 TenantName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
 
 
@@ -59,6 +60,10 @@ class ServerSettings(Strict):
         default=7.0,
         description="time without workers after which the server still has all blocks [days]; older blocks are dropped",
     )
+    cells: CellCount = Field(
+        default=0,
+        description="number of single cells of a pack whose voltages its edge sends, from which the sizes of the streams are computed",
+    )
     disk_gb: Gigabytes | None = Field(
         default=None, description="maximum size of all streams; default: three quarters of the free space at the start"
     )
@@ -97,6 +102,9 @@ class TenantSettings(Strict):
     packs: PackCount | None = Field(default=None, description="number of packs; default: server.packs")
     outage_days: Days | None = Field(
         default=None, description="time without workers that must be bridged [days]; default: server.outage_days"
+    )
+    cells: CellCount | None = Field(
+        default=None, description="number of single cells whose voltages are sent; default: server.cells"
     )
     disk_gb: Gigabytes | None = Field(
         default=None, description="maximum size of all streams of the tenant, including replicas; default: no limit"

@@ -1,6 +1,6 @@
 """Sizes of a tenant's streams, from the number of packs and the days without workers that the streams must bridge.
 
-The sizes of a block, an hourly summary and a pack's state were measured with simulated packs at 1 Hz without cell voltages
+The sizes of a block, an hourly summary and a pack's state were measured with simulated packs at 1 Hz
 (``tests/fleet/nats/test_stream_sizes.py`` prints them).
 """
 
@@ -23,6 +23,11 @@ STATE_BYTES = 42_000
 """Maximum size of a pack in a checkpoint [bytes]."""
 DAILY_STATE_BYTES = 19_000
 """Size of a pack in a checkpoint after 24 h [bytes], which is nearly that of a daily checkpoint."""
+CELL_BLOCK_BYTES, CELLS_BLOCK_BYTES, MAX_CELLS_BLOCK_BYTES = 60, 160, 4096
+"""Additional size of such a block for each cell voltage, for their mean, and its maximum [bytes]. From 67 cells on, not all
+samples have cell voltages (``edge.cell_voltages``)."""
+CELL_STATE_BYTES = 400
+"""Additional size of a pack in a checkpoint for each cell [bytes]."""
 LAST_CHECKPOINTS, DAILY_CHECKPOINTS = 4, 30
 """Number of whole checkpoints of a partition: the last two, whose increments have at most half of their size, with the one that
 is being written; and the daily ones."""
@@ -45,15 +50,25 @@ class StreamSizes:
         return round(self.raw * (1.0 + HOURS_FRACTION + DEAD_FRACTION)) + self.states
 
 
-def stream_sizes(packs: int, outage_days: float) -> StreamSizes:
+def stream_sizes(packs: int, outage_days: float, cells: int = 0) -> StreamSizes:
     """Return the sizes of the streams for a number of packs.
 
     Args:
         packs: Number of packs of the tenant.
         outage_days: Days without workers after which ``RAW`` still has all blocks, even if one pack sends blocks of the
             maximum size.
+        cells: Number of single cells of a pack whose voltages are sent.
     """
-    fleet_bytes = packs * outage_days * DAY_BLOCKS * BLOCK_BYTES
+    fleet_bytes = packs * outage_days * DAY_BLOCKS * block_bytes(cells)
     one_pack_bytes = outage_days * DAY_BLOCKS * MAX_BLOCK_BYTES / PACK_FRACTION
-    states_bytes = packs * (LAST_CHECKPOINTS * STATE_BYTES + DAILY_CHECKPOINTS * DAILY_STATE_BYTES)
+    checkpoints = LAST_CHECKPOINTS + DAILY_CHECKPOINTS
+    states_bytes = packs * (
+        LAST_CHECKPOINTS * STATE_BYTES + DAILY_CHECKPOINTS * DAILY_STATE_BYTES + checkpoints * cells * CELL_STATE_BYTES
+    )
     return StreamSizes(raw=round(max(fleet_bytes, one_pack_bytes)), states=max(states_bytes, MIN_STATES_BYTES))
+
+
+def block_bytes(cells: int) -> int:
+    """Return the size of a block of 60 samples with the voltages of ``cells`` cells in ``RAW`` [bytes]."""
+    cells_bytes = min(CELLS_BLOCK_BYTES + CELL_BLOCK_BYTES * cells, MAX_CELLS_BLOCK_BYTES) if cells else 0
+    return BLOCK_BYTES + cells_bytes

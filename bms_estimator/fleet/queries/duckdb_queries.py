@@ -29,6 +29,7 @@ from bms_estimator.fleet.queries.parquet_files import (
 )
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
+from bms_estimator.settings.alarm_limits import MIN_SHORT_C
 
 SQL = resources.files("bms_estimator.fleet.queries") / "sql"
 AGED_SOC = 1000.0
@@ -63,7 +64,7 @@ QUESTIONS = {
         ("days", "packs", "cell_days"), "packs whose cells differ at rest, and the trend of the difference"
     ),
     "self-discharge": Query(
-        ("days", "packs", "cell_days"), "cells whose voltage at rest falls over the days relative to the others"
+        ("days", "packs"), "cells that discharge themselves, for example by an internal short, with their current"
     ),
     "clocks": Query((), "packs whose edge's clock is wrong, so that their hours are quarantined"),
 }
@@ -89,13 +90,13 @@ class Limits:
     """Query outliers: lower bound of the relative standard deviation between packs of a type."""
     recent_days: int = 3
     """Query failing: number of most recent days. A pack is reported if more than half of them have a new input fault.
-    Queries weak-cells and imbalance use the rows of these days."""
+    Queries weak-cells, imbalance and self-discharge use the rows of these days."""
     weak_cell_v: float = 0.02
     """Query weak-cells: minimum mean deviation of the weakest cell below the mean of the cells [V]."""
     imbalance_v: float = 0.02
     """Query imbalance: minimum difference between the highest and the lowest cell at rest [V]."""
-    self_discharge_v: float = 0.0002
-    """Query self-discharge: minimum fall of a cell's voltage relative to the others [V/day]."""
+    self_discharge_c: float = MIN_SHORT_C
+    """Query self-discharge: minimum self-discharge of a cell above the median cell, as a C-rate [1/h]."""
     silent_hours: int = 2
     """Query silent: maximum age of the last summary [h]. The newest summary of a live pack is of the previous hour."""
     max_packs: int = 10_000

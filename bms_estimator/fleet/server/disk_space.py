@@ -33,7 +33,8 @@ def _stored_bytes(path: Path) -> int:
 def sizes_of(settings: FleetSettings, tenant: TenantSettings) -> StreamSizes:
     """Return the sizes of a tenant's streams."""
     server = settings.server
-    return stream_sizes(tenant.packs or server.packs, tenant.outage_days or server.outage_days)
+    cells = server.cells if tenant.cells is None else tenant.cells
+    return stream_sizes(tenant.packs or server.packs, tenant.outage_days or server.outage_days, cells)
 
 
 def check_disk_space(settings: FleetSettings, folder: Path, available: int, copies_per_node: float) -> None:

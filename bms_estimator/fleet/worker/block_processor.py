@@ -25,7 +25,7 @@ from bms_estimator.fleet.worker.pack_state import (
     Fields,
     UnpackedRecord,
 )
-from bms_estimator.fleet.worker.single_cells import SingleCells
+from bms_estimator.fleet.worker.single_cells import SingleCells, known_voltages
 from bms_estimator.forecast.capability import write_usable_charge
 from bms_estimator.forecast.forecast import Forecast, unknown_values
 from bms_estimator.model.clock import iso_utc
@@ -156,7 +156,7 @@ class BlockProcessor:
             trace = pack_type.estimator.run(part.samples)
             hour_summary.add(self._record["hour"], trace, part, pack_type.estimator)
             pack_type.meter.add(trace)
-            self._window.add(trace, arrival_s, part.cells_v)
+            self._window.add(trace, arrival_s, known_voltages(part.cells_v))
             self._single_cells.run(part, trace)
         cell_summary.add(self._record[0]["cells"], block, hour_summary.rest_current_a(pack_type.estimator))
         counters["blocks"] += 1

@@ -10,6 +10,7 @@ from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.fleet.worker.cell_summary import MAX_CELLS
 from bms_estimator.fleet.worker.pack_state import UnpackedRecord
 from bms_estimator.model.payloads.cells import CellsReport
+from bms_estimator.model.sample import CellBlock
 from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
 
 PAYLOAD_S = 60.0
@@ -123,3 +124,8 @@ class SingleCells:
         if self._cells is not None:
             self._cells.use_state(self._unpacked.cells, self._unpacked.bank)
             self._is_loaded, self._begin_s = True, float(self._unpacked.bank["time_s"][0])
+
+
+def known_voltages(cells_v: CellBlock) -> CellBlock:
+    """Return the rows with a voltage, because an edge does not send the cell voltages of all samples of a large block."""
+    return cells_v[np.isfinite(cells_v).any(axis=1)] if cells_v.size else cells_v

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import nats
@@ -9,19 +10,28 @@ import numpy as np
 import pytest
 
 from bms_estimator.edge import subjects
+from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.nats.stream_sizes import (
     BLOCK_BYTES,
+    CELL_STATE_BYTES,
     DAILY_STATE_BYTES,
     DAY_BLOCKS,
     HOUR_ROW_BYTES,
     STATE_BYTES,
+    block_bytes,
     stream_sizes,
 )
 from bms_estimator.fleet.nats.streams import HOURS_FRACTION, make_streams, pack_blocks
 from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
+from bms_estimator.fleet.server.disk_space import sizes_of
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import NO_CELLS
+from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings
+from bms_estimator.settings.pack import Settings
+from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 from tests.fleet.nats_cluster import running
 
 PACKS = 4
@@ -64,10 +74,46 @@ async def test_stored_day_of_a_pack_is_at_most_as_large_as_computed(tmp_path: Pa
     assert 0.5 * DAILY_STATE_BYTES < state_bytes <= 1.2 * DAILY_STATE_BYTES
 
 
+@pytest.mark.parametrize("cells", [4, 16, 66, 100])
+def test_block_hour_and_state_with_cell_voltages_are_at_most_as_large_as_computed(cells: int) -> None:
+    rng, cell = np.random.default_rng(1), load_cell("nmc", 50.0)
+    bank, model = SimulatedBank(cell, BankCells.drawn(rng, cells, 50.0, 0.8)), cell.pack(cells, 1)
+    settings, store_ns = Settings(), 490_000 * 3600 * 10**9
+    partition, sizes, hours, additional = Partition(0, lambda _: (settings, model)), [], [], []
+    for number in range(1, 62):
+        history = bank.run(np.round(10.0 + 5.0 * rng.standard_normal(60), 2))
+        cells_v = np.round(history.cell_v + 5e-4 * rng.standard_normal(history.cell_v.shape), 3)
+        samples = history.samples(rng, 2e-3, 1e-2)
+        block = Block(store_ns, number, 1, store_ns / 1e9 + 60.0 * number, samples, cells_v)
+        data, without_cells = encode(block), encode(replace(block, cells_v=NO_CELLS))
+        hours += partition.take("with", data, 2 * number - 1).hours
+        partition.take("without", without_cells, 2 * number)
+        sizes.append(len(data))
+        additional.append(len(data) - len(without_cells))
+    snapshot = partition.snapshot()
+    state_bytes = (len(snapshot.unmigrated["with"].packed) - len(snapshot.packs["without"])) / cells
+    ((_, hour),) = hours
+    sys.stdout.write(
+        f"{cells} cells: block {np.mean(sizes):.0f}, of these {np.mean(additional):.0f} for the cells, "
+        f"hourly summary {len(hour)}, state {state_bytes:.0f} for each cell\n"
+    )
+    assert 0.4 * (block_bytes(cells) - BLOCK_BYTES) < np.mean(additional) <= block_bytes(cells) - BLOCK_BYTES
+    assert HOURS_FRACTION * 60 * block_bytes(cells) > 1.5 * len(hour)
+    assert 0.5 * CELL_STATE_BYTES < state_bytes <= CELL_STATE_BYTES
+
+
 @pytest.mark.parametrize("packs", [1, 1000, 100_000])
 @pytest.mark.parametrize("days", [0.5, 7.0, 30.0])
-def test_streams_hold_the_outage_for_any_number_of_packs(packs: int, days: float) -> None:
-    sizes = stream_sizes(packs, days)
-    assert sizes.raw >= packs * days * DAY_BLOCKS * BLOCK_BYTES
+@pytest.mark.parametrize("cells", [0, 16])
+def test_streams_hold_the_outage_for_any_number_of_packs(packs: int, days: float, cells: int) -> None:
+    sizes = stream_sizes(packs, days, cells)
+    assert sizes.raw >= packs * days * DAY_BLOCKS * block_bytes(cells)
+    assert sizes.states >= packs * (STATE_BYTES + cells * CELL_STATE_BYTES)
     assert HOURS_FRACTION * sizes.raw >= packs * days * 24 * HOUR_ROW_BYTES
     assert pack_blocks(sizes.raw) >= days * DAY_BLOCKS
+
+
+@pytest.mark.parametrize(("tenant_cells", "cells"), [(None, 16), (0, 0), (4, 4)])
+def test_cells_of_a_tenant_replace_those_of_the_server(tenant_cells: int | None, cells: int) -> None:
+    settings = FleetSettings(server=ServerSettings(packs=100_000, cells=16))
+    assert sizes_of(settings, TenantSettings(cells=tenant_cells)) == stream_sizes(100_000, 7.0, cells)

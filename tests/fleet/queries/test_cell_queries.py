@@ -5,6 +5,7 @@ import pytest
 
 from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.fleet.queries.parquet_files import write
+from tests.benchmarks.fleet.self_discharge import SHORTED_CELL, hourly_rows
 from tests.fleet.hour_rows import BEGIN, make_hour
 
 DAYS, CELLS, PACKS = 30, 8, 20
@@ -34,6 +35,11 @@ def folder(tmp_path_factory):
                     "weakest_cell": weakest + 1,
                     "weakest_cell_v": float(loaded_v[weakest]),
                     "cells_rest_v": (cells_v - cells_v.mean()).tolist(),
+                    "weakest_cell_soc_deviation": -0.01 * weakest,
+                    "weakest_cell_resistance_ratio": 1.0 + 0.5 * (weakest == 2),
+                    "self_discharge_cell": 5,
+                    "self_discharge_a": 0.005 if f"p{n}" == LEAKING else 0.002,
+                    "self_discharge_std_a": 0.001,
                 }
                 rows.append(make_hour(f"p{n}", BEGIN + 24 * day + hour, **values))
     write(folder, rows)
@@ -46,6 +52,7 @@ def test_cell_that_is_below_the_others_under_load_is_found(folder):
     (row,) = [row for row in rows if row["pack"] == WEAK]
     assert row["deviation_v"] == pytest.approx(-0.06 * 7 / 8, abs=0.01)
     assert row["fraction"] == 1.0
+    assert (row["soc_deviation"], row["resistance_ratio"]) == (pytest.approx(-0.02), 1.5)
 
 
 def test_packs_whose_cells_differ_at_rest_are_found_with_the_trend(folder):
@@ -57,10 +64,34 @@ def test_packs_whose_cells_differ_at_rest_are_found_with_the_trend(folder):
     assert rows[LEAKING]["spread_v_per_30_days"] == pytest.approx(0.03, abs=0.01)
 
 
-def test_cell_that_discharges_itself_is_found_at_any_soc(folder):
+def test_cell_with_a_significant_self_discharge_is_found(folder):
     (row,) = run_query(folder, "self-discharge").records
     assert (row["pack"], row["cell"]) == (LEAKING, 5)
-    assert row["mv_per_day"] == pytest.approx(-1.0 * 7 / 8, abs=0.05)  # relative to the mean, which falls too
+    assert (row["self_discharge_ma"], row["self_discharge_std_ma"]) == (pytest.approx(5.0), pytest.approx(1.0))
+    assert row["percent_per_day"] == pytest.approx(100 * 24 * 0.005 / 3.0)
+
+
+def test_internal_short_of_a_simulated_pack_is_found_with_its_current_and_a_healthy_pack_is_not(tmp_path):
+    for name, short_ohm in (("shorted", 30.0), ("healthy", np.inf)):
+        rows = hourly_rows("nmc", 1, short_ohm, days=3, short_day=1)
+        write(tmp_path, [row.model_copy(update={"pack": name}) for row in rows])
+    (row,) = run_query(tmp_path, "self-discharge").records
+    assert (row["pack"], row["cell"]) == ("shorted", SHORTED_CELL + 1)
+    assert row["self_discharge_ma"] == pytest.approx(1000 * 3.8 / 30.0, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"self_discharge_a": 0.005, "self_discharge_std_a": 0.004},  # not significant
+        {"self_discharge_a": 0.00005, "self_discharge_std_a": 0.00001},  # below C/30,000
+        {"self_discharge_a": -0.005, "self_discharge_std_a": 0.001},
+        {},  # an hour of an earlier worker, or before the first estimate
+    ],
+)
+def test_other_self_discharge_is_not_reported(tmp_path, values):
+    write(tmp_path, [make_hour("a", BEGIN, self_discharge_cell=1, **values)])
+    assert run_query(tmp_path, "self-discharge").rows == []
 
 
 def test_fleet_without_cell_voltages_has_no_rows(tmp_path):

@@ -110,6 +110,13 @@ def test_worker_publishes_the_weakest_cell_and_all_cells_once_a_minute(blocks):
     assert all(result.cells for result in results[1:])
 
 
+def test_state_has_the_last_known_cell_voltages_of_a_block():
+    (block,) = minutes(1, 1)
+    block.cells_v[-1] = math.nan
+    result = Partition(0, table).take("a", encode(block), 1)
+    assert json.loads(result.state)["cells_v"] == block.cells_v[-2].tolist()
+
+
 def test_short_blocks_do_not_publish_the_cells_more_often():
     parts = [
         replace(block, number=6 * (block.number - 1) + n + 1, samples=block.samples[10 * n : 10 * n + 10],
