@@ -8,6 +8,8 @@
 ``edge.<pack>.awaits``       ``BlockRequest`` to the edge: the first block that no saved checkpoint includes
 ``bms.<pack>.<topic>``       estimates, in the format of the command ``run``
 ``dead.<pack>.<digest>``     a block that a worker could not process, stored in the stream ``DEAD``
+``telemetry.<pack>``         batches of an operator's telemetry platform, received by the stream ``TELEMETRY``
+``ingest.<pack>``            report of ``fleet ingest`` about dropped samples or a rejected batch
 ``hours.<pack>``             one-hour summaries by a worker, stored in the stream ``HOURS``
 ``fleet.worker.<id>``        heartbeat of a worker, once a second, with its partitions and its lag
 ``fleet.unknown.<pack>``     one report of a worker that it has blocks of an unregistered pack, with the reason
@@ -18,7 +20,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-RAW_STREAM, HOURS_STREAM, DEAD_STREAM = "RAW", "HOURS", "DEAD"
+RAW_STREAM, HOURS_STREAM, DEAD_STREAM, TELEMETRY_STREAM = "RAW", "HOURS", "DEAD", "TELEMETRY"
 PACKS_BUCKET, CELLS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "cells", "checkpoints", "states"
 """Names of buckets. The first three are key-value buckets: settings by pack, cell files by name, and the last checkpoint
 by partition. The fourth is an object bucket with the content of the checkpoints."""
@@ -29,6 +31,16 @@ PARTITIONS = 64
 def raw(pack: str) -> str:
     """Return the subject on which an edge publishes."""
     return f"raw.{pack}"
+
+
+def telemetry(pack: str = "*") -> str:
+    """Return the subject on which a telemetry platform publishes batches of samples."""
+    return f"telemetry.{pack}"
+
+
+def ingest_report(pack: str) -> str:
+    """Return the subject of reports about dropped samples and rejected batches."""
+    return f"ingest.{pack}"
 
 
 def table_change(pack: str = "*") -> str:
@@ -56,7 +68,7 @@ def mapping(partitions: int) -> tuple[str, str]:
     return "*.*", f"p.{{{{partition({partitions},2)}}}}.{{{{wildcard(1)}}}}.{{{{wildcard(2)}}}}"
 
 
-def block_request(pack: str) -> str:
+def block_request(pack: str = "*") -> str:
     """Return the subject of a worker's requests to an edge."""
     return f"edge.{pack}.awaits"
 

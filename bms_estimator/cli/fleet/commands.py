@@ -17,6 +17,9 @@ COMMANDS = {
     "worker": LazyCommand(
         "bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."
     ),
+    "ingest": LazyCommand(
+        "bms_estimator.cli.fleet.ingest:ingest", "Receive batches of samples from a telemetry platform."
+    ),
     "status": LazyCommand(
         "bms_estimator.cli.fleet.status:status", "List the workers, their versions and the partitions they refuse."
     ),

@@ -1,6 +1,6 @@
-"""Dead letters: blocks that workers could not process, stored in the stream ``DEAD`` with the reason.
+"""Dead letters: blocks that workers could not process, and rejected batches of telemetry, with the reason.
 
-Each block has a subject of its own, made of its pack and its digest. Therefore a block that is sent again replaces its earlier
+They are stored in the stream ``DEAD``. Each block has a subject of its own, made of its pack and its digest. Therefore a block that is sent again replaces its earlier
 dead letter.
 """
 
@@ -13,6 +13,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stream_reader import StoredMessage, read_stream
 
 REASON_HEADER, SEQUENCE_HEADER, WORKER_HEADER = "Bms-Reason", "Bms-Sequence", "Bms-Worker"
+SUBJECT_HEADER = "Bms-Subject"
 TIME_HEADER = "Nats-Time-Stamp"
 """Header of the server with the time of storage (RFC 3339)."""
 DIGEST_BYTES = 8
@@ -20,16 +21,18 @@ DIGEST_BYTES = 8
 
 
 class DeadLetter(NamedTuple):
-    """Block that a worker could not process."""
+    """Block that a worker could not process, or batch of telemetry that was rejected."""
 
     pack: str
     sequence: int
-    """Sequence number of the block in the stream ``RAW``."""
+    """Sequence number of the block in the stream ``RAW``, or of the batch in ``TELEMETRY``."""
     reason: str
     worker: str
     """Name of the worker that stored the dead letter."""
     data: bytes
     """Bytes of the block."""
+    batch_subject: str = ""
+    """Subject of a rejected batch of telemetry; empty for a block."""
     time: str = ""
     """Time of storage (RFC 3339), set by the server."""
     stored_sequence: int = 0
@@ -43,7 +46,8 @@ class DeadLetter(NamedTuple):
     def headers(self) -> dict[str, str]:
         """Return the headers of the stored message."""
         reason = self.reason.replace("\r", " ").replace("\n", " ")
-        return {REASON_HEADER: reason, SEQUENCE_HEADER: str(self.sequence), WORKER_HEADER: self.worker}
+        subject = {SUBJECT_HEADER: self.batch_subject} if self.batch_subject else {}
+        return {REASON_HEADER: reason, SEQUENCE_HEADER: str(self.sequence), WORKER_HEADER: self.worker} | subject
 
     @classmethod
     def of(cls, message: StoredMessage) -> Self:
@@ -55,6 +59,7 @@ class DeadLetter(NamedTuple):
             reason=headers.get(REASON_HEADER, ""),
             worker=headers.get(WORKER_HEADER, ""),
             data=message.data,
+            batch_subject=headers.get(SUBJECT_HEADER, ""),
             time=headers.get(TIME_HEADER, ""),
             stored_sequence=message.sequence,
         )
@@ -81,5 +86,5 @@ async def replay_letter(nc: Client, letter: DeadLetter) -> None:
         nats.errors.Error: The server does not accept the block; the dead letter remains stored.
     """
     js = nc.jetstream()
-    await js.publish(subjects.raw(letter.pack), letter.data)
+    await js.publish(letter.batch_subject or subjects.raw(letter.pack), letter.data)
     await js.purge_stream(subjects.DEAD_STREAM, subject=letter.subject, seq=letter.stored_sequence + 1)

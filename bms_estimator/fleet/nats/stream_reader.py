@@ -5,7 +5,7 @@ support. Each request is independent, so that reading continues after a restart 
 """
 
 import json
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, Mapping
 from datetime import UTC, datetime
 from typing import NamedTuple
 
@@ -42,7 +42,7 @@ class StreamError(Exception):
 
 async def read_stream(
     nc: Client, stream: str, subject: str, *, first: int = 1, since_s: float | None = None
-) -> AsyncIterator[list[StoredMessage]]:
+) -> AsyncGenerator[list[StoredMessage], None]:
     """Yield batches of messages in the order of the stream, up to its last message.
 
     Args:

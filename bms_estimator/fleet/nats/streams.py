@@ -118,6 +118,23 @@ async def partitions_of(nc: Client) -> int | None:
     return int(response["config"].get("metadata", {}).get(PARTITIONS_KEY, subjects.PARTITIONS))
 
 
+async def make_telemetry_stream(nc: Client, max_bytes: int) -> None:
+    """Create the stream ``TELEMETRY``, or set its maximum size. It has as many replicas as ``RAW``.
+
+    A full stream rejects new batches, so that their senders keep them.
+
+    Raises:
+        UserError: There is no stream ``RAW``, or the server has too little disk space.
+        NoAnswerError: The server does not respond.
+    """
+    response = await _retry(_request, nc, f"STREAM.INFO.{subjects.RAW_STREAM}", {})
+    if "error" in response:
+        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
+    limits = {"max_bytes": max_bytes, "discard": "new", "allow_direct": True}
+    stream = _stream(subjects.TELEMETRY_STREAM, subjects.telemetry(), **limits)
+    await _retry(_ensure_stream, nc, stream | {"num_replicas": response["config"]["num_replicas"]})
+
+
 def consumer(partition: int) -> str:
     """Return the name of a partition's durable consumer."""
     return f"p{partition}"

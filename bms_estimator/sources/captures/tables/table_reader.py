@@ -107,7 +107,7 @@ class Table:
         """Yield blocks as read, and their samples, whose current has the sign of the table."""
         start_s = None
         for raw in self._reader.blocks():
-            samples = _samples(raw, self._layout)
+            samples = to_samples(raw, self._layout)
             if self._layout.columns[Role.TIME].kind is CellKind.DATE_TIME:
                 start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
                 samples["time_s"] -= start_s
@@ -124,8 +124,8 @@ class Table:
         return np.concatenate(blocks) if blocks else np.empty(0, dtype=SAMPLE)
 
 
-def _samples(raw: RawBlock, layout: Layout) -> SampleBlock:
-    """Return samples in SI units."""
+def to_samples(raw: RawBlock, layout: Layout) -> SampleBlock:
+    """Return samples in SI units. The current has the sign of the table."""
     with np.errstate(over="ignore"):  # infinite results are dropped like other invalid values
         values = {role: raw[role] * column.unit.factor + column.unit.offset for role, column in layout.columns.items()}
     samples = np.zeros(values[Role.TIME].size, dtype=SAMPLE)

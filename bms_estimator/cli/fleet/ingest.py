@@ -1,0 +1,61 @@
+"""``bms-estimator fleet ingest``: intake of batches from a telemetry platform."""
+
+import asyncio
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
+from bms_estimator.cli.options.capture_options import MappedColumns, SignOfCurrent
+
+DEFAULT_BLOCK_S = 60.0
+GB = 10**9
+
+
+def ingest(
+    server: Server = DEFAULT_SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="folder of the blocks that no worker has confirmed; default: the state folder of systemd, or ~/.local/state/bms-estimator-ingest",
+            show_default=False,
+        ),
+    ] = None,
+    columns: MappedColumns = None,
+    current_sign: SignOfCurrent = None,
+    block_s: Annotated[
+        float,
+        typer.Option(min=1.0, max=3600.0, help="duration of a block, which is sent to the workers as one message"),
+    ] = DEFAULT_BLOCK_S,
+    buffer_gb: Annotated[
+        float, typer.Option(min=0.001, help="maximum size of the batches that wait on the server [GB]")
+    ] = 1.0,
+) -> None:
+    """Receive batches of samples from a telemetry platform, in place of the edges of its packs, until SIGINT or SIGTERM.
+
+    The platform publishes a batch, JSON or Arrow, on the NATS subject telemetry.PACK or the MQTT topic telemetry/PACK.
+    """
+    from bms_estimator.fleet.ingest.ingest import Options, ingest  # noqa: PLC0415 - its packages are optional
+    from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
+    from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
+
+    options = Options(
+        server, folder or _default_folder(), creds, ca, block_s, round(buffer_gb * GB), columns, current_sign
+    )
+
+    async def run() -> None:
+        await ingest(options, stop_on_signal())
+
+    configure_logs()
+    with flush_logs():
+        asyncio.run(run())
+
+
+def _default_folder() -> Path:
+    systemd_folder = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    user_folder = Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state") / "bms-estimator-ingest"
+    return Path(systemd_folder or user_folder).expanduser()

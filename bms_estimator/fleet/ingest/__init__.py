@@ -1,0 +1,1 @@
+"""Intake of samples from an operator's telemetry platform, in place of edges."""

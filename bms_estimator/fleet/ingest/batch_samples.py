@@ -1,0 +1,222 @@
+"""Samples of a telemetry batch: units, sign of the current, timestamps and order. No I/O."""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.edge.cell_voltages import MAX_CELLS
+from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, Values
+from bms_estimator.fleet.worker.edge_clock import MAX_AHEAD_S
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import (
+    MAX_C,
+    MAX_CELL_V,
+    MIN_C,
+    MIN_CELL_V,
+    NO_CELLS,
+    CellBlock,
+    CurrentSign,
+    SampleBlock,
+    remove_implausible,
+)
+from bms_estimator.sources.captures.tables.cell_values import CellKind
+from bms_estimator.sources.captures.tables.column_tables import parse_column
+from bms_estimator.sources.captures.tables.layout import (
+    Column,
+    ColumnMap,
+    Layout,
+    LayoutFinder,
+    Role,
+    with_time_kind,
+)
+from bms_estimator.sources.captures.tables.table_reader import to_samples
+from bms_estimator.sources.captures.tables.units import Unit, find_unit, split_unit
+
+MIN_TIME_S = 946_684_800.0
+"""Earliest plausible timestamp: 2000-01-01 [s since 1970]."""
+MAX_LAYOUTS = 256
+"""Maximum number of remembered headers."""
+CELLS = "cells"
+"""Name of the column of cell voltages, without its unit."""
+_TEXT = "the batch"
+
+
+class BatchSamples(NamedTuple):
+    """Samples of a batch, with times in seconds since 1970 and the current positive on discharge."""
+
+    samples: SampleBlock
+    cells_v: CellBlock
+    """Shape (n, m) [V]; empty without cell voltages."""
+
+
+class Selection(NamedTuple):
+    """Samples of a batch that continue those of the pack, in order of time, and the numbers of all others."""
+
+    samples: SampleBlock
+    cells_v: CellBlock
+    old: int
+    """Number of samples at or before the pack's last sample, and of repeated times within the batch."""
+    implausible: int
+    """Number of samples without a time, or with a time before 2000 or in the future."""
+
+    def reason(self, last_s: float) -> str:
+        """Return the reason for which samples were dropped; empty if none was.
+
+        Args:
+            last_s: Time of the pack's last sample before the batch [s since 1970].
+        """
+        reasons = []
+        if self.old:
+            end = f"the pack's last stored time {iso_utc(last_s)}" if np.isfinite(last_s) else "an equal time"
+            reasons.append(f"{self.old} samples at or before {end}: sent again, or too late")
+        if self.implausible:
+            reasons.append(f"{self.implausible} samples without a time, or with one before 2000 or in the future")
+        return "; ".join(reasons)
+
+
+class BatchReader:
+    """Converter of columns to samples.
+
+    Args:
+        column_map: Names of columns that the operator gave; without them the columns are recognized.
+        current_sign: Direction of positive current in the batches; None: that of a recognized format, otherwise positive on
+            discharge.
+    """
+
+    def __init__(self, column_map: ColumnMap | None = None, current_sign: CurrentSign | None = None) -> None:
+        self._column_map, self._current_sign = column_map, current_sign
+        self._find_layout = lru_cache(MAX_LAYOUTS)(self._find)
+
+    def read(self, columns: BatchColumns) -> BatchSamples:
+        """Return the samples of a batch, in its order.
+
+        Raises:
+            BatchError: A column is missing, or a value is invalid. The message names column and row.
+        """
+        try:
+            layout, cells = self._find_layout(tuple(columns))
+            layout = with_time_kind(layout, _time_kind(columns[layout.columns[Role.TIME].name]))
+            raw = {role: _floats(column, columns[column.name]) for role, column in layout.columns.items()}
+            cells_v = _cell_voltages(cells.name, columns[cells.name], cells.unit) if cells else NO_CELLS
+        except UserError as error:
+            raise BatchError(str(error).removeprefix(f"{_TEXT}: ")) from None
+        except OverflowError:
+            raise BatchError("a number is too large") from None
+        samples = to_samples(raw, layout)
+        if self._sign_of(layout) == "charge_positive":
+            samples["current_a"] *= -1.0
+        remove_implausible(samples["temperature_c"], MIN_C, MAX_C)
+        return BatchSamples(samples, cells_v)
+
+    def _find(self, header: tuple[str, ...]) -> tuple[Layout, Column | None]:
+        """Return the columns of a sample, and the column of cell voltages.
+
+        Raises:
+            UserError: A column is missing.
+        """
+        finder = LayoutFinder(_TEXT, self._column_map)
+        layout = finder.find(header)
+        if layout is None:
+            raise finder.no_header()
+        roles: dict[Role, Column] = {
+            role: Column(column.index, header[column.index], column.unit, column.assumed)
+            for role, column in layout.columns.items()
+            if role is not Role.STATE
+        }
+        cells = [name for name in header if split_unit(name).name == CELLS]
+        if not cells:
+            return Layout(layout.dialect, roles), None
+        unit = find_unit("voltage", split_unit(cells[0]).unit or "V")
+        if unit is None or len(cells) > 1:
+            raise UserError(f"column {', '.join(cells)}: must be one column cells_v or cells_mv")
+        return Layout(layout.dialect, roles), Column(header.index(cells[0]), cells[0], unit)
+
+    def _sign_of(self, layout: Layout) -> CurrentSign:
+        by_format = layout.dialect.current_sign if layout.dialect else None
+        return self._current_sign or by_format or "discharge_positive"
+
+
+def select_new(batch: BatchSamples, last_s: float, now_s: float) -> Selection:
+    """Return the samples of a batch after the pack's last sample, in order of time and each time once.
+
+    Args:
+        batch: Samples of the batch.
+        last_s: Time of the pack's last sample [s since 1970]; minus infinity without one.
+        now_s: Time of arrival of the batch [s since 1970].
+    """
+    times: NDArray[np.float64] = batch.samples["time_s"]
+    plausible = (times >= MIN_TIME_S) & (times <= now_s + MAX_AHEAD_S)
+    order = np.flatnonzero(plausible)
+    order = order[np.argsort(times[order], kind="stable")]
+    is_new = np.diff(times[order], prepend=last_s) > 0.0
+    is_new &= times[order] > last_s
+    chosen = order[is_new]
+    cells_v = batch.cells_v[chosen] if batch.cells_v.size else NO_CELLS
+    implausible = times.size - order.size
+    return Selection(batch.samples[chosen], cells_v, order.size - chosen.size, implausible)
+
+
+def _time_kind(values: Values) -> CellKind:
+    is_stamp = isinstance(values, np.ndarray) and values.dtype.kind == "M"
+    is_text = not isinstance(values, np.ndarray) and any(isinstance(value, str) for value in values[:1])
+    return CellKind.DATE_TIME if is_stamp or is_text else CellKind.NUMBER
+
+
+def _floats(column: Column, values: Values) -> NDArray[np.float64]:
+    """Return a column as floats, with NaN for missing values; timestamps in seconds since 1970.
+
+    Raises:
+        BatchError: A value is not of the kind of the column.
+        UserError: A text is not a date and time.
+    """
+    if isinstance(values, np.ndarray):
+        if values.dtype.kind == "M":
+            seconds = values.astype("datetime64[us]").astype(np.int64) / 1e6
+            return np.where(np.isnat(values), np.nan, seconds)
+        return values.astype(np.float64)
+    if column.kind is CellKind.DATE_TIME:
+        _check_each(column.name, values, str, column.kind.value)
+        return parse_column(_TEXT, column, list(values))
+    array = _array(values)
+    if array is not None and array.dtype.kind in "fiu" and array.ndim == 1:
+        return array.astype(np.float64)
+    _check_each(column.name, values, (int, float), "number")
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def _check_each(name: str, values: Values, types: type | tuple[type, ...], kind: str) -> None:
+    for row, value in enumerate(values, start=1):
+        if value is not None and (not isinstance(value, types) or isinstance(value, bool)):
+            raise BatchError(f"row {row}: {name} = {repr(value)[:40]}: must be a {kind}")
+
+
+def _array(values: Any) -> NDArray[Any] | None:
+    """Return an array of values; None if they have no common shape."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        return None
+
+
+def _cell_voltages(name: str, rows: Values, unit: Unit) -> CellBlock:
+    """Return cell voltages, shape (n, m) [V].
+
+    Raises:
+        BatchError: The rows have different numbers of cells, or a value is not a number.
+    """
+    lists = [row for row in rows if row is not None]
+    cells = len(lists[0]) if lists and isinstance(lists[0], list | np.ndarray) else 0
+    if not lists:
+        return NO_CELLS
+    if not 1 <= cells <= MAX_CELLS or any(not isinstance(row, list | np.ndarray) or len(row) != cells for row in lists):
+        raise BatchError(f"{name}: must be one list of equal length, of 1 to {MAX_CELLS} cell voltages, for each row")
+    try:
+        values = np.array([[np.nan] * cells if row is None else list(row) for row in rows], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise BatchError(f"{name}: must be numbers") from None
+    cells_v: CellBlock = values * unit.factor + unit.offset
+    remove_implausible(cells_v, MIN_CELL_V, MAX_CELL_V)
+    return cells_v

@@ -1,0 +1,224 @@
+"""Store of the blocks that workers have not confirmed, and the samples of blocks that are not complete yet."""
+
+import asyncio
+import math
+import sqlite3
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+import structlog
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.js.errors import NotFoundError
+from pydantic import ValidationError
+
+from bms_estimator.edge import subjects
+from bms_estimator.edge.block import BlockError, decode
+from bms_estimator.edge.block_table import NS
+from bms_estimator.edge.subjects import BlockRequest
+from bms_estimator.fleet.ingest.batch_samples import BatchSamples, Selection
+from bms_estimator.fleet.ingest.block_publisher import BlockPublisher
+from bms_estimator.fleet.ingest.open_blocks import NO_POSITION, OpenBlocks
+from bms_estimator.fleet.ingest.store_table import (
+    INGEST_TABLES,
+    Changes,
+    PackPosition,
+    Progress,
+    read_state,
+)
+from bms_estimator.fleet.worker.edge_clock import last_sample_s
+from bms_estimator.process.tasks import end
+from bms_estimator.store.database import Database, StoreError
+
+RETRY_S = 1.0
+"""Retry interval of a failed disk operation [s]."""
+HANDOVER_S = 5.0
+"""Time limit for sending the remaining blocks at shutdown [s]."""
+FILE = "ingest.sqlite"
+"""Name of the database."""
+
+Result = TypeVar("Result")
+
+log = structlog.get_logger(__name__)
+
+
+class IngestStore:
+    """Edge of many packs: divides their samples into blocks, stores and sends these, and receives confirmations.
+
+    Args:
+        nc: Connection to the tenant's NATS account, which reconnects.
+        folder: Folder of the database.
+        partitions: Number of partitions of the stream ``RAW``.
+        block_s: Duration of a block [s].
+
+    Attributes:
+        publisher: Publisher of the blocks.
+        progress: Progress in the stream ``TELEMETRY``, as stored.
+        dropped: Number of blocks dropped, because workers did not confirm them.
+    """
+
+    publisher: BlockPublisher
+    progress: Progress
+
+    def __init__(self, nc: Client, folder: Path, partitions: int, block_s: float) -> None:
+        self._nc, self._partitions, self.dropped = nc, partitions, 0
+        self._database = Database(folder / FILE, tables=INGEST_TABLES, sync_s=0.0, retry_s=RETRY_S)
+        self._open = OpenBlocks(block_s, {})
+        self._first_unconfirmed: dict[str, int] = {}
+        self._confirmed: dict[str, int] = {}  # numbers that the next transaction applies
+        self._removed: set[str] = set()
+        self._task: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        """Read the database, and start sending."""
+        await self._database.__aenter__()
+        state = await self._call_until_done(read_state)
+        self.progress, self._first_unconfirmed = state.progress, state.oldest
+        for pack, position in state.positions.items():
+            self._open.set_position(pack, position)
+        self.publisher = BlockPublisher(self._nc, self._database, state.progress.sent)
+        await self._nc.subscribe(subjects.block_request(), cb=self._receive)
+        self._task = asyncio.create_task(self.publisher.run(), name="block publisher")
+        self.publisher.notify()
+        return self
+
+    async def __aexit__(
+        self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None
+    ) -> None:
+        """Close the database."""
+        if self._task is not None:
+            await end(self._task)
+        await self._database.__aexit__()
+
+    def __contains__(self, pack: object) -> bool:
+        return pack in self._open
+
+    @property
+    def packs(self) -> Iterable[str]:
+        """Names of the known packs."""
+        return list(self._open)
+
+    @property
+    def unconfirmed(self) -> int:
+        """Number of completed blocks that no worker has confirmed."""
+        return sum(map(self.unconfirmed_of, self._open))
+
+    def unconfirmed_of(self, pack: str) -> int:
+        """Return the number of completed blocks of a pack that no worker has confirmed."""
+        next_number = self._open.position(pack).next_number
+        return next_number - self._first_unconfirmed.get(pack, next_number)
+
+    def last_s(self, pack: str) -> float:
+        """Return the time of a pack's last sample [s since 1970]."""
+        return self._open.last_s(pack)
+
+    async def add_pack(self, pack: str) -> None:
+        """Add a pack whose position is not stored. It continues after its last block in the stream ``RAW``, if any.
+
+        Raises:
+            nats.errors.Error: The server does not respond.
+        """
+        subject = subjects.stored_raw(subjects.partition_of(pack, self._partitions), pack)
+        try:
+            message = await self._nc.jetstream().get_last_msg(subjects.RAW_STREAM, subject, direct=True)
+            block = decode(message.data or b"")
+        except (NotFoundError, BlockError):
+            self._open.set_position(pack, NO_POSITION)
+            return
+        self._set_end(pack, block.store_created_ns, last_sample_s(block))
+
+    def add(self, pack: str, batch: BatchSamples, arrival_s: float, sequence: int = 0) -> Selection:
+        """Add the new samples of a batch; see ``OpenBlocks.add``."""
+        selection = self._open.add(pack, batch, arrival_s, time.monotonic(), sequence)
+        self._first_unconfirmed.setdefault(pack, self._open.position(pack).next_number)
+        return selection
+
+    def remove(self, pack: str) -> None:
+        """Remove a pack and its blocks."""
+        self._open.remove(pack)
+        self._first_unconfirmed.pop(pack, None)
+        self._confirmed.pop(pack, None)
+        self._removed.add(pack)
+
+    def cut_overdue(self) -> None:
+        """Complete blocks that have been open for too long, because their packs send nothing more."""
+        self._open.cut(time.monotonic())
+
+    def cut(self) -> None:
+        """Complete all open blocks."""
+        self._open.cut()
+
+    async def save(self, stream: str, sequence: int) -> None:
+        """Write all changes to disk. Repeat until the disk accepts them.
+
+        Args:
+            stream: Creation time of the stream ``TELEMETRY``.
+            sequence: Sequence number of the last processed message.
+        """
+        if self._task is not None and self._task.done():
+            self._task.result()  # only an internal error ends the task: raise it
+        first_open = self._open.first_sequence(sequence + 1)
+        blocks, self._open.completed = self._open.completed, []
+        positions, self._open.changed = self._open.changed, {}
+        confirmed, self._confirmed = self._confirmed, {}
+        removed, self._removed = self._removed, set()
+        progress = Progress(stream, first_open - 1, self.publisher.sent)
+        if not (blocks or confirmed or removed) and progress == self.progress:
+            return
+        dropped = await self._call_until_done(Changes(progress, blocks, positions, confirmed, removed))
+        self.progress = progress
+        if dropped:
+            log.warning("the oldest blocks are dropped, because workers do not confirm them", blocks=dropped)
+            self.dropped += dropped
+        if blocks:
+            self.publisher.notify()
+
+    async def send_remaining(self) -> None:
+        """Wait until the server has all stored blocks, but at most ``HANDOVER_S``. The next run sends the others."""
+        try:
+            async with asyncio.timeout(HANDOVER_S):
+                await self.publisher.wait_until_sent()
+        except TimeoutError:
+            log.warning("not all blocks could be sent; the next run sends the others")
+
+    async def _call_until_done(self, transaction: Callable[[sqlite3.Connection], Result]) -> Result:
+        while True:
+            try:
+                return await self._database.call(transaction)
+            except StoreError:
+                await asyncio.sleep(RETRY_S)
+
+    async def _receive(self, message: Msg) -> None:
+        """Process a worker's request: delete confirmed blocks, and send missing ones again."""
+        pack = message.subject.split(".")[1]
+        if pack not in self._open:
+            return  # a pack with an edge
+        try:
+            request = BlockRequest.model_validate_json(message.data)
+        except ValidationError:
+            log.warning("invalid message on the workers' subject", subject=message.subject)
+            return
+        position = self._open.position(pack)
+        created_ns = position.created_s * NS
+        if request.store > created_ns or (request.store == created_ns and request.number > position.next_number):
+            log.warning("a worker has later blocks of this pack than this store: a new store is begun", pack=pack)
+            self._begin_store(pack, request.store)
+        elif request.store == created_ns:
+            self._first_unconfirmed[pack] = max(self._first_unconfirmed.get(pack, 0), request.number)
+            self._confirmed[pack] = self._first_unconfirmed[pack]
+            if request.resend:
+                self.publisher.resend(pack, request.number)
+
+    def _begin_store(self, pack: str, other_ns: int) -> None:
+        """Replace the store of a pack by one that is created after another store [ns since 1970]."""
+        last_s = self._open.position(pack).last_s
+        self.remove(pack)
+        self._set_end(pack, other_ns, last_s)
+
+    def _set_end(self, pack: str, store_ns: int, last_s: float) -> None:
+        """Begin a store with the first sample after ``last_s`` and after the creation of another store."""
+        created_s = math.ceil(store_ns / NS) + 1  # a sample after this time creates a store after the other one
+        self._open.set_position(pack, PackPosition(0, 1, max(last_s, created_s)))

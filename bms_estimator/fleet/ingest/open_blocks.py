@@ -1,0 +1,115 @@
+"""Open blocks of all packs: division of their samples into numbered blocks. No I/O."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from bms_estimator.edge.batching import Batcher, ReadyBlock
+from bms_estimator.edge.block_sender import MAX_BLOCK_AGE
+from bms_estimator.fleet.ingest.batch_samples import BatchSamples, Selection, select_new
+from bms_estimator.fleet.ingest.store_table import NumberedBlock, PackPosition
+
+NO_POSITION = PackPosition(0, 1, -math.inf)
+"""Position of a pack without blocks."""
+
+
+@dataclass
+class _OpenPack:
+    """Samples of a pack that are in no block yet."""
+
+    batcher: Batcher
+    position: PackPosition
+    last_s: float
+    """Time of the last sample [s since 1970]."""
+    first_sequence: int = 0
+    """Sequence number of the message with the first sample of the open block."""
+    opened_s: float = 0.0
+    """Monotonic time of the first sample's arrival [s]."""
+
+
+@dataclass
+class OpenBlocks:
+    """Divides the samples of packs into blocks.
+
+    Args:
+        block_s: Duration of a block [s].
+        positions: Positions of the known packs.
+
+    Attributes:
+        completed: Completed blocks; emptied by the caller.
+        changed: Positions that have changed since the caller emptied it.
+    """
+
+    block_s: float
+    positions: Mapping[str, PackPosition]
+    completed: list[NumberedBlock] = field(default_factory=list)
+    changed: dict[str, PackPosition] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._packs: dict[str, _OpenPack] = {}
+        for pack, position in self.positions.items():
+            self.set_position(pack, position)
+
+    def __contains__(self, pack: object) -> bool:
+        return pack in self._packs
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._packs)
+
+    def set_position(self, pack: str, position: PackPosition) -> None:
+        """Set the position of a pack, and discard its open block."""
+        self._packs[pack] = _OpenPack(Batcher(self.block_s), position, position.last_s)
+
+    def remove(self, pack: str) -> None:
+        """Forget a pack, and discard its open block and its completed blocks that the caller has not taken."""
+        self._packs.pop(pack, None)
+        self.changed.pop(pack, None)
+        self.completed = [block for block in self.completed if block.pack != pack]
+
+    def position(self, pack: str) -> PackPosition:
+        """Return the position of a pack."""
+        return self._packs[pack].position
+
+    def last_s(self, pack: str) -> float:
+        """Return the time of a pack's last sample [s since 1970]."""
+        return self._packs[pack].last_s
+
+    def add(self, pack: str, batch: BatchSamples, arrival_s: float, now_s: float, sequence: int = 0) -> Selection:
+        """Add the new samples of a batch, and return them with the numbers of dropped samples.
+
+        Args:
+            pack: Name of the pack, whose position is set.
+            batch: Samples of the batch.
+            arrival_s: Time of arrival of the batch [s since 1970].
+            now_s: Monotonic time [s].
+            sequence: Sequence number of the message.
+        """
+        entry = self._packs[pack]
+        selection = select_new(batch, entry.last_s, arrival_s)
+        if not selection.samples.size:
+            return selection
+        entry.last_s = float(selection.samples["time_s"][-1])
+        was_empty = not len(entry.batcher)
+        completed = entry.batcher.add(selection.samples, arrival_s, selection.cells_v)
+        if completed or was_empty:
+            entry.first_sequence, entry.opened_s = sequence, now_s
+        self._complete(pack, entry, completed)
+        return selection
+
+    def cut(self, now_s: float = math.inf) -> None:
+        """Complete the open blocks that have been open for longer than ``MAX_BLOCK_AGE`` blocks; by default all."""
+        for pack, entry in self._packs.items():
+            if len(entry.batcher) and now_s - entry.opened_s > MAX_BLOCK_AGE * self.block_s:
+                self._complete(pack, entry, entry.batcher.cut())
+
+    def first_sequence(self, default: int) -> int:
+        """Return the smallest sequence number of a message with samples of open blocks; ``default`` without open blocks."""
+        sequences = (entry.first_sequence for entry in self._packs.values() if len(entry.batcher))
+        return min(sequences, default=default)
+
+    def _complete(self, pack: str, entry: _OpenPack, completed: list[ReadyBlock]) -> None:
+        for ready in completed:
+            number, entry.position = entry.position.next_number, entry.position.after(ready)
+            self.completed.append(NumberedBlock(pack, entry.position.created_s, number, ready))
+        if completed:
+            self.changed[pack] = entry.position

@@ -1,0 +1,89 @@
+"""Telemetry platform: batches of a pack's samples, and a process of ``fleet ingest``."""
+
+import contextlib
+import json
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from bms_estimator.model.sample import SampleBlock
+from tests.command_line import PROGRAM, running_program
+from tests.fleet.workers import until
+
+START_S = 1_790_000_000.0
+"""Time of the first sample [s since 1970]."""
+PERIOD_S = 10.0
+"""Interval between two samples [s]."""
+
+
+def samples_of(pack: str, count: int) -> SampleBlock:
+    """Return the first samples of a pack, with times since 1970. The load depends on the pack's name, such as p1."""
+    from tests.fleet.workers import SAMPLES, samples
+
+    blocks = [samples(pack, number) for number in range(1, -(-count // SAMPLES) + 1)]
+    rows = np.concatenate(blocks)[:count]
+    rows["time_s"] += START_S
+    return rows
+
+
+def columns_of(rows: SampleBlock) -> dict[str, list[float]]:
+    """Return samples as columns."""
+    return {name: rows[name].tolist() for name in ("time_s", "current_a", "voltage_v", "temperature_c")}
+
+
+def json_batch(rows: SampleBlock, **more: Any) -> bytes:
+    """Return a batch of samples in JSON."""
+    return json.dumps(columns_of(rows) | more).encode()
+
+
+def arrow_batch(rows: SampleBlock) -> bytes:
+    """Return a batch of samples as an Arrow IPC stream."""
+    return arrow_bytes(pa.table(columns_of(rows)))
+
+
+def arrow_bytes(table: pa.Table, **options: Any) -> bytes:
+    """Return a table as an Arrow IPC stream."""
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema, options=pa.ipc.IpcWriteOptions(**options)) as writer:
+        writer.write_table(table)
+    return sink.getvalue().to_pybytes()
+
+
+class IngestProcess:
+    """Process of ``fleet ingest``."""
+
+    def __init__(self, process: Any, log: Path) -> None:
+        self.process, self._log = process, log
+
+    @property
+    def lines(self) -> list[dict[str, Any]]:
+        """Complete lines of its log."""
+        lines = self._log.read_text().splitlines(keepends=True)
+        return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("\n")]
+
+    async def logged(self, event: str, **values: Any) -> dict[str, Any]:
+        """Wait for a log line with an event and values, and return it."""
+
+        def find_line() -> dict[str, Any] | None:
+            found = (line for line in self.lines if line["event"] == event and values.items() <= line.items())
+            return next(found, None)
+
+        return await until(find_line, self._log.read_text)
+
+    async def end(self) -> int:
+        """End the process by SIGTERM, and return its exit code."""
+        self.process.terminate()
+        return await self.process.wait()
+
+
+@contextlib.asynccontextmanager
+async def running_ingest(folder: Path, url: str, *options: object) -> AsyncIterator[IngestProcess]:
+    """Run ``fleet ingest``, and kill it at the end."""
+    log = folder / "ingest.log"
+    with log.open("a") as stderr:
+        command = (PROGRAM, "fleet", "ingest", "--server", url, "--folder", folder / "blocks", *options)
+        async with running_program(*command, stderr=stderr) as process:
+            yield IngestProcess(process, log)
