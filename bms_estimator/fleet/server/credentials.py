@@ -6,8 +6,8 @@
     claims.json              claims for the servers; public, equal on all nodes
     TENANT/account.nk        key of the account
     TENANT/<role>.nk         key that signs users of a role (``jwt_claims.Role``)
-    TENANT/admin.creds       credentials of programs; likewise worker.creds and reader.creds
-    TENANT/dashboard.token   MQTT password of readers of estimates
+    TENANT/admin.creds       credentials of programs; likewise worker.creds, reader.creds, ingest.creds and sender.creds
+    TENANT/dashboard.token   MQTT password of readers of estimates; likewise mqtt-sender.token of senders of telemetry
 
 Private keys need not be copied: other nodes need only ``claims.json``.
 """

@@ -42,11 +42,17 @@ class Role(Enum):
     """Reads all data: fleet page, queries, captures."""
     WORKER = "worker"
     """Processes blocks and publishes estimates."""
+    SENDER = "sender"
+    """Telemetry platform that sends batches over NATS."""
+    MQTT_SENDER = "mqtt-sender"
+    """Telemetry platform that sends batches over MQTT."""
+    INGEST = "ingest"
+    """Receives batches, and sends blocks for all packs (``fleet ingest``)."""
     ADMIN = "admin"
     """Creates streams and writes the table of packs."""
 
 
-BEARERS = (Role.EDGE, Role.DASHBOARD)
+BEARERS = (Role.EDGE, Role.DASHBOARD, Role.MQTT_SENDER)
 """Roles with bearer tokens. They connect by MQTT, which has no challenge that a key could sign."""
 
 _READER_PUBLISH = (
@@ -73,6 +79,16 @@ _WORKER_PUBLISH = (
     "fleet.>",
     "_INBOX.>",
 )
+_INGEST_PUBLISH = (
+    "$JS.API.STREAM.INFO.*",
+    "$JS.API.DIRECT.GET.>",
+    "$JS.API.STREAM.CREATE.TELEMETRY",
+    "$JS.API.STREAM.UPDATE.TELEMETRY",
+    "$JS.API.STREAM.PURGE.TELEMETRY",
+    "raw.*",
+    "ingest.*",
+    "dead.*.*",
+)
 _SUBSCRIBE = ("_INBOX.>", "bms.>", "fleet.>")
 _ALLOWED: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
     # Subjects to publish and to subscribe; {{name()}} is the user's name. Before 2.12.4 the server requires $MQTT.sub for
@@ -81,6 +97,9 @@ _ALLOWED: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
     Role.DASHBOARD: ((), ("bms", "bms.>", "fleet", "fleet.>", "$MQTT.sub.>")),
     Role.READER: (_READER_PUBLISH, _SUBSCRIBE),
     Role.WORKER: (_WORKER_PUBLISH, _SUBSCRIBE),
+    Role.SENDER: (("telemetry.*",), ("_INBOX.>", "ingest.*")),
+    Role.MQTT_SENDER: (("telemetry.*",), ("ingest.*", "$MQTT.sub.>")),
+    Role.INGEST: (_INGEST_PUBLISH, ("_INBOX.>", "edge.*.awaits")),
     Role.ADMIN: ((">",), (">",)),
 }
 _LIMITS: dict[Role, dict[str, int]] = {

@@ -11,18 +11,14 @@ import pyarrow as pa
 
 from bms_estimator.model.sample import SampleBlock
 from tests.command_line import PROGRAM, running_program
-from tests.fleet.workers import until
+from tests.fleet.workers import SAMPLES, samples, until
 
 START_S = 1_790_000_000.0
 """Time of the first sample [s since 1970]."""
-PERIOD_S = 10.0
-"""Interval between two samples [s]."""
 
 
 def samples_of(pack: str, count: int) -> SampleBlock:
     """Return the first samples of a pack, with times since 1970. The load depends on the pack's name, such as p1."""
-    from tests.fleet.workers import SAMPLES, samples
-
     blocks = [samples(pack, number) for number in range(1, -(-count // SAMPLES) + 1)]
     rows = np.concatenate(blocks)[:count]
     rows["time_s"] += START_S

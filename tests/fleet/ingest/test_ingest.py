@@ -1,7 +1,6 @@
 """Batches that ``fleet ingest`` receives: the workers' states equal those of packs with edges."""
 
 import asyncio
-import json
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
