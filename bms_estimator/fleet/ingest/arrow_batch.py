@@ -25,7 +25,9 @@ def decode_arrow(payload: bytes) -> BatchColumns:
     """
     try:
         return _decode(payload)
-    except (pa.ArrowException, OSError, struct.error, MemoryError) as error:
+    except BatchError:
+        raise
+    except (pa.ArrowException, ValueError, OSError, struct.error, MemoryError) as error:
         raise BatchError(f"damaged Arrow IPC: {error}") from None
 
 

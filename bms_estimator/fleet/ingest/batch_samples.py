@@ -1,7 +1,8 @@
 """Samples of a telemetry batch: units, sign of the current, timestamps and order. No I/O."""
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from types import NoneType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,7 @@ MAX_LAYOUTS = 256
 CELLS = "cells"
 """Name of the column of cell voltages, without its unit."""
 _TEXT = "the batch"
+_NUMBERS = {int, float, NoneType}
 
 
 class BatchSamples(NamedTuple):
@@ -73,7 +75,10 @@ class Selection(NamedTuple):
             end = f"the pack's last stored time {iso_utc(last_s)}" if np.isfinite(last_s) else "an equal time"
             reasons.append(f"{self.old} samples at or before {end}: sent again, or too late")
         if self.implausible:
-            reasons.append(f"{self.implausible} samples without a time, or with one before 2000 or in the future")
+            reasons.append(
+                f"{self.implausible} samples without a time, or with one before 2000 or in the future; "
+                "name a column of milliseconds time_ms"
+            )
         return "; ".join(reasons)
 
 
@@ -180,10 +185,8 @@ def _floats(column: Column, values: Values) -> NDArray[np.float64]:
     if column.kind is CellKind.DATE_TIME:
         _check_each(column.name, values, str, column.kind.value)
         return parse_column(_TEXT, column, list(values))
-    array = _array(values)
-    if array is not None and array.dtype.kind in "fiu" and array.ndim == 1:
-        return array.astype(np.float64)
-    _check_each(column.name, values, (int, float), "number")
+    if not set(map(type, values)) <= _NUMBERS:
+        _check_each(column.name, values, (int, float), "number")
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
@@ -191,14 +194,6 @@ def _check_each(name: str, values: Values, types: type | tuple[type, ...], kind:
     for row, value in enumerate(values, start=1):
         if value is not None and (not isinstance(value, types) or isinstance(value, bool)):
             raise BatchError(f"row {row}: {name} = {repr(value)[:40]}: must be a {kind}")
-
-
-def _array(values: Any) -> NDArray[Any] | None:
-    """Return an array of values; None if they have no common shape."""
-    try:
-        return np.asarray(values)
-    except ValueError:
-        return None
 
 
 def _cell_voltages(name: str, rows: Values, unit: Unit) -> CellBlock:
