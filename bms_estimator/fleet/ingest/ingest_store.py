@@ -132,9 +132,8 @@ class IngestStore:
 
     def add(self, pack: str, batch: BatchSamples, arrival_s: float, sequence: int = 0) -> Selection:
         """Add the new samples of a batch; see ``OpenBlocks.add``."""
-        selection = self._open.add(pack, batch, arrival_s, time.monotonic(), sequence)
         self._first_unconfirmed.setdefault(pack, self._open.position(pack).next_number)
-        return selection
+        return self._open.add(pack, batch, arrival_s, time.monotonic(), sequence)
 
     def remove(self, pack: str) -> None:
         """Remove a pack and its blocks."""

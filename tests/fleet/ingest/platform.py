@@ -51,13 +51,13 @@ def arrow_bytes(table: pa.Table, **options: Any) -> bytes:
 class IngestProcess:
     """Process of ``fleet ingest``."""
 
-    def __init__(self, process: Any, log: Path) -> None:
-        self.process, self._log = process, log
+    def __init__(self, process: Any, log: Path, begin: int) -> None:
+        self.process, self._log, self._begin = process, log, begin
 
     @property
     def lines(self) -> list[dict[str, Any]]:
         """Complete lines of its log."""
-        lines = self._log.read_text().splitlines(keepends=True)
+        lines = self._log.read_text()[self._begin :].splitlines(keepends=True)
         return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("\n")]
 
     async def logged(self, event: str, **values: Any) -> dict[str, Any]:
@@ -80,6 +80,7 @@ async def running_ingest(folder: Path, url: str, *options: object) -> AsyncItera
     """Run ``fleet ingest``, and kill it at the end."""
     log = folder / "ingest.log"
     with log.open("a") as stderr:
+        begin = stderr.tell()
         command = (PROGRAM, "fleet", "ingest", "--server", url, "--folder", folder / "blocks", *options)
         async with running_program(*command, stderr=stderr) as process:
-            yield IngestProcess(process, log)
+            yield IngestProcess(process, log, begin)

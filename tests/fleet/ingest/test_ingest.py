@@ -1,8 +1,9 @@
 """Batches that ``fleet ingest`` receives: the workers' states equal those of packs with edges."""
 
 import asyncio
+import sqlite3
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,21 @@ import pytest
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
+from bms_estimator.edge.block import decode
+from bms_estimator.edge.block_sender import BlockSender
+from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.estimator.estimator import make_estimator
-from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.packs.pack_registry import PackRegistry
+from bms_estimator.fleet.ingest.batch_reports import BatchReport
+from bms_estimator.fleet.nats.dead_letters import read_dead_letters, replay_letter
+from bms_estimator.fleet.nats.streams import make_streams, make_telemetry_stream
+from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK, PackRegistry
 from bms_estimator.fleet.worker.worker import Options, work
+from bms_estimator.model.clock import Clock
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.settings.edge import EdgeSettings
 from tests.fleet.ingest.platform import START_S, json_batch, running_ingest, samples_of
 from tests.fleet.nats_cluster import NatsCluster, connected, running
-from tests.fleet.workers import Heartbeats, end_states, load_packs
+from tests.fleet.workers import Heartbeats, end_states, load_packs, until
 from tests.patience import LONG_S
 
 PARTITIONS = 2
@@ -29,6 +37,16 @@ COUNT = 300
 def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
     with running(tmp_path, partitions=PARTITIONS) as cluster:
         yield cluster
+
+
+@pytest.fixture
+async def nc(cluster: NatsCluster) -> AsyncIterator[Client]:
+    """Yield a connection to the server, which has all streams."""
+    nc = await connected(cluster.url)
+    await make_streams(nc, partitions=PARTITIONS)
+    await make_telemetry_stream(nc, 1 << 30)
+    yield nc
+    await nc.close()
 
 
 @asynccontextmanager
@@ -67,21 +85,122 @@ def of_one_run(registry: PackRegistry, pack: str, rows: SampleBlock) -> bytes:
     return estimator.record.tobytes()
 
 
-async def test_states_from_overlapping_repeated_and_unsorted_batches_are_those_of_one_run(
-    cluster: NatsCluster, tmp_path: Path
+async def send_by_edge(cluster: NatsCluster, folder: Path, pack: str, rows: SampleBlock) -> None:
+    """Send samples by an edge whose clock shows the time of the last sample that has arrived."""
+    now_s = START_S
+    settings = EdgeSettings(url=f"mqtt://127.0.0.1:{cluster.mqtt_port}", block_s=60.0)
+    clock = Clock(wall=lambda: now_s)
+    async with BlockSender(settings, pack, folder, clock=clock, steady=lambda: now_s, handover_s=LONG_S) as edge:
+        for part in np.array_split(rows, 10):
+            now_s = float(part["time_s"][-1])
+            part["time_s"] -= START_S
+            edge.take(part)
+        await until(lambda: edge.store.waiting == 0 and edge.store.unconfirmed, edge.health)
+
+
+async def test_states_of_packs_with_ingest_and_with_an_edge_are_equal(
+    nc: Client, cluster: NatsCluster, tmp_path: Path
 ) -> None:
-    nc = await connected(cluster.url)
-    await make_streams(nc, partitions=PARTITIONS)
-    registry = await load_packs(nc, ["p1"])
+    registry = await load_packs(nc, ["p1", "edge"])
     rows = samples_of("p1", COUNT)
     async with running_ingest(tmp_path, cluster.url) as ingest:
         await ingest.logged("ingested")
-        async with worker(cluster.url, COUNT):
-            await send(nc, "p1", json_batch(rows[:100]))
-            await send(nc, "p1", json_batch(rows[:100]))
-            await send(nc, "p1", json_batch(rows[50:200][::-1]))
-            await send(nc, "p1", json_batch(np.concatenate([rows[200:], rows[200:210]])))
+        async with worker(cluster.url, 2 * COUNT):
+            await send_by_edge(cluster, tmp_path, "edge", rows.copy())
+            # overlapping, repeated and unsorted batches
+            for batch in (rows[:100], rows[:100], rows[50:200][::-1], np.concatenate([rows[200:], rows[200:210]])):
+                await send(nc, "p1", json_batch(batch))
             await ingest.logged("samples of a batch are not stored")
             assert await ingest.end() == 0
-    assert (await states(nc, registry, "p1")) == [of_one_run(registry, "p1", rows)]
-    await nc.close()
+    by_ingest, by_edge = await states(nc, registry, "p1", "edge")
+    assert by_ingest == by_edge == of_one_run(registry, "p1", rows)
+
+
+async def test_kill_in_the_middle_loses_no_sample_and_counts_none_twice(
+    nc: Client, cluster: NatsCluster, tmp_path: Path
+) -> None:
+    registry = await load_packs(nc, ["p1", "p2"])
+    rows = {pack: samples_of(pack, COUNT) for pack in ("p1", "p2")}
+    blocks = await nc.subscribe("raw.*")
+    async with worker(cluster.url, 2 * COUNT):
+        for part in range(0, COUNT, 150):
+            async with running_ingest(tmp_path, cluster.url) as ingest:
+                for pack in rows:
+                    for first in range(part, part + 150, 15):
+                        await send(nc, pack, json_batch(rows[pack][first : first + 15]))
+                        await send(nc, pack, json_batch(rows[pack][max(first - 15, 0) : first]))
+                while blocks.pending_msgs:
+                    await blocks.next_msg()
+                await blocks.next_msg(LONG_S)
+                ingest.process.kill()
+                await ingest.process.wait()
+        async with running_ingest(tmp_path, cluster.url) as ingest:
+            await ingest.logged("ingested")
+            assert await ingest.end() == 0
+    assert await states(nc, registry, *rows) == [of_one_run(registry, pack, rows[pack]) for pack in rows]
+
+
+async def test_missing_block_is_sent_again_and_confirmed_blocks_are_deleted(
+    nc: Client, cluster: NatsCluster, tmp_path: Path
+) -> None:
+    await load_packs(nc, ["p1"])
+    blocks = await nc.subscribe("raw.p1")
+    async with running_ingest(tmp_path, cluster.url) as ingest:
+        await ingest.logged("ingested")
+        await send(nc, "p1", json_batch(samples_of("p1", 31)))  # five blocks of six samples, and an open one
+        received = [decode((await blocks.next_msg(LONG_S)).data) for _ in range(5)]
+        assert [block.number for block in received] == [1, 2, 3, 4, 5]
+        request = BlockRequest(store=received[0].store_created_ns, number=3, resend=True)
+        await nc.publish(subjects.block_request("p1"), request.model_dump_json().encode())
+        resent = [decode((await blocks.next_msg(LONG_S)).data) for _ in range(3)]
+        assert [(block.number, block.oldest) for block in resent] == [(3, 1), (4, 1), (5, 1)]
+        assert await ingest.end() == 0
+        last = decode((await blocks.next_msg(LONG_S)).data)
+        assert (last.number, last.oldest, last.samples.size) == (6, 3, 1)
+    with closing(sqlite3.connect(tmp_path / "blocks" / "ingest.sqlite")) as database:
+        assert database.execute("SELECT number FROM block").fetchall() == [(3,), (4,), (5,), (6,)]
+
+
+async def test_lost_folder_continues_after_the_last_block_of_the_stream(
+    nc: Client, cluster: NatsCluster, tmp_path: Path
+) -> None:
+    registry = await load_packs(nc, ["p1"])
+    rows = samples_of("p1", 60)
+    blocks = await nc.subscribe("raw.p1")
+    async with worker(cluster.url, 60):
+        # a batch of 30 samples makes four blocks of six, and at the end of the process a fifth one
+        for folder, last, sent in ((tmp_path / "first", 30, 4), (tmp_path / "second", 60, 9)):
+            folder.mkdir()
+            async with running_ingest(folder, cluster.url) as ingest:
+                await send(nc, "p1", json_batch(rows[:last]))
+                await until(lambda sent=sent: blocks.pending_msgs >= sent, lambda: blocks.pending_msgs)
+                assert await ingest.end() == 0
+    partitions = await end_states(nc, registry, PARTITIONS)
+    state = partitions[subjects.partition_of("p1", PARTITIONS)].state("p1")
+    assert state is not None
+    assert int(state["estimator"]["observer"]["samples"][0]) == 60
+
+
+async def test_rejected_batch_is_reported_stored_and_can_be_replayed(
+    nc: Client, cluster: NatsCluster, tmp_path: Path
+) -> None:
+    await load_packs(nc, ["p1"])
+    reports = await nc.subscribe("ingest.*")
+    rows = samples_of("p1", 12)
+    batch = json_batch(rows).replace(b"voltage_v", b"U_pack")
+    async with running_ingest(tmp_path, cluster.url) as ingest:
+        await send(nc, "p1", batch)
+        await send(nc, "ghost", batch)
+        received = [BatchReport.model_validate_json((await reports.next_msg(LONG_S)).data) for _ in "12"]
+        assert await ingest.end() == 0
+    assert [report.pack for report in received] == ["p1", "ghost"]
+    assert received[0].error.startswith("no column of voltage; found time_s, current_a, U_pack")
+    assert received[1].error == UNKNOWN_PACK
+    (letter,) = await read_dead_letters(nc)
+    assert (letter.pack, letter.data, letter.reason) == ("p1", batch, received[0].error)
+    columns = "time=time_s,current=current_a,voltage=U_pack"
+    blocks = await nc.subscribe("raw.p1")
+    async with running_ingest(tmp_path, cluster.url, "--map", columns):
+        await replay_letter(nc, letter)
+        block = decode((await blocks.next_msg(LONG_S)).data)
+    assert block.samples["voltage_v"].tolist() == rows["voltage_v"][:6].tolist()
