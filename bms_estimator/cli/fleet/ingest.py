@@ -25,6 +25,13 @@ def ingest(
             show_default=False,
         ),
     ] = None,
+    parquet: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Parquet file, or folder of such files, with the history of packs: send it and end; may be given several times",
+            show_default=False,
+        ),
+    ] = None,
     columns: MappedColumns = None,
     current_sign: SignOfCurrent = None,
     block_s: Annotated[
@@ -39,7 +46,8 @@ def ingest(
 
     The platform publishes a batch, JSON or Arrow, on the NATS subject telemetry.PACK or the MQTT topic telemetry/PACK.
     """
-    from bms_estimator.fleet.ingest.ingest import Options, ingest  # noqa: PLC0415 - its packages are optional
+    from bms_estimator.fleet.ingest.backfill import backfill  # noqa: PLC0415 - its packages are optional
+    from bms_estimator.fleet.ingest.ingest import Options, ingest  # noqa: PLC0415
     from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
     from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
 
@@ -48,7 +56,10 @@ def ingest(
     )
 
     async def run() -> None:
-        await ingest(options, stop_on_signal())
+        if parquet:
+            typer.echo(await backfill(options, parquet, stop_on_signal()))
+        else:
+            await ingest(options, stop_on_signal())
 
     configure_logs()
     with flush_logs():

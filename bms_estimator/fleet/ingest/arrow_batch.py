@@ -5,6 +5,7 @@ size (https://arrow.apache.org/docs/format/Columnar.html#serialization-and-inter
 """
 
 import struct
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import pyarrow as pa
@@ -21,7 +22,7 @@ def decode_arrow(payload: bytes) -> BatchColumns:
     """Return the columns of a stream of one or more record batches.
 
     Raises:
-        BatchError: The bytes are damaged, or a column is of another type than numbers, timestamps, texts, or lists of numbers.
+        BatchError: The bytes are damaged.
     """
     try:
         return _decode(payload)
@@ -31,16 +32,32 @@ def decode_arrow(payload: bytes) -> BatchColumns:
         raise BatchError(f"damaged Arrow IPC: {error}") from None
 
 
+class ArrowColumns(Mapping[str, Values]):
+    """Columns of a table, each converted when it is used."""
+
+    def __init__(self, table: "pa.Table | pa.RecordBatch") -> None:
+        self._table = table
+
+    def __getitem__(self, name: str) -> Values:
+        return _values(name, self._table.column(name))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._table.schema.names)
+
+    def __len__(self) -> int:
+        return len(self._table.schema.names)
+
+
 def columns_of(table: "pa.Table | pa.RecordBatch") -> BatchColumns:
     """Return the columns of a table.
 
     Raises:
-        BatchError: A column has an unusable type, or a name that another column has.
+        BatchError: Several columns have the same name. The use of a column with an unsupported type raises this error too.
     """
     names = table.schema.names
     if len(set(names)) < len(names):
         raise BatchError(f"several columns have the same name: {', '.join(names)}")
-    return {name: _values(name, table.column(name)) for name in names}
+    return ArrowColumns(table)
 
 
 def _decode(payload: bytes) -> BatchColumns:
@@ -49,7 +66,6 @@ def _decode(payload: bytes) -> BatchColumns:
     for message in _messages(reader):
         if message.type == "schema":
             schema = pa.ipc.read_schema(message)
-            _check_types(schema)
         elif message.type == "record batch" and schema is not None:
             _check_size(message.metadata.to_pybytes())
             batches.append(pa.ipc.read_record_batch(message, schema))
@@ -69,14 +85,6 @@ def _messages(reader: Any) -> Any:
             yield reader.read_next_message()
         except StopIteration:
             return
-
-
-def _check_types(schema: "pa.Schema") -> None:
-    for field in schema:
-        if not _is_supported(field.type):
-            raise BatchError(
-                f"column {field.name} is {field.type}: must be numbers, timestamps, texts, or lists of numbers"
-            )
 
 
 def _is_supported(column_type: "pa.DataType") -> bool:

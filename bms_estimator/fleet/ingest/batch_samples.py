@@ -1,5 +1,6 @@
 """Samples of a telemetry batch: units, sign of the current, timestamps and order. No I/O."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from types import NoneType
 from typing import NamedTuple
@@ -107,7 +108,7 @@ class BatchReader:
             raw = {role: _floats(column, columns[column.name]) for role, column in layout.columns.items()}
             cells_v = _cell_voltages(cells.name, columns[cells.name], cells.unit) if cells else NO_CELLS
         except UserError as error:
-            raise BatchError(str(error).removeprefix(f"{_TEXT}: ")) from None
+            raise BatchError(_reason(error)) from None
         except OverflowError:
             raise BatchError("a number is too large") from None
         samples = to_samples(raw, layout)
@@ -115,6 +116,19 @@ class BatchReader:
             samples["current_a"] *= -1.0
         remove_implausible(samples["temperature_c"], MIN_C, MAX_C)
         return BatchSamples(samples, cells_v)
+
+    def used_columns(self, names: Sequence[str]) -> list[Column]:
+        """Return the columns that ``read`` uses. The first one is that of the time.
+
+        Raises:
+            BatchError: A column is missing.
+        """
+        try:
+            layout, cells = self._find_layout(tuple(names))
+        except UserError as error:
+            raise BatchError(_reason(error)) from None
+        others = [column for role, column in layout.columns.items() if role is not Role.TIME]
+        return [layout.columns[Role.TIME], *others, *([cells] if cells else [])]
 
     def _find(self, header: tuple[str, ...]) -> tuple[Layout, Column | None]:
         """Return the columns of a sample, and the column of cell voltages.
@@ -142,6 +156,10 @@ class BatchReader:
     def _sign_of(self, layout: Layout) -> CurrentSign:
         by_format = layout.dialect.current_sign if layout.dialect else None
         return self._current_sign or by_format or "discharge_positive"
+
+
+def _reason(error: UserError) -> str:
+    return str(error).removeprefix(f"{_TEXT}: ")
 
 
 def select_new(batch: BatchSamples, last_s: float, now_s: float) -> Selection:

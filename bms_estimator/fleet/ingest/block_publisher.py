@@ -1,6 +1,7 @@
 """Publisher of stored blocks to the stream ``RAW``: each block once, and again if a worker requests it."""
 
 import asyncio
+import contextlib
 import math
 from collections.abc import Sequence
 
@@ -68,6 +69,12 @@ class BlockPublisher:
         self._requested[pack] = number
         self.resends += 1
         self.notify()
+
+    async def send_again(self, pack: str, number: int) -> None:
+        """Send one block of a pack again, to which a worker replies. Errors are ignored, because the caller repeats the call."""
+        with contextlib.suppress(nats.errors.Error, nats.js.errors.Error, TimeoutError, StoreError):
+            page = await self._database.call(BlockPage(1, pack=pack, first=number))
+            await self._publish([block for block in page if block.id <= self.sent])
 
     async def run(self) -> None:
         """Publish until cancelled."""

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,17 +75,31 @@ async def ingest(options: Options, stop: asyncio.Event) -> None:
     Raises:
         UserError: An option cannot be used, or another process uses the folder.
     """
+    async with opened(options, stop) as started:
+        if started is not None:
+            nc, store, bucket = started
+            reader = BatchReader(options.column_map, options.current_sign)
+            await Ingest(nc, store, bucket, reader, SystemdNotifier([NAME], activity="running")).run(stop)
+
+
+@contextlib.asynccontextmanager
+async def opened(options: Options, stop: asyncio.Event) -> AsyncIterator[tuple[Client, IngestStore, PackBucket] | None]:
+    """Open connection, store and table of packs; None if ``stop`` is set before the server responds.
+
+    Raises:
+        UserError: An option cannot be used, or another process uses the folder.
+    """
     with only_ingest(options.folder):
         starting = asyncio.ensure_future(_start(options))
         await until_first_ends(asyncio.wait([starting]), stop.wait())
         if not starting.done():
             await end(starting)
+            yield None
             return
         nc, partitions, bucket = starting.result()
         try:
             async with IngestStore(nc, options.folder, partitions, options.block_s) as store:
-                reader = BatchReader(options.column_map, options.current_sign)
-                await Ingest(nc, store, bucket, reader, SystemdNotifier([NAME], activity="running")).run(stop)
+                yield nc, store, bucket
         finally:
             await close(nc)
 

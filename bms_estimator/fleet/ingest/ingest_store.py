@@ -29,6 +29,7 @@ from bms_estimator.fleet.ingest.store_table import (
     Progress,
     read_state,
 )
+from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY
 from bms_estimator.fleet.worker.edge_clock import last_sample_s
 from bms_estimator.process.tasks import end
 from bms_estimator.store.database import Database, StoreError
@@ -111,6 +112,12 @@ class IngestStore:
         next_number = self._open.position(pack).next_number
         return next_number - self._first_unconfirmed.get(pack, next_number)
 
+    async def request_confirmation(self, pack: str) -> None:
+        """Send the last block again to which a worker replies."""
+        number = (self._open.position(pack).next_number - 1) // CONFIRM_EVERY * CONFIRM_EVERY
+        if number >= self._first_unconfirmed.get(pack, 1):
+            await self.publisher.send_again(pack, number)
+
     def last_s(self, pack: str) -> float:
         """Return the time of a pack's last sample [s since 1970]."""
         return self._open.last_s(pack)
@@ -156,6 +163,9 @@ class IngestStore:
         Args:
             stream: Creation time of the stream ``TELEMETRY``.
             sequence: Sequence number of the last processed message.
+
+        Raises:
+            Exception: The publisher has ended because of an internal error.
         """
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it

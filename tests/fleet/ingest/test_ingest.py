@@ -1,88 +1,35 @@
 """Batches that ``fleet ingest`` receives: the workers' states equal those of packs with edges."""
 
-import asyncio
 import sqlite3
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, closing
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-import pytest
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.edge.subjects import BlockRequest
-from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.ingest.batch_reports import BatchReport
 from bms_estimator.fleet.nats.dead_letters import read_dead_letters, replay_letter
-from bms_estimator.fleet.nats.streams import make_streams, make_telemetry_stream
-from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK, PackRegistry
-from bms_estimator.fleet.worker.worker import Options, work
+from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.edge import EdgeSettings
 from tests.fleet.ingest.platform import START_S, json_batch, running_ingest, samples_of
-from tests.fleet.nats_cluster import NatsCluster, connected, running
-from tests.fleet.workers import Heartbeats, end_states, load_packs, until
+from tests.fleet.ingest.worker_states import PARTITIONS, of_one_run, states, worker
+from tests.fleet.nats_cluster import NatsCluster
+from tests.fleet.workers import end_states, load_packs, until
 from tests.patience import LONG_S
 
-PARTITIONS = 2
 COUNT = 300
 """Number of samples of a pack."""
-
-
-@pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
-    with running(tmp_path, partitions=PARTITIONS) as cluster:
-        yield cluster
-
-
-@pytest.fixture
-async def nc(cluster: NatsCluster) -> AsyncIterator[Client]:
-    """Yield a connection to the server, which has all streams."""
-    nc = await connected(cluster.url)
-    await make_streams(nc, partitions=PARTITIONS)
-    await make_telemetry_stream(nc, 1 << 30)
-    yield nc
-    await nc.close()
-
-
-@asynccontextmanager
-async def worker(url: str, samples: int) -> AsyncIterator[None]:
-    """Run a worker in this process until it has processed ``samples`` samples, and stop it, so that it saves its states."""
-    nc, stop = await connected(url), asyncio.Event()
-    async with Heartbeats(nc) as heartbeats:
-        task = asyncio.create_task(work(Options(url, "w1", checkpoint_s=1.0), stop))
-        try:
-            yield
-            await heartbeats.until(lambda last: "w1" in last and last["w1"].samples >= samples)
-        finally:
-            stop.set()
-            await task
-            await nc.close()
 
 
 async def send(nc: Client, pack: str, batch: bytes) -> None:
     """Publish a batch, and wait until the server has stored it."""
     await nc.jetstream().publish(subjects.telemetry(pack), batch, timeout=LONG_S)
-
-
-async def states(nc: Client, registry: PackRegistry, *packs: str) -> list[bytes]:
-    """Return the records of the packs' estimators from the last checkpoints."""
-    partitions = await end_states(nc, registry, PARTITIONS)
-    found = [partitions[subjects.partition_of(pack, PARTITIONS)].state(pack) for pack in packs]
-    return [state["estimator"].tobytes() for state in found if state is not None]
-
-
-def of_one_run(registry: PackRegistry, pack: str, rows: SampleBlock) -> bytes:
-    """Return the record of an estimator after one run over samples, with times since the first of them."""
-    estimator = make_estimator(*registry(pack))
-    rows = rows.copy()
-    rows["time_s"] -= START_S
-    estimator.run(rows)
-    return estimator.record.tobytes()
 
 
 async def send_by_edge(cluster: NatsCluster, folder: Path, pack: str, rows: SampleBlock) -> None:

@@ -1,0 +1,148 @@
+"""Intake of the history of packs from Parquet files, as fast as the workers process it."""
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import structlog
+
+from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples
+from bms_estimator.fleet.ingest.ingest import RETRY_S, RETRYABLE_ERRORS, Options, opened
+from bms_estimator.fleet.ingest.ingest_store import IngestStore
+from bms_estimator.fleet.ingest.parquet_history import PackBatch, parquet_files, read_history
+from bms_estimator.fleet.nats.connection import error_text
+from bms_estimator.fleet.packs.pack_bucket import PackBucket
+from bms_estimator.process.tasks import until_first_ends
+
+PART_SAMPLES = 4096
+"""Maximum number of samples that are added at a time, and therefore of blocks."""
+MAX_PACK_BLOCKS = 5000
+"""Number of unconfirmed blocks of a pack at which the backfill waits. With ``PART_SAMPLES`` more, the server and the store still
+hold all of them."""
+MAX_BLOCKS = 1_000_000
+"""Number of unconfirmed blocks of all packs at which the backfill waits: 0.6 GB of minute blocks at 1 Hz."""
+SAVE_SAMPLES = 10_000
+"""Number of samples after which they are written to disk."""
+WAIT_S = 0.5
+"""Interval between two checks whether workers have confirmed blocks [s]."""
+REQUEST_S = 10.0
+"""Interval between two requests of a confirmation [s]. Workers confirm blocks after their next checkpoint."""
+PROGRESS_S = 10.0
+"""Interval between two progress lines [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+async def backfill(options: Options, paths: list[Path], stop: asyncio.Event) -> str:
+    """Send the samples of Parquet files until all are sent or ``stop`` is set. Return a summary.
+
+    Raises:
+        UserError: A file or an option cannot be used, or another process uses the folder.
+    """
+    files = parquet_files(paths)
+    reader = BatchReader(options.column_map, options.current_sign)
+    async with opened(options, stop) as started:
+        if started is None:
+            return "stopped before the server responded"
+        _, store, bucket = started
+        history = read_history(files, reader, options.folder)
+        run = Backfill(store, bucket, stop)
+        try:
+            await run.send(history)
+        finally:
+            history.close()
+        return run.summary
+
+
+class Backfill:
+    """Sender of a history.
+
+    Args:
+        store: Store of the blocks.
+        bucket: Table of packs.
+        stop: Ends the run when set.
+    """
+
+    def __init__(self, store: IngestStore, bucket: PackBucket, stop: asyncio.Event) -> None:
+        self._store, self._bucket, self._stop = store, bucket, stop
+        self._counters, self._unknown = Counter[str](), set[str]()
+        self._unsaved = 0
+        self._progress_s = time.monotonic() + PROGRESS_S
+
+    @property
+    def summary(self) -> str:
+        """Numbers of samples as text."""
+        counters = self._counters
+        unknown = ", ".join(sorted(self._unknown)[:10])
+        return (
+            f"{'stopped: ' if self._stop.is_set() else ''}{counters['samples']:,} samples sent; "
+            f"{counters['old']:,} at or before the last stored time of their pack; "
+            f"{counters['implausible']:,} with an implausible time; "
+            f"{counters['unknown']:,} of packs that are not in the table of packs{f' ({unknown})' if unknown else ''}"
+        )
+
+    async def send(self, history: Iterator[PackBatch]) -> None:
+        """Send the samples of all packs."""
+        while (entry := await asyncio.to_thread(next, history, None)) is not None and not self._stop.is_set():
+            pack, batch = entry
+            if pack not in self._bucket.packs:
+                self._unknown.add(pack)
+                self._counters["unknown"] += batch.samples.size
+                continue
+            if pack not in self._store:
+                await self._add_pack(pack)
+            for first in range(0, batch.samples.size, PART_SAMPLES):
+                await self._wait_for_room(pack)
+                if self._stop.is_set():
+                    break
+                part = slice(first, first + PART_SAMPLES)
+                await self._add(pack, BatchSamples(batch.samples[part], batch.cells_v[part]))
+        self._store.cut()
+        await self._save()
+        if self._stop.is_set():
+            await self._store.send_remaining()
+        else:
+            await until_first_ends(self._store.publisher.wait_until_sent(), self._stop.wait())
+
+    async def _add_pack(self, pack: str) -> None:
+        while not self._stop.is_set():
+            try:
+                await self._store.add_pack(pack)
+            except RETRYABLE_ERRORS as error:
+                log.warning("the server does not respond; trying again", reason=error_text(error))
+                await asyncio.sleep(RETRY_S)
+            else:
+                return
+
+    async def _add(self, pack: str, batch: BatchSamples) -> None:
+        sequence = self._store.progress.sequence + 1  # leaves the progress in the stream of batches unchanged
+        selection = self._store.add(pack, batch, time.time(), sequence)
+        self._counters["samples"] += selection.samples.size
+        self._counters["old"] += selection.old
+        self._counters["implausible"] += selection.implausible
+        self._unsaved += selection.samples.size
+        if self._unsaved >= SAVE_SAMPLES:
+            await self._save()
+
+    async def _save(self) -> None:
+        self._unsaved = 0
+        await self._store.save(self._store.progress.stream, self._store.progress.sequence)
+        if time.monotonic() >= self._progress_s:
+            self._progress_s = time.monotonic() + PROGRESS_S
+            log.info("backfill", **self._counters, unconfirmed=self._store.unconfirmed)
+
+    async def _wait_for_room(self, pack: str) -> None:
+        """Wait until workers have confirmed enough blocks."""
+        request_s = time.monotonic() + REQUEST_S
+        while not self._stop.is_set() and not self._has_room(pack):
+            await self._save()
+            if time.monotonic() >= request_s:
+                request_s = time.monotonic() + REQUEST_S
+                for each in self._store.packs:
+                    await self._store.request_confirmation(each)
+            await asyncio.sleep(WAIT_S)
+
+    def _has_room(self, pack: str) -> bool:
+        return self._store.unconfirmed_of(pack) < MAX_PACK_BLOCKS and self._store.unconfirmed < MAX_BLOCKS
