@@ -60,7 +60,7 @@ prepared: apt venv
 demo: $(CORE) ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@$(BIN)/bms-estimator demo $(ARGS)
 
-demo-fleet: venv ## a fleet's server, 1,000 simulated packs, two workers of which one is killed, the page: a minute
+demo-fleet: venv ## a fleet of 1,000 simulated packs, explained: faulty packs are named, and a worker is killed: a minute
 	@$(BIN)/bms-estimator fleet demo $(ARGS)
 
 fleet: venv ## cost of a fleet, in processes on this machine, e.g. make fleet ARGS="--packs 10000 --minutes 5"

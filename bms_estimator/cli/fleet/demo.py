@@ -10,7 +10,8 @@ import typer
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.page_options import open_browser
-from bms_estimator.fleet.simulation.demo import Demo, free_port, run_demo
+from bms_estimator.fleet.demo.demo import Demo, run_demo
+from bms_estimator.fleet.demo.processes import free_port
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.process.signals import stop_on_signal
 
@@ -19,7 +20,7 @@ def demo(
     packs: Annotated[int, typer.Option(parser=whole(1, 100_000), help="number of simulated packs")] = 1000,
     seconds: Annotated[
         float, typer.Option(parser=decimal(3.0), help="duration in seconds for which the edges send samples")
-    ] = 45.0,
+    ] = 40.0,
     page_port: Annotated[
         int | None,
         typer.Option(parser=whole(1, 65535), help="port of the page; default: a free port", show_default=False),
@@ -30,10 +31,10 @@ def demo(
 ) -> None:
     """Run a server, simulated packs, two workers and the fleet's page in one terminal for a minute.
 
-    All are real processes on the loopback interface, with free ports and a temporary folder.
+    The output explains each step. Three packs send faulty data, which the fleet must name.
     One of the two workers is killed, and the other takes over its packs.
-    The edges run ten times as fast as real time.
-    The output compares the estimates with the true SOC of the simulated packs.
+    The end is a table of measured results.
+    All parts are processes on the loopback interface, with free ports and a temporary folder.
     """
     with show_compile_progress():
         load_fleet_kernels()

@@ -229,7 +229,9 @@ class SimulatedFleet:
     def table(self) -> str:
         """Return the table of packs in the format that ``fleet packs load`` reads."""
         lines = [",".join(COLUMNS)]
-        lines += [_row(name, KINDS[index]) for name, index in zip(self.names, self._kind_index.tolist(), strict=True)]
+        lines += [
+            table_row(name, KINDS[index]) for name, index in zip(self.names, self._kind_index.tolist(), strict=True)
+        ]
         return "\n".join(lines) + "\n"
 
     def truth_table(self) -> str:
@@ -303,7 +305,8 @@ def _mixed(bits: Bits) -> Bits:
         return bits ^ (bits >> np.uint64(31))
 
 
-def _row(name: str, kind: Kind) -> str:
+def table_row(name: str, kind: Kind) -> str:
+    """Return a pack's row of the table of packs, without the end of the line."""
     cells = (kind.cell, "" if kind.capacity_ah is None else kind.capacity_ah, kind.series, kind.parallel)
     return ",".join(map(str, (name, *cells, kind.voltage_resolution_v, kind.current_resolution_a, 1)))
 

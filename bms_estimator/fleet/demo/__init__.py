@@ -1,0 +1,1 @@
+"""A fleet in one terminal: server, simulated packs, workers and page."""
