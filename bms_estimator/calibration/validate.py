@@ -11,7 +11,7 @@ import numpy as np
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, soc_outside
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE
-from bms_estimator.calibration.elements.identify import initial_soc as soc_of_first_rest
+from bms_estimator.calibration.elements.capture_run import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.ocv.overpotential import overpotential
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each

@@ -22,7 +22,6 @@ import math
 import struct
 import zlib
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,22 +50,31 @@ class BlockError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
-    """Block of samples, sent in one message.
+class BlockHeader:
+    """Position of a block in the order of its edge's blocks.
 
     Attributes:
         store_created_ns: Creation time of the edge's store, from which timestamps count [ns since 1970].
         number: Number of this block in its store, from 1.
         oldest: Oldest number that the edge can still send; at most ``number``.
         arrival_s: Wall clock at the arrival of the last sample [s since 1970].
-        samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MAX_SAMPLES`` of them.
-        cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
     """
 
     store_created_ns: int
     number: int
     oldest: int
     arrival_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Block(BlockHeader):
+    """Block of samples, sent in one message.
+
+    Attributes:
+        samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MAX_SAMPLES`` of them.
+        cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
+    """
+
     samples: SampleBlock
     cells_v: CellBlock = field(default_factory=lambda: NO_CELLS)
 
@@ -109,24 +117,22 @@ def decode(data: bytes) -> Block:
     Raises:
         BlockError: The bytes are not a block, or damaged.
     """
-    header = _decode_header(data)
-    samples, cells_v = _decode_body(data[_HEADER.size :], header.samples, header.cells)
-    return Block(header.store, header.number, header.oldest, header.arrival_s, samples, cells_v)
+    header, count, cells = _decode_header(data)
+    samples, cells_v = _decode_body(data[_HEADER.size :], count, cells)
+    return Block(header.store_created_ns, header.number, header.oldest, header.arrival_s, samples, cells_v)
 
 
-class _Header(NamedTuple):
-    """Header of a block: the fields of ``Block``, and the numbers of samples and of cells."""
+def decode_header(data: bytes) -> BlockHeader:
+    """Decode only the header of a block.
 
-    store: int
-    number: int
-    oldest: int
-    arrival_s: float
-    samples: int
-    cells: int
+    Raises:
+        BlockError: The bytes are not a block, or its header is damaged.
+    """
+    return _decode_header(data)[0]
 
 
-def _decode_header(data: bytes) -> _Header:
-    """Return the header of a block."""
+def _decode_header(data: bytes) -> tuple[BlockHeader, int, int]:
+    """Return the header of a block, and its numbers of samples and of cells."""
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         raise BlockError(f"{len(data)} bytes without the header of a block")
     _, version, cells, count, store, number, oldest, arrival_s = _HEADER.unpack_from(data)
@@ -136,17 +142,7 @@ def _decode_header(data: bytes) -> _Header:
         )
     if not (1 <= oldest <= number < MAX_NUMBER and 0 < store < MAX_NUMBER and math.isfinite(arrival_s)):
         raise BlockError(f"implausible header: store {store}, number {number}, oldest {oldest}, arrival {arrival_s}")
-    return _Header(store, number, oldest, arrival_s, count, cells if version > _VERSION_WITHOUT_CELLS else 0)
-
-
-def decode_header(data: bytes) -> Block:
-    """Decode only the header of a block. The returned block has no samples.
-
-    Raises:
-        BlockError: The bytes are not a block, or its header is damaged.
-    """
-    header = _decode_header(data)
-    return Block(header.store, header.number, header.oldest, header.arrival_s, np.zeros(0, SAMPLE))
+    return BlockHeader(store, number, oldest, arrival_s), count, cells if version > _VERSION_WITHOUT_CELLS else 0
 
 
 def peek_header(data: bytes) -> tuple[int, float]:

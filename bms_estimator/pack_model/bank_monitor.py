@@ -6,11 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.fit import PackFit
-from bms_estimator.pack_model.history import History, ReferenceDischarges, WeakCellTime
-from bms_estimator.pack_model.open_circuit import drawn_soc, row_soc
-from bms_estimator.pack_model.weakest_cell import (
+from bms_estimator.pack_model.bank_comparison import (
     MIN_REFERENCE_ROWS,
     MIN_ROWS,
     SINCE_EARLIER,
@@ -20,6 +16,10 @@ from bms_estimator.pack_model.weakest_cell import (
     ReferenceCurve,
     WeakestCell,
 )
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.fit import PackFit
+from bms_estimator.pack_model.history import History, ReferenceDischarges, WeakCellTime
+from bms_estimator.pack_model.open_circuit import drawn_soc, row_soc
 from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_FRACTION, WEAK_CELL_STD
 
 CHARGED_SOC = 0.05

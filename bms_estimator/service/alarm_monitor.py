@@ -23,7 +23,7 @@ from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions
-from bms_estimator.telemetry.weakest_cell import WeakestCellValues
+from bms_estimator.telemetry.weakest_cell_values import WeakestCellValues
 
 UNUSABLE_KINDS = "not_finite", "range", "saturated"
 """Kinds of dropped samples that indicate a sensor fault."""

@@ -36,7 +36,7 @@ from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import Source, SourceHealth
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 from bms_estimator.telemetry.pack_model import pack_model_health
-from bms_estimator.telemetry.weakest_cell import weakest_cell_values
+from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
 
 LAG_STEP_S = 0.1
 """Interval at which the loop's lag is measured [s]. Any longer blocking of the loop is noticed."""

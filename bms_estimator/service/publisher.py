@@ -44,7 +44,7 @@ from bms_estimator.telemetry.publish_window import Window, WindowSummary
 from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.rest_detector import RestDetector
 from bms_estimator.telemetry.state import make_info_payload, make_state_payload
-from bms_estimator.telemetry.weakest_cell import WeakestCellValues, bank_fields
+from bms_estimator.telemetry.weakest_cell_values import WeakestCellValues, bank_fields
 
 log = structlog.get_logger(__name__)
 

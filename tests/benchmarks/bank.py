@@ -15,9 +15,9 @@ import numpy as np
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.accumulators.history import ROW_SOC
 from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.bank_comparison import WeakestCell
 from bms_estimator.pack_model.bank_monitor import BankMonitor, is_discharge
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.weakest_cell import WeakestCell
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 from tests.benchmarks.simulated_banks import CHEMISTRIES, WEAK_CELLS, Recording, Step, recordings
 from tests.pack_model.bank_cycles import CELL

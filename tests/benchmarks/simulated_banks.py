@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 CACHE = Path(tempfile.gettempdir()) / "bank_cache"
 """Folder of recorded banks."""
-DETECTOR = {"weakest_cell.py", "bank_monitor.py", "open_circuit.py"}
+DETECTOR = {"bank_comparison.py", "bank_monitor.py", "open_circuit.py"}
 """Files of ``pack_model`` that compare recordings. The recordings do not depend on them."""
 STEP_S = 5.0
 """Interval between two samples [s]."""

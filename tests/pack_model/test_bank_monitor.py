@@ -8,13 +8,13 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, ROW_SOC
 from bms_estimator.model.cell import load_cell
+from bms_estimator.pack_model.bank_comparison import WeakestCell
 from bms_estimator.pack_model.bank_monitor import BankMonitor, discharge_start, reference_rows
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import SOC, PackFit
 from bms_estimator.pack_model.history import History, ReferenceDischarges, WeakCellTime
 from bms_estimator.pack_model.open_circuit import fitted_ocv
 from bms_estimator.pack_model.saved import history_arrays, history_of, neutral_fit
-from bms_estimator.pack_model.weakest_cell import WeakestCell
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 
 

@@ -17,7 +17,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_bank import BankCells
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.weakest_cell import weakest_cell_values
+from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
 from tests.collector import Collector
 from tests.pack_model.bank_cycles import ONE_C, cycle, new_bank
 from tests.scripted_source import ScriptedSource

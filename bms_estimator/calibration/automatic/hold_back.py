@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture
-from bms_estimator.calibration.elements.identify import MIN_SPAN_K
+from bms_estimator.calibration.elements.capture_run import MIN_SPAN_K
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.columns import Columns
 

@@ -40,7 +40,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, open_capture
 from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.weakest_cell import weakest_cell_values
+from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
 
 MAX_BLOCK_S = 1.0
 """Maximum duration of a block [s]. Alarms are evaluated after each block, by the capture's clock."""

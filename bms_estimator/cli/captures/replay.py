@@ -57,7 +57,7 @@ from bms_estimator.telemetry.cell_columns import CellColumns
 from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 from bms_estimator.telemetry.pack_model import FitTimes, pack_model_health
-from bms_estimator.telemetry.weakest_cell import weakest_cell_values
+from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
 
 RARE_FAULT_FRACTION = 0.01
 """Maximum fraction of samples with a fault for which no likely cause is reported."""

@@ -12,7 +12,8 @@ from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 
-from bms_estimator.calibration.elements.identify import CaptureFit, Identification, identify
+from bms_estimator.calibration.elements.identification import CaptureFit, Identification
+from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.cli.cell.identify_fuel_cell import identify_fuel_cell
 from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (

@@ -9,7 +9,7 @@ from enum import Enum
 
 import numpy as np
 
-from bms_estimator.edge.block import Block
+from bms_estimator.edge.block import BlockHeader
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.worker.pack_state import MAX_LOST_BLOCKS
 from bms_estimator.fleet.worker.unsaved_positions import BlockPosition
@@ -38,12 +38,12 @@ class BlockOrder(Enum):
     """From a store that the edge has since replaced by a newer one."""
 
 
-def classify_block(d: np.void, block: Block) -> BlockOrder:
-    """Classify a block by its header, and update the pack's delivery record.
+def classify_block(d: np.void, block: BlockHeader) -> BlockOrder:
+    """Classify a block, and update the pack's delivery record.
 
     Args:
         d: The pack's record of dtype ``DELIVERY``. The caller advances it past a ``NEXT`` block by ``mark_taken``.
-        block: The received block.
+        block: Header of the received block.
     """
     store, number = int(d["store"]), int(d["awaited"])
     if block.store_created_ns < store:
@@ -98,14 +98,14 @@ def position(d: np.void) -> BlockPosition:
 
 
 def edge_reply(
-    order: BlockOrder, early_blocks: int, block: Block, safe: BlockPosition, *, is_first: bool
+    order: BlockOrder, early_blocks: int, block: BlockHeader, safe: BlockPosition, *, is_first: bool
 ) -> BlockRequest | None:
     """Return the reply to a block's edge; None if no reply is due.
 
     Args:
         order: Result of ``classify_block``.
         early_blocks: Number of blocks that have arrived before the awaited one, including this one.
-        block: The received block.
+        block: Header of the received block.
         safe: Position of the pack before which all blocks are safe.
         is_first: True for the first block of this pack since the worker took over the partition.
     """

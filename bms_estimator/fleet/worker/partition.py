@@ -13,7 +13,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from bms_estimator.edge.block import Block, BlockError, decode, decode_header
+from bms_estimator.edge.block import Block, BlockError, BlockHeader, decode, decode_header
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.packs.pack_type import PackType, PackTypes
 from bms_estimator.fleet.packs.table_change import PackSource, decode_change, encode_change, is_change
@@ -329,10 +329,10 @@ class Partition:
         if isinstance(block, BlockError):
             self._log_rejection(pack, str(block))
             return BlockResult(pack, dead_reason=str(block))
-        return self._take(pack, block, arrival, pack_type, is_lethal=is_lethal)
+        return self._take(pack, block, arrival, pack_type)
 
-    def _decode(self, data: bytes, decode_block: Callable[[bytes], Block] = decode) -> Block | BlockError:
-        """Return the block in a message, or the error of a damaged one."""
+    def _decode(self, data: bytes, decode_block: Callable[[bytes], BlockHeader] = decode) -> BlockHeader | BlockError:
+        """Return the block in a message or its header, or the error of a damaged one."""
         try:
             return decode_block(data)
         except BlockError as error:
@@ -352,8 +352,8 @@ class Partition:
             pack_type = self._type_by_pack[pack] = self._types.of(*entry)
         return pack_type
 
-    def _take(self, pack: str, block: Block, arrival: Arrival, pack_type: PackType, *, is_lethal: bool) -> BlockResult:
-        """Process a block of a known pack."""
+    def _take(self, pack: str, block: BlockHeader, arrival: Arrival, pack_type: PackType) -> BlockResult:
+        """Process a block of a known pack, or skip a lethal one, of which only the header was decoded."""
         unmigrated_fields = self._load(pack)
         d = self._unpacked.delivery
         stored_lost = int(d["lost_blocks"])
@@ -364,11 +364,12 @@ class Partition:
         self._unpacked.count_lost(newly_lost)
         result = BlockResult(pack)
         if order is BlockOrder.NEXT:
-            stepped, fault = None, LETHAL if is_lethal else density_fault(block.samples)
+            stepped, fault, is_lethal = None, LETHAL, not isinstance(block, Block)
+            if isinstance(block, Block):
+                fault = density_fault(block.samples)
+                stepped = None if fault else self._step(pack, block, arrival, pack_type, unmigrated_fields)
             if fault:
                 self._log_rejection(pack, fault)
-            else:
-                stepped = self._step(pack, block, arrival, pack_type, unmigrated_fields)
             if stepped is None:  # reload the record, which the failed block may have changed
                 self._load(pack)
                 self._restore_unmigrated_delivery(pack)

@@ -8,7 +8,9 @@ from bms_estimator.calibration.cleaning.capture_checks import capture_contradict
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
 from bms_estimator.calibration.elements import identify as module
 from bms_estimator.calibration.elements import two_branch_fit
-from bms_estimator.calibration.elements.identify import identify, initial_soc
+from bms_estimator.calibration.elements.capture_run import initial_soc
+from bms_estimator.calibration.elements.cell_from_fit import LADDER_STD
+from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix
 from bms_estimator.calibration.validate import validate
@@ -126,7 +128,7 @@ def test_without_data_near_empty_the_resistances_grow_partly_as_in_the_given_fil
 def test_a_capture_with_little_information_gives_a_larger_std(warm, from_warm_with_given_ocv):
     from_short = identify([Columns(warm.rows[:700], "short")], wrong_start(), refine_ocv=False)
     std, std_from_short = (result.cell.ladder.std for result in (from_warm_with_given_ocv, from_short))
-    assert module.LADDER_STD < std < 1.3 * module.LADDER_STD < 1.5 * std < std_from_short
+    assert LADDER_STD < std < 1.3 * LADDER_STD < 1.5 * std < std_from_short
 
 
 def test_the_two_rc_pairs_of_the_file_are_equivalent_to_its_ladder(identified):

@@ -7,9 +7,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.saved import neutral_fit
-from bms_estimator.pack_model.weakest_cell import (
+from bms_estimator.pack_model.bank_comparison import (
     BIN_SOC,
     MAX_ERROR_RATIO,
     SINCE_EARLIER,
@@ -17,6 +15,8 @@ from bms_estimator.pack_model.weakest_cell import (
     Reference,
     ReferenceCurve,
 )
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.saved import neutral_fit
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 
 SERIES, STD_V = 6, 2e-3

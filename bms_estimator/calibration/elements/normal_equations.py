@@ -1,0 +1,190 @@
+"""Normal equations of the ladder fit over one capture.
+
+The weight of a capture does not depend on its number of rows. The weight of a row is the time since the previous row,
+divided by the time since the last change of current, so that each decade of time in a rest has equal weight. The ends
+of long rests have additional weight: together as much as all other rows. Each capture counts as ``ROWS_PER_CAPTURE``
+rows. Large voltage drops have an error relative to their size. All constants of this module were chosen by the score of
+replays on drive cycles that were not part of the fit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
+from bms_estimator.calibration.cleaning.rests import true_runs
+from bms_estimator.calibration.elements.ladder_columns import model_rows
+from bms_estimator.calibration.ocv.overpotential import arrhenius
+from bms_estimator.kernels.cell_model.open_loop import branch_currents
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.errors import UserError
+
+ROWS_PER_CAPTURE = 30.0
+"""Number of independent rows that a capture counts as."""
+ERROR_V = 4e-3
+"""Std of a row at 25 C per cell [V]."""
+ERROR_J = 22e3
+"""Activation energy of the growth of ``ERROR_V`` in the cold [J/mol]."""
+SOC_STD = 0.01
+"""Std of the SOC after a change of 1. The variance grows with the change: at a knee far from the start a cell deviates
+from its curve, and this voltage error must not appear as a resistance."""
+RELATIVE_STD = 0.1
+"""Std of a row relative to its voltage drop. The drop is the largest of the currents x_0 to x_3 times the scale of the
+resistances."""
+STEP_ROWS = 30.0
+"""Weight of all voltage jumps of a capture at clean current steps, in rows. Jumps determine R_0 and do not drift."""
+STEP_V = 1e-3
+"""Std of a voltage jump at a clean current step, per cell [V]."""
+STEADY_FRACTION = 0.01
+"""Maximum variation of the current before and after a clean step, as a fraction of the largest current. With a varying
+current, a delay between voltage and current samples would change R_0."""
+STEADY_S = 5.0
+"""Duration for which the current is constant before and after a clean step [s]."""
+MAX_STEP_S = 1.5
+"""Maximum time between the two samples of a clean step [s]."""
+COUNT_STD = 0.004
+"""Relative std of the charge counted in a capture, and of the capacity at its temperature."""
+STEP_FRACTION = 0.1
+"""Minimum change of current at which the time since the last change restarts, as a fraction of the largest current."""
+MIN_SINCE_STEP_S = 10.0
+"""Minimum of the time since the last change of current, in the weight of a row [s]."""
+MAX_ROW_S = 30.0
+"""Maximum of the time since the previous row, in the weight of a row [s]."""
+LONG_REST_S = 500.0
+"""Minimum duration of a long rest [s]."""
+REST_FRACTION = 0.01
+"""Maximum current of a rest, as a fraction of the largest current."""
+ROW_INTERVAL_S = 0.5
+"""Minimum time between two rows [s]."""
+MIN_SOC = 0.02
+"""Minimum SOC of the rows."""
+MAX_SOC = 1.01
+"""Maximum SOC of the rows. It exceeds 1 by the error of the counted charge."""
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Normal equations of one capture, with y the measured voltage less the given OCV.
+
+    X are the rows of the model, W their weights. The miscount is the relative error of the counted charge.
+
+    Attributes:
+        information: X'WX with the miscount of the charge marginalized.
+        information_vector: X'Wy with the miscount marginalized.
+        miscount_cross: X'Wc, where c is the voltage change by a miscount of 1.
+        miscount_information: c'Wc plus the inverse prior variance of the miscount.
+        miscount_vector: c'Wy plus the part of the miscount's prior.
+    """
+
+    information: Floats
+    information_vector: Floats
+    miscount_cross: Floats
+    miscount_information: float
+    miscount_vector: float
+
+    def miscount(self, coefficients: Floats) -> float:
+        """Return the relative error of the charge count at which the voltage of a fit matches the capture's."""
+        return float((self.miscount_vector - self.miscount_cross @ coefficients) / self.miscount_information)
+
+
+def normal_equations(
+    load: CleanCapture,
+    soc: Floats,
+    given_v: Floats,
+    slope_v: Floats,
+    temperature_c: Floats,
+    scale_ohm: float,
+    series: int,
+    miscount: float,
+) -> NormalEquations:
+    """Return the normal equations of the regression over ``load``.
+
+    Args:
+        load: Capture that starts at rest.
+        soc: Shape (n,), counted SOC, corrected for ``miscount``.
+        given_v: Shape (n,), the given OCV at SOC and temperature [V].
+        slope_v: Shape (n,), slope dE_o/dSOC of the given OCV [V].
+        temperature_c: Shape (n,) [C].
+        scale_ohm: Scale of the resistances [ohm].
+        series: Cells in series.
+        miscount: Relative correction of the counted charge that ``soc`` includes.
+
+    Raises:
+        UserError: No sample lies within ``MIN_SOC`` to ``MAX_SOC``.
+    """
+    currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])  # x_0, x_1, ...
+    weight, is_rest_end = _weights(load)
+    inside = (soc > MIN_SOC) & (soc < MAX_SOC)
+    selected = (_first_of_each_slot(load.time_s) | is_rest_end) & inside
+    if not selected.any():
+        raise UserError(
+            f"{load.name}: no sample between SOC {MIN_SOC:g} and {MAX_SOC:g} [--soc], so that resistances are undetermined"
+        )
+    max_current_a = np.abs(currents[:, :4]).max(axis=1)  # of x_0 to x_3, see RELATIVE_STD
+    std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE_STD * scale_ohm * max_current_a)
+    std_v = np.hypot(std_v, SOC_STD * np.sqrt(np.abs(soc - soc[0])) * slope_v)
+    weight = np.where(selected, weight, 0.0)
+    root_weight = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[selected]
+    residual_v = load.voltage_v - given_v
+    rows = model_rows(soc[selected], temperature_c[selected], currents[selected]) * root_weight[:, None]
+    target = residual_v[selected] * root_weight
+    # the rows of voltage jumps: each is the difference between the samples after and before a clean step
+    is_after_step = _clean_steps(load) & inside
+    is_before_step = np.r_[is_after_step[1:], False]
+    if is_after_step.any():
+        change_a = np.abs(load.current_a[is_after_step] - load.current_a[is_before_step])
+        step_std_v = np.hypot(STEP_V * series, RELATIVE_STD * scale_ohm * change_a) * arrhenius(
+            ERROR_J, temperature_c[is_after_step]
+        )
+        step_root_weight = np.sqrt(STEP_ROWS / is_after_step.sum()) / step_std_v
+        jump = model_rows(soc[is_after_step], temperature_c[is_after_step], currents[is_after_step])
+        jump -= model_rows(soc[is_before_step], temperature_c[is_before_step], currents[is_before_step])
+        rows = np.vstack([rows, jump * step_root_weight[:, None]])
+        target = np.r_[target, (residual_v[is_after_step] - residual_v[is_before_step]) * step_root_weight]
+    by_miscount = np.zeros(target.size)  # weighted voltage change by a relative miscount of 1; 0 for jumps
+    by_miscount[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * root_weight
+    miscount_cross, miscount_information = rows.T @ by_miscount, float(by_miscount @ by_miscount + 1.0 / COUNT_STD**2)
+    miscount_vector = float(by_miscount @ target - miscount / COUNT_STD**2)
+    return NormalEquations(
+        information=rows.T @ rows - np.outer(miscount_cross, miscount_cross) / miscount_information,
+        information_vector=rows.T @ target - miscount_cross * miscount_vector / miscount_information,
+        miscount_cross=miscount_cross,
+        miscount_information=miscount_information,
+        miscount_vector=miscount_vector,
+    )
+
+
+def _first_of_each_slot(time_s: Floats) -> NDArray[np.bool_]:
+    """Return a mask of the first sample in each slot of ``ROW_INTERVAL_S``."""
+    slot = np.floor(time_s / ROW_INTERVAL_S)
+    return np.asarray(np.r_[True, np.diff(slot) > 0.0], dtype=np.bool_)
+
+
+def _weights(load: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the relative weight of each row, and a mask of the last rows of long rests."""
+    largest_a = float(np.abs(load.current_a).max())
+    step_s = np.clip(np.diff(load.time_s, append=load.time_s[-1] + 1.0), 0.0, MAX_ROW_S)
+    changed = np.r_[True, np.abs(np.diff(load.current_a)) > STEP_FRACTION * largest_a]
+    since_s = load.time_s - load.time_s[np.maximum.accumulate(np.where(changed, np.arange(changed.size), 0))]
+    weight = step_s / np.maximum(since_s + step_s, MIN_SINCE_STEP_S)
+    weight /= weight.sum()
+    resting = np.abs(load.current_a) < REST_FRACTION * largest_a
+    ends = [end - 1 for first, end in true_runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]
+    weight[ends] += 1.0 / max(len(ends), 1)
+    last = np.zeros(weight.size, dtype=np.bool_)
+    last[ends] = True
+    return weight, last
+
+
+def _clean_steps(load: CleanCapture) -> NDArray[np.bool_]:
+    """Return a mask of the samples directly after clean current steps (see ``STEADY_FRACTION``)."""
+    largest_a = float(np.abs(load.current_a).max())
+    change_a = np.abs(np.diff(load.current_a, prepend=load.current_a[0]))
+    step_s = np.diff(load.time_s, prepend=load.time_s[0])
+    changes = np.flatnonzero(change_a > STEADY_FRACTION * largest_a)
+    bounds_s = np.r_[load.time_s[0], load.time_s[changes], load.time_s[-1]]
+    steady = (bounds_s[1:-1] - bounds_s[:-2] >= STEADY_S) & (bounds_s[2:] - bounds_s[1:-1] >= STEADY_S)
+    clean = np.zeros(change_a.size, dtype=np.bool_)
+    clean[changes[steady]] = True
+    return np.asarray(clean & (change_a > STEP_FRACTION * largest_a) & (step_s <= MAX_STEP_S))
