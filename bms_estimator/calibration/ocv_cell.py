@@ -12,17 +12,11 @@ from bms_estimator.calibration.elements.generic_prior import curve as generic_cu
 from bms_estimator.calibration.elements.generic_prior import nearest_generic_cell, scaled_generic_ladder
 from bms_estimator.calibration.elements.initial_elements import initial_elements
 from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
+from bms_estimator.calibration.ocv.hysteresis import center_on_typical_hysteresis, has_plateau
 from bms_estimator.calibration.ocv.points import Points
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
-from bms_estimator.calibration.ocv.sources import (
-    ExternalCurve,
-    OcvSources,
-    Recording,
-    center_on_typical_hysteresis,
-    find_sources,
-    has_plateau,
-    subtract_rc_overpotential,
-)
+from bms_estimator.calibration.ocv.source import ExternalCurve, OcvSources, Recording
+from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder

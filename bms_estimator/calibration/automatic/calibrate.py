@@ -15,7 +15,7 @@ from bms_estimator.calibration.automatic.hold_back import Split, hold_back, use_
 from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFitter
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture, recognize
 from bms_estimator.calibration.elements.replay_score import MIN_SOC, SETTLING_S
-from bms_estimator.calibration.ocv.sources import ExternalCurve
+from bms_estimator.calibration.ocv.source import ExternalCurve
 from bms_estimator.calibration.validate import Validation, validate
 from bms_estimator.calibration.verdict import SocErrors, Verdict, coverage, judge, voltage_errors
 from bms_estimator.estimator import Estimator

@@ -10,7 +10,7 @@ from bms_estimator.calibration.cleaning.clean_capture import clean_capture
 from bms_estimator.calibration.elements.capture_run import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.elements.identification import Identification
 from bms_estimator.calibration.elements.identify import identify
-from bms_estimator.calibration.ocv.sources import ExternalCurve, Recording
+from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
 from bms_estimator.calibration.ocv_cell import OcvCell, determine_ocv
 from bms_estimator.model.cell import CellModel, with_capacity, with_name
 from bms_estimator.model.errors import UserError

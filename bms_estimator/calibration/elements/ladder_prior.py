@@ -12,8 +12,8 @@ from bms_estimator.calibration.elements.ladder_fit import (
     ZERO_FRACTION,
     Prior,
 )
+from bms_estimator.calibration.ocv.hysteresis import REST_SHARE_STD, has_plateau
 from bms_estimator.calibration.ocv.slow_curve import PAIR_V
-from bms_estimator.calibration.ocv.sources import REST_SHARE_STD, has_plateau
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES, weak_share

@@ -1,11 +1,19 @@
 """Sources of the open-circuit voltage: rests, low-rate curves, and given curves."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from bms_estimator.calibration.cleaning.rests import remove_glitches
+from bms_estimator.calibration.ocv.hysteresis import (
+    REST_SHARE_STD,
+    centered,
+    find_hysteresis_source,
+    hysteresis_factor,
+    measured_share,
+    typical_share,
+)
 from bms_estimator.calibration.ocv.overpotential import steady_drop
 from bms_estimator.calibration.ocv.points import Points, joined, points_of
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v, relaxation_test
@@ -17,12 +25,11 @@ from bms_estimator.calibration.ocv.slow_curve import (
     slow_branches,
     slow_curves,
 )
+from bms_estimator.calibration.ocv.source import ExternalCurve, OcvSources, Recording, Source
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
-from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, arrhenius
-from bms_estimator.model.arrays import Floats
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import Ladder
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 SAME_START_V = 0.02
 """Maximum difference of the first rests of captures that start at the same SOC, per cell [V]. Full charges vary by as
@@ -31,109 +38,8 @@ GIVEN_V = 1e-3
 """Std of each point of a given curve, per cell [V]."""
 GIVEN_SYSTEMATIC_V = 2e-3
 """Std of the systematic error of a given curve, per cell [V]."""
-REST_SHARE = 0.7
-"""Fraction of the half difference of low-rate curves that is hysteresis and remains in a rest after a discharge. The
-remainder is polarization. Measured fractions are 0.4 and 0.5 for an NCA cell, 1.0 for an LFP cell."""
-REST_SHARE_STD = 0.3
-"""Std of ``REST_SHARE``."""
-PLATEAU_SHARE = 0.9
-"""Fraction of the hysteresis that remains in a rest, for a curve with a plateau. Two coexisting phases preserve the
-hysteresis (Dreyer et al., Nature Materials 9, 2010, 448). Drives of an LFP cell at 25, 5 and -15 C show 0.9 to 1.0."""
-PLATEAU_V = 0.15
-"""Maximum slope dOCV/dSOC of a plateau, per cell [V]."""
-PLATEAU_SOC = 0.05
-"""SOC interval over which the slope of a plateau is computed."""
-TYPICAL_HYSTERESIS_STD = 0.6
-"""Relative std of a hysteresis that is taken from typical cells."""
-MIN_SHARE = 0.1
-"""Lower limit of the remaining fraction that is measured by rests."""
-SHARE_POINTS = 6
-"""Minimum number of rests that determine the remaining fraction."""
-SHARE_K = 10.0
-"""Maximum distance from 25 C of rests that determine the remaining fraction, in addition to the distance of the low-rate
-curves [K]."""
-SHARE_SOC = (0.1, 0.95)
-"""SOC range of rests that determine the remaining fraction, and of a plateau."""
 MAX_CAPACITY_DIFFERENCE = 0.05
 """Relative difference between the given and the measured capacity above which a source has a remark."""
-
-
-@dataclass(frozen=True)
-class Recording:
-    """Name and raw samples of a capture, dtype ``SAMPLE``."""
-
-    name: str
-    samples: SampleBlock
-
-
-@dataclass(frozen=True)
-class ExternalCurve:
-    """Given OCV curve.
-
-    Attributes:
-        name: Name for messages.
-        soc: Shape (n,), increasing, 0..1.
-        ocv_v: Shape (n,), open-circuit voltage [V].
-        hysteresis_v: Shape (n,), hysteresis [V]; None if unknown.
-    """
-
-    name: str
-    soc: Floats
-    ocv_v: Floats
-    hysteresis_v: Floats | None
-
-
-@dataclass(frozen=True)
-class Source:
-    """One source of points.
-
-    Attributes:
-        name: Names of the captures.
-        kind: Recognized kind, such as "38 rests".
-        points: Points of the open-circuit voltage.
-        temperature_c: Mean temperature [C]; NaN if unknown.
-        hysteresis_v: Hysteresis at ``GRID`` [V]; None if unknown.
-        notes: Remarks.
-        unpaired: Low-rate curve of an unpaired source whose ``points`` contain the overpotential of the RC pairs;
-            otherwise None.
-    """
-
-    name: str
-    kind: str
-    points: Points
-    temperature_c: float
-    hysteresis_v: Floats | None
-    notes: tuple[str, ...]
-    unpaired: SlowBranch | None = None
-
-
-@dataclass(frozen=True)
-class OcvSources:
-    """All sources of the open-circuit voltage of a cell.
-
-    Attributes:
-        capacity_ah: Given capacity, otherwise ``measured_ah`` [Ah].
-        measured_ah: Capacity by a full low-rate discharge [Ah]; NaN without one.
-        sources: Low-rate curves, given curves, and rests.
-        tests: Relaxation tests among ``sources``.
-        hysteresis_v: Hysteresis of a rested cell at ``NODES`` and 25 C [V], from the source nearest to 25 C that shows
-            hysteresis; None without such a source.
-        hysteresis_std_v: Standard deviation of ``hysteresis_v`` [V].
-        usual_hysteresis: True if ``hysteresis_v`` comes from typical cells (``center_on_typical_hysteresis``).
-    """
-
-    capacity_ah: float
-    measured_ah: float
-    sources: tuple[Source, ...]
-    tests: tuple[RelaxationTest, ...]
-    hysteresis_v: Floats | None
-    hysteresis_std_v: Floats
-    usual_hysteresis: bool = False
-
-    @property
-    def points(self) -> Points:
-        """Points of all sources."""
-        return joined([source.points for source in self.sources])
 
 
 def find_sources(
@@ -173,20 +79,20 @@ def find_sources(
     ]
     rests = [recording for recording in recordings if not branches[recording.name]]
     tests_with_points = _rests(rests, sources, all_branches, used_ah, initial_soc, series_count)
-    hysteresis_source = _hysteresis_source(sources)
+    hysteresis_source = find_hysteresis_source(sources)
     hysteresis_v, hysteresis_std_v = None, np.zeros(NODES.size)
     if hysteresis_source is not None and hysteresis_source.hysteresis_v is not None:
-        share = _measured_share(hysteresis_source, tests_with_points)
-        half_difference_v = hysteresis_source.hysteresis_v / _hysteresis_factor(hysteresis_source.temperature_c)
+        share = measured_share(hysteresis_source, tests_with_points)
+        half_difference_v = hysteresis_source.hysteresis_v / hysteresis_factor(hysteresis_source.temperature_c)
         hysteresis_at_rest_v = half_difference_v * (
-            _typical_share(hysteresis_source, series_count) if share is None else share
+            typical_share(hysteresis_source, series_count) if share is None else share
         )
         # the hysteresis of a given curve is used unchanged, unless rests measure its fraction
         is_unchanged = hysteresis_source in sources[len(slow) :] and share is None
         hysteresis_v = np.interp(NODES, GRID, half_difference_v if is_unchanged else hysteresis_at_rest_v)
         hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_difference_v)
         tests_with_points = [
-            (test, _centered(points, hysteresis_at_rest_v * _hysteresis_factor(test.temperature_c), REST_SHARE_STD))
+            (test, centered(points, hysteresis_at_rest_v * hysteresis_factor(test.temperature_c), REST_SHARE_STD))
             for test, points in tests_with_points
         ]
         if share is not None:
@@ -234,63 +140,6 @@ def _given_curve_source(curve: ExternalCurve, series_count: int) -> Source:
     return Source(curve.name, f"given curve, {curve.soc.size} points", points, float("nan"), hysteresis_v, ())
 
 
-def _hysteresis_source(sources: Sequence[Source]) -> Source | None:
-    """Return the source nearest to 25 C that shows hysteresis."""
-    with_hysteresis = [source for source in sources if source.hysteresis_v is not None]
-    return min(with_hysteresis, key=lambda source: _from_reference(source.temperature_c), default=None)
-
-
-def _from_reference(temperature_c: float) -> float:
-    return abs(float(np.nan_to_num(temperature_c, nan=REFERENCE_C)) - REFERENCE_C)
-
-
-def _hysteresis_factor(temperature_c: float) -> float:
-    """Return the hysteresis at a temperature relative to that at 25 C; 1 for NaN."""
-    return float(arrhenius(HYSTERESIS_J, float(np.nan_to_num(temperature_c, nan=REFERENCE_C))))
-
-
-def _measured_share(
-    hysteresis_source: Source, tests_with_points: Sequence[tuple[RelaxationTest, Points]]
-) -> float | None:
-    """Return the median fraction of the hysteresis that remains in rests after discharge; None for too few rests."""
-    low, high = SHARE_SOC
-    shares: list[float] = []
-    for test, points in tests_with_points:
-        if _from_reference(test.temperature_c) > SHARE_K + _from_reference(hysteresis_source.temperature_c):
-            continue
-        hysteresis_v = np.interp(
-            points.soc,
-            GRID,
-            np.zeros(GRID.size) if hysteresis_source.hysteresis_v is None else hysteresis_source.hysteresis_v,
-        )
-        drop_v = np.interp(points.soc, hysteresis_source.points.soc, hysteresis_source.points.ocv_v) - points.ocv_v
-        usable = (points.soc > low) & (points.soc < high) & (points.direction < 0.0) & (hysteresis_v > 0.0)
-        shares += (drop_v[usable] / hysteresis_v[usable]).tolist()
-    return float(np.clip(np.median(shares), MIN_SHARE, 1.0)) if len(shares) >= SHARE_POINTS else None
-
-
-def _typical_share(hysteresis_source: Source, series_count: int) -> float:
-    """Return the typical fraction of the hysteresis that remains in a rest."""
-    return (
-        PLATEAU_SHARE
-        if has_plateau(hysteresis_source.points.soc, hysteresis_source.points.ocv_v, series_count)
-        else REST_SHARE
-    )
-
-
-def has_plateau(soc: Floats, ocv_v: Floats, series_count: int) -> bool:
-    """Return True if the curve has a plateau, where two phases coexist.
-
-    Args:
-        soc: Shape (n,), increasing.
-        ocv_v: Shape (n,), open-circuit voltage [V].
-        series_count: Cells in series.
-    """
-    edges = np.linspace(*SHARE_SOC, 1 + round(np.ptp(SHARE_SOC) / PLATEAU_SOC))
-    slope_v = np.diff(np.interp(edges, soc, ocv_v)) / np.diff(edges)
-    return float(slope_v.min()) < PLATEAU_V * series_count
-
-
 def _rests(
     recordings: Sequence[Recording],
     sources: Sequence[Source],
@@ -333,17 +182,6 @@ def _soc_at(curve: TableFit, voltage_v: float) -> float:
     return float(np.interp(voltage_v, curve(grid), grid))
 
 
-def _centered(points: Points, hysteresis_at_rest_v: Floats, relative_std: float) -> Points:
-    """Move points to the mean of discharge and charge by a hysteresis with the error ``relative_std``."""
-    hysteresis_v = np.interp(points.soc, GRID, hysteresis_at_rest_v)
-    return replace(
-        points,
-        ocv_v=points.ocv_v - points.direction * hysteresis_v,
-        std_v=np.hypot(points.std_v, np.where(points.direction == 0.0, hysteresis_v, 0.0)),
-        systematic_std_v=np.hypot(points.systematic_std_v, relative_std * hysteresis_v),
-    )
-
-
 def subtract_rc_overpotential(found: OcvSources, ladder: Ladder) -> OcvSources:
     """Subtract the steady overpotential of the RC pairs from unpaired low-rate curves. In a pair it cancels.
 
@@ -370,32 +208,6 @@ def _without_rc_overpotential(source: Source, ladder: Ladder) -> Source:
     removed = "the RC pairs" if first else "series resistance and RC pairs"
     note = f"{1e3 * drop_v.mean():.0f} mV subtracted for {removed}, as typical of such cells"
     return replace(source, points=points, unpaired=None, notes=(*source.notes, note))
-
-
-def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSources:
-    """Move sources without measured hysteresis to the mean of discharge and charge by a typical hysteresis.
-
-    Args:
-        found: Result of ``find_sources``.
-        usual_v: Hysteresis of similar cells after rests, at ``NODES`` and 25 C [V].
-    """
-    on_grid_v = np.interp(GRID, NODES, usual_v)
-    moved = tuple(
-        replace(
-            source,
-            points=_centered(
-                source.points, on_grid_v * _hysteresis_factor(source.temperature_c), TYPICAL_HYSTERESIS_STD
-            ),
-        )
-        for source in found.sources
-    )
-    return replace(
-        found,
-        sources=moved,
-        hysteresis_v=usual_v,
-        hysteresis_std_v=TYPICAL_HYSTERESIS_STD * usual_v,
-        usual_hysteresis=True,
-    )
 
 
 def _relaxation_source(test: RelaxationTest, points: Points) -> Source:

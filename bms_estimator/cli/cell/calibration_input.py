@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bms_estimator.calibration.ocv.sources import ExternalCurve
+from bms_estimator.calibration.ocv.source import ExternalCurve
 from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import unique_names
 from bms_estimator.cli.options.pack_options import single_cell_of, with_pack

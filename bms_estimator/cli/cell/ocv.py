@@ -14,7 +14,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit
 from bms_estimator.calibration.ocv.points import max_v, rms_v
-from bms_estimator.calibration.ocv.sources import OcvSources, Recording
+from bms_estimator.calibration.ocv.source import OcvSources, Recording
 from bms_estimator.calibration.ocv.table_fit import TableFit
 from bms_estimator.calibration.ocv_cell import OcvCell, OcvForm, determine_ocv
 from bms_estimator.cli.cell.calibration_input import load_captures_and_curves

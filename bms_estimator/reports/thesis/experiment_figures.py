@@ -15,15 +15,10 @@ from bms_estimator.plot.thinning import thin
 from bms_estimator.reports.svg_plot import plot
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.experiment import Experiment
+from bms_estimator.reports.thesis.observer_plots import crossing_plot, dynamic_static_plot, elements_plot, products_plot
 from bms_estimator.reports.thesis.procedure import Kind, Procedure
 from bms_estimator.reports.thesis.report_items import Figure, Reproduction
 from bms_estimator.reports.thesis.simulation import SOC_GRID
-from bms_estimator.reports.thesis.simulation_figures import (
-    crossing_plot,
-    dynamic_static_plot,
-    elements_plot,
-    products_plot,
-)
 
 MAX_LOADS = 4
 """Maximum number of loads in a figure, as in Fig. 32."""

@@ -13,9 +13,9 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports.svg_plot import plot
 from bms_estimator.reports.thesis import printed_values
+from bms_estimator.reports.thesis.observer_plots import NO_VALUES, condition_plot, elements_plot, products_plot
 from bms_estimator.reports.thesis.report_items import Figure, Reproduction
 from bms_estimator.reports.thesis.simulation import element, mean_error_percent
-from bms_estimator.reports.thesis.simulation_figures import NO_VALUES, condition_plot, elements_plot, products_plot
 from bms_estimator.reports.thesis.theorem_4_1_2 import PRODUCTS
 
 A = printed_values.tables_8_to_10()

@@ -3,17 +3,15 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.ocv.slow_curve import GRID
-from bms_estimator.calibration.ocv.sources import (
+from bms_estimator.calibration.ocv.hysteresis import (
     PLATEAU_SHARE,
     REST_SHARE_STD,
     TYPICAL_HYSTERESIS_STD,
-    ExternalCurve,
-    Recording,
     center_on_typical_hysteresis,
-    find_sources,
-    subtract_rc_overpotential,
 )
+from bms_estimator.calibration.ocv.slow_curve import GRID
+from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
+from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.cell import load_cell

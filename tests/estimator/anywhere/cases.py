@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import nnls
 
-from bms_estimator.calibration.ocv.sources import REST_SHARE_STD
+from bms_estimator.calibration.ocv.hysteresis import REST_SHARE_STD
 from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, load_cell
