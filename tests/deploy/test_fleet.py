@@ -19,7 +19,9 @@ FindProgram = Callable[[str, str], str]
 NODES = "a.example,b.example,c.example"
 
 
-@pytest.fixture(params=["bms-estimator-fleet.service", "bms-estimator-worker@1.service"])
+@pytest.fixture(
+    params=["bms-estimator-fleet.service", "bms-estimator-ingest.service", "bms-estimator-worker@1.service"]
+)
 def unit(request: pytest.FixtureRequest, deploy: Path, tmp_path: Path) -> Path:
     """Return a unit whose program is replaced by one that exists on this machine."""
     text = (deploy / "fleet" / request.param.replace("@1", "@")).read_text()

@@ -46,8 +46,7 @@ def ingest(
 
     The platform publishes a batch, JSON or Arrow, on the NATS subject telemetry.PACK or the MQTT topic telemetry/PACK.
     """
-    from bms_estimator.fleet.ingest.backfill import backfill  # noqa: PLC0415 - its packages are optional
-    from bms_estimator.fleet.ingest.ingest import Options, ingest  # noqa: PLC0415
+    from bms_estimator.fleet.ingest.ingest import Options, ingest  # noqa: PLC0415 - its packages are optional
     from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
     from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
 
@@ -57,6 +56,8 @@ def ingest(
 
     async def run() -> None:
         if parquet:
+            from bms_estimator.fleet.ingest.backfill import backfill  # noqa: PLC0415 - only the backfill needs Arrow
+
             typer.echo(await backfill(options, parquet, stop_on_signal()))
         else:
             await ingest(options, stop_on_signal())

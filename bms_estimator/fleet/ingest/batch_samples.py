@@ -29,12 +29,13 @@ from bms_estimator.sources.captures.tables.column_tables import parse_column
 from bms_estimator.sources.captures.tables.layout import (
     Column,
     ColumnMap,
+    ColumnRole,
     Layout,
     LayoutFinder,
     Role,
     with_time_kind,
 )
-from bms_estimator.sources.captures.tables.table_reader import to_samples
+from bms_estimator.sources.captures.tables.table_reader import cell_voltages, to_samples
 from bms_estimator.sources.captures.tables.units import Unit, find_unit, split_unit
 
 MIN_TIME_S = 946_684_800.0
@@ -42,7 +43,8 @@ MIN_TIME_S = 946_684_800.0
 MAX_LAYOUTS = 256
 """Maximum number of remembered headers."""
 CELLS = "cells"
-"""Name of the column of cell voltages, without its unit."""
+"""Name of the column with a list of cell voltages in each row, without its unit. Instead, each cell may have a column
+``cell_1_v``, ``cell_2_v`` and so on."""
 _TEXT = "the batch"
 _NUMBERS = {int, float, NoneType}
 
@@ -106,7 +108,11 @@ class BatchReader:
             layout, cells = self._find_layout(tuple(columns))
             layout = with_time_kind(layout, _time_kind(columns[layout.columns[Role.TIME].name]))
             raw = {role: _floats(column, columns[column.name]) for role, column in layout.columns.items()}
-            cells_v = _cell_voltages(cells.name, columns[cells.name], cells.unit) if cells else NO_CELLS
+            if cells:
+                cells_v = _listed_cell_voltages(cells.name, columns[cells.name], cells.unit)
+            else:
+                cells_v = cell_voltages(raw, layout)
+                remove_implausible(cells_v, MIN_CELL_V, MAX_CELL_V)
         except UserError as error:
             raise BatchError(_reason(error)) from None
         except OverflowError:
@@ -140,7 +146,7 @@ class BatchReader:
         layout = finder.find(header)
         if layout is None:
             raise finder.no_header()
-        roles: dict[Role, Column] = {
+        roles: dict[ColumnRole, Column] = {
             role: Column(column.index, header[column.index], column.unit, column.assumed)
             for role, column in layout.columns.items()
             if role is not Role.STATE
@@ -214,8 +220,8 @@ def _check_each(name: str, values: Values, types: type | tuple[type, ...], kind:
             raise BatchError(f"row {row}: {name} = {repr(value)[:40]}: must be a {kind}")
 
 
-def _cell_voltages(name: str, rows: Values, unit: Unit) -> CellBlock:
-    """Return cell voltages, shape (n, m) [V].
+def _listed_cell_voltages(name: str, rows: Values, unit: Unit) -> CellBlock:
+    """Return the cell voltages of a column of lists, shape (n, m) [V].
 
     Raises:
         BatchError: The rows have different numbers of cells, or a value is not a number.

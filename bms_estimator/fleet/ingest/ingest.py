@@ -32,7 +32,7 @@ from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 POLL_S = 0.2
 """Poll interval of the stream ``TELEMETRY`` [s]."""
-CHECK_S = 5.0
+CHECK_S = 2.0
 """Interval between two checks of the stream, of the table of packs, and for overdue blocks [s]."""
 STATUS_S = 60.0
 """Interval between two log lines with the counters [s]."""
@@ -163,7 +163,7 @@ class Ingest:
     def __init__(
         self, nc: Client, store: IngestStore, bucket: PackBucket, reader: BatchReader, notifier: SystemdNotifier
     ) -> None:
-        self._store, self._bucket, self._reader, self._notifier = store, bucket, reader, notifier
+        self._nc, self._store, self._bucket, self._reader, self._notifier = nc, store, bucket, reader, notifier
         self._telemetry = TelemetryReader(nc, store.progress.stream, store.progress.sequence)
         self._reports = BatchReports(nc)
         self._counters = self._reports.counters
@@ -190,7 +190,11 @@ class Ingest:
         self._log_status()
 
     async def _step(self, *, check: bool) -> float:
-        """Process some batches. Return the time until the next step [s]."""
+        """Process some batches. Return the time until the next step [s].
+
+        Raises:
+            UserError: The server has closed the connection permanently.
+        """
         try:
             if check:
                 await self._check()
@@ -200,6 +204,8 @@ class Ingest:
                 self._telemetry.sequence = messages[-1].sequence
                 await self._save()
         except RETRYABLE_ERRORS as error:
+            if self._nc.is_closed:
+                raise UserError("the server has closed the connection: check --creds") from None
             if (reason := error_text(error)) != self._trouble:
                 log.warning("batches cannot be received; trying again", reason=reason)
             self._trouble = reason

@@ -37,7 +37,7 @@ class PackPosition(NamedTuple):
     """Time of the last sample in a block [s since 1970]. Samples up to this time are dropped."""
 
     def after(self, ready: ReadyBlock) -> "PackPosition":
-        """Return the position after a block, whose first sample creates the store if there is none."""
+        """Return the position after a block. The first block creates the store, at the time of its first sample."""
         created_s = self.created_s or int(ready.samples["time_s"][0])
         return PackPosition(created_s, self.next_number + 1, float(ready.samples["time_s"][-1]))
 

@@ -5,14 +5,20 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import pytest
 from nats.aio.client import Client
+from nats.js.errors import APIError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.ingest.batch_reports import BatchReport
+from bms_estimator.fleet.ingest.ingest_store import FILE
+from bms_estimator.fleet.ingest.telemetry_reader import TelemetryReader
 from bms_estimator.fleet.nats.dead_letters import read_dead_letters, replay_letter
+from bms_estimator.fleet.nats.streams import make_telemetry_stream
+from bms_estimator.fleet.packs.pack_bucket import remove_keys
 from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.sample import SampleBlock
@@ -30,6 +36,12 @@ COUNT = 300
 async def send(nc: Client, pack: str, batch: bytes) -> None:
     """Publish a batch, and wait until the server has stored it."""
     await nc.jetstream().publish(subjects.telemetry(pack), batch, timeout=LONG_S)
+
+
+def stored_numbers(folder: Path) -> list[int]:
+    """Return the numbers of the stored blocks of all packs."""
+    with closing(sqlite3.connect(folder / "blocks" / FILE)) as database:
+        return [number for (number,) in database.execute("SELECT number FROM block")]
 
 
 async def send_by_edge(cluster: NatsCluster, folder: Path, pack: str, rows: SampleBlock) -> None:
@@ -104,8 +116,7 @@ async def test_missing_block_is_sent_again_and_confirmed_blocks_are_deleted(
         assert await ingest.end() == 0
         last = decode((await blocks.next_msg(LONG_S)).data)
         assert (last.number, last.oldest, last.samples.size) == (6, 3, 1)
-    with closing(sqlite3.connect(tmp_path / "blocks" / "ingest.sqlite")) as database:
-        assert database.execute("SELECT number FROM block").fetchall() == [(3,), (4,), (5,), (6,)]
+    assert stored_numbers(tmp_path) == [3, 4, 5, 6]
 
 
 async def test_lost_folder_continues_after_the_last_block_of_the_stream(
@@ -128,9 +139,7 @@ async def test_lost_folder_continues_after_the_last_block_of_the_stream(
     assert int(state["estimator"]["observer"]["samples"][0]) == 60
 
 
-async def test_rejected_batch_is_reported_stored_and_can_be_replayed(
-    nc: Client, cluster: NatsCluster, tmp_path: Path
-) -> None:
+async def test_rejected_batch_is_reported_and_can_be_replayed(nc: Client, cluster: NatsCluster, tmp_path: Path) -> None:
     await load_packs(nc, ["p1"])
     reports = await nc.subscribe("ingest.*")
     rows = samples_of("p1", 12)
@@ -147,7 +156,35 @@ async def test_rejected_batch_is_reported_stored_and_can_be_replayed(
     assert (letter.pack, letter.data, letter.reason) == ("p1", batch, received[0].error)
     columns = "time=time_s,current=current_a,voltage=U_pack"
     blocks = await nc.subscribe("raw.p1")
-    async with running_ingest(tmp_path, cluster.url, "--map", columns):
+    async with running_ingest(tmp_path, cluster.url, "--map", columns) as ingest:
         await replay_letter(nc, letter)
         block = decode((await blocks.next_msg(LONG_S)).data)
+        await remove_keys(nc, subjects.PACKS_BUCKET, ["p1"])
+        await ingest.logged("a pack was removed from the table; its stored blocks are removed", pack="p1")
+        assert await ingest.end() == 0
     assert block.samples["voltage_v"].tolist() == rows["voltage_v"][:6].tolist()
+    assert stored_numbers(tmp_path) == []
+
+
+async def test_recreated_stream_is_read_from_its_beginning_and_processed_batches_are_removed(nc: Client) -> None:
+    js = nc.jetstream()
+    reader = TelemetryReader(nc, "", 0)
+    for _ in range(3):
+        await send(nc, "p1", b"batch")
+    await reader.check(0)
+    assert [message.sequence for message in await reader.read()] == [1, 2, 3]
+    reader.sequence = 3
+    await reader.check(2)
+    assert (await js.stream_info(subjects.TELEMETRY_STREAM)).state.first_seq == 3
+    assert await reader.read() == []
+    await js.delete_stream(subjects.TELEMETRY_STREAM)
+    await make_telemetry_stream(nc, 1000)
+    for _ in range(5):
+        await send(nc, "p1", bytes(100))
+    await reader.check(3)
+    assert reader.sequence == 0
+    assert len(await reader.read()) == 5
+    await reader.check(0)
+    assert "of the stream TELEMETRY is filled" in reader.warning
+    with pytest.raises(APIError, match="maximum bytes exceeded"):
+        await send(nc, "p1", bytes(1000))

@@ -100,7 +100,7 @@ class Table:
             if self._layout.dialect is not OWN:  # this project's tables hold the time stamps that a source delivered
                 before = _separate_steps(before, samples)
             self.implausible += remove_implausible(samples["temperature_c"], MIN_C, MAX_C)
-            self.cells = _cell_voltages(raw, self._layout)
+            self.cells = cell_voltages(raw, self._layout)
             yield samples
 
     def _blocks_as_signed_in_table(self) -> Iterator[tuple[RawBlock, SampleBlock]]:
@@ -140,8 +140,8 @@ def to_samples(raw: RawBlock, layout: Layout) -> SampleBlock:
     return samples
 
 
-def _cell_voltages(raw: RawBlock, layout: Layout) -> CellBlock:
-    """Return the cell voltages of a block; empty for a table without them."""
+def cell_voltages(raw: RawBlock, layout: Layout) -> CellBlock:
+    """Return the cell voltages of a block, shape (n, m) [V]; empty for a table without them."""
     cells = layout.cells
     return np.column_stack([raw[cell] for cell in cells]) if cells else NO_CELLS
 
