@@ -1,5 +1,6 @@
 """Batches that ``fleet ingest`` receives: the workers' states equal those of packs with edges."""
 
+import asyncio
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -38,10 +39,10 @@ async def send(nc: Client, pack: str, batch: bytes) -> None:
     await nc.jetstream().publish(subjects.telemetry(pack), batch, timeout=LONG_S)
 
 
-def stored_numbers(folder: Path) -> list[int]:
-    """Return the numbers of the stored blocks of all packs."""
+def select(folder: Path, query: str) -> list[int]:
+    """Return a column of the database of ``fleet ingest``."""
     with closing(sqlite3.connect(folder / "blocks" / FILE)) as database:
-        return [number for (number,) in database.execute("SELECT number FROM block")]
+        return [value for (value,) in database.execute(query)]
 
 
 async def send_by_edge(cluster: NatsCluster, folder: Path, pack: str, rows: SampleBlock) -> None:
@@ -99,6 +100,24 @@ async def test_kill_in_the_middle_loses_no_sample_and_counts_none_twice(
     assert await states(nc, registry, *rows) == [of_one_run(registry, pack, rows[pack]) for pack in rows]
 
 
+async def test_kill_of_the_server_loses_no_sample_and_counts_none_twice(
+    nc: Client, cluster: NatsCluster, tmp_path: Path
+) -> None:
+    registry = await load_packs(nc, ["p1"])
+    rows = samples_of("p1", COUNT)
+    async with running_ingest(tmp_path, cluster.url) as ingest, worker(cluster.url, COUNT):
+        await ingest.logged("ingested")
+        for first in range(0, COUNT, 60):
+            await send(nc, "p1", json_batch(rows[first : first + 60]))
+            cluster.kill(0)
+            await asyncio.to_thread(cluster.start, 0)
+            await until(lambda: nc.is_connected, lambda: "no connection")
+        last = COUNT // 6 - 1  # the last six samples are in the open block
+        await until(lambda: select(tmp_path, "SELECT next FROM pack") == [last + 1], lambda: ingest.lines)
+        assert await ingest.end() == 0
+    assert await states(nc, registry, "p1") == [of_one_run(registry, "p1", rows)]
+
+
 async def test_missing_block_is_sent_again_and_confirmed_blocks_are_deleted(
     nc: Client, cluster: NatsCluster, tmp_path: Path
 ) -> None:
@@ -116,7 +135,7 @@ async def test_missing_block_is_sent_again_and_confirmed_blocks_are_deleted(
         assert await ingest.end() == 0
         last = decode((await blocks.next_msg(LONG_S)).data)
         assert (last.number, last.oldest, last.samples.size) == (6, 3, 1)
-    assert stored_numbers(tmp_path) == [3, 4, 5, 6]
+    assert select(tmp_path, "SELECT number FROM block") == [3, 4, 5, 6]
 
 
 async def test_lost_folder_continues_after_the_last_block_of_the_stream(
@@ -163,7 +182,7 @@ async def test_rejected_batch_is_reported_and_can_be_replayed(nc: Client, cluste
         await ingest.logged("a pack was removed from the table; its stored blocks are removed", pack="p1")
         assert await ingest.end() == 0
     assert block.samples["voltage_v"].tolist() == rows["voltage_v"][:6].tolist()
-    assert stored_numbers(tmp_path) == []
+    assert select(tmp_path, "SELECT number FROM block") == []
 
 
 async def test_recreated_stream_is_read_from_its_beginning_and_processed_batches_are_removed(nc: Client) -> None:
