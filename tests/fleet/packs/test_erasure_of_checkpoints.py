@@ -1,6 +1,7 @@
 """``fleet packs remove --erase`` with checkpoints of several days and formats, dead letters and changes of the table."""
 
 import asyncio
+from dataclasses import replace
 
 import pytest
 from nats.aio.client import Client
@@ -13,7 +14,7 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, Part
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.claims import Claim
 from tests.command_line import run
-from tests.fleet.checkpoints import DAY_S, raw, stored_objects
+from tests.fleet.checkpoints import DAY_S, damage, raw, stored_objects
 from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.workers import PACK_ROW, block, load_packs, send
 
@@ -48,6 +49,32 @@ async def test_pack_is_erased_from_daily_checkpoints_of_both_formats_and_the_oth
     assert [file_format for file_format, _ in loaded] == [FORMAT, FORMAT, FORMAT - 1, FORMAT - 1]
     assert [dict(each.packs) for _, each in loaded] == 4 * [{"p2": b"second"}]
     assert [list(each.in_force) for _, each in loaded] == 4 * [["p2"]]
+
+
+@pytest.mark.parametrize("damaged_increment", [None, 1])
+async def test_pack_is_erased_from_increments_and_from_the_daily_checkpoint_before_them(
+    nc, cluster, store, clock, capsys, damaged_increment
+) -> None:
+    records = {f"p{number}": f"record {number} ".encode() * 1000 for number in range(1, 9)}
+    whole = PartitionCheckpoint(0, 1, packs=records)
+    claim = await store.write(await store.claim(0), whole, file_format=FORMAT)
+    for sequence, pack in ((2, "p1"), (3, "p2")):
+        changed = replace(whole, sequence=sequence, packs=records | {pack: b"changed"}, changed={pack})
+        claim = await store.write(claim, changed, file_format=FORMAT)
+    (last,) = claim.pointer.kept
+    assert len(last.increments) == 2
+    if damaged_increment is not None:
+        await damage(nc, last.increments[damaged_increment])
+    code, out, err = await erase(capsys, cluster, "p1")
+    assert (code, err) == (0, "")
+    assert "the state in 2 checkpoints erased" in out
+    claim = await store.claim(0)
+    loaded = [read_checkpoint(data) async for _, data in store.load(claim)]
+    others = {pack: record for pack, record in records.items() if pack != "p1"}
+    last_saved = others if damaged_increment is not None else others | {"p2": b"changed"}
+    assert [dict(each.packs) for each in loaded] == [last_saved, others]
+    assert await stored_objects(nc) == claim.pointer.objects
+    assert not claim.pointer.objects & set(last.objects)
 
 
 async def test_dead_letters_and_table_changes_of_the_pack_are_erased(nc, cluster, capsys) -> None:
