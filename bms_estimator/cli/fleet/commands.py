@@ -26,6 +26,9 @@ COMMANDS = {
     "dead-letters": LazyCommand(
         "bms_estimator.cli.fleet.dead_letters:app", "List or replay blocks that workers could not process."
     ),
+    "checkpoints": LazyCommand(
+        "bms_estimator.cli.fleet.checkpoints:app", "List the stored states of all packs, or return to those of a day."
+    ),
     "backup": LazyCommand(
         "bms_estimator.cli.fleet.backup:backup", "Write a backup of a tenant's streams while they are in use."
     ),

@@ -20,7 +20,7 @@ from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import CheckpointObjects
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, Claims, FencedError
-from bms_estimator.fleet.worker.checkpoint.increment import has_daily, next_increment
+from bms_estimator.fleet.worker.checkpoint.increment import has_daily, next_increment, with_increment
 from bms_estimator.fleet.worker.checkpoint.replay_records import ReplayRecords
 
 CHECKPOINTS_PER_PARTITION = 2
@@ -80,21 +80,27 @@ class CheckpointStore:
         If an increment is damaged, the objects before it are the checkpoint of an earlier save.
         """
         for info in claim.pointer.checkpoints:
-            intact: list[bytes] = []
-            for name in info.objects:
-                data = await self._objects.read(name)
-                if data is None:
-                    self._damaged.add(name)
-                    log.warning(
-                        "a checkpoint is damaged: continuing from an earlier one, or from the stream",
-                        partition=claim.partition,
-                        object=name,
-                        sequence=info.sequence,
-                    )
-                    break
-                intact.append(data)
-            if intact:
-                yield info, b"".join(intact)
+            data = await self.read(info)
+            if self.is_damaged(info):
+                log.warning(
+                    "a checkpoint is damaged: continuing from an earlier one, or from the stream",
+                    partition=claim.partition,
+                    object=next(name for name in info.objects if name in self._damaged),
+                    sequence=info.sequence,
+                )
+            if data:
+                yield info, data
+
+    async def read(self, info: CheckpointInfo) -> bytes:
+        """Return the bytes of a checkpoint up to the first damaged object."""
+        intact: list[bytes] = []
+        for name in info.objects:
+            data = await self._objects.read(name)
+            if data is None:
+                self._damaged.add(name)
+                break
+            intact.append(data)
+        return b"".join(intact)
 
     def is_damaged(self, info: CheckpointInfo) -> bool:
         """Return True if this worker has found an object of a checkpoint damaged."""
@@ -123,12 +129,9 @@ class CheckpointStore:
                 await self._remove_oldest_daily(claim)
             raise
         if increment:
-            new_pointer = _with_increment(pointer, checkpoint.sequence, size, now_s)
+            new_pointer = with_increment(pointer, checkpoint.sequence, size, now_s)
         else:
-            info = CheckpointInfo(
-                sequence=checkpoint.sequence, object=pointer.next, bytes=size, made_s=now_s, format=file_format
-            )
-            new_pointer = self._with_whole(pointer, info)
+            new_pointer = self._with_whole(pointer, _whole_info(claim, checkpoint, size, file_format))
         return await self._replace_pointer(claim, new_pointer)
 
     async def replace(self, claim: Claim, old: CheckpointInfo, chunks: Iterator[bytes] | None) -> Claim:
@@ -152,6 +155,21 @@ class CheckpointStore:
             new = (old.model_copy(update=whole),)
         new_pointer = Pointer(kept=_replaced(pointer.kept, old, new), daily=_replaced(pointer.daily, old, new))
         return await self._replace_pointer(claim, new_pointer, erase=True)
+
+    async def write_only(self, claim: Claim, checkpoint: PartitionCheckpoint, *, file_format: int) -> Claim:
+        """Write a whole checkpoint in place of the last ones. The daily ones remain.
+
+        Args:
+            claim: Claim that the last write returned.
+            checkpoint: Whole checkpoint.
+            file_format: Format of the bytes.
+
+        Raises:
+            FencedError: A worker has taken the partition over; its checkpoints remain.
+        """
+        size = await self._objects.write(claim.pointer.next, checkpoint.chunks(file_format))
+        info = _whole_info(claim, checkpoint, size, file_format)
+        return await self._replace_pointer(claim, Pointer(kept=(info,), daily=claim.pointer.daily))
 
     def _with_whole(self, pointer: Pointer, info: CheckpointInfo) -> Pointer:
         """Return a pointer with a whole checkpoint added. The oldest is left out, and each one that is known to be damaged."""
@@ -204,23 +222,11 @@ async def open_checkpoints(nc: Client, worker: str) -> CheckpointStore:
     return CheckpointStore(nc, worker, checkpoints, await js.object_store(subjects.STATES_BUCKET))
 
 
-def _with_increment(pointer: Pointer, sequence: int, size: int, now_s: float) -> Pointer:
-    """Return a pointer with the next object as an increment of the last checkpoint.
-
-    Args:
-        pointer: Present pointer.
-        sequence: Stream sequence number of the last message that the increment includes.
-        size: Size of the increment [bytes].
-        now_s: Wall clock [s since 1970].
-    """
-    last, *earlier = pointer.kept
-    update = {
-        "sequence": sequence,
-        "made_s": now_s,
-        "increments": (*last.increments, pointer.next),
-        "increment_bytes": last.increment_bytes + size,
-    }
-    return Pointer(kept=(last.model_copy(update=update), *earlier), daily=pointer.daily)
+def _whole_info(claim: Claim, checkpoint: PartitionCheckpoint, size: int, file_format: int) -> CheckpointInfo:
+    """Return the metadata of a whole checkpoint in the next object of a claim."""
+    return CheckpointInfo(
+        sequence=checkpoint.sequence, object=claim.pointer.next, bytes=size, made_s=time.time(), format=file_format
+    )
 
 
 def _replaced(

@@ -1,25 +1,21 @@
 """Erasure of packs from the server: blocks, dead letters, states in checkpoints and in the memory of workers, hourly rows.
 
-The erasure claims the partition of a pack as a worker does. The owner is thereby fenced out, drops the partition from its
-memory, and takes it over again from the rewritten checkpoint. The other packs of the partition lose nothing, because their
-blocks since the checkpoint are in the stream.
+The other packs of a partition lose nothing, because their blocks since the rewritten checkpoint are in the stream.
 """
 
 import asyncio
 import json
 from collections.abc import Collection, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-import nats.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
-from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer, partitions_of
+from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S, partitions_of
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CheckpointError,
@@ -28,17 +24,13 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     read_checkpoint,
 )
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
-from bms_estimator.fleet.worker.checkpoint.claims import FencedError
+from bms_estimator.fleet.worker.checkpoint.fenced_change import change_checkpoints
 from bms_estimator.model.errors import UserError
 
 WORKER_NAME = "packs-remove"
 """Name with which the erasure claims a partition."""
 TABLE_S = 3.0 * POLL_S
 """Waiting time until all workers have removed a pack from their copies of the table [s]."""
-MAX_CLAIMS = 20
-"""Maximum number of claims of a partition, because its worker may claim it again before its checkpoints are rewritten."""
-RETRY_S = 0.5
-"""Delay before a partition is claimed again [s]."""
 MAX_TOKENS = 5
 """Maximum position of a pack's name in a subject [tokens]."""
 V = TypeVar("V")
@@ -121,22 +113,10 @@ def _later_version_error(partition: int, error: UnreadableFormatError) -> UserEr
 async def _erase_states(nc: Client, store: CheckpointStore, partition: int, packs: Collection[str]) -> dict[str, int]:
     """Erase packs from all checkpoints of a partition and from its worker's memory. Return numbers of checkpoints by pack."""
     counts = dict.fromkeys(packs, 0)
-    for _ in range(MAX_CLAIMS):
-        try:
-            await _rewrite_checkpoints(store, partition, counts)
-            break
-        except FencedError:
-            await asyncio.sleep(RETRY_S)
-        except UnreadableFormatError as error:
-            raise _later_version_error(partition, error) from None
-    else:
-        raise UserError(
-            f"partition {partition}: its worker claims it at each attempt; end the workers and repeat the command"
-        )
-    # a worker whose pin ends checks its claim, finds it replaced, and drops the partition from its memory
-    request = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
-    with suppress(nats.errors.TimeoutError):
-        await nc.request(request, json.dumps({"group": GROUP}).encode(), timeout=RESPONSE_TIMEOUT_S)
+    try:
+        await change_checkpoints(nc, partition, lambda: _rewrite_checkpoints(store, partition, counts))
+    except UnreadableFormatError as error:
+        raise _later_version_error(partition, error) from None
     return counts
 
 

@@ -36,6 +36,25 @@ def next_increment(
     return increment if size <= MAX_INCREMENT_FRACTION * last.bytes else None
 
 
+def with_increment(pointer: Pointer, sequence: int, size: int, now_s: float) -> Pointer:
+    """Return a pointer with the next object as an increment of the last checkpoint.
+
+    Args:
+        pointer: Present pointer.
+        sequence: Stream sequence number of the last message that the increment includes.
+        size: Size of the increment [bytes].
+        now_s: Wall clock [s since 1970].
+    """
+    last, *earlier = pointer.kept
+    update = {
+        "sequence": sequence,
+        "made_s": now_s,
+        "increments": (*last.increments, pointer.next),
+        "increment_bytes": last.increment_bytes + size,
+    }
+    return Pointer(kept=(last.model_copy(update=update), *earlier), daily=pointer.daily)
+
+
 def has_daily(daily: tuple[CheckpointInfo, ...], now_s: float) -> bool:
     """Return True if a checkpoint of the present UTC day is among the daily ones."""
     return any(each.made_s // DAY_S == now_s // DAY_S for each in daily)

@@ -1,0 +1,120 @@
+"""``bms-estimator fleet checkpoints``: stored states of the partitions."""
+
+import asyncio
+from collections import defaultdict
+from datetime import UTC, date, datetime
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.options.table import print_table
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer
+
+DAY_COLUMNS = ("day", "partitions", "MB")
+COLUMNS = ("kind", "written (UTC)", "sequence", "format", "increments", "MB")
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    help="List the checkpoints, which contain the states of all packs, or return to those of an earlier day.",
+)
+
+
+@app.command("list")
+def list_checkpoints(
+    partition: Annotated[
+        int | None, typer.Option(help="list the checkpoints of this partition", show_default=False)
+    ] = None,
+    server: Server = DEFAULT_SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+) -> None:
+    """Print the days with daily checkpoints and their number of partitions, or all checkpoints of one partition."""
+    pointers = asyncio.run(_read((server, creds, ca)))
+    if partition is None:
+        print_table(DAY_COLUMNS, _day_rows(pointers.values()))
+    elif partition in pointers:
+        print_table(COLUMNS, _rows(pointers[partition]))
+    if not any(pointer.daily for number, pointer in pointers.items() if partition in (None, number)):
+        typer.echo("none")
+
+
+@app.command()
+def restore(
+    day: Annotated[datetime, typer.Option(formats=["%Y-%m-%d"], help="UTC day")],
+    partition: Annotated[
+        list[int] | None, typer.Option(help="number of a partition, repeatable; default: all", show_default=False)
+    ] = None,
+    skip_blocks: Annotated[
+        bool, typer.Option("--skip-blocks", help="do not process the blocks after the checkpoint again")
+    ] = False,
+    server: Server = DEFAULT_SERVER,
+    creds: Creds = None,
+    ca: Ca = None,
+) -> None:
+    """Return all packs of partitions to the first checkpoint of a day.
+
+    The workers then process the later blocks that are still in the stream again. The states become those of before, unless
+    the version of the workers or the settings of the packs have changed.
+    """
+    chosen = asyncio.run(_restore((server, creds, ca), day.date(), frozenset(partition or ()), skip_blocks=skip_blocks))
+    for number, info in sorted(chosen.items()):
+        typer.echo(f"partition {number}: returned to the checkpoint of {_time(info)} UTC")
+
+
+def _day_rows(pointers: "Iterable[Pointer]") -> list[tuple[object, ...]]:
+    """Return a row for each day, the newest first."""
+    from bms_estimator.fleet.worker.checkpoint.daily_restore import day_of  # noqa: PLC0415 - NATS is optional
+
+    sizes = defaultdict[date, list[int]](list)
+    for pointer in pointers:
+        for info in pointer.daily:
+            sizes[day_of(info)].append(info.bytes)
+    return [(day, len(sizes[day]), _megabytes(sum(sizes[day]))) for day in sorted(sizes, reverse=True)]
+
+
+def _rows(pointer: "Pointer") -> list[tuple[object, ...]]:
+    """Return a row for each checkpoint of a partition."""
+    kinds = [*zip(("last", "previous"), pointer.kept, strict=False), *(("daily", info) for info in pointer.daily)]
+    return [
+        (
+            kind,
+            _time(info),
+            info.sequence,
+            info.format,
+            len(info.increments),
+            _megabytes(info.bytes + info.increment_bytes),
+        )
+        for kind, info in kinds
+    ]
+
+
+def _time(info: "CheckpointInfo") -> str:
+    return f"{datetime.fromtimestamp(info.made_s, UTC):%Y-%m-%d %H:%M:%S}"
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:,.1f}"
+
+
+async def _read(address: ServerAddress) -> "dict[int, Pointer]":
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
+    from bms_estimator.fleet.worker.checkpoint.daily_restore import read_pointers  # noqa: PLC0415
+
+    async with connected(*address) as nc:
+        return await read_pointers(nc)
+
+
+async def _restore(
+    address: ServerAddress, day: date, partitions: frozenset[int], *, skip_blocks: bool
+) -> "Mapping[int, CheckpointInfo]":
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
+    from bms_estimator.fleet.worker.checkpoint.daily_restore import restore_day  # noqa: PLC0415
+
+    async with connected(*address) as nc:
+        return await restore_day(nc, day, partitions, skip_blocks=skip_blocks)
