@@ -264,6 +264,12 @@ def test_real_worker_needs_no_further_permissions(
     assert run(capsys, "fleet", "packs", "load", tmp_path / "packs.csv", *server)[::2] == (0, "")
     violations_before = fleet.cluster.log(0).read_text().count("Violation")
     asyncio.run(_run_worker(fleet))
+    reader, worker = (credentials.credentials_file(fleet.keys, "acme", role) for role in (Role.READER, Role.WORKER))
+    address = ("--server", fleet.cluster.url, "--creds")
+    code, out, err = run(capsys, "fleet", "checkpoints", "list", *address, reader)
+    assert (code, err) == (0, "")
+    day = out.splitlines()[3].split()[0]
+    assert run(capsys, "fleet", "checkpoints", "restore", "--day", day, *address, worker)[::2] == (0, "")
     assert fleet.cluster.log(0).read_text().count("Violation") == violations_before
 
 
