@@ -59,8 +59,8 @@ def restore(
 ) -> None:
     """Return all packs of partitions to the first checkpoint of a day.
 
-    The workers then process the later blocks that are still in the stream again. The states become those of before, unless
-    the version of the workers or the settings of the packs have changed.
+    The workers then process the later blocks that are still in the stream again. If wrong samples have spoiled the states, use
+    --skip-blocks.
     """
     chosen = asyncio.run(_restore((server, creds, ca), day.date(), frozenset(partition or ()), skip_blocks=skip_blocks))
     for number, info in sorted(chosen.items()):
