@@ -8,6 +8,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Self
 
@@ -61,12 +62,14 @@ class Prometheus:
         self._process.wait(LONG_S)
 
     def query(self, expression: str) -> list[dict[str, Any]]:
-        """Return labels (``metric``) and values of an instant query; an empty list before the server listens."""
+        """Return labels (``metric``) and values of an instant query; an empty list until the server is ready."""
         url = f"http://{self._address}/api/v1/query?{urllib.parse.urlencode({'query': expression})}"
         try:
             with urllib.request.urlopen(url, timeout=LONG_S) as answer:
                 return json.load(answer)["data"]["result"]
         except urllib.error.HTTPError as error:
+            if error.code == HTTPStatus.SERVICE_UNAVAILABLE:
+                return []
             raise AssertionError(f"{expression}: {error.read().decode()}") from None
         except (urllib.error.URLError, ConnectionError):
             return []

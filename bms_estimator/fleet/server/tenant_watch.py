@@ -58,6 +58,8 @@ class TenantWatch:
                 if str(error) != last_reason:
                     log.warning("the tenant cannot be watched", tenant=self._name, reason=str(error))
                 last_reason = str(error)
+            except Exception:  # the server must continue without the watch
+                log.exception("the tenant cannot be watched", tenant=self._name)
             await asyncio.sleep(RETRY_S)
 
     async def state(self) -> TenantState:

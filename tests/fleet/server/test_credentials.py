@@ -20,6 +20,8 @@ from nats.errors import Error as NatsError
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
+from bms_estimator.fleet.nats.dead_letters import DeadLetter
+from bms_estimator.fleet.nats.dead_packs import DeadPackReader
 from bms_estimator.fleet.nats.streams import consumer, make_streams
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.jwt_claims import Role
@@ -301,7 +303,10 @@ async def _run_worker(fleet: Fleet) -> None:
 
 
 async def test_reader_cannot_write(fleet: Fleet) -> None:
-    async with fleet.program(Role.READER) as (nc, rejections):
+    letter = DeadLetter("p1", 1, "damaged", "w", b"block")
+    async with fleet.program(Role.WORKER) as (worker, _), fleet.program(Role.READER) as (nc, rejections):
+        await worker.jetstream().publish(letter.subject, letter.data, headers=letter.headers())
+        assert ("p1", "damaged") in (await DeadPackReader(nc).read()).reasons
         js = nc.jetstream()
         assert (await js.stream_info(subjects.RAW_STREAM)).config.name == subjects.RAW_STREAM
         hours = await js.pull_subscribe(subjects.hours(), "collector", stream=subjects.HOURS_STREAM)

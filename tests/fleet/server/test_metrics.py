@@ -8,6 +8,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import aiomqtt
 import nats
 import pytest
 
@@ -38,6 +39,7 @@ class Fleet:
     def __init__(self, folder: Path) -> None:
         self.metrics = f"127.0.0.1:{free_port()}"
         ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
+        self.mqtt_port = int(ports["mqtt"].rpartition(":")[2])
         self.url = f"nats://{ports['listen']}"
         settings = "\n".join(f'{name} = "{address}"' for name, address in (ports | {"metrics": self.metrics}).items())
         file = folder / "fleet.toml"
@@ -174,6 +176,11 @@ def test_alert_fires_when_the_worker_is_killed_and_its_pack_sends(fleet: Fleet, 
     fleet.send(BLOCKS + 1)
     assert len(prometheus.wait(alert)) == 1
     assert fleet.values()["bms_fleet_undelivered_messages",] >= 1.0
+
+
+async def test_sessions_of_mqtt_clients_are_counted(fleet: Fleet) -> None:
+    async with aiomqtt.Client("127.0.0.1", fleet.mqtt_port, timeout=LONG_S):
+        await asyncio.to_thread(fleet.wait, lambda values: values["bms_fleet_mqtt_sessions",] >= 1.0)
 
 
 def test_occupied_address_is_an_error(fleet: Fleet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
