@@ -1,6 +1,7 @@
 """Metrics of a real server and worker, read by a real Prometheus with the alert rules, and the queries of the dashboard."""
 
 import asyncio
+import contextlib
 import json
 import re
 import time
@@ -30,7 +31,6 @@ DASHBOARD = json.loads((ROOT / "deploy" / "grafana" / "fleet.json").read_text(en
 BLOCKS = 12
 """Number of blocks of pack ``p1``: more than an hour, so that a summary is stored."""
 needs_promtool = pytest.mark.skipif(PROMTOOL is None, reason="promtool is not installed (make prometheus)")
-needs_prometheus = pytest.mark.skipif(PROMETHEUS is None, reason="prometheus is not installed (make prometheus)")
 
 
 class Fleet:
@@ -47,6 +47,7 @@ class Fleet:
         self.server = ServeProcess(file, folder / "state")
         self.server.wait("streams ready")
         self.worker = Process(folder, self.url, "w", "--checkpoint-s", 1)
+        self.prometheus: Prometheus | None = None
         self.ready_values: dict[tuple[str, ...], float] = {}
 
     def scrape(self) -> str:
@@ -55,14 +56,12 @@ class Fleet:
 
     def values(self) -> dict[tuple[str, ...], float]:
         """Return the values of a scrape by the metric's name and its labels other than ``tenant`` and ``worker``."""
-        return {
-            (
-                sample.name,
-                *(text for label, text in sorted(sample.labels.items()) if label not in {"tenant", "worker"}),
-            ): (sample.value)
-            for family in text_string_to_metric_families(self.scrape())
-            for sample in family.samples
-        }
+        values = {}
+        for family in text_string_to_metric_families(self.scrape()):
+            for sample in family.samples:
+                labels = {name: text for name, text in sample.labels.items() if name not in {"tenant", "worker"}}
+                values[sample.name, *labels.values()] = sample.value
+        return values
 
     def wait(self, condition: Callable[[dict[tuple[str, ...], float]], object]) -> dict[tuple[str, ...], float]:
         """Wait until the values fulfill a condition, and return them."""
@@ -93,8 +92,14 @@ class Fleet:
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
-    fleet = Fleet(tmp_path_factory.mktemp("fleet"))
-    try:
+    with contextlib.ExitStack() as stack:
+        fleet = Fleet(tmp_path_factory.mktemp("fleet"))
+        stack.callback(fleet.close)
+        if PROMETHEUS:
+            # alerts fire as soon as their condition is true
+            rules = re.sub(r"(?m)^( *for:) .*", r"\1 0s", RULES.read_text())
+            folder = tmp_path_factory.mktemp("prometheus")
+            fleet.prometheus = stack.enter_context(Prometheus(folder, fleet.metrics, rules))
         fleet.send(*range(1, BLOCKS + 1), damaged=b"a damaged block")
         fleet.ready_values = fleet.wait(
             lambda values: (
@@ -106,17 +111,15 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
             )
         )
         yield fleet
-    finally:
-        fleet.close()
 
 
-@pytest.fixture(scope="module")
-def prometheus(fleet: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Prometheus]:
-    """Start a server with the alert rules, which fire as soon as their condition is true."""
-    rules = re.sub(r"(?m)^( *for:) .*", r"\1 0s", RULES.read_text())
-    with Prometheus(tmp_path_factory.mktemp("prometheus"), fleet.metrics, rules) as prometheus:
-        prometheus.wait("bms_fleet_worker_blocks_total")
-        yield prometheus
+@pytest.fixture
+def prometheus(fleet: Fleet) -> Prometheus:
+    """Return the server, which evaluates the alert rules and has scraped the fleet."""
+    if fleet.prometheus is None:
+        pytest.skip("prometheus is not installed (make prometheus)")
+    fleet.prometheus.wait("bms_fleet_worker_blocks_total")
+    return fleet.prometheus
 
 
 def test_a_scrape_has_a_value_of_every_metric(fleet: Fleet) -> None:
@@ -157,7 +160,6 @@ def test_rules_and_dashboard_use_only_existing_metrics() -> None:
     assert used <= names
 
 
-@needs_prometheus
 def test_every_query_of_the_dashboard_has_a_result(fleet: Fleet, prometheus: Prometheus) -> None:
     fleet.send(1)  # a repeated block, so that the lag has a recent value
     for panel in DASHBOARD["panels"]:
@@ -166,7 +168,6 @@ def test_every_query_of_the_dashboard_has_a_result(fleet: Fleet, prometheus: Pro
             prometheus.wait(target["expr"].replace("$tenant", ".*").replace("$__rate_interval", "1m"))
 
 
-@needs_prometheus
 def test_alert_fires_when_the_worker_is_killed_and_its_pack_sends(fleet: Fleet, prometheus: Prometheus) -> None:
     alert = 'ALERTS{alertname="FleetPartitionsWithoutWorker", alertstate="firing"}'
     dead_letters = 'ALERTS{alertname="FleetPacksNeedRepair", alertstate="firing", stream="DEAD"}'
