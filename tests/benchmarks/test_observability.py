@@ -28,14 +28,17 @@ SMOOTH_SOC = 0.03
 """Std of the Gaussian kernel that smooths the simulated curves. Curves of real cells have no steps [SOC]."""
 
 
-def documented() -> dict[tuple[str, str, str], list[str]]:
-    """Return the rows of the documented table by cell, window and full."""
-    lines = [
-        line.strip("| ").split(" | ")
-        for line in PAGE.read_text(encoding="utf-8").splitlines()
-        if line.startswith("| `")
-    ]
-    return {(row[0].strip("`"), row[1], row[2]): row[3:] for row in lines if row[2] in ("yes", "no")}
+def documented() -> dict[tuple[str, float, bool], list[str]]:
+    """Return the stds of the documented table by cell, lowest SOC and full charge. A table cell has two: without and with full charges."""
+    lines = [line.strip("| ").split(" | ") for line in PAGE.read_text(encoding="utf-8").splitlines()]
+    rows = [line for line in lines if line[0].startswith("`") and "/" in line[-1]]
+    return {
+        (row[0].strip("`"), float(row[1]), full): [
+            value if value == "-" else value.split("/")[full] for value in row[2:]
+        ]
+        for row in rows
+        for full in (False, True)
+    }
 
 
 @pytest.mark.parametrize("name", CELLS)
@@ -43,8 +46,8 @@ def test_the_documented_table_has_the_computed_values(name: str) -> None:
     rows, cell = documented(), curves(load_cell(name, RATED_AH))
     for low in LOWEST_SOCS:
         for full in (False, True):
-            window, full_seen, *values = std_row(Observability(cell, Window(low, full=full)))[:-1]
-            expected = rows[name, window, full_seen]
+            _, _, *values = std_row(Observability(cell, Window(low, full=full)))[:-1]
+            expected = rows[name, low, full]
             assert [v == "-" for v in values] == [v == "-" for v in expected]
             numbers = [(float(v), float(e)) for v, e in zip(values, expected, strict=True) if v != "-"]
             assert all(abs(value - number) < TOLERANCE for value, number in numbers)
