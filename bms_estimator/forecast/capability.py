@@ -14,7 +14,7 @@ from bms_estimator.forecast.limiting_cells import charge_limiting_states, discha
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
 from bms_estimator.kernels.forecast.draws import DRAW
-from bms_estimator.kernels.forecast.mean_discharge import discharge_to_cutoff
+from bms_estimator.kernels.forecast.mean_discharge import charge_to_cutoff
 from bms_estimator.kernels.forecast.power import available_power, new_scratch
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
 from bms_estimator.model.arrays import Records
@@ -94,7 +94,8 @@ def write_capability(
         largest_a: Largest current of the load since the last long charge [A].
         cells: Deviations of the single cells; None: unknown.
     """
-    state, settings = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
+    states, settings = estimator.record["filter"], estimator.settings_record[0]["filter"]
+    state = states[0]
     if not state["started"]:
         return
     anchors = estimator.settings_record[0]["anchors"]
@@ -102,13 +103,13 @@ def write_capability(
     charge_a = limits.charge_a if state["temperature_c"] >= limits.charge_min_c else 0.0
     scratch = new_scratch()
     states_by_name = {
-        "discharge": [state, *discharge_limiting_states(state, cells)],
-        "charge": [state, *charge_limiting_states(state, cells)],
+        "discharge": [states, *discharge_limiting_states(states, cells)],
+        "charge": [states, *charge_limiting_states(states, cells)],
     }
     for duration_s in DURATIONS_S:
         for name, limit_v, max_a in (("discharge", cutoff_v, limits.discharge_a), ("charge", full_v, -charge_a)):
             values[f"available_{name}_power_{duration_s:.0f}s_w"] = min(
-                available_power(each, settings, duration_s, limit_v, max_a, QUANTILE_STDS, scratch)
+                available_power(each[0], settings, duration_s, limit_v, max_a, QUANTILE_STDS, scratch)
                 for each in states_by_name[name]
             )
     write_usable_charge(values, estimator, cutoff_v, largest_a, cells)
@@ -131,8 +132,8 @@ def write_usable_charge(
         largest_a: Largest current of the load [A]. The mean current of the last ten minutes applies if it is larger.
         cells: Deviations of the single cells; None: unknown.
     """
-    state = estimator.record[0]["filter"]
-    if not state["started"]:
+    state = estimator.record["filter"]
+    if not state["started"][0]:
         return
     charge_as, energy_ws = usable_charge(state, estimator, cutoff_v, largest_a)
     limited_as = min(
@@ -146,18 +147,17 @@ def write_usable_charge(
     values["remaining_energy_wh"] = energy_ws / 3600.0 * (limited_as / charge_as if charge_as > 0.0 else 1.0)
 
 
-def usable_charge(state: np.void, estimator: Estimator, cutoff_v: float, largest_a: float) -> tuple[float, float]:
+def usable_charge(state: Records, estimator: Estimator, cutoff_v: float, largest_a: float) -> tuple[float, float]:
     """Return charge [A s] and energy at the terminals [W s] from a state of the filter to the cut-off.
 
     Args:
-        state: Record of EKF_STATE of the pack, or of a pack whose cells all equal one of its cells.
+        state: Shape (1,), dtype EKF_STATE, of the pack or of a pack whose cells all equal one of its cells.
         estimator: Estimator of the pack; read only.
         cutoff_v: Terminal voltage at which the load is switched off [V].
         largest_a: Largest current of the load [A].
     """
-    settings, pack, draw = estimator.settings_record[0]["filter"], np.zeros(1, PROJECTED_PACK), np.zeros(1, DRAW)
-    project_pack(pack[0], state, settings, cutoff_v, largest_a)
-    return discharge_to_cutoff(pack[0], state, settings, largest_a, draw[0])
+    settings, pack, draw = estimator.settings_record["filter"], np.zeros(1, PROJECTED_PACK), np.zeros(1, DRAW)
+    return charge_to_cutoff(state, settings, cutoff_v, largest_a, pack, draw)
 
 
 def projected_pack(estimator: Estimator, cutoff_v: float, largest_a: float) -> Records:

@@ -68,7 +68,8 @@ class Window:
             self._cells = cells[-1:]
         if trace.size:
             accumulate_window(self._sums, trace)
-            self._last = trace[-1].copy()
+            # numpy copies a record field by field, which takes longer than the sums
+            self._last = np.frombuffer(trace[-1:].tobytes(), trace.dtype)[0]
         self._arrival_s = arrival_s
 
     def take(self) -> WindowSummary | None:

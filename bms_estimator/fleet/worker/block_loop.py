@@ -6,7 +6,6 @@ server at once, and a block needs no switch of tasks.
 
 import asyncio
 import time
-from collections import deque
 from typing import Protocol
 
 SLICE_S = 0.004
@@ -16,15 +15,15 @@ SLICE_S = 0.004
 class BlockQueue(Protocol):
     """Queue of the delivered messages of one partition (``PartitionLease``)."""
 
-    def process_next(self) -> None:
-        """Process the next message, or leave it to the task of the partition."""
+    def process_next(self) -> bool:
+        """Process the next message, or leave it to the task of the partition. Return True if the next call can process one."""
 
     async def publish(self) -> None:
         """Publish the results of the processed messages."""
 
 
 class BlockLoop:
-    """Loop of a worker.
+    """Loop of a worker, which serves the partitions in turn.
 
     Attributes:
         step_lock: Lock, held while a block is processed.
@@ -32,12 +31,12 @@ class BlockLoop:
 
     def __init__(self) -> None:
         self.step_lock = asyncio.Lock()
-        self._ready: deque[BlockQueue] = deque()
+        self._ready: dict[BlockQueue, None] = {}  # in the order in which they are served
         self._wake_up = asyncio.Event()
 
     def add(self, queue: BlockQueue) -> None:
-        """Process the next message of a partition in its turn."""
-        self._ready.append(queue)
+        """Process the messages of a partition in its turn."""
+        self._ready.setdefault(queue)
         self._wake_up.set()
 
     async def run(self) -> None:
@@ -52,12 +51,13 @@ class BlockLoop:
                 await queue.publish()
             await asyncio.sleep(0)
 
-    def _process_slice(self) -> list[BlockQueue]:
-        """Process messages for ``SLICE_S``. Return the partitions that were served."""
-        end_s = time.monotonic() + SLICE_S
-        served: dict[BlockQueue, None] = {}
+    def _process_slice(self) -> set[BlockQueue]:
+        """Process messages for ``SLICE_S``. Return the served partitions."""
+        end_s, served = time.monotonic() + SLICE_S, set[BlockQueue]()
         while self._ready and time.monotonic() < end_s:
-            queue = self._ready.popleft()
-            queue.process_next()
-            served[queue] = None
-        return list(served)
+            queue = next(iter(self._ready))
+            del self._ready[queue]
+            if queue.process_next():
+                self._ready[queue] = None  # at the end
+            served.add(queue)
+        return served

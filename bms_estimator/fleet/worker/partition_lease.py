@@ -140,28 +140,39 @@ class PartitionLease:
             self._pin_lapsed, self._next_search_s = True, time.monotonic() + SILENCE_S
         self._block_loop.add(self)
 
-    def process_next(self) -> None:
-        """Process the next delivered message, or wake up the task of this lease if a request to the server is necessary."""
-        partition, delivered = self.partition, self.consumer.waiting[0] if self.consumer.waiting else None
-        if partition is None or delivered is None or not self._is_next(delivered):
-            self._wake_up.set()
-            return
-        self.consumer.pop()
+    def process_next(self) -> bool:
+        """Process the next delivered message, or wake up the task of this lease if a request to the server is necessary.
+
+        Returns:
+            True if the next call can process a message.
+        """
+        partition = self.partition
+        if partition is None or not (self._is_idle and self._is_next_gapless()):
+            if self.consumer.waiting or self._pin_lapsed:
+                self._wake_up.set()
+            return False
+        delivered = self.consumer.pop()
         self._next_search_s = time.monotonic() + SILENCE_S
-        if delivered.sequence <= partition.sequence:
-            return
+        if delivered.sequence > partition.sequence:
+            self._unpublished.append(self._process_gapless(partition, delivered))
+        return self._is_next_gapless()
+
+    def _is_next_gapless(self) -> bool:
+        """Return True if a message waits, the state includes all messages before it, and it needs no request to the server."""
+        if not self.consumer.waiting or not self._is_gapless or self._pin_lapsed:
+            return False
+        delivered = self.consumer.waiting[0]
+        return delivered.follows and delivered.pin == self._pin and not self._guard.is_guarded(delivered.sequence)
+
+    def _process_gapless(self, partition: Partition, delivered: DeliveredMessage) -> BlockResult:
+        """Process or defer a message that needs no request to the server."""
         pack, data, sequence = delivered.pack, delivered.data, delivered.sequence
         result = self._reject_or_defer(partition, pack, sequence)
         if result is None:
             take = partial(partition.take, received_s=delivered.received_s)
             result = self.runner.run_unguarded(pack, data, sequence, take)
             self._count(partition, pack, data)
-        self._unpublished.append(result)
-
-    def _is_next(self, delivered: DeliveredMessage) -> bool:
-        """Return True if the state includes all messages before a delivered one, and no request to the server is necessary."""
-        is_gapless = self._is_gapless and delivered.follows and delivered.pin == self._pin
-        return is_gapless and self._is_idle and not self._pin_lapsed and not self._guard.is_guarded(delivered.sequence)
+        return result
 
     async def publish(self) -> None:
         """Publish the results of ``process_next``, and request further messages."""
@@ -193,24 +204,30 @@ class PartitionLease:
         await until_first_ends(self._process_messages(), self._deferred.run(), self._changes.run())
 
     async def _process_messages(self) -> None:
+        """Process the messages that need requests to the server; leave the others to the block loop."""
         while True:
             self._wake_up.clear()
             if self._pin_lapsed:
                 await self._try(self._check_ownership)
             await self.consumer.request_taken()
-            delivered = self.consumer.pop()
-            if delivered is not None:
-                await self._process_delivered(delivered)
+            if self.consumer.waiting and not self._is_next_gapless():
+                await self._process_delivered(self.consumer.pop())
                 self._next_search_s = time.monotonic() + SILENCE_S
-            elif self._silent:
+            elif self._silent and not self.consumer.waiting:
                 self._silent, self._next_search_s = False, time.monotonic() + SILENCE_S
                 await self._try(self._read_undelivered)
             else:
-                self._is_idle = True
-                try:
-                    await self._wake_up.wait()
-                finally:
-                    self._is_idle = False
+                await self._wait()
+
+    async def _wait(self) -> None:
+        """Let the block loop process messages until ``_wake_up`` is set."""
+        self._is_idle = True
+        if self.consumer.waiting:
+            self._block_loop.add(self)
+        try:
+            await self._wake_up.wait()
+        finally:
+            self._is_idle = False
 
     async def save(self) -> None:
         """Write a checkpoint if the state has changed since the last one, or if a live worker cannot read the last one.

@@ -101,10 +101,8 @@ class PinnedConsumer:
         """
         await self._request(BATCH if len(self.waiting) < BATCH else 1)
 
-    def pop(self) -> DeliveredMessage | None:
-        """Return the next queued message; None without one."""
-        if not self.waiting:
-            return None
+    def pop(self) -> DeliveredMessage:
+        """Return the next queued message. The caller has checked that ``waiting`` is not empty."""
         self._taken_since_request += 1
         return self.waiting.popleft()
 

@@ -12,14 +12,34 @@ import math
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
 from bms_estimator.kernels.forecast.block_table import PEAK_FRACTION
 from bms_estimator.kernels.forecast.draws import loaded_voltage
-from bms_estimator.kernels.forecast.projected_pack import grid_position
-from bms_estimator.model.arrays import Record
+from bms_estimator.kernels.forecast.projected_pack import grid_position, project_pack
+from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 
 MIN_LOAD_C = 0.05
 """Minimum mean current of the load, as a C-rate. It is used at rest and while charging."""
 SOC_STEP = 0.005
 """Step of the SOC towards empty. The crossing of the cut-off voltage is interpolated within a step."""
+
+
+@njit(cache=True)
+def charge_to_cutoff(
+    state: Records, settings: Records, cutoff_v: float, largest_a: float, pack: Records, draw: Records
+) -> tuple[float, float]:
+    """Return the charge [A s] and the energy at the terminals [W s] until the cut-off.
+
+    A caller in Python passes an array ten times faster than a record.
+
+    Args:
+        state: Shape (1,), dtype EKF_STATE.
+        settings: Shape (1,), dtype EKF_SETTINGS.
+        cutoff_v: Terminal voltage at which the load is switched off [V].
+        largest_a: Largest current of the load [A].
+        pack: Shape (1,), dtype PROJECTED_PACK; written.
+        draw: Shape (1,), dtype DRAW; written.
+    """
+    project_pack(pack[0], state[0], settings[0], cutoff_v, largest_a)
+    return discharge_to_cutoff(pack[0], state[0], settings[0], largest_a, draw[0])
 
 
 @njit(cache=True)

@@ -114,12 +114,14 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
         name: fleet_rig.workers[name].pid for name in names
     }
     cpu_before_s = {name: cpu_s(pid) for name, pid in pids.items()}
+    idle_before_s = psutil.cpu_times().idle
     measure_begin_s, blocks_before = time.monotonic(), received.blocks
     received.lags_s.clear()
     received.worst_s = 0.0
     await asyncio.sleep(60.0 * arguments.minutes)
     elapsed_s, processed_blocks = time.monotonic() - measure_begin_s, received.blocks - blocks_before
     cpu_time_s = {name: cpu_s(pid) - cpu_before_s[name] for name, pid in pids.items()}
+    idle_s = psutil.cpu_times().idle - idle_before_s
     memory_mib = {name: rss_mib(pid) for name, pid in pids.items()}
     wire_bytes = _wire_bytes(fleet_rig)
     lags_s = np.sort(received.lags_s) if received.lags_s else np.array([np.nan])
@@ -143,6 +145,9 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
         "workers, CPU, cores": f"{workers_cpu_s / elapsed_s:.3f}",
         "server, CPU, cores": f"{cpu_time_s['server'] / elapsed_s:.3f}",
         "edges simulated, CPU, cores": f"{cpu_time_s['edges'] / elapsed_s:.3f}",
+        "spare cores": f"{idle_s / elapsed_s:.2f}",
+        "workers, CPU per block, ms": f"{1e3 * workers_cpu_s / max(1, processed_blocks):.3f}",
+        "server, CPU per block, ms": f"{1e3 * cpu_time_s['server'] / max(1, processed_blocks):.3f}",
         "workers, CPU per pack-day, s": f"{workers_cpu_s / pack_days:.3f}",
         "server, CPU per pack-day, s": f"{cpu_time_s['server'] / pack_days:.3f}",
         "wire per pack-day, kB": f"{wire_bytes / raw_messages * blocks_per_day / 1e3:,.0f}",
