@@ -134,6 +134,7 @@ def test_damaged_arrow_is_rejected_or_read(damage: bytes, offset: int) -> None:
     with suppress(BatchError):
         assert read(data[:offset] + damage + data[offset + len(damage) :]).samples.dtype == SAMPLE
 
+
 def test_each_cell_may_have_a_column_of_its_own():
     columns = {"cell_1_v": [3.6] * 5, "cell_2_v": [3.7, None, 99.0, 3.7, 3.7]}
     cells_v = read(encode({"time_s": TIMES} | columns | VALUES)).cells_v
