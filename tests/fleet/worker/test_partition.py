@@ -24,7 +24,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import load_any
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.parameters import ParameterReport
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.sources.captures.replay import Replay
@@ -79,7 +79,7 @@ def test_duplicates_gaps_resends_and_a_takeover_after_each_message_give_the_stat
 class MemoryCapture:
     """Capture in memory."""
 
-    fraction, implausible = 1.0, 0  # read fraction, and number of implausible values, as ``Replay`` needs them
+    fraction, implausible, cells = 1.0, 0, NO_CELLS  # as ``Replay`` needs them
 
     def __init__(self, samples) -> None:
         self._samples = samples
