@@ -9,23 +9,21 @@ from pathlib import Path
 import structlog
 from nats.aio.client import Client
 from nats.aio.msg import Msg
-from nats.js.errors import NotFoundError
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
 from bms_estimator.fleet.nats.connection import close, connect, error_text
-from bms_estimator.fleet.nats.streams import partitions_of
-from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.block_loop import BlockLoop
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.heartbeat_report import HeartbeatReport
 from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.periodic_storage import PeriodicStorage
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
+from bms_estimator.fleet.worker.refused_check import check_refused
 from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
+from bms_estimator.fleet.worker.tenant_stores import TenantStores, open_stores
+from bms_estimator.fleet.worker.unknown_packs import UnknownPacks
 from bms_estimator.fleet.worker.unsaved_check import UnsavedCheck
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import SystemdNotifier
@@ -92,7 +90,7 @@ async def _start(options: Options, notifier: SystemdNotifier) -> "Worker":
     last_reason = ""
     while True:
         try:
-            return await _create_worker(nc, options, notifier)
+            return Worker(nc, options, await open_stores(nc, options.name), notifier)
         except (*RETRYABLE_ERRORS, UserError) as error:
             _raise_if_closed(nc, options)
             if (text := error_text(error)) != last_reason:
@@ -111,53 +109,19 @@ def _raise_if_closed(nc: Client, options: Options) -> None:
         raise UserError(f"the server {options.servers} has closed the connection: check --creds")
 
 
-async def _create_worker(nc: Client, options: Options, notifier: SystemdNotifier) -> "Worker":
-    """Open the buckets, read the table of packs and return a worker.
-
-    Raises:
-        UserError: A stream is missing.
-    """
-    partitions = await partitions_of(nc)
-    if partitions is None:
-        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
-    js = nc.jetstream()
-    try:
-        await js.stream_info(subjects.DEAD_STREAM)
-    except NotFoundError:
-        raise UserError(
-            f"the server has no stream {subjects.DEAD_STREAM}: upgrade and restart `bms-estimator fleet serve` before the workers"
-        ) from None
-    checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
-    states = await js.object_store(subjects.STATES_BUCKET)
-    bucket = PackBucket(nc)
-    await bucket.refresh()
-    store = CheckpointStore(nc, options.name, checkpoints, states)
-    return Worker(nc, options, partitions, store, bucket, notifier)
-
-
 class Worker:
     """Worker process with its partitions.
 
     Args:
         nc: Connection to the tenant's NATS account.
         options: Options of the worker.
-        partitions: Total number of partitions.
-        checkpoints: Store of the checkpoints.
-        bucket: Table of packs.
+        stores: Stores of the tenant.
         notifier: Notifies systemd that the worker is ready, alive or stopping.
     """
 
-    def __init__(
-        self,
-        nc: Client,
-        options: Options,
-        partitions: int,
-        checkpoints: CheckpointStore,
-        bucket: PackBucket,
-        notifier: SystemdNotifier,
-    ) -> None:
-        self._nc, self._options, self._partitions = nc, options, partitions
-        self._checkpoints, self._bucket, self._notifier = checkpoints, bucket, notifier
+    def __init__(self, nc: Client, options: Options, stores: TenantStores, notifier: SystemdNotifier) -> None:
+        self._nc, self._options, self._notifier = nc, options, notifier
+        self._partitions, self._checkpoints, self._bucket = stores
         self._members = Membership(options.name)
         self._inbox = nc.new_inbox()
         self._lease_tasks: dict[int, tuple[PartitionLease, asyncio.Task[None]]] = {}
@@ -167,9 +131,9 @@ class Worker:
         self._leaving = False
         self._block_loop = BlockLoop()
         self._release_slots = asyncio.Semaphore(MAX_RELEASES)
-        self._reported_unknown: set[str] = set()
+        self._unknown = UnknownPacks(nc, self._bucket.packs)
         self._report = HeartbeatReport(options.name)
-        self._storage = PeriodicStorage(nc, options.checkpoint_s, partitions)
+        self._storage = PeriodicStorage(nc, options.checkpoint_s, self._partitions)
         self._unsaved = UnsavedCheck(nc)
 
     async def run(self) -> None:
@@ -249,17 +213,8 @@ class Worker:
         if self._nc.is_connected:
             heartbeat = self._heartbeat()
             await self._nc.publish(subjects.worker(self._options.name), heartbeat.model_dump_json().encode())
-            await self._publish_unknown()
+            await self._unknown.publish(self._leases)
         self._notifier.alive(self._options.name)
-
-    async def _publish_unknown(self) -> None:
-        """Publish the reason for each pack that has become unknown."""
-        unknown = {pack for lease in self._leases if lease.partition for pack in lease.partition.unknown}
-        for pack in unknown - self._reported_unknown:
-            reason = self._bucket.packs.reason(pack)
-            log.warning("unknown pack: its blocks are deferred", pack=pack, reason=reason)
-            await self._nc.publish(subjects.unknown(pack), reason.encode())
-        self._reported_unknown = unknown
 
     async def _update_leases(self) -> None:
         """Claim assigned partitions, release the others, and request more messages."""
@@ -291,19 +246,10 @@ class Worker:
             await self._send_heartbeat()
 
     async def _check_refused(self) -> None:
-        """Accept the refused partitions whose checkpoints another worker has written in a readable format since."""
-        for number in list(self._members.refused):
-            if number in self._lease_tasks or not self._nc.is_connected:
-                continue
-            try:
-                await self._checkpoints.claims.check_format(number)
-            except UnreadableFormatError as error:
-                self._members.refused[number] = error.found
-            except RETRYABLE_ERRORS as error:
-                log.warning("a refused partition cannot be checked", partition=number, reason=error_text(error))
-            else:
-                log.info("the checkpoint of a refused partition has become readable", partition=number)
-                del self._members.refused[number]
+        """Accept the refused partitions whose checkpoints have become readable."""
+        if self._nc.is_connected:
+            numbers = self._members.refused.keys() - self._lease_tasks.keys()
+            await check_refused(numbers, self._members, self._checkpoints)
 
     async def _send_requests(self) -> None:
         if self._nc.is_connected:

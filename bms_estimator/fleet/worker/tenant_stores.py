@@ -1,0 +1,49 @@
+"""Streams and buckets of a tenant that a worker needs."""
+
+from typing import NamedTuple
+
+from nats.aio.client import Client
+from nats.js.errors import NotFoundError
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.streams import partitions_of
+from bms_estimator.fleet.packs.pack_bucket import PackBucket
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.model.errors import UserError
+
+
+class TenantStores(NamedTuple):
+    """Stores of a tenant."""
+
+    partitions: int
+    """Total number of partitions."""
+    checkpoints: CheckpointStore
+    bucket: PackBucket
+    """Table of packs."""
+
+
+async def open_stores(nc: Client, worker: str) -> TenantStores:
+    """Open the buckets and read the table of packs.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+        worker: Name of the worker.
+
+    Raises:
+        UserError: A stream is missing.
+    """
+    partitions = await partitions_of(nc)
+    if partitions is None:
+        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
+    js = nc.jetstream()
+    try:
+        await js.stream_info(subjects.DEAD_STREAM)
+    except NotFoundError:
+        raise UserError(
+            f"the server has no stream {subjects.DEAD_STREAM}: upgrade and restart `bms-estimator fleet serve` before the workers"
+        ) from None
+    checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
+    states = await js.object_store(subjects.STATES_BUCKET)
+    bucket = PackBucket(nc)
+    await bucket.refresh()
+    return TenantStores(partitions, CheckpointStore(nc, worker, checkpoints, states), bucket)
