@@ -91,11 +91,12 @@ class BlockProcessor:
         arrival_s, now_s = self._arrival_s(block), self._wall()
         self._estimate(block, pack_type, arrival_s)
         state = self._state_payload(pack_type, now_s)
-        parameters = None
+        parameters = cells = None
         if is_new_hour and state is not None:
             parameters = self._parameters_payload(pack_type.estimator, arrival_s, now_s)
-        cells = self._single_cells.payload(pack_type.short_limit_a, now_s)
-        return state, parameters, None if cells is None else _json(cells), rows
+            report = self._single_cells.payload(pack_type.short_limit_a, now_s)
+            cells = None if report is None else _json(report)
+        return state, parameters, cells, rows
 
     def reset_window(self) -> None:
         """Drop the samples of a failed block from the publish window."""

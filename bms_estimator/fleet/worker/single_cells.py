@@ -13,9 +13,6 @@ from bms_estimator.model.payloads.cells import CellsReport
 from bms_estimator.model.sample import CellBlock
 from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
 
-PAYLOAD_S = 60.0
-"""Interval of the payloads of topic ``cells`` on the clock of the samples [s]."""
-
 
 class SingleCells:
     """Estimators of the single cells of the pack that is loaded into a record.
@@ -31,7 +28,6 @@ class SingleCells:
         self._unpacked = unpacked
         self._cells: CellEstimator | None = None  # of the loaded pack
         self._is_loaded = False  # ``_cells`` uses the state in the record
-        self._begin_s = 0.0  # time of the last sample before the block [s]
 
     def begin(self, cells: CellEstimator) -> None:
         """Begin a block of a pack with the estimators of its type."""
@@ -84,16 +80,14 @@ class SingleCells:
         return {} if deviations is None else weakest_cell_fields(deviations)
 
     def payload(self, short_limit_a: float, now_s: float) -> CellsReport | None:
-        """Return the payload of topic ``cells``, once in ``PAYLOAD_S``; None without an estimate.
+        """Return the payload of topic ``cells``; None without an estimate.
 
         Args:
             short_limit_a: Minimum proven self-discharge of a cell with an internal short [A].
             now_s: Wall clock [s since 1970].
         """
         deviations = self._deviations
-        if deviations is None or deviations.at_s // PAYLOAD_S == self._begin_s // PAYLOAD_S:
-            return None
-        return make_cells_payload(deviations, short_limit_a, now_s)
+        return None if deviations is None else make_cells_payload(deviations, short_limit_a, now_s)
 
     def row_fields(self, weakest: int | None) -> dict[str, Any]:
         """Return the fields of an hourly row; empty without an estimate.
@@ -123,7 +117,7 @@ class SingleCells:
         """Let the estimators use the state in the record."""
         if self._cells is not None:
             self._cells.use_state(self._unpacked.cells, self._unpacked.bank)
-            self._is_loaded, self._begin_s = True, float(self._unpacked.bank["time_s"][0])
+            self._is_loaded = True
 
 
 def known_voltages(cells_v: CellBlock) -> CellBlock:

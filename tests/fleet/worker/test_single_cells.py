@@ -99,15 +99,19 @@ def test_states_of_cells_are_bit_identical_to_those_of_a_replay(blocks, take_ove
         assert partition.state(pack)["estimator"].tobytes() == estimator.record.tobytes()
 
 
-def test_worker_publishes_the_weakest_cell_and_all_cells_once_a_minute(blocks):
+def test_worker_publishes_the_weakest_cell_with_each_block_and_all_cells_once_an_hour(blocks):
     _, results = run(Partition(0, table), {"b": blocks["b"]})
     state = json.loads(results[-1].state)
     _, cells = replayed(blocks["b"])
     assert state["cells_v"] == blocks["b"][-1].cells_v[-1].tolist()
     assert (state["weakest_cell"], state["weakest_cell_soc"]) == (WEAK + 1, cells.deviations.soc[WEAK])
-    report = json.loads(results[-1].cells)
+    assert [number for number, result in enumerate(results, 1) if result.cells] == [
+        1,
+        60,
+    ]  # the first block of each hour
+    _, cells = replayed(blocks["b"][:60])
+    report = json.loads(results[59].cells)
     assert [cell["soc"] for cell in report["cells"]] == cells.deviations.soc.tolist()
-    assert all(result.cells for result in results[1:])
 
 
 def test_state_has_the_last_known_cell_voltages_of_a_block():
@@ -115,17 +119,6 @@ def test_state_has_the_last_known_cell_voltages_of_a_block():
     block.cells_v[-1] = math.nan
     result = Partition(0, table).take("a", encode(block), 1)
     assert json.loads(result.state)["cells_v"] == block.cells_v[-2].tolist()
-
-
-def test_short_blocks_do_not_publish_the_cells_more_often():
-    parts = [
-        replace(block, number=6 * (block.number - 1) + n + 1, samples=block.samples[10 * n : 10 * n + 10],
-                cells_v=block.cells_v[10 * n : 10 * n + 10])
-        for block in minutes(1, 10) for n in range(6)
-    ]  # fmt: skip
-    _, results = run(Partition(0, table), {"a": parts})
-    assert all(result.state for result in results)
-    assert 9 <= sum(result.cells is not None for result in results) <= 11
 
 
 def test_hourly_row_has_the_estimates_of_the_weakest_and_of_the_leaking_cell(blocks):
@@ -202,14 +195,20 @@ def test_cells_are_kept_with_another_tuning_and_begin_anew_with_another_capacity
     assert stds[0] < 1.5 * windows_before[0, 0, 0] < stds[1]
 
 
-def test_gap_at_a_new_store_does_not_count_as_time_of_the_former_store(blocks):
-    packs = {"b": blocks["b"][:20]}
-    partition, _ = run(Partition(0, table), packs)
-    new_store = STORE_ID_NS + 7200 * 10**9
-    block = replace(blocks["b"][0], store_created_ns=new_store, number=1, arrival_s=new_store / 1e9 + 60.0)
-    result = partition.take("b", encode(block), partition.sequence + 1)
-    assert json.loads(result.state)["weakest_cell"] == WEAK + 1
-    assert json.loads(result.cells)["cells"][WEAK]["fault"] is None
+def test_gap_at_a_new_store_counts_as_a_gap_of_the_cells(blocks):
+    gap_s = 7200.0
+    partition, _ = run(Partition(0, table), {"b": blocks["b"][:20]})
+    last_s = float(blocks["b"][19].samples["time_s"][-1])
+    new_store = STORE_ID_NS + round((last_s + gap_s) * 1e9)
+    block = replace(blocks["b"][0], store_created_ns=new_store, arrival_s=new_store / 1e9 + 60.0)
+    block = replace(block, samples=block.samples.copy())
+    block.samples["time_s"] -= block.samples["time_s"][0]
+    partition.take("b", encode(block), partition.sequence + 1)
+    estimator, cells = replayed(blocks["b"][:20])
+    estimator.resume(gap_s)
+    cells.resume(gap_s)
+    cells.run(block.samples, block.cells_v, estimator.run(block.samples))
+    assert partition.cells("b").tobytes() == cells.cells.tobytes()
 
 
 def test_layouts_of_other_records_are_not_taken_for_those_of_cells():
