@@ -109,8 +109,8 @@ def test_worker_publishes_the_weakest_cell_with_each_block_and_all_cells_once_an
         1,
         60,
     ]  # the first block of each hour
-    _, cells = replayed(blocks["b"][:60])
-    report = json.loads(results[59].cells)
+    _, cells = replayed(blocks["b"][:61])
+    report = json.loads(results[60].cells)
     assert [cell["soc"] for cell in report["cells"]] == cells.deviations.soc.tolist()
 
 
