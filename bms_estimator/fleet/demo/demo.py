@@ -93,8 +93,8 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
 
 
 async def _run_steps(demo: Demo, processes: Processes, stack: contextlib.AsyncExitStack) -> None:
-    # the edges are faster than real time, and their clocks must not get ahead of the server's
-    begin_s = int(time.time() - SPEED * (demo.seconds + TIMEOUT_S)) - BLOCK_S
+    # the edges are faster than real time, and their clocks must not get ahead of the server's while two steps wait
+    begin_s = int(time.time() - SPEED * (demo.seconds + 2.0 * TIMEOUT_S)) - BLOCK_S
     fleet = SimulatedFleet(demo.packs, seed=SEED, begin_ns=begin_s * 10**9)
     demo.report(
         f"A fleet on this machine: a server, {demo.packs:,} packs, two workers and a page. Only the packs are\n"

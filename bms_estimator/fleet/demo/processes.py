@@ -7,9 +7,9 @@ import random
 import socket
 import sys
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
-from typing import TypeVar
+from typing import IO, TypeVar
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import ends_with_us
@@ -36,16 +36,9 @@ class Processes:
         self._running: dict[str, asyncio.subprocess.Process] = {}
 
     async def start(self, name: str, *arguments: object) -> asyncio.subprocess.Process:
-        """Start a command in a new session, so that Ctrl-C reaches only this process, which ends the others."""
+        """Start a command."""
         with (self.folder / f"{name}.log").open("ab") as log:
-            process = await asyncio.create_subprocess_exec(
-                *_COMMAND,
-                *map(str, arguments),
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                preexec_fn=ends_with_us(),
-            )
+            process = await _start_process(arguments, stdout=log, stderr=log)
         self._running[name] = process
         return process
 
@@ -62,14 +55,7 @@ class Processes:
 
     async def output(self, *arguments: object) -> str | None:
         """Return the output of a command; None if it fails."""
-        process = await asyncio.create_subprocess_exec(
-            *_COMMAND,
-            *map(str, arguments),
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.DEVNULL,
-            start_new_session=True,
-            preexec_fn=ends_with_us(),
-        )
+        process = await _start_process(arguments, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL)
         output, _ = await process.communicate()
         return None if process.returncode else output.decode()
 
@@ -135,6 +121,20 @@ class Processes:
     def _ended(self, name: str) -> UserError:
         lines = (self.folder / f"{name}.log").read_text(errors="replace").strip().splitlines()
         return UserError(f"{name} has ended: {lines[-1] if lines else 'without output'}")
+
+
+async def _start_process(
+    arguments: Iterable[object], *, stdout: int | IO[bytes], stderr: int | IO[bytes]
+) -> asyncio.subprocess.Process:
+    """Start a command in a new session, so that Ctrl-C reaches only this process, which ends the others."""
+    return await asyncio.create_subprocess_exec(
+        *_COMMAND,
+        *map(str, arguments),
+        stdout=stdout,
+        stderr=stderr,
+        start_new_session=True,
+        preexec_fn=ends_with_us(),
+    )
 
 
 def free_port() -> int:
