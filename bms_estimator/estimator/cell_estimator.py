@@ -22,7 +22,6 @@ LEAK_STDS = 2.5
 """Minimum difference between the self-discharges of a cell and of the median cell that counts as a short [std]."""
 NEW_FIELDS = {"response", "score", "information", "near_full_soc"}
 """Fields of CELL and BANK that older checkpoints do not have. They begin at zero, so that the hypotheses start again."""
-
 CONSTANT_FRACTION = 0.5
 """Fraction of ``BIAS_V`` that is constant, such as the offset of a converter."""
 MAX_MEAN = np.array([1.0, 10.0, 10.0, 10.0, 1.0])
@@ -94,10 +93,11 @@ class CellEstimator:
         self._enabled = estimator.identifying and isinstance(cell, CellModel) and self._series >= MIN_CELLS
         self._balancing_v = balancing_voltage_v(cell) if isinstance(cell, CellModel) else math.inf
         self._deviations: CellDeviations | None = None
-        self._deviations_window = 0  # window of ``_deviations``
+        self._deviations_window = 0  # number of the window of ``_deviations``
         self._start(0)
 
     def _start(self, count: int) -> None:
+        """Begin without a state of ``count`` cells."""
         self.cells: Records = np.zeros(count, CELL)
         self.bank: Records = np.zeros(1, BANK)
         self._scratch = np.zeros(2 * count + STATES)
@@ -232,9 +232,9 @@ class CellEstimator:
 
 def _has_state(saved: Records, dtype: np.dtype[Any]) -> bool:
     """Return True if the fields of ``saved`` are those of ``dtype``, possibly without ``NEW_FIELDS``."""
-    present, found = dict(dtype.fields or {}), dict(saved.dtype.fields or {})
-    common = present.keys() & found.keys()
-    return present.keys() - NEW_FIELDS <= common and all(found[name][0] == present[name][0] for name in common)
+    expected, stored = dict(dtype.fields or {}), dict(saved.dtype.fields or {})
+    common = expected.keys() & stored.keys()
+    return expected.keys() - NEW_FIELDS <= common and all(stored[name][0] == expected[name][0] for name in common)
 
 
 def _invalid_reason(cells: Records, bank: Records) -> str:

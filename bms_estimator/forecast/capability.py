@@ -123,7 +123,9 @@ def write_capability(
 def write_usable_charge(
     values: ForecastRows, estimator: Estimator, cutoff_v: float, largest_a: float, cells: CellDeviations | None = None
 ) -> None:
-    """Write usable capacity and remaining energy to ``values``. They stay unchanged as in ``write_capability``.
+    """Write usable capacity and remaining energy to ``values``.
+
+    Both stay unchanged before the first sample, without the identifier and for a fuel cell.
 
     Args:
         values: Shape (1,), dtype ``FORECAST``; written.
@@ -139,11 +141,14 @@ def write_usable_charge(
     limited_as = min(
         [
             charge_as,
-            *(usable_charge(s, estimator, cutoff_v, largest_a)[0] for s in discharge_limiting_states(state, cells)),
+            *(
+                usable_charge(each, estimator, cutoff_v, largest_a)[0]
+                for each in discharge_limiting_states(state, cells)
+            ),
         ]
     )
     values["usable_capacity_ah"] = limited_as / 3600.0
-    # energy is taken as proportional to charge: the mean voltage is assumed not to depend on the limiting cell
+    # the mean voltage is assumed not to depend on the limiting cell, so that the energy is proportional to the charge
     values["remaining_energy_wh"] = energy_ws / 3600.0 * (limited_as / charge_as if charge_as > 0.0 else 1.0)
 
 

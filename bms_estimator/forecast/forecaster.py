@@ -144,7 +144,7 @@ class Forecaster:
         if self._cells is None:
             return
         self._has_cell_voltages |= cells_v.size > 0
-        if self._has_cell_voltages:  # the call alone would take a tenth of the time of a block of one sample
+        if self._has_cell_voltages:  # otherwise the call would take a tenth of the time of a block of one sample
             self._cells.run(block, cells_v, trace)
             self._deviations = self._cells.deviations
 

@@ -24,7 +24,7 @@ CURVE_DRAWS = 200
 CURVE_POINTS = 60
 """Maximum number of points of a curve."""
 DRAWN_LOADS = 3
-"""Weight of the randomly drawn loads: as many draws have such a load as follow this number of analogues."""
+"""Weight of randomly drawn loads, if the weight of each analogue is 1. The draws are divided in proportion to the weights."""
 MIN_OBSERVED_BLOCK_S = 10
 """Minimum length of a block of the observed load [s]."""
 MAX_STEPS = 360
@@ -47,8 +47,8 @@ MIN_GIVEN_BLOCK_S = 1.0
 MAX_BLOCKS = 2500
 """Maximum number of blocks of a given load within a horizon."""
 MAX_DRAW_STEPS = 20_000
-"""Maximum number of parts of a given load in a draw. A short load that discharges the pack slowly would repeat more often. Its draws
-end there, and are extrapolated."""
+"""Maximum number of parts of a given load in a draw. A short load that discharges the pack slowly would repeat more often. After
+this number the outcome is extrapolated."""
 MAX_TOTAL_STEPS = 500_000
 """Maximum number of steps of all draws under a given load, unless there are only ``MIN_DRAWS``."""
 MIN_DRAWS = 100
@@ -96,22 +96,22 @@ def project_observed_load(
     draw_load_factors(spread.std, spread.degrees, draws)
     simulate_observed_load(m, blocks, float(block_s), steps, draws)
     parts_of_draws = list(_analogue_parts(pack, analogues, horizon_s))
-    for chosen, parts in parts_of_draws:
-        followed, no_points = draws[chosen], np.empty((chosen.size, 0))
-        simulate_given_load(m, parts, horizon_s, followed, math.inf, no_points, no_points)
-        draws[chosen] = followed
+    for followers, parts in parts_of_draws:
+        outcomes, no_points = draws[followers], np.empty((followers.size, 0))
+        simulate_given_load(m, parts, horizon_s, outcomes, math.inf, no_points, no_points)
+        draws[followers] = outcomes
     time_s, charge_as = _extrapolated(draws, load_a)
     curve_steps = min(math.ceil(CURVE_END * time_quantiles(time_s)[-1] / block_s), steps)
     stride = math.ceil(curve_steps / CURVE_POINTS)
     soc, voltage_v = np.empty((2, CURVE_DRAWS, math.ceil(curve_steps / stride)))
     record_curves(m, blocks, float(block_s), curve_steps, draws[:CURVE_DRAWS], stride, soc, voltage_v)
     for followers, parts in parts_of_draws:
-        chosen = followers[followers < CURVE_DRAWS]
-        soc_points, voltage_points_v = np.empty((2, chosen.size, soc.shape[1]))
+        curve_draws = followers[followers < CURVE_DRAWS]
+        soc_points, voltage_points_v = np.empty((2, curve_draws.size, soc.shape[1]))
         simulate_given_load(
-            m, parts, curve_steps * block_s, draws[chosen], stride * block_s, soc_points, voltage_points_v
+            m, parts, curve_steps * block_s, draws[curve_draws], stride * block_s, soc_points, voltage_points_v
         )
-        soc[chosen], voltage_v[chosen] = soc_points, voltage_points_v
+        soc[curve_draws], voltage_v[curve_draws] = soc_points, voltage_points_v
     elapsed_s: Floats = block_s * (np.arange(soc.shape[1], dtype=np.float64) * stride + 0.5)
     return Projection(time_s, charge_as, _curve(elapsed_s, soc, voltage_v, time_s))
 

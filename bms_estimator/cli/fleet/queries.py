@@ -85,7 +85,7 @@ def ask(
     from bms_estimator.fleet.queries import duckdb_queries  # noqa: PLC0415 - its packages are optional
 
     if name is None:
-        _list_queries(duckdb_queries.QUESTIONS)
+        _list_queries(duckdb_queries.QUERIES)
         return
     if (query is not None) != (name == "sql"):
         raise UserError("give an SQL query after sql, and only there: fleet ask sql 'SELECT count(*) FROM hours'")

@@ -51,9 +51,10 @@ class Query(NamedTuple):
     tables: tuple[str, ...]
     """Tables that the query uses; each is created by an SQL file of its name."""
     help: str
+    """Description in the list of queries."""
 
 
-QUESTIONS = {
+QUERIES = {
     "soh": Query(("days", "packs", "fits"), "capacity trend a year with its band, of each type and pack"),
     "outliers": Query(("days", "packs"), "packs whose capacity or R_s deviates from their type"),
     "failing": Query(("days", "packs", "fits"), "packs that will soon reach a limit, or have recent input faults"),
@@ -124,23 +125,23 @@ class Answer:
 
 
 def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limits = LIMITS) -> Answer:
-    """Run one of ``QUESTIONS``.
+    """Run a named query.
 
     Args:
         folder: Folder of the Parquet files, written by ``fleet collect``.
-        name: Name of the query.
+        name: Name in ``QUERIES``.
         days: Number of last days (UTC) that are used; None: all.
         limits: Parameters of the query.
 
     Raises:
         UserError: The query, the folder or its rows do not exist, or a file is damaged.
     """
-    if name not in QUESTIONS:
-        raise UserError(f"{name}: no such query; there are {', '.join(QUESTIONS)}, and sql 'SELECT ...'")
+    if name not in QUERIES:
+        raise UserError(f"{name}: no such query; there are {', '.join(QUERIES)}, and sql 'SELECT ...'")
     with open_database(folder, days) as database:
         (now_hour,) = database.execute("SELECT getvariable('now_hour')").fetchone() or (0,)
         parameters = vars(limits) | _parameters(int(now_hour))
-        for table in QUESTIONS[name].tables:
+        for table in QUERIES[name].tables:
             _run(database, _sql(table), parameters)
             if table == "packs":  # the limit depends on the number of packs
                 parameters["stds"] = _reporting_limit_stds(database)

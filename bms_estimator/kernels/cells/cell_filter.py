@@ -28,13 +28,14 @@ RESISTANCE_DRIFT = 0.05
 LEAK_DRIFT = 5e-7
 """Q: change of the self-discharge in one hour [1/h]."""
 SHORT_DRIFT_H, SHORT_DRIFT = 10.0, 0.1
-"""Q: change of the self-discharge in one hour, over its square [h], and its maximum relative to the self-discharge."""
+"""Q: change of a short's self-discharge in one hour: ``SHORT_DRIFT_H`` [h] times its square, and at most the fraction
+``SHORT_DRIFT`` of it."""
 GAP_STD = 0.003
 """Q: std of a cell's SOC after a gap, in which a balancer may have been active."""
 BALANCING_C = 0.002
 """Q: current of a balancer, as a C-rate."""
 BALANCING_SPREAD_V = 0.005
-"""Minimum voltage above the lowest cell of a cell that a balancer drains [V]."""
+"""Minimum difference from the voltage of the lowest cell at which a balancer may drain a cell [V]."""
 READING_V = 0.001
 """R: std of the mean of a cell's readings in one window [V]."""
 DROP_ERROR = 0.05
@@ -42,9 +43,10 @@ DROP_ERROR = 0.05
 MAX_RESISTANCE_STD = 0.3
 """Maximum of the relative std of a cell's resistance after a time without a load."""
 CURVE_STDS = 2.0
-"""Range of a cell's SOC in which its OCV counts as possible, in std."""
+"""Half width of the SOC range in which the OCV curve is compared with its tangent, in std of the SOC."""
 CURVE_WINDOWS = 30.0
-"""Number of successive windows in which the error by the shape of the OCV curve is similar, so that their mean has the same error."""
+"""Number of successive windows with nearly the same error by the shape of the OCV curve. Averaging over these windows does not
+reduce the error."""
 FLAT_SOC = (0.1, 0.9)
 """SOC range of the mean slope of the OCV curve, without its steep ends."""
 STEEP_RATIO = 4.0
@@ -57,7 +59,7 @@ HOUR_S = 3600.0
 
 @njit(cache=True)
 def initialize_cell(c: Record) -> None:
-    """Write the initial state of a cell, of which nothing is known."""
+    """Write the initial state of an unknown cell: no deviation, with the std of P(0)."""
     for i in range(STATES):
         c.mean[i] = 0.0
         for j in range(STATES):
@@ -93,21 +95,21 @@ def predict_cell(c: Record, b: Record, balancing_variance: float) -> None:
 
     ``balancing_variance`` is the variance of the SOC that a balancer may have changed.
     """
-    cov, hours, kept = c.covariance, b.elapsed_s / HOUR_S, math.exp(-b.throughput / BIAS_SOC)
+    cov, hours, bias_decay = c.covariance, b.elapsed_s / HOUR_S, math.exp(-b.throughput / BIAS_SOC)
     advance(c.mean, b)
     # F has a unit diagonal except for BIAS, and two entries in the row of the SOC
     for j in range(STATES):
         cov[SOC, j] += b.change * cov[CAPACITY, j] - hours * cov[LEAK, j]
-        cov[BIAS, j] *= kept
+        cov[BIAS, j] *= bias_decay
     for j in range(STATES):
         cov[j, SOC] += b.change * cov[j, CAPACITY] - hours * cov[j, LEAK]
-        cov[j, BIAS] *= kept
+        cov[j, BIAS] *= bias_decay
     cov[SOC, SOC] += CHARGE_STD**2 * b.throughput + balancing_variance + (GAP_STD**2 if b.gap else 0.0)
     drift = RESISTANCE_DRIFT**2 * hours
     cov[RESISTANCE, RESISTANCE] = min(cov[RESISTANCE, RESISTANCE] + drift, MAX_RESISTANCE_STD**2)
     leak_drift = max(LEAK_DRIFT, min(SHORT_DRIFT_H * c.mean[LEAK] ** 2, SHORT_DRIFT * abs(c.mean[LEAK])))
     cov[LEAK, LEAK] += leak_drift**2 * hours
-    cov[BIAS, BIAS] += BIAS_V**2 * (1.0 - kept * kept)
+    cov[BIAS, BIAS] += BIAS_V**2 * (1.0 - bias_decay * bias_decay)
 
 
 @njit(cache=True)
@@ -127,7 +129,7 @@ def deviation_v(c: Record, p: Record, soc: float, drop_v: float) -> tuple[float,
 
 @njit(cache=True)
 def expected_v(x: Floats, slope_v: float, drop_v: float) -> float:
-    """Return the deviation of the voltage by a small state, shape (STATES,): H x [V]."""
+    """Return the voltage deviation that a small state ``x``, shape (STATES,), causes: H x [V]."""
     return slope_v * x[SOC] - drop_v * x[RESISTANCE] + x[BIAS]
 
 
@@ -152,13 +154,13 @@ def correct_cell(c: Record, innovation_v: float, variance_v2: float, ph: Floats)
 
 @njit(cache=True)
 def noise_variance(drop_v: float) -> float:
-    """Return the part of R that differs in each window, for an overpotential ``drop_v`` [V] of the reference cell [V^2]."""
+    """Return the part of R that is independent in each window [V^2]. ``drop_v`` is the overpotential of the reference cell [V]."""
     return READING_V**2 + (DROP_ERROR * drop_v) ** 2
 
 
 @njit(cache=True)
 def curve_variance(c: Record, p: Record, soc: float, soc_std: float) -> float:
-    """Return the part of R by the shape of the OCV curve, which is similar in successive windows [V^2].
+    """Return the part of R that the shape of the OCV curve causes [V^2]. It is nearly equal in successive windows.
 
     Args:
         c: The cell.

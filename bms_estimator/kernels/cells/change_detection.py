@@ -1,8 +1,8 @@
 """Detection of changes that the filter of a cell does not expect: generalized likelihood ratios of its innovations.
 
 A. Willsky and H. Jones, "A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems",
-IEEE Transactions on Automatic Control 21 (1976), pages 108-112. ``response`` is the error of the state for a change by 1 at the
-restart of the hypothesis. The innovations are white under the filter's own model. ``score`` over the root of ``information``
+IEEE Transactions on Automatic Control 21 (1976), pages 108-112. ``response`` is the error of the filter's state
+if a change by 1 began at the restart of the hypothesis. The innovations are white under the filter's own model. ``score`` over the root of ``information``
 therefore has a standard normal distribution without a change, so that the threshold needs no training.
 
 ``c`` is a record of CELL, ``b`` of BANK.
@@ -24,7 +24,8 @@ THRESHOLD_STD = 4.0
 END_STD = 2.0
 """Minimum significance of a fall, which ends an alarm and never raises one, in std."""
 MIN_INFORMATION = 1e4
-"""Minimum information [h^2]: the change has a std of at most C/100. A shorter observation would take one wrong innovation for a large short."""
+"""Minimum information [h^2]: the change has a std of at most C/100. With less, a single wrong
+innovation would look like a large short."""
 MARGIN = 9.0
 """Minimum excess of the likelihood ratio (twice its logarithm) of a self-discharge over that of a balancer."""
 
@@ -58,19 +59,19 @@ def update_hypotheses(
         slope_v: Derivative of the deviation by the cell's SOC [V].
         drop_v: Overpotential of the reference cell [V].
         innovation_v: Innovation [V].
-        variance_v2: Its variance S [V^2].
-        balancing: True if a balancer may be active: its current is not yet known.
+        variance_v2: Variance S of the innovation [V^2].
+        balancing: True if a balancer may be active. Its current is unknown, so that the innovation is not evaluated.
         ph: P H', shape (STATES,).
     """
     min_change_c = max(MIN_CHANGE_C, MIN_CHANGE_FRACTION * abs(c.mean[LEAK]))
     for h in range(HYPOTHESES):
-        f = c.response[h]
-        change_v = expected_v(f, slope_v, drop_v)
+        response = c.response[h]
+        change_v = expected_v(response, slope_v, drop_v)
         if not balancing:
             c.score[h] += change_v * innovation_v / variance_v2
             c.information[h] += change_v * change_v / variance_v2
         for i in range(STATES):
-            f[i] -= ph[i] / variance_v2 * change_v
+            response[i] -= ph[i] / variance_v2 * change_v
         if balancing and h == DRAIN:
             continue
         is_too_small = not c.score[h] > min_change_c * c.information[h]  # also if it is not finite
@@ -96,10 +97,10 @@ def apply_changes(c: Record) -> None:
     threshold = END_STD if best == FALL else THRESHOLD_STD
     if max(rise, fall, drain) < threshold or (best == RISE and rise**2 - drain**2 < MARGIN):
         return
-    f, change = c.response[best], c.score[best] / c.information[best]
+    response, change = c.response[best], c.score[best] / c.information[best]
     for i in range(STATES):
-        c.mean[i] += change * f[i]
+        c.mean[i] += change * response[i]
         for j in range(STATES):
-            c.covariance[i, j] += f[i] * f[j] / c.information[best]
+            c.covariance[i, j] += response[i] * response[j] / c.information[best]
     for h in range(HYPOTHESES):
         restart_hypothesis(c, h)

@@ -54,10 +54,10 @@ CELL = np.dtype(
         ("score", "f8", HYPOTHESES),  # expected times measured innovation over the variance, sum since the restart
         ("information", "f8", HYPOTHESES),  # squared expected innovation over the variance, sum since the restart
         ("held_v", "f8"),  # voltage at its last change [V]
-        ("held_reference_v", "f8"),  # median voltage of the cells at that time [V]
+        ("held_reference_v", "f8"),  # median voltage of the cells when held_v changed [V]
         ("sums", "f8", 5),  # decaying sums since a jump of the innovation
-        ("suspect_s", "f8"),  # time since this jump [s]; 0: none
-        ("recovered_s", "f8"),  # time in which the reading has contradicted the fault [s]
+        ("suspect_s", "f8"),  # time since a jump of the innovation [s]; 0: no jump
+        ("recovered_s", "f8"),  # duration of readings that contradict the fault [s]
         ("error_ohm", "f8"),  # error of the reading per ampere [ohm]; minus the resistance of a contact
         ("offset_v", "f8"),  # part of the error that does not depend on the current [V]
         ("first_offset_v", "f8"),  # offset_v when the fault was confirmed [V]
@@ -85,10 +85,8 @@ BANK = np.dtype(
         ("sum_a", "f8"),  # sum of the currents in the window [A]
         ("sum_drop_v", "f8"),  # sum of the overpotentials of one cell in the window [V]
         ("gap", "i8"),  # 1: samples are missing in the window
-        (
-            "near_full_soc",
-            "f8",
-        ),  # remaining throughput for which the cells are not compared after one was nearly full [SOC]
+        # remaining throughput until the cells are compared again, after one was nearly full [SOC]
+        ("near_full_soc", "f8"),
         ("balancing_s", "f8"),  # duration for which a balancer may have been active [s]
     ],
     align=True,

@@ -44,11 +44,11 @@ WINDOW_S = 10.0
 MAX_STEP_S = 60.0
 """Maximum time between two samples over which the current counts as measured [s]."""
 MAX_GAP_S = 1e9
-"""Time between two samples from which the clock counts as another one [s]: 30 years."""
+"""Minimum time between two samples that shows another time base [s]: 30 years."""
 NEAR_FULL_SOC = 0.1
 """Charge throughput for which the cells are not compared after one of them was nearly full [SOC], if the OCV curve is steep there."""
 NEAR_FULL_STD = 0.03
-"""Minimum std of a cell's SOC after this throughput."""
+"""Minimum std of a cell's SOC while the cells are not compared."""
 MIN_CELL_SOC, MAX_CELL_SOC = -0.2, 1.2
 """Range of the SOC of a cell that is over-discharged or overcharged."""
 _NONE, _STUCK = int(ReadingFault.NONE), int(ReadingFault.STUCK)
@@ -135,7 +135,8 @@ def update_cells(
 ) -> None:
     """Update all cells by the means of a window, and begin the next window.
 
-    ``b`` is a record of BANK, ``p`` of EKF_SETTINGS; the other arguments are those of ``run_cells``.
+    ``b`` is a record of BANK, ``p`` of EKF_SETTINGS. ``soc`` and ``soc_std`` are the pack's SOC at the end of the window and its std.
+    ``run_cells`` describes ``cells``, ``balancing_v`` and ``scratch``.
     """
     m = cells.size
     voltages_v, errors_v, ph = scratch[:m], scratch[m : 2 * m], scratch[2 * m : 2 * m + STATES]
@@ -212,7 +213,7 @@ def update_cell(
         slope_v: Derivative of the deviation by the cell's SOC [V].
         drop_v: Overpotential of the reference cell [V].
         innovation_v: Innovation [V].
-        variance_v2: Its variance S [V^2].
+        variance_v2: Variance S of the innovation [V^2].
         curve_v2: Part of R by the shape of the OCV curve [V^2].
         balancing: True if a balancer may be active.
         near_full: True if the cells are not compared, because one was nearly full.
@@ -256,9 +257,9 @@ def balancing_soc_variance(b: Record, active: bool) -> float:
 
 @njit(cache=True)
 def median(values: Floats, cells: Records) -> float:
-    """Return the median of the finite values of cells without a faulty reading; NaN if fewer than two have one.
+    """Return the median of the finite values of cells without a faulty reading; NaN for fewer than two values.
 
-    It is found by counting, because a sorted copy would need memory. ``values`` has shape (m,).
+    The median is found by counting, because a sorted copy would need memory. ``values`` has shape (m,).
     """
     count = 0
     for i in range(values.size):

@@ -81,10 +81,10 @@ class AlarmList:
 
         Args:
             name: Name of the alarm.
-            times_s: As for ``AlarmState.update``.
-            steps_s: As for ``AlarmState.update``.
-            values: As for ``AlarmState.update``.
-            wall_offset_s: As for ``AlarmState.update``.
+            times_s: Times on the samples' clock [s], shape (n,).
+            steps_s: Interval since the previous sample [s], 0 after a gap, shape (n,).
+            values: Values in the unit of the limit, NaN if not measured, shape (n,).
+            wall_offset_s: Wall clock minus the samples' clock [s].
             reason_at: Function that returns the cause of an alarm that was raised at a time on the samples' clock [s].
         """
         state = self.states.get(name)

@@ -1,7 +1,7 @@
 """All alarms of a pack, evaluated from samples and estimates.
 
-Alarms evaluate each sample, not the published means, and use the samples' clock. A replay therefore raises the alarms of
-the live run. They use raw values, including glitches that the estimator drops. The delays suppress single glitches.
+Alarms evaluate each sample, not the published means, and use the samples' clock. A replay therefore raises the same
+alarms as the live run. Alarms use raw values, including glitches that the estimator drops. The delays suppress single glitches.
 """
 
 import json
@@ -77,7 +77,7 @@ class AlarmEvaluator:
         self._charging_a = charging_a
         self._inputs, self._silence_limit_s = inputs, silence_limit_s
         self._silence_reason = ""  # reason why no samples arrive; empty while they do
-        self._has_samples = False  # since the start of this run
+        self._has_samples = False  # True after the first sample of this run
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
         self._weak_cell_intervals = SampleIntervals(math.inf)  # no interval is a gap, because a weak cell remains weak
         self._cell_intervals = SampleIntervals(CELLS_GAP_S)
@@ -256,9 +256,7 @@ class AlarmEvaluator:
         passed_s, observed_s = self._sample_intervals.measure(times_s)
         for name, series in measured_values(samples, extremes_v, self._charging_a).items():
             self._alarms.update(name, times_s, observed_s, series, wall_offset_s)
-        gaps_s = np.where(
-            observed_s < passed_s, passed_s, 0.0
-        )  # 0 without a gap: a value then holds for the whole interval
+        gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # duration of the gap before each sample [s]; 0: no gap
         self._alarms.update("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
         counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
         cells = extremes_v[:, 2].astype(np.int64)
@@ -314,7 +312,7 @@ class AlarmEvaluator:
         self._alarms.update("collapse_risk", times_s, observed_s, risks, wall_offset_s, reason_at)
 
     def _save_state(self) -> None:
-        """Update ``saved_state``, so that for example a relay that has cut the load stays open over a restart."""
+        """Update ``saved_state``. With it, a relay that an alarm has opened stays open over a restart."""
         saved: dict[str, Any] = self._alarms.saved_state
         if inputs := self._inputs.saved_state:
             saved[INPUTS] = inputs

@@ -1,4 +1,4 @@
-"""State machine of one alarm: hysteresis, delays, latch. All times are those of the samples, so that no clock is read."""
+"""State machine of one alarm: hysteresis, delays, latch. It uses the times of the samples and reads no clock."""
 
 import math
 from dataclasses import dataclass
@@ -115,7 +115,7 @@ class AlarmState:
         return True
 
     def _next_state(self, at_s: float, value: float, wall_offset_s: float) -> list[AlarmTransition]:
-        """Go to the next state. Return the transition if the alarm is raised or ends."""
+        """Change to the next state. Return the transition if the alarm is raised or ends."""
         if self.raised is None:
             return self.raise_at(at_s, RaisedAlarm(at_s + wall_offset_s, value if math.isfinite(value) else None))
         if self.cause_cleared:  # the cause has returned

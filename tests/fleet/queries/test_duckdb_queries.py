@@ -5,7 +5,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bms_estimator.fleet.queries.duckdb_queries import AGED_SOC, CHARGE_ERROR, QUESTIONS, run_query, select
+from bms_estimator.fleet.queries.duckdb_queries import AGED_SOC, CHARGE_ERROR, QUERIES, run_query, select
 from bms_estimator.fleet.queries.parquet_files import SCHEMA, compact, write
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.errors import UserError
@@ -178,7 +178,7 @@ def test_files_that_lack_columns_are_read_unless_pack_and_hour_are_missing(tmp_p
     write(tmp_path, [make_hour("a", BEGIN)])
     (file,) = tmp_path.glob("*/*.parquet")
     pq.write_table(pq.read_table(file).drop_columns(["capacity_first_std", "r_s_ratio"]), file)
-    for name in QUESTIONS:
+    for name in QUERIES:
         assert run_query(tmp_path, name).rows == []
     pq.write_table(pa.table({"x": [1]}), file)
     with pytest.raises(UserError, match="lack the columns pack and hour"):
