@@ -11,7 +11,9 @@ would run.
 
 import contextlib
 import fcntl
+import functools
 import hashlib
+import importlib
 import os
 import tempfile
 import warnings
@@ -95,6 +97,7 @@ def njit(**options: Any) -> Callable[[Function], Function]:
         def compile_or_wait(signature: Any) -> Any:
             # numba's lock of this process comes first, so that no other thread waits for it with the kernel locked
             with global_compiler_lock, _kernel_lock(name):
+                _import_without_blas()
                 return numba_compile(signature)
 
         kernel.get_call_template, kernel.compile = get_call_template, compile_or_wait
@@ -151,31 +154,45 @@ def count_cached_kernels() -> int:
     return sum(1 for folder in folders for _ in (CACHE_FOLDER / folder).glob("*.nbi"))
 
 
+@functools.cache
+def _kernel_folder(source: str) -> str | None:
+    """Return the folder of a source file's kernels, below the cache folder. Create it if it does not exist.
+
+    Return None for a file of another package, or if the folder cannot be written.
+    """
+    file = Path(source)
+    if not file.is_relative_to(_PACKAGE):
+        return None
+    folder = Path(numba.config.CACHE_DIR) / file.parent.relative_to(_PACKAGE)  # type: ignore[attr-defined]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return None
+    return str(folder)
+
+
 class _PackageLocator(_CacheLocator):
     """Place of a kernel of this package in the cache.
 
     numba's own locators use the absolute path of the source file, so that each installation would compile the kernels again.
+    They also examine the folder again for each kernel of a file.
     """
 
-    def __init__(self, function: Callable[..., Any], source: str) -> None:
+    def __init__(self, function: Callable[..., Any], source: str, folder: str) -> None:
         self._py_file = source  # the name that numba uses in its warnings
         self._line = function.__code__.co_firstlineno
+        self._folder = folder
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], source: str) -> Self | None:
         """Return the place; None for a function of another package, or if the folder cannot be written."""
-        if not Path(source).is_relative_to(_PACKAGE):
-            return None
-        locator = cls(function, source)
-        try:
-            locator.ensure_cache_path()  # type: ignore[no-untyped-call]
-        except OSError:
-            return None
-        return locator
+        folder = _kernel_folder(source)
+        return None if folder is None else cls(function, source, folder)
 
     def get_cache_path(self) -> str:
         """Return the folder of the source file within the package, below the cache folder."""
-        return str(Path(numba.config.CACHE_DIR) / Path(self._py_file).parent.relative_to(_PACKAGE))  # type: ignore[attr-defined]
+        return self._folder
 
     def get_source_stamp(self) -> str:
         """Return the same value for all files, because the name of the cache folder contains the hash of the sources."""
@@ -184,6 +201,25 @@ class _PackageLocator(_CacheLocator):
     def get_disambiguator(self) -> str:
         """Return the line of the function, which distinguishes functions of the same name."""
         return str(self._line)
+
+
+@functools.cache
+def _import_without_blas() -> None:
+    """Import numba's array functions without ``scipy.linalg``, whose import takes a fifth of the time to load the kernels.
+
+    numba imports it to find out whether a BLAS exists. No kernel uses one. Without it, ``numpy.correlate`` and
+    ``numpy.convolve`` in compiled code of other packages use a loop.
+    """
+    linalg: Any = importlib.import_module("numba.np.linalg")
+    ensure_blas, linalg.ensure_blas = linalg.ensure_blas, _deny_blas
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        linalg.ensure_blas = ensure_blas
+
+
+def _deny_blas() -> None:
+    raise ImportError("no kernel uses a BLAS")
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from bms_estimator.telemetry.alarms.message import Change
 from tests.collector import Collector
 from tests.scripted_source import ScriptedSource
 
-CELLS, CAPACITY_AH, STEP_S, BLOCK = 6, 20.0, 10.0, 6
+CELLS, CAPACITY_AH, STEP_S, BLOCK = 6, 20.0, 10.0, 30
 """Number of cells, their capacity [Ah], the interval of the samples [s], and the number of samples in a block."""
 NOISE_V = 5e-4
 """Std of a cell's reading [V], which has a resolution of 1 mV."""

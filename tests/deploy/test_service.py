@@ -87,7 +87,7 @@ def compiled_kernels(cache: Path) -> dict[str, int]:
 
 
 def test_systemd_is_notified_of_ready_watchdog_and_stopping(tmp_path):
-    kernel_cache.fill(tmp_path / "cache")
+    kernel_cache.fill(tmp_path / "cache", omitted=None)
     with start(tmp_path) as service:
         assert service.next_notice().startswith("READY=1\n")
         for _ in range(3):

@@ -141,6 +141,19 @@ print(bms_estimator.__file__, crc16(numpy.zeros(4, "u1"), 0, 4), sum(crc16.stats
     assert output == f"{tmp_path}/bms_estimator/__init__.py 33984 0\n"
 
 
+def test_loading_a_kernel_imports_no_linear_algebra_and_others_may_still_use_it(cached_kernel: Path) -> None:
+    script = """
+import sys, numpy
+from bms_estimator.protocols.firmware.framing import crc16
+print(crc16(numpy.zeros(4, "u1"), 0, 4), "scipy.linalg" in sys.modules)
+from numba.np.linalg import ensure_blas
+ensure_blas()
+"""
+    variables = {"NUMBA_CACHE_DIR": str(cached_kernel)}
+    output = subprocess.check_output([sys.executable, "-c", script], env=os.environ | variables, text=True)
+    assert output == "33984 False\n"
+
+
 def truncate(content: bytes) -> bytes:
     """Return only the first 20 bytes, which end within the header."""
     return content[:20]
