@@ -18,8 +18,8 @@ from tests.estimator.month.sources import SOLAR
 from tests.estimator.month.uses import HOUR_S, SOLAR_STEP_S, Phase, Use
 from tests.fit_interval import fits_every
 
-CASE = Case("LFP", "everything", SOLAR, declared_ah=20.0, days=4)
-INTERVAL_S = 1.5 * DAY_S
+CASE = Case("LFP", "everything", SOLAR, declared_ah=20.0, days=3)
+INTERVAL_S = 1.25 * DAY_S
 """Interval between two fits [s], so that the second fit has a history with merged rows."""
 
 
@@ -40,7 +40,7 @@ def everything(rng, pack):
 
 @pytest.fixture(scope="module")
 def recording() -> Recording:
-    """Return samples of four days."""
+    """Return samples of the days of ``CASE``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(uses.USES, CASE.use, Use(everything, step_s=SOLAR_STEP_S))
         return CASE.draw(SHARED_DATA)
@@ -81,8 +81,8 @@ def test_a_part_is_disabled_in_its_run_only(recording, estimates) -> None:
 
 def test_the_score_is_that_of_the_last_days(recording) -> None:
     time_s, soc, soc_std = run_without(CASE, recording, PARTS["slow fit"])
-    is_last = time_s >= 3 * DAY_S
+    is_last = time_s >= (CASE.days - 1) * DAY_S
     true_soc = recording.truth["soc"][np.searchsorted(recording.samples["time_s"], time_s)]
     expected = score(time_s[is_last], soc[is_last], soc_std[is_last], true_soc[is_last], after_s=0.0)
     assert expected is not None
-    assert score_without(CASE, recording, PARTS["slow fit"], first_day=4) == expected
+    assert score_without(CASE, recording, PARTS["slow fit"], first_day=CASE.days) == expected

@@ -1,5 +1,7 @@
 """Guided test: recognition of each step by the samples, warnings, and control of a load by a relay."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -230,9 +232,9 @@ def test_the_state_depends_only_on_the_samples() -> None:
     )
 
 
-@pytest.mark.parametrize("plan", [SHORT, LONG], ids=lambda plan: plan.name)
-@pytest.mark.parametrize("chemistry", ["lfp", "nca", "nmc", "lco", "lmo", "lto"])
-def test_ocv_near_full_follows_from_the_rests_of_a_plan(plan, chemistry) -> None:
+@functools.cache
+def socs_of_rests(plan):
+    """Return the SOCs at which a pack rests in a test by a plan. They do not depend on the chemistry."""
     pack = Pack(plan)
     pack.charge()
     test = pack.run(plan.full_rest_s + 5, 0.0, 4.18)
@@ -240,7 +242,13 @@ def test_ocv_near_full_follows_from_the_rests_of_a_plan(plan, chemistry) -> None
         pack.run(1, 1.5, 3.8)
         if test.phase is Phase.REST:
             pack.run(plan.rest_s + 5, 0.0, 3.9)
-    rests = np.array(sorted({0.0, *(min(point.soc, 1.0) for point in test.points)}))
+    return np.array(sorted({0.0, *(min(point.soc, 1.0) for point in test.points)}))
+
+
+@pytest.mark.parametrize("plan", [SHORT, LONG], ids=lambda plan: plan.name)
+@pytest.mark.parametrize("chemistry", ["lfp", "nca", "nmc", "lco", "lmo", "lto"])
+def test_ocv_near_full_follows_from_the_rests_of_a_plan(plan, chemistry) -> None:
+    rests = socs_of_rests(plan)
     grid = ocv_grid(load_cell(chemistry, 3.0))
     std_v = np.full(rests.size, 0.001)
     curve = fit_table(Points(rests, ocv_of_each(rests, *grid), std_v, std_v))

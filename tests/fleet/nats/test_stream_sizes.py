@@ -34,7 +34,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 from tests.fleet.nats_cluster import running
 
-PACKS = 4
+PACKS = 2
 
 
 async def test_stored_day_of_a_pack_is_at_most_as_large_as_computed(tmp_path: Path) -> None:
