@@ -3,14 +3,18 @@
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from functools import partial
 
 import structlog
 
+from bms_estimator.edge import subjects
 from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
+from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.packs.table_change import is_change
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
-from bms_estimator.fleet.worker.partition import INTERNAL_ERROR, BlockResult
+from bms_estimator.fleet.worker.partition import INTERNAL_ERROR, BlockResult, Partition
+from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage
 from bms_estimator.fleet.worker.replay_guard import ReplayGuard
 from bms_estimator.fleet.worker.result_publisher import ResultPublisher
 from bms_estimator.fleet.worker.table_change_sender import TableChangeSender
@@ -23,13 +27,14 @@ class BlockRunner:
 
     Args:
         number: Number of the partition.
+        partitions: Number of partitions of the stream.
         worker: Name of the worker.
-        step_lock: Lock of the worker, held while a block is estimated. The event loop can send requests and heartbeats between
-            two blocks.
+        step_lock: Lock of the worker (``BlockLoop``), held while a block is processed.
         guard: Guard of the partition.
         results: Publisher of summaries and dead letters.
         changes: Sender of changes of the table.
         save: Writes a checkpoint.
+        on_deferred: Called after a message was deferred.
 
     Attributes:
         budget: Processor time of each pack.
@@ -42,21 +47,63 @@ class BlockRunner:
     def __init__(
         self,
         number: int,
+        partitions: int,
         worker: str,
         step_lock: asyncio.Lock,
         guard: ReplayGuard,
         results: ResultPublisher,
         changes: TableChangeSender,
+        *,
         save: Callable[[], Awaitable[None]],
+        on_deferred: Callable[[], None],
     ) -> None:
-        self._number, self._worker, self._step_lock = number, worker, step_lock
-        self._guard, self._results, self._changes, self._save = guard, results, changes, save
+        self._number, self._partitions, self._worker, self._step_lock = number, partitions, worker, step_lock
+        self._guard, self._results, self._changes = guard, results, changes
+        self._save, self._on_deferred = save, on_deferred
         self.budget = CpuBudget()
         self.blocks = self.samples = self.faults = self.dead_letters = 0
         self.lag_s: float | None = None
 
+    async def process(self, partition: Partition, pack: str, message: StoredMessage) -> BlockResult:
+        """Process a message, or defer it if its pack has exhausted its budget or has deferred messages.
+
+        Raises:
+            nats.errors.Error: The server does not respond.
+        """
+        result = self._reject_or_defer(partition, pack, message.sequence)
+        if result is not None:
+            await asyncio.sleep(0)  # lets the event loop send heartbeats while many messages are deferred
+            return result
+        take = partial(partition.take, received_s=message.received_s)
+        result = await self.run(pack, message.data, message.sequence, take)
+        self._count_taken(partition, pack, message.data)
+        return result
+
+    def process_unguarded(self, partition: Partition, pack: str, message: DeliveredMessage) -> BlockResult:
+        """Process or defer a message that does not belong to a guarded replay, without a request to the server."""
+        result = self._reject_or_defer(partition, pack, message.sequence)
+        if result is None:
+            take = partial(partition.take, received_s=message.received_s)
+            result = self._run_unguarded(pack, message.data, message.sequence, take)
+            self._count_taken(partition, pack, message.data)
+        return result
+
+    def _reject_or_defer(self, partition: Partition, pack: str, sequence: int) -> BlockResult | None:
+        """Reject or defer a message, or return None if its pack is within its budget and has no deferred messages."""
+        if subjects.partition_of(pack, self._partitions) != self._number:
+            return partition.reject_misplaced(pack, sequence)
+        if pack not in partition.deferred and not self.budget.is_exhausted(pack):
+            return None
+        self._on_deferred()
+        return partition.defer(pack, sequence)
+
+    def _count_taken(self, partition: Partition, pack: str, data: bytes) -> None:
+        """Count a block, unless ``Partition.take`` has deferred it."""
+        if pack not in partition.deferred:
+            self.count_block(data)
+
     async def run(self, pack: str, data: bytes, sequence: int, take: Callable[..., BlockResult]) -> BlockResult:
-        """Process a message while no other block is processed. ``run_unguarded`` describes the arguments.
+        """Process a message while no other block is processed. ``_run_unguarded`` describes the arguments.
 
         Raises:
             nats.errors.Error: The server does not respond.
@@ -64,13 +111,13 @@ class BlockRunner:
         async with self._step_lock:
             await asyncio.sleep(0)  # lets the event loop send heartbeats between two blocks
             is_lethal = await self._guard.is_lethal(sequence)
-            result = self.run_unguarded(pack, data, sequence, take, is_lethal=is_lethal)
+            result = self._run_unguarded(pack, data, sequence, take, is_lethal=is_lethal)
             await self._guard.end_block(sequence)
         if is_lethal:
             await self._save()  # the next owner must not process the block again
         return result
 
-    def run_unguarded(
+    def _run_unguarded(
         self, pack: str, data: bytes, sequence: int, take: Callable[..., BlockResult], *, is_lethal: bool = False
     ) -> BlockResult:
         """Process a message, and charge the processor time to its pack.

@@ -20,7 +20,6 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stored_messages import read_messages
-from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.packs.table_change import trusted_data
 from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.block_runner import BlockRunner
@@ -28,6 +27,7 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFo
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, FencedError
 from bms_estimator.fleet.worker.deferred_reader import DeferredReader
+from bms_estimator.fleet.worker.delivered_messages import SILENCE_S, DeliveredMessages
 from bms_estimator.fleet.worker.partition import BlockResult, PackLookup, PackSources, Partition
 from bms_estimator.fleet.worker.partition_restore import restore_partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
@@ -37,9 +37,6 @@ from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
 from bms_estimator.fleet.worker.table_change_sender import TableChangeSender
 from bms_estimator.process.tasks import until_first_ends
 
-SILENCE_S = 3.0
-"""Time without a delivery after which the stream is searched for further messages [s]. Another worker releases the partition in
-less time."""
 IDLE_SILENCE_S = 5.0 * SILENCE_S
 """Interval between two searches while the stream has no further messages [s]."""
 _FENCED = (FencedError, UnreadableFormatError)
@@ -90,13 +87,21 @@ class PartitionLease:
         is_busy: Callable[[], bool],
         sources: PackSources | None = None,
     ) -> None:
-        self._nc, self.number, self._table, self._sources, self._partitions = nc, number, table, sources, partitions
+        self._nc, self.number, self._table, self._sources = nc, number, table, sources
         self._checkpoints, self._checkpoint_format, self._block_loop = checkpoints, checkpoint_format, block_loop
         self._guard = ReplayGuard(checkpoints.replays, number)
         self._changes = TableChangeSender(nc, lambda: self.partition, self._try)
         self.results = ResultPublisher(nc)
         self.runner = BlockRunner(
-            number, checkpoints.worker, block_loop.step_lock, self._guard, self.results, self._changes, self.save
+            number,
+            partitions,
+            checkpoints.worker,
+            block_loop.step_lock,
+            self._guard,
+            self.results,
+            self._changes,
+            save=self.save,
+            on_deferred=lambda: self._deferred.wake_up(),  # noqa: PLW0108 - created below
         )
         self._deferred = DeferredReader(
             nc, lambda: self.partition, self.runner, self.results, is_busy=is_busy, attempt=self._try
@@ -107,16 +112,10 @@ class PartitionLease:
         self.claim: Claim | None = None
         self.trouble, self.checkpoint_due_s = "", 0.0
         self.refused_format: int | None = None
-        self._pin = 0  # number of the pin under which the claim was last confirmed
-        self._is_gapless = False  # the state includes all messages before the last delivered one
-        self._pin_lapsed = False  # the ownership must be checked, because the pin has ended
-        self._silent = False  # the stream must be searched, because no message has arrived
-        self._next_search_s = time.monotonic() + SILENCE_S  # monotonic clock of the next search of the stream
-        self._wake_up = asyncio.Event()
-        self._is_idle = (
-            False  # the task of this lease waits for ``_wake_up``, so that the block loop may process messages
+        self._delivered = DeliveredMessages(
+            self.consumer, self._guard, self.results, block_loop, self._process_gapless, self._try
         )
-        self._unpublished: list[BlockResult] = []
+        self._silent = False  # the stream must be searched, because no message has arrived
         self._state_lock = asyncio.Lock()  # held while ``partition`` and ``claim`` change
 
     @property
@@ -137,65 +136,18 @@ class PartitionLease:
     def receive(self, message: Msg) -> None:
         """Process a message or status from the server."""
         if self.consumer.receive(message):
-            self._pin_lapsed, self._next_search_s = True, time.monotonic() + SILENCE_S
-        self._block_loop.add(self)
-
-    def process_next(self) -> bool:
-        """Process the next delivered message, or wake up the task of this lease if a request to the server is necessary.
-
-        Returns:
-            True if the next call can process a message.
-        """
-        partition = self.partition
-        if partition is None or not (self._is_idle and self._is_next_gapless()):
-            if self.consumer.waiting or self._pin_lapsed:
-                self._wake_up.set()
-            return False
-        delivered = self.consumer.pop()
-        self._next_search_s = time.monotonic() + SILENCE_S
-        if delivered.sequence > partition.sequence:
-            self._unpublished.append(self._process_gapless(partition, delivered))
-        return self._is_next_gapless()
-
-    def _is_next_gapless(self) -> bool:
-        """Return True if a message waits, the state includes all messages before it, and it needs no request to the server."""
-        if not self.consumer.waiting or not self._is_gapless or self._pin_lapsed:
-            return False
-        delivered = self.consumer.waiting[0]
-        return delivered.follows and delivered.pin == self._pin and not self._guard.is_guarded(delivered.sequence)
-
-    def _process_gapless(self, partition: Partition, delivered: DeliveredMessage) -> BlockResult:
-        """Process or defer a message that needs no request to the server."""
-        pack, data, sequence = delivered.pack, delivered.data, delivered.sequence
-        result = self._reject_or_defer(partition, pack, sequence)
-        if result is None:
-            take = partial(partition.take, received_s=delivered.received_s)
-            result = self.runner.run_unguarded(pack, data, sequence, take)
-            self._count(partition, pack, data)
-        return result
-
-    async def publish(self) -> None:
-        """Publish the results of ``process_next``, and request further messages."""
-        results, self._unpublished = self._unpublished, []
-        if not results:
-            return
-
-        async def publish_all() -> None:
-            for result in results:
-                await self.results.publish(result)
-            await self.consumer.request_taken()
-
-        if not await self._try(publish_all):
-            self._is_gapless = False
+            self._delivered.pin_lapsed = True
+            self._delivered.postpone_search()
+        self._block_loop.add(self._delivered)
 
     def check_silence(self) -> None:
         """Request a search of the stream after silence, and a check of deferred packs and of changes of the table.
 
         The caller calls this method about once a second.
         """
-        if time.monotonic() >= self._next_search_s:
+        if time.monotonic() >= self._delivered.next_search_s:
             self._silent = True
-            self._wake_up.set()
+            self._delivered.wake_up()
         self._deferred.wake_up()
         self._changes.wake_up()
 
@@ -205,29 +157,21 @@ class PartitionLease:
 
     async def _process_messages(self) -> None:
         """Process the messages that need requests to the server; leave the others to the block loop."""
+        delivered = self._delivered
         while True:
-            self._wake_up.clear()
-            if self._pin_lapsed:
+            delivered.begin_pass()
+            if delivered.pin_lapsed:
                 await self._try(self._check_ownership)
             await self.consumer.request_taken()
-            if self.consumer.waiting and not self._is_next_gapless():
+            if self.consumer.waiting and not delivered.is_next_gapless():
                 await self._process_delivered(self.consumer.pop())
-                self._next_search_s = time.monotonic() + SILENCE_S
+                delivered.postpone_search()
             elif self._silent and not self.consumer.waiting:
-                self._silent, self._next_search_s = False, time.monotonic() + SILENCE_S
+                self._silent = False
+                delivered.postpone_search()
                 await self._try(self._read_undelivered)
             else:
-                await self._wait()
-
-    async def _wait(self) -> None:
-        """Let the block loop process messages until ``_wake_up`` is set."""
-        self._is_idle = True
-        if self.consumer.waiting:
-            self._block_loop.add(self)
-        try:
-            await self._wake_up.wait()
-        finally:
-            self._is_idle = False
+                await delivered.wait()
 
     async def save(self) -> None:
         """Write a checkpoint if the state has changed since the last one, or if a live worker cannot read the last one.
@@ -292,34 +236,22 @@ class PartitionLease:
             self._deferred.wake_up()
 
     async def _process_delivered(self, delivered: DeliveredMessage) -> None:
-        """Process a delivered message after all earlier ones. Return without it if the pin is lost."""
-        while not await self._try(lambda: self._process_before(delivered)):
+        """Process the stream up to a delivered message. Return without it if the pin is lost."""
+        self._delivered.is_gapless = False
+        while not await self._try(partial(self._process_up_to, delivered)):
             await asyncio.sleep(RETRY_S)
             if not self.consumer.has_pin:
-                self._is_gapless = False
                 return
-        partition = self.partition
-        if partition is None or delivered.sequence <= partition.sequence:
-            return
-        if not await self._try(partial(self._take_delivered, partition, delivered)):
-            self._is_gapless = False
 
-    async def _take_delivered(self, partition: Partition, delivered: DeliveredMessage) -> None:
-        """Process a delivered message whose predecessors are all processed."""
-        await self.results.publish(await self._take_or_defer(partition, delivered.pack, delivered))
-
-    async def _process_before(self, delivered: DeliveredMessage) -> None:
-        """Bring the state up to the message before a delivered one."""
+    async def _process_up_to(self, delivered: DeliveredMessage) -> None:
+        """Process the stream up to a delivered message, after a confirmation of the claim if its pin is new."""
         partition = self.partition
-        if delivered.pin != self._pin or partition is None:
-            self._is_gapless = False
+        if delivered.pin != self._delivered.pin or partition is None:
             async with self._state_lock:
                 partition = await self._take_over()
-            self._pin = delivered.pin
-        if not (self._is_gapless and delivered.follows):
-            self._is_gapless = False
-            await self._catch_up(partition, delivered.sequence)
-            self._is_gapless = True
+            self._delivered.pin = delivered.pin
+        await self._catch_up(partition, delivered.sequence)
+        self._delivered.is_gapless = True
 
     async def _read_undelivered(self) -> None:
         """Bring the state up to the end of the stream after silence, unless another worker is pinned."""
@@ -332,7 +264,7 @@ class PartitionLease:
         try:
             await js.get_msg(subjects.RAW_STREAM, partition.sequence + 1, subject, next=True)
         except NotFoundError:
-            self._next_search_s = time.monotonic() + IDLE_SILENCE_S
+            self._delivered.postpone_search(IDLE_SILENCE_S)
         else:
             await self._catch_up(partition, await self._last_partition_sequence())
 
@@ -379,43 +311,21 @@ class PartitionLease:
             async for message in messages:
                 pack = message.subject.rpartition(".")[2]
                 trusted = message._replace(data=trusted_data(message.subject, message.data))
-                result = await self._take_or_defer(partition, pack, trusted)
-                latest[pack] = merge(latest.get(pack), result)
+                latest[pack] = merge(latest.get(pack), await self.runner.process(partition, pack, trusted))
         for result in latest.values():
             await self.results.publish(result)
 
-    async def _take_or_defer(
-        self, partition: Partition, pack: str, message: DeliveredMessage | StoredMessage
-    ) -> BlockResult:
-        """Process a message, or defer it if its pack has exhausted its budget or has deferred messages."""
-        data, sequence = message.data, message.sequence
-        result = self._reject_or_defer(partition, pack, sequence)
-        if result is not None:
-            await asyncio.sleep(0)  # lets the event loop send heartbeats while many messages are deferred
-            return result
-        result = await self.runner.run(pack, data, sequence, partial(partition.take, received_s=message.received_s))
-        self._count(partition, pack, data)
-        return result
-
-    def _reject_or_defer(self, partition: Partition, pack: str, sequence: int) -> BlockResult | None:
-        """Return None if a message can be processed now. Otherwise reject or defer it."""
-        if subjects.partition_of(pack, self._partitions) != self.number:
-            return partition.reject_misplaced(pack, sequence)
-        if pack not in partition.deferred and not self.runner.budget.is_exhausted(pack):
-            return None
-        self._deferred.wake_up()
-        return partition.defer(pack, sequence)
-
-    def _count(self, partition: Partition, pack: str, data: bytes) -> None:
-        """Count a message that was processed and not deferred."""
-        if pack not in partition.deferred:
-            self.runner.count_block(data)
+    def _process_gapless(self, delivered: DeliveredMessage) -> None:
+        """Process a delivered message whose predecessors are all processed."""
+        partition = self.partition
+        if partition is not None and delivered.sequence > partition.sequence:
+            self.results.add(self.runner.process_unguarded(partition, delivered.pack, delivered))
 
     async def _check_ownership(self) -> None:
         """Check the ownership after the pin has lapsed."""
         async with self._state_lock:
             await self._confirm_claim()
-        self._pin_lapsed = False
+        self._delivered.pin_lapsed = False
 
     async def _confirm_claim(self) -> None:
         """Confirm this worker's claim, if any; the caller holds ``_state_lock``."""
@@ -429,7 +339,7 @@ class PartitionLease:
         """Drop state and claim, because another worker has claimed the partition."""
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
         self.partition = self.claim = None
-        self._pin, self._is_gapless = 0, False
+        self._delivered.reset()
         self.results.clear()  # the owner of the partition computes them from the last checkpoint on
 
     def _refuse(self, error: UnreadableFormatError) -> None:

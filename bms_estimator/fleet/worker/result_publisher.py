@@ -27,12 +27,14 @@ class ResultPublisher:
     Attributes:
         waiting_summaries: Summaries that the server has not acknowledged yet: (message id, pack, row).
         waiting_dead_letters: Dead letters that the server has not acknowledged yet.
+        added: Results to be published by ``publish_added``.
     """
 
     def __init__(self, nc: Client) -> None:
         self._nc = nc
         self.waiting_summaries: deque[tuple[str, str, bytes]] = deque()
         self.waiting_dead_letters: deque[DeadLetter] = deque()
+        self.added: list[BlockResult] = []
         self._send_lock = asyncio.Lock()
 
     @property
@@ -76,6 +78,16 @@ class ResultPublisher:
                 await js.publish(letter.subject, letter.data, headers=letter.headers())
                 if self.waiting_dead_letters and self.waiting_dead_letters[0] is letter:
                     self.waiting_dead_letters.popleft()
+
+    def add(self, result: BlockResult) -> None:
+        """Add a result for ``publish_added``."""
+        self.added.append(result)
+
+    async def publish_added(self) -> None:
+        """Publish the added results."""
+        results, self.added = self.added, []
+        for result in results:
+            await self.publish(result)
 
     async def publish(self, result: BlockResult) -> None:
         """Publish reply and estimates of a result, unless the connection is interrupted."""
