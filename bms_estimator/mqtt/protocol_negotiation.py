@@ -32,7 +32,8 @@ class BrokerConnector:
 
     def __init__(self, settings: BrokerSettings, timeouts: Timeouts = DEFAULT_TIMEOUTS) -> None:
         self._settings, self._timeouts = settings, timeouts
-        # URLs to try with MQTT 3.1.1 next, because MQTT 5 got no response: the broker is stopped, or too old to reject it
+        # URLs to try with MQTT 3.1.1 next, because MQTT 5 was rejected, or got no response: the broker is stopped, or too old
+        # to reject it
         self._v311_urls: set[str] = set()
 
     @contextlib.asynccontextmanager
@@ -64,9 +65,11 @@ class BrokerConnector:
                 except aiomqtt.MqttError as error:
                     if protocol is ProtocolVersion.V311 or not should_retry_with_v311(error):
                         raise
-                return await stack.enter_async_context(
+                client = await stack.enter_async_context(
                     open_client(arguments, ProtocolVersion.V311, options, self._timeouts)
                 )
+                self._v311_urls.add(url)  # a rejected attempt costs the broker a second TLS handshake
+                return client
         except TimeoutError:
             self._v311_urls ^= {url}  # try the other version next time
             raise BrokerConnectionError(f"no answer within {self._timeouts.connect_s:g} s") from None

@@ -9,6 +9,10 @@ from typing import Self
 import aiomqtt
 import pytest
 
+from bms_estimator.mqtt.broker_config import brokers
+from bms_estimator.mqtt.connection import ConnectOptions
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.settings.mqtt import MqttSettings
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state, until
 
@@ -112,3 +116,15 @@ async def test_killed_cluster_node_loses_no_state(tmp_path: Path, *, serves_clie
                 await until(lambda: live.availability[-1] == b"online")
     assert_all_in_order(live.states, STATE_COUNT)
     assert sink.delivery.drops == 0
+
+
+async def test_a_reconnect_takes_one_connection_although_the_server_rejects_mqtt_5(tmp_path: Path) -> None:
+    with running(tmp_path) as server:
+        settings = MqttSettings(url=f"mqtt://127.0.0.1:{server.mqtt_port}")
+        connect, options = BrokerConnector(settings), ConnectOptions("edge", None, lambda _reason, _topic: None)
+        totals = []
+        for _ in range(3):
+            async with connect(brokers(settings)[0], options) as connection:
+                assert connection.protocol == "MQTT 3.1.1"
+            totals.append(server.ask(0, "varz")["total_connections"])
+        assert totals == [totals[0], totals[0] + 1, totals[0] + 2]
