@@ -40,6 +40,9 @@ MAX_BLOCK_AGE = 1.5
 """Age at which an incomplete block is sent, as a multiple of the block duration."""
 HANDOVER_S = 2.0
 """Time limit for sending the remaining blocks at shutdown [s]."""
+MAX_RECONNECT_DELAY_S = 120.0
+"""Maximum delay before a reconnect [s]. Delays have a mean of three quarters of it, so that 100,000 edges make 1,100
+connection attempts a second. If more attempts arrive than the server can complete before their timeout, all are in vain."""
 DISCONNECT_TIMEOUT_S = 1.0
 """Timeout of a disconnect from the server [s]."""
 
@@ -98,7 +101,13 @@ class BlockSender:
             log.warning("secret is readable by other users", reason=warning)
         options = ConnectOptions(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._count_invalid)
         self._link = ReconnectLoop(
-            brokers(settings), options, connect or BrokerConnector(settings), self._serve, self.delivery, first_delay_s
+            brokers(settings),
+            options,
+            connect or BrokerConnector(settings),
+            self._serve,
+            self.delivery,
+            first_delay_s,
+            MAX_RECONNECT_DELAY_S,
         )
         self._sample_clock: SampleClock | None = None
         self._overdue_timer: asyncio.TimerHandle | None = None

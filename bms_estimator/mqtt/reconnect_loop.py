@@ -9,7 +9,7 @@ import structlog
 from bms_estimator.mqtt.broker_config import Broker
 from bms_estimator.mqtt.connection import BrokerConnectionError, Connect, Connection, ConnectOptions
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.process.backoff import FIRST_DELAY_S, Backoff
+from bms_estimator.process.backoff import FIRST_DELAY_S, MAX_DELAY_S, Backoff
 
 MIN_CONNECTION_S = 10.0
 """Minimum duration of a connection that counts as successful [s]; a shorter one is followed by the backoff delay."""
@@ -31,6 +31,7 @@ class ReconnectLoop:
         serve: Uses a connection until it is lost or the loop is closed.
         delivery: Statistics in which losses and their reasons are recorded.
         first_delay_s: First backoff delay [s].
+        max_delay_s: Maximum backoff delay [s].
 
     Attributes:
         closing: Event that ends the loop.
@@ -44,10 +45,11 @@ class ReconnectLoop:
         serve: Callable[[Connection], Awaitable[None]],
         delivery: DeliveryStats,
         first_delay_s: float = FIRST_DELAY_S,
+        max_delay_s: float = MAX_DELAY_S,
     ) -> None:
         self._brokers, self._options, self._connect, self._serve = brokers, options, connect, serve
         self._delivery = delivery
-        self._backoff = Backoff(first_delay_s)
+        self._backoff = Backoff(first_delay_s, max_delay_s)
         self._logged: dict[str, tuple[str, float]] = {}  # by URL: last reason and the time at which it was logged
         self.closing = asyncio.Event()
 

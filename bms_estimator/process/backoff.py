@@ -18,15 +18,17 @@ class Backoff:
 
     Args:
         first_s: First delay [s].
+        max_s: Maximum delay [s].
     """
 
-    def __init__(self, first_s: float = FIRST_DELAY_S) -> None:
+    def __init__(self, first_s: float = FIRST_DELAY_S, max_s: float = MAX_DELAY_S) -> None:
         self._first_s = self._next_s = first_s
+        self._max_s = max_s
 
     def next_s(self) -> float:
         """Return the next delay [s]."""
         delay_s = self._next_s
-        self._next_s = min(2.0 * delay_s, MAX_DELAY_S)
+        self._next_s = min(2.0 * delay_s, self._max_s)
         return delay_s * random.uniform(0.5, 1.0)
 
     def reset(self) -> None:

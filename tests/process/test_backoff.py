@@ -1,0 +1,13 @@
+"""Delays before retries."""
+
+from bms_estimator.process.backoff import FIRST_DELAY_S, MAX_DELAY_S, Backoff
+
+
+def test_delays_double_up_to_the_maximum_and_differ_between_clients() -> None:
+    for backoff, max_s in ((Backoff(), MAX_DELAY_S), (Backoff(max_s=120.0), 120.0)):
+        for attempt in range(10):
+            full_s = min(FIRST_DELAY_S * 2.0**attempt, max_s)
+            assert full_s / 2.0 <= backoff.next_s() <= full_s
+        backoff.reset()
+        assert backoff.next_s() <= FIRST_DELAY_S
+    assert len({Backoff().next_s() for _ in range(10)}) > 1
