@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import resource
 import shutil
 import signal
 import socket
@@ -336,6 +337,17 @@ def test_server_refuses_to_start_if_the_streams_do_not_fit(
     assert code == 2
     assert reason in err
     assert not (tmp_path / "nats-server.conf").exists()
+
+
+@pytest.mark.parametrize(("limit", "warnings"), [(10_999, 1), (11_000, 0), (resource.RLIM_INFINITY, 0)])
+def test_limit_of_open_files_below_the_number_of_packs_is_reported(
+    limit: int, warnings: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1024, limit))
+    tenants = {"acme": TenantSettings(packs=4000), "harbour": TenantSettings()}
+    with capture_logs() as logs:
+        nats_server._warn_of_few_files(FleetSettings(server=ServerSettings(packs=6000), tenants=tenants))
+    assert sum("limit of open files" in line["event"] for line in logs) == warnings
 
 
 def test_every_setting_is_documented() -> None:
