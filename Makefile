@@ -24,7 +24,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank cells observability power collapse resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
+.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-sessions fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank cells observability power collapse resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -69,6 +69,9 @@ fleet: venv ## cost of a fleet, in processes on this machine, e.g. make fleet AR
 fleet-kills: venv ## workers and server nodes killed 100 times, with one node and with three, states compared bit by bit: 15 minutes
 	for nodes in $(NODES); do KILLS=$(KILLS) NODES=$$nodes $(BIN)/python -m pytest -s --timeout=7200 \
 		tests/fleet/worker/test_worker.py -k kills $(ARGS) || exit 1; done
+
+fleet-sessions: venv ## cost of 10,000 MQTT sessions with TLS, and their return after a killed server, e.g. make fleet-sessions ARGS="--sessions 1000": four minutes
+	@$(BIN)/python -m tests.benchmarks.fleet.mqtt_sessions $(ARGS)
 
 nats: venv ## a node of a NATS cluster killed while messages arrive, in each of its roles: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/mqtt/test_nats_server.py $(ARGS)

@@ -25,6 +25,7 @@ from bms_estimator.fleet.server import credentials, tenant_streams, tenant_watch
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_server import serve as serve_node
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
+from bms_estimator.fleet.server.open_files import warn_of_few_files
 from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
@@ -346,7 +347,7 @@ def test_limit_of_open_files_below_the_number_of_packs_is_reported(
     monkeypatch.setattr(resource, "getrlimit", lambda _: (1024, limit))
     tenants = {"acme": TenantSettings(packs=4000), "harbour": TenantSettings()}
     with capture_logs() as logs:
-        nats_server._warn_of_few_files(FleetSettings(server=ServerSettings(packs=6000), tenants=tenants))
+        warn_of_few_files(FleetSettings(server=ServerSettings(packs=6000), tenants=tenants))
     assert sum("limit of open files" in line["event"] for line in logs) == warnings
 
 
