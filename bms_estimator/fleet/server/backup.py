@@ -147,8 +147,12 @@ def _check_fit(backup: BackupList, configs: dict[str, dict[str, Any]]) -> None:
     """Check that the streams of a backup can be restored with the configurations of the new server.
 
     Raises:
-        UserError: They have another number of partitions, more replicas, or are larger.
+        UserError: A stream is missing; or they have another number of partitions, more replicas, or are larger.
     """
+    if missing := set(BACKUP_ORDER) - backup.streams.keys():
+        raise UserError(
+            f"the backup lacks {', '.join(sorted(missing))}: restore it with version {backup.program} of this program"
+        )
     partitions = _partitions(configs[subjects.RAW_STREAM])
     if backup.partitions != partitions:
         raise UserError(

@@ -226,6 +226,7 @@ def edit_raw(backup: Path, part: str, **fields: object) -> None:
         (lambda backup: (backup / "files" / "fleet.toml").write_text("["), "fleet.toml: has 1 bytes instead of 9"),
         (lambda backup: (backup / "backup.json").unlink(), "no complete backup, because backup.json is missing"),
         (lambda backup: edit_list(backup, version=2), "backup.json: version: Input should be 1"),
+        (lambda backup: edit_list(backup, streams={}), "the backup lacks DEAD, HOURS, KV_cells, KV_checkpoints"),
         (lambda backup: edit_list(backup, partitions=8), "the backup has 8 partitions, the server 2"),
         (lambda backup: edit_raw(backup, "config", num_replicas=3), "RAW: the backup has 3 copies, the server 1"),
         (lambda backup: edit_raw(backup, "state", bytes=10**18), "RAW: the backup has 1,000,000,000,000,000,000 bytes"),
