@@ -13,7 +13,6 @@ from asyncio import sslproto
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import IntEnum
 from typing import Protocol, cast
 
 import numpy as np
@@ -24,18 +23,12 @@ from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.mqtt.client import DEFAULT_TIMEOUTS
 from bms_estimator.mqtt.reconnect_loop import MIN_CONNECTION_S
+from tests.benchmarks.fleet.mqtt_packets import Packet, next_packet, packet, text
 
 sslproto.SSLProtocol.max_size = 16 << 10  # type: ignore[attr-defined] # asyncio would allocate 256 KiB for each connection
 
 BLOCK_SAMPLES = 60
 """Number of samples of a block, at 1 Hz."""
-
-
-class Packet(IntEnum):
-    """First byte of an MQTT packet, without flags."""
-
-    CONNECT, CONNACK, PUBLISH, PUBACK = 0x10, 0x20, 0x30, 0x40
-    SUBSCRIBE, SUBACK, PINGREQ, PINGRESP = 0x82, 0x90, 0xC0, 0xD0
 
 
 class Delays(Protocol):
@@ -200,12 +193,12 @@ class Session(asyncio.Protocol):
         data = block(self._created_ns, number, arrival_s=self._created_ns / 1e9 + BLOCK_SAMPLES * number)
         self._totals.counts["sent"] += 1
         self._in_flight[number] = time.monotonic()
-        self._send(_packet(Packet.PUBLISH | 0x02, _text(self._topic) + struct.pack(">H", number) + data))
+        self._send(packet(Packet.PUBLISH | 0x02, text(self._topic) + struct.pack(">H", number) + data))
 
     def _connect_packet(self) -> bytes:
         flags = 0xC0 | (0x00 if self._options.persistent else 0x02)  # user name, password, clean session
-        header = _text(b"MQTT") + struct.pack(">BBH", 4, flags, DEFAULT_TIMEOUTS.keepalive_s)
-        return _packet(Packet.CONNECT, header + b"".join(map(_text, (self._id, self._id, self._token.encode()))))
+        header = text(b"MQTT") + struct.pack(">BBH", 4, flags, DEFAULT_TIMEOUTS.keepalive_s)
+        return packet(Packet.CONNECT, header + b"".join(map(text, (self._id, self._id, self._token.encode()))))
 
     @property
     def _id(self) -> bytes:
@@ -231,8 +224,8 @@ class Session(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Process the complete packets."""
         self._received += data
-        while packet := _next_packet(self._received):
-            self._process(*packet)
+        while received := next_packet(self._received):
+            self._process(*received)
 
     def _process(self, kind: int, body: bytes) -> None:
         if kind == Packet.CONNACK:
@@ -240,7 +233,7 @@ class Session(asyncio.Protocol):
                 self.drop()
                 return
             qos = int(self._options.persistent)
-            self._send(_packet(Packet.SUBSCRIBE, b"\0\1" + _text(self._requests) + bytes([qos])))
+            self._send(packet(Packet.SUBSCRIBE, b"\0\1" + text(self._requests) + bytes([qos])))
         elif kind == Packet.SUBACK:
             if self._ready is not None and not self._ready.done():
                 self._ready.set_result(None)
@@ -262,7 +255,7 @@ class Session(asyncio.Protocol):
         """Acknowledge a worker's reply, and send the blocks that it requests."""
         payload = 2 + int.from_bytes(body[:2], "big")
         if kind & 0x06:
-            self._send(_packet(Packet.PUBACK, body[payload : payload + 2]))
+            self._send(packet(Packet.PUBACK, body[payload : payload + 2]))
             payload += 2
         with contextlib.suppress(ValueError):
             request = BlockRequest.model_validate_json(body[payload:])
@@ -281,35 +274,3 @@ def block(created_ns: int, number: int, arrival_s: float) -> bytes:
     samples: SampleBlock = _SAMPLES.copy()
     samples["time_s"] = BLOCK_SAMPLES * (number - 1.0) + np.arange(1.0, BLOCK_SAMPLES + 1.0)
     return encode(Block(store_created_ns=created_ns, number=number, oldest=1, arrival_s=arrival_s, samples=samples))
-
-
-def _text(data: bytes) -> bytes:
-    return struct.pack(">H", len(data)) + data
-
-
-def _packet(kind: int, body: bytes) -> bytes:
-    """Return a packet; its length is encoded in groups of seven bits."""
-    length, rest = bytearray(), len(body)
-    while True:
-        rest, digit = rest >> 7, rest & 0x7F
-        length.append(digit | (0x80 if rest else 0))
-        if not rest:
-            return bytes([kind]) + bytes(length) + body
-
-
-def _next_packet(received: bytearray) -> tuple[int, bytes] | None:
-    """Remove the first packet from the received bytes and return kind and body; None if it is incomplete."""
-    length, position = 0, 1
-    while position < len(received):
-        digit = received[position]
-        length |= (digit & 0x7F) << (7 * (position - 1))
-        position += 1
-        if not digit & 0x80:
-            break
-    else:
-        return None
-    if len(received) < position + length:
-        return None
-    kind, body = received[0], bytes(received[position : position + length])
-    del received[: position + length]
-    return kind, body
