@@ -51,6 +51,8 @@ lovelace:
 """
 CLIENT_ID = "http://127.0.0.1/"
 """Name of the tests at Home Assistant's login."""
+POLL_S = 0.3
+"""Interval at which the tests read all states [s]. A shorter one would keep Home Assistant busy with JSON."""
 
 
 class HomeAssistant:
@@ -130,7 +132,7 @@ class HomeAssistant:
         deadline = time.monotonic() + LONG_S
         while not condition(states := self.states()):
             assert time.monotonic() < deadline, {name: state["state"] for name, state in states.items()}
-            time.sleep(0.1)
+            time.sleep(POLL_S)
         return states
 
     def websocket_command(self, command_type: str, **arguments: Any) -> Any:

@@ -25,7 +25,7 @@ initial_soc = 0.5
 port = "{port}"
 protocol = "{protocol}"
 [publish]
-rate_hz = 5
+rate_hz = 2
 [mqtt]
 url = "{url}"
 commands = {commands}

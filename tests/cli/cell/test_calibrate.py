@@ -164,7 +164,7 @@ async def test_after_a_kill_the_test_continues_unless_charge_may_be_missing(
     assert ocv_at(load_cell(tmp_path / "cell.toml"), drawn_ah) == pytest.approx(ocv_at(pack.cell, drawn_ah), abs=0.03)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.thorough), signal.SIGTERM])
 async def test_a_signal_disconnects_the_load_and_ends_with_code_130(pack, tmp_path, number) -> None:
     async with calibration(tmp_path) as process:
         await pack.advance(until=lambda: pack.is_loaded)
