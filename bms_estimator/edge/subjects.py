@@ -12,6 +12,7 @@
 ``ingest.<pack>``            report of ``fleet ingest`` about dropped samples or a rejected batch
 ``hours.<pack>``             one-hour summaries by a worker, stored in the stream ``HOURS``
 ``fleet.worker.<id>``        heartbeat of a worker, once a second, with its partitions and its lag
+``fleet.ingest``             subscribed by the running ``fleet ingest``, so that a second one notices it
 ``fleet.unknown.<pack>``     one report of a worker that it has blocks of an unregistered pack, with the reason
 ===========================  ================================================================================
 """
@@ -24,6 +25,8 @@ RAW_STREAM, HOURS_STREAM, DEAD_STREAM, TELEMETRY_STREAM = "RAW", "HOURS", "DEAD"
 PACKS_BUCKET, CELLS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "cells", "checkpoints", "states"
 """Names of buckets. The first three are key-value buckets: settings by pack, cell files by name, and the last checkpoint
 by partition. The fourth is an object bucket with the content of the checkpoints."""
+INGEST_PRESENCE = "fleet.ingest"
+"""Subject that the running ``fleet ingest`` subscribes to."""
 PARTITIONS = 64
 """Default number of partitions. The number cannot be changed after the streams were created."""
 

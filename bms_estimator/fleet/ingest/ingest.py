@@ -12,7 +12,9 @@ import nats.errors
 import nats.js.errors
 import structlog
 from nats.aio.client import Client
+from nats.aio.msg import Msg
 
+from bms_estimator.edge import subjects
 from bms_estimator.fleet.ingest.batch_columns import BatchError
 from bms_estimator.fleet.ingest.batch_decoder import decode_batch
 from bms_estimator.fleet.ingest.batch_reports import BatchReport, BatchReports
@@ -38,6 +40,8 @@ STATUS_S = 60.0
 """Interval between two log lines with the counters [s]."""
 RETRY_S = 1.0
 """Retry interval after an error of the server [s]."""
+PRESENCE_TIMEOUT_S = 1.0
+"""Timeout of the request to another process [s]. The server rejects the request at once if no process runs."""
 YIELD_MESSAGES = 50
 """Number of messages after which other tasks run."""
 RETRYABLE_ERRORS = (nats.errors.Error, nats.js.errors.Error, StreamError, NoAnswerError, TimeoutError)
@@ -105,25 +109,46 @@ async def opened(options: Options, stop: asyncio.Event) -> AsyncIterator[tuple[C
 
 
 async def _start(options: Options) -> tuple[Client, int, PackBucket]:
-    """Connect, and create the stream; repeat until the server has the streams."""
+    """Connect, and create the stream; repeat until the server has the streams, and no other process runs."""
     nc = await connect(options.servers, NAME, creds=options.creds, ca=options.ca)
-    last_reason = ""
+    last_reason, is_claimed = "", False
     while True:
         try:
-            partitions = await partitions_of(nc)
+            if not is_claimed:
+                await _claim(nc)
+            is_claimed = True
             await make_telemetry_stream(nc, options.buffer_bytes)
+            partitions = await partitions_of(nc)
             bucket = PackBucket(nc)
             await bucket.refresh()
         except (*RETRYABLE_ERRORS, UserError) as error:
             if nc.is_closed:
                 raise UserError(f"the server {options.servers} has closed the connection: check --creds") from None
             if (text := error_text(error)) != last_reason:
-                log.warning("waiting for the server", reason=text)
+                log.warning("waiting", reason=text)
             last_reason = text
             await asyncio.sleep(RETRY_S)
             continue
         if partitions is not None:
             return nc, partitions, bucket
+
+
+async def _claim(nc: Client) -> None:
+    """Check that no other process runs for the tenant, and announce this one.
+
+    Raises:
+        UserError: Another process runs.
+        nats.errors.Error: The request cannot be sent.
+    """
+    with contextlib.suppress(nats.errors.NoRespondersError):
+        with contextlib.suppress(nats.errors.TimeoutError):
+            await nc.request(subjects.INGEST_PRESENCE, timeout=PRESENCE_TIMEOUT_S)
+        raise UserError("another `fleet ingest` runs for this tenant: this one starts when it has ended")
+    await nc.subscribe(subjects.INGEST_PRESENCE, cb=_ignore)
+
+
+async def _ignore(_: Msg) -> None:
+    """Ignore a request of another process, which needs no reply."""
 
 
 @contextlib.contextmanager

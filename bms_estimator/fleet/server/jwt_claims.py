@@ -88,6 +88,7 @@ _INGEST_PUBLISH = (
     "raw.*",
     "ingest.*",
     "dead.*.*",
+    "fleet.ingest",
 )
 _SUBSCRIBE = ("_INBOX.>", "bms.>", "fleet.>")
 _ALLOWED: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -99,7 +100,7 @@ _ALLOWED: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
     Role.WORKER: (_WORKER_PUBLISH, _SUBSCRIBE),
     Role.SENDER: (("telemetry.*",), ("_INBOX.>", "ingest.*")),
     Role.MQTT_SENDER: (("telemetry.*",), ("ingest.*", "$MQTT.sub.>")),
-    Role.INGEST: (_INGEST_PUBLISH, ("_INBOX.>", "edge.*.awaits")),
+    Role.INGEST: (_INGEST_PUBLISH, ("_INBOX.>", "edge.*.awaits", "fleet.ingest")),
     Role.ADMIN: ((">",), (">",)),
 }
 _LIMITS: dict[Role, dict[str, int]] = {

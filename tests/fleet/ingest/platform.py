@@ -13,7 +13,7 @@ from bms_estimator.model.sample import SampleBlock
 from tests.command_line import PROGRAM, running_program
 from tests.fleet.workers import SAMPLES, samples, until
 
-START_S = 1_790_000_000.0
+START_S = 1_700_000_000.0
 """Time of the first sample [s since 1970]."""
 
 

@@ -156,7 +156,7 @@ def test_new_samples_are_sorted_and_unique() -> None:
     assert selection.samples["current_a"].tolist() == [1.0, 2.0, 0.0]
     assert (selection.old, selection.implausible) == (3, 0)
     assert selection.reason(t0) == (
-        "3 samples at or before the pack's last stored time 2026-09-21T14:13:20.000Z: sent again, or too late"
+        "3 samples at or before the pack's last stored time 2023-11-14T22:13:20.000Z: sent again, or too late"
     )
 
 

@@ -138,7 +138,7 @@ async def test_missing_block_is_sent_again_and_confirmed_blocks_are_deleted(
     assert select(tmp_path, "SELECT number FROM block") == [3, 4, 5, 6]
 
 
-async def test_lost_folder_continues_after_the_last_block_of_the_stream(
+async def test_second_process_waits_and_continues_after_the_last_block_of_the_stream(
     nc: Client, cluster: NatsCluster, tmp_path: Path
 ) -> None:
     registry = await load_packs(nc, ["p1"])
@@ -146,12 +146,18 @@ async def test_lost_folder_continues_after_the_last_block_of_the_stream(
     blocks = await nc.subscribe("raw.p1")
     async with worker(cluster.url, 60):
         # a batch of 30 samples makes four blocks of six, and at the end of the process a fifth one
-        for folder, last, sent in ((tmp_path / "first", 30, 4), (tmp_path / "second", 60, 9)):
+        folders = tmp_path / "first", tmp_path / "second"
+        for folder in folders:
             folder.mkdir()
-            async with running_ingest(folder, cluster.url) as ingest:
-                await send(nc, "p1", json_batch(rows[:last]))
-                await until(lambda sent=sent: blocks.pending_msgs >= sent, lambda: blocks.pending_msgs)
-                assert await ingest.end() == 0
+        async with running_ingest(folders[0], cluster.url) as first:
+            await first.logged("ingested")
+            async with running_ingest(folders[1], cluster.url) as second:
+                reason = "another `fleet ingest` runs for this tenant: this one starts when it has ended"
+                await second.logged("waiting", reason=reason)
+                for process, last, sent in ((first, 30, 4), (second, 60, 9)):
+                    await send(nc, "p1", json_batch(rows[:last]))
+                    await until(lambda sent=sent: blocks.pending_msgs >= sent, lambda: blocks.pending_msgs)
+                    assert await process.end() == 0
     partitions = await end_states(nc, registry, PARTITIONS)
     state = partitions[subjects.partition_of("p1", PARTITIONS)].state("p1")
     assert state is not None
