@@ -10,8 +10,8 @@ import typer
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
 from bms_estimator.cli.options.capture_options import MappedColumns, SignOfCurrent
 
-DEFAULT_BLOCK_S = 60.0
 GB = 10**9
+"""Gigabyte [bytes]."""
 
 
 def ingest(
@@ -37,7 +37,7 @@ def ingest(
     block_s: Annotated[
         float,
         typer.Option(min=1.0, max=3600.0, help="duration of a block, which is sent to the workers as one message"),
-    ] = DEFAULT_BLOCK_S,
+    ] = 60.0,
     buffer_gb: Annotated[
         float, typer.Option(min=0.001, help="maximum size of the batches that wait on the server [GB]")
     ] = 1.0,
@@ -51,7 +51,7 @@ def ingest(
     from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
 
     options = Options(
-        server, folder or _default_folder(), creds, ca, block_s, round(buffer_gb * GB), columns, current_sign
+        server, folder or _default_folder(), block_s, round(buffer_gb * GB), creds, ca, columns, current_sign
     )
 
     async def run() -> None:

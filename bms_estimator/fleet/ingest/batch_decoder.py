@@ -4,6 +4,7 @@ import json
 from typing import Any
 
 from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError
+from bms_estimator.sources.captures.tables.layout import REQUIRED
 
 _ARROW_STREAM, _ARROW_FILE = b"\xff\xff\xff\xff", b"ARROW1"
 """First bytes of an Arrow IPC stream and of an Arrow IPC file."""
@@ -35,11 +36,11 @@ def decode_batch(payload: bytes) -> BatchColumns:
 
 
 def _columns_of_object(document: object) -> BatchColumns:
+    """Return the columns of an object. Its other values are ignored if it has enough lists for a sample, and else it is a row."""
     if not isinstance(document, dict) or not document:
         raise BatchError("must be an object of columns or a list of rows")
-    if all(isinstance(values, list) for values in document.values()):
-        return document
-    return {name: [value] for name, value in document.items()}
+    lists = {name: values for name, values in document.items() if isinstance(values, list)}
+    return lists if len(lists) >= len(REQUIRED) else {name: [value] for name, value in document.items()}
 
 
 def _columns_of_rows(rows: list[Any]) -> BatchColumns:

@@ -189,9 +189,10 @@ def select_new(batch: BatchSamples, last_s: float, now_s: float) -> Selection:
 
 
 def _time_kind(values: Values) -> CellKind:
-    is_stamp = isinstance(values, np.ndarray) and values.dtype.kind == "M"
-    is_text = not isinstance(values, np.ndarray) and any(isinstance(value, str) for value in values[:1])
-    return CellKind.DATE_TIME if is_stamp or is_text else CellKind.NUMBER
+    if isinstance(values, np.ndarray):
+        return CellKind.DATE_TIME if values.dtype.kind == "M" else CellKind.NUMBER
+    first = next((value for value in values if value is not None), None)
+    return CellKind.DATE_TIME if isinstance(first, str) else CellKind.NUMBER
 
 
 def _floats(column: Column, values: Values) -> NDArray[np.float64]:

@@ -65,10 +65,10 @@ class Options:
 
     servers: str
     folder: Path
+    block_s: float
+    buffer_bytes: int
     creds: Path | None = None
     ca: Path | None = None
-    block_s: float = 60.0
-    buffer_bytes: int = 1 << 30
     column_map: ColumnMap | None = None
     current_sign: CurrentSign | None = None
 
@@ -241,7 +241,8 @@ class Ingest:
     async def _check(self) -> None:
         """Do the work that is due every ``CHECK_S``."""
         await self._bucket.refresh()
-        for pack in self._store.packs:
+        # an empty table is that of a new server, and removes nothing
+        for pack in self._store.packs if len(self._bucket.packs) else ():
             if pack not in self._bucket.packs:
                 log.info("a pack was removed from the table; its stored blocks are removed", pack=pack)
                 self._store.remove(pack)

@@ -4,7 +4,7 @@ import asyncio
 import math
 import sqlite3
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -67,7 +67,7 @@ class IngestStore:
     def __init__(self, nc: Client, folder: Path, partitions: int, block_s: float) -> None:
         self._nc, self._partitions, self.dropped = nc, partitions, 0
         self._database = Database(folder / FILE, tables=INGEST_TABLES, sync_s=0.0, retry_s=RETRY_S)
-        self._open = OpenBlocks(block_s, {})
+        self._open = OpenBlocks(block_s)
         self._first_unconfirmed: dict[str, int] = {}
         self._confirmed: dict[str, int] = {}  # numbers that the next transaction applies
         self._removed: set[str] = set()
@@ -98,7 +98,7 @@ class IngestStore:
         return pack in self._open
 
     @property
-    def packs(self) -> Iterable[str]:
+    def packs(self) -> list[str]:
         """Names of the known packs."""
         return list(self._open)
 
@@ -137,7 +137,7 @@ class IngestStore:
             return
         self._set_end(pack, block.store_created_ns, last_sample_s(block))
 
-    def add(self, pack: str, batch: BatchSamples, arrival_s: float, sequence: int = 0) -> Selection:
+    def add(self, pack: str, batch: BatchSamples, arrival_s: float, sequence: int) -> Selection:
         """Add the new samples of a batch; see ``OpenBlocks.add``."""
         self._first_unconfirmed.setdefault(pack, self._open.position(pack).next_number)
         return self._open.add(pack, batch, arrival_s, time.monotonic(), sequence)
@@ -222,7 +222,10 @@ class IngestStore:
                 self.publisher.resend(pack, request.number)
 
     def _begin_store(self, pack: str, other_ns: int) -> None:
-        """Replace the store of a pack by one that is created after another store [ns since 1970]."""
+        """Replace the store of a pack by one that is created after another store [ns since 1970].
+
+        Workers ignore the blocks of the former store. The samples of the open block are dropped too.
+        """
         last_s = self._open.position(pack).last_s
         self.remove(pack)
         self._set_end(pack, other_ns, last_s)

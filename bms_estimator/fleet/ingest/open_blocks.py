@@ -1,8 +1,8 @@
 """Open blocks of all packs: division of their samples into numbered blocks. No I/O."""
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 from bms_estimator.edge.batching import Batcher, ReadyBlock
 from bms_estimator.edge.block_sender import MAX_BLOCK_AGE
@@ -27,28 +27,22 @@ class _OpenPack:
     """Monotonic time of the first sample's arrival [s]."""
 
 
-@dataclass
 class OpenBlocks:
     """Divides the samples of packs into blocks.
 
     Args:
         block_s: Duration of a block [s].
-        positions: Positions of the known packs.
 
     Attributes:
         completed: Completed blocks; emptied by the caller.
         changed: Positions that have changed since the caller emptied it.
     """
 
-    block_s: float
-    positions: Mapping[str, PackPosition]
-    completed: list[NumberedBlock] = field(default_factory=list)
-    changed: dict[str, PackPosition] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
+    def __init__(self, block_s: float) -> None:
+        self._block_s = block_s
         self._packs: dict[str, _OpenPack] = {}
-        for pack, position in self.positions.items():
-            self.set_position(pack, position)
+        self.completed: list[NumberedBlock] = []
+        self.changed: dict[str, PackPosition] = {}
 
     def __contains__(self, pack: object) -> bool:
         return pack in self._packs
@@ -58,7 +52,7 @@ class OpenBlocks:
 
     def set_position(self, pack: str, position: PackPosition) -> None:
         """Set the position of a pack, and discard its open block."""
-        self._packs[pack] = _OpenPack(Batcher(self.block_s), position, position.last_s)
+        self._packs[pack] = _OpenPack(Batcher(self._block_s), position, position.last_s)
 
     def remove(self, pack: str) -> None:
         """Forget a pack, and discard its open block and its completed blocks that the caller has not taken."""
@@ -74,7 +68,7 @@ class OpenBlocks:
         """Return the time of a pack's last sample [s since 1970]."""
         return self._packs[pack].last_s
 
-    def add(self, pack: str, batch: BatchSamples, arrival_s: float, now_s: float, sequence: int = 0) -> Selection:
+    def add(self, pack: str, batch: BatchSamples, arrival_s: float, now_s: float, sequence: int) -> Selection:
         """Add the new samples of a batch, and return them with the numbers of dropped samples.
 
         Args:
@@ -99,7 +93,7 @@ class OpenBlocks:
     def cut(self, now_s: float = math.inf) -> None:
         """Complete the open blocks that have been open for longer than ``MAX_BLOCK_AGE`` blocks; by default all."""
         for pack, entry in self._packs.items():
-            if len(entry.batcher) and now_s - entry.opened_s > MAX_BLOCK_AGE * self.block_s:
+            if len(entry.batcher) and now_s - entry.opened_s > MAX_BLOCK_AGE * self._block_s:
                 self._complete(pack, entry, entry.batcher.cut())
 
     def first_sequence(self, default: int) -> int:

@@ -74,7 +74,8 @@ async def test_backfill_waits_for_confirmations(
     for name, value in values.items():
         monkeypatch.setattr(backfill_module, name, value)
     blocks = await nc.subscribe("raw.p1")
-    running = asyncio.create_task(backfill(Options(cluster.url, tmp_path / "blocks"), [tmp_path], asyncio.Event()))
+    options = Options(cluster.url, tmp_path / "blocks", block_s=60.0, buffer_bytes=1 << 30)
+    running = asyncio.create_task(backfill(options, [tmp_path], asyncio.Event()))
     await blocks.next_msg(LONG_S)
     async with worker(cluster.url, 240):
         assert not running.done()  # 40 blocks, of which no worker has confirmed one

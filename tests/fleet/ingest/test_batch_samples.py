@@ -51,9 +51,13 @@ def test_columns_that_are_not_used_may_have_any_type() -> None:
     table = pa.table({"time_s": TIMES, **VALUES, "charging": [True] * 5, "place": [{"lat": 1.0}] * 5})
     assert read(arrow_bytes(table)).samples.size == 5
     assert read(encode({"time_s": TIMES, **VALUES, "charging": [True] * 5, "place": ["x"] * 5})).samples.size == 5
+    assert read(encode({"time_s": TIMES, **VALUES, "pack": "p1"})).samples.size == 5
 
 
 def test_single_row_needs_no_lists() -> None:
+    row = {"time": None, "current_a": 1, "voltage_v": 3.7}
+    assert read(encode([row, row | {"time": ISO_TIMES[0]}])).samples["time_s"][1] == TIMES[0]
+    assert read(encode(row | {"time": ISO_TIMES[0], "cells_v": [3.6, 3.7]})).cells_v.tolist() == [[3.6, 3.7]]
     assert read(encode({"time_s": TIMES[0], "current_a": 1, "voltage_v": None})).samples.size == 1
 
 

@@ -165,7 +165,7 @@ async def test_second_process_waits_and_continues_after_the_last_block_of_the_st
 
 
 async def test_rejected_batch_is_reported_and_can_be_replayed(nc: Client, cluster: NatsCluster, tmp_path: Path) -> None:
-    await load_packs(nc, ["p1"])
+    await load_packs(nc, ["p1", "p2"])
     reports = await nc.subscribe("ingest.*")
     rows = samples_of("p1", 12)
     batch = json_batch(rows).replace(b"voltage_v", b"U_pack")
