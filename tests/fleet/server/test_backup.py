@@ -20,7 +20,7 @@ from bms_estimator.fleet.nats.stream_snapshot import read_info
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.server.backup import BACKUP_ORDER, back_up, restore
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.claims import Claims
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.workers import Heartbeats, Process, block, end_states, load_packs, samples, send, until
@@ -135,9 +135,8 @@ async def back_up_while_blocks_arrive(nc: Client, folder: Path) -> None:
 async def checkpoint_sequences(nc: Client) -> list[int]:
     """Return the sequence numbers of the last checkpoints of the partitions that have one."""
     js = nc.jetstream(timeout=LONG_S)
-    bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
-    store = CheckpointStore(nc, "test", bucket, await js.object_store(subjects.STATES_BUCKET))
-    pointers = [await store._read_pointer(number) for number in range(PARTITIONS)]
+    claims = Claims("test", await js.key_value(subjects.CHECKPOINTS_BUCKET))
+    pointers = [await claims.read(number) for number in range(PARTITIONS)]
     return [stored.pointer.kept[0].sequence for stored in pointers if stored and stored.pointer.kept]
 
 
