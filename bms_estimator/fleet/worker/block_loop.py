@@ -1,7 +1,7 @@
-"""Loop that processes the delivered blocks of all partitions of a worker, in the order of their arrival.
+"""Loop that processes the delivered messages of all partitions of a worker in turn.
 
-The event loop runs between two slices of blocks, not between two blocks. The messages of a slice are therefore written to the
-server at once, and a block needs no switch of tasks.
+The event loop runs between two slices of messages, not between two messages. Therefore the results of a slice are written to
+the server together, and a message needs no switch of tasks.
 """
 
 import asyncio
@@ -9,11 +9,12 @@ import time
 from typing import Protocol
 
 SLICE_S = 0.004
-"""Time after which the event loop can send heartbeats and receive messages [s]. A slice ends with the block that exceeds it."""
+"""Duration of a slice [s], after which the event loop sends heartbeats and receives messages. The last message of a slice may
+exceed it."""
 
 
 class BlockQueue(Protocol):
-    """Queue of the delivered messages of one partition (``PartitionLease``)."""
+    """Delivered messages of one partition (``DeliveredMessages``)."""
 
     def process_next(self) -> bool:
         """Process the next message, or leave it to the task of the partition. Return True if the next call can process one."""
@@ -26,7 +27,7 @@ class BlockLoop:
     """Loop of a worker, which serves the partitions in turn.
 
     Attributes:
-        step_lock: Lock, held while a block is processed.
+        step_lock: Lock, held while a message is processed.
     """
 
     def __init__(self) -> None:

@@ -47,7 +47,7 @@ def rows() -> Iterator[Row]:
     for part_name, us in _part_us(partition, samples, blocks):
         rest_us -= us
         yield Row(f"  {part_name}", "-", f"{us:.1f} us", None)
-    yield Row("  order of blocks, checks, and caches that other packs filled", "-", f"{rest_us:.1f} us", None)
+    yield Row("  the rest: order of blocks, checks, cache misses", "-", f"{rest_us:.1f} us", None)
     packs = partition.snapshot().packs
     bytes_per_pack = sum(map(sys.getsizeof, packs.values())) / PACKS
     begin_s = time.process_time()
