@@ -84,7 +84,7 @@ class Limits:
     r_s_fresh_s: float = 86_400.0
     """Maximum time since R_s was last identified [s]; older values are not used."""
     min_days: int = 7
-    """Queries soh, failing: minimum number of days in a trend."""
+    """Queries soh, failing, imbalance, self-discharge: minimum number of days in a trend."""
     min_packs: int = 5
     """Query outliers: minimum number of packs with a valid value that define the reference of their type."""
     min_spread: float = 0.01

@@ -76,7 +76,7 @@ def test_internal_short_of_a_simulated_pack_is_found_with_its_current_and_a_heal
         rows = hourly_rows("nmc", 1, short_ohm, days=3, short_day=1)
         write(tmp_path, [row.model_copy(update={"pack": name}) for row in rows])
     (row,) = run_query(tmp_path, "self-discharge").records
-    assert (row["pack"], row["cell"]) == ("shorted", SHORTED_CELL + 1)
+    assert (row["pack"], row["cell"], row["method"]) == ("shorted", SHORTED_CELL + 1, "estimate")
     assert row["self_discharge_ma"] == pytest.approx(1000 * 3.8 / 30.0, rel=0.15)
 
 
@@ -92,6 +92,27 @@ def test_internal_short_of_a_simulated_pack_is_found_with_its_current_and_a_heal
 def test_other_self_discharge_is_not_reported(tmp_path, values):
     write(tmp_path, [make_hour("a", BEGIN, self_discharge_cell=1, **values)])
     assert run_query(tmp_path, "self-discharge").rows == []
+
+
+@pytest.mark.parametrize(("soc_per_day", "is_found"), [(0.01, True), (0.0005, False), (-0.01, False)])
+def test_falling_soc_of_the_weakest_cell_is_found_as_self_discharge(tmp_path, soc_per_day, is_found):
+    rng = np.random.default_rng(2)
+    rows = [
+        make_hour(
+            "a",
+            BEGIN + 24 * day,
+            weakest_cell=4,
+            weakest_cell_soc_deviation=-0.05 - soc_per_day * day + 0.0003 * rng.standard_normal(),
+        )
+        for day in range(10)
+    ]
+    write(tmp_path, rows[:5])
+    assert run_query(tmp_path, "self-discharge").rows == []  # fewer than 7 days
+    write(tmp_path, rows[5:])
+    found = run_query(tmp_path, "self-discharge").records
+    assert [(row["cell"], row["method"]) for row in found] == ([(4, "trend")] if is_found else [])
+    if is_found:
+        assert found[0]["self_discharge_ma"] == pytest.approx(1000 * 3.0 * 0.01 / 24, rel=0.05)
 
 
 def test_fleet_without_cell_voltages_has_no_rows(tmp_path):
