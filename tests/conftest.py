@@ -62,9 +62,11 @@ LONG_FILES = (
     "tests/cli/captures/test_replay.py",
     "tests/kernels/test_cache_folder.py",
     "tests/fleet/packs/test_erasure.py",
+    "tests/service/test_pack_model.py",
     "tests/estimator/test_faults.py",
     "tests/calibration/guided_test/test_guided_test.py",
     "tests/benchmarks/weeks/test_exported_file.py",
+    "tests/pack_model/test_learning.py",
     "tests/calibration/automatic/test_calibrate.py",
     "tests/fleet/page/test_browser.py",
     "tests/estimator/anywhere/test_anywhere.py",
@@ -72,13 +74,13 @@ LONG_FILES = (
     "tests/store/test_outage.py",
     "tests/kernels/observer/test_observer.py",
     "tests/pack_model/test_exchange.py",
+    "tests/page/test_setup.py",
+    "tests/reports/test_history_report.py",
     "tests/fleet/worker/test_full_stream.py",
     "tests/forecast/test_forecaster.py",
     "tests/fuzz/test_files.py",
     "tests/reports/thesis/test_errata.py",
     "tests/test_docs.py",
-    "tests/estimator/test_cell_estimator.py",
-    "tests/service/test_cell_alarms.py",
 )
 """Test files that take longest, by CPU time and waits. They run first, because otherwise one worker could still run one of them
 at the end."""
