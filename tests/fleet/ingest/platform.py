@@ -1,7 +1,9 @@
 """Telemetry platform: batches of a pack's samples, and a process of ``fleet ingest``."""
 
+import asyncio
 import contextlib
 import json
+import sqlite3
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from bms_estimator.fleet.ingest.ingest import Options, ingest
+from bms_estimator.fleet.ingest.ingest_store import FILE
 from bms_estimator.model.sample import SampleBlock
 from tests.command_line import PROGRAM, running_program
 from tests.fleet.workers import SAMPLES, samples, until
@@ -48,6 +52,40 @@ def arrow_bytes(table: pa.Table, **options: Any) -> bytes:
     return sink.getvalue().to_pybytes()
 
 
+def options(folder: Path, url: str, **more: Any) -> Options:
+    """Return the options of ``fleet ingest`` with their defaults."""
+    return Options(url, folder / "blocks", block_s=60.0, buffer_bytes=1 << 30, **more)
+
+
+@contextlib.asynccontextmanager
+async def ingesting(folder: Path, url: str, **more: Any) -> AsyncIterator[None]:
+    """Receive batches in this process, and stop at the end, so that open blocks are sent."""
+    stop = asyncio.Event()
+    task = asyncio.create_task(ingest(options(folder, url, **more), stop))
+    try:
+        yield
+    finally:
+        stop.set()
+        await task
+
+
+def select(folder: Path, query: str) -> list[int]:
+    """Return a column of the stored blocks' database; an empty list if there is no database yet."""
+    path = folder / "blocks" / FILE
+    with contextlib.suppress(sqlite3.OperationalError), contextlib.closing(_read_only(path)) as database:
+        return [value for (value,) in database.execute(query)]
+    return []
+
+
+def _read_only(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+
+
+async def until_stored(folder: Path, blocks: int) -> None:
+    """Wait until ``blocks`` blocks of the only pack were completed."""
+    await until(lambda: select(folder, "SELECT next FROM pack") == [blocks + 1], lambda: "the blocks are not stored")
+
+
 class IngestProcess:
     """Process of ``fleet ingest``."""
 
@@ -76,11 +114,11 @@ class IngestProcess:
 
 
 @contextlib.asynccontextmanager
-async def running_ingest(folder: Path, url: str, *options: object) -> AsyncIterator[IngestProcess]:
+async def running_ingest(folder: Path, url: str, *arguments: object) -> AsyncIterator[IngestProcess]:
     """Run ``fleet ingest``, and kill it at the end."""
     log = folder / "ingest.log"
     with log.open("a") as stderr:
         begin = stderr.tell()
-        command = (PROGRAM, "fleet", "ingest", "--server", url, "--folder", folder / "blocks", *options)
+        command = (PROGRAM, "fleet", "ingest", "--server", url, "--folder", folder / "blocks", *arguments)
         async with running_program(*command, stderr=stderr) as process:
             yield IngestProcess(process, log, begin)

@@ -14,11 +14,10 @@ from pyarrow import parquet
 from bms_estimator.fleet.ingest import backfill as backfill_module
 from bms_estimator.fleet.ingest.backfill import backfill
 from bms_estimator.fleet.ingest.batch_samples import BatchReader
-from bms_estimator.fleet.ingest.ingest import Options
 from bms_estimator.fleet.ingest.parquet_history import parquet_files, read_history
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from tests.fleet.ingest.platform import columns_of, running_ingest, samples_of
+from tests.fleet.ingest.platform import columns_of, options, running_ingest, samples_of
 from tests.fleet.ingest.worker_states import of_one_run, states, worker
 from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.workers import load_packs
@@ -51,16 +50,14 @@ async def test_interrupted_and_repeated_backfill_gives_the_states_of_one_run(
         both = np.concatenate([rows[pack][part] for pack in rows])
         write(tmp_path / "history" / f"{number}.parquet", both[::-1], pack=["p2"] * part.size + ["p1"] * part.size)
     blocks = await nc.subscribe("raw.*")
-    options = ("--parquet", tmp_path / "history")
     async with worker(cluster.url, 2 * COUNT):
-        async with running_ingest(tmp_path, cluster.url, *options) as ingest:
+        async with running_ingest(tmp_path, cluster.url, "--parquet", tmp_path / "history") as ingest:
             await blocks.next_msg(LONG_S)
             ingest.process.kill()
+            await ingest.process.wait()
         for _ in range(2):
-            async with running_ingest(tmp_path, cluster.url, *options) as ingest:
-                out, _ = await ingest.process.communicate()
-                assert ingest.process.returncode == 0
-        assert out.startswith(b"0 samples sent; 12,000 at or before the last stored time of their pack;")
+            summary = await backfill(options(tmp_path, cluster.url), [tmp_path / "history"], asyncio.Event())
+    assert summary.startswith("0 samples sent; 12,000 at or before the last stored time of their pack;")
     assert await states(nc, registry, *rows) == [of_one_run(registry, pack, rows[pack]) for pack in rows]
 
 
@@ -74,8 +71,7 @@ async def test_backfill_waits_for_confirmations(
     for name, value in values.items():
         monkeypatch.setattr(backfill_module, name, value)
     blocks = await nc.subscribe("raw.p1")
-    options = Options(cluster.url, tmp_path / "blocks", block_s=60.0, buffer_bytes=1 << 30)
-    running = asyncio.create_task(backfill(options, [tmp_path], asyncio.Event()))
+    running = asyncio.create_task(backfill(options(tmp_path, cluster.url), [tmp_path], asyncio.Event()))
     await blocks.next_msg(LONG_S)
     async with worker(cluster.url, 240):
         assert not running.done()  # 40 blocks, of which no worker has confirmed one

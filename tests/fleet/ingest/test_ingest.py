@@ -1,21 +1,20 @@
 """Batches that ``fleet ingest`` receives: the workers' states equal those of packs with edges."""
 
 import asyncio
-import sqlite3
-from contextlib import closing
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
 from nats.aio.client import Client
 from nats.js.errors import APIError
+from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.ingest.batch_reports import BatchReport
-from bms_estimator.fleet.ingest.ingest_store import FILE
 from bms_estimator.fleet.ingest.telemetry_reader import TelemetryReader
 from bms_estimator.fleet.nats.dead_letters import read_dead_letters, replay_letter
 from bms_estimator.fleet.nats.streams import make_telemetry_stream
@@ -24,7 +23,16 @@ from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.edge import EdgeSettings
-from tests.fleet.ingest.platform import START_S, json_batch, running_ingest, samples_of
+from bms_estimator.sources.captures.tables.layout import parse_column_map
+from tests.fleet.ingest.platform import (
+    START_S,
+    ingesting,
+    json_batch,
+    running_ingest,
+    samples_of,
+    select,
+    until_stored,
+)
 from tests.fleet.ingest.worker_states import PARTITIONS, of_one_run, states, worker
 from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.workers import end_states, load_packs, until
@@ -32,17 +40,13 @@ from tests.patience import LONG_S
 
 COUNT = 300
 """Number of samples of a pack."""
+BLOCK_SAMPLES = 6
+"""Number of samples of a block, which lasts a minute."""
 
 
 async def send(nc: Client, pack: str, batch: bytes) -> None:
     """Publish a batch, and wait until the server has stored it."""
     await nc.jetstream().publish(subjects.telemetry(pack), batch, timeout=LONG_S)
-
-
-def select(folder: Path, query: str) -> list[int]:
-    """Return a column of the database of ``fleet ingest``."""
-    with closing(sqlite3.connect(folder / "blocks" / FILE)) as database:
-        return [value for (value,) in database.execute(query)]
 
 
 async def send_by_edge(cluster: NatsCluster, folder: Path, pack: str, rows: SampleBlock) -> None:
@@ -63,15 +67,12 @@ async def test_states_of_packs_with_ingest_and_with_an_edge_are_equal(
 ) -> None:
     registry = await load_packs(nc, ["p1", "edge"])
     rows = samples_of("p1", COUNT)
-    async with running_ingest(tmp_path, cluster.url) as ingest:
-        await ingest.logged("ingested")
-        async with worker(cluster.url, 2 * COUNT):
-            await send_by_edge(cluster, tmp_path, "edge", rows.copy())
-            # overlapping, repeated and unsorted batches
-            for batch in (rows[:100], rows[:100], rows[50:200][::-1], np.concatenate([rows[200:], rows[200:210]])):
-                await send(nc, "p1", json_batch(batch))
-            await ingest.logged("samples of a batch are not stored")
-            assert await ingest.end() == 0
+    async with worker(cluster.url, 2 * COUNT), ingesting(tmp_path, cluster.url):
+        await send_by_edge(cluster, tmp_path, "edge", rows.copy())
+        # overlapping, repeated and unsorted batches
+        for batch in (rows[:100], rows[:100], rows[50:200][::-1], np.concatenate([rows[200:], rows[200:210]])):
+            await send(nc, "p1", json_batch(batch))
+        await until_stored(tmp_path, COUNT // BLOCK_SAMPLES - 1)
     by_ingest, by_edge = await states(nc, registry, "p1", "edge")
     assert by_ingest == by_edge == of_one_run(registry, "p1", rows)
 
@@ -105,16 +106,13 @@ async def test_kill_of_the_server_loses_no_sample_and_counts_none_twice(
 ) -> None:
     registry = await load_packs(nc, ["p1"])
     rows = samples_of("p1", COUNT)
-    async with running_ingest(tmp_path, cluster.url) as ingest, worker(cluster.url, COUNT):
-        await ingest.logged("ingested")
+    async with worker(cluster.url, COUNT), ingesting(tmp_path, cluster.url):
         for first in range(0, COUNT, 60):
             await send(nc, "p1", json_batch(rows[first : first + 60]))
             cluster.kill(0)
             await asyncio.to_thread(cluster.start, 0)
             await until(lambda: nc.is_connected, lambda: "no connection")
-        last = COUNT // 6 - 1  # the last six samples are in the open block
-        await until(lambda: select(tmp_path, "SELECT next FROM pack") == [last + 1], lambda: ingest.lines)
-        assert await ingest.end() == 0
+        await until_stored(tmp_path, COUNT // BLOCK_SAMPLES - 1)
     assert await states(nc, registry, "p1") == [of_one_run(registry, "p1", rows)]
 
 
@@ -123,18 +121,16 @@ async def test_missing_block_is_sent_again_and_confirmed_blocks_are_deleted(
 ) -> None:
     await load_packs(nc, ["p1"])
     blocks = await nc.subscribe("raw.p1")
-    async with running_ingest(tmp_path, cluster.url) as ingest:
-        await ingest.logged("ingested")
-        await send(nc, "p1", json_batch(samples_of("p1", 31)))  # five blocks of six samples, and an open one
+    async with ingesting(tmp_path, cluster.url):
+        await send(nc, "p1", json_batch(samples_of("p1", 5 * BLOCK_SAMPLES + 1)))
         received = [decode((await blocks.next_msg(LONG_S)).data) for _ in range(5)]
         assert [block.number for block in received] == [1, 2, 3, 4, 5]
         request = BlockRequest(store=received[0].store_created_ns, number=3, resend=True)
         await nc.publish(subjects.block_request("p1"), request.model_dump_json().encode())
         resent = [decode((await blocks.next_msg(LONG_S)).data) for _ in range(3)]
-        assert [(block.number, block.oldest) for block in resent] == [(3, 1), (4, 1), (5, 1)]
-        assert await ingest.end() == 0
-        last = decode((await blocks.next_msg(LONG_S)).data)
-        assert (last.number, last.oldest, last.samples.size) == (6, 3, 1)
+        assert [block.number for block in resent] == [3, 4, 5]
+    last = decode((await blocks.next_msg(LONG_S)).data)
+    assert (last.number, last.oldest, last.samples.size) == (6, 3, 1)
     assert select(tmp_path, "SELECT number FROM block") == [3, 4, 5, 6]
 
 
@@ -143,21 +139,16 @@ async def test_second_process_waits_and_continues_after_the_last_block_of_the_st
 ) -> None:
     registry = await load_packs(nc, ["p1"])
     rows = samples_of("p1", 60)
-    blocks = await nc.subscribe("raw.p1")
-    async with worker(cluster.url, 60):
-        # a batch of 30 samples makes four blocks of six, and at the end of the process a fifth one
-        folders = tmp_path / "first", tmp_path / "second"
-        for folder in folders:
-            folder.mkdir()
-        async with running_ingest(folders[0], cluster.url) as first:
-            await first.logged("ingested")
-            async with running_ingest(folders[1], cluster.url) as second:
-                reason = "another `fleet ingest` runs for this tenant: this one starts when it has ended"
-                await second.logged("waiting", reason=reason)
-                for process, last, sent in ((first, 30, 4), (second, 60, 9)):
-                    await send(nc, "p1", json_batch(rows[:last]))
-                    await until(lambda sent=sent: blocks.pending_msgs >= sent, lambda: blocks.pending_msgs)
-                    assert await process.end() == 0
+    first, second = tmp_path / "first", tmp_path / "second"
+    async with worker(cluster.url, 60), AsyncExitStack() as stack:
+        async with ingesting(first, cluster.url):
+            await send(nc, "p1", json_batch(rows[:30]))
+            await until_stored(first, 4)
+            with capture_logs() as lines:
+                await stack.enter_async_context(ingesting(second, cluster.url))
+                await until(lambda: "another `fleet ingest` runs" in str(lines), lambda: lines)
+        await send(nc, "p1", json_batch(rows))  # of which the first process has sent the first half
+        await until_stored(second, 4)
     partitions = await end_states(nc, registry, PARTITIONS)
     state = partitions[subjects.partition_of("p1", PARTITIONS)].state("p1")
     assert state is not None
@@ -167,28 +158,24 @@ async def test_second_process_waits_and_continues_after_the_last_block_of_the_st
 async def test_rejected_batch_is_reported_and_can_be_replayed(nc: Client, cluster: NatsCluster, tmp_path: Path) -> None:
     await load_packs(nc, ["p1", "p2"])
     reports = await nc.subscribe("ingest.*")
-    rows = samples_of("p1", 12)
+    rows = samples_of("p1", 2 * BLOCK_SAMPLES)
     batch = json_batch(rows).replace(b"voltage_v", b"U_pack")
-    async with running_ingest(tmp_path, cluster.url) as ingest:
+    async with ingesting(tmp_path, cluster.url):
         await send(nc, "p1", batch)
         await send(nc, "ghost", batch)
         received = [BatchReport.model_validate_json((await reports.next_msg(LONG_S)).data) for _ in "12"]
-        assert await ingest.end() == 0
     assert [report.pack for report in received] == ["p1", "ghost"]
     assert received[0].error.startswith("no column of voltage; found time_s, current_a, U_pack")
     assert received[1].error == UNKNOWN_PACK
     (letter,) = await read_dead_letters(nc)
     assert (letter.pack, letter.data, letter.reason) == ("p1", batch, received[0].error)
-    columns = "time=time_s,current=current_a,voltage=U_pack"
-    blocks = await nc.subscribe("raw.p1")
-    async with running_ingest(tmp_path, cluster.url, "--map", columns) as ingest:
+    column_map = parse_column_map("time=time_s,current=current_a,voltage=U_pack")
+    async with ingesting(tmp_path, cluster.url, column_map=column_map):
         await replay_letter(nc, letter)
-        block = decode((await blocks.next_msg(LONG_S)).data)
+        await until_stored(tmp_path, 1)
         await remove_keys(nc, subjects.PACKS_BUCKET, ["p1"])
-        await ingest.logged("a pack was removed from the table; its stored blocks are removed", pack="p1")
-        assert await ingest.end() == 0
-    assert block.samples["voltage_v"].tolist() == rows["voltage_v"][:6].tolist()
-    assert select(tmp_path, "SELECT number FROM block") == []
+        await until(lambda: select(tmp_path, "SELECT next FROM pack") == [], lambda: "the pack is not removed")
+        assert select(tmp_path, "SELECT number FROM block") == []
 
 
 async def test_recreated_stream_is_read_from_its_beginning_and_processed_batches_are_removed(nc: Client) -> None:

@@ -20,13 +20,13 @@ PARTITIONS = 2
 
 @asynccontextmanager
 async def worker(url: str, samples: int) -> AsyncIterator[None]:
-    """Run a worker in this process until it has processed ``samples`` samples, and stop it, so that it saves its states."""
+    """Run a worker in this process until it has processed ``samples`` samples, without repeated ones, and stop it, so that it saves its states."""
     nc, stop = await connected(url), asyncio.Event()
     async with Heartbeats(nc) as heartbeats:
         task = asyncio.create_task(work(Options(url, "w1", checkpoint_s=1.0), stop))
         try:
             yield
-            await heartbeats.until(lambda last: "w1" in last and last["w1"].samples >= samples)
+            await heartbeats.until(lambda last: "w1" in last and last["w1"].counters.get("samples", 0) >= samples)
         finally:
             stop.set()
             await task
