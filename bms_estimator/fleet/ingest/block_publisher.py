@@ -35,7 +35,7 @@ class BlockPublisher:
         sent: Id of the last block that the server has acknowledged.
 
     Attributes:
-        sent: As above, updated.
+        sent: As above, updated. The caller sets it to 0 to send all blocks again.
         published: Number of acknowledged blocks since the start, with repetitions.
         resends: Number of requests of workers.
     """
@@ -94,9 +94,11 @@ class BlockPublisher:
 
     async def _send_next(self) -> bool:
         """Send the next page of blocks. Return False if all blocks were sent."""
-        page = await self._database.call(BlockPage(PAGE_BLOCKS, after_id=self.sent))
+        sent = self.sent
+        page = await self._database.call(BlockPage(PAGE_BLOCKS, after_id=sent))
         await self._publish(page)
-        self.sent = page[-1].id if page else self.sent
+        if page and self.sent == sent:  # unless all blocks must be sent again
+            self.sent = page[-1].id
         return bool(page)
 
     async def _resend_requested(self) -> bool:

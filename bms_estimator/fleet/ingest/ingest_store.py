@@ -71,6 +71,7 @@ class IngestStore:
         self._first_unconfirmed: dict[str, int] = {}
         self._confirmed: dict[str, int] = {}  # numbers that the next transaction applies
         self._removed: set[str] = set()
+        self._open_count = 0  # value of database.open_count at the last transaction
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -78,6 +79,7 @@ class IngestStore:
         await self._database.__aenter__()
         state = await self._call_until_done(read_state)
         self.progress, self._first_unconfirmed = state.progress, state.oldest
+        self._open_count = self._database.open_count
         for pack, position in state.positions.items():
             self._open.set_position(pack, position)
         self.publisher = BlockPublisher(self._nc, self._database, state.progress.sent)
@@ -175,15 +177,23 @@ class IngestStore:
         confirmed, self._confirmed = self._confirmed, {}
         removed, self._removed = self._removed, set()
         progress = Progress(stream, first_open - 1, self.publisher.sent)
-        if not (blocks or confirmed or removed) and progress == self.progress:
+        if not (blocks or positions or confirmed or removed) and progress == self.progress:
             return
         dropped = await self._call_until_done(Changes(progress, blocks, positions, confirmed, removed))
         self.progress = progress
+        if self._open_count != self._database.open_count:
+            self._on_reopened()
         if dropped:
             log.warning("the oldest blocks are dropped, because workers do not confirm them", blocks=dropped)
             self.dropped += dropped
         if blocks:
             self.publisher.notify()
+
+    def _on_reopened(self) -> None:
+        """Write all positions and send all blocks again, because a damaged file was replaced by an empty one."""
+        self._open_count = self._database.open_count
+        self._open.changed = {pack: self._open.position(pack) for pack in self._open}
+        self.publisher.sent = 0
 
     async def send_remaining(self) -> None:
         """Wait until the server has all stored blocks, but at most ``HANDOVER_S``. The next run sends the others."""

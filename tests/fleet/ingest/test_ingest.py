@@ -15,6 +15,7 @@ from bms_estimator.edge.block import decode
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.ingest.batch_reports import BatchReport
+from bms_estimator.fleet.ingest.ingest_store import FILE
 from bms_estimator.fleet.ingest.telemetry_reader import TelemetryReader
 from bms_estimator.fleet.nats.dead_letters import read_dead_letters, replay_letter
 from bms_estimator.fleet.nats.streams import make_telemetry_stream
@@ -134,6 +135,26 @@ async def test_missing_block_is_sent_again_and_confirmed_blocks_are_deleted(
     assert select(tmp_path, "SELECT number FROM block") == [3, 4, 5, 6]
 
 
+async def test_damaged_file_is_replaced_and_later_samples_continue(
+    nc: Client, cluster: NatsCluster, tmp_path: Path
+) -> None:
+    registry = await load_packs(nc, ["p1", "p2"])
+    rows = {pack: samples_of(pack, 60) for pack in ("p1", "p2")}
+    garbage = tmp_path / "garbage"
+    garbage.write_bytes(b"garbage" * 1000)
+    async with worker(cluster.url, 120), ingesting(tmp_path, cluster.url):
+        await send(nc, "p2", json_batch(rows["p2"][:30]))
+        await send(nc, "p1", json_batch(rows["p1"][:30]))
+        await until(lambda: select(tmp_path, "SELECT next FROM pack") == [5, 5], lambda: "not stored")
+        garbage.replace(tmp_path / "blocks" / FILE)
+        await send(nc, "p1", json_batch(rows["p1"]))
+        # the file has the position of the other pack too
+        await until(lambda: select(tmp_path, "SELECT next FROM pack") == [10, 5], lambda: "not stored")
+        await send(nc, "p2", json_batch(rows["p2"]))
+        await until(lambda: select(tmp_path, "SELECT next FROM pack") == [10, 10], lambda: "not stored")
+    assert await states(nc, registry, *rows) == [of_one_run(registry, pack, rows[pack]) for pack in rows]
+
+
 async def test_second_process_waits_and_continues_after_the_last_block_of_the_stream(
     nc: Client, cluster: NatsCluster, tmp_path: Path
 ) -> None:
@@ -159,17 +180,17 @@ async def test_rejected_batch_is_reported_and_can_be_replayed(nc: Client, cluste
     await load_packs(nc, ["p1", "p2"])
     reports = await nc.subscribe("ingest.*")
     rows = samples_of("p1", 2 * BLOCK_SAMPLES)
-    batch = json_batch(rows).replace(b"voltage_v", b"U_pack")
+    batch = json_batch(rows).replace(b"voltage_v", "U_größe".encode())
     async with ingesting(tmp_path, cluster.url):
         await send(nc, "p1", batch)
         await send(nc, "ghost", batch)
         received = [BatchReport.model_validate_json((await reports.next_msg(LONG_S)).data) for _ in "12"]
     assert [report.pack for report in received] == ["p1", "ghost"]
-    assert received[0].error.startswith("no column of voltage; found time_s, current_a, U_pack")
+    assert received[0].error.startswith("no column of voltage; found time_s, current_a, U_größe")
     assert received[1].error == UNKNOWN_PACK
     (letter,) = await read_dead_letters(nc)
     assert (letter.pack, letter.data, letter.reason) == ("p1", batch, received[0].error)
-    column_map = parse_column_map("time=time_s,current=current_a,voltage=U_pack")
+    column_map = parse_column_map("time=time_s,current=current_a,voltage=U_größe")
     async with ingesting(tmp_path, cluster.url, column_map=column_map):
         await replay_letter(nc, letter)
         await until_stored(tmp_path, 1)
