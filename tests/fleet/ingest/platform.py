@@ -70,9 +70,9 @@ async def ingesting(folder: Path, url: str, **more: Any) -> AsyncIterator[None]:
 
 
 def select(folder: Path, query: str) -> list[int]:
-    """Return a column of the stored blocks' database; an empty list if there is no database yet."""
+    """Return a column of the stored blocks' database; an empty list without a readable database."""
     path = folder / "blocks" / FILE
-    with contextlib.suppress(sqlite3.OperationalError), contextlib.closing(_read_only(path)) as database:
+    with contextlib.suppress(sqlite3.DatabaseError), contextlib.closing(_read_only(path)) as database:
         return [value for (value,) in database.execute(query)]
     return []
 

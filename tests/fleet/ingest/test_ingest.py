@@ -146,6 +146,8 @@ async def test_damaged_file_is_replaced_and_later_samples_continue(
         await send(nc, "p2", json_batch(rows["p2"][:30]))
         await send(nc, "p1", json_batch(rows["p1"][:30]))
         await until(lambda: select(tmp_path, "SELECT next FROM pack") == [5, 5], lambda: "not stored")
+        for suffix in ("-wal", "-shm"):
+            (tmp_path / "blocks" / (FILE + suffix)).unlink()
         garbage.replace(tmp_path / "blocks" / FILE)
         await send(nc, "p1", json_batch(rows["p1"]))
         # the file has the position of the other pack too
