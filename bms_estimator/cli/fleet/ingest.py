@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
-from bms_estimator.cli.options.capture_options import MappedColumns, SignOfCurrent
+from bms_estimator.model.sample import CurrentSign
+from bms_estimator.sources.captures.tables.layout import ColumnMap, parse_column_map
 
 GB = 10**9
 """Gigabyte [bytes]."""
@@ -28,12 +29,29 @@ def ingest(
     parquet: Annotated[
         list[Path] | None,
         typer.Option(
+            metavar="PATH",
             help="Parquet file, or folder of such files, with the history of packs: send it and end; may be given several times",
             show_default=False,
         ),
     ] = None,
-    columns: MappedColumns = None,
-    current_sign: SignOfCurrent = None,
+    columns: Annotated[
+        ColumnMap | None,
+        typer.Option(
+            "--map",
+            parser=parse_column_map,
+            metavar="time=COLUMN,...",
+            help="columns with unknown names, for time, current, voltage and, optionally, temperature",
+            show_default=False,
+        ),
+    ] = None,
+    current_sign: Annotated[
+        CurrentSign | None,
+        typer.Option(
+            metavar="SIGN",
+            help="direction of positive current: discharge_positive or charge_positive; default: that of a recognized format, "
+            "otherwise discharge_positive",
+        ),
+    ] = None,
     block_s: Annotated[
         float,
         typer.Option(min=1.0, max=3600.0, help="duration of a block, which is sent to the workers as one message"),
