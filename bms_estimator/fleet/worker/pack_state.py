@@ -1,7 +1,8 @@
 """State of one pack in a worker: awaited block, totals, sums of the hour, estimator record, and estimators of single cells.
 
-The estimators of single cells follow the record of dtype ``PACK_STATE`` only if the pack's blocks have cell voltages. The record is stored packed (``kernels.packed_record``) in immutable bytes, so that a snapshot of a partition needs no
-copy. An edge's store is identified by its creation time [ns since 1970]; see ``edge.block``.
+The estimators of single cells follow the record of dtype ``PACK_STATE`` only if the pack's blocks have cell voltages. The
+record is stored packed (``kernels.packed_record``) in immutable bytes, so that a snapshot of a partition needs no copy. An
+edge's store is identified by its creation time [ns since 1970]; see ``edge.block``.
 """
 
 from collections.abc import Mapping

@@ -93,7 +93,8 @@ class SingleCells:
         """Return the fields of an hourly row; empty without an estimate.
 
         Args:
-            weakest: Number of the cell with the lowest mean voltage, from 1; None without cell voltages in this hour.
+            weakest: Number of the cell with the lowest mean voltage, from 1; None without cell voltages in this hour. Blocks of
+                another number of cells may give a larger number than the pack has.
         """
         d = self._deviations
         if d is None:
@@ -104,7 +105,7 @@ class SingleCells:
             "self_discharge_a": float(d.self_discharge_a[leaking]),
             "self_discharge_std_a": float(d.self_discharge_std_a[leaking]),
         }
-        if weakest is not None:
+        if weakest is not None and weakest <= d.soc.size:
             fields["weakest_cell_soc_deviation"] = float(d.soc_deviation[weakest - 1])
             fields["weakest_cell_resistance_ratio"] = float(d.resistance_ratio[weakest - 1])
         return fields

@@ -132,6 +132,18 @@ def test_hourly_row_has_the_estimates_of_the_weakest_and_of_the_leaking_cell(blo
     assert row.self_discharge_std_a == cells.deviations.self_discharge_std_a[leaking]
 
 
+def test_blocks_with_more_cells_than_the_pack_has_do_not_stop_it(blocks):
+    first, *others = blocks["b"]
+    surplus = np.full((60, 1), 3.0)
+    others = [replace(block, cells_v=np.hstack([block.cells_v, surplus])) for block in others]
+    partition, results = run(Partition(0, table), {"b": [first, *others]})
+    assert not any(result.failed for result in results)
+    ((_, data),) = [hour for result in results for hour in result.hours]
+    row = Hour.model_validate_json(data)
+    assert (row.weakest_cell, row.weakest_cell_soc_deviation) == (CELLS + 1, None)
+    assert partition.cells("b").size == CELLS
+
+
 def test_pack_without_cell_voltages_stores_and_publishes_nothing_of_cells(blocks):
     without = [replace(block, cells_v=NO_CELLS) for block in blocks["b"]]
     partition, results = run(Partition(0, table), {"a": without, "b": blocks["b"]})
