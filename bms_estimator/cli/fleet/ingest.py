@@ -64,7 +64,8 @@ def ingest(
 
     The platform publishes a batch, JSON or Arrow, on the NATS subject telemetry.PACK or the MQTT topic telemetry/PACK.
     """
-    from bms_estimator.fleet.ingest.ingest import Options, ingest  # noqa: PLC0415 - its packages are optional
+    from bms_estimator.fleet.ingest.ingest import ingest  # noqa: PLC0415 - its packages are optional
+    from bms_estimator.fleet.ingest.startup import Options  # noqa: PLC0415
     from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
     from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
 

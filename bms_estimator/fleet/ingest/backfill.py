@@ -9,9 +9,9 @@ from pathlib import Path
 import structlog
 
 from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples
-from bms_estimator.fleet.ingest.ingest import RETRY_S, RETRYABLE_ERRORS, Options, opened
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.ingest.parquet_history import PackBatch, parquet_files, read_history
+from bms_estimator.fleet.ingest.startup import RETRY_S, RETRYABLE_ERRORS, Options, opened
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.process.tasks import until_first_ends
