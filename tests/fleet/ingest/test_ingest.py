@@ -142,10 +142,13 @@ async def test_damaged_file_is_replaced_and_later_samples_continue(
     rows = {pack: samples_of(pack, 60) for pack in ("p1", "p2")}
     garbage = tmp_path / "garbage"
     garbage.write_bytes(b"garbage" * 1000)
+    blocks = await nc.subscribe("raw.*")
     async with worker(cluster.url, 120), ingesting(tmp_path, cluster.url):
         await send(nc, "p2", json_batch(rows["p2"][:30]))
         await send(nc, "p1", json_batch(rows["p1"][:30]))
         await until(lambda: select(tmp_path, "SELECT next FROM pack") == [5, 5], lambda: "not stored")
+        for _ in range(2 * 4):  # only blocks that are not sent yet are lost with the file
+            await blocks.next_msg(LONG_S)
         for suffix in ("-wal", "-shm"):
             (tmp_path / "blocks" / (FILE + suffix)).unlink()
         garbage.replace(tmp_path / "blocks" / FILE)

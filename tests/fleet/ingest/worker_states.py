@@ -20,7 +20,10 @@ PARTITIONS = 2
 
 @asynccontextmanager
 async def worker(url: str, samples: int) -> AsyncIterator[None]:
-    """Run a worker in this process until it has processed ``samples`` samples, without repeated ones, and stop it, so that it saves its states."""
+    """Run a worker in this process until it has processed ``samples`` samples; then stop it, so that it saves its states.
+
+    Repeated samples are not counted.
+    """
     nc, stop = await connected(url), asyncio.Event()
     async with Heartbeats(nc) as heartbeats:
         task = asyncio.create_task(work(Options(url, "w1", checkpoint_s=1.0), stop))
