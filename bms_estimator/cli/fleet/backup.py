@@ -23,7 +23,8 @@ def backup(
 ) -> None:
     """Write a backup of the streams of a tenant while server, workers and edges run. It needs admin.creds.
 
-    The backup contains samples, hourly summaries, dead letters, the table of packs and the checkpoints.
+    The backup contains samples, hourly summaries, dead letters, the table of packs and the checkpoints. It does not
+    contain batches that wait for `fleet ingest`.
     """
     asyncio.run(_back_up((server, creds, ca), folder, include or []))
 
