@@ -50,7 +50,7 @@ LONG_FILES = (
     "tests/deploy/test_wheel.py",
     "tests/telemetry/test_alarms.py",
     "tests/firmware/test_firmware.py",
-    "tests/fleet/simulation/test_demo.py",
+    "tests/fleet/demo/test_demo.py",
     "tests/fleet/worker/test_versions.py",
     "tests/fleet/worker/test_dead_letters.py",
     "tests/end_to_end/test_whole_way.py",
