@@ -25,7 +25,7 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     PartitionCheckpoint,
     read_checkpoint,
 )
-from bms_estimator.fleet.worker.checkpoint.record_layout import PreviousLayoutState, dtype_of
+from bms_estimator.fleet.worker.checkpoint.record_layout import RecordWithLayout, dtype_of
 from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
 from bms_estimator.fleet.worker.density import density_fault
 from bms_estimator.fleet.worker.edge_clock import Arrival
@@ -126,7 +126,7 @@ class Partition:
         self._counters: Counter[str] = Counter()
         self._packs: dict[str, bytes] = {}  # packs without single cells
         self._cell_packs: dict[str, CellPack] = {}
-        self._unmigrated: dict[str, PreviousLayoutState] = {}  # packs whose record still has a previous layout
+        self._unmigrated: dict[str, RecordWithLayout] = {}  # packs whose record still has a previous layout
         # delivery records of these packs, which only this process has updated since it restored the partition
         self._unmigrated_deliveries: dict[str, np.void] = {}
         self.deferred = Deferred()
@@ -162,7 +162,7 @@ class Partition:
         partition.sequence = checkpoint.sequence
         partition._counters.update(checkpoint.counters)
         partition._packs.update(checkpoint.packs)
-        for pack, state in checkpoint.unmigrated.items():
+        for pack, state in checkpoint.other_layouts.items():
             if cells := cell_count(state.layout):
                 partition._cell_packs[pack] = CellPack(cells, state.packed)
             else:
@@ -174,14 +174,14 @@ class Partition:
         """Return a snapshot of the partition. Records are not copied, because they are immutable bytes."""
         changed = self._unsaved.begin_save()
         with_cells = {
-            pack: PreviousLayoutState(cell_layout(cells), packed) for pack, (cells, packed) in self._cell_packs.items()
+            pack: RecordWithLayout(cell_layout(cells), packed) for pack, (cells, packed) in self._cell_packs.items()
         }
         return PartitionCheckpoint(
             number=self.number,
             sequence=self.sequence,
             counters=dict(self._counters),
             packs=dict(self._packs),
-            unmigrated=self._unmigrated | with_cells,
+            other_layouts=self._unmigrated | with_cells,
             deferred=self.deferred.spans(),
             in_force=dict(self._in_force),
             changed=changed,

@@ -91,7 +91,7 @@ def test_block_hour_and_state_with_cell_voltages_are_at_most_as_large_as_compute
         sizes.append(len(data))
         additional.append(len(data) - len(without_cells))
     snapshot = partition.snapshot()
-    state_bytes = (len(snapshot.unmigrated["with"].packed) - len(snapshot.packs["without"])) / cells
+    state_bytes = (len(snapshot.other_layouts["with"].packed) - len(snapshot.packs["without"])) / cells
     ((_, hour),) = hours
     sys.stdout.write(
         f"{cells} cells: block {np.mean(sizes):.0f}, of these {np.mean(additional):.0f} for the cells, "

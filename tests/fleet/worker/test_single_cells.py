@@ -149,7 +149,7 @@ def test_pack_without_cell_voltages_stores_and_publishes_nothing_of_cells(blocks
     partition, results = run(Partition(0, table), {"a": without, "b": blocks["b"]})
     assert partition.cells("a").size == 0
     snapshot = partition.snapshot()
-    assert (set(snapshot.packs), set(snapshot.unmigrated)) == ({"a"}, {"b"})
+    assert (set(snapshot.packs), set(snapshot.other_layouts)) == ({"a"}, {"b"})
     assert not any(result.cells for result in results if result.pack == "a")
     ((_, data),) = [hour for result in results if result.pack == "a" for hour in result.hours]
     assert b"cell_spread_v" not in data
@@ -168,7 +168,7 @@ def test_earlier_version_drops_the_cells_and_keeps_the_estimator(blocks, monkeyp
         for number, pack in enumerate(PACKS, 1 + partition.sequence):
             older.take(pack, encode(last[pack][0]), number)
         data = b"".join(older.snapshot().chunks())
-    assert older.snapshot().unmigrated == {}
+    assert older.snapshot().other_layouts == {}
     partition = Partition.restore(0, table, data)
     for offset in range(1, 10):
         for pack in PACKS:
@@ -183,7 +183,7 @@ def test_later_version_with_other_fields_keeps_the_cells(blocks, monkeypatch):
     partition, _ = run(Partition(0, table), blocks)
     monkeypatch.setattr(partition_module, "cell_count", lambda _: 0)  # the layout is not that of the later version
     later = restored(partition)
-    assert set(later.snapshot().unmigrated) == set(PACKS)
+    assert set(later.snapshot().other_layouts) == set(PACKS)
     before = {pack: partition.cells(pack).tobytes() for pack in PACKS}
     for pack in PACKS:  # a repeated block migrates the record
         later.take(pack, encode(blocks[pack][-1]), later.sequence + 1)

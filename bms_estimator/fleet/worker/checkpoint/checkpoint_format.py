@@ -31,7 +31,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from bms_estimator.fleet.packs.table_change import PackSource
-from bms_estimator.fleet.worker.checkpoint.record_layout import CURRENT_LAYOUT, PreviousLayoutState, dtype_of
+from bms_estimator.fleet.worker.checkpoint.record_layout import CURRENT_LAYOUT, RecordWithLayout, dtype_of
 from bms_estimator.fleet.worker.deferred import Span
 
 Header = dict[str, Any]
@@ -128,7 +128,7 @@ class PartitionCheckpoint:
         sequence: Stream sequence number of the last included message.
         counters: Counts by name.
         packs: Packed records in this version's layout, by pack.
-        unmigrated: Packed records in the layout of another version, or with single cells, by pack.
+        other_layouts: Packed records in the layout of another version, or with single cells, by pack.
         deferred: Deferred messages by pack, in the order in which the packs are served.
         in_force: Row and cell file of each pack at this position of the stream, for packs with processed blocks.
         increment: 0 if the records of all packs are contained; otherwise the number of the increment.
@@ -139,7 +139,7 @@ class PartitionCheckpoint:
     sequence: int
     counters: Mapping[str, int] = field(default_factory=dict)
     packs: Mapping[str, bytes] = field(default_factory=dict)
-    unmigrated: Mapping[str, PreviousLayoutState] = field(default_factory=dict)
+    other_layouts: Mapping[str, RecordWithLayout] = field(default_factory=dict)
     deferred: Mapping[str, Span] = field(default_factory=dict)
     in_force: Mapping[str, PackSource] = field(default_factory=dict)
     increment: int = 0
@@ -156,18 +156,18 @@ class PartitionCheckpoint:
             self,
             increment=number,
             packs={pack: self.packs[pack] for pack in changed if pack in self.packs},
-            unmigrated={pack: self.unmigrated[pack] for pack in changed if pack in self.unmigrated},
+            other_layouts={pack: self.other_layouts[pack] for pack in changed if pack in self.other_layouts},
         )
 
     def with_increment(self, increment: "PartitionCheckpoint") -> "PartitionCheckpoint":
         """Return the checkpoint of an increment and of the checkpoint before it, which is this one."""
-        packs = {pack: packed for pack, packed in self.packs.items() if pack not in increment.unmigrated}
-        unmigrated = {pack: state for pack, state in self.unmigrated.items() if pack not in increment.packs}
+        packs = {pack: packed for pack, packed in self.packs.items() if pack not in increment.other_layouts}
+        other_layouts = {pack: state for pack, state in self.other_layouts.items() if pack not in increment.packs}
         return replace(
             increment,
             increment=0,
             packs=packs | {**increment.packs},
-            unmigrated=unmigrated | {**increment.unmigrated},
+            other_layouts=other_layouts | {**increment.other_layouts},
         )
 
     def chunks(self, file_format: int | None = None) -> Iterator[bytes]:
@@ -177,7 +177,7 @@ class PartitionCheckpoint:
             file_format: Format to write, ``FORMAT`` or the one before it; None: ``FORMAT``.
         """
         file_format = file_format or FORMAT
-        layouts = list(dict.fromkeys([CURRENT_LAYOUT, *(each.layout for each in self.unmigrated.values())]))[
+        layouts = list(dict.fromkeys([CURRENT_LAYOUT, *(each.layout for each in self.other_layouts.values())]))[
             :_MAX_LAYOUTS
         ]
         sources = list(dict.fromkeys(self.in_force.values()))
@@ -191,7 +191,7 @@ class PartitionCheckpoint:
             "sources": sources,
             "in_force": {pack: indexes[source] for pack, source in self.in_force.items()},
             "layouts": [json.loads(layout) for layout in layouts],
-            "entries": len(self.packs) + len(self.unmigrated),
+            "entries": len(self.packs) + len(self.other_layouts),
         }
         if PREVIOUS and file_format < FORMAT:
             header = PREVIOUS.downgrade(header)
@@ -211,7 +211,7 @@ class PartitionCheckpoint:
         indexes = {layout: index for index, layout in enumerate(layouts)}
         for pack, packed in self.packs.items():
             yield _entry(indexes[CURRENT_LAYOUT], pack, packed)
-        for pack, state in self.unmigrated.items():
+        for pack, state in self.other_layouts.items():
             yield _entry(indexes[state.layout], pack, state.packed)
 
 
@@ -266,7 +266,7 @@ def _read(data: memoryview) -> tuple[PartitionCheckpoint, int]:
         if layout != CURRENT_LAYOUT:
             dtype_of(layout)
     packs: dict[str, bytes] = {}
-    unmigrated: dict[str, PreviousLayoutState] = {}
+    other_layouts: dict[str, RecordWithLayout] = {}
     entries, offset = 0, header_end
     while chunk := _read_chunk(data, offset):
         offset += _CHUNK_HEAD.size + len(chunk)
@@ -275,7 +275,7 @@ def _read(data: memoryview) -> tuple[PartitionCheckpoint, int]:
             if layouts[layout_index] == CURRENT_LAYOUT:
                 packs[pack] = packed
             else:
-                unmigrated[pack] = PreviousLayoutState(layouts[layout_index], packed)
+                other_layouts[pack] = RecordWithLayout(layouts[layout_index], packed)
     if entries != header["entries"]:
         raise CheckpointError(f"the checkpoint is damaged: {entries} of {header['entries']} entries")
     sources = [PackSource(str(row), cell if cell is None else str(cell)) for row, cell in header["sources"]]
@@ -284,7 +284,7 @@ def _read(data: memoryview) -> tuple[PartitionCheckpoint, int]:
         sequence=int(header["sequence"]),
         counters={str(name): int(count) for name, count in header["counters"].items()},
         packs=packs,
-        unmigrated=unmigrated,
+        other_layouts=other_layouts,
         deferred={str(pack): Span(int(first), int(last)) for pack, (first, last) in header["deferred"].items()},
         in_force={str(pack): sources[index] for pack, index in header["in_force"].items()},
         increment=int(header["increment"]),

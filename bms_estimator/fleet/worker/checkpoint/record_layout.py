@@ -15,7 +15,7 @@ _MAX_RECORD_BYTES = 1 << 24
 """Maximum size of a record that a layout from a checkpoint may describe [bytes]."""
 
 
-class PreviousLayoutState(NamedTuple):
+class RecordWithLayout(NamedTuple):
     """A pack's record in the layout of another version, or with single cells."""
 
     layout: str

@@ -23,7 +23,7 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
 )
 from bms_estimator.fleet.worker.checkpoint.record_layout import (
     CURRENT_LAYOUT,
-    PreviousLayoutState,
+    RecordWithLayout,
     dtype_of,
     layout_of,
 )
@@ -44,7 +44,7 @@ snapshots = st.builds(
     st.dictionaries(names, st.integers(0)),
     st.dictionaries(names, st.binary(max_size=40)),
     st.dictionaries(
-        names, st.builds(PreviousLayoutState, st.just(layout_of(np.dtype([("x", "<f8", (2,))]))), st.binary(max_size=9))
+        names, st.builds(RecordWithLayout, st.just(layout_of(np.dtype([("x", "<f8", (2,))]))), st.binary(max_size=9))
     ),
     st.dictionaries(names, st.builds(Span, st.integers(0, 2**63), st.integers(0, 2**63))),
     st.dictionaries(names, st.builds(PackSource, names, st.none() | names)),
@@ -63,11 +63,11 @@ def test_checkpoint_is_read_as_it_was_written(snapshot: PartitionCheckpoint) -> 
 
 @given(snapshots, snapshots, st.data())
 def test_increments_replace_the_records_of_the_changed_packs(before, after, data) -> None:
-    after = replace(after, packs={**before.packs, **after.packs}, unmigrated={})
+    after = replace(after, packs={**before.packs, **after.packs}, other_layouts={})
     changed = {pack for pack, packed in after.packs.items() if before.packs.get(pack) != packed}
     unchanged = data.draw(st.sets(st.sampled_from([*after.packs, "another"])))
-    increment = replace(after, changed=changed | unchanged | before.unmigrated.keys()).to_increment(1)
-    expected = replace(after, unmigrated={p: s for p, s in before.unmigrated.items() if p not in after.packs})
+    increment = replace(after, changed=changed | unchanged | before.other_layouts.keys()).to_increment(1)
+    expected = replace(after, other_layouts={p: s for p, s in before.other_layouts.items() if p not in after.packs})
     assert increment.packs.keys() >= changed
     assert read_checkpoint(to_bytes(replace(before, increment=0)) + to_bytes(increment)) == expected
 
@@ -189,14 +189,14 @@ def test_state_is_bit_identical_after_an_upgrade_that_changed_no_field_of_the_es
     for part in previous.record.dtype.names:
         for name in previous.record.dtype[part].names:
             previous.record[part][name] = state[part][name]
-    previous_state = PreviousLayoutState(layout_of(previous.record.dtype), previous.packed_bytes())
-    snapshot = replace(stream.partition.snapshot(), packs={}, unmigrated={"a": previous_state})
+    previous_record = RecordWithLayout(layout_of(previous.record.dtype), previous.packed_bytes())
+    snapshot = replace(stream.partition.snapshot(), packs={}, other_layouts={"a": previous_record})
     upgraded = Partition.restore(5, table, to_bytes(snapshot))
     assert upgraded.take("a", blocks[98], upgraded.sequence + 1).state is None  # it was processed before
     for data in blocks[100:]:
         for partition in (stream.partition, upgraded):
             partition.take("a", data, partition.sequence + 1)
-    assert upgraded.snapshot().unmigrated == {}
+    assert upgraded.snapshot().other_layouts == {}
     assert upgraded.state("a")["estimator"].tobytes() == stream.partition.state("a")["estimator"].tobytes()
     assert upgraded.state("a")["hour"].tobytes() == stream.partition.state("a")["hour"].tobytes()
 
@@ -220,9 +220,9 @@ class TestPreviousLayout:
             for name in set(dtype[part].names) & set(PACK_STATE[part].names):
                 work.record[part][name] = state[part][name]
         work.record["delivery"]["once_known"] = 7
-        previous_state = PreviousLayoutState(layout_of(dtype), work.packed_bytes())
+        previous_record = RecordWithLayout(layout_of(dtype), work.packed_bytes())
         snapshot = stream.partition.snapshot()
-        return stream, to_bytes(replace(snapshot, packs={}, unmigrated={"a": previous_state}))
+        return stream, to_bytes(replace(snapshot, packs={}, other_layouts={"a": previous_record}))
 
     def test_next_block_migrates_the_record_by_field_names(self, previous_layout, samples) -> None:
         stream, data = previous_layout
@@ -238,7 +238,7 @@ class TestPreviousLayout:
         assert estimate.soc_std < 0.05
         assert estimate.charge_out_ah == pytest.approx(expected.charge_out_ah)
         assert migrated.counters["taken_over"] == 1
-        assert migrated.snapshot().unmigrated == {}
+        assert migrated.snapshot().other_layouts == {}
 
     def test_record_keeps_its_layout_until_a_block_is_processed(self, previous_layout, samples) -> None:
         _, data = previous_layout
@@ -249,7 +249,7 @@ class TestPreviousLayout:
         partition.mark_saved(is_whole=True)
         assert partition.take("a", blocks[155], partition.sequence + 1).reply.number == 3000 // SAMPLES + 1
         assert partition.counters["packs"] == 1
-        assert partition.snapshot().unmigrated == read_checkpoint(data).unmigrated
+        assert partition.snapshot().other_layouts == read_checkpoint(data).other_layouts
         restored = Partition.restore(5, table, to_bytes(partition.snapshot()))
         assert restored.take("a", blocks[150], restored.sequence + 1).state
 
@@ -260,7 +260,7 @@ class TestPreviousLayout:
         states = [partition.take("a", early_block, partition.sequence + 1).state for _ in range(MAX_EARLY_REPEATS)]
         assert [state is None for state in states] == (MAX_EARLY_REPEATS - 1) * [True] + [False]
         assert partition.counters["lost_blocks"] == 1
-        assert partition.snapshot().unmigrated == {}
+        assert partition.snapshot().other_layouts == {}
 
     def test_record_is_migrated_after_a_lost_and_a_rejected_block(self, previous_layout, samples, monkeypatch) -> None:
         _, data = previous_layout
@@ -274,7 +274,7 @@ class TestPreviousLayout:
         assert (partition.counters["lost_blocks"], partition.counters["too_dense"]) == (1, 1)
 
     def test_record_that_does_not_fit_its_layout_is_reset(self, samples) -> None:
-        previous_state = PreviousLayoutState(layout_of(np.dtype([("x", "<f8")])), b"1234567")
-        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, unmigrated={"a": previous_state})))
+        previous_record = RecordWithLayout(layout_of(np.dtype([("x", "<f8")])), b"1234567")
+        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, other_layouts={"a": previous_record})))
         assert partition.take("a", blocks_of(samples)[0], 1).state
         assert partition.counters["damaged_states"] == 1
