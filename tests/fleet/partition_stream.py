@@ -3,7 +3,8 @@
 import numpy as np
 
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.fleet.worker.partition import BlockResult, Partition
+from bms_estimator.fleet.worker.block_result import BlockResult
+from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import PackSettings, Settings
@@ -51,7 +52,7 @@ class Stream:
     def take_deferred(self, max_messages: int = 10_000) -> list[BlockResult]:
         """Process deferred messages of known packs, one message of each pack in turn."""
         results: list[BlockResult] = []
-        while len(results) < max_messages and (entry := self.partition.deferred.next(self.partition.is_known)):
+        while len(results) < max_messages and (entry := self.partition.deferred.next(self.partition.in_force.is_known)):
             pack, span = entry
             messages = enumerate(self.messages, 1)
             data, sequence = next((data, n) for n, (sender, data) in messages if sender == pack and n >= span.first)
@@ -72,7 +73,7 @@ class Stream:
         """Restore the partition from a snapshot, as another worker does."""
         partition = self.partition
         data = b"".join(partition.snapshot().chunks())
-        self.partition = Partition.restore(partition.number, partition._table, data)
+        self.partition = Partition.restore(partition.number, partition.in_force._table, data)
 
 
 def deliver(stream: Stream, pack: str, blocks: list[bytes], first: int = 1) -> None:

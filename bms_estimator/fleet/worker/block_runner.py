@@ -12,8 +12,9 @@ from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.packs.table_change import is_change
+from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, BlockResult
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
-from bms_estimator.fleet.worker.partition import INTERNAL_ERROR, BlockResult, Partition
+from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage
 from bms_estimator.fleet.worker.replay_guard import ReplayGuard
 from bms_estimator.fleet.worker.result_publisher import ResultPublisher

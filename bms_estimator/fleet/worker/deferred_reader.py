@@ -58,7 +58,7 @@ class DeferredReader:
     def _is_due(self, pack: str) -> bool:
         """Return True if a deferred pack is known and within its budget, or if no other pack needs the processor."""
         partition = self._owned_partition()
-        is_known = partition is not None and partition.is_known(pack)
+        is_known = partition is not None and partition.in_force.is_known(pack)
         return is_known and not (self._runner.budget.is_exhausted(pack) and self._is_busy())
 
     async def _process(self, partition: Partition, pack: str, span: Span) -> None:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import aclosing
 from functools import partial
+from typing import TYPE_CHECKING
 
 import structlog
 from nats.aio.client import Client
@@ -28,14 +29,18 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointSto
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, FencedError
 from bms_estimator.fleet.worker.deferred_reader import DeferredReader
 from bms_estimator.fleet.worker.delivered_messages import SILENCE_S, DeliveredMessages
-from bms_estimator.fleet.worker.partition import BlockResult, PackLookup, PackSources, Partition
+from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.partition_restore import restore_partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
 from bms_estimator.fleet.worker.replay_guard import ReplayGuard
 from bms_estimator.fleet.worker.result_publisher import ResultPublisher, merge
 from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
 from bms_estimator.fleet.worker.table_change_sender import TableChangeSender
+from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 from bms_estimator.process.tasks import until_first_ends
+
+if TYPE_CHECKING:
+    from bms_estimator.fleet.worker.block_result import BlockResult
 
 IDLE_SILENCE_S = 5.0 * SILENCE_S
 """Interval between two searches while the stream has no further messages [s]."""
@@ -230,8 +235,8 @@ class PartitionLease:
     def settings_changed(self, pack: str) -> None:
         """Handle a changed or new row of the table of packs."""
         if self.partition:
-            if pack not in self.partition.in_force:  # a row in force changes only by a message of the stream
-                self.partition.settings_changed(pack)
+            if pack not in self.partition.in_force.rows:  # a row in force changes only by a message of the stream
+                self.partition.in_force.settings_changed(pack)
             self._changes.add(pack)
             self._deferred.wake_up()
 
@@ -278,7 +283,7 @@ class PartitionLease:
             replay_end = await self._last_partition_sequence()
             await self._guard.begin(claim, replay_end)
             self.partition, self.claim, self.restored_counters = partition, claim, partition.counters
-            self._changes.begin(partition.in_force, replay_end)
+            self._changes.begin(partition.in_force.rows, replay_end)
             self._deferred.wake_up()
         last_sequence = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
         if partition.sequence > last_sequence:

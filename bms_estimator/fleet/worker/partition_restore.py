@@ -7,7 +7,8 @@ import structlog
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.claims import Claim
-from bms_estimator.fleet.worker.partition import PackLookup, PackSources, Partition
+from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 
 log = structlog.get_logger(__name__)
 

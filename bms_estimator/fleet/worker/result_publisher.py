@@ -12,7 +12,7 @@ from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
-from bms_estimator.fleet.worker.partition import BlockResult
+from bms_estimator.fleet.worker.block_result import BlockResult
 
 MAX_PENDING_SUMMARIES = 128
 """Maximum number of published summaries that wait for the server's acknowledgment."""

@@ -59,6 +59,6 @@ class TableChangeSender:
 
     async def _send(self, partition: Partition, pack: str) -> None:
         """Send the row of a pack if it differs from the one in force."""
-        change = partition.table_change(pack)
+        change = partition.in_force.table_change(pack)
         if change is not None:
             await self._nc.jetstream().publish(subjects.table_change(pack), change)

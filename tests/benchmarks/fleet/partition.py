@@ -89,9 +89,9 @@ def _block_us(partition: Partition, blocks: list[bytes]) -> float:
 
 def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) -> Iterator[tuple[str, float]]:
     """Yield the time of each part, on the state before the last block [us]."""
-    unpacked, pack_type = partition._unpacked, partition._type_by_pack["pack0"]
+    unpacked, pack_type = partition._records.unpacked, partition.in_force._type_by_pack["pack0"]
     estimator, wall_s = pack_type.estimator, STORE_ID / 1e9 + samples.size
-    packed, block, window = partition._packs["pack0"], decode(blocks[-1]), Window()
+    packed, block, window = partition._records._packs["pack0"], decode(blocks[-1]), Window()
     unpacked.load(packed)
     values = unknown_values()
     before, trace = estimator.record.copy(), estimator.run(block.samples).copy()

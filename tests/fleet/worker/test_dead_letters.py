@@ -9,7 +9,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters, replay_letter
-from bms_estimator.fleet.worker.partition import LETHAL
+from bms_estimator.fleet.worker.block_result import LETHAL
 from tests.command_line import PROGRAM, running_program
 from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.worker import later_blocks, lethal_block

@@ -446,7 +446,7 @@ class TestChangedSettings:
         self.send_blocks(stream, samples, 0, 20)
         other_cell = load_cell("ncr18650", 4.0)  # a capacity of 4 Ah
         packs["a"] = SETTINGS, other_cell
-        stream.partition.settings_changed("a")
+        stream.partition.in_force.settings_changed("a")
         self.send_blocks(stream, samples, 20, 30)
         estimator = make_estimator(SETTINGS, other_cell)
         estimator.run(samples[400:600])
@@ -464,7 +464,7 @@ class TestChangedSettings:
         if is_taken_over:  # a new owner reads the new settings at once
             stream.take_over()
         else:
-            stream.partition.settings_changed("a")
+            stream.partition.in_force.settings_changed("a")
         stream.send("a", blocks_of(samples)[3])  # it was processed before, and migrates nothing
         result = self.send_blocks(stream, samples, 20, 21)
         state = Estimate.model_validate_json(result.state)
@@ -479,10 +479,10 @@ class TestChangedSettings:
         stream = Stream(Partition(5, packs.get))
         self.send_blocks(stream, samples, 0, 10)
         row = packs.pop("a")
-        stream.partition.settings_changed("a")
+        stream.partition.in_force.settings_changed("a")
         assert self.send_blocks(stream, samples, 10, 20).state is None
         packs["a"] = row
-        stream.partition.settings_changed("a")
+        stream.partition.in_force.settings_changed("a")
         assert len(stream.take_deferred()) == 10
         assert_state_equals(stream, "a", record_of_one_run(samples[:400]))
 

@@ -13,9 +13,9 @@ from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
-from bms_estimator.fleet.worker.partition import PackLookup
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
+from bms_estimator.fleet.worker.table_in_force import PackLookup
 from bms_estimator.fleet.worker.worker import Options, work
 from bms_estimator.process.tasks import until_first_ends
 from tests.fleet.nats_cluster import running

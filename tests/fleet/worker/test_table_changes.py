@@ -53,7 +53,7 @@ def messages() -> list[bytes]:
     partition = partition_of(registry)
     partition.take("p1", block("p1", 1), 1)
     registry.set_row("p1", CHANGED_ROW)
-    change = partition.table_change("p1")
+    change = partition.in_force.table_change("p1")
     assert change is not None
     return [block("p1", 1), block("p1", 2), change, block("p1", 3)]
 
@@ -90,7 +90,7 @@ def test_changed_row_takes_effect_at_its_message_and_not_before(messages: list[b
     for sequence, message in enumerate(messages[1:], 2):
         partition.take("p1", message, sequence)
     assert estimator_state(partition) == expected
-    assert partition.table_change("p1") is None  # it is in force
+    assert partition.in_force.table_change("p1") is None  # it is in force
 
 
 @pytest.mark.parametrize("saved_after", [1, 2, 3])
@@ -114,10 +114,10 @@ def test_removed_pack_is_unknown_from_its_message_on() -> None:
     partition = partition_of(registry)
     partition.take("p1", block("p1", 1), 1)
     registry.set_row("p1", None)
-    change = partition.table_change("p1")
+    change = partition.in_force.table_change("p1")
     assert change is not None
     assert decode_change(change) is None
-    assert partition.is_known("p1")
+    assert partition.in_force.is_known("p1")
     partition.take("p1", change, 2)
     partition.take("p1", block("p1", 2), 3)
     assert partition.unknown == ("p1",)

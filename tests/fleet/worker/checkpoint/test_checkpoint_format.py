@@ -275,6 +275,8 @@ class TestPreviousLayout:
 
     def test_record_that_does_not_fit_its_layout_is_reset(self, samples) -> None:
         previous_record = RecordWithLayout(layout_of(np.dtype([("x", "<f8")])), b"1234567")
-        partition = Partition.restore(5, table, to_bytes(PartitionCheckpoint(5, 0, other_layouts={"a": previous_record})))
+        partition = Partition.restore(
+            5, table, to_bytes(PartitionCheckpoint(5, 0, other_layouts={"a": previous_record}))
+        )
         assert partition.take("a", blocks_of(samples)[0], 1).state
         assert partition.counters["damaged_states"] == 1
