@@ -15,8 +15,8 @@ from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 
 OBSERVED_PACKS = 100
 """Number of packs whose estimates are compared with the true SOC."""
-IN_STREAM = ("blocks", "resends", "gaps", "damaged")
-"""Counters of the partitions whose sum is the number of blocks that workers have read from the stream."""
+READ_COUNTERS = ("blocks", "resends", "gaps", "damaged")
+"""Counters whose sum is the number of blocks that workers have read from the stream."""
 
 
 @dataclass
@@ -76,7 +76,7 @@ class Observer:
     def read_blocks(self) -> int:
         """Number of blocks that workers have read from the stream, without repetitions after the kill."""
         counters = self.counters
-        return sum(counters[name] for name in IN_STREAM)
+        return sum(counters[name] for name in READ_COUNTERS)
 
     def clock_error_s(self, pack: str) -> float | None:
         """Return the error of the clock of a pack's edge [s]; None if no live worker reports one."""

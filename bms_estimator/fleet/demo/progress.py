@@ -16,8 +16,8 @@ INTERVAL_S = 5.0
 HEADING = "    time   blocks/s      lag   SOC error   partitions"
 
 
-class _Position(NamedTuple):
-    """Numbers of values that the previous rows have shown."""
+class _RowEnd(NamedTuple):
+    """Time at the end of a row, and numbers of the values received until then."""
 
     elapsed_s: float
     processed: int
@@ -36,7 +36,7 @@ class Progress:
     def __init__(self, observer: Observer, report: Callable[[str], object]) -> None:
         self._observer, self._report = observer, report
         self._begin_s = time.monotonic()
-        self._shown = _Position(0.0, 0, 0, 0)
+        self._last_row_end = _RowEnd(0.0, 0, 0, 0)
 
     @property
     def elapsed_s(self) -> float:
@@ -50,23 +50,23 @@ class Progress:
             UserError: A process has ended.
         """
         self._report(HEADING)
-        self._shown = self._position()
-        end_s = max(until_s, self._shown.elapsed_s + HEARTBEAT_S)  # each row needs a heartbeat
-        while end_s - self._shown.elapsed_s > HEARTBEAT_S / 2.0:
-            row_s = min(self._shown.elapsed_s + INTERVAL_S, end_s)
+        self._last_row_end = self._row_end()
+        end_s = max(until_s, self._last_row_end.elapsed_s + HEARTBEAT_S)  # each row needs a heartbeat
+        while end_s - self._last_row_end.elapsed_s > HEARTBEAT_S / 2.0:
+            row_s = min(self._last_row_end.elapsed_s + INTERVAL_S, end_s)
             while self.elapsed_s < row_s:
                 processes.check()
                 await asyncio.sleep(POLL_S)
             self._report(self._row())
 
-    def _position(self) -> _Position:
+    def _row_end(self) -> _RowEnd:
         observer = self._observer
-        return _Position(self.elapsed_s, observer.processed, len(observer.lags_s), len(observer.errors))
+        return _RowEnd(self.elapsed_s, observer.processed, len(observer.lags_s), len(observer.errors))
 
     def _row(self) -> str:
         """Return the row of the time since the previous one."""
-        observer, before, now = self._observer, self._shown, self._position()
-        self._shown = now
+        observer, before, now = self._observer, self._last_row_end, self._row_end()
+        self._last_row_end = now
         rate = (now.processed - before.processed) / (now.elapsed_s - before.elapsed_s)
         lag_s = max(observer.lags_s[before.lags :], default=0.0)
         errors = observer.errors[before.errors :]

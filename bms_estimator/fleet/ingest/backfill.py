@@ -1,4 +1,4 @@
-"""Intake of the history of packs from Parquet files, as fast as the workers process it."""
+"""Backfill: the history of packs from Parquet files, sent as fast as the workers process it."""
 
 import asyncio
 import time
@@ -11,17 +11,17 @@ import structlog
 from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.ingest.parquet_history import PackBatch, parquet_files, read_history
-from bms_estimator.fleet.ingest.startup import RETRY_S, RETRYABLE_ERRORS, Options, opened
+from bms_estimator.fleet.ingest.startup import RETRY_S, RETRYABLE_ERRORS, Options, open_ingest
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.process.tasks import until_first_ends
 
 PART_SAMPLES = 4096
 """Maximum number of samples that are added at a time, and therefore of blocks."""
-MAX_PACK_BLOCKS = 5000
-"""Number of unconfirmed blocks of a pack at which the backfill waits. With ``PART_SAMPLES`` more, the server and the store still
-hold all of them."""
-MAX_BLOCKS = 1_000_000
+MAX_UNCONFIRMED_OF_PACK = 5000
+"""Number of unconfirmed blocks of a pack at which the backfill waits. ``PART_SAMPLES`` more blocks may follow. The sum is below
+``store_table.MAX_PACK_BLOCKS``, so that none is dropped."""
+MAX_UNCONFIRMED = 1_000_000
 """Number of unconfirmed blocks of all packs at which the backfill waits: 0.6 GB of minute blocks at 1 Hz."""
 SAVE_SAMPLES = 10_000
 """Number of samples after which they are written to disk."""
@@ -43,7 +43,7 @@ async def backfill(options: Options, paths: list[Path], stop: asyncio.Event) -> 
     """
     files = parquet_files(paths)
     reader = BatchReader(options.column_map, options.current_sign)
-    async with opened(options, stop) as started:
+    async with open_ingest(options, stop) as started:
         if started is None:
             return "stopped before the server responded"
         _, store, bucket = started
@@ -94,7 +94,7 @@ class Backfill:
             if pack not in self._store:
                 await self._add_pack(pack)
             for first in range(0, batch.samples.size, PART_SAMPLES):
-                await self._wait_for_room(pack)
+                await self._wait_for_confirmations(pack)
                 if self._stop.is_set():
                     break
                 part = slice(first, first + PART_SAMPLES)
@@ -133,10 +133,10 @@ class Backfill:
             self._progress_s = time.monotonic() + PROGRESS_S
             log.info("backfill", **self._counters, unconfirmed=self._store.unconfirmed)
 
-    async def _wait_for_room(self, pack: str) -> None:
-        """Wait until workers have confirmed enough blocks."""
+    async def _wait_for_confirmations(self, pack: str) -> None:
+        """Wait until workers have confirmed so many blocks that further samples may be added."""
         request_s = time.monotonic() + REQUEST_S
-        while not self._stop.is_set() and not self._has_room(pack):
+        while not self._stop.is_set() and not self._may_add(pack):
             await self._save()
             if time.monotonic() >= request_s:
                 request_s = time.monotonic() + REQUEST_S
@@ -144,5 +144,5 @@ class Backfill:
                     await self._store.request_confirmation(each)
             await asyncio.sleep(WAIT_S)
 
-    def _has_room(self, pack: str) -> bool:
-        return self._store.unconfirmed_of(pack) < MAX_PACK_BLOCKS and self._store.unconfirmed < MAX_BLOCKS
+    def _may_add(self, pack: str) -> bool:
+        return self._store.unconfirmed_of(pack) < MAX_UNCONFIRMED_OF_PACK and self._store.unconfirmed < MAX_UNCONFIRMED

@@ -36,7 +36,11 @@ def decode_batch(payload: bytes) -> BatchColumns:
 
 
 def _columns_of_object(document: object) -> BatchColumns:
-    """Return the columns of an object. Its other values are ignored if it has enough lists for a sample, and else it is a row."""
+    """Return the columns of an object.
+
+    An object with enough lists for a sample has one list for each column, and its other values are ignored. Any other object is
+    one row.
+    """
     if not isinstance(document, dict) or not document:
         raise BatchError("must be an object of columns or a list of rows")
     lists = {name: values for name, values in document.items() if isinstance(values, list)}

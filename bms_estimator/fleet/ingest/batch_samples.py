@@ -41,11 +41,12 @@ from bms_estimator.sources.captures.tables.units import Unit, find_unit, split_u
 MIN_TIME_S = 946_684_800.0
 """Earliest plausible timestamp: 2000-01-01 [s since 1970]."""
 MAX_LAYOUTS = 256
-"""Maximum number of remembered headers."""
+"""Maximum number of headers whose layout is cached."""
 CELLS = "cells"
 """Name of the column with a list of cell voltages in each row, without its unit. Instead, each cell may have a column
 ``cell_1_v``, ``cell_2_v`` and so on."""
-_TEXT = "the batch"
+_TABLE_NAME = "the batch"
+"""Name of a batch in the errors of ``LayoutFinder``; removed from them."""
 _NUMBERS = {int, float, NoneType}
 
 
@@ -89,7 +90,7 @@ class BatchReader:
     """Converter of columns to samples.
 
     Args:
-        column_map: Names of columns that the operator gave; without them the columns are recognized.
+        column_map: Configured names of columns; None: the columns are recognized.
         current_sign: Direction of positive current in the batches; None: that of a recognized format, otherwise positive on
             discharge.
     """
@@ -142,7 +143,7 @@ class BatchReader:
         Raises:
             UserError: A column is missing.
         """
-        finder = LayoutFinder(_TEXT, self._column_map)
+        finder = LayoutFinder(_TABLE_NAME, self._column_map)
         layout = finder.find(header)
         if layout is None:
             raise finder.no_header()
@@ -165,7 +166,7 @@ class BatchReader:
 
 
 def _reason(error: UserError) -> str:
-    return str(error).removeprefix(f"{_TEXT}: ")
+    return str(error).removeprefix(f"{_TABLE_NAME}: ")
 
 
 def select_new(batch: BatchSamples, last_s: float, now_s: float) -> Selection:
@@ -209,7 +210,7 @@ def _floats(column: Column, values: Values) -> NDArray[np.float64]:
         return values.astype(np.float64)
     if column.kind is CellKind.DATE_TIME:
         _check_each(column.name, values, str, column.kind.value)
-        return parse_column(_TEXT, column, list(values))
+        return parse_column(_TABLE_NAME, column, list(values))
     if not set(map(type, values)) <= _NUMBERS:
         _check_each(column.name, values, (int, float), "number")
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)

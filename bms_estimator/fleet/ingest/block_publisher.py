@@ -35,9 +35,9 @@ class BlockPublisher:
         sent: Id of the last block that the server has acknowledged.
 
     Attributes:
-        sent: As above, updated. The caller sets it to 0 to send all blocks again.
+        sent: Id of the last acknowledged block. The caller sets it to 0 to send all blocks again.
         published: Number of acknowledged blocks since the start, with repetitions.
-        resends: Number of requests of workers.
+        resends: Number of requests of workers to send blocks again.
     """
 
     def __init__(self, nc: Client, database: Database, sent: int) -> None:

@@ -10,7 +10,7 @@ from bms_estimator.fleet.ingest.batch_decoder import decode_batch
 from bms_estimator.fleet.ingest.batch_reports import BatchReport, BatchReports
 from bms_estimator.fleet.ingest.batch_samples import BatchReader
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
-from bms_estimator.fleet.ingest.startup import NAME, RETRY_S, RETRYABLE_ERRORS, Options, opened
+from bms_estimator.fleet.ingest.startup import NAME, RETRY_S, RETRYABLE_ERRORS, Options, open_ingest
 from bms_estimator.fleet.ingest.telemetry_reader import TelemetryReader
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
@@ -38,7 +38,7 @@ async def ingest(options: Options, stop: asyncio.Event) -> None:
     Raises:
         UserError: An option cannot be used, or another process uses the folder.
     """
-    async with opened(options, stop) as started:
+    async with open_ingest(options, stop) as started:
         if started is not None:
             nc, store, bucket = started
             reader = BatchReader(options.column_map, options.current_sign)

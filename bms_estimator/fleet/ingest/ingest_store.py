@@ -47,7 +47,7 @@ log = structlog.get_logger(__name__)
 
 
 class IngestStore:
-    """Edge of many packs: divides their samples into blocks, stores and sends these, and receives confirmations.
+    """Edge of many packs, which divides their samples into blocks, stores and sends the blocks, and receives confirmations.
 
     Args:
         nc: Connection to the tenant's NATS account, which reconnects.
@@ -58,7 +58,7 @@ class IngestStore:
     Attributes:
         publisher: Publisher of the blocks.
         progress: Progress in the stream ``TELEMETRY``, as stored.
-        dropped: Number of blocks dropped, because workers did not confirm them.
+        dropped: Number of blocks that were dropped, because workers did not confirm them.
     """
 
     publisher: BlockPublisher
@@ -67,11 +67,11 @@ class IngestStore:
     def __init__(self, nc: Client, folder: Path, partitions: int, block_s: float) -> None:
         self._nc, self._partitions, self.dropped = nc, partitions, 0
         self._database = Database(folder / FILE, tables=INGEST_TABLES, sync_s=0.0, retry_s=RETRY_S)
-        self._open = OpenBlocks(block_s)
+        self._open_blocks = OpenBlocks(block_s)
         self._first_unconfirmed: dict[str, int] = {}
         self._confirmed: dict[str, int] = {}  # numbers that the next transaction applies
         self._removed: set[str] = set()
-        self._open_count = 0  # value of database.open_count at the last transaction
+        self._file_count = 0  # ``Database.open_count`` at the last transaction
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -79,9 +79,9 @@ class IngestStore:
         await self._database.__aenter__()
         state = await self._call_until_done(read_state)
         self.progress, self._first_unconfirmed = state.progress, state.oldest
-        self._open_count = self._database.open_count
+        self._file_count = self._database.open_count
         for pack, position in state.positions.items():
-            self._open.set_position(pack, position)
+            self._open_blocks.set_position(pack, position)
         self.publisher = BlockPublisher(self._nc, self._database, state.progress.sent)
         await self._nc.subscribe(subjects.block_request(), cb=self._receive)
         self._task = asyncio.create_task(self.publisher.run(), name="block publisher")
@@ -97,32 +97,32 @@ class IngestStore:
         await self._database.__aexit__()
 
     def __contains__(self, pack: object) -> bool:
-        return pack in self._open
+        return pack in self._open_blocks
 
     @property
     def packs(self) -> list[str]:
         """Names of the known packs."""
-        return list(self._open)
+        return list(self._open_blocks)
 
     @property
     def unconfirmed(self) -> int:
         """Number of completed blocks that no worker has confirmed."""
-        return sum(map(self.unconfirmed_of, self._open))
+        return sum(map(self.unconfirmed_of, self._open_blocks))
 
     def unconfirmed_of(self, pack: str) -> int:
         """Return the number of completed blocks of a pack that no worker has confirmed."""
-        next_number = self._open.position(pack).next_number
+        next_number = self._open_blocks.position(pack).next_number
         return next_number - self._first_unconfirmed.get(pack, next_number)
 
     async def request_confirmation(self, pack: str) -> None:
         """Send the last block again to which a worker replies."""
-        number = (self._open.position(pack).next_number - 1) // CONFIRM_EVERY * CONFIRM_EVERY
+        number = (self._open_blocks.position(pack).next_number - 1) // CONFIRM_EVERY * CONFIRM_EVERY
         if number >= self._first_unconfirmed.get(pack, 1):
             await self.publisher.send_again(pack, number)
 
     def last_s(self, pack: str) -> float:
         """Return the time of a pack's last sample [s since 1970]."""
-        return self._open.last_s(pack)
+        return self._open_blocks.last_s(pack)
 
     async def add_pack(self, pack: str) -> None:
         """Add a pack whose position is not stored. It continues after its last block in the stream ``RAW``, if any.
@@ -135,29 +135,29 @@ class IngestStore:
             message = await self._nc.jetstream().get_last_msg(subjects.RAW_STREAM, subject, direct=True)
             block = decode(message.data or b"")
         except (NotFoundError, BlockError):
-            self._open.set_position(pack, NO_POSITION)
+            self._open_blocks.set_position(pack, NO_POSITION)
             return
         self._set_end(pack, block.store_created_ns, last_sample_s(block))
 
     def add(self, pack: str, batch: BatchSamples, arrival_s: float, sequence: int) -> Selection:
         """Add the new samples of a batch; see ``OpenBlocks.add``."""
-        self._first_unconfirmed.setdefault(pack, self._open.position(pack).next_number)
-        return self._open.add(pack, batch, arrival_s, time.monotonic(), sequence)
+        self._first_unconfirmed.setdefault(pack, self._open_blocks.position(pack).next_number)
+        return self._open_blocks.add(pack, batch, arrival_s, time.monotonic(), sequence)
 
     def remove(self, pack: str) -> None:
         """Remove a pack and its blocks."""
-        self._open.remove(pack)
+        self._open_blocks.remove(pack)
         self._first_unconfirmed.pop(pack, None)
         self._confirmed.pop(pack, None)
         self._removed.add(pack)
 
     def cut_overdue(self) -> None:
         """Complete blocks that have been open for too long, because their packs send nothing more."""
-        self._open.cut(time.monotonic())
+        self._open_blocks.cut(time.monotonic())
 
     def cut(self) -> None:
         """Complete all open blocks."""
-        self._open.cut()
+        self._open_blocks.cut()
 
     async def save(self, stream: str, sequence: int) -> None:
         """Write all changes to disk. Repeat until the disk accepts them.
@@ -171,9 +171,9 @@ class IngestStore:
         """
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
-        first_open = self._open.first_sequence(sequence + 1)
-        blocks, self._open.completed = self._open.completed, []
-        positions, self._open.changed = self._open.changed, {}
+        first_open = self._open_blocks.first_sequence(sequence + 1)
+        blocks, self._open_blocks.completed = self._open_blocks.completed, []
+        positions, self._open_blocks.changed = self._open_blocks.changed, {}
         confirmed, self._confirmed = self._confirmed, {}
         removed, self._removed = self._removed, set()
         progress = Progress(stream, first_open - 1, self.publisher.sent)
@@ -181,7 +181,7 @@ class IngestStore:
             return
         dropped = await self._call_until_done(Changes(progress, blocks, positions, confirmed, removed))
         self.progress = progress
-        if self._open_count != self._database.open_count:
+        if self._file_count != self._database.open_count:
             self._on_reopened()
         if dropped:
             log.warning("the oldest blocks are dropped, because workers do not confirm them", blocks=dropped)
@@ -191,8 +191,8 @@ class IngestStore:
 
     def _on_reopened(self) -> None:
         """Write all positions and send all blocks again, because a damaged file was replaced by an empty one."""
-        self._open_count = self._database.open_count
-        self._open.changed = {pack: self._open.position(pack) for pack in self._open}
+        self._file_count = self._database.open_count
+        self._open_blocks.changed = {pack: self._open_blocks.position(pack) for pack in self._open_blocks}
         self.publisher.sent = 0
 
     async def send_remaining(self) -> None:
@@ -213,14 +213,14 @@ class IngestStore:
     async def _receive(self, message: Msg) -> None:
         """Process a worker's request: delete confirmed blocks, and send missing ones again."""
         pack = message.subject.split(".")[1]
-        if pack not in self._open:
+        if pack not in self._open_blocks:
             return  # a pack with an edge
         try:
             request = BlockRequest.model_validate_json(message.data)
         except ValidationError:
             log.warning("invalid message on the workers' subject", subject=message.subject)
             return
-        position = self._open.position(pack)
+        position = self._open_blocks.position(pack)
         created_ns = position.created_s * NS
         if request.store > created_ns or (request.store == created_ns and request.number > position.next_number):
             log.warning("a worker has later blocks of this pack than this store: a new store is begun", pack=pack)
@@ -236,11 +236,11 @@ class IngestStore:
 
         Workers ignore the blocks of the former store. The samples of the open block are dropped too.
         """
-        last_s = self._open.position(pack).last_s
+        last_s = self._open_blocks.position(pack).last_s
         self.remove(pack)
         self._set_end(pack, other_ns, last_s)
 
     def _set_end(self, pack: str, store_ns: int, last_s: float) -> None:
         """Begin a store with the first sample after ``last_s`` and after the creation of another store."""
         created_s = math.ceil(store_ns / NS) + 1  # a sample after this time creates a store after the other one
-        self._open.set_position(pack, PackPosition(0, 1, max(last_s, created_s)))
+        self._open_blocks.set_position(pack, PackPosition(0, 1, max(last_s, created_s)))

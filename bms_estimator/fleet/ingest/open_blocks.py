@@ -28,7 +28,7 @@ class _OpenPack:
 
 
 class OpenBlocks:
-    """Divides the samples of packs into blocks.
+    """Divider of the samples of packs into blocks.
 
     Args:
         block_s: Duration of a block [s].
@@ -55,7 +55,7 @@ class OpenBlocks:
         self._packs[pack] = _OpenPack(Batcher(self._block_s), position, position.last_s)
 
     def remove(self, pack: str) -> None:
-        """Forget a pack, and discard its open block and its completed blocks that the caller has not taken."""
+        """Remove a pack, its open block, and its blocks in ``completed``."""
         self._packs.pop(pack, None)
         self.changed.pop(pack, None)
         self.completed = [block for block in self.completed if block.pack != pack]

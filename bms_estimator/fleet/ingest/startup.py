@@ -60,13 +60,15 @@ class Options:
 
 
 @contextlib.asynccontextmanager
-async def opened(options: Options, stop: asyncio.Event) -> AsyncIterator[tuple[Client, IngestStore, PackBucket] | None]:
+async def open_ingest(
+    options: Options, stop: asyncio.Event
+) -> AsyncIterator[tuple[Client, IngestStore, PackBucket] | None]:
     """Open connection, store and table of packs; None if ``stop`` is set before the server responds.
 
     Raises:
         UserError: An option cannot be used, or another process uses the folder.
     """
-    with only_ingest(options.folder):
+    with lock_folder(options.folder):
         starting = asyncio.ensure_future(_start(options))
         await until_first_ends(asyncio.wait([starting]), stop.wait())
         if not starting.done():
@@ -125,7 +127,7 @@ async def _ignore(_: Msg) -> None:
 
 
 @contextlib.contextmanager
-def only_ingest(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Lock the folder against other processes.
 
     Raises:

@@ -8,7 +8,7 @@ from nats.aio.client import Client
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError, read_stream
 
-HALF = 0.5
+WARNING_FRACTION = 0.5
 """Fraction of the maximum size of the stream above which a warning is due."""
 REQUEST_TIMEOUT_S = 5.0
 """Timeout of a request [s]."""
@@ -23,7 +23,8 @@ class TelemetryReader:
         sequence: Stream sequence number of the last processed message.
 
     Attributes:
-        stream, sequence: As above, updated.
+        stream: Creation time of the present stream.
+        sequence: Stream sequence number after which ``read`` begins.
         warning: Reason for a warning; empty without one.
     """
 
@@ -66,7 +67,7 @@ class TelemetryReader:
         share = state["bytes"] / info["config"]["max_bytes"]
         self.warning = (
             f"{share:.0%} of the stream {subjects.TELEMETRY_STREAM} is filled; a full stream rejects batches"
-            if share > HALF
+            if share > WARNING_FRACTION
             else ""
         )
         if processed > self._purged:

@@ -118,6 +118,18 @@ async def partitions_of(nc: Client) -> int | None:
     return int(response["config"].get("metadata", {}).get(PARTITIONS_KEY, subjects.PARTITIONS))
 
 
+async def require_partitions(nc: Client) -> int:
+    """Return the number of partitions of the stream ``RAW``.
+
+    Raises:
+        UserError: The stream does not exist.
+    """
+    partitions = await partitions_of(nc)
+    if partitions is None:
+        raise _no_raw_stream()
+    return partitions
+
+
 async def make_telemetry_stream(nc: Client, max_bytes: int) -> None:
     """Create the stream ``TELEMETRY``, or set its maximum size. It has as many replicas as ``RAW``.
 
@@ -129,10 +141,14 @@ async def make_telemetry_stream(nc: Client, max_bytes: int) -> None:
     """
     response = await _retry(_request, nc, f"STREAM.INFO.{subjects.RAW_STREAM}", {})
     if "error" in response:
-        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
+        raise _no_raw_stream()
     limits = {"max_bytes": max_bytes, "discard": "new", "allow_direct": True}
     stream = _stream(subjects.TELEMETRY_STREAM, subjects.telemetry(), **limits)
     await _retry(_ensure_stream, nc, stream | {"num_replicas": response["config"]["num_replicas"]})
+
+
+def _no_raw_stream() -> UserError:
+    return UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
 
 
 def consumer(partition: int) -> str:

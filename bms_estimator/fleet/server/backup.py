@@ -1,6 +1,6 @@
 """Backup of a tenant's streams while they are in use, and restoration on a new server.
 
-The server takes the snapshots of the streams one after another, and meanwhile workers and edges go on. ``BACKUP_ORDER`` makes the
+The server takes the snapshots of the streams one after another, while workers and edges continue. ``BACKUP_ORDER`` makes the
 snapshots consistent:
 
 - The pointers to the checkpoints come before the checkpoints, because a worker writes a checkpoint before the pointer to it. A
@@ -9,6 +9,9 @@ snapshots consistent:
 - ``RAW`` comes after the checkpoints, so that it has all messages that they include, and all later ones up to its snapshot.
   ``HOURS`` and ``DEAD`` also come after the checkpoints, because a worker sends to them before it writes a checkpoint.
 - The table comes after ``RAW``, so that it has a row for each pack in ``RAW``. Rows come before the cell files that they name.
+
+The stream ``TELEMETRY`` of ``fleet ingest`` is not part of a backup, because a batch waits there only until ``fleet ingest`` has
+its samples in blocks on its own disk.
 """
 
 import contextlib
@@ -52,9 +55,9 @@ BACKUP_ORDER = (
     f"KV_{subjects.PACKS_BUCKET}",
     f"KV_{subjects.CELLS_BUCKET}",
 )
-"""Names of all streams of a tenant, in the order of their snapshots."""
+"""Names of the streams in a backup, in the order of their snapshots."""
 RESTORE_ORDER = (*(name for name in BACKUP_ORDER if name != subjects.RAW_STREAM), subjects.RAW_STREAM)
-"""Names of all streams of a tenant, in the order of their restoration: a worker waits until ``RAW`` exists."""
+"""Names of the streams in a backup, in the order of their restoration: a worker waits until ``RAW`` exists."""
 
 
 async def back_up(nc: Client, folder: Path, include: list[Path], report: Callable[[str], None]) -> None:
@@ -130,7 +133,7 @@ async def _delete_streams(nc: Client) -> None:
 
 
 async def _empty_streams(nc: Client) -> dict[str, dict[str, Any]]:
-    """Return the configurations of the tenant's streams.
+    """Return the configurations of the streams, which have never had a message.
 
     Raises:
         UserError: A stream has, or has had, messages.

@@ -15,7 +15,7 @@ from bms_estimator.fleet.nats.stream_snapshot import StreamInfo
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 
-LIST = "backup.json"
+LIST_FILE = "backup.json"
 """Name of the file that lists all others."""
 MAX_FILE_BYTES = 64 << 20
 """Maximum size of a copied file, and of ``backup.json`` [bytes]."""
@@ -68,7 +68,7 @@ class FileWriter:
         self._bytes += len(data)
 
     def sync(self) -> FileDigest:
-        """Sync the file to the disk and return its digest."""
+        """Sync the file to disk, and return its digest."""
         self._file.flush()
         os.fsync(self._file.fileno())
         return FileDigest(bytes=self._bytes, sha256=self._sha256.hexdigest())
@@ -127,7 +127,7 @@ def _copy(file: Path, copy: Path) -> FileDigest:
 
 def write_list(folder: Path, backup: BackupList) -> None:
     """Write ``backup.json``, which completes the backup."""
-    write_private(folder / LIST, backup.model_dump_json(indent=1).encode())
+    write_private(folder / LIST_FILE, backup.model_dump_json(indent=1).encode())
 
 
 def read_list(folder: Path) -> BackupList:
@@ -137,14 +137,14 @@ def read_list(folder: Path) -> BackupList:
         UserError: The backup is incomplete, damaged, or of another version.
     """
     try:
-        backup = BackupList.model_validate_json(read_private(folder / LIST, MAX_FILE_BYTES))
+        backup = BackupList.model_validate_json(read_private(folder / LIST_FILE, MAX_FILE_BYTES))
     except FileNotFoundError:
-        raise UserError(f"{folder}: no complete backup, because {LIST} is missing") from None
+        raise UserError(f"{folder}: no complete backup, because {LIST_FILE} is missing") from None
     except (OSError, UnsafeFileError) as error:
-        raise UserError(f"{folder / LIST}: cannot be read: {error}") from None
+        raise UserError(f"{folder / LIST_FILE}: cannot be read: {error}") from None
     except ValidationError as error:
         detail = error.errors()[0]
-        raise UserError(f"{folder / LIST}: {'.'.join(map(str, detail['loc']))}: {detail['msg']}") from None
+        raise UserError(f"{folder / LIST_FILE}: {'.'.join(map(str, detail['loc']))}: {detail['msg']}") from None
     for name, digest in backup.files.items():
         _check_file(folder / name, digest)
     return backup

@@ -15,7 +15,7 @@ from bms_estimator.settings.fleet import client_address
 async def connect(
     node: Node, credentials_file: Path | None, on_close: Callable[[], Awaitable[None]] | None = None
 ) -> Client:
-    """Connect without reconnecting.
+    """Return a new connection, which does not reconnect.
 
     Args:
         node: The server.

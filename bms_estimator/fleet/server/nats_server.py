@@ -22,7 +22,7 @@ from bms_estimator.fleet.server.monitor import POLL_S, is_healthy, wait_for_moni
 from bms_estimator.fleet.server.nats_config import configuration
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, check_node_disk, check_tls_files, node_of
 from bms_estimator.fleet.server.node_watch import NodeWatch
-from bms_estimator.fleet.server.open_files import warn_of_few_files
+from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
 from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
 from bms_estimator.model.errors import UserError
@@ -57,7 +57,7 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
     binary, spec = find_server(), read()
     place = replace(place, available_bytes=available_bytes(place.streams))
     check_node_disk(place, spec)
-    warn_of_few_files(spec.settings)
+    warn_of_open_file_limit(spec.settings)
     node = node_of(place, spec)
     if node.tls:
         check_tls_files(node.tls)

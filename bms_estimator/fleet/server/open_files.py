@@ -6,13 +6,13 @@ import structlog
 
 from bms_estimator.settings.fleet import FleetSettings, TenantSettings
 
-OWN_FILES = 1000
+OTHER_FILES = 1000
 """Number of open files besides the connections of edges: those of the streams, and the connections of workers."""
 
 log = structlog.get_logger(__name__)
 
 
-def warn_of_few_files(settings: FleetSettings) -> None:
+def warn_of_open_file_limit(settings: FleetSettings) -> None:
     """Log a warning if the limit of open files is too small for a connection of each pack's edge.
 
     The hard limit counts, because nats-server raises its soft limit to it.
@@ -20,7 +20,7 @@ def warn_of_few_files(settings: FleetSettings) -> None:
     tenants = settings.tenants or {"": TenantSettings()}
     packs = sum(tenant.packs or settings.server.packs for tenant in tenants.values())
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    if limit != resource.RLIM_INFINITY and limit < packs + OWN_FILES:
+    if limit != resource.RLIM_INFINITY and limit < packs + OTHER_FILES:
         log.warning(
             "the limit of open files is too small for all edges: increase LimitNOFILE of the systemd unit, or ulimit -n",
             packs=packs,

@@ -1,4 +1,4 @@
-"""Watch over one tenant on the server's machine: heartbeats of the workers, streams, and unsaved blocks."""
+"""Watch over one tenant: heartbeats of its workers, its streams, and unsaved blocks."""
 
 import asyncio
 import contextlib
@@ -22,9 +22,9 @@ from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warni
 from bms_estimator.fleet.server.local_client import connect
 from bms_estimator.fleet.server.nats_config import Node
 
-UNSAVED_S = 60.0
+UNSAVED_CHECK_S = 60.0
 """Interval between two checks how much of the stream is unsaved [s]."""
-LAG_S = 60.0
+LAG_WINDOW_S = 60.0
 """Time over which the largest lag is found [s], at least the usual interval of scrapes."""
 RETRY_S = 1.0
 """Delay before the next connection [s]."""
@@ -43,7 +43,7 @@ class TenantWatch:
 
     def __init__(self, name: str, node: Node, credentials_file: Path | None) -> None:
         self._name, self._node, self._credentials_file = name, node, credentials_file
-        self._workers = FleetWorkers(node.partitions, LAG_S)
+        self._workers = FleetWorkers(node.partitions, LAG_WINDOW_S)
         self._nc: Client | None = None
         self._unsaved_share: float | None = None
 
@@ -110,7 +110,7 @@ class TenantWatch:
                     "the stream fills with blocks that no checkpoint includes", tenant=self._name, reason=warning
                 )
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(UNSAVED_S):
+                async with asyncio.timeout(UNSAVED_CHECK_S):
                     await closed.wait()
 
     async def _receive(self, message: Msg) -> None:

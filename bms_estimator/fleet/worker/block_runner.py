@@ -1,4 +1,8 @@
-"""Processing of single messages of one partition: one at a time in the worker, guarded against deaths, and charged to the pack."""
+"""Runner of the messages of one partition.
+
+A worker processes one message at a time. The processor time is charged to the pack. In a guarded replay, a block that kills workers
+is found and skipped (``replay_guard``).
+"""
 
 import asyncio
 import time

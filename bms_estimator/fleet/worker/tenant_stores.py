@@ -6,9 +6,9 @@ from nats.aio.client import Client
 from nats.js.errors import NotFoundError
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.streams import partitions_of
+from bms_estimator.fleet.nats.streams import require_partitions
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
-from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
 from bms_estimator.model.errors import UserError
 
 
@@ -32,18 +32,14 @@ async def open_stores(nc: Client, worker: str) -> TenantStores:
     Raises:
         UserError: A stream is missing.
     """
-    partitions = await partitions_of(nc)
-    if partitions is None:
-        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
-    js = nc.jetstream()
+    partitions = await require_partitions(nc)
     try:
-        await js.stream_info(subjects.DEAD_STREAM)
+        await nc.jetstream().stream_info(subjects.DEAD_STREAM)
     except NotFoundError:
         raise UserError(
             f"the server has no stream {subjects.DEAD_STREAM}: upgrade and restart `bms-estimator fleet serve` before the workers"
         ) from None
-    checkpoints = await js.key_value(subjects.CHECKPOINTS_BUCKET)
-    states = await js.object_store(subjects.STATES_BUCKET)
+    checkpoints = await open_checkpoints(nc, worker)
     bucket = PackBucket(nc)
     await bucket.refresh()
-    return TenantStores(partitions, CheckpointStore(nc, worker, checkpoints, states), bucket)
+    return TenantStores(partitions, checkpoints, bucket)

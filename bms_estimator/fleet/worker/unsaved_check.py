@@ -1,4 +1,4 @@
-"""Check of a worker how much of the stream is filled by blocks that no checkpoint includes."""
+"""Check how much of the stream is filled by blocks that no checkpoint includes."""
 
 from collections.abc import Iterable
 

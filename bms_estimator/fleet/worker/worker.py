@@ -36,10 +36,10 @@ DISCOVERY_S = 0.5
 once."""
 CHECK_S = 0.5
 """Interval between two checks for a due checkpoint or waiting summaries [s]."""
-REFUSAL_S = 10.0
+REFUSAL_CHECK_S = 10.0
 """Interval between two checks whether the checkpoint of a refused partition has become readable [s]."""
-UNSAVED_S = 30.0
-"""Interval between two checks how much of the stream is unsaved [s]."""
+UNSAVED_CHECK_S = 30.0
+"""Interval between two runs of ``UnsavedCheck`` [s]."""
 MAX_RELEASES = 8
 """Maximum number of partitions that are saved and released concurrently."""
 
@@ -153,8 +153,10 @@ class Worker:
             _repeat(RENEW_S, self._update_leases),
             _repeat(CHECK_S, lambda: self._storage.save(self._leases)),
             _repeat(CHECK_S, lambda: self._storage.send_results(self._leases)),
-            _repeat(REFUSAL_S, self._check_refused),
-            _repeat(UNSAVED_S, lambda: self._unsaved.run([lease.number for lease in self._leases if lease.is_owned])),
+            _repeat(REFUSAL_CHECK_S, self._check_refused),
+            _repeat(
+                UNSAVED_CHECK_S, lambda: self._unsaved.run([lease.number for lease in self._leases if lease.is_owned])
+            ),
             self._bucket.follow(self._changed_packs.put_nowait),
             self._apply_table_changes(),
             self._block_loop.run(),
@@ -257,7 +259,6 @@ class Worker:
                 await lease.consumer.renew()
 
     def _start_lease(self, number: int, now_s: float) -> None:
-        # while any partition is busy, deferred packs that have exceeded their CPU budget must wait
         lease = PartitionLease(
             self._nc,
             number,

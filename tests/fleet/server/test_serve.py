@@ -25,7 +25,7 @@ from bms_estimator.fleet.server import credentials, tenant_streams, tenant_watch
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_server import serve as serve_node
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
-from bms_estimator.fleet.server.open_files import warn_of_few_files
+from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
 from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
@@ -219,7 +219,7 @@ async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_an
 async def test_server_logs_a_warning_when_unsaved_blocks_fill_half_of_the_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tenant_watch, "UNSAVED_S", 0.1)
+    monkeypatch.setattr(tenant_watch, "UNSAVED_CHECK_S", 0.1)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
     # a stream of 2.3 MB
     spec = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4, packs=1, outage_days=0.002)))
@@ -347,7 +347,7 @@ def test_limit_of_open_files_below_the_number_of_packs_is_reported(
     monkeypatch.setattr(resource, "getrlimit", lambda _: (1024, limit))
     tenants = {"acme": TenantSettings(packs=4000), "harbour": TenantSettings()}
     with capture_logs() as logs:
-        warn_of_few_files(FleetSettings(server=ServerSettings(packs=6000), tenants=tenants))
+        warn_of_open_file_limit(FleetSettings(server=ServerSettings(packs=6000), tenants=tenants))
     assert sum("limit of open files" in line["event"] for line in logs) == warnings
 
 

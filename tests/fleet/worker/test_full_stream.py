@@ -138,7 +138,7 @@ async def test_status_warns_when_unsaved_blocks_fill_half_of_the_stream(
 async def test_heartbeat_warns_when_unsaved_blocks_fill_half_of_the_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_module, "UNSAVED_S", 0.1)
+    monkeypatch.setattr(worker_module, "UNSAVED_CHECK_S", 0.1)
     with running(tmp_path, 1, partitions=PARTITIONS) as cluster:
         nc = await connected(cluster.urls)
         await make_streams(nc, partitions=PARTITIONS, raw_bytes=1 << 20)

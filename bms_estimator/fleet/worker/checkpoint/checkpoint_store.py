@@ -27,7 +27,7 @@ CHECKPOINTS_PER_PARTITION = 2
 """Number of stored checkpoints of a partition: the last checkpoint, and the previous one in case the last is damaged."""
 DAILY_CHECKPOINTS = 30
 """Maximum number of stored checkpoints of a partition from different days, besides the last ones."""
-NO_SPACE = frozenset({10002, 10023, 10047, 10077})
+NO_SPACE_CODES = frozenset({10002, 10023, 10047, 10077})
 """Error codes of the server for a full account, server, disk or stream."""
 
 log = structlog.get_logger(__name__)
@@ -125,7 +125,7 @@ class CheckpointStore:
         try:
             size = await self._objects.write(pointer.next, (increment or checkpoint).chunks(file_format))
         except APIError as error:
-            if error.err_code in NO_SPACE and pointer.daily:
+            if error.err_code in NO_SPACE_CODES and pointer.daily:
                 await self._remove_oldest_daily(claim)
             raise
         if increment:
@@ -156,7 +156,7 @@ class CheckpointStore:
         new_pointer = Pointer(kept=_replaced(pointer.kept, old, new), daily=_replaced(pointer.daily, old, new))
         return await self._replace_pointer(claim, new_pointer, erase=True)
 
-    async def write_only(self, claim: Claim, checkpoint: PartitionCheckpoint, *, file_format: int) -> Claim:
+    async def replace_last(self, claim: Claim, checkpoint: PartitionCheckpoint, *, file_format: int) -> Claim:
         """Write a whole checkpoint in place of the last ones. The daily ones remain.
 
         Args:

@@ -9,7 +9,7 @@ from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer, pointer_key
-from bms_estimator.fleet.nats.streams import partitions_of
+from bms_estimator.fleet.nats.streams import require_partitions
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import CheckpointError, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
@@ -31,11 +31,9 @@ async def read_pointers(nc: Client) -> dict[int, Pointer]:
     Raises:
         UserError: The server has no streams.
     """
-    count = await partitions_of(nc)
-    if count is None:
-        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
+    partitions = await require_partitions(nc)
     entries = await read_bucket(nc, subjects.CHECKPOINTS_BUCKET)
-    keys = {number: pointer_key(number) for number in range(count)}
+    keys = {number: pointer_key(number) for number in range(partitions)}
     return {number: Pointer.model_validate_json(entries[key]) for number, key in keys.items() if key in entries}
 
 
@@ -94,4 +92,4 @@ async def _restore(store: CheckpointStore, number: int, info: CheckpointInfo, la
     if last_sequence is not None:
         checkpoint = replace(checkpoint, sequence=last_sequence, deferred={})
     # all live workers read the format of the last checkpoint
-    await store.write_only(claim, checkpoint, file_format=claim.pointer.kept[0].format)
+    await store.replace_last(claim, checkpoint, file_format=claim.pointer.kept[0].format)

@@ -15,7 +15,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
-from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S, partitions_of
+from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S, require_partitions
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CheckpointError,
@@ -67,9 +67,7 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
             read; then nothing is erased.
         StreamError: The server rejects a request.
     """
-    partitions = await partitions_of(nc)
-    if partitions is None:
-        raise UserError(f"the server has no stream {subjects.RAW_STREAM}: create it with `bms-estimator fleet serve`")
+    partitions = await require_partitions(nc)
     store = await open_checkpoints(nc, WORKER_NAME)
     numbers = {subjects.partition_of(pack, partitions) for pack in packs}
     for number in numbers:

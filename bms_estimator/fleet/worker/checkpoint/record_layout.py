@@ -16,7 +16,7 @@ _MAX_RECORD_BYTES = 1 << 24
 
 
 class RecordWithLayout(NamedTuple):
-    """A pack's record in the layout of another version, or with single cells."""
+    """Packed record whose layout is not ``CURRENT_LAYOUT``: of another version, or with single cells."""
 
     layout: str
     packed: bytes

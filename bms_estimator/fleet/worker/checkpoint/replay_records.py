@@ -14,9 +14,9 @@ class ReplayRecord(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     sequence: int = 0
-    """Stream sequence number of the block that the holder processes; 0: none."""
+    """Stream sequence number of the block that the owner of the partition processes; 0: none."""
     deaths: dict[int, int] = {}
-    """Number of holders that died while they processed a block, by its stream sequence number."""
+    """Number of owners that died while they processed a block, by its stream sequence number."""
 
 
 class ReplayRecords:
