@@ -15,13 +15,9 @@ from typing import TYPE_CHECKING
 import structlog
 from nats.aio.client import Client
 from nats.aio.msg import Msg
-from nats.js.errors import NotFoundError
 
-from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.nats.stored_messages import read_messages
-from bms_estimator.fleet.packs.table_change import trusted_data
 from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.block_runner import BlockRunner
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
@@ -32,6 +28,7 @@ from bms_estimator.fleet.worker.delivered_messages import SILENCE_S, DeliveredMe
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.partition_restore import restore_partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
+from bms_estimator.fleet.worker.raw_messages import RawMessages
 from bms_estimator.fleet.worker.replay_guard import ReplayGuard
 from bms_estimator.fleet.worker.result_publisher import ResultPublisher, merge
 from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
@@ -92,8 +89,9 @@ class PartitionLease:
         is_busy: Callable[[], bool],
         sources: PackSources | None = None,
     ) -> None:
-        self._nc, self.number, self._table, self._sources = nc, number, table, sources
+        self.number, self._table, self._sources = number, table, sources
         self._checkpoints, self._checkpoint_format, self._block_loop = checkpoints, checkpoint_format, block_loop
+        self._messages = RawMessages(nc, number)
         self._guard = ReplayGuard(checkpoints.replays, number)
         self._changes = TableChangeSender(nc, lambda: self.partition, self._try)
         self.results = ResultPublisher(nc)
@@ -265,13 +263,10 @@ class PartitionLease:
             return
         async with self._state_lock:
             partition = await self._take_over()
-        js, subject = self._nc.jetstream(), subjects.stored(self.number)
-        try:
-            await js.get_msg(subjects.RAW_STREAM, partition.sequence + 1, subject, next=True)
-        except NotFoundError:
-            self._delivered.postpone_search(IDLE_SILENCE_S)
+        if await self._messages.has_later(partition.sequence):
+            await self._catch_up(partition, await self._messages.last_sequence())
         else:
-            await self._catch_up(partition, await self._last_partition_sequence())
+            self._delivered.postpone_search(IDLE_SILENCE_S)
 
     async def _take_over(self) -> Partition:
         """Claim the partition unless this worker owns it. Return its state, which may be that of an old checkpoint."""
@@ -280,12 +275,12 @@ class PartitionLease:
         if partition is None:
             claim = await self._checkpoints.claim(self.number)
             partition = await restore_partition(self._checkpoints, claim, self.number, self._table, self._sources)
-            replay_end = await self._last_partition_sequence()
+            replay_end = await self._messages.last_sequence()
             await self._guard.begin(claim, replay_end)
             self.partition, self.claim, self.restored_counters = partition, claim, partition.counters
             self._changes.begin(partition.in_force.rows, replay_end)
             self._deferred.wake_up()
-        last_sequence = (await self._nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq
+        last_sequence = await self._messages.last_of_all_partitions()
         if partition.sequence > last_sequence:
             log.warning(
                 "the stream ends before the checkpoint, because it was recreated or has lost its end: reading it from its beginning",
@@ -297,26 +292,14 @@ class PartitionLease:
             partition.deferred.clear()
         return partition
 
-    async def _last_partition_sequence(self) -> int:
-        """Return the sequence number of the last message of the partition; 0 without a message."""
-        js, subject = self._nc.jetstream(), subjects.stored(self.number)
-        try:
-            return (await js.get_last_msg(subjects.RAW_STREAM, subject)).seq or 0
-        except NotFoundError:
-            return 0
-
     async def _catch_up(self, partition: Partition, sequence: int) -> None:
         """Process the stream up to a message. Of each pack, only the newest reply and the newest estimates are published."""
         if partition.sequence >= sequence:
             return
         latest: dict[str, BlockResult] = {}
-        subject = subjects.stored(self.number)
-        messages = read_messages(self._nc, subjects.RAW_STREAM, subject, partition.sequence + 1, sequence)
-        async with aclosing(messages):
-            async for message in messages:
-                pack = message.subject.rpartition(".")[2]
-                trusted = message._replace(data=trusted_data(message.subject, message.data))
-                latest[pack] = merge(latest.get(pack), await self.runner.process(partition, pack, trusted))
+        async with aclosing(self._messages.read(partition.sequence + 1, sequence)) as messages:
+            async for pack, message in messages:
+                latest[pack] = merge(latest.get(pack), await self.runner.process(partition, pack, message))
         for result in latest.values():
             await self.results.publish(result)
 
