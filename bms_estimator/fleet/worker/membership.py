@@ -13,7 +13,7 @@ from collections.abc import Collection, Mapping
 from hashlib import blake2b
 
 from bms_estimator.fleet.heartbeat import DEAD_S, Heartbeat, RefusedPartition
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import common_format
+from bms_estimator.fleet.worker.checkpoint.format_versions import common_format
 
 
 def assign_partitions(partitions: int, workers: Mapping[str, Collection[int]]) -> list[str | None]:

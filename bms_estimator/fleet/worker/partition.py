@@ -19,11 +19,8 @@ from bms_estimator.fleet.packs.table_change import is_change
 from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken, position
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
 from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, LETHAL, BlockResult
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
-    CheckpointError,
-    PartitionCheckpoint,
-    read_checkpoint,
-)
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError
 from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
 from bms_estimator.fleet.worker.density import density_fault
 from bms_estimator.fleet.worker.edge_clock import Arrival

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 import structlog
 
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.format_versions import UnreadableFormatError
 from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.retry import RETRYABLE_ERRORS
 

@@ -15,8 +15,9 @@ import numpy as np
 import psutil
 
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, PartitionCheckpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
+from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
 from bms_estimator.fleet.worker.partition import Partition
 from tests.benchmarks.fleet.partition import CELL_MODEL, MINUTES, SAMPLES, SETTINGS, encoded_block
 from tests.benchmarks.load import pulses

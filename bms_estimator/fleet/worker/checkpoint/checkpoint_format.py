@@ -3,7 +3,7 @@
 Layout, little-endian::
 
     0  magic    8s   b"BMSFLEET"
-    8  format   u2   FORMAT, or the format before it
+    8  format   u2   see ``format_versions``
     10 length   u4   of the header
     14 crc      u4   CRC-32 of the header
     18 header        JSON: number of the increment, partition, sequence, counters, spans of deferred messages, rows of the
@@ -15,10 +15,6 @@ Layout, little-endian::
 A whole checkpoint contains all packs. An increment contains only the packs that were changed since the checkpoint before it,
 and a complete header. A whole checkpoint and its increments, concatenated in order, are again a checkpoint.
 
-A version reads its own format and the format before it (``PREVIOUS``). It writes either of the two. A worker writes the
-newest format that all live workers read, so that workers of two versions can take over partitions from each other. A reader of
-a format that it does not know raises ``UnreadableFormatError``, and the worker then leaves the partition to others.
-
 An entry is one pack's packed record; its layout is an index into the header's layouts. A layout names each field of a record,
 so that a version with other fields can restore the state.
 """
@@ -26,97 +22,19 @@ so that a version with other fields can restore the state.
 import json
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
 
 from bms_estimator.fleet.packs.table_change import PackSource
+from bms_estimator.fleet.worker.checkpoint import format_versions
+from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError, UnreadableFormatError, is_readable
 from bms_estimator.fleet.worker.checkpoint.record_layout import CURRENT_LAYOUT, RecordWithLayout, dtype_of
 from bms_estimator.fleet.worker.deferred import Span
 
-Header = dict[str, Any]
-
-
-class HeaderMigration(NamedTuple):
-    """Conversions of a header between two successive formats. Entries need none, because layouts name their fields."""
-
-    upgrade: Callable[[Header], Header]
-    """Return a header of the older format as one of the newer format."""
-    downgrade: Callable[[Header], Header]
-    """Return a header of the newer format as one of the older format."""
-
-
-FORMAT = 3
-"""Newest format that this version reads and writes. Format 3 added increments."""
-INCREMENT_FORMAT = 3
-"""First format with increments."""
 CHUNK_BYTES = 1 << 20
 """Size at which a chunk of entries is finished [bytes]."""
 _FILE_HEAD, _CHUNK_HEAD, _ENTRY_HEAD = struct.Struct("<8sHII"), struct.Struct("<II"), struct.Struct("<BHI")
 _MAGIC = b"BMSFLEET"
-_MAX_LAYOUTS = 256
-"""Maximum number of layouts, because an index has one byte."""
-
-
-class CheckpointError(ValueError):
-    """Unreadable checkpoint; the message gives the reason and a remedy."""
-
-
-def _without_increments(header: Header) -> Header:
-    """Return a header of format 3 as one of format 2."""
-    return {name: value for name, value in header.items() if name != "increment"}
-
-
-def _with_increments(header: Header) -> Header:
-    """Return a header of format 2 as one of format 3.
-
-    Raises:
-        CheckpointError: The header is not of format 2.
-    """
-    if "increment" in header:
-        raise CheckpointError("the checkpoint is damaged: its format is not the one of its header")
-    return header | {"increment": 0}
-
-
-PREVIOUS: HeaderMigration | None = HeaderMigration(upgrade=_with_increments, downgrade=_without_increments)
-"""Migration between format ``FORMAT - 1`` and ``FORMAT``; None while ``FORMAT`` is the first format."""
-
-
-class UnreadableFormatError(CheckpointError):
-    """Error of an intact checkpoint in a format that this version cannot read.
-
-    Args:
-        found: Format of the checkpoint; 0 if even the metadata of the checkpoint is unreadable.
-    """
-
-    def __init__(self, found: int) -> None:
-        what = f"the checkpoint is of format {found}" if found else "the pointer to the checkpoints is unreadable"
-        super().__init__(f"{what}, this version reads {readable_text()}: start a worker of the version that wrote it")
-        self.found = found
-
-
-def oldest_format() -> int:
-    """Return the oldest format that this version reads and writes."""
-    return FORMAT if PREVIOUS is None else FORMAT - 1
-
-
-def readable_text() -> str:
-    """Return the readable formats as text, such as ``1 and 2``."""
-    return f"{FORMAT}" if PREVIOUS is None else f"{FORMAT - 1} and {FORMAT}"
-
-
-def is_readable(found: int) -> bool:
-    """Return True if this version reads a format."""
-    return oldest_format() <= found <= FORMAT
-
-
-def common_format(newest_formats: Iterable[int]) -> int:
-    """Return the format to write: the newest one that all workers read, as far as this version writes it.
-
-    Args:
-        newest_formats: Newest format that each other worker reads.
-    """
-    return max(oldest_format(), min([FORMAT, *newest_formats]))
 
 
 @dataclass(frozen=True)
@@ -176,13 +94,11 @@ class PartitionCheckpoint:
         Args:
             file_format: Format to write, ``FORMAT`` or the one before it; None: ``FORMAT``.
         """
-        file_format = file_format or FORMAT
-        layouts = list(dict.fromkeys([CURRENT_LAYOUT, *(each.layout for each in self.other_layouts.values())]))[
-            :_MAX_LAYOUTS
-        ]
+        file_format = file_format or format_versions.FORMAT
+        layouts = list(dict.fromkeys([CURRENT_LAYOUT, *(each.layout for each in self.other_layouts.values())]))
         sources = list(dict.fromkeys(self.in_force.values()))
         indexes = {source: index for index, source in enumerate(sources)}
-        header: Header = {
+        header = {
             "increment": self.increment,
             "partition": self.number,
             "sequence": self.sequence,
@@ -193,9 +109,7 @@ class PartitionCheckpoint:
             "layouts": [json.loads(layout) for layout in layouts],
             "entries": len(self.packs) + len(self.other_layouts),
         }
-        if PREVIOUS and file_format < FORMAT:
-            header = PREVIOUS.downgrade(header)
-        text = json.dumps(header, separators=(",", ":")).encode()
+        text = json.dumps(format_versions.downgrade(header, file_format), separators=(",", ":")).encode()
         chunk = [_FILE_HEAD.pack(_MAGIC, file_format, len(text), zlib.crc32(text)), text]
         entries: list[bytes] = []
         size = 0
@@ -252,15 +166,13 @@ def read_checkpoint(data: bytes) -> PartitionCheckpoint:
 
 def _read(data: memoryview) -> tuple[PartitionCheckpoint, int]:
     """Read one whole checkpoint or increment at the beginning of ``data``. Return it and its size [bytes]."""
-    magic, version, length, crc = _FILE_HEAD.unpack_from(data)
+    magic, file_format, length, crc = _FILE_HEAD.unpack_from(data)
     if magic != _MAGIC:
         raise CheckpointError("not a checkpoint: its first bytes differ")
-    if not is_readable(version):
-        raise UnreadableFormatError(version)
+    if not is_readable(file_format):
+        raise UnreadableFormatError(file_format)
     header_end = _FILE_HEAD.size + length
-    header = json.loads(_verify(data[_FILE_HEAD.size : header_end], length, crc))
-    if PREVIOUS and version < FORMAT:
-        header = PREVIOUS.upgrade(header)
+    header = format_versions.upgrade(json.loads(_verify(data[_FILE_HEAD.size : header_end], length, crc)), file_format)
     layouts = [json.dumps(layout, separators=(",", ":")) for layout in header["layouts"]]
     for layout in layouts:
         if layout != CURRENT_LAYOUT:

@@ -13,8 +13,8 @@ from nats.nuid import NUID
 from pydantic import ValidationError
 
 from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError, is_readable
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import object_name
+from bms_estimator.fleet.worker.checkpoint.format_versions import UnreadableFormatError, is_readable
 
 
 class FencedError(Exception):

@@ -11,9 +11,10 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer, pointer_key
 from bms_estimator.fleet.nats.streams import require_partitions
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import CheckpointError, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
 from bms_estimator.fleet.worker.checkpoint.fenced_change import change_checkpoints
+from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError
 from bms_estimator.model.errors import UserError
 
 WORKER_NAME = "checkpoints-restore"

@@ -5,7 +5,8 @@ their number.
 """
 
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import INCREMENT_FORMAT, PartitionCheckpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint
+from bms_estimator.fleet.worker.checkpoint.format_versions import INCREMENT_FORMAT
 
 MAX_INCREMENTS = 32
 """Maximum number of increments of a checkpoint, which limits the number of objects."""

@@ -13,12 +13,13 @@ from nats.aio.client import Client
 
 from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, PartitionCheckpoint, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import (
     CHECKPOINTS_PER_PARTITION,
     CheckpointStore,
     open_checkpoints,
 )
+from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
 from bms_estimator.fleet.worker.checkpoint.increment import MAX_INCREMENT_FRACTION, MAX_INCREMENTS
 from bms_estimator.fleet.worker.partition import Partition
 from tests.estimator.simulated_cell import pulses
