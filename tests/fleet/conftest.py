@@ -1,4 +1,4 @@
-"""Server with one partition, its checkpoints, and a clock of the checkpoints that a test can set."""
+"""Server with its streams, its checkpoints, and a clock of the checkpoints that a test can set."""
 
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -15,16 +15,29 @@ from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.workers import Heartbeats
 
 
+@pytest.fixture(scope="module")
+def partitions() -> int:
+    """Return the number of partitions of the server."""
+    return 1
+
+
 @pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
-    with running(tmp_path, partitions=1) as cluster:
+def cluster(tmp_path: Path, partitions: int) -> Iterator[NatsCluster]:
+    with running(tmp_path, partitions=partitions) as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="module")
+def module_cluster(tmp_path_factory: pytest.TempPathFactory, partitions: int) -> Iterator[NatsCluster]:
+    """Yield a server that all tests of a module share."""
+    with running(tmp_path_factory.mktemp("cluster"), partitions=partitions) as cluster:
         yield cluster
 
 
 @pytest.fixture
-async def nc(cluster: NatsCluster) -> AsyncIterator[Client]:
+async def nc(cluster: NatsCluster, partitions: int) -> AsyncIterator[Client]:
     async with await nats.connect(cluster.url) as nc:
-        await make_streams(nc, partitions=1)
+        await make_streams(nc, partitions=partitions)
         yield nc
 
 

@@ -115,7 +115,7 @@ class IngestStore:
         return next_number - self._first_unconfirmed.get(pack, next_number)
 
     async def request_confirmation(self, pack: str) -> None:
-        """Send the last block again to which a worker replies."""
+        """Send the last block that a worker answers with a confirmation (``CONFIRM_EVERY``) again."""
         number = (self._open_blocks.position(pack).next_number - 1) // CONFIRM_EVERY * CONFIRM_EVERY
         if number >= self._first_unconfirmed.get(pack, 1):
             await self.publisher.send_again(pack, number)

@@ -1,20 +1,18 @@
 """Server with all streams."""
 
-from collections.abc import AsyncIterator, Iterator
-from pathlib import Path
+from collections.abc import AsyncIterator
 
 import pytest
 from nats.aio.client import Client
 
 from bms_estimator.fleet.nats.streams import make_streams, make_telemetry_stream
 from tests.fleet.ingest.worker_states import PARTITIONS
-from tests.fleet.nats_cluster import NatsCluster, connected, running
+from tests.fleet.nats_cluster import NatsCluster, connected
 
 
-@pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
-    with running(tmp_path, partitions=PARTITIONS) as cluster:
-        yield cluster
+@pytest.fixture(scope="module")
+def partitions() -> int:
+    return PARTITIONS
 
 
 @pytest.fixture

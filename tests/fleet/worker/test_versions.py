@@ -3,24 +3,21 @@
 import asyncio
 import sys
 import time
-from collections.abc import AsyncIterator
 from contextlib import ExitStack
 from pathlib import Path
 
-import nats
 import pytest
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import RefusedPartition
 from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
-from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
 from bms_estimator.fleet.worker.partition import Partition
 from tests.command_line import PROGRAM, running_program
-from tests.fleet.nats_cluster import NatsCluster, running
+from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.worker import later_version
 from tests.fleet.worker.later_version import DOWNGRADED, UPGRADED
 from tests.fleet.workers import Process, block, end_states, estimated, load_packs, send
@@ -35,17 +32,9 @@ TWO_FORMATS, UNREADABLE_FORMAT = FORMAT + 1, FORMAT + 2
 """Format of a version that also reads the format of this version, and of a version that does not."""
 
 
-@pytest.fixture
-def cluster(tmp_path: Path):
-    with running(tmp_path, partitions=PARTITIONS) as cluster:
-        yield cluster
-
-
-@pytest.fixture
-async def nc(cluster: NatsCluster) -> AsyncIterator[Client]:
-    async with await nats.connect(cluster.url) as nc:
-        await make_streams(nc, partitions=PARTITIONS)
-        yield nc
+@pytest.fixture(scope="module")
+def partitions() -> int:
+    return PARTITIONS
 
 
 class Workers:

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
 from contextlib import suppress
 
 import nats
@@ -26,7 +25,7 @@ from bms_estimator.fleet.worker.checkpoint.claims import FencedError
 from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT, UnreadableFormatError, readable_text
 from bms_estimator.fleet.worker.worker import Options, work
 from tests.fleet.checkpoints import STATES_STREAM, Clock, chunk_subject, load, raw
-from tests.fleet.nats_cluster import running
+from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.workers import PERIOD_S, SAMPLES, Heartbeats, block, end_states, estimated, load_packs, send, until
 from tests.patience import LONG_S
 
@@ -42,16 +41,13 @@ def noon(clock: Clock) -> None:
 
 
 @pytest.fixture(scope="module")
-def url(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("cluster"), partitions=2) as cluster:
-        yield cluster.url
+def partitions() -> int:
+    return 2
 
 
 @pytest.fixture
-async def nc(url) -> AsyncIterator[Client]:
-    async with await nats.connect(url) as nc:
-        await make_streams(nc, partitions=2)
-        yield nc
+def cluster(module_cluster: NatsCluster) -> NatsCluster:
+    return module_cluster
 
 
 async def _objects(nc: Client, partition: int) -> set[str]:
@@ -203,7 +199,7 @@ async def test_pointer_of_another_version_is_not_replaced(nc):
     assert (await bucket.get("p12")).revision == revision
 
 
-async def test_worker_refuses_a_partition_whose_bytes_are_of_another_format_than_its_pointer_says(nc, url):
+async def test_worker_refuses_a_partition_whose_bytes_are_of_another_format_than_its_pointer_says(nc, cluster):
     store = await open_checkpoints(nc, "later")
     data = bytearray(b"".join(PartitionCheckpoint(0, 1).chunks()))
     data[FORMAT_OFFSET] = FORMAT + 1
@@ -211,7 +207,7 @@ async def test_worker_refuses_a_partition_whose_bytes_are_of_another_format_than
     claim = await store.write(await store.claim(0), raw(1, bytes(data)), file_format=FORMAT)
     stop = asyncio.Event()
     async with Heartbeats(nc) as heartbeats:
-        worker_task = asyncio.create_task(work(Options(url, "w"), stop))
+        worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
         await send(nc, "p1", block("p1", 1))
         refused = (RefusedPartition(partition=0, format=FORMAT + 1),)
         await heartbeats.until(lambda last: "w" in last and last["w"].refused == refused)

@@ -5,14 +5,12 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-import nats
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nats.aio.client import Client
 
 from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
-from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import (
     CHECKPOINTS_PER_PARTITION,
@@ -24,7 +22,7 @@ from bms_estimator.fleet.worker.checkpoint.increment import MAX_INCREMENT_FRACTI
 from bms_estimator.fleet.worker.partition import Partition
 from tests.estimator.simulated_cell import pulses
 from tests.fleet.checkpoints import DAY_S, Clock, damage, load, stored_objects
-from tests.fleet.nats_cluster import running
+from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.partition_stream import Stream, blocks_of, table
 
 if TYPE_CHECKING:
@@ -33,23 +31,15 @@ if TYPE_CHECKING:
 PACKS = tuple(f"p{n}" for n in range(20))
 RECORD_BYTES = 60_000
 """Size of a pack's record, so that a header is much smaller than the records of all packs [bytes]."""
-partitions = itertools.count()
+unused_partitions = itertools.count()
 """Numbers of unused partitions, one for each test."""
 FEW, MANY = PACKS[:1], PACKS[:12]
 """Packs whose change is saved as an increment, and packs whose records exceed the maximum size of increments."""
 
 
-@pytest.fixture(scope="module")
-def url(tmp_path_factory: pytest.TempPathFactory):
-    with running(tmp_path_factory.mktemp("cluster"), partitions=1) as cluster:
-        yield cluster.url
-
-
 @pytest.fixture
-async def nc(url: str):
-    async with await nats.connect(url) as nc:
-        await make_streams(nc, partitions=1)
-        yield nc
+def cluster(module_cluster: NatsCluster) -> NatsCluster:
+    return module_cluster
 
 
 class Saves:
@@ -94,7 +84,7 @@ class Saves:
 
 @pytest.fixture
 async def saves(nc: Client, clock: Clock) -> Saves:
-    return Saves(await open_checkpoints(nc, "w"), next(partitions))
+    return Saves(await open_checkpoints(nc, "w"), next(unused_partitions))
 
 
 async def test_saves_of_few_changed_packs_are_small_and_restore_all_packs(saves: Saves) -> None:
