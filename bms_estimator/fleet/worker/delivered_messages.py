@@ -31,7 +31,7 @@ class DeliveredMessages:
 
     Attributes:
         pin: Number of the pin under which the claim was last confirmed.
-        is_gapless: True if the state includes all messages before the last delivered one.
+        is_caught_up: True if the state includes all messages before the last delivered one.
         pin_lapsed: True if the ownership must be checked, because the pin has ended.
         next_search_s: Monotonic clock of the next search of the stream [s].
     """
@@ -47,7 +47,7 @@ class DeliveredMessages:
     ) -> None:
         self._consumer, self._guard, self._results, self._block_loop = consumer, guard, results, block_loop
         self._process, self._attempt = process, attempt
-        self.pin, self.is_gapless, self.pin_lapsed = 0, False, False
+        self.pin, self.is_caught_up, self.pin_lapsed = 0, False, False
         self.next_search_s = time.monotonic() + SILENCE_S
         self._is_task_waiting = False
         self._wake_up = asyncio.Event()
@@ -58,17 +58,17 @@ class DeliveredMessages:
         Returns:
             True if the next call can process a message.
         """
-        if not (self._is_task_waiting and self.is_next_gapless()):
+        if not (self._is_task_waiting and self.can_process_next()):
             if self._consumer.waiting or self.pin_lapsed:
                 self._wake_up.set()
             return False
         self.postpone_search()
         self._process(self._consumer.pop())
-        return self.is_next_gapless()
+        return self.can_process_next()
 
-    def is_next_gapless(self) -> bool:
+    def can_process_next(self) -> bool:
         """Return True if a message waits, the state includes all earlier ones, and it needs no request to the server."""
-        if not self._consumer.waiting or not self.is_gapless or self.pin_lapsed:
+        if not self._consumer.waiting or not self.is_caught_up or self.pin_lapsed:
             return False
         delivered = self._consumer.waiting[0]
         return delivered.follows and delivered.pin == self.pin and not self._guard.is_guarded(delivered.sequence)
@@ -76,7 +76,7 @@ class DeliveredMessages:
     async def publish(self) -> None:
         """Publish the results of ``process_next``, and request further messages."""
         if self._results.added and not await self._attempt(self._publish):
-            self.is_gapless = False
+            self.is_caught_up = False
 
     async def _publish(self) -> None:
         await self._results.publish_added()
@@ -88,7 +88,7 @@ class DeliveredMessages:
 
     def reset(self) -> None:
         """Leave all messages to the task of the partition until it has confirmed the claim."""
-        self.pin, self.is_gapless = 0, False
+        self.pin, self.is_caught_up = 0, False
 
     def wake_up(self) -> None:
         """Wake up the task of the partition."""

@@ -116,7 +116,7 @@ class PartitionLease:
         self.trouble, self.checkpoint_due_s = "", 0.0
         self.refused_format: int | None = None
         self._delivered = DeliveredMessages(
-            self.consumer, self._guard, self.results, block_loop, self._process_gapless, self._try
+            self.consumer, self._guard, self.results, block_loop, self._process_next_of_stream, self._try
         )
         self._silent = False  # the stream must be searched, because no message has arrived
         self._state_lock = asyncio.Lock()  # held while ``partition`` and ``claim`` change
@@ -166,7 +166,7 @@ class PartitionLease:
             if delivered.pin_lapsed:
                 await self._try(self._check_ownership)
             await self.consumer.request_taken()
-            if self.consumer.waiting and not delivered.is_next_gapless():
+            if self.consumer.waiting and not delivered.can_process_next():
                 await self._process_delivered(self.consumer.pop())
                 delivered.postpone_search()
             elif self._silent and not self.consumer.waiting:
@@ -240,7 +240,7 @@ class PartitionLease:
 
     async def _process_delivered(self, delivered: DeliveredMessage) -> None:
         """Process the stream up to a delivered message. Return without it if the pin is lost."""
-        self._delivered.is_gapless = False
+        self._delivered.is_caught_up = False
         while not await self._try(partial(self._process_up_to, delivered)):
             await asyncio.sleep(RETRY_S)
             if not self.consumer.has_pin:
@@ -254,7 +254,7 @@ class PartitionLease:
                 partition = await self._take_over()
             self._delivered.pin = delivered.pin
         await self._catch_up(partition, delivered.sequence)
-        self._delivered.is_gapless = True
+        self._delivered.is_caught_up = True
 
     async def _read_undelivered(self) -> None:
         """Bring the state up to the end of the stream after silence, unless another worker is pinned."""
@@ -303,7 +303,7 @@ class PartitionLease:
         for result in latest.values():
             await self.results.publish(result)
 
-    def _process_gapless(self, delivered: DeliveredMessage) -> None:
+    def _process_next_of_stream(self, delivered: DeliveredMessage) -> None:
         """Process a delivered message whose predecessors are all processed."""
         partition = self.partition
         if partition is not None and delivered.sequence > partition.sequence:

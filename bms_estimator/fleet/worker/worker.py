@@ -16,6 +16,7 @@ from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
 from bms_estimator.fleet.nats.connection import close, connect, error_text
 from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.heartbeat_report import HeartbeatReport
+from bms_estimator.fleet.worker.lease_tasks import LeaseTasks
 from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.periodic_storage import PeriodicStorage
@@ -40,8 +41,6 @@ REFUSAL_CHECK_S = 10.0
 """Interval between two checks whether the checkpoint of a refused partition has become readable [s]."""
 UNSAVED_CHECK_S = 30.0
 """Interval between two runs of ``UnsavedCheck`` [s]."""
-MAX_RELEASES = 8
-"""Maximum number of partitions that are saved and released concurrently."""
 
 log = structlog.get_logger(__name__)
 
@@ -124,15 +123,13 @@ class Worker:
         self._partitions, self._checkpoints, self._bucket = stores
         self._members = Membership(options.name)
         self._inbox = nc.new_inbox()
-        self._lease_tasks: dict[int, tuple[PartitionLease, asyncio.Task[None]]] = {}
-        self._releases: dict[int, asyncio.Task[None]] = {}
         self._changed_packs: asyncio.Queue[set[str]] = asyncio.Queue()
         self._leases_updated_s = time.monotonic()
         self._leaving = False
         self._block_loop = BlockLoop()
-        self._release_slots = asyncio.Semaphore(MAX_RELEASES)
         self._unknown = UnknownPacks(nc, self._bucket.packs)
         self._report = HeartbeatReport(options.name)
+        self._lease_tasks = LeaseTasks(self._report.totals, lambda: nc.is_connected)
         self._storage = PeriodicStorage(nc, options.checkpoint_s, self._partitions)
         self._unsaved = UnsavedCheck(nc)
 
@@ -170,17 +167,15 @@ class Worker:
             log.warning(
                 "no connection to the server: the next owners of the partitions read the stream from the last checkpoints"
             )
-        for number in list(self._lease_tasks):
-            self._start_release(number)
         # a pin expires without requests: continue them until each consumer is released
         renewing = asyncio.ensure_future(_repeat(RENEW_S, self._send_requests))
-        await asyncio.gather(*self._releases.values())
+        await self._lease_tasks.release_all()
         await end(renewing)
         await close(self._nc)
 
     @property
     def _leases(self) -> list[PartitionLease]:
-        return [lease for lease, _ in self._lease_tasks.values()]
+        return self._lease_tasks.leases
 
     async def _receive_heartbeat(self, message: Msg) -> None:
         """Process another worker's heartbeat; answer the first one of a new worker."""
@@ -206,9 +201,9 @@ class Worker:
         Messages arrive on the stream's subject p.<partition>.raw.<pack>, statuses on <inbox>.<partition>.<pin>.
         """
         tokens = message.subject.split(".")
-        entry = self._lease_tasks.get(int(tokens[-2] if message.subject.startswith(self._inbox) else tokens[1]))
-        if entry:
-            entry[0].receive(message)
+        lease = self._lease_tasks.get(int(tokens[-2] if message.subject.startswith(self._inbox) else tokens[1]))
+        if lease:
+            lease.receive(message)
 
     async def _send_heartbeat(self) -> None:
         """Publish the heartbeat and the unknown packs, and notify systemd."""
@@ -228,13 +223,11 @@ class Worker:
         self._leases_updated_s = now_s
         await self._refuse_unreadable()
         share = self._members.share(self._partitions, now_s)
-        for number in self._lease_tasks.keys() - share:
-            self._start_release(number)
-        for number in sorted(share - self._lease_tasks.keys()):
-            self._start_lease(number, now_s)
-        for task in [*self._releases.values(), *(task for _, task in self._lease_tasks.values())]:
-            if task.done() and not task.cancelled():
-                task.result()  # an internal error must end the process; otherwise the partition would have no owner
+        for number in self._lease_tasks.numbers - share:
+            self._lease_tasks.start_release(number)
+        for number in sorted(share - self._lease_tasks.numbers):
+            self._lease_tasks.start(self._make_lease(number, now_s))
+        self._lease_tasks.raise_internal_errors()
         await self._send_requests()
         if self._nc.is_connected:
             for lease in self._leases:
@@ -250,7 +243,7 @@ class Worker:
     async def _check_refused(self) -> None:
         """Accept the refused partitions whose checkpoints have become readable."""
         if self._nc.is_connected:
-            numbers = self._members.refused.keys() - self._lease_tasks.keys()
+            numbers = self._members.refused.keys() - self._lease_tasks.numbers
             await check_refused(numbers, self._members, self._checkpoints)
 
     async def _send_requests(self) -> None:
@@ -258,7 +251,7 @@ class Worker:
             for lease in self._leases:
                 await lease.consumer.renew()
 
-    def _start_lease(self, number: int, now_s: float) -> None:
+    def _make_lease(self, number: int, now_s: float) -> PartitionLease:
         lease = PartitionLease(
             self._nc,
             number,
@@ -272,27 +265,15 @@ class Worker:
             is_busy=lambda: any(each.consumer.waiting for each in self._leases),
         )
         lease.checkpoint_due_s = self._storage.first_due_s(number, now_s)
-        self._lease_tasks[number] = lease, asyncio.create_task(lease.run())
-
-    def _start_release(self, number: int) -> None:
-        if number not in self._releases:
-            self._releases[number] = asyncio.create_task(self._release(*self._lease_tasks[number]))
-
-    async def _release(self, lease: PartitionLease, task: asyncio.Task[None]) -> None:
-        await end(task)
-        async with self._release_slots:
-            if self._nc.is_connected:
-                await lease.release()
-        self._report.totals.update(self._leases)
-        del self._lease_tasks[lease.number], self._releases[lease.number]
+        return lease
 
     async def _apply_table_changes(self) -> None:
         """Notify partitions of changed and new rows of the table of packs."""
         while True:
             for pack in await self._changed_packs.get():
-                entry = self._lease_tasks.get(subjects.partition_of(pack, self._partitions))
-                if entry:
-                    entry[0].settings_changed(pack)
+                lease = self._lease_tasks.get(subjects.partition_of(pack, self._partitions))
+                if lease:
+                    lease.settings_changed(pack)
 
     def _heartbeat(self) -> Heartbeat:
         lease_trouble = next((lease.trouble for lease in self._leases if lease.trouble), "")
