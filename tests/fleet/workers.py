@@ -24,7 +24,7 @@ from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
@@ -195,9 +195,14 @@ async def end_states(nc: Client, registry: PackRegistry, partitions: int) -> dic
 
 def estimated(registry: PackRegistry, pack: str, blocks: int) -> bytes:
     """Return the record of an estimator that has processed blocks 1 to ``blocks`` of a pack in one run."""
+    return record_of_run(registry, pack, np.concatenate([samples(pack, number) for number in range(1, blocks + 1)]))
+
+
+def record_of_run(registry: PackRegistry, pack: str, rows: SampleBlock) -> bytes:
+    """Return the record of an estimator that has processed samples of a pack in one run."""
     settings, cell = registry(pack) or (None, None)
     assert settings
     assert cell
     estimator = make_estimator(settings, cell)
-    estimator.run(np.concatenate([samples(pack, number) for number in range(1, blocks + 1)]))
+    estimator.run(rows)
     return estimator.record.tobytes()

@@ -1,4 +1,4 @@
-"""``bms-estimator fleet status``: table of the workers and their versions, refused partitions, dead letters, wrong clocks, unsaved blocks."""
+"""``bms-estimator fleet status``: table of the workers, and what needs attention."""
 
 import asyncio
 from datetime import timedelta
@@ -30,7 +30,11 @@ def status(
         ),
     ] = None,
 ) -> None:
-    """List the workers with their versions, the partitions that they refuse, packs with dead letters or a wrong clock, and a warning if blocks fill the server that no checkpoint includes."""
+    """List the workers with their versions, and what needs attention.
+
+    Listed are refused partitions, packs with dead letters, and packs whose edge's clock is wrong. A warning follows if more than
+    half of the stream is filled by blocks that no checkpoint includes.
+    """
     heartbeats = asyncio.run(_receive_heartbeats((server, creds, ca)))
     warning, dead_packs = asyncio.run(_read_streams((server, creds, ca)))
     print_table(COLUMNS, [_row(each) for each in heartbeats])

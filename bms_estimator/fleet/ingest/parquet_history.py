@@ -22,6 +22,7 @@ BATCH_ROWS = 50_000
 MEMORY = "1GB"
 """Memory for sorting; larger data are sorted on disk."""
 DAY_S = 86_400.0
+"""Duration of a day [s]."""
 
 
 class PackBatch(NamedTuple):

@@ -8,7 +8,7 @@ from nats.aio.client import Client
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError, read_stream
 
-WARNING_FRACTION = 0.5
+WARNING_SHARE = 0.5
 """Fraction of the maximum size of the stream above which a warning is due."""
 REQUEST_TIMEOUT_S = 5.0
 """Timeout of a request [s]."""
@@ -67,7 +67,7 @@ class TelemetryReader:
         share = state["bytes"] / info["config"]["max_bytes"]
         self.warning = (
             f"{share:.0%} of the stream {subjects.TELEMETRY_STREAM} is filled; a full stream rejects batches"
-            if share > WARNING_FRACTION
+            if share > WARNING_SHARE
             else ""
         )
         if processed > self._purged:

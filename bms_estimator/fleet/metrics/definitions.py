@@ -98,7 +98,9 @@ NODE: tuple[Definition[NodeState], ...] = (
         lambda s: s.monitored("jetstream", "config", "max_storage"),
     ),
     Definition("bms_fleet_disk_bytes", "Size of the file system with the streams", lambda s: s.disk_bytes),
-    Definition("bms_fleet_disk_free_bytes", "Free space of this file system", lambda s: s.disk_free_bytes),
+    Definition(
+        "bms_fleet_disk_free_bytes", "Free space of the file system with the streams", lambda s: s.disk_free_bytes
+    ),
 )
 """Metrics of the node."""
 
@@ -127,7 +129,7 @@ TENANT: tuple[Definition[TenantState], ...] = (
     Definition("bms_fleet_mqtt_sessions", "MQTT sessions, including those of disconnected edges", _mqtt_sessions),
     Definition("bms_fleet_stream_messages", "Stored messages of a stream", _of_streams(lambda s: s.messages), "stream"),
     Definition("bms_fleet_stream_bytes", "Size of a stream", _of_streams(lambda s: s.stored_bytes), "stream"),
-    Definition("bms_fleet_stream_max_bytes", "Limit of the size", _of_streams(lambda s: s.max_bytes), "stream"),
+    Definition("bms_fleet_stream_max_bytes", "Maximum size of a stream", _of_streams(lambda s: s.max_bytes), "stream"),
 )
 """Metrics of a tenant."""
 

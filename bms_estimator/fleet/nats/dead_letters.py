@@ -1,7 +1,7 @@
 """Dead letters: blocks that workers could not process, and rejected batches of telemetry, with the reason.
 
-They are stored in the stream ``DEAD``. Each block has a subject of its own, made of its pack and its digest. Therefore a block that is sent again replaces its earlier
-dead letter.
+They are stored in the stream ``DEAD``. The subject of a dead letter contains the pack and the digest of the block or batch. Therefore
+a block that is sent again replaces its earlier dead letter.
 """
 
 import hashlib
@@ -28,9 +28,9 @@ class DeadLetter(NamedTuple):
     """Sequence number of the block in the stream ``RAW``, or of the batch in ``TELEMETRY``."""
     reason: str
     worker: str
-    """Name of the worker that stored the dead letter."""
+    """Name of the worker that stored the dead letter; ``ingest`` for a batch."""
     data: bytes
-    """Bytes of the block."""
+    """Bytes of the block or batch."""
     batch_subject: str = ""
     """Subject of a rejected batch of telemetry; empty for a block."""
     time: str = ""

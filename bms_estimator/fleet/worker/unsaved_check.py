@@ -15,6 +15,9 @@ log = structlog.get_logger(__name__)
 class UnsavedCheck:
     """Check of the partitions of one worker.
 
+    Args:
+        nc: Connection to the tenant's NATS account.
+
     Attributes:
         warning: Present warning; empty without one.
     """

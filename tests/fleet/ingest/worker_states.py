@@ -7,13 +7,12 @@ from contextlib import asynccontextmanager
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
-from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.worker import Options, work
 from bms_estimator.model.sample import SampleBlock
 from tests.fleet.ingest.platform import START_S
 from tests.fleet.nats_cluster import connected
-from tests.fleet.workers import Heartbeats, end_states
+from tests.fleet.workers import Heartbeats, end_states, record_of_run
 
 PARTITIONS = 2
 
@@ -45,8 +44,6 @@ async def states(nc: Client, registry: PackRegistry, *packs: str) -> list[bytes]
 
 def of_one_run(registry: PackRegistry, pack: str, rows: SampleBlock) -> bytes:
     """Return the record of an estimator after one run over samples, with times since the first of them."""
-    estimator = make_estimator(*registry(pack))
     rows = rows.copy()
     rows["time_s"] -= START_S
-    estimator.run(rows)
-    return estimator.record.tobytes()
+    return record_of_run(registry, pack, rows)

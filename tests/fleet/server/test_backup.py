@@ -14,16 +14,14 @@ from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode, with_oldest
-from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.nats.stream_snapshot import read_info
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.server.backup import BACKUP_ORDER, back_up, restore
 from bms_estimator.fleet.worker.checkpoint.claims import Claims
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, connected, running
-from tests.fleet.workers import Heartbeats, Process, block, end_states, load_packs, samples, send, until
+from tests.fleet.workers import Heartbeats, Process, block, end_states, load_packs, record_of_run, samples, send, until
 from tests.patience import LONG_S, end
 
 PARTITIONS = 2
@@ -45,13 +43,6 @@ async def numbers(nc: Client, pack: str) -> list[int]:
     subject = subjects.stored_raw(subjects.partition_of(pack, PARTITIONS), pack)
     async with aclosing(read_stream(nc, subjects.RAW_STREAM, subject)) as batches:
         return [decode(message.data).number async for batch in batches for message in batch]
-
-
-def estimated(registry: PackRegistry, pack: str, block_numbers: list[int]) -> bytes:
-    """Return the record of an estimator that has processed these blocks of a pack."""
-    estimator = make_estimator(*registry(pack) or pytest.fail(f"{pack} is unknown"))
-    estimator.run(np.concatenate([samples(pack, number) for number in block_numbers]))
-    return estimator.record.tobytes()
 
 
 async def test_worker_continues_after_a_restoration_as_if_only_blocks_that_no_edge_has_were_missing(
@@ -105,7 +96,8 @@ async def test_worker_continues_after_a_restoration_as_if_only_blocks_that_no_ed
             lost = FORGOTTEN if pack == "p1" else 0
             assert (state["delivery"]["awaited"][0], state["delivery"]["lost_blocks"][0]) == (last[pack] + 1, lost)
             processed = [*stored[pack], *range(oldest[pack], last[pack] + 1)]
-            assert state["estimator"].tobytes() == estimated(registry, pack, processed)
+            rows = np.concatenate([samples(pack, number) for number in processed])
+            assert state["estimator"].tobytes() == record_of_run(registry, pack, rows)
         await nc.close()
 
 
