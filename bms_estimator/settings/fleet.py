@@ -127,6 +127,11 @@ class FleetSettings(Strict):
         description="a section [tenants.NAME] for each tenant; default: one tenant for all clients of the server",
     )
 
+    @property
+    def tenants_or_default(self) -> dict[str, TenantSettings]:
+        """Settings by name of the tenant; without tenants, default settings under an empty name."""
+        return self.tenants or {"": TenantSettings()}
+
     @model_validator(mode="after")
     def _check_protection(self) -> Self:
         for name in ("listen", "mqtt"):

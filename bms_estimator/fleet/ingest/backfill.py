@@ -134,7 +134,7 @@ class Backfill:
             log.info("backfill", **self._counters, unconfirmed=self._store.unconfirmed)
 
     async def _wait_for_confirmations(self, pack: str) -> None:
-        """Wait until workers have confirmed so many blocks that further samples may be added."""
+        """Wait until workers have confirmed enough blocks for further samples."""
         request_s = time.monotonic() + REQUEST_S
         while not self._stop.is_set() and not self._may_add(pack):
             await self._save()

@@ -23,14 +23,20 @@ STATE_BYTES = 42_000
 """Maximum size of a pack in a checkpoint [bytes]."""
 DAILY_STATE_BYTES = 19_000
 """Size of a pack in a checkpoint after 24 h [bytes], which is nearly that of a daily checkpoint."""
-CELL_BLOCK_BYTES, CELLS_BLOCK_BYTES, MAX_CELLS_BLOCK_BYTES = 60, 160, 4096
-"""Additional size of such a block for each cell voltage, for their mean, and its maximum [bytes]. From 67 cells on, not all
-samples have cell voltages (``edge.cell_voltages``)."""
+CELL_BLOCK_BYTES = 60
+"""Additional size of a block of 60 samples for the voltages of each cell [bytes]."""
+MEAN_VOLTAGE_BLOCK_BYTES = 160
+"""Additional size of a block of 60 samples for the mean voltages of the cells [bytes]."""
+MAX_CELLS_BLOCK_BYTES = 4096
+"""Maximum additional size of a block with cell voltages [bytes]. From 67 cells on, not all samples have cell voltages
+(``edge.cell_voltages``)."""
 CELL_STATE_BYTES = 400
 """Additional size of a pack in a checkpoint for each cell [bytes]."""
-LAST_CHECKPOINTS, DAILY_CHECKPOINTS = 4, 30
-"""Number of whole checkpoints of a partition: the last two, whose increments have at most half of their size, with the one that
-is being written; and the daily ones."""
+LAST_CHECKPOINTS = 4
+"""Size of the last checkpoints of a partition, in whole checkpoints: two with increments of at most half their size, and the one
+that is being written."""
+DAILY_CHECKPOINTS = 30
+"""Maximum number of daily checkpoints of a partition."""
 MIN_STATES_BYTES = 256 << 20
 """Minimum size of the checkpoints' stream [bytes]: 64 partitions without packs, each with all its checkpoints."""
 
@@ -70,5 +76,5 @@ def stream_sizes(packs: int, outage_days: float, cells: int = 0) -> StreamSizes:
 
 def block_bytes(cells: int) -> int:
     """Return the size of a block of 60 samples with the voltages of ``cells`` cells in ``RAW`` [bytes]."""
-    cells_bytes = min(CELLS_BLOCK_BYTES + CELL_BLOCK_BYTES * cells, MAX_CELLS_BLOCK_BYTES) if cells else 0
+    cells_bytes = min(MEAN_VOLTAGE_BLOCK_BYTES + CELL_BLOCK_BYTES * cells, MAX_CELLS_BLOCK_BYTES) if cells else 0
     return BLOCK_BYTES + cells_bytes

@@ -9,7 +9,7 @@ from bms_estimator.settings.fleet import FleetSettings, TenantSettings
 
 GB = 1_000_000_000
 """Gigabyte [bytes]."""
-BLOCK_BYTES = 512
+ST_BLOCK_BYTES = 512
 """Unit of ``st_blocks`` [bytes]."""
 USABLE_FRACTION = 0.75
 """Fraction of the available space that the streams may use without ``server.disk_gb``."""
@@ -25,7 +25,7 @@ def available_bytes(folder: Path) -> int:
 def _stored_bytes(path: Path) -> int:
     """Return the space that a file takes on the disk [bytes]; 0 if it was removed meanwhile."""
     try:
-        return path.stat().st_blocks * BLOCK_BYTES
+        return path.stat().st_blocks * ST_BLOCK_BYTES
     except OSError:
         return 0
 
@@ -49,8 +49,8 @@ def check_disk_space(settings: FleetSettings, folder: Path, available: int, copi
     Raises:
         UserError: They are larger than ``server.disk_gb`` or the available space.
     """
-    tenants = settings.tenants or {"": TenantSettings()}
-    needed = copies_per_node * sum(sizes_of(settings, tenant).total for tenant in tenants.values())
+    tenants = settings.tenants_or_default.values()
+    needed = copies_per_node * sum(sizes_of(settings, tenant).total for tenant in tenants)
     limit_gb = settings.server.disk_gb
     if limit_gb is not None and needed > GB * limit_gb:
         raise UserError(

@@ -37,7 +37,7 @@ class NodeWatch:
         """Watch the tenants of these settings instead of the former ones."""
         await end(*self._tasks)
         node, keys = node_of(self._place, spec), self._place.keys
-        names = (spec.settings.tenants or ("",)) if makes_streams(self._place, node) else ()
+        names = spec.settings.tenants_or_default if makes_streams(self._place, node) else ()
         self._tenants = {
             name: TenantWatch(name, node, credentials.credentials_file(keys, name, Role.READER) if name else None)
             for name in names

@@ -4,7 +4,7 @@ import resource
 
 import structlog
 
-from bms_estimator.settings.fleet import FleetSettings, TenantSettings
+from bms_estimator.settings.fleet import FleetSettings
 
 OTHER_FILES = 1000
 """Number of open files besides the connections of edges: those of the streams, and the connections of workers."""
@@ -17,8 +17,7 @@ def warn_of_open_file_limit(settings: FleetSettings) -> None:
 
     The hard limit counts, because nats-server raises its soft limit to it.
     """
-    tenants = settings.tenants or {"": TenantSettings()}
-    packs = sum(tenant.packs or settings.server.packs for tenant in tenants.values())
+    packs = sum(tenant.packs or settings.server.packs for tenant in settings.tenants_or_default.values())
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     if limit != resource.RLIM_INFINITY and limit < packs + OTHER_FILES:
         log.warning(

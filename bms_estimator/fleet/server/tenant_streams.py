@@ -22,7 +22,7 @@ async def make_all_streams(place: NodeLocation, spec: ServerSpec, report: Callab
     if not makes_streams(place, node):
         report("ready; streams are made by the node that has the keys, the first")
         return
-    for name, tenant in (spec.settings.tenants or {"": TenantSettings()}).items():
+    for name, tenant in spec.settings.tenants_or_default.items():
         await _make_streams(place, spec, name, tenant)
         keys = f"; its keys: {place.keys / name}" if name else ""
         report(f"{f'tenant {name}: ' if name else ''}streams ready, {node.partitions} partitions{keys}")

@@ -43,7 +43,8 @@ MAX_PART_SAMPLES = 4096
 """Maximum number of samples that are estimated at a time. It limits the buffer of estimates of 200 bytes each, which
 exists for each type of pack in each partition."""
 NO_PEAK_A = 0.0
-"""Peak current for ``write_usable_charge`` [A]. A worker does not store the peaks of the load; with 0, the mean current is used."""
+"""Peak current for ``write_usable_charge`` [A]. A worker does not store the peaks of the load. With 0, the mean current is
+used."""
 NO_FORECAST_REASON = "a fleet worker makes no forecasts"
 
 Publications = tuple[bytes | None, bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]

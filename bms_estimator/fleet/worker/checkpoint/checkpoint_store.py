@@ -17,6 +17,7 @@ from nats.js.object_store import ObjectStore
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer
+from bms_estimator.fleet.nats.stream_sizes import DAILY_CHECKPOINTS
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import CheckpointObjects
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, Claims, FencedError
@@ -25,8 +26,6 @@ from bms_estimator.fleet.worker.checkpoint.replay_records import ReplayRecords
 
 CHECKPOINTS_PER_PARTITION = 2
 """Number of stored checkpoints of a partition: the last checkpoint, and the previous one in case the last is damaged."""
-DAILY_CHECKPOINTS = 30
-"""Maximum number of stored checkpoints of a partition from different days, besides the last ones."""
 NO_SPACE_CODES = frozenset({10002, 10023, 10047, 10077})
 """Error codes of the server for a full account, server, disk or stream."""
 
