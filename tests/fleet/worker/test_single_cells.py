@@ -11,7 +11,7 @@ from bms_estimator.edge.block import Block, decode, encode
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.hour_row import Hour
-from bms_estimator.fleet.worker import partition as partition_module
+from bms_estimator.fleet.worker import pack_records
 from bms_estimator.fleet.worker.checkpoint.cell_layouts import cell_count, cell_layout
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import CURRENT_LAYOUT
 from bms_estimator.fleet.worker.partition import Partition
@@ -161,7 +161,7 @@ def test_earlier_version_drops_the_cells_and_keeps_the_estimator(blocks, monkeyp
     partition, _ = run(Partition(0, table), first)
     # an earlier version reads the record with cells by the names of its fields
     with monkeypatch.context() as earlier:
-        earlier.setattr(partition_module, "cell_count", lambda _: 0)
+        earlier.setattr(pack_records, "cell_count", lambda _: 0)
         earlier.setattr("bms_estimator.fleet.worker.pack_state.UnpackedRecord._copy_cells", lambda *_: None)
         earlier.setattr(CellEstimator, "estimated_cells", 0)
         older = restored(partition)
@@ -181,7 +181,7 @@ def test_earlier_version_drops_the_cells_and_keeps_the_estimator(blocks, monkeyp
 
 def test_later_version_with_other_fields_keeps_the_cells(blocks, monkeypatch):
     partition, _ = run(Partition(0, table), blocks)
-    monkeypatch.setattr(partition_module, "cell_count", lambda _: 0)  # the layout is not that of the later version
+    monkeypatch.setattr(pack_records, "cell_count", lambda _: 0)  # the layout is not that of the later version
     later = restored(partition)
     assert set(later.snapshot().other_layouts) == set(PACKS)
     before = {pack: partition.cells(pack).tobytes() for pack in PACKS}

@@ -199,7 +199,7 @@ async def test_change_that_the_table_has_withdrawn_before_it_was_applied_is_foll
             stop.set()
             await worker_task
         restored = (await end_states(nc, registry_of(PACK_ROW), 1))[0]
-        assert restored.in_force == {"p1": PackSource(PACK_ROW.decode(), None)}
+        assert restored.in_force.rows == {"p1": PackSource(PACK_ROW.decode(), None)}
         await nc.close()
 
 
