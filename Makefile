@@ -24,7 +24,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb docs test test-all prepared demo demo-fleet fleet fleet-kills fleet-sessions fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank cells observability power collapse resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
+.PHONY: help venv apt audit check deb docs test test-all prepared collected demo demo-fleet fleet fleet-kills fleet-sessions fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank cells observability power collapse resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -55,7 +55,11 @@ test-all: prepared ## also the redundant and longer tests
 	$(BIN)/python -m pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder $(ARGS)
 
 prepared: apt venv
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant prometheus
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync kernels check firmware real-home-assistant prometheus collected
+
+# Compiles the test modules once. Otherwise each worker of pytest compiles all of them in a new checkout.
+collected:
+	@$(BIN)/python -m pytest --collect-only -qq > /dev/null || true # the run of the tests reports errors
 
 demo: $(CORE) ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@$(BIN)/bms-estimator demo $(ARGS)

@@ -14,6 +14,7 @@ from bms_estimator.fleet.ingest.startup import NAME, RETRY_S, RETRYABLE_ERRORS, 
 from bms_estimator.fleet.ingest.telemetry_reader import TelemetryReader
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
+from bms_estimator.fleet.nats.streams import make_telemetry_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 from bms_estimator.model.errors import UserError
@@ -42,7 +43,8 @@ async def ingest(options: Options, stop: asyncio.Event) -> None:
         if started is not None:
             nc, store, bucket = started
             reader = BatchReader(options.column_map, options.current_sign)
-            await Ingest(nc, store, bucket, reader, SystemdNotifier([NAME], activity="running")).run(stop)
+            notifier = SystemdNotifier([NAME], activity="running")
+            await Ingest(nc, store, bucket, reader, notifier, options.buffer_bytes).run(stop)
 
 
 class Ingest:
@@ -54,12 +56,20 @@ class Ingest:
         bucket: Table of packs.
         reader: Converter of batches to samples.
         notifier: Notifies systemd.
+        buffer_bytes: Maximum size of the stream ``TELEMETRY`` [bytes].
     """
 
     def __init__(
-        self, nc: Client, store: IngestStore, bucket: PackBucket, reader: BatchReader, notifier: SystemdNotifier
+        self,
+        nc: Client,
+        store: IngestStore,
+        bucket: PackBucket,
+        reader: BatchReader,
+        notifier: SystemdNotifier,
+        buffer_bytes: int,
     ) -> None:
         self._nc, self._store, self._bucket, self._reader, self._notifier = nc, store, bucket, reader, notifier
+        self._buffer_bytes = buffer_bytes
         self._telemetry = TelemetryReader(nc, store.progress.stream, store.progress.sequence)
         self._reports = BatchReports(nc)
         self._counters = self._reports.counters
@@ -99,7 +109,7 @@ class Ingest:
                 await self._process(messages)
                 self._telemetry.sequence = messages[-1].sequence
                 await self._save()
-        except RETRYABLE_ERRORS as error:
+        except (*RETRYABLE_ERRORS, UserError) as error:
             if self._nc.is_closed:
                 raise UserError("the server has closed the connection: check --creds") from None
             if (reason := error_text(error)) != self._trouble:
@@ -112,6 +122,7 @@ class Ingest:
     async def _check(self) -> None:
         """Do the work that is due every ``CHECK_S``."""
         await self._bucket.refresh()
+        await make_telemetry_stream(self._nc, self._buffer_bytes)  # the server may have been replaced
         # an empty table is that of a new server, and removes nothing
         for pack in self._store.packs if len(self._bucket.packs) else ():
             if pack not in self._bucket.packs:

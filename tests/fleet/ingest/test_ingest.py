@@ -1,13 +1,14 @@
 """Batches that ``fleet ingest`` receives: the workers' states equal those of packs with edges."""
 
 import asyncio
+import time
 from contextlib import AsyncExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
 from nats.aio.client import Client
-from nats.js.errors import APIError
+from nats.js.errors import APIError, NoStreamResponseError
 from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
@@ -202,6 +203,25 @@ async def test_rejected_batch_is_reported_and_can_be_replayed(nc: Client, cluste
         await remove_keys(nc, subjects.PACKS_BUCKET, ["p1"])
         await until(lambda: select(tmp_path, "SELECT next FROM pack") == [], lambda: "the pack is not removed")
         assert select(tmp_path, "SELECT number FROM block") == []
+
+
+async def test_missing_stream_is_created_again_and_later_batches_are_stored(
+    nc: Client, cluster: NatsCluster, tmp_path: Path
+) -> None:
+    await load_packs(nc, ["p1"])
+    rows = samples_of("p1", 12)
+    async with ingesting(tmp_path, cluster.url):
+        await send(nc, "p1", json_batch(rows[:6]))
+        await until(lambda: select(tmp_path, "SELECT name FROM pack") == ["p1"], lambda: "not stored")
+        await nc.jetstream().delete_stream(subjects.TELEMETRY_STREAM)
+        deadline_s = time.monotonic() + LONG_S
+        while True:
+            try:
+                await send(nc, "p1", json_batch(rows))
+                break
+            except NoStreamResponseError:
+                assert time.monotonic() < deadline_s
+        await until_stored(tmp_path, 1)
 
 
 async def test_recreated_stream_is_read_from_its_beginning_and_processed_batches_are_removed(nc: Client) -> None:
