@@ -45,7 +45,7 @@ class Measurement:
 
 def rows() -> Iterator[Row]:
     """Measure each fraction of changed packs."""
-    checkpoint = _checkpoint()
+    checkpoint = simulated_checkpoint()
     for fraction in CHANGED_FRACTIONS:
         m = asyncio.run(_measure(checkpoint, fraction))
         what = f"a checkpoint of {PACKS} packs, {fraction:.0%} of them changed"
@@ -54,7 +54,7 @@ def rows() -> Iterator[Row]:
         yield Row(f"  restore, {m.increments} increments", "-", f"{1e3 * m.restore_s:.0f} ms", None)
 
 
-def _checkpoint() -> PartitionCheckpoint:
+def simulated_checkpoint() -> PartitionCheckpoint:
     """Return the checkpoint of packs with the state of one pack after its first blocks."""
     samples = pulses(MINUTES * SAMPLES, rate_hz=1)
     partition = Partition(0, lambda _: (SETTINGS, CELL_MODEL))

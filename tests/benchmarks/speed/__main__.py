@@ -3,7 +3,7 @@
 import sys
 from itertools import chain
 
-from tests.benchmarks.fleet import checkpoints, partition
+from tests.benchmarks.fleet import checkpoints, faults, partition
 from tests.benchmarks.speed import capture, cells, forecast, forecast_request, kernel, live, packs
 from tests.benchmarks.table import show
 
@@ -17,6 +17,7 @@ GROUPS = {  # each function yields the rows of the table
     "packs": packs.rows,
     "partition": partition.rows,
     "checkpoints": checkpoints.rows,
+    "faults": faults.rows,
 }
 
 
