@@ -59,7 +59,7 @@ prepared: apt venv
 
 # Compiles the test modules once. Otherwise each worker of pytest compiles all of them in a new checkout.
 collected:
-	@$(BIN)/python -m pytest --collect-only -qq > /dev/null || true # the run of the tests reports errors
+	@$(BIN)/python -m pytest --collect-only -qq > /dev/null 2>&1 || true # the run of the tests reports errors
 
 demo: $(CORE) ## broker, board and service in one terminal, e.g. make demo ARGS="--seconds 20"
 	@$(BIN)/bms-estimator demo $(ARGS)
