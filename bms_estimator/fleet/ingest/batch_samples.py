@@ -59,7 +59,7 @@ class BatchSamples(NamedTuple):
 
 
 class Selection(NamedTuple):
-    """Samples of a batch that continue those of the pack, in order of time, and the numbers of all others."""
+    """New samples of a batch in order of time, and the numbers of dropped samples."""
 
     samples: SampleBlock
     cells_v: CellBlock
@@ -125,7 +125,7 @@ class BatchReader:
         return BatchSamples(samples, cells_v)
 
     def used_columns(self, names: Sequence[str]) -> list[Column]:
-        """Return the columns that ``read`` uses. The first one is that of the time.
+        """Return the columns that ``read`` uses. The time column is the first.
 
         Raises:
             BatchError: A column is missing.

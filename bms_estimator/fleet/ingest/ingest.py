@@ -11,7 +11,7 @@ from bms_estimator.fleet.ingest.batch_reports import BatchReport, BatchReports
 from bms_estimator.fleet.ingest.batch_samples import BatchReader
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.ingest.startup import NAME, RETRY_S, RETRYABLE_ERRORS, Options, open_ingest
-from bms_estimator.fleet.ingest.telemetry_reader import TelemetryReader
+from bms_estimator.fleet.ingest.telemetry_reader import MissingStreamError, TelemetryReader
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.nats.streams import make_telemetry_stream
@@ -122,7 +122,6 @@ class Ingest:
     async def _check(self) -> None:
         """Do the work that is due every ``CHECK_S``."""
         await self._bucket.refresh()
-        await make_telemetry_stream(self._nc, self._buffer_bytes)  # the server may have been replaced
         # an empty table is that of a new server, and removes nothing
         for pack in self._store.packs if len(self._bucket.packs) else ():
             if pack not in self._bucket.packs:
@@ -130,7 +129,10 @@ class Ingest:
                 self._store.remove(pack)
         self._store.cut_overdue()
         await self._save()
-        await self._telemetry.check(self._store.progress.sequence)
+        try:
+            await self._telemetry.check(self._store.progress.sequence)
+        except MissingStreamError:  # the server was replaced
+            await make_telemetry_stream(self._nc, self._buffer_bytes)
         if self._telemetry.warning:
             log.warning("batches arrive faster than they are stored", reason=self._telemetry.warning)
         self._notifier.ready(NAME)

@@ -16,7 +16,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.tables.layout import Column
 
 PACK_COLUMN = "pack"
-"""Column with the name of the pack. Without it, each file has one pack, and its name without the ending is that of the pack."""
+"""Column with the name of the pack. A file without this column has the samples of one pack, and is named after it."""
 BATCH_ROWS = 50_000
 """Maximum number of rows in memory."""
 MEMORY = "1GB"

@@ -7,11 +7,16 @@ from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError, read_stream
+from bms_estimator.fleet.nats.streams import NO_SUCH_STREAM
 
 WARNING_SHARE = 0.5
 """Fraction of the maximum size of the stream above which a warning is due."""
 REQUEST_TIMEOUT_S = 5.0
 """Timeout of a request [s]."""
+
+
+class MissingStreamError(StreamError):
+    """The server has no stream ``TELEMETRY``."""
 
 
 class TelemetryReader:
@@ -53,6 +58,7 @@ class TelemetryReader:
             processed: Sequence number up to which messages are removed.
 
         Raises:
+            MissingStreamError: The stream does not exist.
             StreamError: The server rejects a request.
             nats.errors.Error: The server does not respond.
         """
@@ -78,6 +84,7 @@ class TelemetryReader:
         subject = f"$JS.API.STREAM.{operation}.{subjects.TELEMETRY_STREAM}"
         message = await self._nc.request(subject, json.dumps(request).encode(), timeout=REQUEST_TIMEOUT_S)
         response: dict[str, dict[str, int]] = json.loads(message.data)
-        if "error" in response:
-            raise StreamError(f"the server rejects {operation} of {subjects.TELEMETRY_STREAM}: {response['error']}")
+        if error := response.get("error"):
+            kind = MissingStreamError if error.get("err_code") == NO_SUCH_STREAM else StreamError
+            raise kind(f"the server rejects {operation} of {subjects.TELEMETRY_STREAM}: {error}")
         return response

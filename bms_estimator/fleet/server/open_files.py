@@ -7,7 +7,7 @@ import structlog
 from bms_estimator.settings.fleet import FleetSettings
 
 OTHER_FILES = 1000
-"""Number of open files besides the connections of edges: those of the streams, and the connections of workers."""
+"""Number of open files besides the connections of edges: files of the streams and connections of workers."""
 
 log = structlog.get_logger(__name__)
 

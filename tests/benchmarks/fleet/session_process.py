@@ -43,7 +43,7 @@ DELAYS: dict[str, Callable[[], Delays]] = {
     "short": Backoff,
     "constant": ConstantDelay,
 }
-"""Delays before reconnects by name: those of the real edge, those of other MQTT clients of the project, and a constant one."""
+"""Delays before reconnects, by the name of the option: of the edge, of the other MQTT clients, and constant."""
 
 
 class Share(NamedTuple):

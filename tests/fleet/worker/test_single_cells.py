@@ -176,12 +176,12 @@ def test_earlier_version_drops_the_cells_and_keeps_the_estimator(blocks, monkeyp
     for pack in PACKS:
         estimator, _ = replayed(blocks[pack])
         assert partition.state(pack)["estimator"].tobytes() == estimator.record.tobytes()
-        assert partition.cells(pack)["samples"].size == CELLS  # the estimators of the cells have begun anew
+        assert partition.cells(pack)["samples"].size == CELLS  # the estimators of the cells were reset
 
 
 def test_later_version_with_other_fields_keeps_the_cells(blocks, monkeypatch):
     partition, _ = run(Partition(0, table), blocks)
-    monkeypatch.setattr(pack_records, "cell_count", lambda _: 0)  # the layout is not that of the later version
+    monkeypatch.setattr(pack_records, "cell_count", lambda _: 0)  # the later version has another layout
     later = restored(partition)
     assert set(later.snapshot().other_layouts) == set(PACKS)
     before = {pack: partition.cells(pack).tobytes() for pack in PACKS}

@@ -65,7 +65,7 @@ def workers(tmp_path: Path, cluster: NatsCluster):
 
 
 async def send_blocks(nc: Client, number: int) -> None:
-    """Send block ``number`` of each pack, before the first ones those of the idle packs."""
+    """Send block ``number`` of each pack. The idle packs send only their first block, before the others."""
     for pack in (*IDLE_PACKS, *PACKS) if number == 1 else PACKS:
         await send(nc, pack, block(pack, number))
 
