@@ -1,5 +1,6 @@
 """Division of samples into blocks. No I/O."""
 
+import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,12 @@ class Batcher:
         """Return the number of samples in the open block."""
         return self._count
 
+    def copy(self) -> "Batcher":
+        """Return a copy, to which samples can be added independently."""
+        other = copy.copy(self)
+        other._parts, other._cell_parts = self._parts.copy(), self._cell_parts.copy()  # noqa: SLF001 - of this class
+        return other
+
     def add(self, samples: SampleBlock, arrival_s: float, cells_v: CellBlock = NO_CELLS) -> list[ReadyBlock]:
         """Add samples in order of their times, with their cell voltages, if any. Return the blocks that they complete."""
         completed = []
@@ -51,9 +58,10 @@ class Batcher:
                 self._end_s = float(samples["time_s"][0]) + self._block_s
             before_end = int(np.searchsorted(samples["time_s"], self._end_s))
             end = min(before_end, self._max_samples - self._count)
-            (part, samples), (cell_part, cells_v) = np.split(samples, [end]), np.split(cells_v, [end])
+            part, samples = samples[:end], samples[end:]
             self._parts.append(part)
-            self._cell_parts.append(cell_part)
+            self._cell_parts.append(cells_v[:end])
+            cells_v = cells_v[end:]
             self._count += part.size
             self._arrival_s = arrival_s if part.size else self._arrival_s
             if samples.size or self._count == self._max_samples:

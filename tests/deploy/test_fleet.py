@@ -42,6 +42,10 @@ def test_exposure_is_at_most_1_5(find_program: FindProgram, unit: Path) -> None:
     assert float(exposure[1]) <= MAX_EXPOSURE
 
 
+def test_memory_of_ingest_is_limited(deploy: Path) -> None:
+    assert "\nMemoryMax=2G\n" in (deploy / "fleet" / "bms-estimator-ingest.service").read_text()
+
+
 def example_configuration(deploy: Path, number: int) -> str:
     """Return the configuration of node ``number`` of three, with placeholders for the claims of the accounts."""
     settings = read_toml(deploy / "fleet" / "fleet.toml", FleetSettings)

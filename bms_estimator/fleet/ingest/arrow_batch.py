@@ -1,7 +1,8 @@
 """Columns of a batch in the streaming format of Arrow IPC.
 
-Compressed and dictionary-encoded columns are rejected before they are decoded, because few bytes of them may expand to any
-size (https://arrow.apache.org/docs/format/Columnar.html#serialization-and-interprocess-communication-ipc).
+Few bytes may expand to any size, because columns may be compressed, have a dictionary, or refer to the same bytes
+(https://arrow.apache.org/docs/format/Columnar.html#serialization-and-interprocess-communication-ipc). Therefore compressed
+columns and dictionaries are rejected, and the number of values is limited, before a record batch is decoded.
 """
 
 import struct
@@ -10,19 +11,19 @@ from typing import Any
 
 import pyarrow as pa
 
-from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, Values
+from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, Values, check_count
 
-MAX_ROWS = 200_000
-"""Maximum number of rows of a record batch. A message of 1 MiB holds fewer rows of numbers."""
-_HEADER, _LENGTH, _COMPRESSION = 2, 0, 3
-"""Indices of fields: ``header`` of the table ``Message``, ``length`` and ``compression`` of the table ``RecordBatch``."""
+_HEADER, _LENGTH, _NODES, _COMPRESSION = 2, 0, 1, 3
+"""Indices of fields: ``header`` of the table ``Message``; ``length``, ``nodes``, ``compression`` of the table ``RecordBatch``."""
+_NODE = struct.Struct("<qq")
+"""Number of values of a column, or of the elements of its lists, and number of its missing values."""
 
 
 def decode_arrow(payload: bytes) -> BatchColumns:
     """Return the columns of a stream of one or more record batches.
 
     Raises:
-        BatchError: The bytes are damaged.
+        BatchError: The bytes are damaged, or the batch has too many values.
     """
     try:
         return _decode(payload)
@@ -62,12 +63,13 @@ def columns_of(table: "pa.Table | pa.RecordBatch") -> BatchColumns:
 
 def _decode(payload: bytes) -> BatchColumns:
     reader = pa.ipc.MessageReader.open_stream(payload)
-    schema, batches = None, []
+    schema, batches, values = None, [], 0
     for message in _messages(reader):
         if message.type == "schema":
             schema = pa.ipc.read_schema(message)
         elif message.type == "record batch" and schema is not None:
-            _check_size(message.metadata.to_pybytes())
+            values += _count_values(message.metadata.to_pybytes())
+            check_count(values)
             batches.append(pa.ipc.read_record_batch(message, schema))
         else:
             raise BatchError(f"an Arrow message {message.type} is not supported: send columns without dictionaries")
@@ -102,11 +104,11 @@ def _is_text(column_type: "pa.DataType") -> bool:
     return bool(pa.types.is_string(column_type) or pa.types.is_large_string(column_type))
 
 
-def _check_size(metadata: bytes) -> None:
-    """Check the header of a record batch, before its body is decoded.
+def _count_values(metadata: bytes) -> int:
+    """Return the number of rows and values in the header of a record batch, before its body is decoded.
 
     Raises:
-        BatchError: The record batch is compressed or too long.
+        BatchError: The record batch is compressed.
         struct.error: The header is damaged.
     """
     message = _reference(metadata, 0)
@@ -116,8 +118,20 @@ def _check_size(metadata: bytes) -> None:
         raise BatchError("the Arrow record batch is compressed: send it uncompressed")
     length = _field(metadata, record_batch, _LENGTH)
     (rows,) = struct.unpack_from("<q", metadata, length) if length else (0,)
-    if not 0 <= rows <= MAX_ROWS:
-        raise BatchError(f"{rows} rows: must be at most {MAX_ROWS}")
+    counts = [rows, *(count for count, _ in _NODE.iter_unpack(_structs(metadata, record_batch)))]
+    if min(counts) < 0:
+        raise BatchError("damaged Arrow IPC: a negative number of values")
+    return sum(counts)
+
+
+def _structs(metadata: bytes, record_batch: int) -> bytes:
+    """Return the vector ``nodes`` of a record batch."""
+    field = _field(metadata, record_batch, _NODES)
+    if not field:
+        return b""
+    vector = _reference(metadata, field)
+    (count,) = struct.unpack_from("<I", metadata, vector)
+    return metadata[vector + 4 : vector + 4 + _NODE.size * count]
 
 
 def _reference(data: bytes, offset: int) -> int:

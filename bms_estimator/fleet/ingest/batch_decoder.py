@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError
+from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, check_count
 from bms_estimator.sources.captures.tables.layout import REQUIRED
 
 _ARROW_STREAM, _ARROW_FILE = b"\xff\xff\xff\xff", b"ARROW1"
@@ -25,7 +25,9 @@ def decode_batch(payload: bytes) -> BatchColumns:
 
         return decode_arrow(payload[8:] if payload.startswith(_ARROW_FILE) else payload)
     try:
-        document = json.loads(payload)
+        document = json.loads(payload, object_pairs_hook=_object)
+    except BatchError:
+        raise
     except (ValueError, RecursionError) as error:
         raise BatchError(f"neither JSON nor Arrow IPC: {error}") from None
     columns = _columns_of_rows(document) if isinstance(document, list) else _columns_of_object(document)
@@ -33,6 +35,18 @@ def decode_batch(payload: bytes) -> BatchColumns:
     if len(set(lengths.values())) > 1:
         raise BatchError(f"the columns differ in length: {lengths}")
     return columns
+
+
+def _object(members: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object.
+
+    Raises:
+        BatchError: Several members have the same name.
+    """
+    document = dict(members)
+    if len(document) < len(members):
+        raise BatchError("several columns have the same name")
+    return document
 
 
 def _columns_of_object(document: object) -> BatchColumns:
@@ -54,4 +68,5 @@ def _columns_of_rows(rows: list[Any]) -> BatchColumns:
     for number, row in enumerate(rows, start=1):
         if not isinstance(row, dict):
             raise BatchError(f"row {number} is no object with the names of columns")
+    check_count(len(rows) * len(rows[0]))
     return {name: [row.get(name) for row in rows] for name in rows[0]}

@@ -1,6 +1,7 @@
 """Reports about batches that were rejected, or whose samples were dropped: to their sender, to the log, and as dead letters."""
 
 import asyncio
+import itertools
 import time
 from collections import Counter
 
@@ -12,13 +13,16 @@ from pydantic import BaseModel, ConfigDict
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.nats.dead_letters import DeadLetter
+from bms_estimator.fleet.nats.dead_letters import DeadLetter, one_line
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
+from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 
 LOG_INTERVAL_S = 60.0
 """Minimum interval between two log lines about a pack [s]."""
 MAX_LOGGED_PACKS = 10_000
-"""Maximum number of packs whose last log line is remembered."""
+"""Maximum number of packs whose last log line is remembered, and of unknown packs that are counted."""
+SHOWN_PACKS = 10
+"""Maximum number of unknown packs that a log line names."""
 ATTEMPTS = 5
 """Maximum number of attempts to store a dead letter."""
 RETRY_S = 1.0
@@ -58,14 +62,35 @@ class BatchReports:
     def __init__(self, nc: Client) -> None:
         self._nc, self.counters = nc, Counter[str]()
         self._logged: dict[str, float] = {}  # time of the last log line by pack, in the order of time
+        self._unknown, self._unknown_batches = dict[str, None](), 0  # packs, in the order of their batches
 
-    async def reject(self, message: StoredMessage, pack: str, reason: str, *, is_dead: bool = True) -> None:
-        """Report a batch of which nothing is stored, and store it as a dead letter if ``is_dead``."""
+    async def reject(self, message: StoredMessage, pack: str, reason: str, stored: int = 0) -> None:
+        """Report a batch of which ``stored`` samples are stored and the others are not, and store it as a dead letter."""
         self.counters["rejected_batches"] += 1
-        await self.report(BatchReport(pack=pack, sequence=message.sequence, stored=0, dropped=0, error=reason))
-        if is_dead:
-            letter = DeadLetter(pack, message.sequence, reason, WORKER, message.data, subjects.telemetry(pack))
-            await self._store(letter)
+        reason = one_line(reason)
+        await self.report(BatchReport(pack=pack, sequence=message.sequence, stored=stored, dropped=0, error=reason))
+        letter = DeadLetter(pack, message.sequence, reason, WORKER, message.data, subjects.telemetry(pack))
+        await self._store(letter)
+
+    async def reject_unknown(self, message: StoredMessage, pack: str) -> None:
+        """Report a batch of a pack that is not in the table of packs. ``log_unknown`` logs it."""
+        self.counters["rejected_batches"] += 1
+        self._unknown_batches += 1
+        if len(self._unknown) < MAX_LOGGED_PACKS:
+            self._unknown[pack] = None
+        await self._publish(BatchReport(pack=pack, sequence=message.sequence, stored=0, dropped=0, error=UNKNOWN_PACK))
+
+    def log_unknown(self) -> None:
+        """Log one line for all batches of unknown packs since the last call."""
+        if self._unknown_batches:
+            names = ", ".join(itertools.islice(self._unknown, SHOWN_PACKS))
+            log.warning(
+                "batches of packs that are not in the table of packs",
+                batches=self._unknown_batches,
+                packs=len(self._unknown),
+                first=names,
+            )
+        self._unknown, self._unknown_batches = {}, 0
 
     async def report(self, report: BatchReport) -> None:
         """Publish a report, and log it unless another one of the pack was logged less than ``LOG_INTERVAL_S`` ago."""
@@ -76,6 +101,9 @@ class BatchReports:
             if len(self._logged) > MAX_LOGGED_PACKS:
                 del self._logged[next(iter(self._logged))]
             log.warning("samples of a batch are not stored", **report.model_dump())
+        await self._publish(report)
+
+    async def _publish(self, report: BatchReport) -> None:
         try:
             await self._nc.publish(subjects.ingest_report(report.pack), report.model_dump_json().encode())
         except nats.errors.Error as error:

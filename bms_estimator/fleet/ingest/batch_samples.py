@@ -1,6 +1,7 @@
 """Samples of a telemetry batch: units, sign of the current, timestamps and order. No I/O."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from types import NoneType
 from typing import NamedTuple
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.edge.cell_voltages import MAX_CELLS
-from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, Values
+from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, Values, check_count
 from bms_estimator.fleet.worker.edge_clock import MAX_AHEAD_S
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
@@ -42,6 +43,8 @@ MIN_TIME_S = 946_684_800.0
 """Earliest plausible timestamp: 2000-01-01 [s since 1970]."""
 MAX_LAYOUTS = 256
 """Maximum number of headers whose layout is cached."""
+MAX_CACHED_COLUMNS, MAX_CACHED_CHARACTERS = 400, 8000
+"""Maximum size of a header whose layout is cached. With ``MAX_LAYOUTS`` headers of this size the cache has about 16 MB."""
 CELLS = "cells"
 """Name of the column with a list of cell voltages in each row, without its unit. Instead, each cell may have a column
 ``cell_1_v``, ``cell_2_v`` and so on."""
@@ -68,23 +71,6 @@ class Selection(NamedTuple):
     implausible: int
     """Number of samples without a time, or with a time before 2000 or in the future."""
 
-    def reason(self, last_s: float) -> str:
-        """Return the reason for which samples were dropped; empty if none was.
-
-        Args:
-            last_s: Time of the pack's last sample before the batch [s since 1970].
-        """
-        reasons = []
-        if self.old:
-            end = f"the pack's last stored time {iso_utc(last_s)}" if np.isfinite(last_s) else "an equal time"
-            reasons.append(f"{self.old} samples at or before {end}: sent again, or too late")
-        if self.implausible:
-            reasons.append(
-                f"{self.implausible} samples without a time, or with one before 2000 or in the future; "
-                "name a column of milliseconds time_ms"
-            )
-        return "; ".join(reasons)
-
 
 class BatchReader:
     """Converter of columns to samples.
@@ -97,7 +83,7 @@ class BatchReader:
 
     def __init__(self, column_map: ColumnMap | None = None, current_sign: CurrentSign | None = None) -> None:
         self._column_map, self._current_sign = column_map, current_sign
-        self._find_layout = lru_cache(MAX_LAYOUTS)(self._find)
+        self._find_cached = lru_cache(MAX_LAYOUTS)(self._find)
 
     def read(self, columns: BatchColumns) -> BatchSamples:
         """Return the samples of a batch, in its order.
@@ -137,6 +123,10 @@ class BatchReader:
         others = [column for role, column in layout.columns.items() if role is not Role.TIME]
         return [layout.columns[Role.TIME], *others, *([cells] if cells else [])]
 
+    def _find_layout(self, header: tuple[str, ...]) -> tuple[Layout, Column | None]:
+        is_small = len(header) <= MAX_CACHED_COLUMNS and sum(map(len, header)) <= MAX_CACHED_CHARACTERS
+        return (self._find_cached if is_small else self._find)(header)
+
     def _find(self, header: tuple[str, ...]) -> tuple[Layout, Column | None]:
         """Return the columns of a sample, and the column of cell voltages.
 
@@ -152,6 +142,8 @@ class BatchReader:
             for role, column in layout.columns.items()
             if role is not Role.STATE
         }
+        if len(layout.cells) > MAX_CELLS:
+            raise UserError(f"{len(layout.cells)} columns of cell voltages: must be at most {MAX_CELLS}")
         cells = [name for name in header if split_unit(name).name == CELLS]
         if not cells:
             return Layout(layout.dialect, roles), None
@@ -187,6 +179,37 @@ def select_new(batch: BatchSamples, last_s: float, now_s: float) -> Selection:
     cells_v = batch.cells_v[chosen] if batch.cells_v.size else NO_CELLS
     implausible = times.size - order.size
     return Selection(batch.samples[chosen], cells_v, order.size - chosen.size, implausible)
+
+
+def drop_reason(old: int, implausible: int, last_s: float) -> str:
+    """Return the reason for which samples were dropped; empty if none was.
+
+    Args:
+        old: ``Selection.old``.
+        implausible: ``Selection.implausible``.
+        last_s: Time of the pack's last sample before the batch [s since 1970].
+    """
+    reasons = []
+    if old:
+        end = f"the pack's last stored time {iso_utc(last_s)}" if np.isfinite(last_s) else "an equal time"
+        reasons.append(f"{old} samples at or before {end}: sent again, or too late")
+    if implausible:
+        reasons.append(
+            f"{implausible} samples without a time, or with one before 2000 or in the future; "
+            "name a column of milliseconds time_ms"
+        )
+    return "; ".join(reasons)
+
+
+def split_by_time(batch: BatchSamples, max_samples: int) -> Iterator[BatchSamples]:
+    """Yield the samples of a batch in parts of at most ``max_samples``. Several parts are in order of time."""
+    if batch.samples.size <= max_samples:
+        yield batch
+        return
+    order = np.argsort(batch.samples["time_s"], kind="stable")
+    for first in range(0, order.size, max_samples):
+        part = order[first : first + max_samples]
+        yield BatchSamples(batch.samples[part], batch.cells_v[part] if batch.cells_v.size else NO_CELLS)
 
 
 def _time_kind(values: Values) -> CellKind:
@@ -226,18 +249,20 @@ def _listed_cell_voltages(name: str, rows: Values, unit: Unit) -> CellBlock:
     """Return the cell voltages of a column of lists, shape (n, m) [V].
 
     Raises:
-        BatchError: The rows have different numbers of cells, or a value is not a number.
+        BatchError: The rows have different numbers of cells or too many values, or a value is not a number.
+        OverflowError: A number is too large.
     """
     lists = [row for row in rows if row is not None]
-    cells = len(lists[0]) if lists and isinstance(lists[0], list | np.ndarray) else 0
+    cells = len(lists[0]) if lists and isinstance(lists[0], list) else 0
     if not lists:
         return NO_CELLS
-    if not 1 <= cells <= MAX_CELLS or any(not isinstance(row, list | np.ndarray) or len(row) != cells for row in lists):
+    if not 1 <= cells <= MAX_CELLS or any(not isinstance(row, list) or len(row) != cells for row in lists):
         raise BatchError(f"{name}: must be one list of equal length, of 1 to {MAX_CELLS} cell voltages, for each row")
-    try:
-        values = np.array([[np.nan] * cells if row is None else list(row) for row in rows], dtype=np.float64)
-    except (TypeError, ValueError):
-        raise BatchError(f"{name}: must be numbers") from None
-    cells_v: CellBlock = values * unit.factor + unit.offset
+    if not set(map(type, itertools.chain.from_iterable(lists))) <= _NUMBERS:
+        raise BatchError(f"{name}: must be numbers")
+    check_count(len(rows) * cells)
+    values = np.array([[np.nan] * cells if row is None else row for row in rows], dtype=np.float64)
+    with np.errstate(over="ignore"):  # an infinite voltage is implausible
+        cells_v: CellBlock = values * unit.factor + unit.offset
     remove_implausible(cells_v, MIN_CELL_V, MAX_CELL_V)
     return cells_v

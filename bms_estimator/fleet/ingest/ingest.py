@@ -1,6 +1,9 @@
 """Process that receives batches of telemetry and acts as the edge of their packs."""
 
 import asyncio
+import traceback
+from collections import Counter
+from pathlib import Path
 
 import structlog
 from nats.aio.client import Client
@@ -8,15 +11,14 @@ from nats.aio.client import Client
 from bms_estimator.fleet.ingest.batch_columns import BatchError
 from bms_estimator.fleet.ingest.batch_decoder import decode_batch
 from bms_estimator.fleet.ingest.batch_reports import BatchReport, BatchReports
-from bms_estimator.fleet.ingest.batch_samples import BatchReader
+from bms_estimator.fleet.ingest.batch_samples import BatchReader, drop_reason, split_by_time
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.ingest.startup import NAME, RETRY_S, RETRYABLE_ERRORS, Options, open_ingest
-from bms_estimator.fleet.ingest.telemetry_reader import MissingStreamError, TelemetryReader
+from bms_estimator.fleet.ingest.telemetry_reader import DamagedStreamError, MissingStreamError, TelemetryReader
 from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.nats.streams import make_telemetry_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
-from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
@@ -29,6 +31,8 @@ STATUS_S = 60.0
 """Interval between two log lines with the counters [s]."""
 YIELD_MESSAGES = 50
 """Number of messages after which other tasks run."""
+PART_SAMPLES = 500
+"""Maximum number of samples, and therefore of completed blocks, after which other tasks run."""
 
 log = structlog.get_logger(__name__)
 
@@ -129,13 +133,40 @@ class Ingest:
                 self._store.remove(pack)
         self._store.cut_overdue()
         await self._save()
-        try:
-            await self._telemetry.check(self._store.progress.sequence)
-        except MissingStreamError:  # the server was replaced
-            await make_telemetry_stream(self._nc, self._buffer_bytes)
+        await self._check_stream()
         if self._telemetry.warning:
             log.warning("batches arrive faster than they are stored", reason=self._telemetry.warning)
         self._notifier.ready(NAME)
+
+    async def _check_stream(self) -> None:
+        """Check the stream, and replace it if it is missing or damaged."""
+        try:
+            lost = await self._telemetry.check(self._store.progress.sequence)
+            if lost is not None:
+                await self._on_lost(lost)
+        except MissingStreamError:  # the server was replaced
+            await make_telemetry_stream(self._nc, self._buffer_bytes)
+        except DamagedStreamError as error:
+            is_damaged = self._telemetry.is_damaged
+            action = "it is deleted and created again" if is_damaged else "trying again"
+            log.warning("the server has an error in the stream of batches", action=action, reason=str(error))
+            if not is_damaged:
+                return
+            await self._save_open_blocks()
+            await self._telemetry.delete()
+            await make_telemetry_stream(self._nc, self._buffer_bytes)
+
+    async def _on_lost(self, lost: range) -> None:
+        """Log the sequence numbers of lost batches, and save the open blocks."""
+        await self._save_open_blocks()
+        if lost:
+            self._counters["lost_batches"] += len(lost)
+            log.error("the server has lost batches", batches=len(lost), first=lost[0], last=lost[-1])
+
+    async def _save_open_blocks(self) -> None:
+        """Complete and save the open blocks, because their batches cannot be read again."""
+        self._store.cut()
+        await self._save()
 
     async def _save(self) -> None:
         await self._store.save(self._telemetry.stream, self._telemetry.sequence)
@@ -157,25 +188,40 @@ class Ingest:
         pack = message.subject.partition(".")[2]
         self._counters["batches"] += 1
         if pack not in self._store:
-            await self._reports.reject(message, pack, UNKNOWN_PACK, is_dead=False)
+            await self._reports.reject_unknown(message, pack)
             return
+        last_s, counts = self._store.last_s(pack), Counter[str]()
         try:
-            batch = self._reader.read(decode_batch(message.data))
-        except BatchError as error:
-            await self._reports.reject(message, pack, str(error))
-            return
-        last_s = self._store.last_s(pack)
-        selection = self._store.add(pack, batch, float(message.received_s), message.sequence)
-        self._counters["samples"] += selection.samples.size
-        self._counters["old_samples"] += selection.old
-        self._counters["implausible_times"] += selection.implausible
-        if reason := selection.reason(last_s):
-            stored, dropped = selection.samples.size, selection.old + selection.implausible
-            await self._reports.report(
-                BatchReport(pack=pack, sequence=message.sequence, stored=stored, dropped=dropped, error=reason)
-            )
+            await self._add(message, pack, counts)
+        except Exception as error:  # noqa: BLE001 - no batch may stop the others
+            await self._reports.reject(message, pack, _reason(error), counts["samples"])
+        else:
+            old, implausible = counts["old_samples"], counts["implausible_times"]
+            if reason := drop_reason(old, implausible, last_s):
+                stored, dropped = counts["samples"], old + implausible
+                await self._reports.report(
+                    BatchReport(pack=pack, sequence=message.sequence, stored=stored, dropped=dropped, error=reason)
+                )
+        self._counters.update(counts)
+
+    async def _add(self, message: StoredMessage, pack: str, counts: Counter[str]) -> None:
+        """Add the samples of a batch, and count them. Other tasks run between its parts.
+
+        Raises:
+            Exception: The batch is invalid. Earlier parts of it stay stored.
+        """
+        batch = self._reader.read(decode_batch(message.data))
+        for i, part in enumerate(split_by_time(batch, PART_SAMPLES)):
+            if i:
+                self._notifier.alive(NAME)
+                await asyncio.sleep(0)
+            selection = self._store.add(pack, part, float(message.received_s), message.sequence)
+            counts["samples"] += selection.samples.size
+            counts["old_samples"] += selection.old
+            counts["implausible_times"] += selection.implausible
 
     def _log_status(self) -> None:
+        self._reports.log_unknown()
         publisher = self._store.publisher
         log.info(
             "ingested",
@@ -185,3 +231,11 @@ class Ingest:
             unconfirmed=self._store.unconfirmed,
             dropped_blocks=self._store.dropped,
         )
+
+
+def _reason(error: Exception) -> str:
+    """Return the reason of a rejected batch. The place of an internal error is part of it."""
+    if isinstance(error, BatchError):
+        return str(error)
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"internal error: {type(error).__name__} in {Path(place.filename).name}, line {place.lineno}: {error}"

@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import structlog
+
 from bms_estimator.edge.batching import Batcher, ReadyBlock
 from bms_estimator.edge.block_sender import MAX_BLOCK_AGE
 from bms_estimator.fleet.ingest.batch_samples import BatchSamples, Selection, select_new
@@ -11,6 +13,8 @@ from bms_estimator.fleet.ingest.store_table import NumberedBlock, PackPosition
 
 NO_POSITION = PackPosition(0, 1, -math.inf)
 """Position of a pack without blocks."""
+
+log = structlog.get_logger(__name__)
 
 
 @dataclass
@@ -71,30 +75,41 @@ class OpenBlocks:
     def add(self, pack: str, batch: BatchSamples, arrival_s: float, now_s: float, sequence: int) -> Selection:
         """Add the new samples of a batch, and return them with the numbers of dropped samples.
 
+        An exception changes nothing, so that it belongs to this batch only.
+
         Args:
             pack: Name of the pack, whose position is set.
             batch: Samples of the batch.
             arrival_s: Time of arrival of the batch [s since 1970].
             now_s: Monotonic time [s].
             sequence: Sequence number of the message.
+
+        Raises:
+            Exception: A block with samples of the batch cannot be encoded.
         """
         entry = self._packs[pack]
         selection = select_new(batch, entry.last_s, arrival_s)
         if not selection.samples.size:
             return selection
-        entry.last_s = float(selection.samples["time_s"][-1])
-        was_empty = not len(entry.batcher)
-        completed = entry.batcher.add(selection.samples, arrival_s, selection.cells_v)
-        if completed or was_empty:
-            entry.first_sequence, entry.opened_s = sequence, now_s
+        batcher = entry.batcher.copy()
+        completed = batcher.add(selection.samples, arrival_s, selection.cells_v)
         self._complete(pack, entry, completed)
+        if completed or not len(entry.batcher):
+            entry.first_sequence, entry.opened_s = sequence, now_s
+        entry.batcher, entry.last_s = batcher, float(selection.samples["time_s"][-1])
         return selection
 
     def cut(self, now_s: float = math.inf) -> None:
-        """Complete the open blocks that have been open for longer than ``MAX_BLOCK_AGE`` blocks; by default all."""
+        """Complete the open blocks that have been open for longer than ``MAX_BLOCK_AGE`` blocks; by default all.
+
+        The samples of a block that cannot be encoded are dropped, so that the other packs continue.
+        """
         for pack, entry in self._packs.items():
             if len(entry.batcher) and now_s - entry.opened_s > MAX_BLOCK_AGE * self._block_s:
-                self._complete(pack, entry, entry.batcher.cut())
+                try:
+                    self._complete(pack, entry, entry.batcher.cut())
+                except Exception:
+                    log.exception("samples of an open block are dropped, because it cannot be encoded", pack=pack)
 
     def first_sequence(self, default: int) -> int:
         """Return the smallest sequence number of a message with samples of open blocks; ``default`` without open blocks."""
@@ -102,8 +117,10 @@ class OpenBlocks:
         return min(sequences, default=default)
 
     def _complete(self, pack: str, entry: _OpenPack, completed: list[ReadyBlock]) -> None:
+        position, blocks = entry.position, list[NumberedBlock]()
         for ready in completed:
-            number, entry.position = entry.position.next_number, entry.position.after(ready)
-            self.completed.append(NumberedBlock(pack, entry.position.created_s, number, ready))
-        if completed:
-            self.changed[pack] = entry.position
+            number, position = position.next_number, position.after(ready)
+            blocks.append(NumberedBlock.of(pack, number, position.created_s, ready))
+        if blocks:
+            self.completed += blocks
+            entry.position = self.changed[pack] = position

@@ -3,7 +3,7 @@
 import sqlite3
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import Block, encode, with_oldest
@@ -43,21 +43,24 @@ class PackPosition(NamedTuple):
 
 
 class NumberedBlock(NamedTuple):
-    """Block of a pack with its number."""
+    """Encoded block of a pack with its number."""
 
     pack: str
-    created_s: int
     number: int
-    ready: ReadyBlock
+    data: bytes
 
-    def encode(self) -> bytes:
-        """Return the encoded block, with times since the creation of the store."""
-        samples = self.ready.samples.copy()
-        samples["time_s"] -= self.created_s  # exact, because the creation time is a whole number of seconds
-        oldest = self.number  # replaced at the time of sending
-        return encode(
-            Block(self.created_s * NS, self.number, oldest, self.ready.arrival_s, samples, self.ready.cells_v)
-        )
+    @classmethod
+    def of(cls, pack: str, number: int, created_s: int, ready: ReadyBlock) -> Self:
+        """Return the encoded block, with times since the creation of the store [s since 1970].
+
+        Raises:
+            Exception: The block cannot be encoded.
+        """
+        samples = ready.samples.copy()
+        samples["time_s"] -= created_s  # exact, because the creation time is a whole number of seconds
+        oldest = number  # replaced at the time of sending
+        block = Block(created_s * NS, number, oldest, ready.arrival_s, samples, ready.cells_v)
+        return cls(pack, number, encode(block))
 
 
 class Progress(NamedTuple):
@@ -92,8 +95,7 @@ class Changes:
         for pack in self.removed:
             connection.execute("DELETE FROM block WHERE pack = ?", (pack,))
             connection.execute("DELETE FROM pack WHERE name = ?", (pack,))
-        rows = ((block.pack, block.number, block.encode()) for block in self.blocks)
-        connection.executemany("INSERT OR REPLACE INTO block (pack, number, data) VALUES (?, ?, ?)", rows)
+        connection.executemany("INSERT OR REPLACE INTO block (pack, number, data) VALUES (?, ?, ?)", self.blocks)
         rows_of_packs = ((pack, *position) for pack, position in self.positions.items())
         connection.executemany("INSERT OR REPLACE INTO pack VALUES (?, ?, ?, ?)", rows_of_packs)
         delete = "DELETE FROM block WHERE pack = ? AND number < ?"

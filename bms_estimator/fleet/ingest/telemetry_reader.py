@@ -1,5 +1,6 @@
 """Reader of the stream ``TELEMETRY``, which holds batches until their samples are in stored blocks."""
 
+import asyncio
 import contextlib
 import json
 
@@ -13,10 +14,20 @@ WARNING_SHARE = 0.5
 """Fraction of the maximum size of the stream above which a warning is due."""
 REQUEST_TIMEOUT_S = 5.0
 """Timeout of a request [s]."""
+UNAVAILABLE = 503
+"""Error class of a server that cannot respond now, for example because its cluster has no leader. The stream is intact."""
+RETRY_S = 1.0
+"""Retry interval after the first internal error of the server [s]. Each further error doubles it."""
+MAX_FAILURES = 6
+"""Number of successive internal errors, within half a minute, after which the stream is damaged."""
 
 
 class MissingStreamError(StreamError):
     """The server has no stream ``TELEMETRY``."""
+
+
+class DamagedStreamError(StreamError):
+    """The server has an internal error in the stream ``TELEMETRY``."""
 
 
 class TelemetryReader:
@@ -36,6 +47,8 @@ class TelemetryReader:
     def __init__(self, nc: Client, stream: str, sequence: int) -> None:
         self._nc, self.stream, self.sequence, self.warning = nc, stream, sequence, ""
         self._purged = 0  # all messages up to this one were removed
+        self._last = 0  # last message in the stream at the last check
+        self._failures, self._retry_s = 0, 0.0
 
     async def read(self) -> list[StoredMessage]:
         """Return some messages after the position; none at the end of the stream. The caller sets the position.
@@ -51,25 +64,64 @@ class TelemetryReader:
                 return messages
         return []
 
-    async def check(self, processed: int) -> None:
-        """Remove processed messages, and set the position back if the server has lost or recreated the stream.
+    @property
+    def is_damaged(self) -> bool:
+        """True after ``MAX_FAILURES`` successive internal errors of the server."""
+        return self._failures >= MAX_FAILURES
+
+    async def check(self, processed: int) -> range | None:
+        """Remove processed messages, and set the position if the server has lost messages or recreated the stream.
 
         Args:
             processed: Sequence number up to which messages are removed.
 
+        Returns:
+            Sequence numbers of messages that were lost before they were read, if the position was set; otherwise None. After
+            a change of the position the server has none of the processed messages.
+
         Raises:
             MissingStreamError: The stream does not exist.
+            DamagedStreamError: The server has an internal error.
             StreamError: The server rejects a request.
             nats.errors.Error: The server does not respond.
         """
+        now_s = asyncio.get_running_loop().time()
+        if now_s < self._retry_s:
+            return None
+        try:
+            lost = await self._check(processed)
+        except DamagedStreamError:
+            self._retry_s = now_s + RETRY_S * 2**self._failures
+            self._failures += 1
+            raise
+        self._failures = 0
+        return lost
+
+    async def delete(self) -> None:
+        """Delete the stream.
+
+        Raises:
+            StreamError: The server rejects the request.
+            nats.errors.Error: The server does not respond.
+        """
+        await self._request("DELETE", {})
+        self._failures, self._retry_s = 0, 0.0
+
+    async def _check(self, processed: int) -> range | None:
+        unread = range(self.sequence + 1, self._last + 1)
         info = await self._request("INFO", {})
         state, created = info["state"], str(info["created"])
         if created != self.stream:
-            self.stream, self.sequence, self._purged = created, 0, 0
-            return
-        if state["last_seq"] < self.sequence:  # the server has lost the end of the stream: numbers are used again
-            self.sequence = self._purged = state["last_seq"]
-            return
+            self.stream, self.sequence, self._purged, self._last = created, 0, 0, 0
+            return unread
+        self._last = state["last_seq"]
+        if self._last < self.sequence:  # the server has lost the end of the stream: numbers are used again
+            self.sequence = self._purged = self._last
+            return unread
+        if state["first_seq"] > self.sequence + 1:  # the server has lost the beginning of the stream
+            unread = range(self.sequence + 1, state["first_seq"])
+            self.sequence = unread[-1]
+            return unread
         share = state["bytes"] / info["config"]["max_bytes"]
         self.warning = (
             f"{share:.0%} of the stream {subjects.TELEMETRY_STREAM} is filled; a full stream rejects batches"
@@ -79,12 +131,14 @@ class TelemetryReader:
         if processed > self._purged:
             await self._request("PURGE", {"seq": processed + 1})
             self._purged = processed
+        return None
 
     async def _request(self, operation: str, request: dict[str, int]) -> dict[str, dict[str, int]]:
         subject = f"$JS.API.STREAM.{operation}.{subjects.TELEMETRY_STREAM}"
         message = await self._nc.request(subject, json.dumps(request).encode(), timeout=REQUEST_TIMEOUT_S)
         response: dict[str, dict[str, int]] = json.loads(message.data)
         if error := response.get("error"):
-            kind = MissingStreamError if error.get("err_code") == NO_SUCH_STREAM else StreamError
+            is_missing, is_unavailable = error.get("err_code") == NO_SUCH_STREAM, error.get("code") == UNAVAILABLE
+            kind = MissingStreamError if is_missing else StreamError if is_unavailable else DamagedStreamError
             raise kind(f"the server rejects {operation} of {subjects.TELEMETRY_STREAM}: {error}")
         return response

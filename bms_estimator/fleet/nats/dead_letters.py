@@ -18,6 +18,8 @@ TIME_HEADER = "Nats-Time-Stamp"
 """Header of the server with the time of storage (RFC 3339)."""
 DIGEST_BYTES = 8
 """Size of the digest of a block in its subject [bytes]."""
+MAX_REASON_CHARACTERS = 1000
+"""Maximum length of a reason. A longer one is truncated."""
 
 
 class DeadLetter(NamedTuple):
@@ -45,7 +47,7 @@ class DeadLetter(NamedTuple):
 
     def headers(self) -> dict[str, str]:
         """Return the headers of the stored message."""
-        reason = self.reason.replace("\r", " ").replace("\n", " ")
+        reason = one_line(self.reason)
         subject = {SUBJECT_HEADER: self.batch_subject} if self.batch_subject else {}
         return {REASON_HEADER: reason, SEQUENCE_HEADER: str(self.sequence), WORKER_HEADER: self.worker} | subject
 
@@ -63,6 +65,12 @@ class DeadLetter(NamedTuple):
             time=headers.get(TIME_HEADER, ""),
             stored_sequence=message.sequence,
         )
+
+
+def one_line(reason: str) -> str:
+    """Return a reason as one line that can be encoded. Its parts may come from a batch or block, and contain any characters."""
+    text = reason[:MAX_REASON_CHARACTERS].replace("\r", " ").replace("\n", " ")
+    return text.encode(errors="backslashreplace").decode()
 
 
 async def read_dead_letters(nc: Client) -> list[DeadLetter]:

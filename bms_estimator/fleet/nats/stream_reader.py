@@ -88,8 +88,8 @@ async def _collect(responses: Subscription, stream: str) -> tuple[list[StoredMes
         except NatsTimeoutError:
             raise StreamError(f"the server has not responded for {stream} within {RESPONSE_TIMEOUT_S:g} s") from None
         headers = message.headers or {}
-        status = headers.get("Status")
-        if status is None:
+        status = headers.get("Status", "")
+        if "Nats-Sequence" in headers:  # a stored message, whose sender may have set a status too
             subject, sequence = headers["Nats-Subject"], int(headers["Nats-Sequence"])
             batch.append(StoredMessage(subject, sequence, message.data, headers))
         elif status in (_END_OF_BATCH, _NO_MESSAGES):

@@ -85,6 +85,7 @@ _INGEST_PUBLISH = (
     "$JS.API.STREAM.CREATE.TELEMETRY",
     "$JS.API.STREAM.UPDATE.TELEMETRY",
     "$JS.API.STREAM.PURGE.TELEMETRY",
+    "$JS.API.STREAM.DELETE.TELEMETRY",
     "raw.*",
     "ingest.*",
     "dead.*.*",

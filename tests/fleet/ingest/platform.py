@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import sqlite3
+import struct
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from tests.fleet.workers import SAMPLES, samples, until
 
 START_S = 1_700_000_000.0
 """Time of the first sample [s since 1970]."""
+ALIGNMENT = 8
+"""Alignment of the columns in an Arrow record batch [bytes]."""
 
 
 def samples_of(pack: str, count: int) -> SampleBlock:
@@ -51,6 +54,20 @@ def arrow_bytes(table: pa.Table, **options: Any) -> bytes:
     with pa.ipc.new_stream(sink, table.schema, options=pa.ipc.IpcWriteOptions(**options)) as writer:
         writer.write_table(table)
     return sink.getvalue().to_pybytes()
+
+
+def arrow_with_shared_columns(names: list[str], rows: int) -> bytes:
+    """Return an Arrow IPC stream whose columns of int8 all refer to the same bytes."""
+    ones = pa.array(np.ones(rows, np.int8))
+    data = arrow_bytes(pa.table(dict.fromkeys(names, ones)))
+    size = -(-rows // ALIGNMENT) * ALIGNMENT
+    for number in range(1, len(names)):
+        buffers = struct.pack("<4q", number * size, 0, number * size, rows)  # validity and values: offset and length
+        data = data.replace(buffers, struct.pack("<4q", 0, 0, 0, rows))
+    body = len(names) * size
+    end = data.index(struct.pack("<q", body))
+    data = data[:end] + struct.pack("<q", size) + data[end + 8 :]
+    return data[: -8 - body + size] + data[-8:]  # the last 8 bytes end the stream
 
 
 def options(folder: Path, url: str, **more: Any) -> Options:

@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 
 from bms_estimator.fleet.ingest.batch_columns import BatchError
 from bms_estimator.fleet.ingest.batch_decoder import decode_batch
-from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples, select_new
+from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples, drop_reason, select_new, split_by_time
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.sources.captures.tables.layout import parse_column_map
-from tests.fleet.ingest.platform import arrow_batch, arrow_bytes, json_batch, samples_of
+from tests.fleet.ingest.platform import arrow_batch, arrow_bytes, arrow_with_shared_columns, json_batch, samples_of
 
 ROWS = samples_of("p1", 5)
 TIMES = ROWS["time_s"].tolist()
 ISO_TIMES = [datetime.fromtimestamp(time_s, UTC).isoformat() for time_s in TIMES]
 VALUES = {"current_a": [1.0, 2.0, 3.0, 4.0, 5.0], "voltage_v": [3.7] * 5}
 NOW_S = TIMES[-1] + 1.0
+MANY_COLUMNS = ["time_s", "current_a", "voltage_v", *(f"cell_{number}_v" for number in range(1, 256))]
 
 
 def read(payload: bytes, **options: Any) -> BatchSamples:
@@ -115,13 +116,21 @@ def test_cell_voltages() -> None:
         (encode(VALUES | {"time_s": [10**400] * 5}), "a number is too large"),
         (encode(VALUES | {"time_s": TIMES, "cells_v": [[3.7]] * 4 + [[3.7, 3.7]]}), "cells_v: must be one list"),
         (encode(VALUES | {"time_s": TIMES, "cells_v": [["full"]] * 5}), "cells_v: must be numbers"),
+        (encode(VALUES | {"time_s": TIMES, "cells_v": [[[3.7]]] * 5}), "cells_v: must be numbers"),
+        (encode(VALUES | {"time_s": TIMES, "cells_v": [[10**400]] * 5}), "a number is too large"),
+        (encode(VALUES | {"time_s": TIMES} | {f"cell_{n}_v": [3.7] * 5 for n in range(1, 257)}), "256 columns of cell"),
+        (encode({name: [1.0] * 5000 for name in MANY_COLUMNS[:3]} | {"cells_v": [[3.7] * 255] + [None] * 4999}), "values"),
+        (encode([dict.fromkeys(map(str, range(1000)))] + [{}] * 2000), "2,001,000 values: must be at most 1,048,576"),
+        (encode(VALUES)[:-1] + b', "voltage_v": []}', "several columns have the same name"),
+        (arrow_bytes(pa.concat_tables(2 * [pa.table({"time_s": pa.nulls(2**19)})])), "2,097,152 values: must be at most"),
+        (arrow_with_shared_columns(MANY_COLUMNS, 5000), "values: must be at most 1,048,576"),
         (arrow_batch(ROWS)[:-60], "damaged Arrow IPC"),
         (b"ARROW1\0\0" + b"\xff" * 100, "damaged Arrow IPC"),
         (arrow_bytes(pa.table(VALUES | {"time_s": [True] * 5})), "column time_s is bool: must be numbers"),
         (arrow_bytes(pa.table({"a": pa.array(["x"]).dictionary_encode()})), "dictionary is not supported"),
         (arrow_bytes(pa.table({"time_s": []}, pa.schema([("time_s", "f8")]))), "has no rows"),
         (arrow_bytes(pa.table({"time_s": np.zeros(10**6)}), compression="zstd"), "compressed: send it uncompressed"),
-        (arrow_bytes(pa.table({"time_s": pa.nulls(10**6, pa.float64())})), "rows"),
+        (arrow_bytes(pa.table({"time_s": pa.nulls(2**20, pa.float64())})), "values: must be at most 1,048,576"),
     ],
 )  # fmt: skip
 def test_error_names_what_is_wrong(payload: bytes, reason: str) -> None:
@@ -146,6 +155,18 @@ def test_each_cell_may_have_a_column_of_its_own():
     np.testing.assert_array_equal(cells_v[:, 1], [3.7, np.nan, np.nan, 3.7, 3.7])
 
 
+def test_layouts_of_large_headers_are_not_cached() -> None:
+    reader = BatchReader()
+    for columns in (500, 10):
+        reader.read(decode_batch(encode({"time_s": TIMES, **VALUES} | {f"other {n}": [0] * 5 for n in range(columns)})))
+    assert reader._find_cached.cache_info().currsize == 1
+
+
+def test_parts_of_a_batch_are_in_order_of_time() -> None:
+    parts = split_by_time(batch(5.0, 1.0, 4.0, 2.0, 3.0), 2)
+    assert [part.samples["time_s"].tolist() for part in parts] == [[1.0, 2.0], [3.0, 4.0], [5.0]]
+
+
 def batch(*times: float) -> BatchSamples:
     """Return samples with these times, whose current is their position."""
     rows = np.zeros(len(times), SAMPLE)
@@ -159,7 +180,7 @@ def test_new_samples_are_sorted_and_unique() -> None:
     assert (selection.samples["time_s"] - t0).tolist() == [1.0, 2.0, 3.0]
     assert selection.samples["current_a"].tolist() == [1.0, 2.0, 0.0]
     assert (selection.old, selection.implausible) == (3, 0)
-    assert selection.reason(t0) == (
+    assert drop_reason(3, 0, t0) == (
         "3 samples at or before the pack's last stored time 2023-11-14T22:13:20.000Z: sent again, or too late"
     )
 
@@ -167,4 +188,4 @@ def test_new_samples_are_sorted_and_unique() -> None:
 def test_implausible_times_are_dropped_and_named() -> None:
     selection = select_new(batch(math.nan, 12.5, 1000.0 * TIMES[0], TIMES[0]), -math.inf, NOW_S)
     assert (selection.samples.size, selection.old, selection.implausible) == (1, 0, 3)
-    assert "time_ms" in selection.reason(-math.inf)
+    assert "time_ms" in drop_reason(0, 3, -math.inf)

@@ -1,9 +1,11 @@
 """Batches that ``fleet ingest`` receives: the workers' states equal those of packs with edges."""
 
 import asyncio
+import shutil
 import time
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +17,11 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.edge.subjects import BlockRequest
+from bms_estimator.fleet.ingest import batch_samples, telemetry_reader
+from bms_estimator.fleet.ingest import ingest as ingest_module
 from bms_estimator.fleet.ingest.batch_reports import BatchReport
-from bms_estimator.fleet.ingest.ingest_store import FILE
+from bms_estimator.fleet.ingest.batch_samples import Selection
+from bms_estimator.fleet.ingest.ingest_store import FILE, IngestStore
 from bms_estimator.fleet.ingest.telemetry_reader import TelemetryReader
 from bms_estimator.fleet.nats.dead_letters import read_dead_letters, replay_letter
 from bms_estimator.fleet.nats.streams import make_telemetry_stream
@@ -49,6 +54,16 @@ BLOCK_SAMPLES = 6
 async def send(nc: Client, pack: str, batch: bytes) -> None:
     """Publish a batch, and wait until the server has stored it."""
     await nc.jetstream().publish(subjects.telemetry(pack), batch, timeout=LONG_S)
+
+
+async def send_when_stream_exists(nc: Client, pack: str, batch: bytes) -> None:
+    """Publish a batch, and repeat this until the server has the stream."""
+    deadline_s = time.monotonic() + LONG_S
+    while True:
+        try:
+            return await send(nc, pack, batch)
+        except NoStreamResponseError:
+            assert time.monotonic() < deadline_s
 
 
 async def send_by_edge(cluster: NatsCluster, folder: Path, pack: str, rows: SampleBlock) -> None:
@@ -205,6 +220,87 @@ async def test_rejected_batch_is_reported_and_can_be_replayed(nc: Client, cluste
         assert select(tmp_path, "SELECT number FROM block") == []
 
 
+async def test_no_batch_stops_the_batches_after_it(
+    nc: Client, cluster: NatsCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch_samples, "MAX_CELLS", 1000)  # the batch passes the check, but cannot be encoded
+    await load_packs(nc, ["p1", "p2"])
+    rows = samples_of("p1", 12)
+    many_cells = json_batch(rows, **{f"cell_{number}_v": [3.7] * 12 for number in range(1, 301)})
+    rejected = {
+        many_cells: "internal error: error in block.py",
+        json_batch(rows, cells_v=[[[3.7]]] * 12): "cells_v: must be numbers",
+        b'{"time_s": [1], "current_a": [1], "\\ud800": [1]}': r"no column of voltage; found time_s, current_a, \ud800",
+        b"[" * 100_000: "neither JSON nor Arrow IPC: maximum recursion depth exceeded",
+    }
+    async with ingesting(tmp_path, cluster.url):
+        for batch in rejected:
+            await send(nc, "p2", batch)
+        await nc.jetstream().publish(subjects.telemetry("p1"), json_batch(rows), headers={"Status": "503"})
+        await until(lambda: select(tmp_path, "SELECT next FROM pack") == [2], lambda: "not stored")
+    letters = await read_dead_letters(nc)
+    assert [letter.pack for letter in letters] == ["p2"] * len(rejected)
+    for letter in letters:
+        assert letter.reason.startswith(rejected[letter.data])
+
+
+async def test_unknown_packs_have_one_log_line(nc: Client, cluster: NatsCluster, tmp_path: Path) -> None:
+    await load_packs(nc, ["p1"])
+    reports = await nc.subscribe("ingest.*")
+    with capture_logs() as lines:
+        async with ingesting(tmp_path, cluster.url):
+            for pack in ("ghost1", "ghost2", "ghost1"):
+                await send(nc, pack, json_batch(samples_of("p1", 1)))
+                await reports.next_msg(LONG_S)
+    (line,) = (line for line in lines if "ghost" in str(line))
+    assert (line["batches"], line["packs"], line["first"]) == (3, 2, "ghost1, ghost2")
+
+
+async def test_other_tasks_run_between_the_parts_of_a_batch(
+    nc: Client, cluster: NatsCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await load_packs(nc, ["p1"])
+    iteration, iterations, add = 0, list[int](), IngestStore.add
+
+    def counted_add(*arguments: Any) -> Selection:
+        iterations.append(iteration)
+        return add(*arguments)
+
+    monkeypatch.setattr(IngestStore, "add", counted_add)
+    monkeypatch.setattr(ingest_module, "PART_SAMPLES", 10)
+    async with ingesting(tmp_path, cluster.url):
+        await send(nc, "p1", json_batch(samples_of("p1", 60)))
+        while len(iterations) < 6:
+            iteration += 1
+            await asyncio.sleep(0)
+    assert len(set(iterations)) == 6
+
+
+async def test_damaged_stream_is_replaced_and_its_lost_batches_are_named(
+    nc: Client, cluster: NatsCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ingest_module, "CHECK_S", 0.05)
+    monkeypatch.setattr(telemetry_reader, "RETRY_S", 0.01)
+    await load_packs(nc, ["p1"])
+    for _ in range(3):
+        await send(nc, "p1", json_batch(samples_of("p1", 6)))
+    cluster.kill(0)
+    await asyncio.to_thread(cluster.start, 0)
+    # the server, which has no messages in memory, now answers each purge with error 10051
+    shutil.rmtree(next(cluster.nodes[0].store.rglob("TELEMETRY")) / "msgs")
+    with capture_logs() as lines:
+        async with ingesting(tmp_path, cluster.url):
+            await until(lambda: "deleted and created again" in str(lines), lambda: lines)
+            await until(lambda: nc.is_connected, lambda: "no connection")
+            await send_when_stream_exists(nc, "p1", json_batch(samples_of("p1", 12)))
+            await until_stored(tmp_path, 1)
+    lost = [line for line in lines if line["event"] == "the server has lost batches"]
+    assert [(line["batches"], line["first"], line["last"]) for line in lost] == [(3, 1, 3)]
+    errors = [line["reason"] for line in lines if line["event"] == "the server has an error in the stream of batches"]
+    assert len(errors) == telemetry_reader.MAX_FAILURES
+    assert all("10051" in error for error in errors)
+
+
 async def test_missing_stream_is_created_again_and_later_batches_are_stored(
     nc: Client, cluster: NatsCluster, tmp_path: Path
 ) -> None:
@@ -214,14 +310,9 @@ async def test_missing_stream_is_created_again_and_later_batches_are_stored(
         await send(nc, "p1", json_batch(rows[:6]))
         await until(lambda: select(tmp_path, "SELECT name FROM pack") == ["p1"], lambda: "not stored")
         await nc.jetstream().delete_stream(subjects.TELEMETRY_STREAM)
-        deadline_s = time.monotonic() + LONG_S
-        while True:
-            try:
-                await send(nc, "p1", json_batch(rows))
-                break
-            except NoStreamResponseError:
-                assert time.monotonic() < deadline_s
-        await until_stored(tmp_path, 1)
+        await until_stored(tmp_path, 1)  # the open block, whose batch the new stream does not have
+        await send_when_stream_exists(nc, "p1", json_batch(np.concatenate([rows, samples_of("p1", 18)[12:]])))
+        await until_stored(tmp_path, 2)
 
 
 async def test_recreated_stream_is_read_from_its_beginning_and_processed_batches_are_removed(nc: Client) -> None:

@@ -36,7 +36,7 @@ def changes(pack: str, count: int, **more: object) -> Changes:
     for part in np.split(samples_of("p1", 6 * count), count):
         number, ready = position.next_number, ReadyBlock(START_S, part)
         position = position.after(ready)
-        blocks.append(NumberedBlock(pack, position.created_s, number, ready))
+        blocks.append(NumberedBlock.of(pack, number, position.created_s, ready))
     return Changes(Progress("now", 7, 0), blocks, {pack: position}, **more)
 
 
