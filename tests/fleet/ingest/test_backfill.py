@@ -117,7 +117,7 @@ def test_errors_name_file_and_column(tmp_path: Path) -> None:
         samples_by_pack(parquet_files([tmp_path]))
     nested = pa.array([[[3.7]]] * 5)
     write(tmp_path / "p1.parquet", samples_of("p1", 5), cells_v=nested)
-    with pytest.raises(UserError, match="column cells_v is list<.*must be numbers"):
+    with pytest.raises(UserError, match=r"column cells_v is list<.*must be numbers"):
         samples_by_pack(parquet_files([tmp_path]))
     write(tmp_path / "p1.parquet", samples_of("p1", 5), **{f"cell_{n}_v": [3.7] * 5 for n in range(1, 257)})
     with pytest.raises(UserError, match="256 columns of cell voltages: must be at most 255"):

@@ -305,14 +305,13 @@ async def test_missing_stream_is_created_again_and_later_batches_are_stored(
     nc: Client, cluster: NatsCluster, tmp_path: Path
 ) -> None:
     await load_packs(nc, ["p1"])
-    rows = samples_of("p1", 12)
     async with ingesting(tmp_path, cluster.url):
-        await send(nc, "p1", json_batch(rows[:6]))
-        await until(lambda: select(tmp_path, "SELECT name FROM pack") == ["p1"], lambda: "not stored")
+        await send(nc, "p1", json_batch(samples_of("p1", BLOCK_SAMPLES + 1)))
+        await until_stored(tmp_path, 1)
         await nc.jetstream().delete_stream(subjects.TELEMETRY_STREAM)
-        await until_stored(tmp_path, 1)  # the open block, whose batch the new stream does not have
-        await send_when_stream_exists(nc, "p1", json_batch(np.concatenate([rows, samples_of("p1", 18)[12:]])))
-        await until_stored(tmp_path, 2)
+        await until_stored(tmp_path, 2)  # the open block, whose batch the new stream does not have
+        await send_when_stream_exists(nc, "p1", json_batch(samples_of("p1", 3 * BLOCK_SAMPLES)))
+        await until_stored(tmp_path, 3)
 
 
 async def test_recreated_stream_is_read_from_its_beginning_and_processed_batches_are_removed(nc: Client) -> None:
