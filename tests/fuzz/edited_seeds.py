@@ -122,7 +122,7 @@ def parse_json(data: bytes) -> Any:
     """Return the JSON value of ``data``; None if it has none."""
     try:
         return json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
 
 

@@ -50,6 +50,7 @@ class PackBucket:
         self.faults, self.fault = 0, ""
         self._nc = nc
         self._next_sequence = {PACKS_BUCKET: 1, CELLS_BUCKET: 1}
+        self._created: dict[str, object] = {}  # creation times of the streams with these sequence numbers
         self._changed: dict[str, set[str]] = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
 
     async def refresh(self) -> set[str]:
@@ -67,13 +68,13 @@ class PackBucket:
     async def _read(self, bucket: str, set_value: Callable[[str, bytes | None], bool]) -> None:
         """Read the changed keys of a bucket. They remain in ``_changed`` for the next refresh if this refresh fails."""
         try:
-            state = (await self._nc.jetstream().stream_info(_stream(bucket))).state
+            info = await self._nc.jetstream().stream_info(_stream(bucket))
         except nats.errors.Error as error:
             raise StreamError(f"the server rejects reading {_stream(bucket)}: {error_text(error)}") from None
-        if state.last_seq + 1 < self._next_sequence[bucket]:
-            self._next_sequence[bucket] = (
-                1  # the stream was recreated or has lost its end: sequence numbers are used again
-            )
+        is_recreated = info.created != self._created.get(bucket)
+        if is_recreated or info.state.last_seq + 1 < self._next_sequence[bucket]:  # numbers are used again
+            self._next_sequence[bucket] = 1
+        self._created[bucket] = info.created
         async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next_sequence[bucket]):
             for message in batch:
                 key, data = _entry(bucket, message)

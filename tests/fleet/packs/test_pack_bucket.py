@@ -79,8 +79,14 @@ async def test_refresh_after_the_table_was_recreated_returns_the_changed_packs(n
     with pytest.raises(StreamError, match="KV_packs: a stream is missing"):
         await bucket.refresh()
     await make_streams(nc, partitions=1)
-    await write_bucket(nc, PACKS_BUCKET, {"b": b"{broken"})  # with a sequence number that was read before
-    assert await bucket.refresh() == {"a", "b"}
+    rows = {
+        "b": b"{broken",
+        "d": LFP_ROW,
+        "e": LFP_ROW,
+        "f": LFP_ROW,
+    }  # of which three have numbers that were read before
+    await write_bucket(nc, PACKS_BUCKET, rows)
+    assert await bucket.refresh() == {"a", *rows}
     assert bucket.packs("a")
     assert bucket.packs("b") is None
 
