@@ -37,6 +37,8 @@ DEAD_AGE_S = 30 * 86_400.0
 """Maximum age of a message in the stream ``DEAD`` [s]."""
 MAX_BLOCK_BYTES = 256 << 10
 """Maximum size of a block in ``RAW`` [bytes]: 7,000 incompressible samples."""
+MAX_BATCH_BYTES = (1 << 20) - (16 << 10)
+"""Maximum size of a batch in ``TELEMETRY`` [bytes], so that its dead letter with the reason fits a message of the server."""
 PACK_FRACTION = 1 / 3
 """Fraction of ``RAW`` that one pack can fill with blocks of the maximum size. Beyond this fraction, the pack's oldest
 block is removed. By default the fraction corresponds to seven days of minute blocks."""
@@ -142,7 +144,7 @@ async def make_telemetry_stream(nc: Client, max_bytes: int) -> None:
     response = await _retry(_request, nc, f"STREAM.INFO.{subjects.RAW_STREAM}", {})
     if "error" in response:
         raise _no_raw_stream()
-    limits = {"max_bytes": max_bytes, "discard": "new", "allow_direct": True}
+    limits = {"max_bytes": max_bytes, "max_msg_size": MAX_BATCH_BYTES, "discard": "new", "allow_direct": True}
     stream = _stream(subjects.TELEMETRY_STREAM, subjects.telemetry(), **limits)
     await _retry(_ensure_stream, nc, stream | {"num_replicas": response["config"]["num_replicas"]})
 

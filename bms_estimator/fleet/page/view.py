@@ -4,7 +4,7 @@ import json
 from collections import deque
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic_core import from_json
 
 from bms_estimator.fleet.fleet_workers import RATE_S, FleetWorkers
 from bms_estimator.fleet.heartbeat import Heartbeat
@@ -48,8 +48,9 @@ class FleetView:
     def receive_worker(self, data: bytes, now_s: float) -> None:
         """Store a worker's heartbeat."""
         try:
-            self.workers.receive(Heartbeat.model_validate_json(data), now_s)
-        except ValidationError:
+            heartbeat = Heartbeat.model_validate(from_json(data, allow_inf_nan=False))  # the page's JSON has no NaN
+            self.workers.receive(heartbeat, now_s)
+        except ValueError:
             self.damaged += 1
 
     def receive_unknown(self, name: str, reason: str) -> None:

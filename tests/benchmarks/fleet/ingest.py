@@ -1,6 +1,7 @@
 """Benchmark of ``fleet ingest``: rate and CPU time, from batches that wait on the server to blocks in the stream.
 
-``python -m tests.benchmarks.fleet.ingest --packs 10000`` prints a line for JSON and one for Arrow.
+``python -m tests.benchmarks.fleet.ingest --packs 10000`` prints a line for JSON and one for Arrow, and then the longest time for
+which a batch of 50,000 blocks stops the other tasks.
 """
 
 import argparse
@@ -19,9 +20,17 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams, make_telemetry_stream
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.load import pulses
-from tests.fleet.ingest.platform import START_S, arrow_batch, json_batch, running_ingest
+from tests.fleet.ingest.platform import (
+    START_S,
+    arrow_batch,
+    ingesting,
+    json_batch,
+    running_ingest,
+    select,
+    until_stored,
+)
 from tests.fleet.nats_cluster import connected, running
-from tests.fleet.workers import load_packs
+from tests.fleet.workers import load_packs, until
 
 SAMPLES = 60
 """Number of samples of a batch and of a block, at 1 Hz."""
@@ -31,6 +40,8 @@ POLL_S = 0.05
 """Poll interval of the stream [s]."""
 IN_FLIGHT = 1000
 """Maximum number of batches without an acknowledgment."""
+BLOCKS = 50_000
+"""Number of blocks of the large batch, which has one sample a minute."""
 
 
 async def measure(folder: Path, packs: int, encode: Callable[[SampleBlock], bytes]) -> str:
@@ -76,14 +87,45 @@ async def wait_for_blocks(nc: Client, process: psutil.Process, count: int) -> tu
     return blocks, time.monotonic(), sum(process.cpu_times()[:2])
 
 
+async def measure_holds(folder: Path) -> str:
+    """Return the longest times between two iterations of the event loop while a batch of ``BLOCKS`` blocks is processed."""
+    times_s = START_S - 60 * np.arange(BLOCKS, 0, -1)
+    ones = ",".join(["1"] * BLOCKS)
+    batch = f'{{"time_s":[{",".join(map(str, times_s.astype(int)))}],"current_a":[{ones}],"voltage_v":[{ones}]}}'
+    holds_s = list[float]()
+
+    async def record_holds() -> None:
+        last_s = time.monotonic()
+        while True:
+            await asyncio.sleep(0)
+            now_s = time.monotonic()
+            holds_s.append(now_s - last_s)
+            last_s = now_s
+
+    with running(folder) as cluster:
+        nc = await connected(cluster.url)
+        await make_streams(nc, partitions=1)
+        await load_packs(nc, ["p1"])
+        async with ingesting(folder, cluster.url):
+            await until(lambda: select(folder, "SELECT sequence FROM progress"), lambda: "not started")
+            recording = asyncio.create_task(record_holds())
+            await nc.jetstream().publish(subjects.telemetry("p1"), batch.encode())
+            await until_stored(folder, BLOCKS - 1)
+            recording.cancel()
+        await nc.close()
+    return ", ".join(f"{1e3 * hold_s:.0f}" for hold_s in sorted(holds_s)[-3:]) + " ms"
+
+
 def main() -> None:
-    """Measure both formats."""
+    """Measure both formats, and a large batch."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--packs", type=int, default=10_000)
     packs = parser.parse_args().packs
     for name, encode in (("JSON", json_batch), ("Arrow", arrow_batch)):
         with tempfile.TemporaryDirectory() as folder:
             sys.stdout.write(f"{name}: {asyncio.run(measure(Path(folder), packs, encode))}\n")
+    with tempfile.TemporaryDirectory() as folder:
+        sys.stdout.write(f"{BLOCKS:,} blocks: longest holds {asyncio.run(measure_holds(Path(folder)))}\n")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from bms_estimator.fleet.ingest.batch_samples import Selection
 from bms_estimator.fleet.ingest.ingest_store import FILE, IngestStore
 from bms_estimator.fleet.ingest.telemetry_reader import TelemetryReader
 from bms_estimator.fleet.nats.dead_letters import read_dead_letters, replay_letter
-from bms_estimator.fleet.nats.streams import make_telemetry_stream
+from bms_estimator.fleet.nats.streams import MAX_BATCH_BYTES, make_telemetry_stream
 from bms_estimator.fleet.packs.pack_bucket import remove_keys
 from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 from bms_estimator.model.clock import Clock
@@ -231,7 +231,7 @@ async def test_no_batch_stops_the_batches_after_it(
         many_cells: "internal error: error in block.py",
         json_batch(rows, cells_v=[[[3.7]]] * 12): "cells_v: must be numbers",
         b'{"time_s": [1], "current_a": [1], "\\ud800": [1]}': r"no column of voltage; found time_s, current_a, \ud800",
-        b"[" * 100_000: "neither JSON nor Arrow IPC: maximum recursion depth exceeded",
+        b"[" * MAX_BATCH_BYTES: "neither JSON nor Arrow IPC: maximum recursion depth exceeded",
     }
     async with ingesting(tmp_path, cluster.url):
         for batch in rejected:

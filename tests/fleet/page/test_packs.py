@@ -247,7 +247,9 @@ def test_rate_of_received_states_is_measured():
 def test_invalid_heartbeats_are_counted_and_skipped():
     view = FleetView(1, 0.0)
     view.receive_worker(b"{}", 0.0)
-    assert view.overview(0.0, 0.0)["damaged"] == 1
+    view.receive_worker(heartbeat("w", 0).model_dump_json().encode().replace(b"0.0", b"NaN"), 0.0)
+    view.overview_json(0.0, 0.0)
+    assert view.overview(0.0, 0.0)["damaged"] == 2
 
 
 def test_new_connection_clears_workers_but_not_packs():
