@@ -43,6 +43,8 @@ MIN_TIME_S = 946_684_800.0
 """Earliest plausible timestamp: 2000-01-01 [s since 1970]."""
 MAX_LAYOUTS = 256
 """Maximum number of headers whose layout is cached."""
+MAX_COLUMNS = 4096
+"""Maximum number of columns. Their recognition takes 70 ms, in which other tasks wait."""
 MAX_CACHED_COLUMNS, MAX_CACHED_CHARACTERS = 400, 8000
 """Maximum size of a header whose layout is cached. With ``MAX_LAYOUTS`` headers of this size the cache has about 16 MB."""
 CELLS = "cells"
@@ -124,6 +126,8 @@ class BatchReader:
         return [layout.columns[Role.TIME], *others, *([cells] if cells else [])]
 
     def _find_layout(self, header: tuple[str, ...]) -> tuple[Layout, Column | None]:
+        if len(header) > MAX_COLUMNS:
+            raise UserError(f"{len(header):,} columns: must be at most {MAX_COLUMNS:,}")
         is_small = len(header) <= MAX_CACHED_COLUMNS and sum(map(len, header)) <= MAX_CACHED_CHARACTERS
         return (self._find_cached if is_small else self._find)(header)
 

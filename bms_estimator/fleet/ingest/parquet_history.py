@@ -18,7 +18,7 @@ from bms_estimator.sources.captures.tables.layout import Column
 PACK_COLUMN = "pack"
 """Column with the name of the pack. A file without this column has the samples of one pack, and is named after it."""
 BATCH_ROWS = 4096
-"""Maximum number of rows in memory. So many rows of 255 cell voltages are a batch with ``batch_columns.MAX_VALUES``."""
+"""Maximum number of rows in memory. This number of rows with 255 cells each has fewer values than ``batch_columns.MAX_VALUES``."""
 MEMORY = "1GB"
 """Memory for sorting; larger data are sorted on disk."""
 DAY_S = 86_400.0

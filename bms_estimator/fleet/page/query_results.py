@@ -26,7 +26,7 @@ def answer(folder: Path, name: str) -> dict[str, Any]:
     """
     try:
         result = run_query(folder, name)
-    except (UserError, duckdb.Error) as error:
+    except (UserError, duckdb.Error, OSError) as error:
         return {"reason": str(error)}
     # Rows of ``soh`` for a type have no pack; the page shows only these rows.
     rows = [row for row in result.rows if name != "soh" or row[result.columns.index("pack")] is None]

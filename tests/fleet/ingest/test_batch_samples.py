@@ -120,6 +120,7 @@ def test_cell_voltages() -> None:
         (encode(VALUES | {"time_s": TIMES, "cells_v": [[10**400]] * 5}), "a number is too large"),
         (encode(VALUES | {"time_s": TIMES} | {f"cell_{n}_v": [3.7] * 5 for n in range(1, 257)}), "256 columns of cell"),
         (encode({name: [1.0] * 5000 for name in MANY_COLUMNS[:3]} | {"cells_v": [[3.7] * 255] + [None] * 4999}), "values"),
+        (encode(dict.fromkeys(map(str, range(4097)), 1)), "4,097 columns: must be at most 4,096"),
         (encode([dict.fromkeys(map(str, range(1000)))] + [{}] * 2000), "2,001,000 values: must be at most 1,048,576"),
         (encode(VALUES)[:-1] + b', "voltage_v": []}', "several columns have the same name"),
         (arrow_bytes(pa.concat_tables(2 * [pa.table({"time_s": pa.nulls(2**19)})])), "2,097,152 values: must be at most"),
