@@ -112,7 +112,8 @@ class TelemetryReader:
         info = await self._request("INFO", {})
         state, created = info["state"], str(info["created"])
         if created != self.stream:
-            self.stream, self.sequence, self._purged, self._last = created, 0, 0, 0
+            first = max(1, state["first_seq"])  # 0 for a new stream; later numbers after a loss of this process's folder
+            self.stream, self.sequence, self._purged, self._last = created, first - 1, 0, 0
             return unread
         self._last = state["last_seq"]
         if self._last < self.sequence:  # the server has lost the end of the stream: numbers are used again
