@@ -112,7 +112,9 @@ class TelemetryReader:
         info = await self._request("INFO", {})
         state, created = info["state"], str(info["created"])
         if created != self.stream:
-            first = max(1, state["first_seq"])  # 0 for a new stream; later numbers after a loss of this process's folder
+            first = max(
+                1, state["first_seq"]
+            )  # 0 for a new stream; later numbers after a loss of this process's folder
             self.stream, self.sequence, self._purged, self._last = created, first - 1, 0, 0
             return unread
         self._last = state["last_seq"]

@@ -56,7 +56,10 @@ async def test_batches_over_mqtt_and_nats_become_blocks(fleet: Tenant, tmp_path:
     ("role", "rejected_subjects"),
     [
         (Role.SENDER, ("raw.p1", "dead.p1.1", "edge.p1.awaits", "$KV.packs.p1", "$JS.API.STREAM.PURGE.TELEMETRY")),
-        (Role.INGEST, ("telemetry.p1", "bms.p1.state", "$KV.packs.p1", "$JS.API.STREAM.PURGE.RAW", "p.1.raw.p1")),
+        (
+            Role.INGEST,
+            ("telemetry.p1", "bms.p1.state", "$KV.packs.p1", "$JS.API.STREAM.PURGE.RAW", "$JS.API.STREAM.DELETE.RAW"),
+        ),
     ],
 )
 async def test_credentials_permit_nothing_else(fleet: Tenant, role: Role, rejected_subjects: tuple[str, ...]) -> None:
