@@ -85,9 +85,16 @@ class FrameDecoder:
 
     Args:
         current_sign: Direction of positive current of the board; samples are positive on discharge.
+
+    Attributes:
+        hellos: Number of hellos received.
+        boots: Number of hellos that differ from the previous one in the boot id or serial number, also across reopenings
+            of the port. It shows every reset of which a later hello arrives, with or without samples between them.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive") -> None:
+        self.hellos = self.boots = 0
+        self._boot: tuple[int, int] | None = None  # boot id and serial number of the last hello
         self._state = np.zeros(1, dtype=DECODER)
         self._state["boot_id"] = -1
         self._state["current_sign"] = 1.0 if current_sign == "discharge_positive" else -1.0
@@ -236,7 +243,11 @@ class FrameDecoder:
         """Decode and store a hello or an acknowledgment: version, type and body, padded with zeros."""
         message_type, ack_result = packet[1], packet[3]
         if message_type == MessageType.HELLO:
-            self._hello = Hello.decode(packet[: 2 + Hello.LAYOUT.size].tobytes())
+            hello = self._hello = Hello.decode(packet[: 2 + Hello.LAYOUT.size].tobytes())
+            boot = hello.boot_id, hello.serial
+            self.hellos += 1
+            self.boots += self._boot not in (None, boot)
+            self._boot = boot
         elif ack_result in _ACK_RESULTS:
             self._acks.append(Ack.decode(packet[: 2 + Ack.LAYOUT.size].tobytes()))
             del self._acks[:-_MAX_MESSAGES]
