@@ -90,17 +90,13 @@ class RelayHook(Hook):
             self._check_resets()
             refusal = await self._send_level()
             self._check_resets()  # a command is done only if the board was not reset after it
-            self._set_error(refusal or self._reset_error())
+            self._set_error(self._reset_error() or refusal)
             await self._wait(RELAY_RETRY_S if refusal else RELAY_S)
 
     def _check_resets(self) -> None:
         resets = self._hold.check(self._board.boots, self._clock())
-        if resets:
-            self.relay_resets += resets
-            self.failures += resets
-            log.warning(
-                "relay: the board was reset", hook=self.description, resets=self._hold.resets, waits_s=self._hold.hold_s
-            )
+        self.relay_resets += resets
+        self.failures += resets
 
     async def _send_level(self) -> str:
         """Send the level that is allowed now. Return why the board does not confirm it; empty if it does."""

@@ -156,7 +156,9 @@ def test_relay_command_is_not_sent_to_a_board_that_was_reset() -> None:
     assert protocol.boots == 1
 
 
-@pytest.mark.parametrize("hello", [HELLO, replace(HELLO, serial=HELLO.serial + 1), replace(HELLO, boot_id=0)])
+@pytest.mark.parametrize(
+    "hello", [HELLO, replace(HELLO, serial=1), replace(HELLO, boot_id=0), replace(HELLO, sequence=2**32 - 1)]
+)
 def test_every_other_boot_or_board_counts_even_without_samples_and_across_openings_of_the_port(hello: Hello) -> None:
     protocol = protocol_after_hello()
     protocol.on_port_opened()
