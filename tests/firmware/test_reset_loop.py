@@ -9,8 +9,10 @@ import pytest
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.model.sample import SampleStatus
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import MessageType, command
+from bms_estimator.service import relay_hook
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import Settings
 from tests.collector import Collector
@@ -22,6 +24,8 @@ pytestmark = pytest.mark.usefixtures("firmware")
 LOAD_A = 5.0
 RESETS = 30
 """Number of resets of the board while the alarm is latched."""
+SAMPLES = 30
+"""Number of samples between two resets, in which a service that does not wait would switch the relay."""
 
 
 class PinMonitor:
@@ -32,12 +36,14 @@ class PinMonitor:
     def __init__(self) -> None:
         self._decoder = FrameDecoder()
         self.is_high, self.rises, self.resets = False, 0, 0
+        self.samples = 0  # number of samples since the last reset
 
     def write(self, arrival_s: float, data: bytes) -> None:
         for sample in self._decoder.feed(arrival_s, data):
             is_high = bool(sample["current_a"] < 0.9 * LOAD_A)  # also if the pin was high for a part of the sample
             self.rises += is_high > self.is_high
             self.is_high = is_high
+            self.samples = 1 if sample["status"] & SampleStatus.RESET else self.samples + 1
         self.resets = self._decoder.counters.resets
 
 
@@ -55,12 +61,14 @@ def raised(snapshot: Snapshot) -> dict[str, str]:
 
 @pytest.mark.parametrize(("relay", "max_rises"), [("low", 0), ("high", 1)])
 async def test_a_board_in_a_reset_loop_does_not_chatter_its_relay_and_raises_alarms(
-    tmp_path: Path, relay: str, max_rises: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, relay: str, max_rises: int
 ) -> None:
     """Low is the safe level: the pin stays low. High is safe: one more attempt follows the first reset."""
+    monkeypatch.setattr(relay_hook, "RELAY_S", 0.02)  # several commands between two resets of the accelerated board
+    monkeypatch.setattr(relay_hook, "RESET_POLL_S", 0.02)
     readings = write_readings(tmp_path / "readings.csv", [(0.0, LOAD_A, 25.9, 25.0)])
     pin, sink, stop = PinMonitor(), Collector(), asyncio.Event()
-    with SimavrBoard(readings, speed=5.0, relay=True) as board:
+    with SimavrBoard(readings, speed=10.0, relay=True) as board:
         settings = Settings.model_validate(
             {
                 "sensor": {"port": board.path},
@@ -80,7 +88,7 @@ async def test_a_board_in_a_reset_loop_does_not_chatter_its_relay_and_raises_ala
         try:
             for resets in range(1, RESETS + 1):
                 os.write(line, b"\0" + command(MessageType.COMMAND_RESTART))
-                await until(lambda resets=resets: pin.resets >= resets)  # type: ignore[misc]
+                await until(lambda resets=resets: pin.resets >= resets and pin.samples >= SAMPLES)  # type: ignore[misc]
             snapshot = await sink.until(lambda snapshot: snapshot.health.line["resets"] >= RESETS)
         finally:
             os.close(line)
