@@ -9,6 +9,7 @@ from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.service.hook import Hook, counts_as_raised
 from bms_estimator.service.hook_check import require_output
+from bms_estimator.service.hook_list_file import HookListFile
 from bms_estimator.service.job_hook import CommandHook, PublishHook, PublishRaw
 from bms_estimator.service.relay_hook import RelayBoard, RelayHook
 from bms_estimator.settings.alarms import AlarmHook
@@ -27,6 +28,7 @@ class AlarmHooks:
         publish: Publishes a message; None without a broker.
         board: Board with a relay pin; None without one.
         clock: Time since boot of the host [s].
+        list_file: File with the hooks of the last start; None: no hook counts as new.
 
     Raises:
         UserError: A hook needs something that is missing.
@@ -39,7 +41,9 @@ class AlarmHooks:
         publish: PublishRaw | None,
         board: RelayBoard | None,
         clock: Callable[[], float] = since_boot,
+        list_file: HookListFile | None = None,
     ) -> None:
+        self._list_file = list_file
         self._hooks: list[Hook] = []
         for i, hook in enumerate(hooks):
             require_output(i, hook, broker=publish is not None, relay=board is not None)
@@ -72,17 +76,20 @@ class AlarmHooks:
     def restore_active(self, alarms: Sequence[Alarm]) -> None:
         """Restore the alarms of an earlier run.
 
-        Jobs of these alarms are not repeated, but the relay is set to its level. If a hook had failed in the earlier run,
-        all jobs are repeated, so that none is lost.
+        Jobs of these alarms are not repeated, but the relay is set to its level. A hook that the earlier run did not have
+        gets its jobs. If a hook had failed in the earlier run, all jobs are repeated, so that none is lost.
         """
         raised = [alarm for alarm in alarms if counts_as_raised(alarm)]
         failed = [alarm for alarm in raised if alarm.name == "hook_failed"]
-        if failed:
-            for alarm in raised:
-                if alarm not in failed:  # hook_failed itself is not announced again
-                    self.on_alarm_change(Change(at_s=0.0, alarm=alarm))  # hooks do not use the time
+        added = self._list_file.replace([hook.settings for hook in self._hooks]) if self._list_file else []
         for hook in self._hooks:
-            hook.restore_active(failed or raised)
+            if failed or hook.settings in added:
+                for alarm in raised:
+                    if alarm not in failed and hook.covers(alarm.name):
+                        hook.on_alarm_change(alarm)
+                hook.restore_active(failed)  # hook_failed itself is not announced again
+            else:
+                hook.restore_active(raised)
 
     async def __aenter__(self) -> Self:
         """Start a task for each hook."""

@@ -19,6 +19,7 @@ class Hook(ABC):
     """One hook.
 
     Attributes:
+        settings: Settings of the hook.
         done: Number of completed jobs since start.
         failures: Number of failed attempts since start.
         relay_resets: Number of resets of the board that undid a relay command, since start.
@@ -26,7 +27,7 @@ class Hook(ABC):
     """
 
     def __init__(self, settings: AlarmHook) -> None:
-        self._settings = settings
+        self.settings = settings
         self.done, self.failures, self.relay_resets, self.error = 0, 0, 0, ""
         self._raised: dict[str, Alarm] = {}  # alarms of this hook that count as raised, by name
         self._wake = asyncio.Event()
@@ -39,7 +40,7 @@ class Hook(ABC):
 
     def covers(self, name: str) -> bool:
         """Return True if the hook is for this alarm. ``hook_failed`` must be listed by name."""
-        return name in self._settings.alarms if self._settings.alarms else name != "hook_failed"
+        return name in self.settings.alarms if self.settings.alarms else name != "hook_failed"
 
     def on_alarm_change(self, alarm: Alarm) -> None:
         """Record the new state of an alarm of this hook, and act if it was raised or cleared."""

@@ -39,8 +39,7 @@ class HookJobs:
         """Add or remove the jobs that follow from an alarm that was raised or cleared."""
         state: State = "raised" if alarm.name in self._raised else "cleared"
         self._add(Job(alarm, state, alarm.name), state)
-        is_first_or_last = len(self._raised) == (state == "raised")
-        if is_first_or_last:
+        if not self._raised.keys() - {alarm.name}:  # the first raised or the last cleared alarm
             self._add(Job(alarm, state, _ANY), _EVENTS_OF_ANY[state])
 
     def _add(self, job: Job, event: HookEvent) -> None:

@@ -47,9 +47,11 @@ class JobHook(Hook):
             self._wake.clear()
             backoff = Backoff(FIRST_RETRY_S)
             while (job := self._jobs.take()) is not None:
-                if self._settings.dry_run:
+                if self.settings.dry_run:
                     log.warning("alarm hook, dry run", would=self.description, alarm=job.alarm.name, state=job.state)
-                elif not await self._run_job(job):
+                elif await self._run_job(job):
+                    backoff.reset()
+                else:
                     await self._retry_later(job, backoff.next_s())
             if self._closing:
                 return
@@ -101,15 +103,15 @@ class CommandHook(JobHook):
     @property
     def description(self) -> str:
         """Description with the name of the program."""
-        return f"run {(self._settings.run or ('',))[0]}"
+        return f"run {(self.settings.run or ('',))[0]}"
 
     async def _run_job(self, job: Job) -> bool:
         """Run the program once. Return False if it could not be started."""
         fields = self._fields(job)
-        text, timeout_s = fields.pop("json").encode(), self._settings.timeout_s
-        variables = program_environment(self._settings.pass_environment, fields)
+        text, timeout_s = fields.pop("json").encode(), self.settings.timeout_s
+        variables = program_environment(self.settings.pass_environment, fields)
         try:
-            code = await run_program(self._settings.run or (), text, variables, timeout_s)
+            code = await run_program(self.settings.run or (), text, variables, timeout_s)
         except StartError as error:
             self._fail(job, f"cannot be started: {error}")
             log.warning("alarm hook: the program cannot be started", hook=self.description, error=str(error))
@@ -145,6 +147,6 @@ class PublishHook(JobHook):
         return f"publish on {self._topic}"
 
     async def _run_job(self, job: Job) -> bool:
-        self._publish(self._topic, Template(self._settings.payload).substitute(self._fields(job)).encode())
+        self._publish(self._topic, Template(self.settings.payload).substitute(self._fields(job)).encode())
         self._succeed()
         return True

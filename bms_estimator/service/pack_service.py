@@ -23,6 +23,7 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import has_relay
+from bms_estimator.service.hook_list_file import HookListFile
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.pack import Settings
@@ -99,7 +100,13 @@ async def run_pack_service(
         )
         all_sinks.insert(0, mqtt)  # so that no other sink delays the messages
     board = source if isinstance(source, SerialSource) and has_relay(settings) else None
-    hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, mqtt.publish_raw if mqtt else None, board)
+    hooks = AlarmHooks(
+        settings.alarms.hook,
+        settings.pack.name,
+        mqtt.publish_raw if mqtt else None,
+        board,
+        list_file=HookListFile(folder, settings.pack.name) if folder else None,
+    )
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None
         all_sinks.append(

@@ -65,16 +65,16 @@ class RelayHook(Hook):
     @property
     def _wants_high(self) -> bool:
         """True if the pin is to be high: its level in ``relay`` while an alarm is raised, otherwise the opposite level."""
-        return (self._settings.relay == "high") == bool(self._raised)
+        return (self.settings.relay == "high") == bool(self._raised)
 
     def _on_transition(self, alarm: Alarm) -> None:
         """Follow the alarms regardless of the hook's ``on``."""
-        is_raised = alarm.name in self._raised
-        if len(self._raised) == is_raised:  # the first raised or the last cleared alarm changes the level
-            state, dry_run = "raised" if is_raised else "cleared", self._settings.dry_run
-            log.warning("relay", dry_run=dry_run, hook=self.description, alarm=alarm.name, state=state)
-            if is_raised:
-                self._hold.end()
+        if self._raised.keys() - {alarm.name}:  # another alarm is raised, so that the level does not change
+            return
+        state = "raised" if self._raised else "cleared"
+        log.warning("relay", dry_run=self.settings.dry_run, hook=self.description, alarm=alarm.name, state=state)
+        if self._raised:
+            self._hold.end()
 
     def restore_active(self, alarms: Iterable[Alarm]) -> None:
         """Restore raised alarms of an earlier run. If a hook had failed, the board may be in a reset loop."""
@@ -85,7 +85,7 @@ class RelayHook(Hook):
 
     async def _run_jobs(self) -> None:
         """Send the level repeatedly until the hook is closed."""
-        while not self._settings.dry_run and not self._closing:
+        while not self.settings.dry_run and not self._closing:
             self._wake.clear()
             self._check_resets()
             refusal = await self._send_level()
@@ -97,6 +97,8 @@ class RelayHook(Hook):
         resets = self._hold.check(self._board.boots, self._clock())
         self.relay_resets += resets
         self.failures += resets
+        if resets:
+            self._set_error(self._reset_error())
 
     async def _send_level(self) -> str:
         """Send the level that is allowed now. Return why the board does not confirm it; empty if it does."""
@@ -128,10 +130,10 @@ class RelayHook(Hook):
 
     def _command(self, *, high: bool) -> Relay:
         """Return the command with a level, and with the level for a silent service."""
-        if self._settings.level_when_silent == "keep":
+        if self.settings.level_when_silent == "keep":
             return Relay(high, high_when_silent=None)
-        high_when_silent = self._settings.level_when_silent == "high"
-        return Relay(high, high_when_silent=high_when_silent, silent_s=self._settings.silent_s)
+        high_when_silent = self.settings.level_when_silent == "high"
+        return Relay(high, high_when_silent=high_when_silent, silent_s=self.settings.silent_s)
 
     async def _wait(self, pause_s: float) -> None:
         """Wait until the next command is due, an alarm changes or the board was reset."""

@@ -19,6 +19,7 @@ from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.service import job_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import hook_warnings
+from bms_estimator.service.hook_list_file import HookListFile
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
@@ -127,6 +128,36 @@ async def test_an_alarm_reported_in_an_earlier_run_is_not_reported_again_and_its
         running.restore_active([RAISED])
         running.on_alarm_change(Change(at_s=0.0, alarm=CLEARED))
         assert await wait_for_lines(out, 1) == ["soc_low cleared"]
+
+
+async def test_a_hook_that_was_added_or_changed_before_a_restart_acts_on_an_alarm_that_is_already_raised(
+    tmp_path: Path,
+) -> None:
+    output: list[str] = []
+    first, second = ({"topic": topic, "payload": f"{topic} $name"} for topic in ("first", "second"))
+    dry_run = first | {"dry_run": True}
+    options = {
+        "publish": lambda _, payload: output.append(payload.decode()),
+        "list_file": HookListFile(tmp_path, "pack"),
+    }
+    for tables in ((first,), (first,), (first, second), (dry_run, second), (first, second)):
+        async with run_hooks(*tables, **options) as running:
+            running.restore_active([RAISED])
+        output.append("restart")
+    assert output == [*["restart"] * 2, "second soc_low", *["restart"] * 2, "first soc_low", "restart"]
+
+
+async def test_a_damaged_list_of_hooks_makes_every_hook_act_again(tmp_path: Path) -> None:
+    output: list[bytes] = []
+    for content in ("[", '{"a": 1}', "\0" * 100):
+        (tmp_path / "pack.hooks.json").write_text(content)
+        async with run_hooks(
+            {"topic": "load/set", "payload": "$name"},
+            publish=lambda _, payload: output.append(payload),
+            list_file=HookListFile(tmp_path, "pack"),
+        ) as running:
+            running.restore_active([RAISED])
+    assert output == [b"soc_low"] * 3
 
 
 async def test_a_hook_runs_only_for_its_alarms_and_states(tmp_path: Path) -> None:
