@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from threading import Thread
 
 import structlog
 
@@ -12,6 +13,9 @@ from bms_estimator.settings.alarms import AlarmHook
 
 MAX_FILE_BYTES = 65_536
 """Maximum size of the file [bytes], about 900 hooks."""
+
+THREAD_NAME = "hook list"
+"""Name of the thread that writes the file."""
 
 log = structlog.get_logger(__name__)
 
@@ -35,12 +39,16 @@ class HookListFile:
         hashes = [_hash(hook) for hook in hooks]
         known = self._load()
         if hashes != known:
-            try:
-                self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-                write_private(self._path, json.dumps(hashes).encode() + b"\n")
-            except (OSError, UnsafeFileError) as error:
-                log.warning("the list of hooks cannot be stored", file=str(self._path), reason=str(error))
+            # in a thread of its own, so that a hung disk does not block the service
+            Thread(target=self._save, args=(hashes,), name=THREAD_NAME, daemon=True).start()
         return [hook for hook, each in zip(hooks, hashes, strict=True) if known is not None and each not in known]
+
+    def _save(self, hashes: Sequence[str]) -> None:
+        try:
+            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            write_private(self._path, json.dumps(hashes).encode() + b"\n")
+        except (OSError, UnsafeFileError) as error:
+            log.warning("the list of hooks cannot be stored", file=str(self._path), reason=str(error))
 
     def _load(self) -> list[object] | None:
         """Return the content of the file; None without a file, and an empty list if it is damaged."""

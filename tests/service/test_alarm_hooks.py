@@ -4,6 +4,7 @@ import asyncio
 import json
 import math
 import resource
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -19,7 +20,7 @@ from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.service import job_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import hook_warnings
-from bms_estimator.service.hook_list_file import HookListFile
+from bms_estimator.service.hook_list_file import THREAD_NAME, HookListFile
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
@@ -91,6 +92,13 @@ def _is_running(process: int) -> bool:
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
+def join_writers() -> None:
+    """Wait until the list of hooks is written."""
+    for thread in threading.enumerate():
+        if thread.name == THREAD_NAME:
+            thread.join(LONG_S)
+
+
 def lines_of(path: Path) -> list[str]:
     """Return the lines of a file; none if it does not exist."""
     return path.read_text().splitlines() if path.exists() else []
@@ -143,6 +151,7 @@ async def test_a_hook_that_was_added_or_changed_before_a_restart_acts_on_an_alar
     for tables in ((first,), (first,), (first, second), (dry_run, second), (first, second)):
         async with run_hooks(*tables, **options) as running:
             running.restore_active([RAISED])
+        join_writers()
         output.append("restart")
     assert output == [*["restart"] * 2, "second soc_low", *["restart"] * 2, "first soc_low", "restart"]
 
@@ -157,6 +166,7 @@ async def test_a_damaged_list_of_hooks_makes_every_hook_act_again(tmp_path: Path
             list_file=HookListFile(tmp_path, "pack"),
         ) as running:
             running.restore_active([RAISED])
+        join_writers()
     assert output == [b"soc_low"] * 3
 
 
