@@ -17,6 +17,7 @@ from bms_estimator.settings.alarm_limits import min_charge_current_a, monitored_
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples, Source
+from bms_estimator.telemetry.alarms.board_resets import BoardResets
 from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST, AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
@@ -72,6 +73,8 @@ class AlarmMonitor:
     ) -> None:
         self._hooks, self._weakest_cell, self._cells = hooks, weakest_cell, cells
         self._cells_seen: CellDeviations | None = None  # evaluated last
+        self._board_resets = BoardResets()
+        self._relay_resets = 0  # number of resets that undid a relay level, at the last evaluation
         self._estimator, self._source, self._clock, self._on_alarm = estimator, source, clock, on_alarm
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
@@ -122,8 +125,12 @@ class AlarmMonitor:
             self._cells_seen = cells
             self.alarms.evaluate_cells(cell_faults(cells), self._arrival_s)
         self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.silence_reason or "")
+        resets = self._source.counters.get("resets", 0)
+        self.alarms.evaluate_resets(self._board_resets.update(resets, now_s), self._clock.wall())
         if (hooks := self._hooks()) is not None:
-            self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall())
+            is_undone = hooks.relay_resets > self._relay_resets
+            self._relay_resets = hooks.relay_resets
+            self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall(), is_undone=is_undone)
         return self._report_changes()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:

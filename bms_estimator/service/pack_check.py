@@ -9,7 +9,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.mqtt.broker_config import check as check_brokers
 from bms_estimator.page.access_control import make_access_control
 from bms_estimator.process.systemd import is_for_the_service
-from bms_estimator.service.alarm_hooks import hook_warnings
+from bms_estimator.service.hook_check import hook_warnings
 from bms_estimator.settings.alarm_limits import implausible_limits
 from bms_estimator.settings.edge import EdgeSettings
 from bms_estimator.settings.exports import InfluxSettings

@@ -21,7 +21,9 @@ from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.process.log_setup import set_level
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.systemd import SystemdNotifier
-from bms_estimator.service.alarm_hooks import AlarmHooks, PublishRaw, select_relay
+from bms_estimator.service.alarm_hooks import AlarmHooks
+from bms_estimator.service.hook_check import has_relay
+from bms_estimator.service.hook_list_file import HookListFile
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.pack import Settings
@@ -84,7 +86,7 @@ async def run_pack_service(
     source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, board_file=memory)
     outbox = Outbox(database, max_messages=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
-    publish_raw: PublishRaw | None = None
+    mqtt: MqttSink | None = None
     if settings.mqtt is not None:
         mqtt = MqttSink(
             settings.mqtt,
@@ -97,8 +99,14 @@ async def run_pack_service(
             alarms=[each.name for each in monitored_alarms(settings, cell)],
         )
         all_sinks.insert(0, mqtt)  # so that no other sink delays the messages
-        publish_raw = mqtt.publish_raw
-    hooks = AlarmHooks(settings.alarms.hook, settings.pack.name, publish_raw, select_relay(settings, source.relay))
+    board = source if isinstance(source, SerialSource) and has_relay(settings) else None
+    hooks = AlarmHooks(
+        settings.alarms.hook,
+        settings.pack.name,
+        mqtt.publish_raw if mqtt else None,
+        board,
+        list_file=HookListFile(folder, settings.pack.name) if folder else None,
+    )
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None
         all_sinks.append(

@@ -32,8 +32,22 @@ AlarmName = Literal[
 ]
 ALARMS: tuple[AlarmName, ...] = get_args(AlarmName)
 """Names of all alarms, in the order in which they are shown."""
-PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value", "limit", "unit", "text")
-"""Fields that the payload of a hook's message may contain, such as $state. ``state`` is ``raised`` or ``cleared``."""
+HookEvent = Literal["raised", "cleared", "first_raised", "last_cleared"]
+"""Change at which a hook acts: of one alarm, or of the number of its raised alarms from and to zero."""
+PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value", "limit", "unit", "text", "raised")
+"""Fields that the payload of a hook's message may contain, such as $state. ``state`` is ``raised`` or ``cleared``, and
+``raised`` the names of the hook's raised alarms."""
+HOOK_EXAMPLES = """\
+[[alarms.hook]]
+alarms = ["cell_over_voltage", "over_temperature"]
+on = ["first_raised", "last_cleared"]  # cleared alone may be reported while another alarm is still raised
+run = ["/usr/local/bin/charger"]
+[[alarms.hook]]
+alarms = ["pack_over_voltage", "over_temperature"]
+relay = "low"  # the level after each reset and without power, so use low for critical alarms
+when_silent = "low"
+"""
+"""Hooks that a new settings file shows as comments."""
 
 
 class AlarmRule(Strict):
@@ -95,9 +109,10 @@ class AlarmHook(Strict):
     """Action when alarms are raised and end: run a program, publish a message, or switch the board's relay."""
 
     alarms: tuple[AlarmName, ...] = Field(default=(), description="names of alarms; default: all but hook_failed")
-    on: tuple[Literal["raised", "cleared"], ...] = Field(
+    on: tuple[HookEvent, ...] = Field(
         default=("raised", "cleared"),
-        description="changes of an alarm at which the program is run or the message published",
+        description="changes at which the program is run or the message published: raised and cleared are those of each "
+        "alarm; first_raised and last_cleared those between none and any of the alarms",
     )
     run: tuple[Annotated[str, Field(min_length=1)], ...] | None = Field(
         default=None, description="program to run and its arguments; no shell is used"
@@ -138,6 +153,9 @@ class AlarmHook(Strict):
         actions = [name for name in ("run", "topic", "relay") if getattr(self, name)]
         if len(actions) != 1:
             raise ValueError("give exactly one of run, topic and relay")
+        for event, event_of_any in (("raised", "first_raised"), ("cleared", "last_cleared")):
+            if event in self.on and event_of_any in self.on:
+                raise ValueError(f"on: give either {event} or {event_of_any}")
         try:
             Template(self.payload).substitute(dict.fromkeys(PAYLOAD_FIELDS, ""))
         except (KeyError, ValueError) as error:
@@ -201,6 +219,7 @@ class AlarmSettings(Strict):
     hook: tuple[AlarmHook, ...] = Field(
         default=(),
         description="actions when an alarm is raised or cleared, each in a section [[alarms.hook]]; default: none",
+        examples=[HOOK_EXAMPLES],
     )
 
     @model_validator(mode="after")

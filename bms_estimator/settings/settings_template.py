@@ -52,9 +52,12 @@ def _setting_lines(section: type[BaseModel], given: Mapping[str, object]) -> Ite
     for name, field in section.model_fields.items():
         key = field.alias or name
         yield from _comment("  ".join(part for part in (field.description, _unit_and_constraints(key, field)) if part))
-        yield (
-            f"{key} = {tomlkit.item(given[key]).as_string()}" if key in given else f"#{key} = {_default_as_toml(field)}"
-        )
+        if key in given:
+            yield f"{key} = {tomlkit.item(given[key]).as_string()}"
+        elif field.examples:  # instead of an empty default
+            yield from (f"#{line}" for line in field.examples[0].splitlines())
+        else:
+            yield f"#{key} = {_default_as_toml(field)}"
 
 
 def _default_as_toml(field: FieldInfo) -> str:

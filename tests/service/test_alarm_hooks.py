@@ -4,6 +4,7 @@ import asyncio
 import json
 import math
 import resource
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -16,9 +17,10 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.health import HookHealth
-from bms_estimator.protocols.base.relay import Relay
-from bms_estimator.service import alarm_hooks
-from bms_estimator.service.alarm_hooks import AlarmHooks, hook_warnings
+from bms_estimator.service import job_hook
+from bms_estimator.service.alarm_hooks import AlarmHooks
+from bms_estimator.service.hook_check import hook_warnings
+from bms_estimator.service.hook_list_file import THREAD_NAME, HookListFile
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
@@ -49,7 +51,7 @@ CLEARED = RAISED.model_copy(update={"active": False, "since": None, "value": Non
 @asynccontextmanager
 async def run_hooks(*tables: dict[str, Any], **changes: Any) -> AsyncIterator[AlarmHooks]:
     """Run the hooks of these tables ``[[alarms.hook]]``. ``changes`` are arguments of ``AlarmHooks``."""
-    options = {"publish": None, "set_relay": None} | changes
+    options = {"publish": None, "board": None} | changes
     async with AlarmHooks([AlarmHook.model_validate(table) for table in tables], "pack", **options) as running:
         yield running
 
@@ -90,6 +92,13 @@ def _is_running(process: int) -> bool:
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
+def join_writers() -> None:
+    """Wait until the list of hooks is written."""
+    for thread in threading.enumerate():
+        if thread.name == THREAD_NAME:
+            thread.join(LONG_S)
+
+
 def lines_of(path: Path) -> list[str]:
     """Return the lines of a file; none if it does not exist."""
     return path.read_text().splitlines() if path.exists() else []
@@ -101,11 +110,11 @@ async def test_programs_get_the_alarm_on_stdin_and_in_the_environment_and_run_in
         tmp_path / "script", f'json=$(cat); echo "$1 $BMS_NAME $BMS_STATE $BMS_VALUE $BMS_DEVICE $json" >> {out}'
     )
     async with run_hooks({"run": [script, "a b;c"]}) as running:
-        for alarm in (RAISED, CLEARED):
+        for lines, alarm in enumerate((RAISED, CLEARED), 1):
             running.on_alarm_change(Change(at_s=0.0, alarm=alarm))
-        output = await wait_for_lines(out, 2)
+            output = await wait_for_lines(out, lines)
     assert output[0].startswith("a b;c soc_low raised 0.09 pack {")
-    assert json.loads(output[0][output[0].index("{") :]) == RAISED.model_dump()
+    assert json.loads(output[0][output[0].index("{") :]) == RAISED.model_dump() | {"raised": ["soc_low"]}
     assert output[1].startswith("a b;c soc_low cleared  pack {")
 
 
@@ -129,6 +138,38 @@ async def test_an_alarm_reported_in_an_earlier_run_is_not_reported_again_and_its
         assert await wait_for_lines(out, 1) == ["soc_low cleared"]
 
 
+async def test_a_hook_that_was_added_or_changed_before_a_restart_acts_on_an_alarm_that_is_already_raised(
+    tmp_path: Path,
+) -> None:
+    output: list[str] = []
+    first, second = ({"topic": topic, "payload": f"{topic} $name"} for topic in ("first", "second"))
+    dry_run = first | {"dry_run": True}
+    options = {
+        "publish": lambda _, payload: output.append(payload.decode()),
+        "list_file": HookListFile(tmp_path, "pack"),
+    }
+    for tables in ((first,), (first,), (first, second), (dry_run, second), (first, second)):
+        async with run_hooks(*tables, **options) as running:
+            running.restore_active([RAISED])
+        join_writers()
+        output.append("restart")
+    assert output == [*["restart"] * 2, "second soc_low", *["restart"] * 2, "first soc_low", "restart"]
+
+
+async def test_a_damaged_list_of_hooks_makes_every_hook_act_again(tmp_path: Path) -> None:
+    output: list[bytes] = []
+    for content in ("[", '{"a": 1}', "\0" * 100):
+        (tmp_path / "pack.hooks.json").write_text(content)
+        async with run_hooks(
+            {"topic": "load/set", "payload": "$name"},
+            publish=lambda _, payload: output.append(payload),
+            list_file=HookListFile(tmp_path, "pack"),
+        ) as running:
+            running.restore_active([RAISED])
+        join_writers()
+    assert output == [b"soc_low"] * 3
+
+
 async def test_a_hook_runs_only_for_its_alarms_and_states(tmp_path: Path) -> None:
     out = tmp_path / "out"
     script = write_program(tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}')
@@ -141,12 +182,13 @@ async def test_a_hook_runs_only_for_its_alarms_and_states(tmp_path: Path) -> Non
 
 async def test_after_a_program_that_hangs_the_next_alarm_is_reported(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    hang = write_program(tmp_path / "hang", f"[ $BMS_STATE = raised ] && sleep 1000; echo $BMS_STATE > {out}")
+    hang = write_program(tmp_path / "hang", f"echo $BMS_STATE >> {out}; [ $BMS_STATE = cleared ] || sleep 1000")
     with capture_logs() as lines:
         async with run_hooks({"run": [hang], "timeout_s": 2.0}) as running:
-            for alarm in (RAISED, CLEARED):
+            for count, alarm in enumerate((RAISED, CLEARED), 1):
                 running.on_alarm_change(Change(at_s=0.0, alarm=alarm))
-            assert await wait_for_lines(out, 1) == ["cleared"]
+                assert (await wait_for_lines(out, count))[-1] == ("raised", "cleared")[count - 1]
+            await wait_for_health(running, lambda health: health.done == 1)
     assert [line["event"] for line in lines] == ["alarm hook: the program takes too long and is killed"]
 
 
@@ -197,17 +239,19 @@ async def test_a_child_that_outlives_its_program_runs_until_the_time_limit(tmp_p
 
 async def test_a_program_that_cannot_be_started_is_tried_again_until_its_alarm_has_ended(tmp_path: Path) -> None:
     out, path = tmp_path / "out", tmp_path / "script"
+    other = RAISED.model_copy(update={"name": "link_lost"})
     async with run_hooks({"run": [str(path)]}) as running:
         running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         await wait_for_health(running, lambda health: health.failures >= 2)
-        running.on_alarm_change(Change(at_s=0.0, alarm=CLEARED))
-        write_program(path, f"echo $BMS_STATE >> {out}")
-        assert await wait_for_lines(out, 1) == ["cleared"]
+        running.on_alarm_change(Change(at_s=0.0, alarm=CLEARED))  # neither is reported
+        write_program(path, f"echo $BMS_NAME $BMS_STATE >> {out}")
+        running.on_alarm_change(Change(at_s=0.0, alarm=other))
+        assert await wait_for_lines(out, 1) == ["link_lost raised"]
         assert (await wait_for_health(running, lambda health: health.done == 1)).failing == []
 
 
 async def test_another_alarm_does_not_shorten_the_retry_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(alarm_hooks, "FIRST_RETRY_S", LONG_S)
+    monkeypatch.setattr(job_hook, "FIRST_RETRY_S", LONG_S)
     async with run_hooks({"run": [str(tmp_path / "none")]}) as running:
         running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         await wait_for_health(running, lambda health: health.failures == 1)
@@ -321,21 +365,57 @@ async def test_a_critical_alarm_that_cannot_be_watched_counts_as_raised() -> Non
     output: list[bytes] = []
     tables = {"topic": "load/set", "payload": "$name $state $text"}
     async with run_hooks(tables, publish=lambda _, payload: output.append(payload)) as running:
-        for alarm in (
-            cold.model_copy(update=unwatched),
-            hot.model_copy(update=unwatched),
-            cold.model_copy(update=unwatched),
-            cold,
-            cold.model_copy(update=unwatched | {"severity": "warning"}),
-            cold.model_copy(update={"severity": "warning"}),
+        for done, alarm in (
+            (1, cold.model_copy(update=unwatched)),
+            (1, hot.model_copy(update=unwatched)),
+            (1, cold.model_copy(update=unwatched)),
+            (2, cold),
+            (2, cold.model_copy(update=unwatched | {"severity": "warning"})),
+            (2, cold.model_copy(update={"severity": "warning"})),
+            (3, RAISED),
         ):
             running.on_alarm_change(Change(at_s=0.0, alarm=alarm))
-        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
-        await wait_for_health(running, lambda health: health.done == 3)
+            await wait_for_health(running, lambda health, done=done: health.done == done)  # type: ignore[misc]
     assert output == [
         b"over_temperature raised no temperature",
         b"over_temperature cleared ",
         b"soc_low raised little charge is left",
+    ]
+
+
+async def test_a_new_critical_alarm_is_reported_before_waiting_warnings_and_pairs_of_changes_are_not(
+    tmp_path: Path,
+) -> None:
+    out, go = tmp_path / "out", tmp_path / "go"
+    script = write_program(
+        tmp_path / "script", f'echo "$BMS_NAME $BMS_STATE" >> {out}; until [ -e {go} ]; do sleep 0.01; done'
+    )
+    hot = RAISED.model_copy(update={"name": "over_temperature", "severity": "critical"})
+    lost, not_lost = (alarm.model_copy(update={"name": "link_lost"}) for alarm in (RAISED, CLEARED))
+    async with run_hooks({"run": [script], "timeout_s": LONG_S}) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
+        await wait_for_lines(out, 1)
+        for alarm in (*[CLEARED, RAISED] * 40, *[lost, not_lost] * 40, lost, hot):
+            running.on_alarm_change(Change(at_s=0.0, alarm=alarm))
+        go.touch()
+        await wait_for_health(running, lambda health: health.done == 3)
+    assert lines_of(out) == ["soc_low raised", "over_temperature raised", "link_lost raised"]
+
+
+async def test_a_hook_for_first_and_last_reports_only_the_change_from_and_to_no_raised_alarm() -> None:
+    output: list[str] = []
+    hook = {"topic": "load/set", "payload": "$name $state: $raised"}
+    set_hook = hook | {"on": ["first_raised", "last_cleared"]}
+    lost, not_lost = (alarm.model_copy(update={"name": "link_lost"}) for alarm in (RAISED, CLEARED))
+    for each in (hook, set_hook):
+        async with run_hooks(each, publish=lambda _, payload: output.append(payload.decode())) as running:
+            for alarm in (RAISED, lost, CLEARED, not_lost):
+                running.on_alarm_change(Change(at_s=0.0, alarm=alarm))
+                await asyncio.sleep(0)
+                await asyncio.sleep(0)
+    assert output == [
+        *("soc_low raised: soc_low", "link_lost raised: soc_low link_lost", "soc_low cleared: link_lost"),
+        *("link_lost cleared: ", "soc_low raised: soc_low", "link_lost cleared: "),
     ]
 
 
@@ -363,19 +443,30 @@ async def test_the_arguments_of_a_program_are_neither_published_nor_logged(tmp_p
     assert "secret" not in str(lines)
 
 
-def test_a_relay_hook_without_when_silent_causes_a_warning() -> None:
-    """After a silence of the service the pin then has the level of an alarm."""
-    settings = Settings.model_validate({"sensor": {"port": "/dev/none"}, "alarms": {"hook": [{"relay": "low"}]}})
-    (line,) = hook_warnings(settings)
-    assert line.startswith(
-        "alarms.hook.0.when_silent: not set, so the board switches its pin to low, as in an alarm, after 30 s"
-    )
-
-
-async def test_a_relay_hook_without_when_silent_sets_the_alarm_level_as_the_fallback_of_the_pin() -> None:
-    switched: asyncio.Queue[Relay] = asyncio.Queue()
-    async with run_hooks({"relay": "low"}, set_relay=switched.put):
-        assert await asyncio.wait_for(switched.get(), LONG_S) == Relay(high=True, high_when_silent=False, silent_s=30)
+@pytest.mark.parametrize(
+    ("hook", "warnings"),
+    [
+        ({"relay": "low", "when_silent": "low"}, []),
+        ({"relay": "low"}, ["when_silent: not set, so the board switches its pin to low, as in an alarm, after 30 s"]),
+        (
+            {"relay": "high", "when_silent": "high"},
+            ['relay = "high": the pin is low after each reset and without power'],
+        ),
+        ({"relay": "high", "when_silent": "high", "alarms": ["soc_low"]}, []),
+        ({"run": ["true"]}, ["on: with several alarms, cleared is reported while others are still raised"]),
+        ({"run": ["true"], "on": ["first_raised", "last_cleared"]}, []),
+        ({"run": ["true"], "alarms": ["soc_low"]}, []),
+        (
+            {"run": ["true"], "on": ["raised"], "timeout_s": 61},
+            ["timeout_s = 61: so long a new critical alarm may wait"],
+        ),
+    ],
+)
+def test_likely_mistakes_in_a_hook_cause_warnings(hook: dict[str, Any], warnings: list[str]) -> None:
+    settings = Settings.model_validate({"sensor": {"port": "/dev/none"}, "alarms": {"hook": [hook]}})
+    found = hook_warnings(settings)
+    assert len(found) == len(warnings)
+    assert all(line.startswith(f"alarms.hook.0.{start}") for line, start in zip(found, warnings, strict=True))
 
 
 async def test_programs_that_are_missing_or_fail_are_logged(tmp_path: Path) -> None:
@@ -399,7 +490,7 @@ async def test_a_dry_run_logs_the_action_and_does_nothing(tmp_path: Path) -> Non
     tables: tuple[dict[str, Any], ...] = {"run": [script]}, {"topic": "load/set", "payload": "OFF"}, {"relay": "high"}
     with capture_logs() as lines:
         async with run_hooks(
-            *({**table, "dry_run": True} for table in tables), publish=output.append, set_relay=output.append
+            *({**table, "dry_run": True} for table in tables), publish=output.append, board=object()
         ) as running:
             running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
     assert [line.get("would") or line.get("hook") for line in lines] == [

@@ -55,9 +55,12 @@ class HookHealth(Payload):
     done: int = Field(description="programs that ended with exit code 0, and published messages")
     failures: int = Field(
         description="failed runs: a program that was not started, was killed or returned another exit code, or a relay level that the board "
-        "rejected"
+        "rejected or that a reset undid"
     )
     failing: list[str] = Field(description="hooks whose last run failed, with the reason")
+    relay_resets: Annotated[int, Quantity(prometheus="counter")] = Field(
+        default=0, description="resets of the board that undid a relay level"
+    )
 
 
 class AnchorReport(Payload):

@@ -66,6 +66,11 @@ class DeviceProtocol(ABC):
         """Maximum time without data while the device works [s]."""
         return 0.0
 
+    @property
+    def boots(self) -> int:
+        """Number of resets and exchanges of the device since start, as far as it reports them."""
+        return 0
+
     def feed(self, arrival_s: float, data: bytes) -> SampleBlock:
         """Decode the bytes of one read, and correct the samples.
 

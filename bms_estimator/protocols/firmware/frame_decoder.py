@@ -14,6 +14,7 @@ from bms_estimator.protocols.firmware.clock_drift import clock_ppm
 from bms_estimator.protocols.firmware.framing import DECODER, HELLO_BYTES, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
 from bms_estimator.protocols.firmware.messages import (
     DELIMITER,
+    MODULUS,
     Ack,
     AckResult,
     Hello,
@@ -85,9 +86,16 @@ class FrameDecoder:
 
     Args:
         current_sign: Direction of positive current of the board; samples are positive on discharge.
+
+    Attributes:
+        hellos: Number of hellos received.
+        boots: Number of hellos that show a reset or another board since the previous hello, also across reopenings of the
+            port. Unlike ``counters.resets`` it needs no sample.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive") -> None:
+        self.hellos = self.boots = 0
+        self._previous_hello: Hello | None = None  # unlike _hello, never discarded
         self._state = np.zeros(1, dtype=DECODER)
         self._state["boot_id"] = -1
         self._state["current_sign"] = 1.0 if current_sign == "discharge_positive" else -1.0
@@ -236,10 +244,20 @@ class FrameDecoder:
         """Decode and store a hello or an acknowledgment: version, type and body, padded with zeros."""
         message_type, ack_result = packet[1], packet[3]
         if message_type == MessageType.HELLO:
-            self._hello = Hello.decode(packet[: 2 + Hello.LAYOUT.size].tobytes())
+            hello = Hello.decode(packet[: 2 + Hello.LAYOUT.size].tobytes())
+            self.hellos += 1
+            self.boots += self._previous_hello is not None and _is_other_boot(self._previous_hello, hello)
+            self._hello = self._previous_hello = hello
         elif ack_result in _ACK_RESULTS:
             self._acks.append(Ack.decode(packet[: 2 + Ack.LAYOUT.size].tobytes()))
             del self._acks[:-_MAX_MESSAGES]
+
+
+def _is_other_boot(previous: Hello, hello: Hello) -> bool:
+    """Return True if the board was reset or exchanged between two hellos."""
+    is_same_board = (hello.boot_id, hello.serial) == (previous.boot_id, previous.serial)
+    has_restarted = (hello.sequence - previous.sequence) % MODULUS >= MODULUS // 2  # two boards may have equal boot ids
+    return not is_same_board or has_restarted
 
 
 def _hexadecimal(serial: int) -> str:

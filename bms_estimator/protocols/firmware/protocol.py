@@ -16,6 +16,7 @@ from bms_estimator.protocols.firmware.messages import (
     AckResult,
     Hello,
     hello_command,
+    relay_word,
     set_rate_command,
     set_relay_command,
     unseal,
@@ -37,6 +38,20 @@ class _PendingCommand(Command):
     """Possible cause of a rejection, which is appended to the error text."""
     changes_hello: bool = True
     acknowledged: bool = False
+
+
+@dataclass
+class _RelayCommand(_PendingCommand):
+    """Pending relay command. It is sent right after a requested hello, so that a board in another boot does not receive it."""
+
+    changes_hello: bool = False
+    hint: str = "; firmware before 0.2.0 has no relay pin"
+    word: int = 0
+    """Setting that the board must confirm."""
+    boots: int = 0
+    """Number of boots of the board when the command was queued."""
+    hellos: int = 0
+    """Number of received hellos when the command was queued or last sent."""
 
 
 class BoardProtocol(DeviceProtocol):
@@ -80,6 +95,11 @@ class BoardProtocol(DeviceProtocol):
         return self._decoder.clock_ppm
 
     @property
+    def boots(self) -> int:
+        """Number of resets and exchanges of the board since the first hello."""
+        return self._decoder.boots
+
+    @property
     def description(self) -> str | None:
         """Firmware, serial number and sample rate; None before a hello."""
         if self.hello is None:
@@ -120,8 +140,12 @@ class BoardProtocol(DeviceProtocol):
     def next_output(self, now_s: float) -> bytes:
         """Return a request for the hello, then the pending command, then the rate command. Each is repeated until answered."""
         output, retry_s = self._choose_output()
-        if output == self._last_output and now_s - self._output_s < retry_s:
+        relay = self._command if isinstance(self._command, _RelayCommand) else None
+        is_repeated = output == self._last_output or (relay is not None and self._last_output == relay.frame)
+        if is_repeated and now_s - self._output_s < retry_s:
             return b""
+        if relay is not None and output == relay.frame:
+            relay.hellos = self._decoder.hellos
         self._last_output, self._output_s = output, now_s
         return output
 
@@ -135,22 +159,24 @@ class BoardProtocol(DeviceProtocol):
             raise UserError(f"the board has no command {name}")
         hint = "; is the sensor connected, and no current flowing?"
         # not repeated, because the board measures for a second before it answers
-        return self._queue(zero_current_command(), retry_s=math.inf, hint=hint)
+        return self._queue(_PendingCommand(frame=zero_current_command(), retry_s=math.inf, hint=hint))
 
     def relay(self, relay: Relay) -> Command:
-        """Queue the command that sets the level of the relay pin."""
-        hint = "; firmware before 0.2.0 has no relay pin"
-        return self._queue(set_relay_command(relay), hint=hint, changes_hello=False)
+        """Queue the command that sets the level of the relay pin. It fails if the board is reset before it confirms."""
+        decoder, frame = self._decoder, set_relay_command(relay)
+        return self._queue(
+            _RelayCommand(frame=frame, word=relay_word(relay), boots=decoder.boots, hellos=decoder.hellos)
+        )
 
     def send(self, frame: bytes) -> Command:
         """Queue a command that may be repeated."""
-        return self._queue(frame)
+        return self._queue(_PendingCommand(frame=frame))
 
-    def _queue(self, frame: bytes, *, retry_s: float = RETRY_S, hint: str = "", changes_hello: bool = True) -> Command:
+    def _queue(self, command: _PendingCommand) -> Command:
         self._decoder.pop_acks()  # discards acknowledgments of the previous command
         self._last_output = b""
-        self._command = _PendingCommand(frame=frame, retry_s=retry_s, hint=hint, changes_hello=changes_hello)
-        return self._command
+        self._command = command
+        return command
 
     def _choose_output(self) -> tuple[bytes, float]:
         """Return the next bytes to send, and their retry interval [s]."""
@@ -158,6 +184,8 @@ class BoardProtocol(DeviceProtocol):
         if hello is None:
             return _HELLO if self._decoder.last_frame_end > self._frame_end_at_opening else b"", RETRY_S
         if self._command is not None and not self._command.done:
+            if isinstance(self._command, _RelayCommand) and self._command.hellos == self._decoder.hellos:
+                return _HELLO, RETRY_S
             return self._command.frame, self._command.retry_s
         if self._rate_hz is not None and self._rate_hz != hello.rate_hz:
             return set_rate_command(self._rate_hz) + _HELLO, RETRY_S
@@ -169,7 +197,10 @@ class BoardProtocol(DeviceProtocol):
             message_type = unseal(command.frame)[1]
             if ack.command != message_type:
                 continue
-            if ack.result == AckResult.OK:
+            if ack.result == AckResult.OK and isinstance(command, _RelayCommand) and ack.value != command.word:
+                command.refusal = f"the board reports the relay setting {ack.value:#x} instead of {command.word:#x}"
+                command.done = True
+            elif ack.result == AckResult.OK:
                 command.acknowledged = True
                 if not command.changes_hello:
                     continue
@@ -177,6 +208,8 @@ class BoardProtocol(DeviceProtocol):
             else:
                 command.refusal = f"the board refuses: {ack.result.name.lower().replace('_', ' ')}{command.hint}"
                 command.done = True
+        if isinstance(command, _RelayCommand) and command.boots != self._decoder.boots:
+            command.refusal, command.done = "the board was reset before it answered", True
         if command.acknowledged and self._decoder.hello is not None:
             command.done = True
         if command.done:

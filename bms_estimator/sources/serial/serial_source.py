@@ -209,13 +209,28 @@ class SerialSource:
         """
         await self._run_command(lambda: self._decoder.command("current_zero"))
 
-    async def relay(self, relay: Relay) -> None:
+    @property
+    def boots(self) -> int:
+        """Number of resets and exchanges of the board since start."""
+        return self._decoder.boots
+
+    async def relay(self, relay: Relay, boots: int | None = None) -> None:
         """Make the board set its relay pin. Another task must iterate over the blocks meanwhile.
 
+        Args:
+            relay: Level of the pin.
+            boots: Value of ``boots`` for which the command is meant. After another reset it is not sent. None: any.
+
         Raises:
-            UserError: The board is not connected, has no relay, does not answer, or rejects the command.
+            UserError: The board is not connected, has no relay, does not answer, rejects the command or was reset.
         """
-        await self._run_command(lambda: self._decoder.relay(relay))
+
+        def start() -> Command:
+            if boots not in (None, self.boots):
+                raise UserError("the board was reset before the command was sent")
+            return self._decoder.relay(relay)
+
+        await self._run_command(start)
 
     async def _run_command(self, start: Callable[[], Command]) -> None:
         """Start a command when earlier ones have ended, and wait for its answer.
@@ -240,6 +255,7 @@ class SerialSource:
                 while not command.done:
                     self._decoded.clear()
                     await self._decoded.wait()
+                    self._send_due()
         except TimeoutError:
             raise UserError(f"the board has not answered within {COMMAND_TIMEOUT_S:.0f} s") from None
         finally:

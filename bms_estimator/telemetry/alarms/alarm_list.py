@@ -39,10 +39,12 @@ class AlarmList:
 
     Attributes:
         states: State by name.
+        board_reason: Reason why the board's resets raise ``sensor_fault``; empty: none.
     """
 
     def __init__(self, definitions: Sequence[AlarmDefinition], lost_s: float) -> None:
         self.states = {each.name: AlarmState(each, lost_s=lost_s) for each in definitions}
+        self.board_reason = ""
         self._unwatched = UnwatchedAlarms()
         self._reasons: dict[AlarmName, Reasons] = {}
         self._changes: list[Change] = []
@@ -203,7 +205,9 @@ class AlarmList:
     def _message(self, state: AlarmState, raised: RaisedAlarm | None, *, cause_cleared: bool) -> AlarmMessage:
         """Return the changing content of the payload of an alarm."""
         name = state.definition.name
-        losses = self._unwatched.loss_texts if name == "sensor_fault" else ()
+        losses: tuple[str, ...] = ()
+        if name == "sensor_fault":
+            losses = self._unwatched.loss_texts + ((self.board_reason,) if self.board_reason else ())
         return AlarmMessage(
             raised,
             cause_cleared=cause_cleared,

@@ -148,19 +148,36 @@ class AlarmEvaluator:
             self._alarms.raise_at("link_lost", self._at_s, RaisedAlarm(now_s, silent_s))
             self._save_state()
 
-    def evaluate_hooks(self, failing: Sequence[str], passed_s: float, now_s: float) -> None:
+    def evaluate_hooks(self, failing: Sequence[str], passed_s: float, now_s: float, *, is_undone: bool = False) -> None:
         """Evaluate the alarm ``hook_failed``.
 
         Args:
             failing: Hooks whose last run failed, each with its reason.
             passed_s: Time since the last call [s].
             now_s: Wall clock [s since 1970].
+            is_undone: True if a reset of the board has undone a relay level. It raises the alarm without its delay.
         """
         if failing:
             self._alarms.set_reasons("hook_failed", *failing)
+        if is_undone:
+            self._alarms.raise_at("hook_failed", self._at_s, RaisedAlarm(now_s, None))
         value = np.array([math.inf if failing else 0.0])  # this alarm publishes no value
         self._alarms.update("hook_failed", np.array([self._at_s]), np.array([passed_s]), value, now_s - self._at_s)
         self._save_state()
+
+    def evaluate_resets(self, reason: str, now_s: float) -> None:
+        """Raise ``sensor_fault`` without its delay while there is a reason.
+
+        Args:
+            reason: Reason why the board's resets are a fault; empty: they are none.
+            now_s: Wall clock [s since 1970].
+        """
+        if reason == self._alarms.board_reason:
+            return
+        self._alarms.board_reason = reason
+        if reason:
+            self._alarms.raise_at("sensor_fault", self._at_s, RaisedAlarm(now_s, None))
+            self._save_state()
 
     def evaluate_weak_cell(self, deviation_std: float, arrival_s: float) -> None:
         """Evaluate the alarm ``weak_cell`` at the last sample.
@@ -281,7 +298,7 @@ class AlarmEvaluator:
         if (fraction := self._faulty_fraction.update(at_s, counts)) is None:
             return
         observed_s, value = fraction
-        if suspects & SENSOR_SUSPECTS or self._is_blinded():
+        if suspects & SENSOR_SUSPECTS or self._is_blinded() or self._alarms.board_reason:
             value = math.inf  # above every limit
         self._alarms.update("sensor_fault", np.array([at_s]), observed_s, np.array([value]), wall_offset_s)
 

@@ -131,15 +131,46 @@ def test_no_bytes_raise_an_error(reads: list[bytes]) -> None:
     assert protocol.counters["bytes_received"] <= sum(map(len, reads))
 
 
-def test_relay_command_is_repeated_until_acknowledged() -> None:
+def test_relay_command_follows_a_requested_hello_and_is_repeated_until_acknowledged() -> None:
     protocol, relay = protocol_after_hello(), Relay(high=True, high_when_silent=False, silent_s=30)
     command = protocol.relay(relay)
-    assert protocol.next_output(0.0) == set_relay_command(relay)
-    assert protocol.next_output(1.1 * RETRY_S) == set_relay_command(relay)
+    for sent_s in (0.0, 2.0 * RETRY_S):
+        assert protocol.next_output(sent_s) == hello_command()
+        assert protocol.next_output(sent_s + 0.5 * RETRY_S) == b""
+        protocol.feed(sent_s, HELLO.encode())
+        assert protocol.next_output(sent_s) == set_relay_command(relay)
+        assert protocol.next_output(sent_s + 0.5 * RETRY_S) == b""
     protocol.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, relay_word(relay)).encode())
     assert (command.done, command.refusal) == (True, None)
-    assert protocol.next_output(2.0) == b""
+    assert protocol.next_output(4.0) == b""
     assert protocol.hello == HELLO
+
+
+def test_relay_command_is_not_sent_to_a_board_that_was_reset() -> None:
+    protocol = protocol_after_hello()
+    command = protocol.relay(Relay(high=True, high_when_silent=None))
+    assert protocol.next_output(0.0) == hello_command()
+    protocol.feed(0.1, replace(HELLO, boot_id=HELLO.boot_id + 1).encode())
+    assert (command.done, command.refusal) == (True, "the board was reset before it answered")
+    assert protocol.next_output(0.2) == b""
+    assert protocol.boots == 1
+
+
+@pytest.mark.parametrize(
+    "hello", [HELLO, replace(HELLO, serial=1), replace(HELLO, boot_id=0), replace(HELLO, sequence=2**32 - 1)]
+)
+def test_every_other_boot_or_board_counts_even_without_samples_and_across_openings_of_the_port(hello: Hello) -> None:
+    protocol = protocol_after_hello()
+    protocol.on_port_opened()
+    protocol.feed(1.0, b"\0" + hello.encode())
+    assert protocol.boots == (hello != HELLO)
+
+
+def test_relay_setting_that_differs_from_the_command_is_an_error() -> None:
+    protocol = protocol_after_hello()
+    command = protocol.relay(Relay(high=True, high_when_silent=None))
+    protocol.feed(1.0, Ack(MessageType.COMMAND_SET_RELAY, AckResult.OK, 0).encode())
+    assert command.refusal == "the board reports the relay setting 0x0 instead of 0x1"
 
 
 def test_relay_command_to_a_firmware_without_relay_gives_the_reason() -> None:

@@ -19,6 +19,7 @@ from serial.tools import list_ports
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.messages import ResetCause
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import Reading
@@ -237,6 +238,23 @@ async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> Non
             blocks.clear()
             await until(lambda: sample_count(blocks) >= 20)
             assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.0, abs=0.03)
+
+
+async def test_relay_command_is_not_sent_to_a_board_that_was_reset_although_its_hello_was_damaged() -> None:
+    high = Relay(high=True, high_when_silent=None)
+    with VirtualBoard(lambda _: STEADY) as virtual:
+        source = SerialSource(SensorSettings(port=virtual.path))
+        async with source, run_tasks(virtual.run(), drain(source)):
+            await until(lambda: source.board)
+            await source.relay(high, source.boots)
+            assert virtual.relay_high
+            virtual.send(b"half a frame, which runs into the hello")
+            virtual.reset()
+            with pytest.raises(UserError, match="the board was reset"):
+                await source.relay(high, 0)
+            assert (source.boots, virtual.relay_high) == (1, False)
+            with pytest.raises(UserError, match="the board was reset before the command was sent"):
+                await source.relay(high, 0)
 
 
 async def test_sample_rate_is_set_again_after_a_reset_whose_hello_was_damaged() -> None:

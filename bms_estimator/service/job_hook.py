@@ -1,0 +1,152 @@
+"""Hooks that run a program or publish a message for each change of an alarm."""
+
+import asyncio
+import contextlib
+import json
+from abc import abstractmethod
+from collections.abc import Callable
+from string import Template
+
+import structlog
+
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.process.backoff import Backoff
+from bms_estimator.service.hook import Hook
+from bms_estimator.service.hook_jobs import HookJobs, Job
+from bms_estimator.service.hook_process import StartError, program_environment, run_program
+from bms_estimator.settings.alarms import AlarmHook
+
+FIRST_RETRY_S = 0.5
+"""First delay before the retry of a program that could not be started [s]. Each retry doubles the delay, up to 30 s."""
+
+PublishRaw = Callable[[str, bytes], None]
+"""Publishes a payload on a topic."""
+
+log = structlog.get_logger(__name__)
+
+
+class JobHook(Hook):
+    """Hook that runs its jobs one after the other.
+
+    Args:
+        settings: Settings of the hook.
+        device: Name of the pack.
+    """
+
+    def __init__(self, settings: AlarmHook, device: str) -> None:
+        super().__init__(settings)
+        self._device = device
+        self._jobs = HookJobs(settings.on, self._raised)
+
+    def _on_transition(self, alarm: Alarm) -> None:
+        self._jobs.add(alarm)
+
+    async def _run_jobs(self) -> None:
+        """Run jobs until the hook is closed. A job whose program cannot be started is retried until its alarm changes."""
+        while True:
+            self._wake.clear()
+            backoff = Backoff(FIRST_RETRY_S)
+            while (job := self._jobs.take()) is not None:
+                if self.settings.dry_run:
+                    log.warning("alarm hook, dry run", would=self.description, alarm=job.alarm.name, state=job.state)
+                elif await self._run_job(job):
+                    backoff.reset()
+                else:
+                    await self._retry_later(job, backoff.next_s())
+            if self._closing:
+                return
+            await self._wake.wait()
+
+    async def _retry_later(self, job: Job, pause_s: float) -> None:
+        """Put a job back, and wait for ``pause_s``, or until another job is more urgent or this one is no longer due."""
+        if not self._closing:
+            self._jobs.put_back(job)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(pause_s):
+                while not self._closing and (first := self._jobs.next()) is not None and first.key == job.key:
+                    self._wake.clear()
+                    await self._wake.wait()
+        if not self._jobs.is_waiting(job):
+            log.warning("alarm hook: the program was never started", hook=self.description, alarm=job.alarm.name)
+
+    @abstractmethod
+    async def _run_job(self, job: Job) -> bool:
+        """Run a job. Return False if its program could not be started."""
+
+    def _succeed(self) -> None:
+        self.done += 1
+        self.error = ""
+
+    def _fail(self, job: Job, error: str) -> None:
+        """Count a failure. A failed job for ``hook_failed`` does not raise ``hook_failed`` again, which would cause endless jobs."""
+        self.failures += 1
+        if job.alarm.name != "hook_failed":
+            self.error = error
+
+    def _fields(self, job: Job) -> dict[str, str]:
+        """Return the fields for a program or a payload; a field without a value is empty."""
+        alarm, raised = job.alarm, list(self._raised)
+        values = {name: getattr(alarm, name) for name in ("name", "severity", "since", "value", "limit", "unit")}
+        fields = {name: "" if value is None else str(value) for name, value in values.items()}
+        return fields | {
+            "text": alarm.text or alarm.unwatched_reason or "",
+            "device": self._device,
+            "state": job.state,
+            "raised": " ".join(raised),
+            "json": json.dumps(alarm.model_dump() | {"raised": raised}),
+        }
+
+
+class CommandHook(JobHook):
+    """Runs a program with the alarm as JSON on its standard input and with the fields of the alarm in its environment."""
+
+    @property
+    def description(self) -> str:
+        """Description with the name of the program."""
+        return f"run {(self.settings.run or ('',))[0]}"
+
+    async def _run_job(self, job: Job) -> bool:
+        """Run the program once. Return False if it could not be started."""
+        fields = self._fields(job)
+        text, timeout_s = fields.pop("json").encode(), self.settings.timeout_s
+        variables = program_environment(self.settings.pass_environment, fields)
+        try:
+            code = await run_program(self.settings.run or (), text, variables, timeout_s)
+        except StartError as error:
+            self._fail(job, f"cannot be started: {error}")
+            log.warning("alarm hook: the program cannot be started", hook=self.description, error=str(error))
+            return False
+        if code is None:
+            self._fail(job, f"took longer than {timeout_s:g} s")
+            log.warning("alarm hook: the program takes too long and is killed", hook=self.description)
+        elif code:
+            self._fail(job, f"exit code {code}")
+            log.warning("alarm hook: the program has failed", hook=self.description, exit_code=code)
+        else:
+            self._succeed()
+        return True
+
+
+class PublishHook(JobHook):
+    """Publishes a message.
+
+    Args:
+        settings: Settings of the hook.
+        device: Name of the pack.
+        topic: Topic of the messages.
+        publish: Publishes a message.
+    """
+
+    def __init__(self, settings: AlarmHook, device: str, topic: str, publish: PublishRaw) -> None:
+        super().__init__(settings, device)
+        self._topic, self._publish = topic, publish
+
+    @property
+    def description(self) -> str:
+        """Description with the topic."""
+        return f"publish on {self._topic}"
+
+    async def _run_job(self, job: Job) -> bool:
+        self._publish(self._topic, Template(self.settings.payload).substitute(self._fields(job)).encode())
+        self._succeed()
+        return True

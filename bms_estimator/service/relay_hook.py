@@ -1,0 +1,146 @@
+"""Hook that switches the relay of the sensor board."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+import structlog
+
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.protocols.base.relay import Relay
+from bms_estimator.service.hook import Hook
+from bms_estimator.service.relay_hold import RelayHold
+from bms_estimator.settings.alarms import AlarmHook
+
+RELAY_S = 2.0
+"""Interval between two relay commands [s]. A command holds only until the board is reset or replaced."""
+RELAY_RETRY_S = 0.5
+"""Interval between attempts after a failed relay command [s]."""
+RESET_POLL_S = 0.1
+"""Interval between two checks for a reset of the board [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+class RelayBoard(Protocol):
+    """Board with a relay pin."""
+
+    @property
+    def boots(self) -> int:
+        """Number of resets and exchanges of the board since start."""
+
+    async def relay(self, relay: Relay, boots: int) -> None:
+        """Set the relay pin.
+
+        Args:
+            relay: Level of the pin.
+            boots: Value of ``boots`` for which the command is meant. After another reset it is not sent.
+
+        Raises:
+            UserError: The board does not confirm the level, or was reset.
+        """
+
+
+class RelayHook(Hook):
+    """Hook that keeps the board's relay at its level by repeated commands.
+
+    Args:
+        settings: Settings of the hook.
+        board: The board.
+        clock: Time since boot of the host [s].
+    """
+
+    def __init__(self, settings: AlarmHook, board: RelayBoard, clock: Callable[[], float]) -> None:
+        super().__init__(settings)
+        self._board, self._clock = board, clock
+        self._hold = RelayHold(low_is_safe=settings.relay == "low")
+
+    @property
+    def description(self) -> str:
+        """Description with the present level of the relay pin."""
+        return f"relay pin {'high' if self._wants_high else 'low'}"
+
+    @property
+    def _wants_high(self) -> bool:
+        """True if the pin is to be high: its level in ``relay`` while an alarm is raised, otherwise the opposite level."""
+        return (self.settings.relay == "high") == bool(self._raised)
+
+    def _on_transition(self, alarm: Alarm) -> None:
+        """Follow the alarms regardless of the hook's ``on``."""
+        if self._raised.keys() - {alarm.name}:  # another alarm is raised, so that the level does not change
+            return
+        state = "raised" if self._raised else "cleared"
+        log.warning("relay", dry_run=self.settings.dry_run, hook=self.description, alarm=alarm.name, state=state)
+        if self._raised:
+            self._hold.end()
+
+    def restore_active(self, alarms: Iterable[Alarm]) -> None:
+        """Restore raised alarms of an earlier run. If a hook had failed, the board may be in a reset loop."""
+        alarms = list(alarms)
+        super().restore_active(alarms)
+        if any(alarm.name == "hook_failed" for alarm in alarms):
+            self._hold.resume(self._clock())
+
+    async def _run_jobs(self) -> None:
+        """Send the level repeatedly until the hook is closed."""
+        while not self.settings.dry_run and not self._closing:
+            self._wake.clear()
+            self._check_resets()
+            refusal = await self._send_level()
+            self._check_resets()  # a command is done only if the board was not reset after it
+            self._set_error(self._reset_error() or refusal)
+            await self._wait(RELAY_RETRY_S if refusal else RELAY_S)
+
+    def _check_resets(self) -> None:
+        resets = self._hold.check(self._board.boots, self._clock())
+        self.relay_resets += resets
+        self.failures += resets
+        if resets:
+            self._set_error(self._reset_error())
+
+    async def _send_level(self) -> str:
+        """Send the level that is allowed now. Return why the board does not confirm it; empty if it does."""
+        level = self._hold.level(high=self._wants_high, now_s=self._clock())
+        if level is None:
+            return ""
+        try:
+            await self._board.relay(self._command(high=level), self._hold.boots)
+        except UserError as error:
+            self.failures += 1
+            return str(error)
+        return ""
+
+    def _reset_error(self) -> str:
+        """Return the error after a reset until later commands have held long enough; otherwise an empty text."""
+        if self._hold.is_proven(self._clock()):
+            return ""
+        return (
+            "the board was reset after a relay command, and a reset sets the pin low; check the board's supply and its "
+            f"cable; the pin is not set high for {self._hold.hold_s:g} s"
+        )
+
+    def _set_error(self, error: str) -> None:
+        if error and error != self.error:
+            log.warning("the board does not hold a relay command", hook=self.description, reason=error)
+        elif self.error and not error:
+            log.info("the board holds relay commands again", hook=self.description)
+        self.error = error
+
+    def _command(self, *, high: bool) -> Relay:
+        """Return the command with a level, and with the level for a silent service."""
+        if self.settings.level_when_silent == "keep":
+            return Relay(high, high_when_silent=None)
+        high_when_silent = self.settings.level_when_silent == "high"
+        return Relay(high, high_when_silent=high_when_silent, silent_s=self.settings.silent_s)
+
+    async def _wait(self, pause_s: float) -> None:
+        """Wait until the next command is due, an alarm changes or the board was reset."""
+        for _ in range(round(pause_s / RESET_POLL_S)):
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(RESET_POLL_S):
+                    await self._wake.wait()
+                    return
+            if self._board.boots != self._hold.boots:
+                return

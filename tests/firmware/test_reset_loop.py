@@ -1,0 +1,103 @@
+"""Relay of the firmware in simavr while the board is reset again and again and an alarm is latched."""
+
+import asyncio
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.model.sample import SampleStatus
+from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
+from bms_estimator.protocols.firmware.messages import MessageType, command
+from bms_estimator.service import relay_hook
+from bms_estimator.service.pack_service import run_pack_service
+from bms_estimator.settings.pack import Settings
+from tests.collector import Collector
+from tests.patience import LONG_S
+from tests.simavr_board import SimavrBoard, write_readings
+
+pytestmark = pytest.mark.usefixtures("firmware")
+
+LOAD_A = 5.0
+RESETS = 30
+"""Number of resets of the board while the alarm is latched."""
+SAMPLES = 30
+"""Number of samples between two resets, in which a service that does not wait would switch the relay."""
+
+
+class PinMonitor:
+    """Receiver of the service's bytes that counts how often the pin goes high, from the current that it disconnects."""
+
+    missed_reads = 0
+
+    def __init__(self) -> None:
+        self._decoder = FrameDecoder()
+        self.is_high, self.rises, self.resets = False, 0, 0
+        self.samples = 0  # number of samples since the last reset
+
+    def write(self, arrival_s: float, data: bytes) -> None:
+        for sample in self._decoder.feed(arrival_s, data):
+            is_high = bool(sample["current_a"] < 0.9 * LOAD_A)  # also if the pin was high for a part of the sample
+            self.rises += is_high > self.is_high
+            self.is_high = is_high
+            self.samples = 1 if sample["status"] & SampleStatus.RESET else self.samples + 1
+        self.resets = self._decoder.counters.resets
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Wait for a condition of the bytes that the board sends."""
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - bytes have no event
+            await asyncio.sleep(0.01)
+
+
+def raised(snapshot: Snapshot) -> dict[str, str]:
+    """Return the texts of all raised alarms, by name."""
+    return {alarm.name: alarm.text for alarm in snapshot.alarms if alarm.active}
+
+
+@pytest.mark.parametrize(("relay", "max_rises"), [("low", 0), ("high", 1)])
+async def test_a_board_in_a_reset_loop_does_not_chatter_its_relay_and_raises_alarms(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, relay: str, max_rises: int
+) -> None:
+    """Low is the safe level: the pin stays low. High is safe: one more attempt follows the first reset."""
+    monkeypatch.setattr(relay_hook, "RELAY_S", 0.02)  # several commands between two resets of the accelerated board
+    monkeypatch.setattr(relay_hook, "RESET_POLL_S", 0.02)
+    readings = write_readings(tmp_path / "readings.csv", [(0.0, LOAD_A, 25.9, 25.0)])
+    pin, sink, stop = PinMonitor(), Collector(), asyncio.Event()
+    with SimavrBoard(readings, speed=10.0, relay=True) as board:
+        settings = Settings.model_validate(
+            {
+                "sensor": {"port": board.path},
+                "publish": {"rate_hz": 10.0},
+                "alarms": {
+                    "pack_over_voltage": {"limit_v": 25.5, "delay_s": 0.5},
+                    "hook": [{"alarms": ["pack_over_voltage"], "relay": relay, "when_silent": "keep"}],
+                },
+            }
+        )
+        cell = load_cell("thunder_power_6s")
+        service = asyncio.create_task(run_pack_service(settings, cell, sinks=[sink], tap=pin, stop=stop))
+        await sink.until(lambda snapshot: "pack_over_voltage" in raised(snapshot))
+        await until(lambda: pin.is_high == (relay == "high"))
+        rises = pin.rises
+        line = os.open(board.path, os.O_WRONLY | os.O_NOCTTY)  # a second writer, unknown to the service
+        try:
+            for resets in range(1, RESETS + 1):
+                os.write(line, b"\0" + command(MessageType.COMMAND_RESTART))
+                await until(lambda resets=resets: pin.resets >= resets and pin.samples >= SAMPLES)  # type: ignore[misc]
+            snapshot = await sink.until(lambda snapshot: snapshot.health.line["resets"] >= RESETS)
+        finally:
+            os.close(line)
+        stop.set()
+        await asyncio.wait_for(service, LONG_S)
+    texts = raised(snapshot)
+    assert pin.rises - rises <= max_rises
+    assert "was reset after a relay command" in texts["hook_failed"]
+    assert "reset at least 3 times" in texts["sensor_fault"]
+    assert "pack_over_voltage" in texts
+    assert snapshot.health.hooks is not None
+    assert snapshot.health.hooks.relay_resets >= RESETS - 1
