@@ -55,8 +55,8 @@ def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDAr
                 f"arrays of shapes {mean.shape} and {largest.shape}: must be equal, with at most {max_size} elements"
             )
     for values in (mean_a, max_a, minutes_mean_a, minutes_max_a, *scalars):
-        largest = MAX_REST_S if values is arrays["rest_s"] else MAX_CURRENT_A
-        if values.dtype.kind not in "fi" or not (np.abs(values) <= largest).all():
+        limit = MAX_REST_S if values is arrays["rest_s"] else MAX_CURRENT_A
+        if values.dtype.kind not in "fi" or not (np.abs(values) <= limit).all():
             raise ValueError("a value is not finite, or too large")
     if arrays["rest_s"] < 0:
         raise ValueError("the duration of the rest is negative")
