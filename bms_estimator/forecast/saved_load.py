@@ -12,6 +12,8 @@ from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 
 MAX_CURRENT_A = 1e6
 """Maximum plausible absolute current [A]."""
+MAX_REST_S = 1e10
+"""Maximum plausible duration of a rest [s]: 300 years."""
 
 
 def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]:
@@ -32,6 +34,8 @@ def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]
 def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Restore a load.
 
+    An earlier version saved too small a largest current for seconds in which the current fell. It is raised to their mean.
+
     Args:
         load: Empty load to fill; unchanged if the arrays are invalid.
         past: Empty minutes to fill; unchanged if the arrays are invalid.
@@ -51,13 +55,14 @@ def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDAr
                 f"arrays of shapes {mean.shape} and {largest.shape}: must be equal, with at most {max_size} elements"
             )
     for values in (mean_a, max_a, minutes_mean_a, minutes_max_a, *scalars):
-        if values.dtype.kind not in "fi" or not (np.abs(values) <= MAX_CURRENT_A).all():
+        limit = MAX_REST_S if values is arrays["rest_s"] else MAX_CURRENT_A
+        if values.dtype.kind not in "fi" or not (np.abs(values) <= limit).all():
             raise ValueError("a value is not finite, or too large")
-    if (mean_a > max_a).any() or arrays["rest_s"] < 0:
-        raise ValueError("a mean is above the largest current, or the duration of the rest is negative")
+    if arrays["rest_s"] < 0:
+        raise ValueError("the duration of the rest is negative")
     row = load.record[0]
     for name in ("filtered_a", "last_a", "rest_s"):
         row[name] = arrays[name]
     row["count"], row["next"] = mean_a.size, mean_a.size % MAX_LOAD_S
-    row["mean_a"][: mean_a.size], row["max_a"][: mean_a.size] = mean_a, max_a
-    past.restore(minutes_mean_a.astype(float), minutes_max_a.astype(float), load)
+    row["mean_a"][: mean_a.size], row["max_a"][: mean_a.size] = mean_a, np.maximum(mean_a, max_a)
+    past.restore(minutes_mean_a.astype(float), np.maximum(minutes_mean_a, minutes_max_a).astype(float), load)

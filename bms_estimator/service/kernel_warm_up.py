@@ -6,6 +6,7 @@ import numpy as np
 
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack_model.curve_change import return_to_cell_file
@@ -47,6 +48,7 @@ def _call_kernels() -> None:
     trace = estimator.run(sample)
     ChargeEnergyMeter(ChargeEnergy(), 1.0).add(trace)
     Window().add(trace, 0.0)
+    known_rows(trace, False)
     pack = cell.pack(MIN_CELLS, 1)
     CellEstimator(new_estimator(Settings(), pack)).run(sample, np.zeros((1, MIN_CELLS)), trace)
     estimator.set_soc(0.5)

@@ -24,6 +24,7 @@ class WindowSummary:
         temperature_c: Mean temperature [C], NaN without a sensor.
         sample_rate_hz: Sample rate on the clock of the samples [Hz], NaN if unknown.
         last: Last row, dtype TRACE.
+        soc_known: True if the SOC is known at the last row.
         cells_v: Last cell voltages [V], shape (m,), NaN if not reported; m is 0 without cell voltages.
     """
 
@@ -35,6 +36,7 @@ class WindowSummary:
     temperature_c: float
     sample_rate_hz: float
     last: np.void
+    soc_known: bool
     cells_v: NDArray[np.float64]
 
 
@@ -43,10 +45,11 @@ class Window:
 
     Attributes:
         previous_end_s: Last time stamp of the previous window [s]; NaN before the first window.
+        soc_known: True if the SOC is known at the last row of this window or an earlier one.
     """
 
     def __init__(self) -> None:
-        self.previous_end_s = math.nan
+        self.previous_end_s, self.soc_known = math.nan, False
         self._sums: NDArray[np.void] = np.zeros(1, dtype=WINDOW_SUMS)
         self._clear()
 
@@ -67,7 +70,7 @@ class Window:
         if cells.size:
             self._cells = cells[-1:]
         if trace.size:
-            accumulate_window(self._sums, trace)
+            self.soc_known = accumulate_window(self._sums, trace, self.soc_known)
             # numpy copies a record field by field, which takes longer than the sums
             self._last = np.frombuffer(trace[-1:].tobytes(), trace.dtype)[0]
         self._arrival_s = arrival_s
@@ -90,6 +93,7 @@ class Window:
             temperature_c=temperature / temperatures if temperatures else math.nan,
             sample_rate_hz=steps / span_s if span_s > 0.0 else math.nan,
             last=self._last,
+            soc_known=self.soc_known,
             cells_v=self._cells.ravel(),
         )
         self.previous_end_s = last_s

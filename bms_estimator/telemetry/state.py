@@ -20,6 +20,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import forecast_fields
 from bms_estimator.telemetry.publish_window import WindowSummary
+from bms_estimator.telemetry.stability_margin import applicable_margin
 from bms_estimator.version import __version__
 
 NO_CELL_FIELDS: Mapping[str, Any] = MappingProxyType(
@@ -32,8 +33,8 @@ NO_CELL_FIELDS: Mapping[str, Any] = MappingProxyType(
     )
 )
 """Fields of ``Estimate`` about estimates of single cells, without any."""
-COMPUTED = {"voltage_v", "current_a", "temperature_c", "converged", "lock"}
-"""Columns of the trace whose field of ``Estimate`` is computed: means, and booleans from integers."""
+COMPUTED = {"voltage_v", "current_a", "temperature_c", "stability_margin", "converged", "lock"}
+"""Columns of the trace whose field of ``Estimate`` is computed: means, a margin that may not apply, and booleans from integers."""
 COPIED = tuple(name for name in TRACE.names or () if name in Estimate.model_fields and name not in COMPUTED)
 """Columns of the trace whose last value is copied to the field of ``Estimate`` with an equal name."""
 
@@ -81,6 +82,8 @@ def make_state_payload(
         **_cells(window.cells_v),
         **{name: last[name] for name in COPIED},
         soc_percent=None if soc is None else 100.0 * soc,
+        soc_known=soc is not None and window.soc_known,
+        stability_margin=finite(applicable_margin(window.last, window.soc_known)),
         remaining_capacity_ah=finite(remaining_capacity_ah),
         **forecast_fields(forecast, float(window.last["time_s"])),
         **{**NO_CELL_FIELDS, **cell_fields},

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from bms_estimator.forecast.load_history import LoadHistory
 from bms_estimator.forecast.past_minutes import PastMinutes
@@ -44,6 +46,50 @@ def test_restored_load_continues_like_the_saved_one(seconds: int) -> None:
     assert (restored.is_charging, restored.rest_s) == (load.is_charging, load.rest_s)
 
 
+currents_a = st.floats(-1000.0, 1000.0, width=32)
+steps_s = st.one_of(st.floats(0.001, 5.0), st.sampled_from([0.1, 1.0 / 3.0, 1.0, 5.1, 100.0]))
+
+
+@settings(max_examples=200)
+@given(st.lists(st.tuples(steps_s, currents_a, st.integers(1, 30)), min_size=1, max_size=80))
+def test_every_load_is_restored_as_saved(load_parts: list[tuple[float, float, int]]) -> None:
+    step_s, current_a, repeats = (np.array(column) for column in zip(*load_parts, strict=True))
+    rows = np.zeros(repeats.sum(), TRACE)
+    rows["time_s"], rows["current_a"] = np.cumsum(np.repeat(step_s, repeats)), np.repeat(current_a, repeats)
+    load, past, restored, restored_past = LoadHistory(1e5), PastMinutes(), LoadHistory(1e5), PastMinutes()
+    load.add(rows)
+    past.add(load)
+    arrays = load_arrays(load, past)
+    restore_load(restored, restored_past, arrays)
+    again = load_arrays(restored, restored_past)
+    assert {name: array.tobytes() for name, array in again.items()} == {name: a.tobytes() for name, a in arrays.items()}
+
+
+def test_largest_current_of_a_second_is_never_below_its_mean() -> None:
+    rows = np.zeros(50_000, TRACE)
+    rng = np.random.default_rng(1)
+    rows["time_s"] = np.cumsum(rng.choice([0.1, 0.3, 1.0, 5.1], rows.size))
+    rows["current_a"] = rng.choice([0.1, 18.0, 0.7, 40.0], rows.size)
+    load = LoadHistory(1e6)
+    load.add(rows)
+    mean_a, max_a = load.mean_and_max()
+    assert (mean_a <= max_a).all()
+
+
+def test_load_of_an_earlier_version_with_too_small_largest_currents_is_restored() -> None:
+    load, past = LoadHistory(CAPACITY_AS), PastMinutes()
+    arrays = load_arrays(observed_load(400), past)
+    arrays["max_a"][7] = 0.5 * arrays["mean_a"][7]
+    restore_load(load, past, arrays)
+    assert load.max_a[7] == load.mean_a[7]
+
+
+def test_load_is_restored_after_a_rest_of_a_year() -> None:
+    load, past = LoadHistory(CAPACITY_AS), PastMinutes()
+    restore_load(load, past, load_arrays(observed_load(400), past) | {"rest_s": np.array(365 * 86_400)})
+    assert load.rest_s == 365 * 86_400
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -53,7 +99,6 @@ def test_restored_load_continues_like_the_saved_one(seconds: int) -> None:
         lambda arrays: arrays.update(mean_a=np.ones(MAX_LOAD_S + 1), max_a=np.ones(MAX_LOAD_S + 1)),
         lambda arrays: arrays.update(mean_a=np.ones(4)),
         lambda arrays: arrays.update(mean_a=np.ones((2, 2)), max_a=np.ones((2, 2))),
-        lambda arrays: arrays.update(mean_a=2.0 * arrays["max_a"]),
         lambda arrays: arrays.update(rest_s=np.array(-1)),
         lambda arrays: arrays.update(minutes_mean_a=np.full(3, np.inf), minutes_max_a=np.full(3, np.inf)),
         lambda arrays: arrays.update(minutes_mean_a=np.ones(3)),
@@ -65,6 +110,6 @@ def test_damaged_arrays_are_rejected_and_change_nothing(damage: Callable[[dict[s
     arrays, load, past = load_arrays(observed_load(400), PastMinutes()), LoadHistory(CAPACITY_AS), PastMinutes()
     damage(arrays)
     empty = load.record.tobytes()
-    with pytest.raises(ValueError, match=r"missing|must be equal|not finite|above the largest"):
+    with pytest.raises(ValueError, match=r"missing|must be equal|not finite|is negative"):
         restore_load(load, past, arrays)
     assert load.record.tobytes() == empty

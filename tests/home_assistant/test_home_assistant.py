@@ -17,6 +17,7 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.home_assistant import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
+from bms_estimator.telemetry.alarms.unknown import UNKNOWN_SOC
 from bms_estimator.telemetry.rest_detector import REST_S
 from tests.home_assistant.conftest import DASHBOARD
 from tests.home_assistant.instance import ENVIRONMENT, HomeAssistant
@@ -87,6 +88,9 @@ def test_states_equal_the_measured_values(home: HomeAssistant, packs: Packs) -> 
     assert states["sensor.bms_pack_current_a"]["attributes"]["positive"] == "discharge"
     assert number_state(states, "sensor.bms_pack_soc_std_percent") > 0.0
     assert states["sensor.bms_pack_time_to_full_h"]["state"] == "unknown"
+    # a new pack without a long load: the SOC is not known yet, and its alarm is neither on nor off
+    assert (states[SOC_ENTITY]["state"], states[SOC_LOW_ENTITY]["state"]) == ("unknown", "unknown")
+    assert states[SOC_LOW_ENTITY]["attributes"]["reason"] == UNKNOWN_SOC
     assert number_state(states, "sensor.bms_pack_energy_out_kwh") >= 0.0
 
 

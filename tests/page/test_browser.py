@@ -41,6 +41,7 @@ STATE_VALUES = {  # as published in ``state``
     "soc": 0.4321,
     "soc_percent": 43.21,
     "soc_std": 0.0123,
+    "soc_known": True,
     "voltage_v": 52.3456,
     "voltage_estimate_v": 52.4,
     "current_a": -12.3456,
@@ -248,6 +249,18 @@ async def test_unknown_values_are_hidden(browser: Browser, programs: RunningProg
         assert page_tab.errors == []
 
 
+async def test_an_soc_that_is_not_known_is_not_shown_as_a_number(browser: Browser, programs: RunningPrograms) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        page, parts = page_tab.page, ("#soc", "#scale", ".soc .band")
+        for known in (True, False, True):
+            await publish_state(programs.live, **STATE_VALUES | {"soc_known": known})
+            await page.locator("#soc").wait_for(state="visible" if known else "hidden")
+            assert await page.get_by_text("not known yet").is_visible() is not known
+            assert [await page.locator(part).is_visible() for part in parts] == [known] * len(parts)
+            assert await page.title() == ("43 % · cellar" if known else "cellar")
+        assert page_tab.errors == []
+
+
 async def test_cells_are_ranked_by_soc_and_the_weakest_is_named(browser: Browser, programs: RunningPrograms) -> None:
     async with dashboard_of(browser, programs, "cellar") as page_tab:
         await publish_state(programs.live, **STATE_VALUES)
@@ -332,6 +345,7 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, programs: 
         limit=2.5,
         unit="V",
         text="cell 3 has 2.412 V: stop discharging",
+        unknown_reason="the SOC is not known yet",
     )
     async with dashboard_of(browser, programs, "cellar") as page_tab:
         await publish(programs.live, "alarm/cell_under_voltage", alarm.model_dump_json())
@@ -339,6 +353,7 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, programs: 
         await element.wait_for()
         text = await element.inner_text()
         for part in (
+            "the SOC is not known yet",
             "under voltage",
             "cell 3 has 2.412 V: stop discharging",
             "2.412 V",

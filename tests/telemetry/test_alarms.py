@@ -66,8 +66,8 @@ CAPTURES: dict[str, tuple[list[Line], dict[str, Any], list[tuple[float, bool]]]]
     "collapse_risk": (knee_lines(), {"pack": {}}, [(0.0, True), (0.0, False)]),
     "stability_margin_low": (
         [Line(400, current_a=20.0), Line(500, current_a=-18.0)],
-        WITHOUT_IDENTIFIER | {"pack": {"initial_soc": 0.2}},
-        [(317.0, True), (0.0, False)],
+        WITHOUT_IDENTIFIER | {"pack": {"initial_soc": 0.15}},
+        [(337.0, True), (0.0, False)],
     ),
     "cell_imbalance": (
         [Line(10, cells_v=GOOD_CELLS), Line(80, cells_v=(3.7, 3.64)), Line(80, cells_v=GOOD_CELLS)],
@@ -89,6 +89,8 @@ A transition is the time since the start of the capture [s], and True if the ala
 then. At a time of 0, the transition may be at any time. An alarm without a second transition is latched. The time of
 raising contains the delay of the alarm.
 """
+LIMITED = load_cell("ncr18650", 10.0).pack(2, 2)
+"""Pack whose model is unstable below an SOC of 0.9 %, so that its stability margin applies. That of ``PACK`` does not."""
 
 
 def test_each_alarm_has_a_capture() -> None:
@@ -100,7 +102,8 @@ def test_each_alarm_has_a_capture() -> None:
 async def test_each_alarm_is_raised_and_cleared_or_latched_on_its_capture(name: str, tmp_path: Path) -> None:
     lines, sections, expected = CAPTURES[name]
     latched = len(expected) == 1  # such an alarm stays raised
-    result = await replayed(record(tmp_path / "capture.bms", lines), settings(**sections))
+    cell = LIMITED if name == "stability_margin_low" else PACK
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings(**sections), cell)
     transitions = result.transitions(name)
     assert [active for _, active in transitions] == [active for _, active in expected]
     for (at_s, _), (expected_s, _) in zip(transitions, expected, strict=True):
@@ -486,8 +489,8 @@ def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_a_sample_ar
 
 def test_damaged_saved_quantities_are_rejected() -> None:
     alarms = make_evaluator()
-    with pytest.raises(ValueError, match="temperature: measured = 77"):
-        alarms.restore(json.dumps({"inputs": {"temperature": [77, True]}}))
+    with pytest.raises(ValueError, match="temperature: measured = -1"):
+        alarms.restore(json.dumps({"inputs": {"temperature": [-1, True]}}))
 
 
 @pytest.mark.parametrize("spacing_s", [0.0, 0.1, 1.0])

@@ -71,7 +71,7 @@ class AlarmResult:
     quiet: Sequence[str]
     """Monitored alarms that were not raised."""
     unmeasured: Sequence[str]
-    """Alarms without a value, because the capture lacks a quantity, or the load for a forecast."""
+    """Alarms without a value at the end, because the capture lacks a quantity or the load for a forecast, or the SOC is not known."""
 
 
 def alarms(
@@ -147,10 +147,10 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     latched = {alarm.name for alarm in monitor.report if alarm.latched}
     for alarm in raised_alarms:
         alarm.latched = alarm.ended_s is None and alarm.alarm in latched
-    raised, measured = {alarm.alarm for alarm in raised_alarms}, {alarm.name for alarm in monitor.report}
-    monitored = monitor.alarms.names()
-    quiet = [name for name in monitored if name in measured and name not in raised]
-    return AlarmResult(raised_alarms, quiet, unmeasured=[name for name in monitored if name not in measured])
+    raised, known = {alarm.alarm for alarm in raised_alarms}, {a.name for a in monitor.report if not a.unknown_reason}
+    not_raised = [name for name in monitor.alarms.names() if name not in raised]
+    quiet = [name for name in not_raised if name in known]
+    return AlarmResult(raised_alarms, quiet, unmeasured=[name for name in not_raised if name not in known])
 
 
 def _pair_changes(changes: list[Change]) -> list[RaisedAlarm]:
@@ -194,5 +194,5 @@ def _print(title: str, result: AlarmResult) -> None:
         console.print(f"{title}: no alarm")
     console.print(f"not raised: {', '.join(result.quiet) or '-'}")
     console.print(
-        f"not monitored, because the capture lacks the quantity or the load for a forecast: {', '.join(result.unmeasured) or '-'}"
+        f"not monitored, because the capture lacks the quantity or the load for a forecast, or the SOC is not known: {', '.join(result.unmeasured) or '-'}"
     )

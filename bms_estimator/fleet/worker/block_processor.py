@@ -88,6 +88,7 @@ class BlockProcessor:
         self._resume_after_store_change(pack_type.estimator, block)
         # another pack may have used the window meanwhile
         self._window.previous_end_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
+        self._window.soc_known = False
         self._record_last_sample(block)
         arrival_s, now_s = self._arrival_s(block), self._wall()
         self._estimate(block, pack_type, arrival_s)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from bms_estimator.kernels.accumulators.soc_certainty import is_soc_known
 from bms_estimator.model.arrays import Records
 from bms_estimator.numba_cache import njit
 
@@ -23,12 +24,13 @@ WINDOW_SUMS = np.dtype(
 
 
 @njit(cache=True)
-def accumulate_window(sums: Records, trace: Records) -> None:
-    """Add accepted samples to the sums of a publish window.
+def accumulate_window(sums: Records, trace: Records, soc_known: bool) -> bool:
+    """Add accepted samples to the sums of a publish window. Return whether the SOC is known at the last one.
 
     Args:
         sums: Shape (1,), dtype WINDOW_SUMS; updated in place.
         trace: Shape (n,), dtype TRACE.
+        soc_known: True if the SOC was known at the sample before.
     """
     s = sums[0]
     for j in range(trace.shape[0]):
@@ -42,3 +44,5 @@ def accumulate_window(sums: Records, trace: Records) -> None:
         if math.isfinite(x.temperature_c):
             s.temperatures += 1
             s.temperature_c += x.temperature_c
+        soc_known = is_soc_known(x.soc_std, soc_known)
+    return soc_known

@@ -73,19 +73,19 @@ def begin_second(load: Record) -> None:
 def add_step(load: Record, step_s: float, mean_a: float, end_a: float, one_c_a: float) -> None:
     """Divide a step between two rows among the seconds that it spans.
 
-    The mean current counts in all of them. The current at the end of the step, ``end_a`` [A], also counts in the second that
-    contains it.
+    The mean current counts in all of them, for their mean and for their largest current. The current at the end of the step,
+    ``end_a`` [A], also counts for the largest current of the second that contains it.
     """
     while load.part_s + step_s >= 1.0:
         part_s = 1.0 - load.part_s
         step_s -= part_s
-        largest_a = max(load.part_max_a, mean_a, end_a if step_s == 0.0 else mean_a)
+        largest_a = max(load.part_max_a, mean_a, end_a if step_s <= 0.0 else mean_a)  # below 0 by rounding
         add_second(load, load.part_as + mean_a * part_s, largest_a, one_c_a)
         begin_second(load)
     if step_s > 0.0:
         load.part_s += step_s
         load.part_as += mean_a * step_s
-        load.part_max_a = max(load.part_max_a, end_a)
+        load.part_max_a = max(load.part_max_a, mean_a, end_a)
 
 
 @njit(cache=True)
@@ -103,7 +103,8 @@ def add_second(load: Record, mean_a: float, max_a: float, one_c_a: float) -> Non
             load.filtered_a = 0.0
     if load.rest_s > MAX_STORED_REST_S or (load.count == 0 and mean_a <= REST_C * one_c_a):
         return
-    load.mean_a[load.next], load.max_a[load.next] = mean_a, max_a
+    # the mean of a constant current may be above it by a rounding error
+    load.mean_a[load.next], load.max_a[load.next] = mean_a, max(mean_a, max_a)
     load.next = (load.next + 1) % MAX_LOAD_S
     load.count = min(load.count + 1, MAX_LOAD_S)
 

@@ -24,3 +24,8 @@ class Alarm(Payload):
         description="false: a required quantity was measured before and is missing, so the alarm cannot be raised",
     )
     unwatched_reason: str | None = Field(default=None, description="reason why it is not watched; null while it is")
+    unknown_reason: str | None = Field(
+        default=None,
+        description="reason why its value is not known, for example because the SOC is not, so that it is neither raised nor "
+        "cleared; null while it is known",
+    )

@@ -61,6 +61,10 @@ class Estimate(Payload):
         description="standard deviation of soc; for cells in series it includes the weakest cell, a tenth of the "
         "charge drawn; null without the identifier"
     )
+    soc_known: bool = Field(
+        description="true: soc_std has fallen below 0.12, and not risen above 0.15 since, or there is no identifier; false: soc is "
+        "not shown, and no alarm judges it"
+    )
     soc_coulomb: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
         description="state of charge by coulomb counting alone, 0..1"
     )
@@ -177,7 +181,9 @@ class Estimate(Payload):
     )
     stability_margin: Annotated[
         float | None, Quantity(raw_entity("Stability margin", None, 3), packs="batteries", prometheus="ratio")
-    ] = Field(description="soc - max(delta_1, delta_2)")
+    ] = Field(
+        description="soc - max(delta_1, delta_2); null unless soc_known, and if the model is stable at each SOC (neither is above 0)"
+    )
     adaptive_gain_k: Annotated[float | None, Quantity(raw_entity("Adaptive gain k", "V²s", 6))] = Field(
         description="adaptive gain state k, (3.13) [V^2 s]"
     )

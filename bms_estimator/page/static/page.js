@@ -73,7 +73,7 @@ function drawStatus(pack) {
 	attribute(document.body, "data-state", kind);
 	text($("why"), trouble);
 	hide($("why"), !trouble);
-	const title = [kind === "stale" && "stale", f.isNumber(state?.soc) && `${f.percent(state.soc, 0)} %`, pack?.name].filter(Boolean).join(" · ");
+	const title = [kind === "stale" && "stale", f.isNumber(state?.soc) && state.soc_known !== false && `${f.percent(state.soc, 0)} %`, pack?.name].filter(Boolean).join(" · ");
 	if (document.title !== title) document.title = title || "bms_estimator";
 }
 
@@ -100,7 +100,7 @@ function drawAlarms({ alarms, topics }) {
 
 function alarmRow(a) {
 	const of = (x, label) => (f.isNumber(x) ? `${label}${f.digits(x)} ${a.unit ?? ""}`.trim() : "");
-	const facts = [a.severity, of(a.value, ""), of(a.limit, "limit "), a.since && `since ${f.when(new Date(a.since))}`, a.latched && "latched", a.watched === false && "cannot be watched"];
+	const facts = [a.severity, of(a.value, ""), of(a.limit, "limit "), a.since && `since ${f.when(new Date(a.since))}`, a.latched && "latched", a.watched === false && "cannot be watched", a.unknown_reason];
 	return node("div", { class: `alarm ${a.severity}`, "data-alarm": a.name },
 		node("b", {}, f.words(a.name)), node("span", {}, a.text || a.unwatched_reason), node("small", {}, facts.filter(Boolean).join(" · ")));
 }

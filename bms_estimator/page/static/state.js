@@ -20,7 +20,8 @@ function timeLeft(s) {
 	return ["To cut-off", band, `90 % band; ${f.percent(s.cutoff_within_5min, 0)} % within 5 min`];
 }
 
-export function drawState(s) {
+export function drawState(state) {
+	const known = state.soc_known !== false, s = known ? state : { ...state, soc_std: null };
 	const time = s.time_to_cutoff_s ?? s.time_to_full_s, [label, left, band] = timeLeft(s);
 	for (const [name, show] of Object.entries(SHOWN)) put(name, show(s[name]));
 	for (const part of parts) hide(part, !f.isNumber(part.dataset.of === "time_left" ? time : s[part.dataset.of]));
@@ -31,7 +32,10 @@ export function drawState(s) {
 	put("time_left_band", band);
 	put("way", s.current_a > 0 ? "discharging" : s.current_a < 0 ? "charging" : "at rest");
 	put("lock", `${s.lock ? "in lock" : "no lock"}, ${s.converged ? "converged" : "converging"}`);
-	if (f.isNumber(s.soc)) drawScale(s);
+	hide($("soc"), !known);
+	hide($("unknownsoc"), known);
+	hide($("scale"), !known);
+	if (f.isNumber(s.soc) && known) drawScale(s);
 }
 
 function drawScale(s) {

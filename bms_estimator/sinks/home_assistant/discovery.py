@@ -173,15 +173,15 @@ def _current_sign_attribute(root: str, positive_direction: str) -> dict[str, str
 
 
 def _alarm(name: str, root: str) -> dict[str, Any]:
-    """Return the sensor of an alarm: on while raised, unavailable instead of off while it cannot be monitored."""
+    """Return the sensor of an alarm. While it is not raised, it is off, unknown with its value, or unavailable if not monitored."""
     topic = f"{root}/alarm/{name}"
     return {
         "platform": "binary_sensor",
         "name": name.replace("_", " ").capitalize().replace("Soc", "State of charge"),
         "state_topic": topic,
-        "value_template": "{{ 'ON' if value_json.active else 'OFF' }}",
+        "value_template": "{{ 'ON' if value_json.active else 'None' if value_json.unknown_reason else 'OFF' }}",
         "json_attributes_topic": topic,
-        "json_attributes_template": "{{ {'reason': value_json.text, 'severity': value_json.severity} | tojson }}",
+        "json_attributes_template": "{{ {'reason': value_json.text or value_json.unknown_reason or '', 'severity': value_json.severity} | tojson }}",
         "availability": [{"topic": f"{root}/availability"}, {"topic": topic, "value_template": _ALARM_AVAILABILITY}],
         "availability_mode": "all",
         "device_class": _ALARM_CLASSES[name],

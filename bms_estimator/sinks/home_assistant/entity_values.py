@@ -92,6 +92,7 @@ def _values(snapshot: Snapshot) -> dict[str, float | None]:
     return {
         **vars(estimate),
         **{key: element.value for key, element in parameters.elements.items()},
+        "soc_percent": estimate.soc_percent if estimate.soc_known else None,
         "soc_std_percent": _scale(100.0, estimate.soc_std),
         "time_to_cutoff_h": _scale(1.0 / 3600.0, estimate.time_to_cutoff_s),
         "time_to_cutoff_p05_h": _scale(1.0 / 3600.0, estimate.time_to_cutoff_p05_s),

@@ -44,9 +44,10 @@ class JsonFields:
         values = self._values.get(name)
         return [_printable(value) for value in values if isinstance(value, str)] if isinstance(values, list) else []
 
-    def flag(self, name: str) -> bool:
-        """Return True if the field is true."""
-        return self._values.get(name) is True
+    def flag(self, name: str, *, default: bool = False) -> bool:
+        """Return a boolean; ``default`` if missing."""
+        value = self._values.get(name)
+        return value if isinstance(value, bool) else default
 
 
 def _printable(value: object) -> str:

@@ -2,7 +2,7 @@
 
 from bms_estimator.mqtt.topic_cache import DeviceMessage
 from bms_estimator.sinks.terminal.json_fields import JsonFields
-from bms_estimator.sinks.terminal.view_state import ALARM_PREFIX, soc_text
+from bms_estimator.sinks.terminal.view_state import ALARM_PREFIX, NOT_KNOWN, soc_text
 from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 
 
@@ -29,9 +29,10 @@ def _state_line(device: str, state: JsonFields, true_soc: float | None) -> str:
     if state.number("adaptation_gain_hz") is not None:
         gain = f"gamma k {number('adaptation_gain_hz', '.4f')}/s"
     cutoff = cutoff_text(*(state.number(name) for name in CUTOFF_FIELDS)) or "-"
+    soc = soc_text(state)
     truth = "" if true_soc is None else f"  true {100.0 * true_soc:.2f} %"
     return (
-        f"{state.text('time')} {device}: soc {soc_text(state)} %{truth}  "
+        f"{state.text('time')} {device}: soc {soc}{'' if soc == NOT_KNOWN else ' %'}{truth}  "
         f"{number('voltage_v', '.3f')} V  {number('current_a', '+.3f')} A  {number('power_w', '+.2f')} W  "
         f"to cut-off {cutoff}  margin {number('stability_margin', '.4f')}  "
         f"delta1 {number('delta_1', '.4f')}  delta2 {number('delta_2', '.4f')}  "

@@ -12,6 +12,8 @@ MAX_SILENT_S = 10.0
 """Maximum time between two messages of a running service [s]. A service that is silent for longer counts as gone."""
 ALARM_PREFIX = "alarm/"
 """Prefix of alarm topics."""
+NOT_KNOWN = "not known"
+"""Text in place of an SOC that is too uncertain."""
 BAND_STDS = 2.0
 """Half width of the SOC's confidence band [standard deviations]. The band contains the true SOC in 95 % of the cases."""
 
@@ -73,6 +75,8 @@ class ViewState(NamedTuple):
 
 def soc_text(state: JsonFields) -> str:
     """Return the SOC of a topic ``state`` with its band, ``89.50 ± 1.20`` [%]; without the band if that is unknown."""
+    if not state.flag("soc_known", default=True) and state.number("soc_percent") is not None:
+        return NOT_KNOWN
     soc, std = state.number_text("soc_percent", ".2f"), state.number("soc_std")
     return soc if std is None else f"{soc} ± {100.0 * BAND_STDS * std:.2f}"
 

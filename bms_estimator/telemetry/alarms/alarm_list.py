@@ -46,6 +46,7 @@ class AlarmList:
         self.states = {each.name: AlarmState(each, lost_s=lost_s) for each in definitions}
         self.board_reason = ""
         self._unwatched = UnwatchedAlarms()
+        self._unknown: Mapping[AlarmName, str] = {}
         self._reasons: dict[AlarmName, Reasons] = {}
         self._changes: list[Change] = []
         self._unreported: dict[AlarmName, AlarmMessage] = {}
@@ -148,13 +149,17 @@ class AlarmList:
         for name in sorted(before.reasons.keys() ^ unwatched.reasons.keys()):
             self._changes.append(Change(at_s, self._payload(self.states[name]), "watched"))
 
+    def set_unknown(self, reasons: Mapping[AlarmName, str]) -> None:
+        """Replace the alarms whose value is not known, each with the reason."""
+        self._unknown = reasons
+
     def changes(self) -> list[Change]:
         """Return the changes since the last call, oldest first."""
         changes, self._changes = self._changes, []
         return changes
 
     def report(self) -> tuple[Alarm, ...]:
-        """Return all alarms that were ever watched.
+        """Return all alarms that were ever watched, or whose value is not known.
 
         An alarm that was raised since the last call is reported as raised, even if it has ended.
         """
@@ -164,7 +169,11 @@ class AlarmList:
             if state.raised is None and name in unreported
             else self._payload(state)
             for name, state in self.states.items()
-            if state.has_value or state.raised is not None or name in self._unwatched.reasons or name in ALWAYS_WATCHED
+            if state.has_value
+            or state.raised is not None
+            or name in self._unwatched.reasons
+            or name in self._unknown
+            or name in ALWAYS_WATCHED
         )
 
     def restore(self, saved: Mapping[AlarmName, Any], unwatched: UnwatchedAlarms) -> None:
@@ -213,4 +222,5 @@ class AlarmList:
             cause_cleared=cause_cleared,
             reasons=losses + self._reasons.get(name, _NO_REASONS).texts,
             unwatched_reason=self._unwatched.reasons.get(name),
+            unknown_reason=self._unknown.get(name),
         )

@@ -13,6 +13,7 @@ import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import ForecastRows, unknown_values
+from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.alarm import Alarm
@@ -28,6 +29,7 @@ from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.sample_buffer import SampleBuffer
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
 from bms_estimator.telemetry.alarms.state import RaisedAlarm
+from bms_estimator.telemetry.alarms.unknown import find_unknown
 from bms_estimator.telemetry.alarms.unwatched import find_unwatched
 from bms_estimator.telemetry.alarms.values import estimated_values, measured_values
 from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
@@ -86,6 +88,7 @@ class AlarmEvaluator:
         self._faulty_fraction = FaultyFraction()
         self._at_s = 0.0  # time of the last sample
         self._mismatch_suspected = False
+        self._soc_known = False  # True if the SOC was known at the last row of the trace
         self.saved_state = ""
 
     @property
@@ -319,7 +322,10 @@ class AlarmEvaluator:
         self._mismatch_suspected = bool(suspects & MODEL_SUSPECTS)
         # a new suspicion counts from the last sample on, because its start is unknown
         is_mismatch[-1] |= self._mismatch_suspected
-        for name, series in estimated_values(trace, is_mismatch).items():
+        soc_known = known_rows(trace, self._soc_known)
+        self._soc_known = bool(soc_known[-1])
+        self._alarms.set_unknown(find_unknown(trace[-1], soc_known=self._soc_known))
+        for name, series in estimated_values(trace, is_mismatch, soc_known).items():
             self._alarms.update(name, times_s, observed_s, series, wall_offset_s)
         risks = collapse_risks(forecasts, trace["current_a"] <= -self._charging_a)
 

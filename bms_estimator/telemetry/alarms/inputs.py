@@ -13,6 +13,9 @@ from bms_estimator.settings.alarm_kinds import Quantity
 Counts = NDArray[np.int64]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 """All measured quantities."""
+RARE_FRACTION = 0.5
+"""Maximum time between two values that counts toward the end of a loss although samples between them lack the quantity, as a
+fraction of ``lost_s``. It is below 1, so that a sensor that almost counts as lost does not end its loss."""
 
 
 @dataclass
@@ -29,7 +32,9 @@ class _Input:
     _missing_s: float | None = None
     """Time since the beginning of the present series of samples without a value [s]; None: the last sample had all values."""
     _restored_s: float | None = None
-    """Time since the first value after a loss [s]; None: no value has arrived since the loss."""
+    """Time with values since the loss [s]; None: no value has arrived since the loss."""
+    _value_age_s: float = 0.0
+    """Time since the last value of a lost quantity [s]."""
 
     def update(self, times_s: Floats, steps_s: Floats, counts: Counts, lost_s: float) -> list[float]:
         """Process the number of values in each sample. Return the times at which the quantity was lost or measured again [s]."""
@@ -44,13 +49,18 @@ class _Input:
 
     def _step(self, step_s: float, lost_s: float, *, present: bool) -> bool:
         """Process one sample. Return True if ``lost`` has changed."""
-        was_lost = self.lost
-        self._missing_s = None if present else 0.0 if self._missing_s is None else self._missing_s + step_s
-        if self._missing_s is not None and self._missing_s >= lost_s:
-            self.lost, self._restored_s = True, None
-        elif self.lost and (present or self._restored_s is not None):
-            self._restored_s = 0.0 if self._restored_s is None else self._restored_s + step_s
-            self.lost = self._restored_s < lost_s
+        was_lost, follows_value = self.lost, self._missing_s is None
+        self._value_age_s += step_s
+        self._missing_s = None if present else 0.0 if follows_value else (self._missing_s or 0.0) + step_s
+        if self._missing_s is not None:
+            if self._missing_s >= lost_s:
+                self.lost, self._restored_s = True, None
+        elif self.lost:
+            continues = follows_value or self._value_age_s <= RARE_FRACTION * lost_s
+            self._restored_s = (
+                self._restored_s + self._value_age_s if continues and self._restored_s is not None else 0.0
+            )
+            self._value_age_s, self.lost = 0.0, self._restored_s < lost_s
         return self.lost != was_lost
 
 
@@ -59,8 +69,8 @@ class Inputs:
     """State of all measured quantities of one pack.
 
     Args:
-        lost_s: Time without a value after which a quantity is lost, and time with values after which it is measured
-            again [s].
+        lost_s: Time of samples without a value after which a quantity is lost, and time of samples with values after which
+            it is measured again [s].
         series: Number of cells in series, the maximum number of cell voltages.
     """
 
@@ -101,16 +111,16 @@ class Inputs:
         ]
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Restore the state of an earlier run.
+        """Restore the state of an earlier run, which may have had more cells in series.
 
         Raises:
             ValueError, TypeError: ``saved`` is damaged.
         """
         for name, each in self._inputs.items():
             max_count, lost = saved.get(name, (0, False))
-            if not 0 <= int(max_count) <= max(self.series, 1) or not isinstance(lost, bool):
+            if int(max_count) < 0 or not isinstance(lost, bool):
                 raise ValueError(f"{name}: measured = {max_count}, lost = {lost}")
-            each.max_count, each.lost = int(max_count), lost
+            each.max_count, each.lost = min(int(max_count), self.series if name == "cells" else 1), lost
 
 
 def count_values(values: Floats) -> Counts:

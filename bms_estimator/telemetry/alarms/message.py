@@ -30,6 +30,8 @@ class AlarmMessage(NamedTuple):
     """Causes, one sentence each."""
     unwatched_reason: str | None
     """Reason why the alarm cannot be watched; None while it is watched."""
+    unknown_reason: str | None
+    """Reason why the value of the alarm is not known; None while it is known."""
 
 
 def alarm_payload(definition: AlarmDefinition, message: AlarmMessage) -> Alarm:
@@ -48,4 +50,5 @@ def alarm_payload(definition: AlarmDefinition, message: AlarmMessage) -> Alarm:
         text=text,
         watched=message.unwatched_reason is None,
         unwatched_reason=message.unwatched_reason,
+        unknown_reason=message.unknown_reason,
     )

@@ -7,6 +7,7 @@ from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.settings.alarms import AlarmName
+from bms_estimator.telemetry.stability_margin import applicable_margin
 
 
 def measured_values(samples: SampleBlock, extremes_v: Floats, charging_a: float) -> dict[AlarmName, Floats]:
@@ -38,16 +39,19 @@ def measured_values(samples: SampleBlock, extremes_v: Floats, charging_a: float)
     }
 
 
-def estimated_values(trace: TraceBlock, is_mismatch: NDArray[np.bool_]) -> dict[AlarmName, Floats]:
-    """Return the values of the alarms on estimates, each of shape (n,).
+def estimated_values(
+    trace: TraceBlock, is_mismatch: NDArray[np.bool_], soc_known: NDArray[np.bool_]
+) -> dict[AlarmName, Floats]:
+    """Return the values of the alarms on estimates, each of shape (n,). Values that need an unknown SOC are NaN.
 
     Args:
         trace: Shape (n,), dtype TRACE.
         is_mismatch: True where the filter suspects a wrong cell model, or the observer is out of lock; shape (n,).
+        soc_known: True where the SOC is known, shape (n,).
     """
     std = trace["soc_std"]
     return {
-        "soc_low": trace["soc"] - np.where(np.isnan(std), 0.0, std),
-        "stability_margin_low": trace["stability_margin"],
+        "soc_low": np.where(soc_known, trace["soc"] - np.where(np.isnan(std), 0.0, std), np.nan),
+        "stability_margin_low": applicable_margin(trace, soc_known),
         "model_mismatch": np.where(is_mismatch, np.inf, np.abs(trace["innovation_v"])),
     }

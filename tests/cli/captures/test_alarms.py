@@ -45,7 +45,8 @@ def test_raised_alarms_are_listed_with_their_times(
         # 70 s and its delay_s of 5 s; 90 s and its clear_delay_s of 60 s
         "over_temperature": (pytest.approx(75.0), pytest.approx(150.0), False),
     }
-    unmeasured = ["cell_over_voltage", "cell_under_voltage", "collapse_risk", "cell_imbalance", "weak_cell"]
+    unmeasured = ["cell_over_voltage", "cell_under_voltage", "soc_low", "collapse_risk", "stability_margin_low"]
+    unmeasured += ["cell_imbalance", "weak_cell"]
     assert result["unmeasured"] == unmeasured
     assert "discharge_over_current" in result["quiet"]
     code, out, _ = run(capsys, "alarms", capture, "--pack", pack)

@@ -61,6 +61,15 @@ def test_a_screen_of_any_size_shows_the_soc_and_no_line_is_too_long(columns: int
     assert "pack 50.00 ± 4.00" in " ".join(" ".join(lines).split())
 
 
+def test_an_soc_that_is_not_known_is_not_shown_as_a_number() -> None:
+    state = ESTIMATE | {"soc_known": False}
+    assert "pack not known live" in text_of(pack_view({"state": state}))
+    line = text_line(DeviceMessage("pack", "state", state))
+    assert line is not None
+    assert "soc not known  24.123 V" in line
+    assert "soc 50.00 ± 4.00 %" in (text_line(DeviceMessage("pack", "state", state | {"soc_known": True})) or "")
+
+
 def test_80_by_24_cells_show_a_pack_with_three_alarms_and_the_log_and_the_hint() -> None:
     alarms = alarm("soc_low", "warning") | alarm("cell_over_voltage", "critical") | alarm("cell_imbalance", "warning")
     topics = alarms | alarm("link_lost", "critical", active=False) | {"state": ESTIMATE}
