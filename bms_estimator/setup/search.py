@@ -148,7 +148,7 @@ async def _search_modbus_host(place: str, result: SearchResult) -> None:
     """Poll a Modbus TCP device or gateway, ``host``, ``host:port`` or ``[IPv6 address]:port``, with each profile.
 
     Raises:
-        UserError: The place is none of them.
+        UserError: The place has another form.
     """
     try:
         url = urlsplit(f"//{place}")
