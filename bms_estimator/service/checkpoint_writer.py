@@ -169,7 +169,7 @@ class CheckpointWriter:
         arrays, discarded = history_arrays(model.history, model.saved_fit), model.discarded
 
         def save() -> None:
-            if discarded != self._discarded:
+            if discarded != self._discarded and file.path.exists():
                 log.warning("history", file=str(file.path), outcome=f"{REJECTED}its fit fails; {file.quarantine()}")
             file.save(arrays)
 

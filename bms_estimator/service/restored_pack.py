@@ -66,6 +66,8 @@ def restore_pack(
         except Exception as error:  # noqa: BLE001 - an odd value of the file must not end the service at each start
             _reject_history(history, error)
             pack_model.load(History(), None, state_fit)
+            h = estimator.record["history"]
+            h["count"] = h["sums"]["duration_s"] = 0  # rows that the history lacks
             pack_model.resume(gap_s, restored=restored)
     if cells and restored and (reason := cells.restore(content.cells, content.unseen_s)):
         log.warning("the state of the single cells was dropped", reason=reason)
