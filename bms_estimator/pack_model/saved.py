@@ -125,7 +125,7 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
             raise ValueError(f"{name} of the fit is damaged")
         values[name] = value if shape else float(value)
     covariance = values["covariance"]
-    if (covariance != covariance.T).any() or (np.diag(covariance) < 0.0).any():
+    if not np.allclose(covariance, covariance.T) or (np.diag(covariance) < 0.0).any():
         raise ValueError("covariance of the fit is damaged")
     if values["first_segment"] > values["segment"]:
         raise ValueError("the fit begins after its last segment")
