@@ -10,16 +10,23 @@ from numpy.typing import NDArray
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import OBSERVER_COUNTERS
+from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, HISTORY_ROW
+from bms_estimator.kernels.kalman_filter.element_map import ELEMENTS
 from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS, store_last_good_state
 from bms_estimator.kernels.kalman_filter.mixture import decorrelate_state
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
 from bms_estimator.kernels.kalman_filter.ocv_correction import reset_ocv_correction
 from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET, STATES
+from bms_estimator.pack_model.saved import MAX_SEGMENT, checked_rows
 
 _PARTS_WITHOUT_FILTER = ("observer.", "learning.", "series_resistance.")
 """Prefixes of the fields that are also estimated while the filter is off."""
 EXTENDABLE_FIELDS = {"filter.mean": 1, "filter.covariance": 2}
 """Number of trailing axes along the filter's states, by field. Later versions append states at the end of these axes."""
+MAX_COUNT = 1e15
+"""Maximum plausible absolute value of a counter: the number of samples of 30,000 years at 1,000 a second."""
+MAX_SUM = 1e24
+"""Maximum plausible absolute value of a sum over a row of the history, the square of the maximum charge [A^2 s^2]."""
 MAX_SOC_DIFFERENCE = 0.03
 """Maximum difference between the SOC of filter and observer. A larger difference shows that the filter was switched
 off for some time, so that its state is outdated."""
@@ -40,6 +47,17 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
         Reason for which the state is invalid; empty if the estimator was restored.
     """
     record_before = estimator.record.copy()
+    try:
+        reason = _restore(estimator, saved, unseen_s)
+    except Exception as error:  # noqa: BLE001 - an odd value of the file must not end the service at each start
+        reason = f"damaged ({type(error).__name__})"
+    if reason:
+        estimator.record[...] = record_before
+    return reason
+
+
+def _restore(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
+    """Restore an estimator as ``restore_state`` does. If the state is invalid, the estimator may be changed in part."""
     estimator.step(time_s=0.0, current_a=0.0, voltage_v=estimator.cell.cell.nominal_voltage_v)
     after_first_sample = estimator.record.copy()
     filter_was_on = bool(saved.get("filter.started", np.zeros(1))[0])
@@ -48,7 +66,6 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
     copy_known_fields(estimator.record, restored)
     reason = _invalid_state_reason(estimator, after_first_sample)
     if reason:
-        estimator.record[...] = record_before
         return reason
     f = estimator.record["filter"]
     soc_difference = abs(f["soc"][0] - estimator.state["soc"][0])
@@ -73,7 +90,7 @@ def copy_known_fields(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]
     """Copy saved fields to the fields of ``record`` with equal names and shapes, or with additional filter states."""
     for name, field in fields(record):
         value = saved.get(name)
-        if value is None or value.ndim != field.ndim:
+        if value is None or value.ndim != field.ndim or not np.can_cast(value.dtype, field.dtype, "same_kind"):
             continue
         if value.shape == field.shape:
             field[...] = value
@@ -134,7 +151,36 @@ def _invalid_state_reason(estimator: Estimator, after_first_sample: NDArray[np.v
     is_used = first["a"] > 0.0  # unused elements of the array are zero after a first sample
     if not (s["a"][is_used] > 0.0).all():
         return "a parameter a1..a15 is not positive"
-    return _invalid_filter_reason(record[0]["filter"]) if estimator.identifying else ""
+    return _invalid_counter_reason(record) or (
+        _invalid_filter_reason(record[0]["filter"]) if estimator.identifying else ""
+    )
+
+
+def _invalid_counter_reason(record: NDArray[np.void]) -> str:
+    """Return the reason for which a counter, an index or the recorded history is invalid; empty if all are valid.
+
+    Kernels do not check that an index is within its array.
+    """
+    h = record[0]["history"]
+    integers = np.concatenate([field.ravel() for _, field in fields(record) if field.dtype.kind == "i"])
+    is_plausible = (np.abs(integers.astype(float)) <= MAX_COUNT).all()
+    if not (is_plausible and 0 <= record[0]["next_element"] < ELEMENTS and 0 <= h["count"] <= COMPLETED_ROWS):
+        return "a counter or an index is implausible"
+    return "" if _has_valid_history(h) else "the last rows of the history are damaged"
+
+
+def _has_valid_history(h: np.void) -> bool:
+    """Return True if the rows that the slow fit has not taken yet are valid, and the present row can be completed."""
+    try:
+        checked_rows(h["rows"][: int(h["count"])])
+    except ValueError:
+        return False
+    sums = np.concatenate([np.ravel(h["sums"][name]) for name in HISTORY_ROW.names or ()])
+    counters = np.array(
+        [h[name] for name in ("elapsed_s", "charge_as", "charge_variance_as2", "throughput_soc", "row_as")]
+    )
+    is_finite = (np.abs(sums) <= MAX_SUM).all() and (np.abs(counters) <= MAX_SUM).all()
+    return bool(is_finite and 0 <= h["segment"] <= MAX_SEGMENT and h["gap_s"] >= 0.0 and h["event_s"] >= 0.0)
 
 
 def _invalid_filter_reason(f: np.void) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bms_estimator.installation import places
-from bms_estimator.installation.machine import Machine, run, tree
+from bms_estimator.installation.machine import Machine, read_file, run, tree
 from bms_estimator.installation.system_files import SYSUSERS_LINES, system_files
 from bms_estimator.model.errors import UserError
 
@@ -110,16 +110,17 @@ def _link_program(machine: Machine, program: Path, report: Report) -> None:
 
 
 def _write_settings(machine: Machine, pack: PackFiles, group: int, report: Report) -> None:
-    """Copy a pack file and the files that it names. Back up the installed settings if they differ."""
-    installed = machine.path(places.PACK_FILE)
-    content = pack.settings.read_bytes()
-    if installed.exists() and not installed.samefile(pack.settings) and installed.read_bytes() != content:
-        backup = places.PACK_FILE.with_suffix(".toml.old")
-        machine.write(backup, installed.read_bytes(), mode=0o640, group=group)
-        report("settings", f"{backup}, the previous settings")
-    for source, name in (*((file, file.name) for file in pack.named), (pack.settings, places.PACK_FILE.name)):
-        machine.write(places.SETTINGS / name, source.read_bytes(), mode=0o640, group=group)
-        report("settings", str(places.SETTINGS / name))
+    """Copy a pack file and the files that it names. Back up each installed file that differs."""
+    files = {places.SETTINGS / file.name: read_file(file) for file in pack.named}
+    files[places.PACK_FILE] = pack.settings.read_bytes()
+    for name, content in files.items():
+        installed = machine.read(name)
+        if installed is not None and installed != content:
+            backup = name.with_name(f"{name.name}.old")
+            machine.write(backup, installed, mode=0o640, group=group)
+            report("settings", f"{backup}, the previous {name.name}")
+        machine.write(name, content, mode=0o640, group=group)
+        report("settings", str(name))
 
 
 def _set_settings_group(machine: Machine, group: int) -> None:

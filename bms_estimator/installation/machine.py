@@ -1,5 +1,6 @@
 """Machine on which the service is installed: root directory, files, users and systemd."""
 
+import errno
 import os
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -7,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bms_estimator.model.errors import UserError
+
+_LINK = "{}: is a symbolic link, which might lead to a file of another user; replace it by the file"
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,18 @@ class Machine:
         """
         run([program, *([] if self.root == Path("/") else [f"{root_option}={self.root}"]), *arguments])
 
+    def read(self, name: str | Path) -> bytes | None:
+        """Return the content of a file; None if there is no file.
+
+        Args:
+            name: Absolute path of the file on the machine.
+
+        Raises:
+            UserError: The path is a symbolic link, or cannot be read.
+        """
+        path = self.path(name)
+        return read_file(path) if path.is_symlink() or path.exists() else None
+
     def write(self, name: str | Path, content: bytes, *, mode: int = 0o644, group: int = 0) -> None:
         """Write a file that belongs to root. Create its folder; replace an existing file atomically.
 
@@ -59,17 +74,19 @@ class Machine:
             group: Id of the group.
 
         Raises:
-            UserError: The file cannot be written.
+            UserError: The path is a symbolic link, or cannot be written.
         """
         path = self.path(name)
+        if path.is_symlink():
+            raise UserError(_LINK.format(path))
         new = path.with_name(f".{path.name}.new")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             new.unlink(missing_ok=True)
-            new.touch(mode=0o600)
-            new.write_bytes(content)
-            os.chown(new, 0, group)
-            new.chmod(mode)
+            with open(new, "xb", opener=_open_private) as file:
+                file.write(content)
+                os.fchown(file.fileno(), 0, group)
+                os.fchmod(file.fileno(), mode)
             new.replace(path)
         except OSError as error:
             raise UserError(f"{path}: cannot be written: {error.strerror}") from None
@@ -79,6 +96,29 @@ class Machine:
         file = self.path("/etc/group")
         lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
         return next((int(line.split(":")[2]) for line in lines if line.startswith(f"{name}:")), None)
+
+
+def read_file(path: Path) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        UserError: The path is a symbolic link, or cannot be read.
+    """
+    try:
+        with open(path, "rb", opener=_open_without_links) as file:
+            return file.read()
+    except OSError as error:
+        raise UserError(
+            _LINK.format(path) if error.errno == errno.ELOOP else f"{path}: cannot be read: {error.strerror}"
+        ) from None
+
+
+def _open_without_links(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW)
+
+
+def _open_private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 def run(command: Sequence[str]) -> None:

@@ -109,7 +109,7 @@ def parse_toml(text: str, model: type[T], path: str) -> T:
     """
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # also an integer of more digits than Python converts
         raise UserError(f"{path}: not valid TOML: {error}") from None
     except RecursionError:
         raise UserError(f"{path}: not valid TOML: nested too deeply") from None
@@ -215,8 +215,12 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def without_secrets(text: str) -> str:
-    """Return a text with everything before the last @ removed, because a URL may contain a user name and a password."""
-    return re.sub(r".*@", "***@", text, flags=re.DOTALL)
+    """Return a text in which *** replaces the user name and password of a URL.
+
+    Everything before the last @ is replaced, and in a URL without a host the password, which is in the place of the port.
+    """
+    text = re.sub(r".*@", "***@", text, flags=re.DOTALL)
+    return re.sub(r"(://[^\s/:\[]*):(?!\d{1,5}(?!\w))[^\s/,'\"]+", r"\1:***", text)
 
 
 def write_text(path: Path, text: str, *, make_folder: bool = False) -> None:

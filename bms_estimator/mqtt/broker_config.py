@@ -1,11 +1,13 @@
 """Addresses, passwords and certificates of the brokers."""
 
+import re
 import ssl
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
+from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.systemd import credential
 from bms_estimator.settings.broker import BrokerSettings
@@ -35,7 +37,7 @@ def brokers(settings: BrokerSettings) -> list[Broker]:
         try:
             addresses.append(parse_url(url))
         except ValueError as error:
-            raise UserError(f"{section}.url = {url}: {error}") from None
+            raise UserError(f"{section}.url = {without_secrets(url)}: {error}") from None
     if settings.cert_file and not any(broker.tls for broker in addresses):
         raise UserError(
             f"{section}.cert_file = {settings.cert_file}: of no use without TLS: {section}.url must be mqtts://..."
@@ -111,9 +113,11 @@ def parse_url(address: str) -> Broker:
         ValueError: The host or the port is invalid.
     """
     url = urlsplit(address)
+    if not url.hostname or not re.fullmatch(r"(\[.*\]|[^:]*)(:\d*)?", url.netloc):  # the error must not show a password
+        raise ValueError("must be mqtt://host:port, with a number as the port")
+    if url.port == 0:
+        raise ValueError("the port must be 1 to 65535")
     host, port = url.hostname, url.port or PORTS[url.scheme]
-    if not host:
-        raise ValueError("must be mqtt://host:port")
     host.encode("idna")  # the resolver encodes the name this way and would fail later
     return Broker(address, host, port, tls=url.scheme == "mqtts")
 

@@ -40,6 +40,9 @@ MIN_ROWS = 8
 MIN_THROUGHPUT_SOC = 1.0
 """Minimum throughput of the history for the adoption of a fit with a large std of the SOC [SOC]. In a shorter history several
 separate SOCs may be possible, which the filter's hypotheses represent and the single normal distribution of a fit does not."""
+MAX_FAILED_FITS = 3
+"""Number of successive failed fits after which the history is discarded. A fit may fail for lack of rows, but a history with an
+odd value would make each fit fail for ever."""
 MIN_CHANGE = 0.01
 """Minimum change of the SOC, or of the ratio of the capacity to the declared one, that is reported as an event."""
 
@@ -78,7 +81,7 @@ class SlowFit:
         submit: Runs a fit, for example in another thread, and returns its future.
         interval_s: Maximum interval between two fits, on the clock of the samples [s]. A history that is younger than
             ``interval_s / INTERVAL_OF_AGE`` is fitted more often. Infinite: no fits.
-        on_failure: Called with the exception of a failed fit. The previous fit stays in use.
+        on_failure: Called with the exception of a failed fit, or of the processing of rows. The previous fit stays in use.
 
     Attributes:
         history: Rows of this and earlier runs.
@@ -87,7 +90,8 @@ class SlowFit:
         fit: The adopted fit, whose curves the filter uses; None: the filter uses the curves of the cell file.
         fits: Number of adopted fits.
         late: Number of fits that were not done when due, so that they were adopted at a later sample.
-        failed: Number of fits that raised an exception.
+        failed: Number of exceptions of fits and of the processing of rows.
+        discarded: Number of histories that were discarded because of such exceptions.
         changes: Number of fits that changed the SOC or the capacity by more than ``MIN_CHANGE``.
         last_change: The last of these changes; None: no change yet.
         unsaved_rows: Number of rows since the last increase of ``revision``.
@@ -106,7 +110,8 @@ class SlowFit:
         self.cell = CellCurves(estimator.cell_file_settings)
         self.bank = BankMonitor(self.cell) if self.cell.series > 1.0 else None
         self.fit: PackFit | None = None
-        self.fits = self.late = self.failed = self.changes = self.revision = self.unsaved_rows = 0
+        self.fits = self.late = self.failed = self.changes = self.revision = self.unsaved_rows = self.discarded = 0
+        self._failed_in_row = 0  # number of failed fits since the last successful one
         self.last_change: FitChange | None = None
         self._submit, self._interval_s, self._on_failure = submit, interval_s, on_failure
         self._pending: Future[PackFit] | None = None
@@ -194,16 +199,38 @@ class SlowFit:
             self.last_change = FitChange(before[0], after[0], before[1], after[1])
 
     def take_rows(self) -> None:
-        """Append the completed rows of the estimator's state to the history."""
+        """Append the completed rows of the estimator's state to the history. An exception discards the history."""
         h = self._h
         if count := int(h["count"]):
-            self.history.append(h["rows"][:count].copy(), self.cell.capacity_as)
-            self._new_rows += count
-            self.unsaved_rows += count
-            if self.bank and self.saved_fit is not None:
-                self.bank.add(self.history, count, self.saved_fit)
+            rows = h["rows"][:count].copy()
             h["count"] = 0
             h["rows"] = np.zeros(1, HISTORY_ROW)  # unused rows would depend on the division of the samples into blocks
+            try:
+                self._append(rows)
+            except Exception as error:  # noqa: BLE001 - an odd value of the history must not end the estimator
+                self._report_failure(error)
+                self._discard_history()
+
+    def _append(self, rows: NDArray[np.void]) -> None:
+        """Append rows to the history, and compare them with earlier discharges."""
+        self.history.append(rows, self.cell.capacity_as)
+        self._new_rows += rows.size
+        self.unsaved_rows += rows.size
+        if self.bank and self.saved_fit is not None:
+            self.bank.add(self.history, rows.size, self.saved_fit)
+
+    def _report_failure(self, error: BaseException) -> None:
+        self.failed += 1
+        self._on_failure(error)
+
+    def _discard_history(self) -> None:
+        """Discard history and last fit. The adopted fit stays in use, as after a restart without the history's file."""
+        self._pending, self.saved_fit, self.history = None, None, History()
+        self._is_late, self._new_rows, self._failed_in_row = False, 0, 0
+        if self.bank:
+            self.bank.reset()
+        self.discarded += 1
+        self.revision += 1
 
     @property
     def _h(self) -> np.void:
@@ -245,14 +272,19 @@ class SlowFit:
 
     def _end_fit(self, done: "Future[PackFit]") -> None:
         """Adopt the result of a completed fit if it is ready for use, or report its failure."""
-        error = done.exception()
-        if error is not None:
-            self.failed += 1
-            self._on_failure(error)
-        elif self._is_adoptable(done.result()):
-            self.adopt(done.result())
-        else:
-            self.saved_fit = done.result()
+        estimator = self.estimator
+        before = estimator.record.copy(), estimator.settings_record.copy(), self.fit
+        try:
+            fitted = done.result()
+            if self._is_adoptable(fitted):
+                self.adopt(fitted)
+            self.saved_fit, self._failed_in_row = fitted, 0
+        except Exception as error:  # noqa: BLE001 - a failed fit must not end the estimator
+            estimator.record[...], estimator.settings_record[...], self.fit = before
+            self._failed_in_row += 1
+            self._report_failure(error)
+            if self._failed_in_row == MAX_FAILED_FITS:
+                self._discard_history()
         self.unsaved_rows = 0
         self.revision += 1
 

@@ -1,5 +1,10 @@
-"""Conversion of history and fit to arrays that can be saved, and back."""
+"""Conversion of history and fit to arrays that can be saved, and back.
 
+A file may contain any values, so that all fields are checked for type, shape and range. An odd value would otherwise end the
+service at each start, or at a later fit.
+"""
+
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -8,14 +13,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
+from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import CURVE, PackFit
 from bms_estimator.pack_model.history import MAX_ROWS, History, ReferenceDischarges, WeakCellTime
+from bms_estimator.pack_model.unknowns import CURVE_NODES, DIRECTION_NODES, DIRECTIONS
 
 SAVED_MINIMA = 2
 """Number of a fit's minima that are saved. The next fit starts from two minima (``fit.starts``)."""
 _RESULTS = CURVE.stop
 """Number of results of a fit. ``CURVE`` is the last part of them."""
+MAX_TIME_S = 1e11
+"""Maximum plausible time since the history began [s], 3,000 years."""
+MAX_SEGMENT = 1e9
+"""Maximum plausible number of a segment. Each restart and each gap begin one."""
+MAX_CHARGE_AS = 1e12
+"""Maximum plausible absolute charge counter [A s]."""
+MAX_VOLTAGE_V, MAX_CURRENT_A, MAX_TEMPERATURE_C = 1e5, 1e6, 1e3
+"""Maximum plausible absolute values of a pack's voltage [V], current [A] and temperature [degC]."""
+_FILTER_SOC = (-0.1, 1.1)
+"""Range of an SOC of the filter, which limits it to -0.05..1.05."""
+_FITTED_SOC = (-2.0, 3.0)
+"""Range of an SOC of a fit, which has no limits."""
+MAX_LN_RATIO = 20.0
+"""Maximum plausible absolute value of a result of a fit: an SOC, a voltage of one cell [V], or ln of a ratio."""
+MAX_COST = 1e15
+"""Maximum plausible absolute cost of a fit."""
+ROUNDING_S = 1.0
+"""Maximum decrease of the time between two rows by the rounding of merged rows [s]."""
+_TIME, _SEGMENT, _CHARGE = (0.0, MAX_TIME_S), (0.0, MAX_SEGMENT), (-MAX_CHARGE_AS, MAX_CHARGE_AS)
+_CURRENT, _VARIANCE, _RESULT = (-MAX_CURRENT_A, MAX_CURRENT_A), (0.0, MAX_CURRENT_A**2), (-MAX_LN_RATIO, MAX_LN_RATIO)
+_ROW_RANGES = {
+    "elapsed_s": _TIME,
+    "duration_s": _TIME,
+    "segment": _SEGMENT,
+    "direction": (-1.0, 1.0),
+    "voltage_v": (-MAX_VOLTAGE_V, MAX_VOLTAGE_V),
+    "current_a": _CURRENT,
+    "between_a2": _VARIANCE,
+    "skew_a2": _VARIANCE,
+    "x_a": _CURRENT,
+    "settled_s": _TIME,
+    "temperature_c": (-MAX_TEMPERATURE_C, MAX_TEMPERATURE_C),
+    "charge_as": _CHARGE,
+    "charge_variance_as2": (0.0, MAX_CHARGE_AS**2),
+    "throughput_soc": (0.0, MAX_CHARGE_AS),
+    "hysteresis": (-1.001, 1.001),  # a mean of values of -1 may be rounded
+    "soc": _FILTER_SOC,
+    "reference_kind": (0.0, 2.0),
+}
+"""Range of each field of a row that is always finite."""
 _SHAPES = {
     "elapsed_s": (),
     "segment": (),
@@ -29,13 +76,28 @@ _SHAPES = {
     "first_segment": (),
 }
 """Fields of a fit on which the curves and the handed-over state depend, with their shapes."""
+_FIT_RANGES = {
+    "elapsed_s": _TIME,
+    "segment": _SEGMENT,
+    "charge_as": _CHARGE,
+    "mean": _RESULT,
+    "covariance": (-(MAX_LN_RATIO**2), MAX_LN_RATIO**2),
+    "curve_v": _RESULT,
+    "ln_r": _RESULT,
+    "hysteresis": (0.0, math.exp(MAX_LN_RATIO)),
+    "cost": (-MAX_COST, MAX_COST),
+    "first_segment": _SEGMENT,
+    "row_elapsed_s": _TIME,
+    "row_soc": _FITTED_SOC,
+    "curves": (-MAX_COST, MAX_COST),
+}
+"""Range of each saved field of a fit."""
+_CURVE_UNKNOWNS = CURVE_NODES + DIRECTIONS * DIRECTION_NODES
+"""Number of unknowns of the OCV's error and of the error by direction."""
 _DEFAULTS: Mapping[str, NDArray[Any]] = {"first_segment": np.zeros(())}
 """Fields that an earlier version did not save, with their values: its fits used all segments."""
 _NEW_ROW_FIELDS = {"between_a2", "skew_a2"}
 """Fields of a row that an earlier version did not save. They are variances, which it assumed to be 0."""
-_START_FIELDS = "row_elapsed_s", "row_soc", "curves"
-"""Fields of a fit from which the next fit starts."""
-
 BANK = "bank_"
 """Prefix of the arrays of the first discharges of a bank and of the fit after them."""
 
@@ -51,19 +113,41 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
     """Return the fit of ``curve_arrays``, without the fields from which the next fit starts.
 
     Raises:
-        ValueError: A field is missing, has another shape or is not finite.
+        ValueError: A field is missing, or has another shape or an implausible value.
     """
     if not arrays:
         return None
     values: dict[str, Any] = {}
     saved = {**_DEFAULTS, **arrays}
     for name, shape in _SHAPES.items():
-        value = saved.get(name)
-        if value is None or value.shape != shape or not np.isfinite(value).all():
-            raise ValueError(f"{name} of the fit is missing or damaged")
+        value = _fit_field(saved, name)
+        if value.shape != shape:
+            raise ValueError(f"{name} of the fit is damaged")
         values[name] = value if shape else float(value)
+    covariance = values["covariance"]
+    if not np.allclose(covariance, covariance.T) or (np.diag(covariance) < 0.0).any():
+        raise ValueError("covariance of the fit is damaged")
+    if values["first_segment"] > values["segment"]:
+        raise ValueError("the fit begins after its last segment")
     none = np.zeros(0)
     return PackFit(**values, row_elapsed_s=none, row_soc=none, curves=())
+
+
+def _fit_field(arrays: Arrays, name: str) -> Floats:
+    """Return a field of a fit.
+
+    Raises:
+        ValueError: The field is missing or has an implausible value.
+    """
+    value = arrays.get(name)
+    if value is None or value.dtype.kind not in "fiu" or not _is_within(value, _FIT_RANGES[name]):
+        raise ValueError(f"{name} of the fit is missing or damaged")
+    return value.astype(float)
+
+
+def _is_within(values: NDArray[Any], limits: tuple[float, float]) -> bool:
+    """Return True if no value is NaN or outside the limits."""
+    return bool(((values >= limits[0]) & (values <= limits[1])).all())
 
 
 def _with_present_fields(rows: NDArray[Any] | None) -> NDArray[Any] | None:
@@ -103,7 +187,10 @@ def history_arrays(history: History, fit: PackFit | None) -> dict[str, NDArray[A
 def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
     """Return the times of weak cells. An earlier version did not save them."""
     saved = arrays.get("weak_cell_times", np.zeros((0, len(WeakCellTime._fields))))
-    if saved.ndim != 2 or saved.shape[1] != len(WeakCellTime._fields) or np.isnan(saved).any():
+    if saved.dtype != float or saved.ndim != 2 or saved.shape[1] != len(WeakCellTime._fields):
+        raise ValueError("the times of weak cells are damaged")
+    start_s, end_s, soc = saved.T
+    if not (_is_within(start_s, _TIME) and (end_s >= start_s).all() and _is_within(soc, _FITTED_SOC)):
         raise ValueError("the times of weak cells are damaged")
     return [WeakCellTime(*row) for row in saved.tolist()]
 
@@ -111,23 +198,31 @@ def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
 def _first_discharges(arrays: Arrays) -> ReferenceDischarges | None:
     """Return the first discharges of a bank; None if none were saved."""
     fit = fit_of_curves({name: arrays[BANK + name] for name in _SHAPES if BANK + name in arrays})
-    return None if fit is None else ReferenceDischarges(_checked_rows(arrays.get("bank_rows")), fit)
+    return None if fit is None else ReferenceDischarges(checked_rows(arrays.get("bank_rows")), fit)
 
 
-def _checked_rows(saved: NDArray[Any] | None) -> NDArray[np.void]:
+def checked_rows(saved: NDArray[Any] | None) -> NDArray[np.void]:
     """Return saved rows.
 
     Raises:
-        ValueError: They have another layout, or are not finite or not in the order of time.
+        ValueError: They have another layout, an implausible value, or are not in the order of time.
     """
     rows = _with_present_fields(saved)
     if rows is None or rows.dtype != HISTORY_ROW or rows.ndim != 1 or rows.size > MAX_ROWS:
         raise ValueError("its rows have another layout")
-    if not all(
-        np.isfinite(rows[name]).all() for name in ("elapsed_s", "duration_s", "segment", "voltage_v", "charge_as")
-    ):
-        raise ValueError("a row is not finite")
-    if (np.diff(rows["segment"]) < 0.0).any():
+    for name, limits in _ROW_RANGES.items():
+        if not _is_within(rows[name], limits):
+            raise ValueError(f"{name} of a row is damaged")
+    for name in ("segment", "direction", "reference_kind"):
+        if (rows[name] % 1.0).any():
+            raise ValueError(f"{name} of a row is damaged")
+    soc, std = rows["reference_soc"], rows["reference_std"]
+    known = ~np.isnan(soc)
+    if not (_is_within(soc[known], _FILTER_SOC) and ((std[known] > 0.0) & (std[known] <= 1.0)).all()):
+        raise ValueError("a known SOC of a row is damaged")
+    if not (rows["gap_s"] >= 0.0).all():
+        raise ValueError("gap_s of a row is damaged")
+    if (np.diff(rows["segment"]) < 0.0).any() or (np.diff(rows["elapsed_s"]) < -ROUNDING_S).any():
         raise ValueError("its rows are not in the order of time")
     return rows
 
@@ -136,13 +231,17 @@ def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
     """Return history and fit of ``history_arrays``.
 
     Raises:
-        ValueError: A field is missing, has another layout or is not finite.
+        ValueError: A field is missing, or has another layout or an implausible value.
     """
-    history = History(_checked_rows(arrays.get("rows")), _weak_cell_times(arrays), _first_discharges(arrays))
+    history = History(checked_rows(arrays.get("rows")), _weak_cell_times(arrays), _first_discharges(arrays))
     fit = fit_of_curves({name: value for name, value in arrays.items() if name in _SHAPES})
     if fit is None:
         return history, None
-    elapsed_s, soc, starts = (arrays.get(name, np.zeros(0)) for name in _START_FIELDS)
-    if elapsed_s.shape != soc.shape or elapsed_s.ndim != 1 or not np.isfinite(starts).all():
-        raise ValueError("the starts of the next fit are damaged")
-    return history, replace(fit, row_elapsed_s=elapsed_s, row_soc=soc, curves=tuple(starts))
+    elapsed_s, soc, curves = (_fit_field(arrays, name) for name in ("row_elapsed_s", "row_soc", "curves"))
+    if elapsed_s.shape != soc.shape or elapsed_s.ndim != 1 or not 0 < elapsed_s.size <= 2 * MAX_ROWS:
+        raise ValueError("the SOCs of the fit are damaged")
+    if curves.ndim != 2 or curves.shape[1] != _CURVE_UNKNOWNS or not 0 < curves.shape[0] <= SAVED_MINIMA:
+        raise ValueError("curves of the fit is damaged")
+    if not history.rows.size or fit.segment > history.rows["segment"][-1]:
+        raise ValueError("the fit is later than the rows")
+    return history, replace(fit, row_elapsed_s=elapsed_s, row_soc=soc, curves=tuple(curves))

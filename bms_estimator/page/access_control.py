@@ -64,13 +64,17 @@ class AccessControl:
         return self._token is None or hmac.compare_digest(_encode_header(cookie), self.cookie.encode())
 
 
-def make_access_control(settings: PageSettings) -> AccessControl:
+def make_access_control(settings: PageSettings, token: str | None = None) -> AccessControl:
     """Make the access control of the settings.
+
+    Args:
+        settings: Host names of the page, and the file with its token.
+        token: Required token if the settings name no file; None: no token is required.
 
     Raises:
         UserError: The token cannot be read, or is too short.
     """
-    return AccessControl((settings.address.host, *settings.hosts), _token(settings))
+    return AccessControl((settings.address.host, *settings.hosts), _token(settings) or token)
 
 
 def _token(settings: PageSettings) -> str | None:

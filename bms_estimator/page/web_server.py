@@ -34,7 +34,7 @@ SHUTDOWN_TIMEOUT_S = 1.0
 LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>bms_estimator</title><form action="/" method="get">
 <p><label>Token <input name="token" type="password" autofocus autocomplete="off"></label> <button>Open</button></p>
-<p>It is in the file token_file of the page's settings.</p></form></html>"""
+<p>It is in the file token_file of the page's settings, or in the terminal of bms-estimator setup.</p></form></html>"""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -73,6 +73,7 @@ class WebServer:
         handlers: Handlers of queries, by path.
         forms: Handlers of submitted forms, by path.
         max_form_bytes: Maximum size of a submitted form [bytes].
+        token: Required token if the settings name no file with one; None: no token is required.
         on_listening: Called with the address once the server listens.
         retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
@@ -89,11 +90,12 @@ class WebServer:
         *,
         forms: Mapping[str, Handler] = MappingProxyType({}),
         max_form_bytes: int = 1024,
+        token: str | None = None,
         on_listening: Callable[[str], object] = str,
         retry: bool = True,
     ) -> None:
         self._latest, self._on_listening, self._retry = latest, on_listening, retry
-        self._access: AccessControl = make_access_control(settings)
+        self._access: AccessControl = make_access_control(settings, token)
         self._configured_address, self._listening = settings.address, settings.address
         self._files = {path: _load_file(file) for path, file in files.items()}
         self._handlers = {**dict.fromkeys(files, self._file), "/events": self._stream_events, **handlers}

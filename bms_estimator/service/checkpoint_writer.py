@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile, RunCounters
 from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
@@ -77,6 +77,7 @@ class CheckpointWriter:
         self._samples_of_saved_load = 0
         self._pack_model, self._history = pack_model, history
         self._saved_revision = pack_model.revision if pack_model else 0
+        self._discarded = 0  # number of histories whose files were set aside
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
         self._totals, self._restarts = totals, restarts
         self._saved_alarms = self._alarms.saved_state
@@ -165,9 +166,15 @@ class CheckpointWriter:
         if file is None or (revision == self._saved_revision and not (is_last and model.unsaved_rows)):
             self._saved_revision = revision
             return True
-        arrays = history_arrays(model.history, model.saved_fit)
-        if await self._write(lambda: file.save(arrays), file.path):
-            self._saved_revision = revision
+        arrays, discarded = history_arrays(model.history, model.saved_fit), model.discarded
+
+        def save() -> None:
+            if discarded != self._discarded and file.path.exists():
+                log.warning("history", file=str(file.path), outcome=f"{REJECTED}its fit fails; {file.quarantine()}")
+            file.save(arrays)
+
+        if await self._write(save, file.path):
+            self._saved_revision, self._discarded = revision, discarded
             return True
         return False
 

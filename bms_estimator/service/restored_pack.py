@@ -60,7 +60,15 @@ def restore_pack(
         # is impossible, and the resistances start with the std of the cell file again.
         return_to_cell_file(estimator)
     if pack_model:
-        pack_model.resume(content.unseen_s if restored else math.inf, restored=restored)
+        gap_s = content.unseen_s if restored else math.inf
+        try:
+            pack_model.resume(gap_s, restored=restored)
+        except Exception as error:  # noqa: BLE001 - an odd value of the file must not end the service at each start
+            _reject_history(history, error)
+            pack_model.load(History(), None, state_fit)
+            h = estimator.record["history"]
+            h["count"] = h["sums"]["duration_s"] = 0  # rows that the history lacks
+            pack_model.resume(gap_s, restored=restored)
     if cells and restored and (reason := cells.restore(content.cells, content.unseen_s)):
         log.warning("the state of the single cells was dropped", reason=reason)
     if refused := outcome.startswith(REJECTED):
@@ -97,11 +105,18 @@ def _load_history(file: HistoryFile | None) -> tuple[History, PackFit | None]:
         if arrays is None:
             return History(), None
         history, fit = history_of(arrays)
-    except (RejectedHistoryError, ValueError) as error:
-        log.warning("history", file=str(file.path), outcome=f"{REJECTED}{error}; {file.quarantine()}")
+    except Exception as error:  # noqa: BLE001 - an odd value of the file must not end the service at each start
+        _reject_history(file, error)
         return History(), None
     log.info("history", file=str(file.path), outcome=f"restored: {history.rows.size} rows")
     return history, fit
+
+
+def _reject_history(file: HistoryFile | None, error: Exception) -> None:
+    """Quarantine the file of a history that cannot be used, and log the reason."""
+    if file is not None:
+        kind = "" if isinstance(error, RejectedHistoryError | ValueError) else f"{type(error).__name__}: "
+        log.warning("history", file=str(file.path), outcome=f"{REJECTED}{kind}{error}; {file.quarantine()}")
 
 
 def _soc_text(estimator: Estimator) -> str:

@@ -13,7 +13,7 @@ Name = Annotated[str, Field(min_length=1)]
 class InfluxSettings(Strict):
     """Export of estimates and alarm changes to InfluxDB, or to another server that accepts its line protocol over HTTP."""
 
-    url: Annotated[str, Field(pattern=r"^https?://[^/@\s?#]+(/[^@\s?#]*)?$")] = Field(
+    url: Annotated[str, Field(pattern=r"^https?://(\[[^\]\s]+\]|[^/@\s?#:]+)(:\d{1,5})?(/[^@\s?#]*)?$")] = Field(
         default="http://localhost:8086", description="http://host:port or https://host:port, without user and password"
     )
     database: Name = Field(default="bms", description="database of InfluxDB 1; ignored if bucket is set")

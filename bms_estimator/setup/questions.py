@@ -128,7 +128,7 @@ def _parse_broker(text: str, _: Answers) -> object:
     try:
         parse_url(text)
     except ValueError as error:
-        raise InvalidAnswerError(f"{text}: {error}") from None
+        raise InvalidAnswerError(f"{without_secrets(text)}: {error}") from None
     return url
 
 

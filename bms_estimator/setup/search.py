@@ -5,6 +5,7 @@ import importlib.util
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from urllib.parse import urlsplit
 
 from pydantic import ValidationError
 
@@ -56,13 +57,23 @@ async def search(places: Sequence[str]) -> SearchResult:
     Args:
         places: Paths of serial ports, URLs of MQTT brokers, ``BLUETOOTH``, and Modbus devices as ``host`` or ``host:port``.
 
-    Raises:
-        UserError: A URL cannot be used.
+    Returns:
+        The devices. A place that cannot be searched is one of the failures, whatever exception its search raised.
     """
     result = SearchResult()
-    await asyncio.gather(*(_search_place(place, result) for place in places))
+    await asyncio.gather(*(_search_or_report(place, result) for place in places))
     result.devices.sort(key=lambda device: device.broker is not None)  # serial devices first
     return result
+
+
+async def _search_or_report(place: str, result: SearchResult) -> None:
+    """Search a place, and add an exception to the failures."""
+    try:
+        await _search_place(place, result)
+    except UserError as error:  # names the place
+        result.failures.append(str(error))
+    except Exception as error:  # noqa: BLE001 - one place must not end the search of the others
+        result.failures.append(f"{without_secrets(place)}: cannot be searched: {type(error).__name__}: {error}")
 
 
 async def _search_place(place: str, result: SearchResult) -> None:
@@ -134,11 +145,21 @@ async def _search_mqtt(url: str, result: SearchResult) -> None:
 
 
 async def _search_modbus_host(place: str, result: SearchResult) -> None:
-    """Poll a Modbus TCP device or gateway, ``host`` or ``host:port``, with each profile."""
-    host, separator, port = place.partition(":")
-    if separator and not port.isdecimal():
-        raise UserError(f"{place}: must be a host or host:port")
-    await _search_modbus({"host": host} | ({"tcp_port": int(port)} if port else {}), place, result)
+    """Poll a Modbus TCP device or gateway, ``host``, ``host:port`` or ``[IPv6 address]:port``, with each profile.
+
+    Raises:
+        UserError: The place has another form.
+    """
+    try:
+        url = urlsplit(f"//{place}")
+        host, port = url.hostname, url.port
+    except ValueError:  # an invalid port or IPv6 address
+        host = port = None
+    if not host or port == 0 or url.netloc != place or "@" in place:
+        raise UserError(
+            f"{without_secrets(place)}: must be a host, host:port or [IPv6 address]:port, with a port of 1 to 65535"
+        )
+    await _search_modbus({"host": host} | ({"tcp_port": port} if port else {}), place, result)
 
 
 async def _search_modbus(address: dict[str, object], name: str, result: SearchResult) -> None:

@@ -1,4 +1,4 @@
-"""Rate-limited log of a line's faults, because noise may arrive for days."""
+"""Rate-limited log of a line's faults and of the reasons why no samples arrive, because noise may arrive for days."""
 
 import math
 from collections.abc import Mapping
@@ -6,7 +6,9 @@ from collections.abc import Mapping
 import structlog
 
 MIN_LOG_INTERVAL_S = 30.0
-"""Minimum interval between two log lines on faults [s]."""
+"""Minimum interval between two log lines on faults, or on one reason [s]."""
+MAX_REASONS = 16
+"""Maximum number of reasons that are logged without a minimum interval. More reasons are noise in a device's text."""
 _NORMAL_EVENTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello", "reconnects", "retained")
 """Counters of normal events, which are not logged here.
 
@@ -35,3 +37,32 @@ class FaultLog:
         if faults != self._logged_faults and now_s - self._log_time_s >= MIN_LOG_INTERVAL_S:
             self._logged_faults, self._log_time_s = faults, now_s
             log.warning("faults on the line", **nonzero)
+
+
+class SilenceLog:
+    """Log of the reasons why no samples arrive: each reason once until samples arrive, however often the reasons alternate."""
+
+    def __init__(self) -> None:
+        self._logged_s: dict[str, float] = {}
+        self._samples_s = -math.inf
+
+    def on_samples(self, now_s: float) -> None:
+        """Permit each reason to be logged again. ``now_s`` is the monotonic clock [s]."""
+        self._samples_s = now_s
+
+    def report(self, reason: str, now_s: float) -> None:
+        """Log a reason, unless it was logged since the last samples, or less than the minimum interval ago.
+
+        Args:
+            reason: Reason why no samples arrive.
+            now_s: Monotonic clock [s].
+        """
+        logged_s = self._logged_s.get(reason, -math.inf)
+        if logged_s > self._samples_s or now_s - logged_s < MIN_LOG_INTERVAL_S:
+            return
+        if len(self._logged_s) >= MAX_REASONS:
+            if now_s - max(self._logged_s.values()) < MIN_LOG_INTERVAL_S:
+                return
+            del self._logged_s[next(iter(self._logged_s))]  # the oldest one
+        self._logged_s[reason] = now_s
+        log.warning("no samples", reason=reason)

@@ -16,7 +16,7 @@ from bms_estimator.process.backoff import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.sources.fault_log import FaultLog
+from bms_estimator.sources.fault_log import FaultLog, SilenceLog
 from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
 
 CHECK_INTERVAL_S = 1.0
@@ -103,11 +103,10 @@ class LineSource:
         self._first_retry_s, self._retry_s = first_retry_s, 0.0
         self._lines: asyncio.Queue[Chunk | None] = asyncio.Queue()
         self._silence_reason: str | None = "not opened yet"
-        self._logged_reason = ""
         self._connections, self._connected = 0, False
         self._last_check_s = self._last_sample_s = monotonic()
         self._block_arrival_s = math.nan  # arrival time of the last block's line
-        self._fault_log = FaultLog()
+        self._fault_log, self._silence_log = FaultLog(), SilenceLog()
         self._produce_task: asyncio.Task[None] | None = None
         self._watch_task: asyncio.Task[None] | None = None
 
@@ -167,7 +166,8 @@ class LineSource:
             block = self._decode(*chunk)
             if block.size:
                 self._block_arrival_s = chunk[0]
-                self._silence_reason, self._logged_reason, self._retry_s = None, "", self._first_retry_s
+                self._silence_reason, self._retry_s = None, self._first_retry_s
+                self._silence_log.on_samples(self._last_sample_s)
                 yield ReceivedSamples(block, self._decoder.cells)
         if self._produce_task is not None and not self._produce_task.cancelled():
             self._produce_task.result()
@@ -222,7 +222,6 @@ class LineSource:
             await asyncio.sleep(self._check_interval_s)
 
     def _report(self, reason: str) -> None:
-        """Set the reason why no samples arrive. It is logged again only after it changed or samples arrived."""
-        if reason != self._logged_reason:
-            log.warning("no samples", reason=reason)
-        self._silence_reason = self._logged_reason = reason
+        """Set the reason why no samples arrive, and log it if it is new since the last samples."""
+        self._silence_log.report(reason, self._monotonic())
+        self._silence_reason = reason

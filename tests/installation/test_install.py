@@ -98,13 +98,35 @@ def test_upgrade_does_not_enable_a_disabled_service(root, pack, capsys):
     assert not link.is_symlink()
 
 
-def test_other_settings_are_backed_up(root, pack, capsys):
+def test_other_settings_and_another_password_are_backed_up_for_root_and_the_service(root, pack, capsys):
     run(capsys, "install", "--root", root, pack)
     pack.write_text(PACK.replace("house", "shed"))
+    (pack.parent / "mqtt-password").write_text("changed")
     run(capsys, "install", "--root", root, pack)
     folder = root / "etc/bms-estimator"
     assert (folder / "pack.toml").read_text() == pack.read_text()
     assert (folder / "pack.toml.old").read_text() == PACK
+    assert [(folder / name).read_text() for name in ("mqtt-password", "mqtt-password.old")] == ["changed", "secret"]
+    status = (folder / "mqtt-password.old").stat()
+    assert (stat.S_IMODE(status.st_mode), status.st_uid, status.st_gid) == (0o640, 0, group_of_service(root))
+
+
+@pytest.mark.parametrize("place", ["root/etc/bms-estimator/mqtt-password", "mqtt-password"])
+def test_a_symbolic_link_in_place_of_a_file_is_rejected(root, pack, capsys, tmp_path, place):
+    run(capsys, "install", "--root", root, pack)
+    other_file = tmp_path / "shadow"
+    other_file.write_text("root:hash")
+    (tmp_path / place).unlink()
+    (tmp_path / place).symlink_to(other_file)
+    code, _, err = run(capsys, "install", "--root", root, pack)
+    assert code == 2
+    assert f"{tmp_path / place}: is a symbolic link" in err
+    assert other_file.read_text() == "root:hash"
+    assert not any(
+        path.read_bytes() == b"root:hash"
+        for path in (root / "etc").rglob("*")
+        if path.is_file() and not path.is_symlink()
+    )
 
 
 def test_invalid_settings_change_nothing(root, pack, capsys):

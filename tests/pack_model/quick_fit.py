@@ -6,11 +6,14 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.kalman_filter.records import NODES
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.fit import CURVE, LN_Q, SOC, PackFit
+from bms_estimator.pack_model.unknowns import CURVE_NODES, DIRECTION_NODES, DIRECTIONS
 
 LN_CAPACITY = -0.1
 """ln of the fitted over the declared capacity."""
 LN_SERIES, LN_PAIRS = 0.3, 0.2
 """ln of the fitted over the file's series resistance, and over the resistances of the RC pairs."""
+UNKNOWNS = CURVE_NODES + DIRECTIONS * DIRECTION_NODES
+"""Number of unknowns of the OCV's error and of the error by direction."""
 CURVE_V = 0.01
 """Fitted correction of the OCV of one cell [V]."""
 
@@ -34,5 +37,5 @@ def quick_fit(_: CellCurves, rows: NDArray[np.void], previous: PackFit | None = 
         row_elapsed_s=rows["elapsed_s"].copy(),
         row_soc=rows["soc"].copy(),
         cost=1.0,
-        curves=(np.zeros(9), np.ones(9)),  # two minima of arbitrary length, which are only saved and restored
+        curves=(np.zeros(UNKNOWNS), np.ones(UNKNOWNS)),  # two minima, which are only saved and restored
     )

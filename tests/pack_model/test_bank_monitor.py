@@ -21,7 +21,7 @@ from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 def rows_of(charge_as: list[float], segment: list[int] | None = None) -> np.ndarray:
     rows = np.zeros(len(charge_as), HISTORY_ROW)
     rows["charge_as"], rows["elapsed_s"], rows["duration_s"] = charge_as, 60.0 * np.arange(rows.size), 60.0
-    rows["direction"] = 1.0
+    rows["direction"], rows["reference_soc"] = 1.0, np.nan
     if segment is not None:
         rows["segment"] = segment
     return rows

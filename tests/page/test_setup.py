@@ -1,5 +1,6 @@
 """The setup page in a real Chromium, with a simulated BMS: from the search to the first estimate."""
 
+import asyncio
 import re
 from pathlib import Path
 
@@ -92,6 +93,24 @@ async def answer_questions(page: Page) -> None:
     await page.get_by_role("button", name="Write").click()
 
 
+async def test_a_failed_search_is_reported_and_can_be_repeated(tmp_path: Path) -> None:
+    async with SetupServer(loopback(), tmp_path / "pack.toml") as server, ClientSession() as client:
+
+        async def text() -> str:
+            async with client.get(server.url) as answer:
+                return await answer.text()
+
+        key = re.search('name="form_key" value="([^"]*)"', await text())
+        assert key
+        await client.post(f"{server.url}search", data={"places": "gx:0 mqtt://user:secret@gx", "form_key": key[1]})
+        async with asyncio.timeout(LONG_S):
+            while "Searching" in (page := await text()):  # noqa: ASYNC110 - the page has no event for this
+                await asyncio.sleep(0.01)
+    assert "gx:0: must be a host" in page
+    assert "Search again" in page
+    assert "secret" not in page
+
+
 async def test_a_form_of_another_page_changes_nothing(tmp_path: Path) -> None:
     async with SetupServer(loopback(), tmp_path / "pack.toml") as server, ClientSession() as client:
         async with client.post(f"{server.url}search", data={"places": "bluetooth"}) as answer:
@@ -100,15 +119,29 @@ async def test_a_form_of_another_page_changes_nothing(tmp_path: Path) -> None:
             assert "Where to search" in await answer.text()
 
 
-async def test_other_machines_need_the_token(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_file", [True, False], ids=["file", "given"])
+async def test_the_token_of_a_file_or_of_the_program_is_required(tmp_path: Path, is_file: bool) -> None:
     token = tmp_path / "token"
     token.write_text(TOKEN)
-    page = loopback(token_file=token)
-    async with SetupServer(page, tmp_path / "pack.toml") as server, ClientSession() as client:
+    page, given = (loopback(token_file=token), None) if is_file else (loopback(), TOKEN)
+    async with SetupServer(page, tmp_path / "pack.toml", given) as server, ClientSession() as client:
         async with client.get(server.url) as answer:
             assert answer.status == 401
         async with client.get(server.url, headers={"Authorization": f"Bearer {TOKEN}"}) as answer:
             assert "Where to search" in await answer.text()
+
+
+@pytest.mark.parametrize(("user", "has_token"), [(0, True), (1000, False)])
+def test_only_root_gets_a_page_with_a_token(
+    capsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, user: int, has_token: bool
+) -> None:
+    ended = asyncio.Event()
+    ended.set()
+    monkeypatch.setattr("bms_estimator.cli.settings.setup.stop_on_signal", lambda: ended)
+    monkeypatch.setattr("os.geteuid", lambda: user)
+    code, out, err = run(capsys, "setup", tmp_path / "pack.toml", "--port", 0)
+    assert code == 0, err
+    assert bool(re.fullmatch(r"setup page: http://127\.0\.0\.1:\d+/\?token=[0-9a-f]{32}\n", out)) == has_token
 
 
 def test_a_page_for_other_machines_without_a_token_is_refused(capsys, tmp_path: Path) -> None:

@@ -299,6 +299,23 @@ async def test_an_unusable_history_is_set_aside(day: SampleBlock, tmp_path: Path
 
 
 @pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("failing", ["adopt_state", "History.append"])
+async def test_a_history_whose_use_raises_exceptions_is_set_aside_and_the_service_goes_on(
+    day: SampleBlock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    first = await run_service(day[: 2 * HOUR], tmp_path)
+
+    def fail(*_: Any) -> None:
+        raise ArithmeticError("odd value")
+
+    monkeypatch.setattr(f"bms_estimator.pack_model.learning.{failing}", fail)
+    second = await run_service(day[2 * HOUR : 5 * HOUR], tmp_path)
+    assert second.estimator.state["samples"][0] == 3 * HOUR
+    assert (tmp_path / "bike.refused.history.npz").exists()
+    assert second.estimator.settings_record.tobytes() == first.estimator.settings_record.tobytes()
+
+
+@pytest.mark.usefixtures("quick")
 async def test_without_a_checkpoint_the_fit_of_the_history_is_used(day: SampleBlock, tmp_path: Path) -> None:
     first = await run_service(day[: 3 * HOUR], tmp_path)
     CheckpointFile(tmp_path, SETTINGS, CELL).path.unlink()

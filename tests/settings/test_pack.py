@@ -166,6 +166,7 @@ def test_a_pack_has_the_values_of_its_cell_times_cells_in_series_and_parallel() 
         ('[identifier]\nenabled = "yes"', "identifier.enabled = 'yes': must be a valid boolean"),
         ("[observer]\nrearm_gain = false", "observer.rearm_gain = False: must be a number"),
         ("a = " + 3000 * "[", "not valid TOML: nested too deeply"),
+        ("a = " + 5000 * "1", "not valid TOML: Exceeds the limit"),
     ],
 )
 def test_values_of_another_type_are_rejected_and_not_converted(tmp_path: Path, text: str, expected: str) -> None:

@@ -2,7 +2,6 @@
 
 import pytest
 
-from bms_estimator.model.errors import UserError
 from bms_estimator.setup import search as search_module
 from bms_estimator.setup.search import search
 from tests.free_port import free_port
@@ -40,8 +39,25 @@ async def test_a_missing_broker_is_reported_with_the_reason() -> None:
     assert result.failures[0].startswith(f"{url}: ")
 
 
-@pytest.mark.parametrize("place", ["ftp://x", "mqtt://user:secret@x", "gx:port"])
-async def test_an_invalid_place_is_rejected_without_its_password(place: str) -> None:
-    with pytest.raises(UserError, match="must be") as caught:
-        await search([place])
-    assert "secret" not in str(caught.value)
+async def test_each_invalid_place_is_reported_without_its_password_and_ends_no_other_search(tmp_path) -> None:
+    addresses = ["ftp://x", "mqtt://user:secret@x", "mqtt://user:secret", "mqtt://x:0", "mqtt://x:70000", "mqtt://[::1"]
+    hosts = ["gx:port", "gx:0", "gx:70000", "::1", "user:secret@gx", ""]
+    missing = f"mqtt://127.0.0.1:{free_port()}"
+    result = await search([*addresses, *hosts, str(tmp_path), missing])
+    reasons = "\n".join(result.failures)
+    assert len(result.failures) == len(addresses) + len(hosts) + 2, reasons
+    assert "secret" not in reasons
+    assert "Traceback" not in reasons
+    assert f"{missing}: " in reasons
+    assert "gx:0: must be a host, host:port or [IPv6 address]:port, with a port of 1 to 65535" in reasons
+
+
+async def test_an_unexpected_exception_of_one_search_is_reported(monkeypatch, tmp_path) -> None:
+    def fail(port: str) -> None:
+        raise ArithmeticError(f"{port} has no number")
+
+    monkeypatch.setattr(search_module, "probe", fail)
+    result = await search(["/dev/a", str(tmp_path / "b")])
+    assert [reason.partition(" cannot be searched: ")[2] for reason in result.failures] == [
+        f"ArithmeticError: {port} has no number" for port in ("/dev/a", tmp_path / "b")
+    ]

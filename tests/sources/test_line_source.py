@@ -71,7 +71,8 @@ def lines(*voltages_v: float) -> list[bytes]:
 
 
 async def test_lost_source_is_reopened_and_the_loss_is_logged_and_counted():
-    scripts = [SourceUnavailableError("no answer")], [*lines(52.1), OSError(5, "Input/output error")], lines(52.2)
+    alternating = [[SourceUnavailableError("no answer")], [OSError(113, "No route to host")]] * 2
+    scripts = *alternating, [*lines(52.1), OSError(5, "Input/output error")], lines(52.2)
     source = LineSource(ScriptedProducer(*scripts), TEXT, first_retry_s=0.001)
     with capture_logs() as logged:
         async with source:
@@ -85,7 +86,10 @@ async def test_lost_source_is_reopened_and_the_loss_is_logged_and_counted():
     assert source.counters["frames_received"] == 2
     assert source.counters["reconnects"] == 1
     reasons = [line["reason"] for line in logged if line["event"] == "no samples"]
-    assert reasons == ["a device: no answer; trying again", "a device: [Errno 5] Input/output error; trying again"]
+    assert reasons == [
+        f"a device: {reason}; trying again"
+        for reason in ("no answer", "[Errno 113] No route to host", "[Errno 5] Input/output error")
+    ]
 
 
 async def test_capture_of_lines_replays_bit_identically(tmp_path: Path):

@@ -14,7 +14,7 @@ from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.fleet.simulation.block_publisher import Report, run_edges
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
-from bms_estimator.model.config_file import write_text
+from bms_estimator.model.config_file import without_secrets, write_text
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import check as check_broker_settings
 from bms_estimator.process.signals import stop_on_signal
@@ -125,7 +125,9 @@ def _broker_settings(url: str, **options: str | Path | None) -> MqttSettings:
         settings = MqttSettings.model_validate({"url": tuple(url.split(",")), **options})
         check_broker_settings(settings)
     except ValidationError as error:
-        raise UserError(f"--mqtt {url}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from None
+        raise UserError(
+            f"--mqtt {without_secrets(url)}: {error.errors()[0]['msg'].removeprefix('Value error, ')}"
+        ) from None
     except UserError as error:
         raise UserError(_with_option_names(str(error))) from None
     return settings

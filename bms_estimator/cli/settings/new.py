@@ -19,6 +19,7 @@ from bms_estimator.cli.options.status_line import show_status
 from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
 from bms_estimator.cli.settings.prompts import Prompts
 from bms_estimator.installation.root_command import root_command
+from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.process.log_setup import configure_logs
@@ -146,7 +147,7 @@ def _default_places() -> list[str]:
 
 def _search(places: Sequence[str], earlier: Sequence[FoundDevice] = ()) -> SearchResult:
     """Search the places, and print what was found, after the devices that were found earlier."""
-    with show_status(f"searching {', '.join(places)}: up to 20 s"):
+    with show_status(f"searching {', '.join(map(without_secrets, places))}: up to 20 s"):
         result = asyncio.run(search(places))
     names = [device.name for device in earlier]
     result.devices = [*earlier, *(device for device in result.devices if device.name not in names)]
@@ -173,12 +174,8 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
         chosen = prompts.ask(text, "--device", device, parse, default=default)
         if isinstance(chosen, FoundDevice):
             return Answers(chosen, found_broker=result.broker)
-        try:
-            later = _search([chosen], result.devices)
-        except UserError as error:
-            typer.echo(f"  {error}")
-        else:
-            result = replace(later, broker=later.broker or result.broker)
+        later = _search([chosen], result.devices)
+        result = replace(later, broker=later.broker or result.broker)
 
 
 def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> FoundDevice | str:

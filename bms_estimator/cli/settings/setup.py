@@ -1,6 +1,8 @@
 """``bms-estimator setup``: the wizard as a web page."""
 
 import asyncio
+import os
+import secrets
 from collections import deque
 from pathlib import Path
 from typing import Annotated
@@ -41,13 +43,15 @@ def setup(
     address = listen if port is None else f"127.0.0.1:{port}"
     page = page_settings(PageSettings(), listen=address, token_file=token_file)
     configure_logs(deque[str](maxlen=1))  # the page reports faults itself
-    asyncio.run(_serve(page, file, browser=browser))
+    # without a token, every user of this machine could run root's wizard
+    token = secrets.token_hex(16) if os.geteuid() == 0 and page.token_file is None else None
+    asyncio.run(_serve(page, file, token, browser=browser))
 
 
-async def _serve(page: PageSettings, file: Path, *, browser: bool) -> None:
+async def _serve(page: PageSettings, file: Path, token: str | None, *, browser: bool) -> None:
     stop = stop_on_signal()
-    async with SetupServer(page, file) as server:
-        typer.echo(f"setup page: {server.url}")
+    async with SetupServer(page, file, token) as server:
+        typer.echo(f"setup page: {server.url}{f'?token={token}' if token else ''}")
         if browser:
-            open_browser(server.url)
+            open_browser(server.url)  # the token would be visible in the arguments of the browser's process
         await stop.wait()

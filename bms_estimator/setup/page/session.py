@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 
+from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.service.kernel_warm_up import load_kernels
@@ -78,8 +79,8 @@ class SetupSession:
         try:
             self.result = await search(self.places)
             self.step = Step.DEVICE
-        except UserError as error:
-            self.error, self.step = str(error), Step.SEARCH
+        except Exception as error:  # noqa: BLE001 - without an end of the search the page would wait for ever
+            self.error, self.step = f"the search failed: {type(error).__name__}: {error}", Step.SEARCH
 
     async def choose_device(self, name: str) -> None:
         """Choose a found device by its name, and measure its values.
@@ -139,7 +140,8 @@ class SetupSession:
         """
         if self.answers is None:
             return
-        self.texts, self.invalid, answers = dict(texts), {}, self.answers
+        self.invalid, answers = {}, self.answers
+        self.texts = {name: without_secrets(text) for name, text in texts.items()}
         for question in QUESTIONS:
             text = texts.get(question.name, "").strip() or question.suggest(answers)
             try:
@@ -157,7 +159,7 @@ class SetupSession:
         try:
             await asyncio.to_thread(load_kernels)
             await run_estimator(pack.settings, pack.cell, self.on_estimate, seconds=ESTIMATE_S)
-        except UserError as error:
+        except Exception as error:  # noqa: BLE001 - the page reports it
             self.error = str(error)
 
     async def close(self) -> None:

@@ -38,12 +38,13 @@ class SetupServer(WebServer):
     Args:
         settings: Address and access of the page.
         file: Settings file to create.
+        token: Required token if the settings name no file with one; None: no token is required.
 
     Raises:
         UserError: The token cannot be read.
     """
 
-    def __init__(self, settings: PageSettings, file: Path) -> None:
+    def __init__(self, settings: PageSettings, file: Path, token: str | None = None) -> None:
         self._latest_estimate = LatestValues()
         self._session = SetupSession(file, self._show)
         self._form_key, self._lock = secrets.token_hex(16), asyncio.Lock()
@@ -63,6 +64,7 @@ class SetupServer(WebServer):
             self._latest_estimate,
             {"/": self._page},
             forms={path: functools.partial(self._run_step, step) for path, step in steps.items()},
+            token=token,
             retry=False,
         )
 
@@ -100,6 +102,8 @@ class SetupServer(WebServer):
                 await step(fields)
             except (UserError, InvalidAnswerError) as error:
                 self._session.error = str(error)
+            except Exception as error:  # noqa: BLE001 - the page reports it
+                self._session.error = f"{type(error).__name__}: {error}"
         return web.Response(status=303, headers={"Location": "/"})
 
     async def _search(self, fields: Fields) -> None:

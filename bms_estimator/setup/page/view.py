@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from html import escape
 
 from bms_estimator.installation.root_command import root_command
+from bms_estimator.model.config_file import without_secrets
 from bms_estimator.setup.first_estimate import load_note
 from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
 from bms_estimator.setup.new_pack import run_command
@@ -58,21 +59,21 @@ def _form(action: str, form_key: str, content: str, button: str, *, secondary: b
 
 
 def _search(session: SetupSession, form_key: str) -> str:
-    places = escape("\n".join(session.places))
+    places = escape("\n".join(map(without_secrets, session.places)))
     content = (
         '<label>Where to search<textarea name="places" rows="4">' + places + "</textarea></label>"
         '<p class="note">One place per line: path of a serial port, URL of an MQTT broker (mqtt://host), host name of a '
         "Modbus device, or bluetooth. A serial port takes up to 20 s.</p>"
     )
     found = session.step is Step.DEVICE and bool(session.result.devices)
-    button = "Search again" if session.step is Step.DEVICE else "Search"
+    button = "Search again" if session.step is Step.DEVICE or session.error else "Search"
     return f'<section class="card">{_form("search", form_key, content, button, secondary=found)}</section>'
 
 
 def _searching(session: SetupSession, _: str) -> str:
     return (
         '<section class="card"><h2>Searching</h2>'
-        f"<ul>{_items(session.places)}</ul><p class='note'>This takes up to 20 s.</p></section>"
+        f"<ul>{_items(map(without_secrets, session.places))}</ul><p class='note'>This takes up to 20 s.</p></section>"
     )
 
 

@@ -17,7 +17,7 @@ from bms_estimator.protocols.base.device_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.sources.fault_log import FaultLog
+from bms_estimator.sources.fault_log import FaultLog, SilenceLog
 from bms_estimator.sources.serial.board_check import BoardCheck, OtherBoardError
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.port_discovery import BUSY_PORT_RETRY_S, WRONG_PORT_RETRY_S, PortDiscovery
@@ -94,7 +94,7 @@ class SerialSource:
         self._path = ""  # path of the open port
         self._last_check_s = monotonic()  # time of the last iteration of the task
         self._block_arrival_s = math.nan  # arrival time of the last block's bytes
-        self._fault_log = FaultLog()
+        self._fault_log, self._silence_log = FaultLog(), SilenceLog()
         self._decoded = asyncio.Event()
         self._command_lock = asyncio.Lock()
         self._task: asyncio.Task[None] | None = None
@@ -157,6 +157,7 @@ class SerialSource:
                     self._block_arrival_s = arrival_s
                     if self._silence_reason is not None:
                         self._silence_reason, self._rejected = None, False
+                        self._silence_log.on_samples(self._monotonic())
                         self._port.reset_backoff()
                     yield ReceivedSamples(block, self._decoder.cells)
         if self._task is not None and not self._task.cancelled():
@@ -328,8 +329,7 @@ class SerialSource:
                     return
 
     def _report(self, reason: str) -> None:
-        """Set the reason why no samples arrive; log it if it is new."""
+        """Set the reason why no samples arrive, and log it if it is new since the last samples."""
         self._last_check_s = self._monotonic()
-        if reason != self._silence_reason:
-            log.warning("no samples", reason=reason)
+        self._silence_log.report(reason, self._last_check_s)
         self._silence_reason, self._rejected = reason, False

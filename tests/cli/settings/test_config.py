@@ -281,3 +281,17 @@ def test_check_fails_on_a_missing_token_file_and_warns_about_a_token_in_the_cred
     code, out, err = run(capsys, "config", "check", pack)
     assert (code, "valid" in out) == (0, True)
     assert "influx.token_file = influx-token: not checked" in err
+
+
+@pytest.mark.parametrize(
+    "url", ["mqtt://user:secret@host", "mqtt://user:secret", "mqtt://user:p@secret@", "x://user:secret"]
+)
+@pytest.mark.parametrize("section", ["mqtt", "edge", "influx"])
+def test_a_rejected_url_is_shown_without_its_password(pack, capsys, section, url):
+    if section == "influx":
+        url = url.replace("mqtt", "http")
+    pack.write_text(f'[{section}]\nurl = "{url}"\n')
+    code, out, err = run(capsys, "config", "check", pack)
+    assert (code, out) == (2, "")
+    assert f"{section}.url = " in err
+    assert "secret" not in err

@@ -1,0 +1,206 @@
+"""A pack that is restored from files with odd values runs on: an exception would end its service at each start."""
+
+import warnings
+from concurrent.futures import Future
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX, HistoryFile
+from bms_estimator.checkpoint.identity import fields
+from bms_estimator.checkpoint.load_file import restore_seen_load
+from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.forecast.saved_load import load_arrays
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW
+from bms_estimator.kernels.cells.records import BANK as BANK_STATE
+from bms_estimator.kernels.cells.records import CELL as CELL_STATE
+from bms_estimator.kernels.records import ESTIMATOR_STATE
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.clock import Clock
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.pack_model import fit as fit_module
+from bms_estimator.pack_model import learning, solve
+from bms_estimator.pack_model.history import ReferenceDischarges, WeakCellTime
+from bms_estimator.pack_model.learning import SlowFit, Submit, run_now
+from bms_estimator.pack_model.saved import curve_arrays, history_arrays, neutral_fit
+from bms_estimator.service.pack_forecaster import new_forecaster
+from bms_estimator.service.restored_pack import restore_pack
+from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.lifetime_totals import new_totals
+
+SERIES = 4
+SETTINGS = Settings.model_validate({"pack": {"cell": "ncr18650", "series": SERIES, "initial_soc": 0.9}})
+CELL = load_cell("ncr18650").pack(SERIES, 1)
+STEP_S = 10.0
+"""Sample period [s]."""
+FIT_S = 1800.0
+"""Interval between two fits [s]."""
+STATE_SUFFIX = ".npz"
+"""End of the name of the checkpoint."""
+STEM = CheckpointFile(Path(), SETTINGS, CELL).path.stem
+"""Begin of the names of all files."""
+Arrays = dict[str, np.ndarray]
+Files = dict[str, Arrays]
+"""Arrays of each file, by the end of its name."""
+Change = float | str | tuple[int, ...]
+"""Number that replaces one or all numbers of an array, or another type or shape of the array."""
+CHANGES: tuple[Change, ...] = (
+    *(np.nan, np.inf, -np.inf, 1e300, -1e300, 1e18, -1.0, 0.0, 0.5, 17.0, 1e6),
+    *("U8", "c16", "f2", "?"),
+    *((), (0,), (1,), (3,), (2, 2)),
+)
+Place = tuple[str, str, str]
+"""End of a file's name, name of an array, and field of a structured array (empty for another array)."""
+RECORDS = {
+    (STATE_SUFFIX, "state"): ESTIMATOR_STATE,
+    (STATE_SUFFIX, "cells.cells"): CELL_STATE,
+    (STATE_SUFFIX, "cells.bank"): BANK_STATE,
+    (SUFFIX, "rows"): HISTORY_ROW,
+    (SUFFIX, "bank_rows"): HISTORY_ROW,
+}
+"""Types of the structured arrays."""
+FIT_FIELDS = tuple(curve_arrays(neutral_fit()))
+COUNTERS = ("restarts", "total", "clean", "alarms", "observer", "wall_s", "synchronised", "boot_s", "boot")
+PLACES: tuple[Place, ...] = (
+    *((file, name, field) for (file, name), record in RECORDS.items() for field, _ in fields(np.zeros(1, record))),
+    *((STATE_SUFFIX, name, "") for name in (*COUNTERS, *(f"fit.{name}" for name in FIT_FIELDS))),
+    *((SUFFIX, name, "") for name in (*FIT_FIELDS, *(f"bank_{name}" for name in FIT_FIELDS))),
+    *((SUFFIX, name, "") for name in ("weak_cell_times", "row_elapsed_s", "row_soc", "curves")),
+    *((LOAD_SUFFIX, name, "") for name in ("mean_a", "max_a", "filtered_a", "last_a", "rest_s")),
+    *((LOAD_SUFFIX, name, "") for name in ("minutes_mean_a", "minutes_max_a")),
+)
+
+
+def samples_of(hours: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return samples of an alternating load, and the voltages of the cells."""
+    samples = np.zeros(int(hours * 3600.0 / STEP_S), SAMPLE)
+    phase = np.arange(samples.size) % 120
+    samples["time_s"] = STEP_S * np.arange(samples.size)
+    samples["current_a"] = np.where(phase < 70, 1.5, np.where(phase < 90, 0.0, -1.2))
+    drawn = np.cumsum(samples["current_a"]) * STEP_S / 3600.0 / CELL.cell.capacity_ah
+    samples["voltage_v"] = SERIES * (4.05 - 0.8 * drawn - 0.03 * samples["current_a"])
+    samples["temperature_c"] = 25.0
+    return samples, np.repeat(samples["voltage_v"][:, None] / SERIES, SERIES, axis=1)
+
+
+class Pack:
+    """Pack of the service with its files in a folder."""
+
+    def __init__(self, folder: Path, submit: Submit = run_now) -> None:
+        self.checkpoint, self.history = CheckpointFile(folder, SETTINGS, CELL), HistoryFile(folder, SETTINGS, CELL)
+        self.load = HistoryFile(folder, SETTINGS, CELL, LOAD_SUFFIX)
+        self.estimator = new_estimator(SETTINGS, CELL)
+        self.cells, self.slow_fit = (
+            CellEstimator(self.estimator),
+            SlowFit(self.estimator, interval_s=FIT_S, submit=submit),
+        )
+        restore_pack(self.estimator, self.slow_fit, self.checkpoint, self.history, Clock(), self.cells)
+        forecaster = new_forecaster(SETTINGS, CELL, self.estimator, self.slow_fit, self.cells)
+        assert forecaster
+        self.forecaster = forecaster
+        restore_seen_load(self.load, forecaster)
+
+    def save(self) -> None:
+        """Write all files."""
+        fit, counters = self.slow_fit.fit, RunCounters(1, new_totals(0.0))
+        self.checkpoint.save(self.estimator.record, counters, curve_arrays(fit), self.cells.saved_state)
+        self.history.save(history_arrays(self.slow_fit.history, self.slow_fit.saved_fit))
+        self.load.save(load_arrays(self.forecaster.load, self.forecaster.past))
+
+    def run(self, hours: float) -> None:
+        """Process samples with cell voltages, without forecasts."""
+        samples, cells_v = samples_of(hours)
+        trace = self.slow_fit.run(samples)
+        self.cells.run(samples, cells_v, trace)
+        self.forecaster.load.add(trace)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_fits():
+    """Shorten the fits."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "STARTS", fit_module.STARTS[:1])
+        patch.setattr(solve, "MAX_ITERATIONS", 0)
+        patch.setattr(learning, "MIN_THROUGHPUT_SOC", 0.0)
+        patch.setattr(learning, "MIN_INTERVAL_S", FIT_S)
+        yield
+
+
+@pytest.fixture(scope="module")
+def seed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the files of a pack with a fit, first discharges and a weak cell."""
+    pack = Pack(tmp_path_factory.mktemp("seed"))
+    pack.run(2.0)
+    history = pack.slow_fit.history
+    history.first = ReferenceDischarges(history.rows[history.rows["direction"] > 0.0], pack.slow_fit.fit)
+    history.weak_cell_times = [WeakCellTime(100.0, 200.0, 0.5), WeakCellTime(1000.0, np.inf, 0.4)]
+    pack.save()
+    assert pack.slow_fit.fits
+    return pack.history.path.parent
+
+
+@cache
+def load_files(folder: Path) -> Files:
+    """Return the arrays of the files in a folder."""
+    return {suffix: dict(np.load(folder / f"{STEM}{suffix}")) for suffix in (STATE_SUFFIX, SUFFIX, LOAD_SUFFIX)}
+
+
+def test_all_arrays_of_the_files_are_changed(seed: Path) -> None:
+    arrays = {(suffix, name) for suffix, content in load_files(seed).items() for name in content}
+    assert {place[:2] for place in PLACES} == {each for each in arrays if each[1] not in {"format", "identity"}}
+
+
+def changed(array: np.ndarray, change: Change, index: int) -> np.ndarray:
+    """Return an array with one number, or all if the index is 0, replaced; or with another type or shape."""
+    if array.dtype.kind == "U" and not isinstance(change, tuple):
+        return np.array(change)
+    if isinstance(change, str):
+        return array.astype(change)
+    if isinstance(change, tuple):
+        return np.resize(array, change)
+    result = np.array(array)
+    with np.errstate(invalid="ignore", over="ignore"):
+        result.reshape(-1)[index % array.size if index and array.size else slice(None)] = np.float64(change).astype(
+            array.dtype
+        )
+    return result
+
+
+def with_change(files: Files, place: Place, change: Change, index: int) -> Files:
+    """Return the files with a change at one place."""
+    file, name, field = place
+    array = files[file][name]
+    if field:
+        if isinstance(change, str | tuple):
+            odd = array[[*array.dtype.names[:-1]]].copy()  # a field is missing
+        else:
+            odd = array.copy()
+            view = dict(fields(odd))[field]
+            view[...] = changed(view, change, index)
+    else:
+        odd = changed(array, change, index)
+    return {**files, file: {**files[file], name: odd}}
+
+
+@example((SUFFIX, "rows", "segment"), 1e300, 0)
+@example((SUFFIX, "rows", "soc"), np.nan, 0)
+@given(st.sampled_from(PLACES), st.sampled_from(CHANGES), st.integers(0, 1 << 16))
+def test_a_pack_with_an_odd_value_in_one_file_runs_on(
+    tmp_path_factory: pytest.TempPathFactory, seed: Path, place: Place, change: Change, index: int
+) -> None:
+    folder = tmp_path_factory.mktemp("pack")
+    for suffix, arrays in with_change(load_files(seed), place, change, index).items():
+        np.savez(folder / f"{STEM}{suffix}", **arrays)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of numpy, which ends no service
+        pack = Pack(folder, run_now if place[0] == SUFFIX else lambda _: Future())  # other files need no fit
+        is_fitted = place[0] == SUFFIX and not list(folder.glob(f"*.refused{SUFFIX}"))
+        pack.run(0.6 if is_fitted else 0.03)
+        if place[0] == LOAD_SUFFIX:
+            pack.forecaster.forecast()
