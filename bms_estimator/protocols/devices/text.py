@@ -46,7 +46,8 @@ class TextProtocol(DeviceProtocol):
         self._overlong = False  # True while the rest of a line that is too long is skipped
         self._synchronized = False  # True once a line has ended, because earlier bytes may be half a line
         self._clock, self._last_s = DeviceClock(), math.nan
-        self._received_bytes = self._samples = self._invalid_lines = self._overlong_lines = self._implausible = 0
+        self._received_bytes = self._samples = self._invalid_lines = self._overlong_lines = 0
+        self._implausible = self._implausible_cells = 0
         self._first_invalid: bytes | None = None  # the first line without values since the last good one
         self._last_reading: Reading | None = None
 
@@ -59,6 +60,7 @@ class TextProtocol(DeviceProtocol):
             "text_errors": self._invalid_lines,
             "length_errors": self._overlong_lines,
             "implausible": self._implausible,
+            "implausible_cells": self._implausible_cells,
             "clock_jumps": self._clock.jumps,
         }
 
@@ -96,7 +98,7 @@ class TextProtocol(DeviceProtocol):
             self._begin_overlong(self._unparsed)
             self._unparsed, self._overlong = b"", True
         self.cells = cell_block([reading.cells_v for reading in readings])
-        self._implausible += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
+        self._implausible_cells += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
         if readings:
             self._samples += len(readings)
