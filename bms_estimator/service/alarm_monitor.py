@@ -127,7 +127,7 @@ class AlarmMonitor:
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
-        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts)
+        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts, self._source.clock_fault)
         self.alarms.evaluate_weak_cell(self._weakest_cell().deviation_std, self._arrival_s)
         cells = self._cells.deviations if self._cells else None
         if cells is not None and cells is not self._cells_seen:

@@ -7,6 +7,8 @@ import pytest
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleStatus
+from bms_estimator.protocols.base.reading import sample_json_line
+from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header
 from bms_estimator.telemetry.impossible import PackBounds
 from tests.telemetry.alarm_captures import Line, record, replayed, settings
 
@@ -84,6 +86,23 @@ async def test_an_impossible_value_does_not_clear_an_alarm(tmp_path: Path) -> No
     lines = [GOOD._replace(cells_v=()), low, low._replace(seconds=60, voltage_v=535.0)]
     result = await replayed(record(tmp_path / "capture.bms", lines), settings(), LFP)
     assert result.transitions("pack_under_voltage") == [(35.0, True)]
+
+
+@pytest.mark.parametrize(("rate", "words"), [(0.5, "0.5 times the rate"), (1e-3, "seconds read as milliseconds")])
+async def test_a_slow_clock_of_the_source_raises_sensor_fault_and_stretches_no_delay(
+    tmp_path: Path, rate: float, words: str
+) -> None:
+    path = tmp_path / "capture.bms"
+    writer = CaptureWriter(path, make_header(settings().sensor))
+    writer.write(100.0, b"\n")
+    for second in range(80):
+        line = sample_json_line(59.0 if second >= 60 else 53.5, 0.0, time_s=rate * second)
+        writer.write(100.0 + second, line)
+    writer.close()
+    result = await replayed(path, settings(), LFP)
+    assert result.transitions("pack_over_voltage") == [(62.0, True)]
+    assert result.transitions("sensor_fault")
+    assert any(words in a.text for s in result.snapshots for a in s.alarms if a.name == "sensor_fault" and a.active)
 
 
 async def test_more_cells_than_in_series_raise_sensor_fault_and_leave_the_alarms_of_cells_unwatched(

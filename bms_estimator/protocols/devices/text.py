@@ -87,6 +87,11 @@ class TextProtocol(DeviceProtocol):
             return None
         return f"prints text, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
+    @property
+    def clock_fault(self) -> str:
+        """Description of a wrong rate of the times in the lines, which are then not used; empty without one."""
+        return self._clock.fault
+
     def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         """Decode the bytes of one read; ``time_s`` is the time since the first sample, from ``DeviceClock``."""
         self._received_bytes += len(data)

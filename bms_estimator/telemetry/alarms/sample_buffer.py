@@ -98,5 +98,6 @@ def _summarize(cells: CellBlock) -> Floats:
     if not cells.shape[1]:
         return np.tile(_NO_CELLS, (len(cells), 1))
     measured = np.count_nonzero(np.isfinite(cells), axis=1)
-    mean_v = np.nansum(cells, axis=1) / np.where(measured, measured, np.nan)
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean_v = np.nansum(cells, axis=1) / np.where(measured, measured, np.nan)
     return np.stack((np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1), measured, mean_v), axis=1)
