@@ -101,7 +101,9 @@ async def test_a_slow_clock_of_the_source_raises_sensor_fault_and_stretches_no_d
     writer.close()
     result = await replayed(path, settings(), LFP)
     assert result.transitions("pack_over_voltage") == [(62.0, True)]
-    assert result.transitions("sensor_fault")
+    assert result.transitions("sensor_fault") == [(40.0, True)]  # 30 s until the rate is known
+    at_once = await replayed(path, settings(), LFP, at_once=True)
+    assert at_once.transitions("pack_over_voltage") == [(62.0, True)]
     assert any(words in a.text for s in result.snapshots for a in s.alarms if a.name == "sensor_fault" and a.active)
 
 

@@ -89,7 +89,9 @@ class GuidedTest:
             samples: Samples of the pack, whose time continues over restarts.
             cells_v: Voltages of the device's cell slots; empty if unknown.
         """
-        for average in self._averager.feed(samples, self._slots.select(cells_v)):
+        selected_v = self._slots.select(cells_v)
+        # with more cells than in series, each of them may end the discharge
+        for average in self._averager.feed(samples, cells_v if self._slots.fault else selected_v):
             self._advance(average)
 
     @property

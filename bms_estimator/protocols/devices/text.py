@@ -111,16 +111,21 @@ class TextProtocol(DeviceProtocol):
             block["current_a"] = [self._sign * reading.current_a for reading in readings]
             block["temperature_c"] = [reading.temperature_c for reading in readings]
             self._implausible += remove_implausible(block["temperature_c"], MIN_C, MAX_C)
+            block["time_s"], clock_status = self._times(arrival_s, readings)
             block["status"] = [_status(reading) for reading in readings]
-            block["time_s"] = self._times(arrival_s, readings)
+            block["status"] |= np.array(clock_status, np.uint32)
         return block
 
-    def _times(self, arrival_s: float, readings: Sequence[Reading]) -> list[float]:
-        """Return times of samples that arrived together [s]."""
+    def _times(self, arrival_s: float, readings: Sequence[Reading]) -> tuple[list[float], list[int]]:
+        """Return the times of samples that arrived together [s], and ``WRONG_CLOCK`` or 0 for each."""
         before_s, self._last_s = (arrival_s if math.isnan(self._last_s) else self._last_s), arrival_s
         steps = np.arange(1, len(readings) + 1) / len(readings)
         arrivals = (before_s + (arrival_s - before_s) * steps).tolist()
-        return [self._clock.sample_time(at_s, reading.time_s) for at_s, reading in zip(arrivals, readings, strict=True)]
+        times_s, status = [], []
+        for at_s, reading in zip(arrivals, readings, strict=True):
+            times_s.append(self._clock.sample_time(at_s, reading.time_s))
+            status.append(SampleStatus.WRONG_CLOCK if self._clock.fault else 0)
+        return times_s, status
 
     def _end_line(self, line: bytes) -> Reading | None:
         """Parse a line. The first line may be partial; it is not counted as a fault and does not describe the device."""

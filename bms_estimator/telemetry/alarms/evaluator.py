@@ -17,7 +17,7 @@ from bms_estimator.forecast.forecast import ForecastRows, unknown_values
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.alarm import Alarm
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarm_limits import AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
@@ -49,6 +49,8 @@ CELLS_GAP_S = 60.0
 """Minimum length of a gap between two evaluations of the single cells [s]."""
 NO_FORECAST = unknown_values()
 """Forecast at all samples of a pack without a forecaster."""
+WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
+"""Text of a wrong clock that is right again at the end of a recorded block."""
 _COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
 """Column of SAMPLE by quantity."""
 
@@ -141,8 +143,8 @@ class AlarmEvaluator:
             return
         self._has_samples = True
         samples, trace, forecasts, cells = self._buffer.take()
-        if clock_fault:
-            self._input_faults.add("time", clock_fault, clock_fault)
+        if (samples["status"] & SampleStatus.WRONG_CLOCK).any():
+            self._input_faults.add("time", "rate", clock_fault or WRONG_CLOCK_TEXT)
         self._alarms.set_suspects("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
         self._alarms.set_suspects("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
         if samples.size:
