@@ -122,15 +122,19 @@ class CellEstimator:
     def run(self, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
         """Process a block of samples.
 
-        A block without cell voltages, or with another number of cells than the pack has in series, has no effect.
+        The estimators start with a sample that lacks at most one cell voltage. Before, no sample has an effect.
 
         Args:
             samples: Samples, shape (n,), dtype SAMPLE.
-            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
+            cells_v: Cell voltages of the samples, shape (n, m) [V], with at most as many columns as cells in series; empty
+                without any.
             trace: Estimates of the accepted samples.
         """
-        if not cells_v.size or not self._enabled or cells_v.shape != (samples.size, self._series) or not trace.size:
+        if not self._enabled or not trace.size or not (cells_v.size or self.cells.size):
             return
+        if cells_v.shape != (samples.size, self._series):  # unmeasured cells
+            measured_v, cells_v = cells_v, np.full((samples.size, self._series), np.nan)
+            cells_v[: len(measured_v), : measured_v.shape[1]] = measured_v
         if not self.cells.size:
             self._start(self._series)
         run_cells(

@@ -12,6 +12,8 @@ from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.can import CanSource
+from bms_estimator.settings.sources.modbus import ModbusSource
 
 MAX_CAPACITY_AH = 2000.0
 """Maximum plausible capacity of a cell [Ah]. The largest Li-ion cells on sale have some 1300 Ah."""
@@ -49,6 +51,7 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
             _full_voltage_off_curve,
             _cutoff_voltage_off_curve,
             _implausible_load_cutoff,
+            _more_cells_than_series,
         )
         full_v = float(ocv_grid(cell)[0][-1])
         lines = [*(check(settings, cell) for check in checks), _voltage_out_of_range(settings, full_v, "when full")]
@@ -139,6 +142,17 @@ def _implausible_load_cutoff(settings: Settings, cell: CellModel) -> str | None:
         f"pack.cutoff_v = {cutoff_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there, and samples below "
         f"{cell.cell.voltage_min_v:.4g} V are dropped as invalid (voltage_min_v); is it the voltage of the whole pack?"
     )
+
+
+def _more_cells_than_series(settings: Settings, cell: CellModel) -> str | None:
+    source, series = settings.source, cell.cell.series_count
+    if isinstance(source, CanSource):
+        count = sum(cells.count for cells in source.cells)
+    else:
+        count = source.cells.count if isinstance(source, ModbusSource) and source.cells else 0
+    if count <= series:
+        return None
+    return f"source.cells: {count} cells, but the pack has {series} in series: the others must read 0 V; is pack.series right?"
 
 
 def _voltage_out_of_range(settings: Settings, highest_v: float, when: str) -> str | None:

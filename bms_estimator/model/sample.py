@@ -56,6 +56,8 @@ class SampleStatus(IntFlag):
     """The voltage repeats an earlier measurement. Current and temperature are new."""
     CURRENT_HELD = 64
     """The current repeats an earlier measurement. Voltage and temperature are new."""
+    WRONG_CLOCK = 128
+    """The time is the arrival time, because the device's clock runs at a wrong rate."""
 
 
 def remove_implausible(values: NDArray[np.float64], low: float, high: float) -> int:

@@ -24,6 +24,7 @@ from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions
+from bms_estimator.telemetry.impossible import PackBounds
 from bms_estimator.telemetry.weakest_cell_values import WeakestCellValues
 
 UNUSABLE_KINDS = "not_finite", "range", "saturated"
@@ -79,7 +80,12 @@ class AlarmMonitor:
         gap_s = float(estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
         self.alarms = AlarmEvaluator(
-            monitored_alarms(settings, cell), min_charge_current_a(cell), gap_s, inputs, silent_limit_s(settings)
+            monitored_alarms(settings, cell),
+            min_charge_current_a(cell),
+            gap_s,
+            inputs,
+            silent_limit_s(settings),
+            PackBounds.of(cell),
         )
         self.report = self.alarms.report()
         # arrival of the last sample, accepted or not, on the monotonic clock and on the wall clock [s]
@@ -87,7 +93,12 @@ class AlarmMonitor:
         self._evaluated_s = -math.inf
 
     def add(
-        self, received: ReceivedSamples, trace: TraceBlock, now_s: float, forecasts: ForecastRows = NO_FORECAST
+        self,
+        received: ReceivedSamples,
+        trace: TraceBlock,
+        now_s: float,
+        forecasts: ForecastRows = NO_FORECAST,
+        cells_fault: str = "",
     ) -> bool:
         """Add received samples and their estimates; evaluate the alarms if this is due.
 
@@ -96,11 +107,12 @@ class AlarmMonitor:
             trace: Estimates of the accepted samples.
             now_s: Monotonic clock [s].
             forecasts: Forecast at each row of ``trace``.
+            cells_fault: Reason why the cell voltages cannot be used; empty if they can.
 
         Returns:
             True if an alarm has changed.
         """
-        self.alarms.add(received.samples, trace, received.cells_v, forecasts)
+        self.alarms.add(received.samples, trace, received.cells_v, forecasts, cells_fault)
         self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
         is_due = now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS
         return is_due and self.evaluate(now_s)
@@ -118,7 +130,7 @@ class AlarmMonitor:
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
-        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts)
+        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts, self._source.clock_fault)
         self.alarms.evaluate_weak_cell(self._weakest_cell().deviation_std, self._arrival_s)
         cells = self._cells.deviations if self._cells else None
         if cells is not None and cells is not self._cells_seen:

@@ -16,6 +16,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.forecaster import Forecaster, Runner
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads.health import RecordingHealth
@@ -164,6 +165,7 @@ async def run_estimation_loop(
                 publisher,
                 edge,
                 restored_s,
+                CellSlots(cell.cell.series_count),
             ),
             _keep_alive(publisher, notifier, name, clock),
             _measure_lag(publisher),
@@ -193,6 +195,7 @@ async def _estimate(
     publisher: Publisher,
     edge: BlockSender | None,
     restored_s: float,
+    slots: CellSlots,
 ) -> None:
     """Pass each block of samples to the edge, the estimator, the totals and the publisher.
 
@@ -205,9 +208,11 @@ async def _estimate(
         publisher: Publisher.
         edge: Sender that receives all samples; None: no sender.
         restored_s: Time since boot at which the state was restored [s].
+        slots: Cell slots of the source.
     """
     unseen_s = estimator.record["unseen_s"].copy()
-    async for received in source:
+    async for each in source:
+        received = each._replace(cells_v=slots.select(each.cells_v))
         if estimator.state["started"][0] and not estimator.state["samples"][0]:
             # the gap before the first sample after a restart also includes the wait for that sample
             estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s
@@ -215,7 +220,7 @@ async def _estimate(
             edge.take(received.samples, received.cells_v)
         trace = forecaster.run(received.samples, received.cells_v) if forecaster else runner.run(received.samples)
         totals.add(trace)
-        publisher.add(received, trace)
+        publisher.add(received, trace, slots.fault)
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
 
 

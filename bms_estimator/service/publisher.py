@@ -161,8 +161,14 @@ class Publisher:
         """Return the time until a snapshot is overdue, which shows that no samples arrive [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
-    def add(self, received: ReceivedSamples, trace: TraceBlock) -> None:
-        """Add received samples and their estimates; publish if a snapshot is due or an alarm has changed."""
+    def add(self, received: ReceivedSamples, trace: TraceBlock, cells_fault: str = "") -> None:
+        """Add received samples and their estimates; publish if a snapshot is due or an alarm has changed.
+
+        Args:
+            received: Samples and cell voltages.
+            trace: Estimates of the accepted samples.
+            cells_fault: Reason why the cell voltages cannot be used (``CellSlots.fault``); empty if they can.
+        """
         if self._source_health:
             self._latency.add(self._source_health().block_age_s)
         now_s = self._clock.monotonic()
@@ -177,7 +183,7 @@ class Publisher:
         if is_due and self.latest:  # before the alarms, so that their evaluation does not delay the estimate
             self._publish_snapshot(now_s)
         forecasts = self._forecaster.rows if self._forecaster else NO_FORECAST
-        alarm_changed = self.alarm_monitor.add(received, trace, now_s, forecasts)
+        alarm_changed = self.alarm_monitor.add(received, trace, now_s, forecasts, cells_fault)
         if is_due and not self.latest:  # the first snapshot lists the alarms that the first samples permit
             self.publish()
         elif alarm_changed:

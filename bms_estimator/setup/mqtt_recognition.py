@@ -5,6 +5,9 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
+import numpy as np
+
+from bms_estimator.model.cell_slots import is_live
 from bms_estimator.settings.sources.mqtt import MqttSource, ValueLocation
 from bms_estimator.settings.sources.mqtt_profiles import DISCHARGE, PROFILES, ProfileName
 from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice, values_text
@@ -133,7 +136,7 @@ def _device(publisher: Publisher, values: Mapping[str, float], broker: str) -> F
             source[key] = value
     sign = 1.0 if profile.current_sign == DISCHARGE else -1.0
     name = NAME_SEPARATOR.join(filter(None, (publisher.profile, source.get("prefix"), source.get("instance"))))
-    cells = sum(key.startswith("cell ") for key in values)
+    cells = int(is_live(np.array([v for key, v in values.items() if key.startswith("cell ")])).sum())
     return FoundDevice(
         name=name,
         description=f"{MqttSource.model_validate(source).short_description}, {broker}",

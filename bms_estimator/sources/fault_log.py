@@ -16,6 +16,10 @@ Bytes and samples before the hello are normal if opening the port does not reset
 normal on MQTT. Sources log reconnects and rejected devices (``unadmitted_bytes``) themselves.
 """
 
+_LOGGED_ONCE = {"implausible": "implausible_temperatures", "implausible_cells": "implausible_cell_voltages"}
+"""Name in the log by counter of values that a device sends for what it does not measure. They are logged only once, because
+they come with each sample."""
+
 log = structlog.get_logger(__name__)
 
 
@@ -33,10 +37,10 @@ class FaultLog:
             now_s: Monotonic clock [s].
         """
         nonzero = {name: n for name, n in counters.items() if name not in _NORMAL_EVENTS and n}
-        faults = sum(nonzero.values())
+        faults = sum(1 if name in _LOGGED_ONCE else n for name, n in nonzero.items())
         if faults != self._logged_faults and now_s - self._log_time_s >= MIN_LOG_INTERVAL_S:
             self._logged_faults, self._log_time_s = faults, now_s
-            log.warning("faults on the line", **nonzero)
+            log.warning("faults on the line", **{_LOGGED_ONCE.get(name, name): n for name, n in nonzero.items()})
 
 
 class SilenceLog:

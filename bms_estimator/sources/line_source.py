@@ -131,6 +131,11 @@ class LineSource:
         """Rate error of the device's clock [1e-6]; None if unknown."""
         return self._decoder.clock_ppm
 
+    @property
+    def clock_fault(self) -> str:
+        """Description of a wrong rate of the device's clock; empty without one."""
+        return self._decoder.clock_fault
+
     current_zero: None = None
     """Function that sets the zero of the current; None: lines have no such command."""
     relay: None = None

@@ -62,6 +62,10 @@ class Source(Protocol):
     def clock_ppm(self) -> float | None:
         """Rate error of the board's clock relative to the host's [1e-6]; None if unknown."""
 
+    @property
+    def clock_fault(self) -> str:
+        """Description of a wrong rate of the device's clock; empty without one."""
+
     def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks of samples; none of them is empty."""
 

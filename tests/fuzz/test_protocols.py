@@ -2,8 +2,13 @@
 
 import contextlib
 
+import numpy as np
 from hypothesis import strategies as st
 
+from bms_estimator.forecast.forecast import unknown_values
+from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices import daly, jbd, jk
 from bms_estimator.protocols.devices.junctek import JunctekProtocol
@@ -14,6 +19,8 @@ from bms_estimator.protocols.firmware.messages import DELIMITER, Ack, Hello, Pro
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
+from bms_estimator.telemetry.alarms.sample_buffer import SampleBuffer
+from bms_estimator.telemetry.impossible import PackBounds
 from tests.fuzz.edited_seeds import edit, edited_seeds, load_seeds
 
 PACKETS = [unseal(frame) for data in load_seeds("frames") for frame in data.split(DELIMITER) if frame]
@@ -21,6 +28,8 @@ VERSION_AND_HELLO, VERSION_AND_SAMPLE = b"\x01\x01", b"\x01\x02"
 """Beginnings of packets: protocol version and message type."""
 EDITED_PACKETS = edit(PACKETS, (VERSION_AND_HELLO, VERSION_AND_SAMPLE))
 FRAMES = st.lists((st.sampled_from(PACKETS) | EDITED_PACKETS).map(seal), min_size=1, max_size=6).map(b"".join)
+
+LFP = PackBounds.of(load_cell("lfp", 100.0).pack(4, 1))
 
 
 def decode(protocol: DeviceProtocol, data: bytes) -> None:
@@ -36,7 +45,14 @@ def decode(protocol: DeviceProtocol, data: bytes) -> None:
     protocol.next_output(3.5)
     assert protocol.counters["bytes_received"] <= 2 * len(data)
     # Properties may compute their value, so that they could raise an exception, too.
-    _ = protocol.fault, protocol.description, protocol.board, protocol.clock_ppm, protocol.allowed_silence_s
+    _ = (
+        protocol.fault,
+        protocol.description,
+        protocol.board,
+        protocol.clock_ppm,
+        protocol.clock_fault,
+        protocol.allowed_silence_s,
+    )
 
 
 def decode_responses(name: str, data: bytes) -> None:
@@ -106,6 +122,11 @@ def test_message_decoders_raise_only_protocol_errors(data: bytes) -> None:
 @edited_seeds("text", b"V=", b"I=", b"T=", b"cells=", b'{"voltage":', b";", b" mA", b"kV")
 def test_text_protocol_decodes_edited_bytes(data: bytes) -> None:
     decode(TextProtocol(), data)
+    decoder, buffer = TextProtocol(), SampleBuffer()
+    samples = decoder.feed(0.0, data)
+    buffer.add(samples, np.zeros(0, TRACE), CellSlots(4).select(decoder.cells), unknown_values())
+    samples, _, _, cells = buffer.take()
+    LFP.find(samples, cells)
 
 
 @edited_seeds("vedirect", b"\r\nV\t", b"\r\nI\t", b"\r\nChecksum\t", b":7F0", repair=with_vedirect_checksums)

@@ -96,8 +96,10 @@ class Service:
 
 
 @asynccontextmanager
-async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -> AsyncIterator[Service]:
-    """Run a service, to which the board has sent ``hello``. ``sensor`` are settings of ``[sensor]``."""
+async def service(
+    line: Line, *, hello: bytes = HELLO.encode(), series: int = 1, **sensor: Any
+) -> AsyncIterator[Service]:
+    """Run a service of ``series`` cells, to which the board has sent ``hello``. ``sensor`` are settings of ``[sensor]``."""
     line.plug()
     settings = Settings(
         pack=PackSettings(initial_soc=0.5),
@@ -107,7 +109,8 @@ async def service(line: Line, *, hello: bytes = HELLO.encode(), **sensor: Any) -
     clock = SkippingClock()
     board = SerialSource(settings.sensor, first_retry_s=0.05, silent_s=0.3, monotonic=clock)
     sink, stop = Collector(), asyncio.Event()
-    task = asyncio.create_task(run_estimation_loop(settings, CELL, source=board, sinks=[sink], stop=stop))
+    pack = CELL.pack(series, 1)
+    task = asyncio.create_task(run_estimation_loop(settings, pack, source=board, sinks=[sink], stop=stop))
     async with asyncio.timeout(LONG_S):
         while "no frame yet" not in (board.silence_reason or ""):  # noqa: ASYNC110 - the board has no event for it
             await asyncio.sleep(0.01)
@@ -266,10 +269,10 @@ async def test_unexpected_text_of_a_board_is_quoted(line: Line) -> None:
 
 
 async def test_the_state_names_the_lowest_and_highest_cell(line: Line) -> None:
-    async with service(line, hello=b"\n", protocol="text") as live:
-        live.line.write(b"V=3.8 I=0.1\n")
+    async with service(line, hello=b"\n", series=3, protocol="text") as live:
+        live.line.write(b"V=11.4 I=0.1\n")
         without = await live.until(lambda s: s.estimate is not None)
-        live.line.write(b"V=3.8 I=0.1 cells=3.81,3.79,3.80\n")
+        live.line.write(b"V=11.4 I=0.1 cells=3.81,3.79,3.80\n")
         snapshot = await live.until(lambda s: s.estimate is not None and s.estimate.cell_lowest_v is not None)
     assert without.estimate
     assert (without.estimate.cell_lowest_v, without.estimate.cell_highest_v) == (None, None)
@@ -296,4 +299,4 @@ async def test_implausible_temperatures_and_cell_voltages_are_not_published(line
     assert snapshot.estimate is not None
     assert snapshot.estimate.temperature_c is None
     assert (snapshot.estimate.cell_lowest_v, snapshot.estimate.cell_highest_v) == (3.8, 3.8)
-    assert health.line["implausible"] == 2
+    assert (health.line["implausible"], health.line["implausible_cells"]) == (1, 1)

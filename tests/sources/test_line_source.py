@@ -15,6 +15,7 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
+from bms_estimator.sources.fault_log import FaultLog
 from bms_estimator.sources.line_source import LineProducer, LineSource, SourceUnavailableError
 from bms_estimator.sources.source import ReceivedSamples
 from tests.patience import LONG_S
@@ -143,3 +144,12 @@ def test_source_sets_defaults_of_the_sensor_which_settings_override():
     gain_std = {"voltage_gain_std": 0.005, "current_gain_std": 0.005}
     assert settings.sensor == sensor.model_copy(update={"protocol": "text", "period_s": 1.0} | gain_std)
     assert settings.sensor.sample_period_s == 1.0
+
+
+def test_values_of_what_a_device_does_not_measure_are_logged_once_with_their_quantity() -> None:
+    fault_log = FaultLog()
+    with capture_logs() as lines:
+        for second in range(0, 3600, 2):
+            fault_log.check({"implausible": second + 1, "implausible_cells": 20 * (second + 1)}, float(second))
+    assert [line["event"] for line in lines] == ["faults on the line"]
+    assert {"implausible_temperatures", "implausible_cell_voltages"} <= lines[0].keys()

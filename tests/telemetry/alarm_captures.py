@@ -11,6 +11,7 @@ import numpy as np
 
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.service.pack_forecaster import new_forecaster
@@ -137,9 +138,11 @@ async def replayed(
         forecaster=forecaster,
     )
     publisher.alarm_monitor.restore(saved_state)
-    async for received in source:
+    slots = CellSlots(cell.cell.series_count)
+    async for each in source:
+        received = each._replace(cells_v=slots.select(each.cells_v))
         now_s = float(received.samples["time_s"][-1])
-        publisher.add(received, runner.run(received.samples))
+        publisher.add(received, runner.run(received.samples), slots.fault)
     publisher.publish_last()
     result.snapshots, result.saved_state = sink.snapshots, publisher.alarm_monitor.alarms.saved_state
     return result

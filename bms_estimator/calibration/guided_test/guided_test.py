@@ -11,6 +11,7 @@ from enum import StrEnum
 from bms_estimator.calibration.guided_test.averages import Average, Averager
 from bms_estimator.calibration.guided_test.load_warnings import empty_warning, limit_warning, load_warning
 from bms_estimator.calibration.guided_test.plan import Limits, Plan
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 
 FULL_MARGIN_V = 0.02
@@ -75,6 +76,7 @@ class GuidedTest:
 
     def __init__(self, plan: Plan, limits: Limits, *, relay: bool = False) -> None:
         self._plan, self._limits, self._relay = plan, limits, relay
+        self._slots = CellSlots(limits.series_count)
         self._averager = Averager()
         self._start_again("")
         self.latest: Average | None = None
@@ -85,9 +87,11 @@ class GuidedTest:
 
         Args:
             samples: Samples of the pack, whose time continues over restarts.
-            cells_v: Cell voltages of the samples; empty if unknown.
+            cells_v: Voltages of the device's cell slots; empty if unknown.
         """
-        for average in self._averager.feed(samples, cells_v):
+        selected_v = self._slots.select(cells_v)
+        # with more cells than in series, each of them may end the discharge
+        for average in self._averager.feed(samples, cells_v if self._slots.fault else selected_v):
             self._advance(average)
 
     @property

@@ -30,6 +30,7 @@ from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.cli.options.silenced_log import silenced_log
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
@@ -125,7 +126,7 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     cells = CellEstimator(estimator)
     slow_fit = new_slow_fit(settings, estimator)
     forecaster = new_forecaster(settings, model, estimator, slow_fit, cells)
-    runner = slow_fit or estimator
+    runner, slots = slow_fit or estimator, CellSlots(model.cell.series_count)
     monitor = AlarmMonitor(
         settings,
         model,
@@ -137,10 +138,11 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
         weakest_cell=lambda: weakest_cell_values(slow_fit),
     )
     with progress_bar("replaying") as bar:
-        async for received in source:
+        async for each in source:
+            received = each._replace(cells_v=slots.select(each.cells_v))
             now_s = max(now_s, float(received.samples["time_s"][-1]))
             trace = forecaster.run(received.samples, received.cells_v) if forecaster else runner.run(received.samples)
-            monitor.add(received, trace, now_s, forecaster.rows if forecaster else NO_FORECAST)
+            monitor.add(received, trace, now_s, forecaster.rows if forecaster else NO_FORECAST, slots.fault)
             bar.update(source.fraction)
     monitor.evaluate(now_s)
     raised_alarms = _pair_changes(changes)

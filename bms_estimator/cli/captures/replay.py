@@ -37,6 +37,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import TraceBlock, new_estimator
 from bms_estimator.forecast.forecaster import Forecaster, Runner
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
@@ -164,7 +165,7 @@ async def _replay(
             settings, estimator, on_failure=lambda error: errors.update({type(error).__name__: str(error)})
         )
     cells = CellEstimator(estimator)
-    cell_columns = CellColumns(cells)
+    cell_columns, slots = CellColumns(cells), CellSlots(model.cell.series_count)
     forecaster = new_forecaster(settings, model, estimator, pack_model, cell_columns if table else cells)
     # forecasts at intervals take longer than the estimates, and the summary needs only the last one
     run = _run_function(forecaster, pack_model or estimator, with_forecasts=bool(table or settings.mqtt))
@@ -173,7 +174,8 @@ async def _replay(
         stack.enter_context(table or nullcontext())
         bar = stack.enter_context(progress_bar("replaying"))
         started_s, impossible = time.perf_counter(), None
-        async for received in source:
+        async for each in source:
+            received = each._replace(cells_v=slots.select(each.cells_v))
             trace = run(received.samples, received.cells_v)
             summary.add(trace)
             if trace.size < received.samples.size:  # samples were dropped
@@ -183,7 +185,7 @@ async def _replay(
                     join_columns(trace, *([forecaster.rows] if forecaster else []), *cell_columns.take_rows(trace.size))
                 )
             if publisher:
-                publisher.add(received, trace)
+                publisher.add(received, trace, slots.fault)
                 await asyncio.sleep(0)  # the MQTT client runs in this event loop
             bar.update(source.fraction)
         wall_s = time.perf_counter() - started_s

@@ -65,7 +65,7 @@ def run_cells(
     trace: Records,
     scratch: Floats,
 ) -> None:
-    """Process a block of samples. Samples before the first cell voltage have no effect.
+    """Process a block of samples. Samples before the first one that lacks at most one cell voltage have no effect.
 
     Args:
         cells: Shape (m,), dtype CELL; updated.
@@ -85,7 +85,7 @@ def run_cells(
             continue
         row = trace[r]
         r += 1
-        if not (bank[0].started or np.isfinite(cells_v[j]).any()):
+        if not (bank[0].started or np.isfinite(cells_v[j]).sum() >= cells.size - 1):
             continue
         if add_sample(cells, bank[0], filter_settings[0], cells_v[j], row) and bank[0].elapsed_s >= WINDOW_S:
             update_cells(cells, bank[0], filter_settings[0], balancing_v, row.soc, row.soc_std, scratch)

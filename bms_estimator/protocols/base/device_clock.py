@@ -2,19 +2,14 @@
 
 import math
 
+from bms_estimator.protocols.base.clock_rate import ClockRate, Point
+
 MAX_LEAD_S = 5.0
 """Maximum time by which a sample may arrive before its timestamp [s]. A larger lead shows that the clock was set."""
 MAX_CONSTANT_S = 10.0
 """Maximum time for which a timestamp may stay constant while samples arrive [s]. Then the timestamp is ignored."""
 MAX_SLOWNESS = 0.01
 """Maximum relative amount by which a device's clock is slower than the host's."""
-LAG_S = 60.0
-"""Minimum time that a clock has lost in successive slow steps before it counts as slow [s]."""
-LAG_STEPS = 3
-"""Minimum number of successive slow steps before a clock counts as slow.
-
-A step is slow if it is less than half of the elapsed time. Delayed samples do not look slow, because they arrive together.
-"""
 
 
 class DeviceClock:
@@ -22,9 +17,9 @@ class DeviceClock:
 
     Delayed samples arrive together, and the device's timestamps give their times. A timestamp that steps back, or leads the
     arrival, shows that the clock was set or the device restarted. Then the arrival time is used. The arrival time is also
-    used after the timestamp has been constant for ``MAX_CONSTANT_S``. A slow clock would lose charge. Examples are a device
-    that sleeps, and a device that sends milliseconds in place of seconds. The time that a slow clock has lost is added in
-    one step, and arrival times are used from then on.
+    used after the timestamp has been constant for ``MAX_CONSTANT_S``, and while the rate of the clock is wrong. A slow clock
+    would lose charge and stretch the delays of alarms. Examples are a device that sleeps, and a device that sends
+    milliseconds in place of seconds. The time that a slow clock has lost is added in one step.
 
     Attributes:
         jumps: Number of rejected timestamps.
@@ -35,7 +30,12 @@ class DeviceClock:
         self._last_s = 0.0
         self._device_s = self._arrival_s = math.nan  # last timestamp, and the arrival time at which it changed
         self._min_delay_s = math.inf
-        self._lag_s, self._slow_steps, self._is_slow = 0.0, 0, False
+        self._rate = ClockRate()
+
+    @property
+    def fault(self) -> str:
+        """Description of a wrong rate; empty while the clock is usable."""
+        return self._rate.fault
 
     def sample_time(self, arrival_s: float, device_s: float) -> float:
         """Return the time of a sample since the first one [s].
@@ -44,30 +44,29 @@ class DeviceClock:
             arrival_s: Arrival time, on any clock that never steps back [s].
             device_s: Timestamp by the device's clock, with any origin [s]; NaN: not reported.
         """
+        wrong_since = self._rate.check(arrival_s)
+        self._advance(arrival_s, device_s, wrong_since)
+        if math.isfinite(device_s):
+            self._rate.add(Point(arrival_s, device_s, self._last_s))
+        return self._last_s
+
+    def _advance(self, arrival_s: float, device_s: float, wrong_since: Point | None) -> None:
+        """Advance ``_last_s``. ``wrong_since`` is the point from which on a wrong clock has given the times, if it was just detected."""
         step_s, delay_s = device_s - self._device_s, arrival_s - device_s
         elapsed_s = 0.0 if math.isnan(self._arrival_s) else max(arrival_s - self._arrival_s, 0.0)
-        if step_s == 0.0 and elapsed_s < MAX_CONSTANT_S:  # several samples may have the same timestamp
-            return self._last_s
-        if self._is_slow:
+        if self._rate.fault:
             step_s = elapsed_s
+            if wrong_since:
+                self.jumps += 1
+                step_s = max(arrival_s - wrong_since.arrival_s - (self._last_s - wrong_since.time_s), 0.0)
+        elif step_s == 0.0 and elapsed_s < MAX_CONSTANT_S:  # several samples may have the same timestamp
+            return
         elif step_s > 0.0 and delay_s >= self._min_delay_s - MAX_LEAD_S:
             self._min_delay_s = min(self._min_delay_s + MAX_SLOWNESS * step_s, delay_s)
-            step_s += self._lost_time(step_s, elapsed_s)
         else:
             self.jumps += not math.isnan(step_s)  # a missing timestamp is no jump
+            self._rate.on_jump()
             self._min_delay_s = math.inf if math.isnan(delay_s) else delay_s
             step_s = elapsed_s
         self._device_s, self._arrival_s = device_s, arrival_s
         self._last_s += step_s
-        return self._last_s
-
-    def _lost_time(self, step_s: float, elapsed_s: float) -> float:
-        """Return the time that a slow clock has lost [s]; 0 if it is not slow."""
-        if 2.0 * step_s >= elapsed_s:
-            self._lag_s, self._slow_steps = 0.0, 0
-            return 0.0
-        self._lag_s, self._slow_steps = self._lag_s + elapsed_s - step_s, self._slow_steps + 1
-        if self._lag_s < LAG_S or self._slow_steps < LAG_STEPS:
-            return 0.0
-        self._is_slow, self.jumps = True, self.jumps + 1
-        return self._lag_s

@@ -62,6 +62,11 @@ class DeviceProtocol(ABC):
         return None
 
     @property
+    def clock_fault(self) -> str:
+        """Description of a wrong rate of the device's clock, whose times are then not used; empty without one."""
+        return ""
+
+    @property
     def allowed_silence_s(self) -> float:
         """Maximum time without data while the device works [s]."""
         return 0.0

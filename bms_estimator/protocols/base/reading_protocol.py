@@ -33,7 +33,9 @@ class ReadingProtocol(DeviceProtocol):
 
     def __init__(self, current_sign: CurrentSign, faults: Iterable[str]) -> None:
         self._sign = 1.0 if current_sign == "discharge_positive" else -1.0
-        self._counts = dict.fromkeys(("bytes_received", "frames_received", *faults, "implausible"), 0)
+        self._counts = dict.fromkeys(
+            ("bytes_received", "frames_received", *faults, "implausible", "implausible_cells"), 0
+        )
         self._first_s = self._last_s = math.nan
         self._fault_text: str | None = None
         self._last_reading: Reading | None = None
@@ -56,7 +58,7 @@ class ReadingProtocol(DeviceProtocol):
             readings.append(reading)
             self._last_reading, self._fault_text = reading, None
         self.cells = cell_block([reading.cells_v for reading in readings])
-        self._counts["implausible"] += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
+        self._counts["implausible_cells"] += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
         if readings:
             self._counts["frames_received"] += len(readings)

@@ -46,7 +46,8 @@ class TextProtocol(DeviceProtocol):
         self._overlong = False  # True while the rest of a line that is too long is skipped
         self._synchronized = False  # True once a line has ended, because earlier bytes may be half a line
         self._clock, self._last_s = DeviceClock(), math.nan
-        self._received_bytes = self._samples = self._invalid_lines = self._overlong_lines = self._implausible = 0
+        self._received_bytes = self._samples = self._invalid_lines = self._overlong_lines = 0
+        self._implausible = self._implausible_cells = 0
         self._first_invalid: bytes | None = None  # the first line without values since the last good one
         self._last_reading: Reading | None = None
 
@@ -59,6 +60,7 @@ class TextProtocol(DeviceProtocol):
             "text_errors": self._invalid_lines,
             "length_errors": self._overlong_lines,
             "implausible": self._implausible,
+            "implausible_cells": self._implausible_cells,
             "clock_jumps": self._clock.jumps,
         }
 
@@ -85,6 +87,11 @@ class TextProtocol(DeviceProtocol):
             return None
         return f"prints text, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
 
+    @property
+    def clock_fault(self) -> str:
+        """Description of a wrong rate of the times in the lines, which are then not used; empty without one."""
+        return self._clock.fault
+
     def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         """Decode the bytes of one read; ``time_s`` is the time since the first sample, from ``DeviceClock``."""
         self._received_bytes += len(data)
@@ -96,7 +103,7 @@ class TextProtocol(DeviceProtocol):
             self._begin_overlong(self._unparsed)
             self._unparsed, self._overlong = b"", True
         self.cells = cell_block([reading.cells_v for reading in readings])
-        self._implausible += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
+        self._implausible_cells += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
         if readings:
             self._samples += len(readings)
@@ -104,16 +111,21 @@ class TextProtocol(DeviceProtocol):
             block["current_a"] = [self._sign * reading.current_a for reading in readings]
             block["temperature_c"] = [reading.temperature_c for reading in readings]
             self._implausible += remove_implausible(block["temperature_c"], MIN_C, MAX_C)
+            block["time_s"], clock_status = self._times(arrival_s, readings)
             block["status"] = [_status(reading) for reading in readings]
-            block["time_s"] = self._times(arrival_s, readings)
+            block["status"] |= np.array(clock_status, np.uint32)
         return block
 
-    def _times(self, arrival_s: float, readings: Sequence[Reading]) -> list[float]:
-        """Return times of samples that arrived together [s]."""
+    def _times(self, arrival_s: float, readings: Sequence[Reading]) -> tuple[list[float], list[int]]:
+        """Return the times of samples that arrived together [s], and ``WRONG_CLOCK`` or 0 for each."""
         before_s, self._last_s = (arrival_s if math.isnan(self._last_s) else self._last_s), arrival_s
         steps = np.arange(1, len(readings) + 1) / len(readings)
         arrivals = (before_s + (arrival_s - before_s) * steps).tolist()
-        return [self._clock.sample_time(at_s, reading.time_s) for at_s, reading in zip(arrivals, readings, strict=True)]
+        times_s, status = [], []
+        for at_s, reading in zip(arrivals, readings, strict=True):
+            times_s.append(self._clock.sample_time(at_s, reading.time_s))
+            status.append(SampleStatus.WRONG_CLOCK if self._clock.fault else 0)
+        return times_s, status
 
     def _end_line(self, line: bytes) -> Reading | None:
         """Parse a line. The first line may be partial; it is not counted as a fault and does not describe the device."""

@@ -172,6 +172,11 @@ class Replay:
         """Rate error of the board's clock when it was recorded [1e-6]; None for a table."""
         return self._decoder.clock_ppm if self._decoder else None
 
+    @property
+    def clock_fault(self) -> str:
+        """Description of a wrong rate of the device's clock when it was recorded; empty without one and for a table."""
+        return self._decoder.clock_fault if self._decoder else ""
+
     async def __aenter__(self) -> Self:
         """Return the replay; the file is opened by the iteration."""
         return self

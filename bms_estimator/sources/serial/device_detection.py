@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self, TypeVar
 
+from bms_estimator.model.cell_slots import is_live
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
 from bms_estimator.protocols.devices.text import TextProtocol
@@ -129,7 +130,7 @@ def _query_in_turn(line: "serial.Serial", decoders: Mapping[str, DeviceProtocol]
 
 def _describe(decoder: DeviceProtocol) -> tuple[str, int | None]:
     """Return the device's description and its number of cells."""
-    return decoder.description or "", decoder.cells.shape[1] or None
+    return decoder.description or "", int(is_live(decoder.cells[-1:]).sum()) or None
 
 
 class BoardClient:

@@ -124,6 +124,11 @@ class SerialSource:
         """Rate error of the board's clock relative to the host's [1e-6]; None if unknown."""
         return self._decoder.clock_ppm
 
+    @property
+    def clock_fault(self) -> str:
+        """Description of a wrong rate of the device's clock; empty without one."""
+        return self._decoder.clock_fault
+
     def health(self) -> SourceHealth:
         """Return the health of the port and its task."""
         now_s = self._port.now_s

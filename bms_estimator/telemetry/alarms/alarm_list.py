@@ -47,6 +47,7 @@ class AlarmList:
         self.board_reason = ""
         self._unwatched = UnwatchedAlarms()
         self._unknown: Mapping[AlarmName, str] = {}
+        self._input_faults: tuple[str, ...] = ()
         self._reasons: dict[AlarmName, Reasons] = {}
         self._changes: list[Change] = []
         self._unreported: dict[AlarmName, AlarmMessage] = {}
@@ -59,7 +60,7 @@ class AlarmList:
 
     @property
     def unwatched_critical(self) -> tuple[AlarmName, ...]:
-        """Names of critical alarms that cannot be watched although their quantities were measured before."""
+        """Names of critical alarms that cannot be watched although their quantities were measured before, or are unusable."""
         return tuple(name for name in self._unwatched.reasons if self.states[name].definition.severity == "critical")
 
     @property
@@ -143,6 +144,10 @@ class AlarmList:
             texts = tuple(text for text in suspicions for suspect in suspects if text.endswith(suspect.text))
             self._reasons[name] = Reasons(suspects, texts)
 
+    def set_input_faults(self, *texts: str) -> None:
+        """Replace the faults of the input that ``sensor_fault`` describes, one sentence each."""
+        self._input_faults = texts
+
     def set_unwatched(self, unwatched: UnwatchedAlarms, at_s: float) -> None:
         """Replace the alarms that cannot be watched, and record the changes at ``at_s`` on the samples' clock [s]."""
         before, self._unwatched = self._unwatched, unwatched
@@ -214,13 +219,14 @@ class AlarmList:
     def _message(self, state: AlarmState, raised: RaisedAlarm | None, *, cause_cleared: bool) -> AlarmMessage:
         """Return the changing content of the payload of an alarm."""
         name = state.definition.name
-        losses: tuple[str, ...] = ()
+        faults: tuple[str, ...] = ()
         if name == "sensor_fault":
-            losses = self._unwatched.loss_texts + ((self.board_reason,) if self.board_reason else ())
+            board = (self.board_reason,) if self.board_reason else ()
+            faults = (*self._unwatched.loss_texts, *self._input_faults, *board)
         return AlarmMessage(
             raised,
             cause_cleared=cause_cleared,
-            reasons=losses + self._reasons.get(name, _NO_REASONS).texts,
+            reasons=faults + self._reasons.get(name, _NO_REASONS).texts,
             unwatched_reason=self._unwatched.reasons.get(name),
             unknown_reason=self._unknown.get(name),
         )

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import ForecastRows, unknown_values
@@ -17,22 +18,24 @@ from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.alarm import Alarm
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarm_limits import AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.alarm_list import AlarmList
 from bms_estimator.telemetry.alarms.collapse_risk import collapse_risks, time_left_text
 from bms_estimator.telemetry.alarms.faulty_fraction import FaultyFraction, SampleCounts
+from bms_estimator.telemetry.alarms.input_faults import InputFaults
 from bms_estimator.telemetry.alarms.inputs import Inputs, count_values
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.alarms.sample_buffer import SampleBuffer
+from bms_estimator.telemetry.alarms.sample_buffer import UNUSABLE, SampleBuffer
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
 from bms_estimator.telemetry.alarms.state import RaisedAlarm
 from bms_estimator.telemetry.alarms.unknown import find_unknown
 from bms_estimator.telemetry.alarms.unwatched import find_unwatched
 from bms_estimator.telemetry.alarms.values import estimated_values, measured_values
 from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
+from bms_estimator.telemetry.impossible import PackBounds
 
 SENSOR_SUSPECTS = (
     InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
@@ -48,6 +51,8 @@ CELLS_GAP_S = 60.0
 """Minimum length of a gap between two evaluations of the single cells [s]."""
 NO_FORECAST = unknown_values()
 """Forecast at all samples of a pack without a forecaster."""
+WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
+"""Text of a wrong clock that is right again at the end of a recorded block."""
 _COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
 """Column of SAMPLE by quantity."""
 
@@ -61,6 +66,7 @@ class AlarmEvaluator:
         gap_s: Minimum length of a gap between samples [s].
         inputs: State of the measured quantities.
         silence_limit_s: Time without a sample after which no alarm is watched [s].
+        bounds: Bounds of the possible values; None: every value is possible.
 
     Attributes:
         rows: Number of samples that wait for ``evaluate``.
@@ -74,10 +80,12 @@ class AlarmEvaluator:
         gap_s: float,
         inputs: Inputs,
         silence_limit_s: float,
+        bounds: PackBounds | None = None,
     ) -> None:
         self._alarms = AlarmList(definitions, inputs.lost_s)
         self._charging_a = charging_a
         self._inputs, self._silence_limit_s = inputs, silence_limit_s
+        self._bounds, self._input_faults = bounds, InputFaults()
         self._silence_reason = ""  # reason why no samples arrive; empty while they do
         self._has_samples = False  # True after the first sample of this run
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
@@ -97,12 +105,34 @@ class AlarmEvaluator:
         return self._buffer.size
 
     def add(
-        self, block: SampleBlock, trace: TraceBlock, cells: CellBlock, forecasts: ForecastRows = NO_FORECAST
+        self,
+        block: SampleBlock,
+        trace: TraceBlock,
+        cells: CellBlock,
+        forecasts: ForecastRows = NO_FORECAST,
+        cells_fault: str = "",
     ) -> None:
-        """Buffer a block of samples, its estimates, its cell voltages and the forecast at each estimate for ``evaluate``."""
-        self._buffer.add(block, trace, cells, forecasts)
+        """Buffer a block of samples for ``evaluate``.
 
-    def evaluate(self, arrival_s: float, counts: SampleCounts, suspects: InputFault, suspicions: Sequence[str]) -> None:
+        Args:
+            block: Samples.
+            trace: Their estimates.
+            cells: Their cell voltages [V]; empty without any.
+            forecasts: Forecast at each row of ``trace``.
+            cells_fault: Reason why the cell voltages cannot be used; empty if they can.
+        """
+        self._buffer.add(block, trace, cells, forecasts, cells_usable=not cells_fault)
+        if cells_fault:
+            self._input_faults.add("cells", cells_fault, cells_fault)
+
+    def evaluate(
+        self,
+        arrival_s: float,
+        counts: SampleCounts,
+        suspects: InputFault,
+        suspicions: Sequence[str],
+        clock_fault: str = "",
+    ) -> None:
         """Evaluate all buffered samples.
 
         Args:
@@ -110,16 +140,19 @@ class AlarmEvaluator:
             counts: Numbers of samples since start.
             suspects: Input faults that the filter suspects now.
             suspicions: The suspected faults, one sentence each.
+            clock_fault: Fault of the source's clock as a sentence; empty without one.
         """
         if not self.rows:
             return
         self._has_samples = True
-        samples, trace, forecasts, extremes_v = self._buffer.take()
+        samples, trace, forecasts, cells = self._buffer.take()
+        if (samples["status"] & SampleStatus.WRONG_CLOCK).any():
+            self._input_faults.add("time", "rate", clock_fault or WRONG_CLOCK_TEXT)
         self._alarms.set_suspects("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
         self._alarms.set_suspects("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
         if samples.size:
             wall_offset_s = arrival_s - float(samples["time_s"][-1])
-            self._evaluate_samples(samples, extremes_v, wall_offset_s)
+            self._evaluate_samples(samples, cells, wall_offset_s)
             self._evaluate_faulty_fraction(float(samples["time_s"][-1]), counts, suspects, wall_offset_s)
         if trace.size:
             self._evaluate_estimates(trace, forecasts, suspects, arrival_s - float(trace["time_s"][-1]))
@@ -259,35 +292,56 @@ class AlarmEvaluator:
         entries = json.loads(saved_state or "{}")
         self._inputs.restore(entries.pop(INPUTS, {}))
         self._silence_reason = str(entries.pop(SILENCE, ""))
-        unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason)
+        unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, {})
         self._alarms.restore(entries, unwatched)
         self._save_state()
 
-    def _evaluate_samples(self, samples: SampleBlock, extremes_v: Floats, wall_offset_s: float) -> None:
+    def _evaluate_samples(self, samples: SampleBlock, cells: Floats, wall_offset_s: float) -> None:
         """Evaluate the alarms on measured values.
 
         Args:
             samples: Shape (n,), dtype SAMPLE.
-            extremes_v: Minimum and maximum cell voltage [V] and number of cell voltages, shape (n, 3).
+            cells: Minimum, maximum [V], number and mean [V] of the cell voltages, shape (n, 4).
             wall_offset_s: Wall clock minus the samples' clock [s].
         """
         times_s = samples["time_s"]
         self._at_s = float(times_s[-1])
         passed_s, observed_s = self._sample_intervals.measure(times_s)
-        for name, series in measured_values(samples, extremes_v, self._charging_a).items():
+        samples, cells, unusable = self._without_impossible(samples, cells)
+        for name, series in measured_values(samples, cells, self._charging_a).items():
             self._alarms.update(name, times_s, observed_s, series, wall_offset_s)
         gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # duration of the gap before each sample [s]; 0: no gap
         self._alarms.update("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
         counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
-        cells = extremes_v[:, 2].astype(np.int64)
-        for at_s in self._inputs.update(times_s, observed_s, counts | {"cells": cells}):
+        counts["cells"] = cells[:, 2].astype(np.int64)
+        for quantity, rows in unusable.items():
+            counts[quantity][rows] = UNUSABLE
+        for at_s in self._inputs.update(times_s, observed_s, counts):
             self._update_unwatched(at_s)
             if self._is_blinded():  # without the delay of the alarm, because a quantity has been missing for ``lost_s``
                 self._alarms.raise_at("sensor_fault", at_s, RaisedAlarm(at_s + wall_offset_s, None))
 
+    def _without_impossible(
+        self, samples: SampleBlock, cells: Floats
+    ) -> tuple[SampleBlock, Floats, dict[Quantity, NDArray[np.bool_]]]:
+        """Return samples and cells with NaN in place of impossible values, and the rows of these values by quantity."""
+        found = self._bounds.find(samples, cells) if self._bounds else {}
+        if found:
+            samples, cells = samples.copy(), cells.copy()
+        for quantity, each in found.items():
+            self._input_faults.add(quantity, each.kind, each.text)
+            if quantity == "cells":
+                cells[each.rows, :2] = np.nan
+            else:
+                samples[_COLUMNS[quantity]][each.rows] = np.nan
+        return samples, cells, {quantity: each.rows for quantity, each in found.items()}
+
     def _update_unwatched(self, at_s: float) -> None:
         """Update the alarms that cannot be watched at ``at_s`` on the samples' clock [s]."""
-        self._alarms.set_unwatched(find_unwatched(self.names(), self._inputs, self._silence_reason), at_s)
+        texts = self._input_faults.texts
+        unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, texts)
+        self._alarms.set_input_faults(*(text for name, text in texts.items() if name not in self._inputs.lost))
+        self._alarms.set_unwatched(unwatched, at_s)
 
     def _is_blinded(self) -> bool:
         """Return True if a quantity is lost that a critical alarm needs."""
@@ -301,7 +355,11 @@ class AlarmEvaluator:
         if (fraction := self._faulty_fraction.update(at_s, counts)) is None:
             return
         observed_s, value = fraction
-        if suspects & SENSOR_SUSPECTS or self._is_blinded() or self._alarms.board_reason:
+        state = self._alarms.states.get("sensor_fault")
+        has_fault = self._input_faults.update(keep=state is not None and state.raised is not None)
+        texts = self._input_faults.texts.items()
+        self._alarms.set_input_faults(*(text for name, text in texts if name not in self._inputs.lost))
+        if suspects & SENSOR_SUSPECTS or has_fault or self._is_blinded() or self._alarms.board_reason:
             value = math.inf  # above every limit
         self._alarms.update("sensor_fault", np.array([at_s]), observed_s, np.array([value]), wall_offset_s)
 

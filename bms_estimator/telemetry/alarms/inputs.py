@@ -37,7 +37,10 @@ class _Input:
     """Time since the last value of a lost quantity [s]."""
 
     def update(self, times_s: Floats, steps_s: Floats, counts: Counts, lost_s: float) -> list[float]:
-        """Process the number of values in each sample. Return the times at which the quantity was lost or measured again [s]."""
+        """Process the number of values in each sample. Return the times at which the quantity was lost or measured again [s].
+
+        A negative number (unusable values) counts as missing also if the quantity was never measured.
+        """
         expected = np.maximum.accumulate(np.concatenate(([self.max_count], counts)))[1:]
         self.max_count = int(expected[-1])
         present = counts >= expected
@@ -80,13 +83,13 @@ class Inputs:
 
     @property
     def lost(self) -> tuple[Quantity, ...]:
-        """Quantities that were measured before and are missing."""
+        """Quantities that were measured before and are missing, or whose values are unusable."""
         return tuple(name for name, each in self._inputs.items() if each.lost)
 
     @property
     def saved_state(self) -> dict[str, Any]:
         """State for ``restore`` after a restart."""
-        return {name: [each.max_count, each.lost] for name, each in self._inputs.items() if each.max_count}
+        return {name: [each.max_count, each.lost] for name, each in self._inputs.items() if each.max_count or each.lost}
 
     def were_measured(self, names: Collection[Quantity]) -> bool:
         """Return True if all these quantities were measured at some time."""
@@ -98,7 +101,7 @@ class Inputs:
         Args:
             times_s: Time of each sample [s], shape (n,).
             steps_s: Time since the previous sample [s], 0 after a gap, shape (n,).
-            counts: Number of values in each sample by quantity, each of shape (n,).
+            counts: Number of values in each sample by quantity, negative for unusable ones, each of shape (n,).
 
         Returns:
             Times at which a quantity was lost or measured again [s].

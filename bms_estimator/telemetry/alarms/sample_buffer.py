@@ -13,12 +13,14 @@ from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
 
 INITIAL_ROWS = 256
 """Initial capacity of a buffer [rows]."""
-_NO_EXTREMES = np.array([math.nan, math.nan, 0.0])
-"""Result of ``_cell_extremes`` for a sample without cell voltages."""
+_NO_CELLS = np.array([math.nan, math.nan, 0.0, math.nan])
+"""Result of ``_summarize`` for a sample without cell voltages."""
+UNUSABLE = -1
+"""Number of cell voltages of a sample whose cell voltages cannot be used."""
 
 
 class SampleBuffer:
-    """Samples that the alarms have not evaluated yet, with their trace, forecasts and the extremes of their cell voltages.
+    """Samples that the alarms have not evaluated yet, with their trace, forecasts and a summary of their cell voltages.
 
     Attributes:
         size: Number of samples.
@@ -26,32 +28,43 @@ class SampleBuffer:
 
     def __init__(self) -> None:
         self._samples, self._traces, self._forecasts = _Rows(SAMPLE), _Rows(TRACE), _Rows(FORECAST)
-        self._extremes = _Rows(np.float64, (3,))
+        self._cells = _Rows(np.float64, (4,))
 
     @property
     def size(self) -> int:
         """Number of samples."""
         return self._samples.size
 
-    def add(self, block: SampleBlock, trace: TraceBlock, cells: CellBlock, forecasts: ForecastRows) -> None:
-        """Append a block."""
+    def add(
+        self,
+        block: SampleBlock,
+        trace: TraceBlock,
+        cells: CellBlock,
+        forecasts: ForecastRows,
+        *,
+        cells_usable: bool = True,
+    ) -> None:
+        """Append a block. ``cells_usable`` is False if samples without cell voltages have some that cannot be used."""
         self._samples.add(block, block.size)
         self._traces.add(trace, trace.size)
         self._forecasts.add(forecasts, trace.size)
-        self._extremes.add(_cell_extremes(cells) if len(cells) == block.size else _NO_EXTREMES, block.size)
+        summary = _summarize(cells if len(cells) == block.size else np.empty((block.size, 0)))
+        if not cells_usable:
+            summary[summary[:, 2] == 0, 2] = UNUSABLE
+        self._cells.add(summary, block.size)
 
     def take(self) -> tuple[SampleBlock, TraceBlock, ForecastRows, Floats]:
         """Remove and return all rows.
 
         Returns:
-            Samples with a finite time stamp; their trace; the forecast at each row of the trace; and the minimum cell voltage [V],
-            maximum cell voltage [V] and number of cell voltages of each sample, shape (n, 3).
+            Samples with a finite time stamp; their trace; the forecast at each row of the trace; and minimum [V], maximum [V],
+            number and mean [V] of the cell voltages of each sample, shape (n, 4).
         """
         samples, trace, forecasts = self._samples.take(), self._traces.take(), self._forecasts.take()
-        extremes_v, has_time = self._extremes.take(), np.isfinite(samples["time_s"])
+        cells, has_time = self._cells.take(), np.isfinite(samples["time_s"])
         if not has_time.all():
-            samples, extremes_v = samples[has_time], extremes_v[has_time]
-        return samples, trace, forecasts, extremes_v
+            samples, cells = samples[has_time], cells[has_time]
+        return samples, trace, forecasts, cells
 
 
 class _Rows:
@@ -77,12 +90,14 @@ class _Rows:
         return rows
 
 
-def _cell_extremes(cells: CellBlock) -> Floats:
-    """Return minimum and maximum cell voltage [V] and number of cell voltages of each sample, shape (n, 3).
+def _summarize(cells: CellBlock) -> Floats:
+    """Return minimum [V], maximum [V], number and mean [V] of the cell voltages of each sample, shape (n, 4).
 
     The voltages of a sample without cell voltages are NaN.
     """
     if not cells.shape[1]:
-        return np.tile(_NO_EXTREMES, (len(cells), 1))
+        return np.tile(_NO_CELLS, (len(cells), 1))
     measured = np.count_nonzero(np.isfinite(cells), axis=1)
-    return np.stack((np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1), measured), axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean_v = np.nansum(cells, axis=1) / np.where(measured, measured, np.nan)
+    return np.stack((np.fmin.reduce(cells, axis=1), np.fmax.reduce(cells, axis=1), measured, mean_v), axis=1)

@@ -10,15 +10,15 @@ from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.stability_margin import applicable_margin
 
 
-def measured_values(samples: SampleBlock, extremes_v: Floats, charging_a: float) -> dict[AlarmName, Floats]:
+def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> dict[AlarmName, Floats]:
     """Return the values of the alarms on measured quantities, each of shape (n,).
 
     Args:
         samples: Shape (n,), dtype SAMPLE.
-        extremes_v: Minimum and maximum cell voltage [V] and number of cell voltages, shape (n, 3).
+        cells: Minimum and maximum [V] of the cell voltages in the first two columns, shape (n, 4).
         charging_a: Minimum current into the pack that counts as charging [A].
     """
-    lowest_v, highest_v = extremes_v[:, 0], extremes_v[:, 1]
+    lowest_v, highest_v = cells[:, 0], cells[:, 1]
     voltage_v, temperature_c = samples["voltage_v"], samples["temperature_c"]
     is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
     current_a = np.where(is_saturated, np.copysign(np.inf, samples["current_a"]), samples["current_a"])

@@ -209,6 +209,14 @@ def cell_file(tmp_path):
         ),
         ({}, "series = 2\ncutoff_v = 7.6", "pack.cutoff_v = 7.6: the OCV of"),
         ({}, "series = 2\ncutoff_v = 3.3", "pack.cutoff_v = 3.3: the OCV of"),
+        (
+            {},
+            (
+                'series = 2\n[source]\nkind = "modbus"\nport = "localhost:502"\n'
+                "voltage = {address = 0}\ncurrent = {address = 1}\ncells = {address = 2, count = 4}"
+            ),
+            "source.cells: 4 cells, but the pack has 2 in series: the others must read 0 V; is pack.series right?",
+        ),
     ],
 )
 def test_check_warns_about_implausible_settings(cell, settings, message, cell_file, pack, capsys):

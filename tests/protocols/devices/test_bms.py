@@ -24,7 +24,16 @@ from tests.protocols import bms_frames as frames
 from tests.protocols.bms_frames import PUBLISHED, PublishedCycle
 
 PROTOCOLS = ("jbd", "daly", "jk")
-ERROR_COUNTERS = ("crc_errors", "length_errors", "short_frames", "noise_bytes", "refused", "other_packs", "implausible")
+ERROR_COUNTERS = (
+    "crc_errors",
+    "length_errors",
+    "short_frames",
+    "noise_bytes",
+    "refused",
+    "other_packs",
+    "implausible",
+    "implausible_cells",
+)
 POLL_CYCLES = {name: PUBLISHED[name].frames for name in ("jbd", "daly", "jk_old", "jk_newer")}
 """Responses of one poll cycle, by device."""
 DALY_FRAME_BYTES = 13

@@ -7,10 +7,12 @@ import json
 import random
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.sample import SampleStatus
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.settings.pack import Settings
@@ -44,7 +46,7 @@ def feed(
     return [json.loads(line) for line in lines if line]
 
 
-def esphome(node: str, voltage: str, current: str, temperature: str, cell: str) -> Messages:
+def esphome(node: str, voltage: str, current: str, temperature: str, cell: str, empty_slots: int = 0) -> Messages:
     """Return the messages of an ESPHome node, which publishes its 16 cells and then its other sensors.
 
     Args:
@@ -53,8 +55,9 @@ def esphome(node: str, voltage: str, current: str, temperature: str, cell: str) 
         current: Name of the sensor of the current.
         temperature: Name of a temperature sensor.
         cell: Name of a sensor of a cell voltage, with {} for the number of the cell.
+        empty_slots: Number of cell sensors without a cell, which are 0 V.
     """
-    cells = [(cell.format(n), f"3.3{n:02}") for n in range(1, 17)]
+    cells = [(cell.format(n), f"3.3{n:02}" if n <= 16 else "0.000") for n in range(1, 17 + empty_slots)]
     values = [*cells, (temperature, "21.5"), (voltage, "52.98"), (current, "-12.34"), ("balancing_current", "0.000")]
     return [(f"{node}/sensor/{node}_{name}/state", value) for name, value in values]
 
@@ -508,3 +511,12 @@ def test_cell_voltages_that_become_null_or_unavailable_are_removed_from_the_samp
         topic_per_cell, [("home/cell/1", "3.3"), ("home/cell/2", "3.4"), pack, ("home/cell/1", "unavailable"), pack]
     )
     assert (before["cells_v"], after["cells_v"]) == ([3.3, 3.4], [None, 3.4])
+
+
+def test_cell_slots_of_an_esphome_node_without_a_cell_are_no_cells() -> None:
+    node = source(profile="esphome-jk", prefix="jk-bms")
+    messages = esphome("jk-bms", "total_voltage", "current", "temperature_sensor_1", "cell_voltage_{}", empty_slots=8)
+    (sample,) = feed(SampleAssembler(node), messages)
+    assert len(sample["cells_v"]) == 24
+    (cells_v,) = CellSlots(16).select(np.array([sample["cells_v"]])).tolist()
+    assert cells_v == [pytest.approx(3.3 + 0.001 * n) for n in range(1, 17)]

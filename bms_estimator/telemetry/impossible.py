@@ -1,0 +1,165 @@
+"""Measured values that cannot be true of a pack, whatever its state, and their likely cause."""
+
+import math
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.sample import MAX_CELL_V, SampleBlock, SampleStatus
+from bms_estimator.settings.alarm_kinds import Quantity
+
+MAX_C_RATE = 100.0
+"""Highest possible current as a C-rate [1/h]. Power cells give 50 C. A current above 100 C is a short circuit, which ends in a
+second, by the fuse or by the cell."""
+MAX_CURRENT_RATIO = 10.0
+"""Highest possible current of a fuel cell in multiples of its maximum current. Its limiting current density is lower."""
+MIN_MEAN_V = -1.0
+"""Lowest possible mean voltage of the cells of a pack [V]. Reversed cells reach it, and never all at once."""
+MEAN_V = 1.0, 5.0
+"""Range of the mean voltage of cells that are not destroyed [V], of all chemistries."""
+MAX_SUM_DIFFERENCE = 0.2
+"""Highest possible difference between the pack's voltage and the sum of its cells, as a fraction of the higher one. Wires and
+contactors drop a few percent."""
+MAX_SPREAD_V = 1.0
+"""Maximum difference between cells that confirm each other [V]."""
+FACTORS = 10, 100, 1000
+"""Usual factors between the scales or units of two devices."""
+FACTOR_TOLERANCE = 0.1
+"""Tolerance of a ratio that shows one of the factors."""
+MIN_SWAPPED = 1e7
+"""Absolute value from which a number is assumed to have swapped words. As a float or an integer of two registers, these differ
+from the true number by a factor of 65,536 and more."""
+STEPS = 1.0, 0.1, 0.01, 0.001
+"""Usual resolutions of integers in protocols."""
+WORD_BITS = 16, 32
+"""Lengths of integers in protocols."""
+
+
+class ImpossibleValue(NamedTuple):
+    """Samples with an impossible value of one quantity."""
+
+    rows: NDArray[np.bool_]
+    """True for each sample with an impossible value; shape (n,)."""
+    kind: str
+    """Likely cause of the last one, as part of a sentence."""
+    text: str
+    """The last one and its likely cause, as a sentence."""
+
+
+class PackBounds(NamedTuple):
+    """Bounds of the possible values of one pack. They are far wider than the limits of its alarms."""
+
+    series: int
+    max_a: float
+    """Highest possible current [A]."""
+    range_v: tuple[float, float]
+    """Lowest and highest usual voltage of the pack [V]."""
+    range_a: float
+    """Highest usual current [A]."""
+
+    @classmethod
+    def of(cls, cell: PackModel) -> Self:
+        """Return the bounds of the model of a whole pack."""
+        c = cell.cell
+        max_a = (
+            MAX_C_RATE * cell.cell.capacity_ah if isinstance(cell, CellModel) else MAX_CURRENT_RATIO * c.current_max_a
+        )
+        return cls(c.series_count, max_a, (c.voltage_min_v, c.voltage_max_v), c.current_max_a)
+
+    def find(self, samples: SampleBlock, cells: Floats) -> dict[Quantity, ImpossibleValue]:
+        """Return the impossible values by quantity.
+
+        Args:
+            samples: Shape (n,), dtype SAMPLE.
+            cells: Minimum, maximum [V], number and mean [V] of the cell voltages, shape (n, 4).
+        """
+        voltage_v, current_a = samples["voltage_v"], samples["current_a"]
+        lowest_v, highest_v, count, mean_v = cells.T
+        pack_mean_v = voltage_v / self.series
+        # NaN is never outside a range and never differs
+        is_outside = (pack_mean_v < MIN_MEAN_V) | (pack_mean_v > MAX_CELL_V)
+        differs = (count == self.series) & (
+            np.abs(pack_mean_v - mean_v) > MAX_SUM_DIFFERENCE * np.maximum(np.abs(pack_mean_v), np.abs(mean_v))
+        )
+        pack_is_usual, cells_are_usual = ((MEAN_V[0] <= v) & (v <= MEAN_V[1]) for v in (pack_mean_v, mean_v))
+        cells_agree = highest_v - lowest_v <= MAX_SPREAD_V
+        is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
+        found: dict[Quantity, ImpossibleValue] = {}
+        rows = is_outside | (differs & cells_are_usual & (~pack_is_usual | cells_agree))
+        if rows.any():
+            last = np.flatnonzero(rows)[-1]
+            sum_v = self.series * float(mean_v[last]) if differs[last] and cells_are_usual[last] else math.nan
+            found["voltage"] = ImpossibleValue(rows, *self._voltage_cause(float(voltage_v[last]), sum_v))
+        rows = differs & pack_is_usual & ~cells_are_usual
+        if rows.any():
+            last = np.flatnonzero(rows)[-1]
+            sum_v, pack_v = self.series * float(mean_v[last]), float(voltage_v[last])
+            kind = factor_text(sum_v / pack_v) or "are the wires of the cells connected?"
+            text = f"the cell voltages cannot be true: their sum is {sum_v:.6g} V, and the pack has {pack_v:.6g} V"
+            found["cells"] = ImpossibleValue(rows, kind, f"{text} ({kind})")
+        rows = (np.abs(current_a) > self.max_a) & ~is_saturated
+        if rows.any():
+            ampere = float(current_a[rows][-1])
+            kind = current_cause(ampere, self.range_a)
+            text = f"the current cannot be true: {ampere:.6g} A, and at most {self.max_a:.6g} A are possible"
+            found["current"] = ImpossibleValue(rows, kind, f"{text} ({kind})")
+        return found
+
+    def _voltage_cause(self, volt: float, sum_v: float) -> tuple[str, str]:
+        """Return the likely cause of an impossible voltage, and a sentence with it.
+
+        Args:
+            volt: The voltage [V].
+            sum_v: Sum of the cell voltages [V]; NaN if it does not contradict the voltage.
+        """
+        text = f"the pack's voltage cannot be true: {volt:.6g} V"
+        if math.isfinite(sum_v):
+            kind = factor_text(volt / sum_v) or (
+                "is the output switched off, or is another voltage measured?"
+                if volt >= 0.0
+                else "are the wires reversed?"
+            )
+            return kind, f"{text}, and the sum of the cells is {sum_v:.6g} V ({kind})"
+        low_v, high_v = self.range_v
+        fitting = next((factor for factor in FACTORS if low_v <= volt / factor <= high_v), None)
+        if fitting:
+            kind = factor_text(fitting)
+        elif abs(volt) >= MIN_SWAPPED:
+            kind = "are the words of a 32-bit number swapped?"
+        else:
+            kind = "are the wires reversed?" if volt < 0.0 else "is pack.series right?"
+        return kind, f"{text} of {self.series} cells in series ({kind})"
+
+
+def current_cause(ampere: float, range_a: float) -> str:
+    """Return the likely cause of an impossible current, as a question.
+
+    Args:
+        ampere: The current [A].
+        range_a: Highest usual current [A].
+    """
+    for bits in WORD_BITS:
+        for step_a in STEPS:
+            if abs(2**bits * step_a - abs(ampere)) <= range_a:
+                return f"is a signed number of {bits} bits read as an unsigned one?"
+    if abs(ampere) >= MIN_SWAPPED:
+        return "are the words of a 32-bit number swapped?"
+    fitting = [factor for factor in FACTORS if abs(ampere) <= factor * range_a]
+    return (
+        f"is the unit or scale wrong by a factor of {' or '.join(map(str, fitting))}?"
+        if fitting
+        else "is the sensor broken?"
+    )
+
+
+def factor_text(ratio: float) -> str:
+    """Return the question for a value that is wrong by one of ``FACTORS``; empty for another ratio to the true value."""
+    for factor in FACTORS:
+        for fault in (factor, 1 / factor):
+            if abs(ratio / fault - 1.0) <= FACTOR_TOLERANCE:
+                return f"is the unit or scale wrong by a factor of {factor}?"
+    return ""
