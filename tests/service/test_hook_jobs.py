@@ -3,7 +3,7 @@
 import pytest
 
 from bms_estimator.model.payloads.alarm import Alarm
-from bms_estimator.service.hook_jobs import HookJobs
+from bms_estimator.service.job_hook import HookJobs
 from bms_estimator.settings.alarms import HookEvent
 
 

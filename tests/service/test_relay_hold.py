@@ -2,7 +2,7 @@
 
 import pytest
 
-from bms_estimator.service.relay_hold import FIRST_HOLD_S, MAX_HOLD_S, QUIET_S, RelayHold
+from bms_estimator.service.relay_hook import FIRST_HOLD_S, MAX_HOLD_S, QUIET_S, RelayHold
 
 
 def waiting_times_s(hold: RelayHold, interval_s: float, resets: int) -> list[float]:

@@ -12,7 +12,7 @@ from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import relay_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
-from bms_estimator.service.relay_hold import FIRST_HOLD_S
+from bms_estimator.service.relay_hook import FIRST_HOLD_S
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.telemetry.alarms.message import Change
 from tests.patience import LONG_S
