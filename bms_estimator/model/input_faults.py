@@ -15,6 +15,8 @@ class InputFault(IntFlag):
     VOLTAGE = 64
     CURRENT = 128
     PACK = 256
+    PROBE = 512
+    """Not of the identifier, but of ``SampleStatus.PROBE_FAULT``."""
 
     @property
     def text(self) -> str:
@@ -39,6 +41,7 @@ _TEXTS = {
     "and that the source does not repeat an old value",
     InputFault.CURRENT: "the current stays the same to the last digit though the voltage changes: check the current sensor, "
     "and that all loads flow through it",
+    InputFault.PROBE: "a temperature probe is broken or loose, or far from the others: check it",
     InputFault.PACK: "SOC or voltages after a gap do not fit the pack before it: check whether the pack "
     "was exchanged, because capacity and resistances were learned from the pack before; the request forget_pack discards them",
 }

@@ -129,7 +129,7 @@ def _jk_old(measured: Measured) -> bytes:
 def _jk_newer(measured: Measured) -> bytes:
     frame = bytearray(jk.FRAME_BYTES)
     # offsets of a real-time frame: cell voltages 6, bits of the present cells 70, voltage 150, current 158,
-    # two temperatures 162, SOC 173
+    # two temperatures 162, SOC 173. The bits of further probes, at 214, are 0
     frame[:5] = jk.START + bytes((jk.REALTIME,))
     struct.pack_into(f"<{len(measured.cells_v)}H", frame, 6, *(_to_u16(v, 1000) for v in measured.cells_v))
     struct.pack_into("<I", frame, 70, (1 << len(measured.cells_v)) - 1)

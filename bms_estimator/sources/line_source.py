@@ -168,7 +168,7 @@ class LineSource:
             if block.size:
                 self._block_arrival_s = chunk[0]
                 self._silence_reason, self._logged_reason, self._retry_s = None, "", self._first_retry_s
-                yield ReceivedSamples(block, self._decoder.cells)
+                yield ReceivedSamples(block, self._decoder.cells, self._decoder.probes)
         if self._produce_task is not None and not self._produce_task.cancelled():
             self._produce_task.result()
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.accumulators.publish_window import WINDOW_SUMS, accumulate_window
-from bms_estimator.model.sample import NO_CELLS, CellBlock
+from bms_estimator.model.sample import NO_CELLS, NO_PROBES, CellBlock, ProbeBlock
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ class WindowSummary:
         sample_rate_hz: Sample rate on the clock of the samples [Hz], NaN if unknown.
         last: Last row, dtype TRACE.
         cells_v: Last cell voltages [V], shape (m,), NaN if not reported; m is 0 without cell voltages.
+        probes: Last temperature probes, shape (m,), dtype PROBE; m is 0 without a list of them.
     """
 
     arrival_s: float
@@ -36,6 +37,7 @@ class WindowSummary:
     sample_rate_hz: float
     last: np.void
     cells_v: NDArray[np.float64]
+    probes: ProbeBlock
 
 
 class Window:
@@ -54,18 +56,23 @@ class Window:
         self._sums.fill(0)
         self._last: np.void | None = None
         self._arrival_s = math.nan
-        self._cells = NO_CELLS
+        self._cells, self._probes = NO_CELLS, NO_PROBES
 
-    def add(self, trace: TraceBlock, arrival_s: float, cells: CellBlock = NO_CELLS) -> None:
+    def add(
+        self, trace: TraceBlock, arrival_s: float, cells: CellBlock = NO_CELLS, probes: ProbeBlock = NO_PROBES
+    ) -> None:
         """Add the trace of one block.
 
         Args:
             trace: Accepted samples, shape (n,), dtype TRACE; n may be 0.
             arrival_s: Wall clock at the arrival of the block [s since 1970].
             cells: Cell voltages of the block.
+            probes: Temperature probes of the block.
         """
         if cells.size:
             self._cells = cells[-1:]
+        if probes.size:
+            self._probes = probes[-1:]
         if trace.size:
             accumulate_window(self._sums, trace)
             # numpy copies a record field by field, which takes longer than the sums
@@ -91,6 +98,7 @@ class Window:
             sample_rate_hz=steps / span_s if span_s > 0.0 else math.nan,
             last=self._last,
             cells_v=self._cells.ravel(),
+            probes=self._probes.ravel(),
         )
         self.previous_end_s = last_s
         self._clear()

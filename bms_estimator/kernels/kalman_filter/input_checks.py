@@ -77,7 +77,7 @@ TEMPERATURE_MARGIN_K = 5.0
 """Distance from the temperature range of the cell file for the fault TEMPERATURE [K]."""
 
 SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT, PACK = (
-    int(bit) for bit in InputFault
+    int(bit) for bit in InputFault if bit is not InputFault.PROBE
 )
 UNUSABLE = SIGN_OF_CURRENT | VOLTAGE | CURRENT
 """Faults during which the voltage is not used."""

@@ -126,10 +126,7 @@ class DalyProtocol(PolledProtocol):
         probes_c = self._join_frames(self._probes_c, PROBES_PER_FRAME, self._probe_count) if has_recent_probes else []
         # each cell voltage is part of one sample only; temperatures are repeated for up to ``MAX_ATTACHED_AGE_S``
         self._cells_v, self._has_sample = {}, True
-        present_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
-        return Reading(
-            decivolts / 10, (deciamperes - ZERO_CURRENT) / 10, self._mean_temperature_c(present_c), tuple(cells_v)
-        )
+        return Reading(decivolts / 10, (deciamperes - ZERO_CURRENT) / 10, tuple(probes_c), tuple(cells_v))
 
     def _join_frames(
         self, frames: Mapping[int, Sequence[float]], values_per_frame: int, count: int | None

@@ -97,9 +97,7 @@ class JbdProtocol(PolledProtocol):
         return Reading(
             centivolts / 100,
             centiamperes / 100,
-            self._mean_temperature_c(
-                [(step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", _whole_words(probe_data))]
-            ),
+            tuple((step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", _whole_words(probe_data))),
             self._recent_cells.at(arrival_s)[: self._cell_count],
         )
 

@@ -123,7 +123,7 @@ class JunctekProtocol(ReadingProtocol):
         return Reading(
             0.01 * measured[VOLTAGE],
             current_a if measured[DIRECTION] == 1 else -current_a,
-            float(measured[TEMPERATURE] - ZERO_C),
+            (float(measured[TEMPERATURE] - ZERO_C),),
         )
 
 

@@ -41,7 +41,7 @@ ABSENT = "-"
 
 
 class PylontechProtocol(ReadingProtocol):
-    """Protocol of the console. A reading has the mean voltage, the sum of the currents and the mean temperature.
+    """Protocol of the console. A reading has the mean voltage, the sum of the currents, and the lowest and highest temperature of each battery.
 
     The cells of all batteries are concatenated, each with its last recent voltage.
 
@@ -159,13 +159,13 @@ class PylontechProtocol(ReadingProtocol):
             texts if ABSENT not in texts else [row[temperature]]
             for texts, row in zip(cell_temperatures, present, strict=True)
         ]
-        temperatures_c = [1e-3 * _parse_integer(text) for texts in temperature_texts for text in texts]
+        temperatures_c = tuple(1e-3 * _parse_integer(text) for texts in temperature_texts for text in texts)
         self._batteries = tuple(int(row[0]) for row in present)
         battery_cells_v = [
             self._cells[battery].at(arrival_s) if battery in self._cells else () for battery in self._batteries
         ]
         cells_v = tuple(itertools.chain(*battery_cells_v)) if all(battery_cells_v) else ()
-        return Reading(_mean(voltages_v), sum(currents_a), _mean(temperatures_c), cells_v)
+        return Reading(_mean(voltages_v), sum(currents_a), temperatures_c, cells_v)
 
 
 def _parse_integer(text: str) -> int:

@@ -7,9 +7,7 @@ import numpy as np
 
 from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import (
-    MAX_C,
     MAX_CELL_V,
-    MIN_C,
     MIN_CELL_V,
     SAMPLE,
     CurrentSign,
@@ -20,6 +18,7 @@ from bms_estimator.model.sample import (
 from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.device_clock import DeviceClock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
+from bms_estimator.protocols.base.probe_check import ProbeCheck
 from bms_estimator.protocols.base.reading import Reading, read_line
 
 MAX_LINE_BYTES = 4096
@@ -49,6 +48,7 @@ class TextProtocol(DeviceProtocol):
         self._received_bytes = self._samples = self._invalid_lines = self._overlong_lines = self._implausible = 0
         self._first_invalid: bytes | None = None  # the first line without values since the last good one
         self._last_reading: Reading | None = None
+        self._probe_check = ProbeCheck()
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -58,7 +58,7 @@ class TextProtocol(DeviceProtocol):
             "frames_received": self._samples,
             "text_errors": self._invalid_lines,
             "length_errors": self._overlong_lines,
-            "implausible": self._implausible,
+            "implausible": self._implausible + self._probe_check.faults,
             "clock_jumps": self._clock.jumps,
         }
 
@@ -102,10 +102,9 @@ class TextProtocol(DeviceProtocol):
             self._samples += len(readings)
             block["voltage_v"] = [reading.voltage_v for reading in readings]
             block["current_a"] = [self._sign * reading.current_a for reading in readings]
-            block["temperature_c"] = [reading.temperature_c for reading in readings]
-            self._implausible += remove_implausible(block["temperature_c"], MIN_C, MAX_C)
             block["status"] = [_status(reading) for reading in readings]
             block["time_s"] = self._times(arrival_s, readings)
+        self.probes = self._probe_check.apply(block, [reading.temperatures_c for reading in readings])
         return block
 
     def _times(self, arrival_s: float, readings: Sequence[Reading]) -> list[float]:

@@ -8,7 +8,6 @@ line, may appear in between and are not part of the checksum.
 
 import re
 from collections.abc import Iterator, Mapping
-from math import nan
 
 from bms_estimator.model.decimal_text import number
 from bms_estimator.model.sample import CurrentSign
@@ -89,7 +88,7 @@ class VeDirectProtocol(ReadingProtocol):
             return Reading(
                 1e-3 * number(fields["V"]),
                 1e-3 * number(fields["I"]),
-                nan if temperature == NO_SENSOR else number(temperature),
+                () if temperature == NO_SENSOR else (number(temperature),),
             )
         except ValueError as error:
             self._count_fault("text_errors", f"a VE.Direct block without a voltage or a current: {error}")

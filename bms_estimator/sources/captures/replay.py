@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress, no_progress
-from bms_estimator.model.sample import SAMPLE, CellBlock, CurrentSign, SampleBlock
+from bms_estimator.model.sample import NO_PROBES, SAMPLE, CellBlock, CurrentSign, ProbeBlock, SampleBlock
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
@@ -113,6 +113,11 @@ class RawCapture:
         """Cell voltages of the last block; empty without any."""
         return self.decoder.cells
 
+    @property
+    def probes(self) -> ProbeBlock:
+        """Temperature probes of the last block; empty without a list of them."""
+        return self.decoder.probes
+
     def __iter__(self) -> Iterator[SampleBlock]:
         """Yield blocks of samples."""
         for batch in read_capture(self._path):
@@ -187,11 +192,16 @@ class Replay:
 
     async def _unpaced(self) -> AsyncIterator[ReceivedSamples]:
         for block in self.capture:
-            cells = self.capture.cells
+            cells, probes = self.capture.cells, self._probes
             before = self.fraction
             for part in _parts(block["time_s"], self._max_block_s):
                 self._advance(before, part.stop / block.size)
-                yield ReceivedSamples(block[part], cells[part])
+                yield ReceivedSamples(block[part], cells[part], probes[part])
+
+    @property
+    def _probes(self) -> ProbeBlock:
+        """Temperature probes of the last block, which only a raw capture has."""
+        return self.capture.probes if isinstance(self.capture, RawCapture) else NO_PROBES
 
     def _advance(self, before: float, fraction_of_block: float) -> None:
         """Set ``fraction`` within a block, which began at the fraction ``before``."""
@@ -208,7 +218,7 @@ class Replay:
                 end = int(np.searchsorted(due_s, now_s, side="right"))
                 if end > first:
                     self._advance(before, end / block.size)
-                    yield ReceivedSamples(block[first:end], self.capture.cells[first:end])
+                    yield ReceivedSamples(block[first:end], self.capture.cells[first:end], self._probes[first:end])
                     first = end
                 else:
                     await asyncio.sleep(min((due_s[first] - now_s) / speed + PACED_INTERVAL_S, 1.0))

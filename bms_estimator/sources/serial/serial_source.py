@@ -158,7 +158,7 @@ class SerialSource:
                     if self._silence_reason is not None:
                         self._silence_reason, self._rejected = None, False
                         self._port.reset_backoff()
-                    yield ReceivedSamples(block, self._decoder.cells)
+                    yield ReceivedSamples(block, self._decoder.cells, self._decoder.probes)
         if self._task is not None and not self._task.cancelled():
             self._task.result()
 

@@ -33,7 +33,12 @@ from bms_estimator.telemetry.alarms.values import estimated_values, measured_val
 from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
 
 SENSOR_SUSPECTS = (
-    InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
+    InputFault.SIGN_OF_CURRENT
+    | InputFault.OFFSET
+    | InputFault.OUTLIERS
+    | InputFault.VOLTAGE
+    | InputFault.CURRENT
+    | InputFault.PROBE
 )
 """Input faults that raise ``sensor_fault``."""
 MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV

@@ -305,7 +305,7 @@ async def test_simulated_device_is_read_by_the_serial_source(name: str, cell_cou
         sensor = SensorSettings.model_validate({"protocol": name, "port": meter.path})
         running = asyncio.create_task(meter.run())
         async with asyncio.timeout(LONG_S), SerialSource(sensor) as source:
-            async for block, cells_v in source:
+            async for block, cells_v, *_ in source:
                 assert voltages_and_currents(block) == [(49.87, -3.25)] * block.size
                 assert set(block["temperature_c"]) == {21.0}
                 if cells_v.shape[1] == cell_count:

@@ -117,10 +117,10 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
             ("BE/spec_data", '{"cell_voltages":[3.701,3.702,3.700],"cell_balancing":[false,false,true]}'),
             (
                 "BE/info",
-                '{"bms_status":"ACTIVE","SOC":81.5,"temperature_max":21.5,"battery_current":-12.3,"battery_voltage":355.2}',
+                '{"bms_status":"ACTIVE","SOC":81.5,"temperature_max":21.5,"temperature_min":20.5,"battery_current":-12.3,"battery_voltage":355.2}',
             ),
         ],
-        {"voltage_v": 355.2, "current_a": -12.3, "temperature_c": 21.5, "cells_v": [3.701, 3.702, 3.7]},
+        {"voltage_v": 355.2, "current_a": -12.3, "temperatures_c": [21.5, 20.5], "cells_v": [3.701, 3.702, 3.7]},
         "charge_positive",
     ),
     "opendtu": (
@@ -250,7 +250,7 @@ def test_a_voltage_is_used_once_and_the_samples_of_later_currents_mark_it() -> N
         assembler.add_message(topic, payload, time_s, retained=False)
         for now_s in (time_s, time_s + 0.45, time_s + 0.55):
             block = decoder.feed(now_s, assembler.line(now_s))
-            samples += [(voltage_v, int(status)) for _, _, voltage_v, _, status in block.tolist()]
+            samples += block[["voltage_v", "status"]].tolist()
     measured = [voltage_v for voltage_v, status in samples if not status & SampleStatus.VOLTAGE_HELD]
     assert measured == [52.0, 51.0, 50.0]
     assert len(samples) >= 20
@@ -391,7 +391,7 @@ def test_settings_override_the_profile() -> None:
     merged = source(profile="battery-emulator", current={"scale": -1}, temperature="temperature_min", interval_s=2)
     assert merged.current.topics == ("{prefix}/info{instance}",)
     assert (merged.current.path, merged.current.scale) == ("battery_current", -1.0)
-    assert merged.temperature.path == "temperature_min"
+    assert [location.path for location in merged.temperature] == ["temperature_min"]
     assert (merged.prefix, merged.period_s) == ("BE", 2.0)  # the prefix is that of the profile
 
 
