@@ -28,6 +28,12 @@ class Reading(NamedTuple):
     """True if the voltage repeats an earlier reading, and only the other values are new."""
     current_held: bool = False
     """True if the current repeats an earlier reading, and only the other values are new."""
+    soc: float = nan
+    """State of charge by the device, 0..1; NaN: not reported."""
+    remaining_ah: float = nan
+    """Remaining charge by the device [Ah]; NaN: not reported."""
+    capacity_ah: float = nan
+    """Capacity from which the device computes its SOC [Ah]; NaN: not reported."""
 
 
 VOLTAGE_HELD, CURRENT_HELD = "voltage_held", "current_held"

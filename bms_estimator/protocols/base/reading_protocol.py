@@ -28,6 +28,9 @@ class ReadingProtocol(DeviceProtocol):
     Args:
         current_sign: Direction of positive current of the device; samples are positive on discharge.
         faults: Names of the fault counters.
+
+    Attributes:
+        last_reading: Last decoded reading; None before the first one.
     """
 
     def __init__(self, current_sign: CurrentSign, faults: Iterable[str]) -> None:
@@ -35,7 +38,7 @@ class ReadingProtocol(DeviceProtocol):
         self._counts = dict.fromkeys(("bytes_received", "frames_received", *faults, "implausible"), 0)
         self._first_s = self._last_s = math.nan
         self._fault_text: str | None = None
-        self._last_reading: Reading | None = None
+        self.last_reading: Reading | None = None
         self._probe_check = ProbeCheck()
 
     @property
@@ -54,7 +57,7 @@ class ReadingProtocol(DeviceProtocol):
         readings = []
         for reading in self._read(arrival_s, data):
             readings.append(reading)
-            self._last_reading, self._fault_text = reading, None
+            self.last_reading, self._fault_text = reading, None
         self.cells = cell_block([reading.cells_v for reading in readings])
         self._counts["implausible"] += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)

@@ -38,7 +38,10 @@ REGISTER_BYTES: Mapping[int, int] = {
     0xBA: 24,
 }
 """Length of each register [bytes], except that of the cells, which contains its own length."""
-CELLS, BOX_C, BATTERY_C, VOLTAGE, CURRENT, SOFTWARE, VERSION = 0x79, 0x81, 0x82, 0x83, 0x84, 0xB7, 0xC0
+CELLS, BOX_C, BATTERY_C, VOLTAGE, CURRENT, SOC, CAPACITY, SOFTWARE, VERSION = (
+    *(0x79, 0x81, 0x82, 0x83, 0x84),
+    *(0x85, 0xAA, 0xB7, 0xC0),
+)
 """Registers of an older frame."""
 MINUS_ZERO = 100
 """Value of a probe at -0 degC in an older frame. Larger values are negative temperatures."""
@@ -56,6 +59,8 @@ REALTIME = 0x02
 """Kind of a newer frame with measured values."""
 CELLS_OFFSET, CELL_BITS_OFFSET, VOLTAGE_OFFSET, CURRENT_OFFSET = 6, 70, 150, 158
 """Offsets in a newer frame of the voltages of 32 cells, a bit for each present cell, voltage and current."""
+SOC_OFFSET, REMAINING_OFFSET = 173, 174
+"""Offsets in a newer frame of the SOC, and of remaining charge and capacity."""
 PROBE_OFFSETS = {1: 162, 2: 164, 4: 256, 5: 258}
 """Offsets in a newer frame of the battery's probes, by JK's number; the boards have no third one."""
 PROBE_BITS_OFFSET = 214
@@ -185,7 +190,14 @@ class JkProtocol(PolledProtocol):
             current_a = (raw & ~CHARGING) / (100 if raw & CHARGING else -100)
         probes = [_number(registers[code]) for code in (BOX_C, BATTERY_C) if code in registers]
         probes_c = tuple(math.nan if probe == ABSENT_C else _old_celsius(probe) for probe in probes)
-        return Reading(_number(registers[VOLTAGE]) / 100, current_a, probes_c, tuple(cells_v))
+        return Reading(
+            _number(registers[VOLTAGE]) / 100,
+            current_a,
+            probes_c,
+            tuple(cells_v),
+            soc=_number(registers[SOC]) / 100 if SOC in registers else math.nan,
+            capacity_ah=float(_number(registers[CAPACITY])) if CAPACITY in registers else math.nan,
+        )
 
     def _decode_newer(self, arrival_s: float, frame: bytes) -> Reading | None:
         address = frame[FRAME_BYTES] if len(frame) > FRAME_BYTES else None
@@ -200,7 +212,16 @@ class JkProtocol(PolledProtocol):
         cells_v = [mv / 1000 for i, mv in enumerate(cells) if cell_bits >> i & 1]
         self._description = f"JK-BMS, {len(cells_v)} cells" + ("" if address is None else f", pack {address}")
         probes_c = tuple(_newer_celsius(frame, number) for number in range(1, max(PROBE_OFFSETS) + 1))
-        return Reading(millivolts / 1000, milliamperes / 1000, probes_c, tuple(cells_v))
+        remaining_mah, capacity_mah = struct.unpack_from("<2I", frame, REMAINING_OFFSET)
+        return Reading(
+            millivolts / 1000,
+            milliamperes / 1000,
+            probes_c,
+            tuple(cells_v),
+            soc=frame[SOC_OFFSET] / 100,
+            remaining_ah=remaining_mah / 1000,
+            capacity_ah=capacity_mah / 1000,
+        )
 
 
 def _registers(data: bytes) -> Iterator[tuple[int, bytes]]:
