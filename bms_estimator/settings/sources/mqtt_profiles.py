@@ -35,6 +35,10 @@ class Profile(NamedTuple):
     """Descriptions of the settings without which the profile is incomplete, by name."""
 
 
+_VENUS_TEMPERATURES = ("Dc/0/Temperature", "System/MinCellTemperature", "System/MaxCellTemperature")
+"""Paths of temperatures of a battery on Venus OS. A battery without cells has only the first."""
+
+
 def _esphome_defaults(voltage: str, current: str, temperature: Sequence[str], cell: str) -> dict[str, Any]:
     """Return the defaults of an ESPHome node.
 
@@ -116,13 +120,15 @@ PROFILES: Mapping[ProfileName, Profile] = {
         {
             "voltage": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Voltage", "path": "value"},
             "current": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Current", "path": "value"},
-            "temperature": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Temperature", "path": "value"},
+            "temperature": [
+                {"topic": f"N/{{prefix}}/battery/{{instance}}/{path}", "path": "value"} for path in _VENUS_TEMPERATURES
+            ],
             "cells": {"topic": "N/{prefix}/battery/{instance}/Voltages/Cell{cell}", "path": "value"},
             "ask": {
                 "R/{prefix}/keepalive": '{"keepalive-options":["suppress-republish"]}',
                 "R/{prefix}/battery/{instance}/Dc/0/Voltage": "",
                 "R/{prefix}/battery/{instance}/Dc/0/Current": "",
-                "R/{prefix}/battery/{instance}/Dc/0/Temperature": "",
+                **{f"R/{{prefix}}/battery/{{instance}}/{path}": "" for path in _VENUS_TEMPERATURES},
                 "R/{prefix}/battery/{instance}/Voltages": "",
             },
             "ask_s": 2.0,

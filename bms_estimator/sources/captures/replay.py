@@ -294,8 +294,8 @@ def load_capture(
             of a spreadsheet's ``sheet``; None: recognize them.
 
     Returns:
-        ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor) and
-        ``status``, bits of ``SampleStatus``. Attributes ``note`` and ``warning`` say what was guessed about a table.
+        ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor),
+        ``temperature_min_c``, ``temperature_max_c`` (lowest and highest probe, with one probe equal to ``temperature_c``) and ``status``, bits of ``SampleStatus``. Attributes ``note`` and ``warning`` say what was guessed about a table.
 
     Raises:
         UserError: The file does not exist or cannot be read, a column is missing, or ``current_sign`` is not valid.

@@ -287,6 +287,29 @@ def test_the_values_of_a_publisher_that_sends_only_changes_hold_for_its_longest_
     assert feed(assembler, [("i", "2")], 500.0) == []  # the voltage is too old
 
 
+@pytest.mark.parametrize(
+    ("temperature", "messages", "temperatures_c"),
+    [
+        pytest.param({"topic": "t/{probe}"}, [("t/2", "22"), ("t/1", "21")], [21.0, 22.0], id="topics"),
+        pytest.param({"topic": "t/{probe}"}, [("t/3", "23"), ("t/1", "21")], [21.0, None, 23.0], id="missing"),
+        pytest.param({"topic": "t/{probe}"}, [("t/2", "22"), ("t/2", "null"), ("t/1", "21")], [21.0, None], id="null"),
+        pytest.param({"topic": "t/{probe}"}, [("t/0", "1"), ("t/33", "1"), ("t/x", "1")], None, id="no probes"),
+        pytest.param(
+            {"topic": "t", "path": "T{probe}"}, [("t", '{"T1":21,"T2":22,"TMOS":70}')], [21.0, 22.0], id="keys"
+        ),
+        pytest.param(
+            [{"topic": "t", "path": "0"}, {"topic": "u"}], [("u", "22"), ("t", "[21]")], [21.0, 22.0], id="list"
+        ),
+    ],
+)
+def test_all_temperature_probes_are_part_of_the_sample(
+    temperature: object, messages: Messages, temperatures_c: list[float | None] | None
+) -> None:
+    assembler = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature=temperature))
+    (line,) = feed(assembler, [*messages, ("v", "52"), ("i", "1")])
+    assert line.get("temperatures_c") == temperatures_c
+
+
 def test_temperature_is_used_for_five_minutes() -> None:
     assembler = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature={"topic": "t"}))
     voltage_and_current = [("v", "52"), ("i", "1")]
