@@ -35,7 +35,7 @@ class ScriptedSource:
     def give(self, *rows: tuple[float, float, float] | tuple[float, float, float, float, int]) -> None:
         """Add a block with rows of (time_s, current_a, voltage_v[, temperature_c, status])."""
         padded = [row if len(row) == 5 else (*row, np.nan, 0) for row in rows]
-        self.give_block(np.array(padded, dtype=SAMPLE))
+        self.give_block(np.array([(*row[:4], row[3], row[3], row[4]) for row in padded], dtype=SAMPLE))
 
     def give_block(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS) -> None:
         """Add a block of samples with their cell voltages."""

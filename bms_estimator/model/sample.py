@@ -15,7 +15,9 @@ SAMPLE = np.dtype(
         ("time_s", "f8"),  # time on the source's clock; it decreases only after a fault
         ("current_a", "f8"),  # positive on discharge
         ("voltage_v", "f8"),  # voltage at the pack's terminals
-        ("temperature_c", "f8"),  # NaN without a sensor
+        ("temperature_c", "f8"),  # mean of the credible probes; NaN without a sensor
+        ("temperature_min_c", "f8"),  # lowest credible probe; with one probe equal to temperature_c
+        ("temperature_max_c", "f8"),  # highest credible probe
         ("status", "u4"),  # bits of SampleStatus
     ],
     align=True,
@@ -33,6 +35,15 @@ CellBlock = NDArray[np.float64]
 
 NO_CELLS: CellBlock = np.empty((0, 0))
 """Empty ``CellBlock``, used for blocks of any length without cell voltages."""
+
+PROBE = np.dtype([("temperature_c", "f8"), ("faulty", "?")])
+"""Reading of a temperature probe [C], NaN if absent, and whether the probe is faulty."""
+
+ProbeBlock = NDArray[np.void]
+"""Shape (n, m), dtype ``PROBE``: m temperature probes for each of a block's n samples."""
+
+NO_PROBES: ProbeBlock = np.empty((0, 0), dtype=PROBE)
+"""Empty ``ProbeBlock``, used for blocks of any length without a list of probes."""
 
 MIN_C = -60.0
 """Lowest plausible temperature of a pack or stack [C]."""
@@ -58,6 +69,8 @@ class SampleStatus(IntFlag):
     """The current repeats an earlier measurement. Voltage and temperature are new."""
     WRONG_CLOCK = 128
     """The time is the arrival time, because the device's clock runs at a wrong rate."""
+    PROBE_FAULT = 256
+    """A temperature probe is faulty."""
 
 
 def remove_implausible(values: NDArray[np.float64], low: float, high: float) -> int:

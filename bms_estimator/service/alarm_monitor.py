@@ -22,6 +22,7 @@ from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST, AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.probe_faults import ProbeFaults
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.impossible import PackBounds
@@ -91,6 +92,7 @@ class AlarmMonitor:
         # arrival of the last sample, accepted or not, on the monotonic clock and on the wall clock [s]
         self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
+        self._probe_faults = ProbeFaults()
 
     def add(
         self,
@@ -113,6 +115,7 @@ class AlarmMonitor:
             True if an alarm has changed.
         """
         self.alarms.add(received.samples, trace, received.cells_v, forecasts, cells_fault)
+        self._probe_faults.add(received.samples, received.probes)
         self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
         is_due = now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS
         return is_due and self.evaluate(now_s)
@@ -130,7 +133,9 @@ class AlarmMonitor:
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
-        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts, self._source.clock_fault)
+        self.alarms.evaluate(
+            self._arrival_s, self._counts(), suspects, texts, self._source.clock_fault, self._probe_faults.take()
+        )
         self.alarms.evaluate_weak_cell(self._weakest_cell().deviation_std, self._arrival_s)
         cells = self._cells.deviations if self._cells else None
         if cells is not None and cells is not self._cells_seen:

@@ -173,7 +173,7 @@ class Publisher:
             self._latency.add(self._source_health().block_age_s)
         now_s = self._clock.monotonic()
         if trace.size:
-            self._window.add(trace, self._clock.wall(), received.cells_v)
+            self._window.add(trace, self._clock.wall(), received.cells_v, received.probes)
             self._sample_s = now_s
         if trace.size < received.samples.size:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""

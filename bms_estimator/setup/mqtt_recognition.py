@@ -15,8 +15,8 @@ from bms_estimator.sources.mqtt.payload_value import InvalidValueError, read_cel
 
 MAX_PUBLISHERS = 1000
 """Maximum number of publishers that are stored. Messages of further publishers are ignored."""
-_PLACEHOLDER = re.compile(r"\{(prefix|instance|cell)\}")
-_PATTERNS = {"prefix": ".+", "instance": "[^/]*", "cell": "[0-9]{1,3}"}
+_PLACEHOLDER = re.compile(r"\{(prefix|instance|cell|probe)\}")
+_PATTERNS = {"prefix": ".+", "instance": "[^/]*", "cell": "[0-9]{1,3}", "probe": "[0-9]{1,3}"}
 """Pattern of the text that replaces a placeholder of a topic."""
 
 
@@ -91,9 +91,11 @@ def _iter_templates() -> Iterator[_Template]:
         for quantity in ("voltage", "current", "temperature", "cells"):
             if quantity not in profile.table:
                 continue
-            location = ValueLocation.model_validate(profile.table[quantity])
-            for topic in location.topics:
-                yield _Template(name, quantity, location, _topic_pattern(topic))
+            tables = profile.table[quantity]
+            for table in tables if isinstance(tables, list) else [tables]:
+                location = ValueLocation.model_validate(table)
+                for topic in location.topics:
+                    yield _Template(name, quantity, location, _topic_pattern(topic))
 
 
 def _topic_pattern(topic: str) -> re.Pattern[str]:

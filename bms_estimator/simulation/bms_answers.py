@@ -13,7 +13,7 @@ ADDRESS = 1
 """Address of the simulated Daly and of the newer JK."""
 JBD_SOFTWARE, JBD_SWITCHES_ON = 0x20, 0b11
 """Software version 2.0; bits of the charge and the discharge switch, both on."""
-JK_SWITCHES_C, JK_SOC, JK_PROBES, JK_CELL_COUNT, JK_CAPACITY = 0x80, 0x85, 0x86, 0x8A, 0xAA
+JK_SWITCHES_C, JK_PROBES, JK_CELL_COUNT = 0x80, 0x86, 0x8A
 """Registers of an older JK that the decoder does not use. The first is the temperature of the switches."""
 JK_OLD_MIN_C, JK_OLD_MAX_C = -39, 100
 """Range of a temperature of an older JK [degC]. The value for -40 means an absent probe."""
@@ -113,8 +113,8 @@ def _jk_old(measured: Measured) -> bytes:
         + cells
         + struct.pack(">BHBHBH", JK_SWITCHES_C, probe_word, jk.BOX_C, probe_word, jk.BATTERY_C, probe_word)
         + struct.pack(">BHBH", jk.VOLTAGE, _to_u16(measured.voltage_v, 100), jk.CURRENT, current_word)
-        + struct.pack(">BBBB", JK_SOC, _to_steps(measured.soc, 100, 0, 100), JK_PROBES, 2)
-        + struct.pack(">BHBI", JK_CELL_COUNT, len(measured.cells_v), JK_CAPACITY, round(measured.capacity_ah))
+        + struct.pack(">BBBB", jk.SOC, _to_steps(measured.soc, 100, 0, 100), JK_PROBES, 2)
+        + struct.pack(">BHBI", JK_CELL_COUNT, len(measured.cells_v), jk.CAPACITY, round(measured.capacity_ah))
         + bytes((jk.SOFTWARE,))
         + NAME.ljust(15, b"_")
         + bytes((jk.VERSION, 1))
@@ -129,7 +129,7 @@ def _jk_old(measured: Measured) -> bytes:
 def _jk_newer(measured: Measured) -> bytes:
     frame = bytearray(jk.FRAME_BYTES)
     # offsets of a real-time frame: cell voltages 6, bits of the present cells 70, voltage 150, current 158,
-    # two temperatures 162, SOC 173
+    # two temperatures 162, SOC 173. The bits of further probes, at 214, are 0
     frame[:5] = jk.START + bytes((jk.REALTIME,))
     struct.pack_into(f"<{len(measured.cells_v)}H", frame, 6, *(_to_u16(v, 1000) for v in measured.cells_v))
     struct.pack_into("<I", frame, 70, (1 << len(measured.cells_v)) - 1)

@@ -173,7 +173,7 @@ class LineSource:
                 self._block_arrival_s = chunk[0]
                 self._silence_reason, self._retry_s = None, self._first_retry_s
                 self._silence_log.on_samples(self._last_sample_s)
-                yield ReceivedSamples(block, self._decoder.cells)
+                yield ReceivedSamples(block, self._decoder.cells, self._decoder.probes)
         if self._produce_task is not None and not self._produce_task.cancelled():
             self._produce_task.result()
 

@@ -3,7 +3,7 @@
 from collections.abc import AsyncIterator, Mapping
 from typing import NamedTuple, Protocol, Self
 
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.sample import NO_PROBES, CellBlock, ProbeBlock, SampleBlock
 
 Chunk = tuple[float, bytes]
 """Arrival time [s since 1970] and bytes of one read."""
@@ -32,12 +32,14 @@ class ReadTap(Protocol):
 
 
 class ReceivedSamples(NamedTuple):
-    """Block of samples and the cell voltages that were measured with it."""
+    """Block of samples, and the cell voltages and temperature probes that were measured with it."""
 
     samples: SampleBlock
     """Samples, shape (n,), dtype SAMPLE."""
     cells_v: CellBlock
     """Cell voltages of the samples, shape (n, m) [V]; ``NO_CELLS`` if none are measured."""
+    probes: ProbeBlock = NO_PROBES
+    """Temperature probes of the samples, shape (n, m); ``NO_PROBES`` without a list of them."""
 
 
 class Source(Protocol):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.accumulators.publish_window import WINDOW_SUMS, accumulate_window
-from bms_estimator.model.sample import NO_CELLS, CellBlock
+from bms_estimator.model.sample import NO_CELLS, NO_PROBES, CellBlock, ProbeBlock
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class WindowSummary:
         last: Last row, dtype TRACE.
         soc_known: True if the SOC is known at the last row.
         cells_v: Last cell voltages [V], shape (m,), NaN if not reported; m is 0 without cell voltages.
+        probes: Last temperature probes, shape (m,), dtype PROBE; m is 0 without a list of them.
     """
 
     arrival_s: float
@@ -38,6 +39,7 @@ class WindowSummary:
     last: np.void
     soc_known: bool
     cells_v: NDArray[np.float64]
+    probes: ProbeBlock
 
 
 class Window:
@@ -57,18 +59,23 @@ class Window:
         self._sums.fill(0)
         self._last: np.void | None = None
         self._arrival_s = math.nan
-        self._cells = NO_CELLS
+        self._cells, self._probes = NO_CELLS, NO_PROBES
 
-    def add(self, trace: TraceBlock, arrival_s: float, cells: CellBlock = NO_CELLS) -> None:
+    def add(
+        self, trace: TraceBlock, arrival_s: float, cells: CellBlock = NO_CELLS, probes: ProbeBlock = NO_PROBES
+    ) -> None:
         """Add the trace of one block.
 
         Args:
             trace: Accepted samples, shape (n,), dtype TRACE; n may be 0.
             arrival_s: Wall clock at the arrival of the block [s since 1970].
             cells: Cell voltages of the block.
+            probes: Temperature probes of the block.
         """
         if cells.size:
             self._cells = cells[-1:]
+        if probes.size:
+            self._probes = probes[-1:]
         if trace.size:
             self.soc_known = accumulate_window(self._sums, trace, self.soc_known)
             # numpy copies a record field by field, which takes longer than the sums
@@ -95,6 +102,7 @@ class Window:
             last=self._last,
             soc_known=self.soc_known,
             cells_v=self._cells.ravel(),
+            probes=self._probes.ravel(),
         )
         self.previous_end_s = last_s
         self._clear()

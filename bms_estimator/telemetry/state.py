@@ -16,6 +16,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.info import Info
 from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
+from bms_estimator.model.sample import ProbeBlock
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import forecast_fields
@@ -79,6 +80,7 @@ def make_state_payload(
         current_a=window.current_a,
         power_w=window.power_w,
         temperature_c=finite(window.temperature_c),
+        **_probes(window.probes),
         **_cells(window.cells_v),
         **{name: last[name] for name in COPIED},
         soc_percent=None if soc is None else 100.0 * soc,
@@ -112,6 +114,16 @@ def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
         "cell_lowest": lowest + 1,
         "cell_highest": highest + 1,
         "cells_v": [finite(volts) for volts in cells_v],
+    }
+
+
+def _probes(probes: ProbeBlock) -> dict[str, Any]:
+    """Return the fields of several temperature probes, shape (m,)."""
+    if probes.size < 2:
+        return {"temperatures_c": None, "faulty_probes": None}
+    return {
+        "temperatures_c": [finite(reading_c) for reading_c in probes["temperature_c"]],
+        "faulty_probes": (np.flatnonzero(probes["faulty"]) + 1).tolist(),
     }
 
 

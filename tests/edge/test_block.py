@@ -10,8 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bms_estimator.edge.block import MAX_SAMPLES, Block, BlockError, decode, encode
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.edge.block import (
+    EXTREMES,
+    MAX_PROBE_SAMPLES,
+    MAX_SAMPLES,
+    Block,
+    BlockError,
+    decode,
+    encode,
+    peek_cells,
+    peek_probes,
+)
+from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 
 
 def samples(count: int = 60) -> SampleBlock:
@@ -31,13 +42,41 @@ HEADER_BYTES = 40
     hnp.arrays(
         SAMPLE,
         st.integers(1, 20),
-        elements=st.tuples(*(st.floats(width=64) for _ in range(4)), st.integers(0, 2**32 - 1)),
+        elements=st.tuples(*(st.floats(width=64) for _ in range(6)), st.integers(0, 2**32 - 1)),
     )
 )
 def test_decoded_samples_equal_the_encoded_ones_bit_for_bit(rows: SampleBlock) -> None:
     decoded = decode(encode(Block(store_created_ns=1, number=1, oldest=1, arrival_s=0.0, samples=rows))).samples
+    has_several_probes = bool((rows["temperature_min_c"] < rows["temperature_max_c"]).any())
     for name in SAMPLE.names or ():
-        assert decoded[name].tobytes() == rows[name].tobytes()
+        is_copy = name in EXTREMES and not has_several_probes
+        assert decoded[name].tobytes() == rows["temperature_c" if is_copy else name].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("lowest_c", "count", "cells", "version"),
+    [(25.0, 60, 0, 1), (25.0, 60, 4, 2), (20.0, 60, 0, 3), (20.0, 60, 4, 3), (20.0, MAX_PROBE_SAMPLES + 1, 0, 1)],
+)
+def test_a_block_has_the_lowest_version_that_can_hold_it(lowest_c: float, count: int, cells: int, version: int) -> None:
+    rows = samples(count)
+    rows["temperature_c"] = rows["temperature_max_c"] = 25.0
+    rows["temperature_min_c"] = lowest_c
+    cells_v = np.full((count, cells), 3.3)
+    data = encode(Block(store_created_ns=1, number=1, oldest=1, arrival_s=0.0, samples=rows, cells_v=cells_v))
+    assert (data[4], peek_cells(data), peek_probes(data)) == (version, cells, version == 3)
+    decoded = decode(data)
+    expected_c = lowest_c if version == 3 else 25.0
+    assert decoded.samples[list(EXTREMES)].tolist() == [(expected_c, 25.0)] * count
+    assert decoded.cells_v.tolist() == (cells_v if cells else NO_CELLS).tolist()
+
+
+def test_incompressible_samples_of_version_3_stay_below_the_servers_limit() -> None:
+    rows = np.frombuffer(np.random.default_rng(1).bytes(MAX_PROBE_SAMPLES * SAMPLE.itemsize), SAMPLE).copy()
+    rows["temperature_min_c"], rows["temperature_max_c"] = np.sort(rows[list(EXTREMES)].tolist()).T
+    cells_v = np.random.default_rng(1).uniform(3.0, 4.0, (rows.size, 16))
+    data = encode(Block(store_created_ns=1, number=1, oldest=1, arrival_s=0.0, samples=rows, cells_v=cells_v))
+    assert data[4] == 3
+    assert len(data) <= MAX_BLOCK_BYTES
 
 
 def test_header_is_decoded_as_it_was_encoded() -> None:
@@ -106,6 +145,6 @@ def test_implausible_header_is_rejected(store: int, number: int, oldest: int, ar
 
 def test_block_of_a_later_version_is_rejected() -> None:
     data = bytearray(encode(BLOCK))
-    data[4] = 3  # version, after the magic bytes
-    with pytest.raises(BlockError, match="version 3; this program reads versions 1 to 2: upgrade workers before edges"):
+    data[4] = 4  # version, after the magic bytes
+    with pytest.raises(BlockError, match="version 4; this program reads versions 1 to 3: upgrade workers before edges"):
         decode(bytes(data))

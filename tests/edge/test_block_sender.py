@@ -64,7 +64,9 @@ class SimulatedEdge:
         for _ in range(round(60 * minutes)):
             sample = np.zeros(1, dtype=SAMPLE)
             sample["time_s"], sample["voltage_v"] = self.now_s, 3.0 + 1e-6 * self._count
-            sample["current_a"], sample["temperature_c"] = self._random.normal(), np.nan
+            sample["current_a"] = self._random.normal()
+            for name in ("temperature_c", "temperature_min_c", "temperature_max_c"):
+                sample[name] = np.nan
             self.edge.take(sample, cells_v)
             sample["time_s"] += WALL_S
             self._sent.append(sample)

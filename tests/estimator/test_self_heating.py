@@ -24,7 +24,7 @@ def temperature_rise_k(samples, cell=None):
     """
     estimator = Estimator(cell or load_cell("nmc", 5.0), initial_soc=1.0)
     rise_k = np.zeros(samples.size)
-    for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):
+    for n, (time_s, current_a, voltage_v, temperature_c, *_, status) in enumerate(samples.tolist()):
         estimator.step(time_s, current_a, voltage_v, status, temperature_c)
         rise_k[n] = used_temperature_c(estimator) - REFERENCE_C
     return rise_k

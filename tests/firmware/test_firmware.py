@@ -365,7 +365,7 @@ async def test_serial_source_sets_the_rate_and_reads_the_samples(tmp_path: Path)
     with SimavrBoard(readings) as simulated:
         settings = SensorSettings(port=simulated.path, sample_rate_hz=250)
         async with SerialSource(settings, first_retry_s=0.05) as board:
-            async for block, _ in board:
+            async for block, *_ in board:
                 assert block["voltage_v"] == pytest.approx(22.2, abs=0.03)
                 assert block["current_a"] == pytest.approx(2.5, abs=0.06)
                 if len(block) and board.board.get("sample_rate_hz") == "250":

@@ -65,7 +65,8 @@ def samples(pack: str, number: int) -> np.ndarray:
     rows["time_s"] = time_s
     rows["current_a"] = np.where(np.sin(time_s / (200.0 + int(pack[1:]))) > 0.0, 1.5, 0.25)
     rows["voltage_v"] = 3.9 - 0.06 * rows["current_a"] - 5e-6 * time_s
-    rows["temperature_c"] = 25.0
+    for name in ("temperature_c", "temperature_min_c", "temperature_max_c"):
+        rows[name] = 25.0
     return rows
 
 

@@ -83,7 +83,7 @@ JK_RECORD_OF_PACK_2 = bytes.fromhex("0210162000010478")
 """Record that follows the newer frame on RS485: eggcho/jk-bms-passive-bridge, README."""
 
 JK_NEWER = PublishedCycle(
-    "jk", JK_NEWER_FRAME + JK_RECORD_OF_PACK_2, 51.689, 0.0, 17.7,
+    "jk", JK_NEWER_FRAME + JK_RECORD_OF_PACK_2, 51.689, 0.0, 17.825,
     [3.246, 3.230, 3.226, 3.231, 3.233, 3.231, 3.232, 3.232, 3.225, 3.232, 3.216, 3.225, 3.237, 3.231, 3.225, 3.242],
     "JK-BMS, 16 cells, pack 2",
 )  # fmt: skip

@@ -155,7 +155,7 @@ async def test_the_next_broker_is_tried_and_the_unreachable_one_is_named(broker:
     assert source
     with capture_logs() as lines:
         async with asyncio.timeout(LONG_S), source, publishing(broker, "53.00", "-12.5"):
-            async for block, _ in source:
+            async for block, *_ in source:
                 assert block["voltage_v"][0] == 53.0
                 break
     reasons = [line["reason"] for line in lines if line["event"] == "no samples"]

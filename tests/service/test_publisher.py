@@ -48,7 +48,7 @@ def test_a_raised_alarm_is_published_before_the_next_snapshot_is_due() -> None:
     clock = Clock(monotonic=lambda: now_s)
     publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock)
     for now_s, voltage_v in ((0.0, 3.8), (1.0, 3.8), (2.0, 6.0), (3.0, 6.0)):
-        block = np.array([(now_s, 0.0, voltage_v, 25.0, 0)], dtype=SAMPLE)
+        block = np.array([(now_s, 0.0, voltage_v, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
         publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
     raised_alarms = [[alarm.name for alarm in each.alarms if alarm.active] for each in sink.snapshots]
     assert raised_alarms == [[], ["pack_over_voltage"]]
@@ -64,7 +64,7 @@ def test_an_estimate_that_is_due_is_published_before_the_alarm_of_the_same_sampl
     clock = Clock(monotonic=lambda: now_s)
     publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock)
     for now_s, voltage_v in ((0.0, 3.8), (1.0, 4.05)):
-        block = np.array([(now_s, 0.0, voltage_v, 25.0, 0)], dtype=SAMPLE)
+        block = np.array([(now_s, 0.0, voltage_v, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
         publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
     assert [
         (each.estimate and each.estimate.voltage_v, any(alarm.active for alarm in each.alarms))
@@ -82,7 +82,7 @@ def test_the_curves_of_a_forecast_are_published_once_a_minute() -> None:
         settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock, forecaster=forecaster
     )
     for now_s in np.arange(0.0, 181.0, 10.0):
-        block = np.array([(now_s, 0.1, 3.8, 25.0, 0)], dtype=SAMPLE)
+        block = np.array([(now_s, 0.1, 3.8, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
         publisher.add(ReceivedSamples(block, NO_CELLS), forecaster.run(block))
     reports = [each.forecast for each in sink.snapshots if each.forecast]
     assert len({id(report) for report in reports}) == 4  # at 0, 60, 120 and 180 s
@@ -94,7 +94,7 @@ def test_a_pack_without_the_identifier_has_no_forecast_and_a_reason() -> None:
     settings, estimator = Settings(), Estimator(cell, identifier=None, initial_soc=0.5)
     assert new_forecaster(settings, cell, estimator, None) is None
     publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=Clock())
-    block = np.array([(0.0, 0.1, 3.8, 25.0, 0)], dtype=SAMPLE)
+    block = np.array([(0.0, 0.1, 3.8, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
     publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
     [snapshot] = sink.snapshots
     assert snapshot.estimate

@@ -29,7 +29,7 @@ async def test_the_mqtt_source_receives_current_with_its_sign_voltage_temperatur
     async with asyncio.timeout(LONG_S), Listener(broker, "bms7/status") as listener, source:
         node_task = asyncio.create_task(node.run(1e9))  # longer than the test
         received_samples = 0
-        async for block, cells_v in source:
+        async for block, cells_v, *_ in source:
             assert (block["voltage_v"] == 53.0).all()
             assert (block["current_a"] == 12.5).all()
             assert cells_v.shape == (block.size, 16)

@@ -58,7 +58,7 @@ class SampleRecord:
         return sum(block.size for block in self.blocks)
 
     async def collect(self, source: SerialSource) -> None:
-        async for block, cells_v in source:
+        async for block, cells_v, *_ in source:
             self.blocks.append(block.copy())
             self.cells += cells_v.tolist()
 

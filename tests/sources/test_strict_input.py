@@ -53,7 +53,7 @@ async def test_missing_and_implausible_temperatures_of_a_table_are_nan(tmp_path:
     third_word = "nan" if word == "1e999" else word  # 1e999 is no number and would be an error
     path.write_text(f"{CSV_HEADER}0,1,3.7,1e308\n1,1,3.7,-61\n2,1,3.7,{third_word}\n3,1,3.7,25\n")
     replay = Replay(open_capture(path))
-    blocks = [block async for block, _ in replay]
+    blocks = [block async for block, *_ in replay]
     assert np.concatenate(blocks)["temperature_c"].tolist() == pytest.approx(
         [math.nan, math.nan, math.nan, 25], nan_ok=True
     )

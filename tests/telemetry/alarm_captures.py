@@ -42,13 +42,18 @@ class Line(NamedTuple):
     current_a: float = 0.0
     temperature_c: float | None = 25.0
     cells_v: tuple[float, ...] = ()
+    temperatures_c: tuple[float, ...] = ()
+    """Temperatures of several probes, in place of ``temperature_c``."""
     silent: bool = False
     """True: the board prints nothing."""
 
     def text(self) -> bytes:
         """Return the printed line."""
         reading: dict[str, Any] = {"voltage": self.voltage_v, "current": self.current_a}
-        reading |= {} if self.temperature_c is None else {"temperature": self.temperature_c}
+        if self.temperatures_c:
+            reading["temperatures_c"] = self.temperatures_c
+        elif self.temperature_c is not None:
+            reading["temperature"] = self.temperature_c
         reading |= {"cells": self.cells_v} if self.cells_v else {}
         return json.dumps(reading).encode() + b"\n"
 

@@ -25,6 +25,7 @@ from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.state import AlarmState
+from bms_estimator.telemetry.alarms.values import measured_values
 from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
 from tests.telemetry.alarm_captures import PACK, WALL_S, Line, ReplayResult, knee_lines, record, replayed, settings
 
@@ -91,6 +92,48 @@ raising contains the delay of the alarm.
 """
 LIMITED = load_cell("ncr18650", 10.0).pack(2, 2)
 """Pack whose model is unstable below an SOC of 0.9 %, so that its stability margin applies. That of ``PACK`` does not."""
+
+
+async def test_one_hot_probe_of_four_raises_the_alarm_and_is_named(tmp_path: Path) -> None:
+    rise = [Line(1, temperatures_c=(25.0, 25.0 + 8.0 * n, 25.0, 25.0)) for n in range(10)]
+    lines = [
+        *rise,
+        Line(20, temperatures_c=(25.0, 97.0, 25.0, 25.0)),
+        Line(70, temperatures_c=(25.0, 50.0, 25.0, 25.0)),
+    ]
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert result.transitions("over_temperature") == [(15.0, True), (90.0, False)]  # above 60 degC from 5 s to 30 s
+    texts = [
+        change.alarm.text for change in result.changes if change.alarm.name == "sensor_fault" and change.alarm.active
+    ]
+    assert len(texts) == 1
+    assert "probe 2 reads 57 °C: a temperature probe is broken" in texts[0]
+    last = [snapshot.estimate for snapshot in result.snapshots if snapshot.estimate][-1]
+    assert (last.temperatures_c, last.faulty_probes) == ([25.0, 50.0, 25.0, 25.0], [])
+
+
+@pytest.mark.parametrize("others_c", [(), (5.0,), (25.0, 26.0, 25.0)])
+async def test_an_open_probe_raises_no_freezing_alarm_but_is_named(others_c: tuple[float, ...], tmp_path: Path) -> None:
+    lines = [Line(20, current_a=-2.0, temperatures_c=(*others_c, 25.0))] if others_c else []
+    lines += [Line(60, current_a=-2.0, temperatures_c=(*others_c, -30.0))]
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert result.transitions("charging_below_freezing") == result.transitions("under_temperature") == []
+    (text,) = [change.alarm.text for change in result.changes if change.alarm.name == "sensor_fault"]
+    assert f"probe {len(others_c) + 1} reads -30 °C" in text
+
+
+async def test_the_coldest_probe_raises_the_freezing_alarm(tmp_path: Path) -> None:
+    lines = [Line(40, current_a=-2.0, temperatures_c=(12.0, -3.0, 10.0))]
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert result.transitions("charging_below_freezing") == [(10.0, True)]
+    assert result.transitions("sensor_fault") == []
+
+
+def test_samples_with_only_a_mean_temperature_are_judged_by_it() -> None:
+    samples = np.zeros(2, dtype=SAMPLE)
+    samples["temperature_c"] = 70.0, -5.0
+    values = measured_values(samples, np.full((2, 3), NAN), charging_a=0.1)
+    assert values["over_temperature"].tolist() == values["under_temperature"].tolist() == [70.0, -5.0]
 
 
 def test_each_alarm_has_a_capture() -> None:

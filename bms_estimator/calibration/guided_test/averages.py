@@ -20,7 +20,7 @@ class Average:
         time_s: Time of the last sample [s].
         current_a: Mean current, positive on discharge [A].
         voltage_v: Mean voltage [V].
-        temperature_c: Mean temperature [°C]; NaN without a sensor.
+        temperature_c: Mean temperature of the hottest probe [°C]; NaN without a sensor.
         min_cell_v: Voltage of the lowest cell [V]; NaN if unknown.
         max_cell_v: Voltage of the highest cell [V]; NaN if unknown.
     """
@@ -83,13 +83,13 @@ class Averager:
         rows = np.concatenate(self._pending)
         cells_v = np.concatenate([block.ravel() for block in self._cells])
         cells_v = cells_v[np.isfinite(cells_v)]
-        temperature_c = rows["temperature_c"][np.isfinite(rows["temperature_c"])]
+        hottest_c = np.fmax(rows["temperature_c"], rows["temperature_max_c"])[np.isfinite(rows["temperature_c"])]
         self._pending, self._cells, self._begin_s = [], [], float(rows["time_s"][-1])
         return Average(
             time_s=float(rows["time_s"][-1]),
             current_a=float(rows["current_a"].mean()),
             voltage_v=float(rows["voltage_v"].mean()),
-            temperature_c=float(temperature_c.mean()) if temperature_c.size else math.nan,
+            temperature_c=float(hottest_c.mean()) if hottest_c.size else math.nan,
             min_cell_v=float(cells_v.min()) if cells_v.size else math.nan,
             max_cell_v=float(cells_v.max()) if cells_v.size else math.nan,
         )

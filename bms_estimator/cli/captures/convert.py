@@ -97,17 +97,18 @@ def _columns_with_values(capture: Capture) -> tuple[list[str], int]:
 
     A file with a status needs all columns, because captures with fewer have no status.
     """
-    *columns, temperature, _ = SAMPLE.names or ()
-    has_temperature = has_status = False
+    *columns, temperature, lowest, highest, status = SAMPLE.names or ()
+    has_temperature = has_probes = has_status = False
     cells = 0
     for block in capture:
         has_status |= bool(block["status"].any())
         has_temperature |= bool(np.isfinite(block["temperature_c"]).any())
+        has_probes |= bool((block[lowest] < block[highest]).any())
         if np.isfinite(capture.cells).any():
             cells = max(cells, capture.cells.shape[1])
-    if has_status:
-        return [*(SAMPLE.names or ())], cells
-    return ([*columns, temperature] if has_temperature else columns), cells
+    if has_temperature or has_status:
+        columns.append(temperature)
+    return columns + [lowest, highest] * has_probes + [status] * has_status, cells
 
 
 def _bdf_blocks(reopen: Callable[[], Capture], progress: Progress) -> Iterator[NDArray[np.void]]:

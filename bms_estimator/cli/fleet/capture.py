@@ -73,7 +73,9 @@ def capture(
     rows = 0
     with sink:
         for samples, cells_v in fetched.samples_with_cells():
-            sink.write(join_columns(samples, cell_voltage_columns(cells_v, samples.size, fetched.cells)))
+            sink.write(
+                join_columns(samples[fetched.columns], cell_voltage_columns(cells_v, samples.size, fetched.cells))
+            )
             rows += samples.size
     first_s, last_s = fetched.span_s
     typer.echo(

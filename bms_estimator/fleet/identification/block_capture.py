@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from nats.aio.client import Client
 
-from bms_estimator.edge.block import Block, BlockError, decode, peek_cells
+from bms_estimator.edge.block import EXTREMES, Block, BlockError, decode, peek_cells, peek_probes
 from bms_estimator.edge.subjects import RAW_STREAM
 from bms_estimator.fleet.nats.stream_reader import read_stream
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
 
 AHEAD_S = 3600.0
 """Maximum lead of an edge's clock over the server's clock [s]. A block may be stored this long before the time of its
@@ -87,6 +87,12 @@ class BlockCapture:
         """Number of cells of the newest block with cell voltages; 0 without any."""
         counts = (peek_cells(self._blocks[key]) for key in sorted(self._blocks, reverse=True))
         return next(filter(None, counts), 0)
+
+    @property
+    def columns(self) -> list[str]:
+        """Fields of the samples, without the extremes of the temperature probes if no block has them."""
+        has_probes = any(map(peek_probes, self._blocks.values()))
+        return [name for name in SAMPLE.names or () if has_probes or name not in EXTREMES]
 
     def samples(self) -> Iterator[SampleBlock]:
         """Yield all samples; ``samples_with_cells`` describes their times."""

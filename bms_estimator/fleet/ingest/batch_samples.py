@@ -15,9 +15,7 @@ from bms_estimator.fleet.worker.edge_clock import MAX_AHEAD_S
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import (
-    MAX_C,
     MAX_CELL_V,
-    MIN_C,
     MIN_CELL_V,
     NO_CELLS,
     CellBlock,
@@ -36,7 +34,11 @@ from bms_estimator.sources.captures.tables.layout import (
     Role,
     with_time_kind,
 )
-from bms_estimator.sources.captures.tables.table_reader import cell_voltages, to_samples
+from bms_estimator.sources.captures.tables.table_reader import (
+    cell_voltages,
+    remove_implausible_temperatures,
+    to_samples,
+)
 from bms_estimator.sources.captures.tables.units import Unit, find_unit, split_unit
 
 MIN_TIME_S = 946_684_800.0
@@ -109,7 +111,7 @@ class BatchReader:
         samples = to_samples(raw, layout)
         if self._sign_of(layout) == "charge_positive":
             samples["current_a"] *= -1.0
-        remove_implausible(samples["temperature_c"], MIN_C, MAX_C)
+        remove_implausible_temperatures(samples)
         return BatchSamples(samples, cells_v)
 
     def used_columns(self, names: Sequence[str]) -> list[Column]:

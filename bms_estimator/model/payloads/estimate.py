@@ -30,6 +30,12 @@ class Estimate(Payload):
     temperature_c: Annotated[float | None, Quantity(Entity(None, "°C", 1, 0.3, "temperature", is_primary=True))] = (
         Field(description="mean temperature [C]; null without a sensor")
     )
+    temperatures_c: list[float | None] | None = Field(
+        description="readings of all temperature probes at the last sample [C]; null for an absent probe, or with a single one"
+    )
+    faulty_probes: list[int] | None = Field(
+        description="numbers of the faulty temperature probes at the last sample, from 1; null with a single one"
+    )
     cell_lowest_v: Annotated[
         float | None, Quantity(Entity("Lowest cell, voltage", "V", 3, 0.005, "voltage"), packs="with cell voltages")
     ] = Field(description="lowest cell voltage at the last sample [V]; null without cell voltages")

@@ -27,6 +27,7 @@ export function drawState(state) {
 	for (const part of parts) hide(part, !f.isNumber(part.dataset.of === "time_left" ? time : s[part.dataset.of]));
 	put("soc_std", f.percent(f.isNumber(s.soc_std) ? 2 * s.soc_std : null));
 	put("weakest_cell_soc_std", f.percent(f.isNumber(s.weakest_cell_soc_std) ? 2 * s.weakest_cell_soc_std : null));
+	put("temperatures_c", s.temperatures_c?.map((c, i) => (f.fixed(c, 1) || "–") + (s.faulty_probes.includes(i + 1) ? " faulty" : "")).join(", ") ?? "");
 	put("time_left", left);
 	put("time_left_label", label);
 	put("time_left_band", band);

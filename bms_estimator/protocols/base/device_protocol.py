@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, NO_PROBES, SAMPLE, CellBlock, ProbeBlock, SampleBlock
+from bms_estimator.protocols.base.probe_check import probe_block
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.base.sensor_correction import EXACT, SensorCorrection
 
@@ -31,6 +32,8 @@ class DeviceProtocol(ABC):
 
     cells: CellBlock = NO_CELLS
     """Cell voltages of the samples that ``feed`` or ``feed_reads`` returned last [V]."""
+    probes: ProbeBlock = NO_PROBES
+    """Temperature probes of the same samples; empty if the device has a single one that is never faulty."""
     probing: bool = False
     """True while the device is unknown. Then ``next_output`` returns only queries that change nothing in any device."""
     correction: SensorCorrection = EXACT
@@ -109,12 +112,14 @@ class DeviceProtocol(ABC):
     ) -> SampleBlock:
         """Decode many reads at once to samples as measured."""
         blocks, cells = [np.empty(0, dtype=SAMPLE)], list[Sequence[float]]()
+        probes = list[Sequence[tuple[float, bool]]]()
         begin = 0
         for arrival_s, end in zip(arrivals_s.tolist(), ends.tolist(), strict=True):
             blocks.append(self._decode(arrival_s, data[begin:end].tobytes()))
             cells += self.cells.tolist() or [()] * blocks[-1].size
+            probes += self.probes.tolist() or [()] * blocks[-1].size
             begin = end
-        self.cells = cell_block(cells)
+        self.cells, self.probes = cell_block(cells), probe_block(probes)
         return np.concatenate(blocks)
 
     def serial_number_in(self, data: bytes) -> str | None:  # noqa: ARG002 - for subclasses

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from enum import Enum
 
-from bms_estimator.model.sample import MAX_C, MIN_C, CurrentSign
+from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 
@@ -181,12 +181,3 @@ class PolledProtocol(ReadingProtocol):
             "other_packs", f"pack {address} responds, but pack {self._address} is selected: see sensor.address"
         )
         return True
-
-    def _mean_temperature_c(self, probes_c: Sequence[float]) -> float:
-        """Return the mean temperature of the probes [C].
-
-        Absent or broken probes report values outside of the plausible range and are omitted.
-        """
-        valid_c = [probe_c for probe_c in probes_c if MIN_C <= probe_c <= MAX_C]
-        self._counts["implausible"] += len(probes_c) - len(valid_c)
-        return sum(valid_c) / len(valid_c) if valid_c else math.nan

@@ -19,7 +19,8 @@ class Reading(NamedTuple):
     voltage_v: float
     current_a: float
     """Current with the device's sign [A]."""
-    temperature_c: float = nan
+    temperatures_c: tuple[float, ...] = ()
+    """Temperatures of all probes, always in the same order; NaN: absent or not reported [C]."""
     cells_v: tuple[float, ...] = ()
     time_s: float = nan
     """Timestamp by the device's clock, with any origin [s]; NaN: not reported."""
@@ -27,6 +28,12 @@ class Reading(NamedTuple):
     """True if the voltage repeats an earlier reading, and only the other values are new."""
     current_held: bool = False
     """True if the current repeats an earlier reading, and only the other values are new."""
+    soc: float = nan
+    """State of charge by the device, 0..1; NaN: not reported."""
+    remaining_ah: float = nan
+    """Remaining charge by the device [Ah]; NaN: not reported."""
+    capacity_ah: float = nan
+    """Capacity from which the device computes its SOC [Ah]; NaN: not reported."""
 
 
 VOLTAGE_HELD, CURRENT_HELD = "voltage_held", "current_held"
@@ -36,6 +43,7 @@ _UNITS: Mapping[str, Mapping[str, float]] = {
     "voltage_v": _VOLT,
     "current_a": {"": 1.0, "a": 1.0, "amp": 1.0, "amps": 1.0, "ma": 1e-3},
     "temperature_c": {"": 1.0, "c": 1.0, "degc": 1.0},
+    "temperatures_c": {"": 1.0, "c": 1.0, "degc": 1.0},
     "time_s": {"s": 1.0},
     VOLTAGE_HELD: {"": 1.0},  # 1: held, 0: measured
     CURRENT_HELD: {"": 1.0},
@@ -45,6 +53,7 @@ _NAMES = {
     "voltage_v": ("V", "v", "U", "u", "volt", "volts", "voltage", "vbat", "vbatt", "bus_voltage", "pack_voltage"),
     "current_a": ("I", "i", "A", "amp", "amps", "current", "ibat", "ibatt"),
     "temperature_c": ("T", "temp", "temperature"),  # t may be the time
+    "temperatures_c": ("temperatures",),
     "time_s": ("time",),  # only with its unit, because boards print times in any unit
     VOLTAGE_HELD: (VOLTAGE_HELD,),
     CURRENT_HELD: (CURRENT_HELD,),
@@ -58,6 +67,8 @@ _QUANTITIES = {
 }
 """Quantity, and unit if the name contains one, by name in a line."""
 
+_LISTS = ("cells_v", "temperatures_c")
+"""Quantities with any number of values."""
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 _PAIR = re.compile(
     r"(?<![A-Za-z0-9_])([A-Za-z_][A-Za-z0-9_]*)\s*[=:]\s*"
@@ -71,7 +82,7 @@ def read_line(line: bytes) -> Reading | None:
     """Parse a line; None if it has no voltage and current.
 
     Examples: ``13.3,2.0`` or ``13.3 2.0 25`` (volts, amperes, degrees Celsius), ``13,3;2,0`` (commas in its numbers),
-    ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
+    ``V=13.3 I=2000mA T=25 cells=3.32,3.33``, ``V=13.3 I=2 temperatures=25,26`` (several probes), ``Voltage: 13.3 V, Current: 2 A``, ``{"voltage": 13.3, "current": 2}``.
     ``time_s`` is the board's timestamp. ``voltage_held=1`` and ``current_held=1`` mark a value of an earlier line. A cell that is ``null``
     was not measured. Unknown names are skipped. A repeated name or an unknown unit makes the line invalid.
     """
@@ -85,7 +96,7 @@ def read_line(line: bytes) -> Reading | None:
         columns = line.translate(_SEPARATORS).decode("ascii").split()
         if len(columns) not in (2, 3):
             return None
-        return Reading(number(columns[0]), number(columns[1]), measured(columns[2]) if len(columns) == 3 else nan)
+        return Reading(number(columns[0]), number(columns[1]), tuple(measured(column) for column in columns[2:]))
     except (ValueError, OverflowError, RecursionError):
         return None
 
@@ -120,24 +131,25 @@ def _to_reading(named_values: Iterable[_NamedValues]) -> Reading | None:
         if not field:
             continue
         factor = _UNITS[field].get((unit or named_unit).lower())
-        if factor is None or field in values_si or (field != "cells_v" and len(values) != 1):
+        if factor is None or field in values_si or (field not in _LISTS and len(values) != 1):
             raise ValueError(name)
         values_si[field] = [factor * value for value in values]
     if "voltage_v" not in values_si or "current_a" not in values_si:
         return None
-    (voltage_v,), (current_a,), (temperature_c,), (time_s,) = (
-        values_si.get(field, [nan]) for field in ("voltage_v", "current_a", "temperature_c", "time_s")
+    (voltage_v,), (current_a,), (time_s,) = (
+        values_si.get(field, [nan]) for field in ("voltage_v", "current_a", "time_s")
     )
+    temperatures_c = tuple(values_si.get("temperatures_c", values_si.get("temperature_c", ())))
     cells_v = tuple(values_si.get("cells_v", ()))
     voltage_held, current_held = (values_si.get(name, [0.0])[0] > 0.0 for name in (VOLTAGE_HELD, CURRENT_HELD))
-    return Reading(voltage_v, current_a, temperature_c, cells_v, time_s, voltage_held, current_held)
+    return Reading(voltage_v, current_a, temperatures_c, cells_v, time_s, voltage_held, current_held)
 
 
 def sample_json_line(
     voltage_v: float,
     current_a: float,
     *,
-    temperature_c: float | None = None,
+    temperatures_c: Sequence[float | None] = (),
     cells_v: Sequence[float | None] = (),
     time_s: float | None = None,
     voltage_held: bool = False,
@@ -148,7 +160,7 @@ def sample_json_line(
     Args:
         voltage_v: Voltage of the pack's terminals [V].
         current_a: Current with the device's sign, see ``sensor.current_sign`` [A].
-        temperature_c: None or NaN: not measured [degC].
+        temperatures_c: Temperatures of the probes, always in the same order; None or NaN: not measured [degC].
         cells_v: Cell voltages, from the first on; None or NaN: not measured [V].
         time_s: Timestamp by the device's clock, with any origin [s]; None: not reported.
         voltage_held: True if the voltage repeats an earlier sample.
@@ -160,8 +172,11 @@ def sample_json_line(
     if not (math.isfinite(voltage_v) and math.isfinite(current_a)):
         raise ValueError(f"no sample: {voltage_v} V, {current_a} A")
     line: dict[str, object] = {"voltage_v": round(voltage_v, 6), "current_a": round(current_a, 6)}
-    if temperature_c is not None and math.isfinite(temperature_c):
-        line["temperature_c"] = round(temperature_c, 3)
+    probes_c = [_rounded(probe_c, 3) for probe_c in temperatures_c]
+    if len(probes_c) > 1:
+        line["temperatures_c"] = probes_c
+    elif probes_c and probes_c[0] is not None:
+        line["temperature_c"] = probes_c[0]
     if time_s is not None and math.isfinite(time_s):
         line["time_s"] = round(time_s, 6)
     if voltage_held:
@@ -169,5 +184,10 @@ def sample_json_line(
     if current_held:
         line[CURRENT_HELD] = 1
     if cells_v:
-        line["cells_v"] = [None if v is None or not math.isfinite(v) else round(v, 4) for v in cells_v]
+        line["cells_v"] = [_rounded(v, 4) for v in cells_v]
     return json.dumps(line, separators=(",", ":")).encode() + b"\n"
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    """Return the rounded value; None without a finite one."""
+    return round(value, digits) if value is not None and math.isfinite(value) else None

@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.sample import (
-    MAX_C,
     MAX_CELL_V,
-    MIN_C,
     MIN_CELL_V,
     SAMPLE,
     CurrentSign,
@@ -18,6 +16,7 @@ from bms_estimator.model.sample import (
     remove_implausible,
 )
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
+from bms_estimator.protocols.base.probe_check import ProbeCheck
 from bms_estimator.protocols.base.reading import Reading
 
 
@@ -29,6 +28,9 @@ class ReadingProtocol(DeviceProtocol):
     Args:
         current_sign: Direction of positive current of the device; samples are positive on discharge.
         faults: Names of the fault counters.
+
+    Attributes:
+        last_reading: Last decoded reading; None before the first one.
     """
 
     def __init__(self, current_sign: CurrentSign, faults: Iterable[str]) -> None:
@@ -38,12 +40,13 @@ class ReadingProtocol(DeviceProtocol):
         )
         self._first_s = self._last_s = math.nan
         self._fault_text: str | None = None
-        self._last_reading: Reading | None = None
+        self.last_reading: Reading | None = None
+        self._probe_check = ProbeCheck()
 
     @property
     def counters(self) -> Mapping[str, int]:
         """Samples and faults since start."""
-        return dict(self._counts)
+        return self._counts | {"implausible": self._counts["implausible"] + self._probe_check.faults}
 
     @property
     def fault(self) -> str | None:
@@ -56,7 +59,7 @@ class ReadingProtocol(DeviceProtocol):
         readings = []
         for reading in self._read(arrival_s, data):
             readings.append(reading)
-            self._last_reading, self._fault_text = reading, None
+            self.last_reading, self._fault_text = reading, None
         self.cells = cell_block([reading.cells_v for reading in readings])
         self._counts["implausible_cells"] += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)
@@ -64,10 +67,9 @@ class ReadingProtocol(DeviceProtocol):
             self._counts["frames_received"] += len(readings)
             block["voltage_v"] = [reading.voltage_v for reading in readings]
             block["current_a"] = [self._sign * reading.current_a + 0.0 for reading in readings]  # no -0
-            block["temperature_c"] = [reading.temperature_c for reading in readings]
-            self._counts["implausible"] += remove_implausible(block["temperature_c"], MIN_C, MAX_C)
             block["status"] = 0
             block["time_s"] = self._spaced_times(arrival_s, len(readings))
+        self.probes = self._probe_check.apply(block, [reading.temperatures_c for reading in readings])
         return block
 
     @abstractmethod

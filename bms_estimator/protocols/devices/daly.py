@@ -114,7 +114,7 @@ class DalyProtocol(PolledProtocol):
         return None
 
     def _decode_pack(self, arrival_s: float, data: bytes) -> Reading:
-        decivolts, _, deciamperes, _ = struct.unpack(">4H", data)
+        decivolts, _, deciamperes, permille = struct.unpack(">4H", data)
         cells_v = (
             self._join_frames(self._cells_v, CELLS_PER_FRAME, self._cell_count)
             if arrival_s - self._cells_s < MAX_ATTACHED_AGE_S
@@ -126,10 +126,8 @@ class DalyProtocol(PolledProtocol):
         probes_c = self._join_frames(self._probes_c, PROBES_PER_FRAME, self._probe_count) if has_recent_probes else []
         # each cell voltage is part of one sample only; temperatures are repeated for up to ``MAX_ATTACHED_AGE_S``
         self._cells_v, self._has_sample = {}, True
-        present_c = [probe_c for probe_c in probes_c if not math.isnan(probe_c)]
-        return Reading(
-            decivolts / 10, (deciamperes - ZERO_CURRENT) / 10, self._mean_temperature_c(present_c), tuple(cells_v)
-        )
+        current_a = (deciamperes - ZERO_CURRENT) / 10
+        return Reading(decivolts / 10, current_a, tuple(probes_c), tuple(cells_v), soc=permille / 1000)
 
     def _join_frames(
         self, frames: Mapping[int, Sequence[float]], values_per_frame: int, count: int | None

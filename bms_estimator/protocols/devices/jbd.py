@@ -27,6 +27,8 @@ HEAD_BYTES, TAIL_BYTES = 4, 3
 """Number of bytes of a frame before its data, and after them."""
 MIN_BASIC_BYTES = 23
 """Length of the basic information before the probes [bytes]. Its last two bytes are the numbers of cells and probes."""
+SOC_OFFSET = 19
+"""Offset of the SOC in the basic information."""
 MAX_DATA_BYTES = 128
 """Maximum length of the data of a frame [bytes]. 32 cells need 64 bytes."""
 ZERO_C = 2731
@@ -91,16 +93,17 @@ class JbdProtocol(PolledProtocol):
         return None
 
     def _decode_basic(self, arrival_s: float, data: bytes) -> Reading:
-        centivolts, centiamperes = struct.unpack_from(">Hh", data)
+        centivolts, centiamperes, remaining_cah, capacity_cah = struct.unpack_from(">HhHH", data)
         self._cell_count, probes = data[MIN_BASIC_BYTES - 2 : MIN_BASIC_BYTES]
         probe_data = data[MIN_BASIC_BYTES:][: 2 * probes]
         return Reading(
             centivolts / 100,
             centiamperes / 100,
-            self._mean_temperature_c(
-                [(step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", _whole_words(probe_data))]
-            ),
+            tuple((step - ZERO_C) / 10 for (step,) in struct.iter_unpack(">H", _whole_words(probe_data))),
             self._recent_cells.at(arrival_s)[: self._cell_count],
+            soc=data[SOC_OFFSET] / 100,
+            remaining_ah=remaining_cah / 100,
+            capacity_ah=capacity_cah / 100,
         )
 
 

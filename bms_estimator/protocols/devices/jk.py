@@ -38,8 +38,13 @@ REGISTER_BYTES: Mapping[int, int] = {
     0xBA: 24,
 }
 """Length of each register [bytes], except that of the cells, which contains its own length."""
-CELLS, BOX_C, BATTERY_C, VOLTAGE, CURRENT, SOFTWARE, VERSION = 0x79, 0x81, 0x82, 0x83, 0x84, 0xB7, 0xC0
+CELLS, BOX_C, BATTERY_C, VOLTAGE, CURRENT, SOC, CAPACITY, SOFTWARE, VERSION = (
+    *(0x79, 0x81, 0x82, 0x83, 0x84),
+    *(0x85, 0xAA, 0xB7, 0xC0),
+)
 """Registers of an older frame."""
+MINUS_ZERO = 100
+"""Value of a probe at -0 degC in an older frame. Larger values are negative temperatures."""
 ABSENT_C = 140
 """Value of an absent probe in an older frame: the lower end of the scale, -40 degC."""
 CHARGING = 0x8000
@@ -52,8 +57,14 @@ FRAME_BYTES, RECORD_BYTES = 300, 8
 """Length of a newer frame, and of the Modbus record after it [bytes]."""
 REALTIME = 0x02
 """Kind of a newer frame with measured values."""
-CELLS_OFFSET, CELL_BITS_OFFSET, VOLTAGE_OFFSET, CURRENT_OFFSET, PROBES_OFFSET = 6, 70, 150, 158, 162
-"""Offsets in a newer frame of the voltages of 32 cells, a bit for each present cell, voltage, current, and two probes."""
+CELLS_OFFSET, CELL_BITS_OFFSET, VOLTAGE_OFFSET, CURRENT_OFFSET = 6, 70, 150, 158
+"""Offsets in a newer frame of the voltages of 32 cells, a bit for each present cell, voltage and current."""
+SOC_OFFSET, REMAINING_OFFSET = 173, 174
+"""Offsets in a newer frame of the SOC, and of remaining charge and capacity."""
+PROBE_OFFSETS = {1: 162, 2: 164, 4: 256, 5: 258}
+"""Offsets in a newer frame of the battery's probes, by JK's number; the boards have no third one."""
+PROBE_BITS_OFFSET = 214
+"""Offset in a newer frame of a bit for each connected probe, by its number. Older boards, with two probes, send 0."""
 KINDS = (0x01, 0x02, 0x03)
 """Valid kinds of newer frames."""
 MODBUS_WRITE = 0x10
@@ -178,9 +189,15 @@ class JkProtocol(PolledProtocol):
         else:
             current_a = (raw & ~CHARGING) / (100 if raw & CHARGING else -100)
         probes = [_number(registers[code]) for code in (BOX_C, BATTERY_C) if code in registers]
-        # values above 100 are negative temperatures: 101 is -1 degC
-        probes_c = [float(probe if probe <= 100 else 100 - probe) for probe in probes if probe != ABSENT_C]
-        return Reading(_number(registers[VOLTAGE]) / 100, current_a, self._mean_temperature_c(probes_c), tuple(cells_v))
+        probes_c = tuple(math.nan if probe == ABSENT_C else _old_celsius(probe) for probe in probes)
+        return Reading(
+            _number(registers[VOLTAGE]) / 100,
+            current_a,
+            probes_c,
+            tuple(cells_v),
+            soc=_number(registers[SOC]) / 100 if SOC in registers else math.nan,
+            capacity_ah=float(_number(registers[CAPACITY])) if CAPACITY in registers else math.nan,
+        )
 
     def _decode_newer(self, arrival_s: float, frame: bytes) -> Reading | None:
         address = frame[FRAME_BYTES] if len(frame) > FRAME_BYTES else None
@@ -194,8 +211,17 @@ class JkProtocol(PolledProtocol):
         cells = struct.unpack_from("<32H", frame, CELLS_OFFSET)
         cells_v = [mv / 1000 for i, mv in enumerate(cells) if cell_bits >> i & 1]
         self._description = f"JK-BMS, {len(cells_v)} cells" + ("" if address is None else f", pack {address}")
-        probes_c = [c / 10 for c in struct.unpack_from("<2h", frame, PROBES_OFFSET) if c != ABSENT_DECI_C]
-        return Reading(millivolts / 1000, milliamperes / 1000, self._mean_temperature_c(probes_c), tuple(cells_v))
+        probes_c = tuple(_newer_celsius(frame, number) for number in range(1, max(PROBE_OFFSETS) + 1))
+        remaining_mah, capacity_mah = struct.unpack_from("<2I", frame, REMAINING_OFFSET)
+        return Reading(
+            millivolts / 1000,
+            milliamperes / 1000,
+            probes_c,
+            tuple(cells_v),
+            soc=frame[SOC_OFFSET] / 100,
+            remaining_ah=remaining_mah / 1000,
+            capacity_ah=capacity_mah / 1000,
+        )
 
 
 def _registers(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -216,6 +242,20 @@ def _registers(data: bytes) -> Iterator[tuple[int, bytes]]:
         if not length or len(content) < length:
             return
         yield code, content
+
+
+def _old_celsius(byte: int) -> float:
+    """Return the temperature of a probe in an older frame [C]: 101 is -1 C."""
+    return float(byte if byte < MINUS_ZERO else MINUS_ZERO - byte)
+
+
+def _newer_celsius(frame: bytes, number: int) -> float:
+    """Return the temperature of a probe in a newer frame [C]; NaN if it is absent."""
+    is_connected = number <= 2 or frame[PROBE_BITS_OFFSET] >> number & 1
+    if number not in PROBE_OFFSETS or not is_connected:
+        return math.nan
+    (step,) = struct.unpack_from("<h", frame, PROBE_OFFSETS[number])
+    return math.nan if step == ABSENT_DECI_C else step / 10
 
 
 def _number(content: bytes) -> int:

@@ -2,7 +2,7 @@
 
 A monitor answers ``:R50=ADDRESS,2,1,`` with ``:r50=ADDRESS,CHECKSUM,VALUE,...,``; the checksum is 1 plus the sum of
 the values modulo 255 (the manuals' chapters on the protocol). The first value is the voltage [10 mV], the second the
-current [10 mA], the seventh the temperature plus 100 [degC], the tenth the direction: 0 discharge, 1 charge. The monitor's own display polls on the
+current [10 mA], the third the remaining charge [mAh], the seventh the temperature plus 100 [degC], the tenth the direction: 0 discharge, 1 charge. The monitor's own display polls on the
 same line; its responses are used as well.
 """
 
@@ -22,7 +22,7 @@ POLL_INTERVAL_S = 1.0
 """Poll interval [s]."""
 MAX_LINE_BYTES = 256
 """Maximum length of a line [bytes]."""
-VOLTAGE, CURRENT, TEMPERATURE, DIRECTION = 0, 1, 6, 9
+VOLTAGE, CURRENT, REMAINING, TEMPERATURE, DIRECTION = 0, 1, 2, 6, 9
 """Indices of the values in a response."""
 MIN_VALUES = DIRECTION + 3
 """Minimum number of values of a response: address, checksum, and values up to the direction."""
@@ -54,9 +54,9 @@ class JunctekProtocol(ReadingProtocol):
     @property
     def description(self) -> str | None:
         """Name and last values; None before the first reading."""
-        if self._last_reading is None:
+        if self.last_reading is None:
             return None
-        return f"Junctek battery monitor, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
+        return f"Junctek battery monitor, {self.last_reading.voltage_v:g} V, {self.last_reading.current_a:g} A"
 
     def on_port_opened(self) -> None:
         """Poll immediately. Decoded values are not reset, because a capture does not contain the openings of the port."""
@@ -123,7 +123,8 @@ class JunctekProtocol(ReadingProtocol):
         return Reading(
             0.01 * measured[VOLTAGE],
             current_a if measured[DIRECTION] == 1 else -current_a,
-            float(measured[TEMPERATURE] - ZERO_C),
+            (float(measured[TEMPERATURE] - ZERO_C),),
+            remaining_ah=1e-3 * measured[REMAINING],
         )
 
 

@@ -36,12 +36,14 @@ MAX_CELLS_AGE_S = 90.0
 """Maximum age of cell voltages [s]: two cycles of 16 batteries, with some lost responses."""
 MAX_DIGITS = 9
 """Maximum number of digits of a value."""
+SOC = "Coulomb"
+"""Column of the SOC [%]."""
 ABSENT = "-"
 """Value of a battery or cell that is absent."""
 
 
 class PylontechProtocol(ReadingProtocol):
-    """Protocol of the console. A reading has the mean voltage, the sum of the currents and the mean temperature.
+    """Protocol of the console. A reading has the mean voltage, the sum of the currents, and the lowest and highest temperature of each battery.
 
     The cells of all batteries are concatenated, each with its last recent voltage.
 
@@ -63,11 +65,11 @@ class PylontechProtocol(ReadingProtocol):
     @property
     def description(self) -> str | None:
         """Number of batteries and last values; None before the first reading."""
-        if self._last_reading is None:
+        if self.last_reading is None:
             return None
         n = len(self._batteries)
         batteries = "1 battery" if n == 1 else f"{n} batteries"
-        return f"Pylontech, {batteries}, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
+        return f"Pylontech, {batteries}, {self.last_reading.voltage_v:g} V, {self.last_reading.current_a:g} A"
 
     def on_port_opened(self) -> None:
         """Poll immediately. Decoded values are not reset, because a capture does not contain the openings of the port."""
@@ -159,13 +161,23 @@ class PylontechProtocol(ReadingProtocol):
             texts if ABSENT not in texts else [row[temperature]]
             for texts, row in zip(cell_temperatures, present, strict=True)
         ]
-        temperatures_c = [1e-3 * _parse_integer(text) for texts in temperature_texts for text in texts]
+        temperatures_c = tuple(1e-3 * _parse_integer(text) for texts in temperature_texts for text in texts)
         self._batteries = tuple(int(row[0]) for row in present)
         battery_cells_v = [
             self._cells[battery].at(arrival_s) if battery in self._cells else () for battery in self._batteries
         ]
         cells_v = tuple(itertools.chain(*battery_cells_v)) if all(battery_cells_v) else ()
-        return Reading(_mean(voltages_v), sum(currents_a), _mean(temperatures_c), cells_v)
+        return Reading(_mean(voltages_v), sum(currents_a), temperatures_c, cells_v, soc=_stack_soc(names, present))
+
+
+def _stack_soc(names: Sequence[str], rows: Sequence[Sequence[str]]) -> float:
+    """Return the mean SOC of batteries in parallel, 0..1; NaN if one of them reports none."""
+    if SOC not in names:
+        return math.nan
+    texts = [row[names.index(SOC)] for row in rows]
+    if not all(text.endswith("%") and text[:-1].isdecimal() for text in texts):
+        return math.nan
+    return _mean([float(text[:-1]) / 100 for text in texts])
 
 
 def _parse_integer(text: str) -> int:

@@ -7,9 +7,7 @@ import numpy as np
 
 from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import (
-    MAX_C,
     MAX_CELL_V,
-    MIN_C,
     MIN_CELL_V,
     SAMPLE,
     CurrentSign,
@@ -20,6 +18,7 @@ from bms_estimator.model.sample import (
 from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.device_clock import DeviceClock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
+from bms_estimator.protocols.base.probe_check import ProbeCheck
 from bms_estimator.protocols.base.reading import Reading, read_line
 
 MAX_LINE_BYTES = 4096
@@ -50,6 +49,7 @@ class TextProtocol(DeviceProtocol):
         self._implausible = self._implausible_cells = 0
         self._first_invalid: bytes | None = None  # the first line without values since the last good one
         self._last_reading: Reading | None = None
+        self._probe_check = ProbeCheck()
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -59,7 +59,7 @@ class TextProtocol(DeviceProtocol):
             "frames_received": self._samples,
             "text_errors": self._invalid_lines,
             "length_errors": self._overlong_lines,
-            "implausible": self._implausible,
+            "implausible": self._implausible + self._probe_check.faults,
             "implausible_cells": self._implausible_cells,
             "clock_jumps": self._clock.jumps,
         }
@@ -109,11 +109,10 @@ class TextProtocol(DeviceProtocol):
             self._samples += len(readings)
             block["voltage_v"] = [reading.voltage_v for reading in readings]
             block["current_a"] = [self._sign * reading.current_a for reading in readings]
-            block["temperature_c"] = [reading.temperature_c for reading in readings]
-            self._implausible += remove_implausible(block["temperature_c"], MIN_C, MAX_C)
             block["time_s"], clock_status = self._times(arrival_s, readings)
             block["status"] = [_status(reading) for reading in readings]
             block["status"] |= np.array(clock_status, np.uint32)
+        self.probes = self._probe_check.apply(block, [reading.temperatures_c for reading in readings])
         return block
 
     def _times(self, arrival_s: float, readings: Sequence[Reading]) -> tuple[list[float], list[int]]:

@@ -2,7 +2,8 @@
 
 The device sends a block each second. Each line is CR LF, label, tab and value. The value of the last line, ``Checksum``,
 is one byte that makes the sum of all bytes of the block 0 modulo 256 (Victron's VE.Direct protocol and its FAQ). The labels
-are V [mV], I [mA, positive on charge] and T [degrees Celsius, only with a sensor]. A second block contains history. HEX messages, from ``:`` to the end of the
+are V [mV], I [mA, positive on charge] and T [degrees Celsius, only with a sensor], and
+SOC [0.1 %]. A second block contains history. HEX messages, from ``:`` to the end of the
 line, may appear in between and are not part of the checksum.
 """
 
@@ -22,8 +23,8 @@ HEX = re.compile(rb":[0-9A-Fa-f]*\r?\n")
 """HEX message."""
 END = b"Checksum\t"
 """Label of the last line of a block."""
-NO_SENSOR = "---"
-"""Value of the temperature without a sensor."""
+UNKNOWN = "---"
+"""Value of an unknown quantity: the temperature without a sensor, or the SOC before the first synchronization."""
 
 
 class VeDirectProtocol(ReadingProtocol):
@@ -42,9 +43,9 @@ class VeDirectProtocol(ReadingProtocol):
     @property
     def description(self) -> str | None:
         """Product and last values; None before the first reading."""
-        if self._last_reading is None:
+        if self.last_reading is None:
             return None
-        return f"VE.Direct battery monitor {self._product}, {self._last_reading.voltage_v:g} V, {self._last_reading.current_a:g} A"
+        return f"VE.Direct battery monitor {self._product}, {self.last_reading.voltage_v:g} V, {self.last_reading.current_a:g} A"
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:  # noqa: ARG002 - the base class adds the time
         self._unparsed += data
@@ -85,11 +86,12 @@ class VeDirectProtocol(ReadingProtocol):
 
     def _make_reading(self, fields: Mapping[str, str]) -> Reading | None:
         try:
-            temperature = fields.get("T", NO_SENSOR)
+            temperature = fields.get("T", UNKNOWN)
             return Reading(
                 1e-3 * number(fields["V"]),
                 1e-3 * number(fields["I"]),
-                nan if temperature == NO_SENSOR else number(temperature),
+                () if temperature == UNKNOWN else (number(temperature),),
+                soc=nan if (soc := fields.get("SOC", UNKNOWN)) == UNKNOWN else 1e-3 * number(soc),
             )
         except ValueError as error:
             self._count_fault("text_errors", f"a VE.Direct block without a voltage or a current: {error}")

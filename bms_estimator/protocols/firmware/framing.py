@@ -367,6 +367,7 @@ def decode_sample(d: Record, s: Record, arrival_s: float, out: Record) -> int:
     if out.temperature_c < MIN_C or out.temperature_c > MAX_C:
         out.temperature_c = math.nan
         d.implausible += 1
+    out.temperature_min_c = out.temperature_max_c = out.temperature_c
     out.status = status | (status_bits & _SATURATED_OR_OVERRUN)
     return 1
 

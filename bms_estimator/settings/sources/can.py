@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.sources.source import BaseSource, merge_profile
+from bms_estimator.settings.sources.source import BaseSource, as_tuple, merge_profile
 
 PROFILES: dict[str, dict[str, object]] = {
     "pylontech-can": {
@@ -113,7 +113,9 @@ class CanSource(BaseSource):
     current: Signal = Field(
         description="signal of the current, written like voltage; sensor.current_sign is the direction of positive current"
     )
-    temperature: Signal | None = Field(default=None, description="signal of the temperature, written like voltage")
+    temperature: Annotated[tuple[Signal, ...], BeforeValidator(as_tuple)] = Field(
+        default=(), description="signal of the temperature, written like voltage; a list for several probes"
+    )
     cells: tuple[CellSignals, ...] = Field(
         default=(),
         description='signals of the cell voltages, such as [{ signal = "Cell{}_mV", count = 16, scale = 0.001 }]',

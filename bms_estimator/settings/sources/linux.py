@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from bms_estimator.model.config_file import Positive
-from bms_estimator.settings.sources.source import BaseSource, Name
+from bms_estimator.settings.sources.source import BaseSource, Name, as_tuple
 
 RESOLUTION_V = {"ina219": 4e-3, "ina220": 4e-3, "ads1015": 2e-3}
 """Voltage resolution at the pins by chip [V], from the data sheet of the INA219; for the ADS1015, at 4.096 V full scale."""
@@ -31,9 +31,9 @@ class LinuxSource(BaseSource):
         default="curr1_input",
         description="file or channel of the current, written like voltage; shunt_ohm is required if it is a voltage across the shunt",
     )
-    temperature: Name | None = Field(
-        default=None,
-        description="file or channel of the pack's temperature (not the chip's), such as temp1_input, written like voltage",
+    temperature: Annotated[tuple[Name, ...], BeforeValidator(as_tuple)] = Field(
+        default=(),
+        description="file or channel of the pack's temperature (not the chip's), such as temp1_input, written like voltage; a list for several probes",
     )
     voltage_scale: Positive = Field(
         default=1.0, description="ratio of the voltage divider: pack voltage / voltage at the chip"

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.sources.source import BaseSource, merge_profile
+from bms_estimator.settings.sources.source import BaseSource, as_tuple, merge_profile
 
 MAX_WORDS = 125
 """Maximum number of registers, which are 16-bit words, in a request (Modbus application protocol V1.1b3, section 6.3)."""
@@ -30,7 +30,10 @@ PROFILES: dict[str, dict[str, object]] = {
         "unit": 0,
         "voltage": {"address": 0x1000, "table": "input", "type": "uint16", "scale": 0.01},
         "current": {"address": 0x1001, "table": "input", "type": "int16", "scale": 0.01},
-        "temperature": {"address": 0x1009, "table": "input", "type": "uint16", "scale": 0.1, "offset": -273.15},
+        "temperature": [  # mean, highest and lowest of the cells' probes
+            {"address": address, "table": "input", "type": "uint16", "scale": 0.1, "offset": -273.15, "absent": 0}
+            for address in (0x1009, 0x100C, 0x100D)
+        ],
         "cells": {"address": 0x1100, "table": "input", "type": "uint16", "scale": 0.001, "count": 16},
     },
 }
@@ -116,7 +119,9 @@ class ModbusSource(BaseSource):
     current: Register = Field(
         description="register of the current, written like voltage; sensor.current_sign is the direction of positive current"
     )
-    temperature: Register | None = Field(default=None, description="register of the temperature, written like voltage")
+    temperature: Annotated[tuple[Register, ...], BeforeValidator(as_tuple)] = Field(
+        default=(), description="register of the temperature, written like voltage; a list for several probes"
+    )
     cells: CellRegisters | None = Field(
         default=None,
         description="register of the first cell's voltage, written like voltage, with count, the number of cells; step is the distance between two cells if registers are not consecutive",

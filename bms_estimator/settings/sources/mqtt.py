@@ -4,12 +4,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from bms_estimator.model.config_file import Positive, Strict
 from bms_estimator.settings.broker import BrokerSettings, BrokerUrls
 from bms_estimator.settings.sources.mqtt_profiles import PROFILES, ProfileName
-from bms_estimator.settings.sources.source import BaseSource, Name
+from bms_estimator.settings.sources.source import BaseSource, Name, as_tuple
 
 Unit = Literal["V", "mV", "A", "mA", "C", "F", "K", "s", "ms", "iso"]
 ALLOWED_UNITS: Mapping[str, tuple[Unit, ...]] = {
@@ -66,6 +66,16 @@ class ValueLocation(Strict):
         return factor * (self.scale * number + self.offset) + offset
 
 
+def _merge_location(default: Any, configured: dict[str, Any]) -> Any:
+    """Return a location with the settings of the profile that are not configured.
+
+    If the profile has several locations, a configured topic or path replaces all of them.
+    """
+    defaults = [default] if isinstance(default, dict) else default
+    merged = [{**each, **configured} for each in defaults]
+    return merged[0] if len(merged) == 1 or {"topic", "path"} & configured.keys() else merged
+
+
 class SourceBroker(BrokerSettings):
     """Connection to the broker of ``[source]``."""
 
@@ -95,8 +105,9 @@ class MqttSource(BaseSource):
         default=None,
         description="location of the current, written like voltage; sensor.current_sign is the direction of positive current",
     )
-    temperature: ValueLocation | None = Field(
-        default=None, description="location of the temperature, written like voltage"
+    temperature: Annotated[tuple[ValueLocation, ...], BeforeValidator(as_tuple)] = Field(
+        default=(),
+        description="location of the temperature, written like voltage; a list for several probes, or {probe} in place of the probe's number",
     )
     cells: ValueLocation | None = Field(
         default=None,
@@ -167,7 +178,7 @@ class MqttSource(BaseSource):
             configured = table.get(name)
             configured = {"path": configured} if isinstance(configured, str) else configured
             if name in profile.table and isinstance(configured, dict):
-                merged[name] = {**profile.table[name], **configured}
+                merged[name] = _merge_location(profile.table[name], configured)
         missing = [
             f"{name}: missing ({description})"
             for name, description in profile.required_settings.items()
@@ -196,14 +207,15 @@ class MqttSource(BaseSource):
         return self
 
     def locations(self) -> Iterator[tuple[str, ValueLocation]]:
-        """Yield name and location of each configured quantity."""
+        """Yield the name of each configured quantity with each of its locations."""
         for name in self.quantities:
-            location = getattr(self, name)
-            if location is not None:
-                yield name, location
+            value = getattr(self, name)
+            locations = value if isinstance(value, tuple) else () if value is None else (value,)
+            yield from ((name, location) for location in locations)
 
     def substitute(self, text: str) -> str:
-        """Substitute prefix and instance in a topic or a path."""
+        """Substitute prefix and instance in a topic or a path. ``{probe}`` becomes ``{cell}``, the placeholder of a number."""
+        text = text.replace("{probe}", "{cell}")
         return text.replace("{prefix}", self.prefix or "").replace("{instance}", self.instance)
 
     def topics(self, location: ValueLocation) -> list[str]:

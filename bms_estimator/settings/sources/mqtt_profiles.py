@@ -4,7 +4,7 @@
 Explicit settings take precedence over a profile. Each profile names its source, as of November 2026.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 ProfileName = Literal[
@@ -35,7 +35,11 @@ class Profile(NamedTuple):
     """Descriptions of the settings without which the profile is incomplete, by name."""
 
 
-def _esphome_defaults(voltage: str, current: str, temperature: str, cell: str) -> dict[str, Any]:
+_VENUS_TEMPERATURES = ("Dc/0/Temperature", "System/MinCellTemperature", "System/MaxCellTemperature")
+"""Paths of temperatures of a battery on Venus OS. A battery without cells has only the first."""
+
+
+def _esphome_defaults(voltage: str, current: str, temperature: Sequence[str], cell: str) -> dict[str, Any]:
     """Return the defaults of an ESPHome node.
 
     Its topics are ``<topic_prefix>/sensor/<object_id>/state`` with a plain number as payload
@@ -46,7 +50,7 @@ def _esphome_defaults(voltage: str, current: str, temperature: str, cell: str) -
     Args:
         voltage: Name of the sensor of the pack voltage.
         current: Name of the sensor of the current.
-        temperature: Name of the sensor of the temperature.
+        temperature: Names of the sensors of the temperature, which may contain ``{probe}``.
         cell: Name of the sensors of the cell voltages, with ``{cell}``.
     """
 
@@ -56,7 +60,7 @@ def _esphome_defaults(voltage: str, current: str, temperature: str, cell: str) -
     return {
         "voltage": topics(voltage),
         "current": topics(current),
-        "temperature": topics(temperature),
+        "temperature": [topics(name) for name in temperature],
         "cells": topics(cell),
         "availability_topic": "{prefix}/status",
     }
@@ -73,7 +77,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
         {
             "voltage": {"topic": "{prefix}/soc/total_voltage"},
             "current": {"topic": "{prefix}/soc/current"},
-            "temperature": {"topic": "{prefix}/temperatures/1"},
+            "temperature": {"topic": "{prefix}/temperatures/{probe}"},
             "cells": {"topic": "{prefix}/cell_voltages/{cell}"},
             "interval_s": 10.0,
         },
@@ -84,7 +88,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
     ),
     # syssi/esphome-jk-bms, esp32-example.yaml and esp32-ble-example.yaml
     "esphome-jk": Profile(
-        _esphome_defaults("total_voltage", "current", "temperature_sensor_1", "cell_voltage_{cell}"),
+        _esphome_defaults("total_voltage", "current", ["temperature_sensor_{probe}"], "cell_voltage_{cell}"),
         current_sign=CHARGE,
         voltage_resolution_v=0.01,
         current_resolution_a=0.01,
@@ -92,7 +96,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
     ),
     # syssi/esphome-jbd-bms, esp32-ble-example.yaml
     "esphome-jbd": Profile(
-        _esphome_defaults("total_voltage", "current", "temperature_1", "cell_voltage_{cell}"),
+        _esphome_defaults("total_voltage", "current", ["temperature_{probe}"], "cell_voltage_{cell}"),
         current_sign=CHARGE,
         voltage_resolution_v=0.01,
         current_resolution_a=0.01,
@@ -101,7 +105,9 @@ PROFILES: Mapping[ProfileName, Profile] = {
     # ESPHome's daly_bms, with the sensor names and the interval of 20 s of its documentation. The sign is that of the
     # frame (esphome/components/daly_bms/daly_bms.cpp), as in protocols/devices/daly.py
     "esphome-daly": Profile(
-        _esphome_defaults("battery_voltage", "battery_current", "max_temperature", "cell_{cell}_voltage")
+        _esphome_defaults(
+            "battery_voltage", "battery_current", ["max_temperature", "min_temperature"], "cell_{cell}_voltage"
+        )
         | {"interval_s": 20.0},
         current_sign=DISCHARGE,
         voltage_resolution_v=0.1,
@@ -114,13 +120,15 @@ PROFILES: Mapping[ProfileName, Profile] = {
         {
             "voltage": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Voltage", "path": "value"},
             "current": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Current", "path": "value"},
-            "temperature": {"topic": "N/{prefix}/battery/{instance}/Dc/0/Temperature", "path": "value"},
+            "temperature": [
+                {"topic": f"N/{{prefix}}/battery/{{instance}}/{path}", "path": "value"} for path in _VENUS_TEMPERATURES
+            ],
             "cells": {"topic": "N/{prefix}/battery/{instance}/Voltages/Cell{cell}", "path": "value"},
             "ask": {
                 "R/{prefix}/keepalive": '{"keepalive-options":["suppress-republish"]}',
                 "R/{prefix}/battery/{instance}/Dc/0/Voltage": "",
                 "R/{prefix}/battery/{instance}/Dc/0/Current": "",
-                "R/{prefix}/battery/{instance}/Dc/0/Temperature": "",
+                **{f"R/{{prefix}}/battery/{{instance}}/{path}": "" for path in _VENUS_TEMPERATURES},
                 "R/{prefix}/battery/{instance}/Voltages": "",
             },
             "ask_s": 2.0,
@@ -140,7 +148,9 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "prefix": "BE",
             "voltage": {"topic": "{prefix}/info{instance}", "path": "battery_voltage"},
             "current": {"topic": "{prefix}/info{instance}", "path": "battery_current"},
-            "temperature": {"topic": "{prefix}/info{instance}", "path": "temperature_max"},
+            "temperature": [
+                {"topic": "{prefix}/info{instance}", "path": path} for path in ("temperature_max", "temperature_min")
+            ],
             "cells": {"topic": "{prefix}/spec_data{instance}", "path": "cell_voltages"},
             "availability_topic": "{prefix}/status",
         },
@@ -154,7 +164,10 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "prefix": "solar",
             "voltage": {"topic": "{prefix}/battery/voltage"},
             "current": {"topic": "{prefix}/battery/current"},
-            "temperature": {"topic": ["{prefix}/battery/temperature", "{prefix}/battery/BatteryTempOneCelsius"]},
+            "temperature": [
+                {"topic": ["{prefix}/battery/temperature", "{prefix}/battery/BatteryTempOneCelsius"]},
+                {"topic": "{prefix}/battery/BatteryTempTwoCelsius"},
+            ],
             "cells": {"topic": "{prefix}/battery/Cell{cell}MilliVolt", "unit": "mV"},
             "availability_topic": "{prefix}/dtu/status",
         },

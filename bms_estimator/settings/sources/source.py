@@ -30,6 +30,11 @@ class BaseSource(Strict):
         return {}
 
 
+def as_tuple(value: object) -> object:
+    """Return a list as it is, and another value as the only item of a tuple: a quantity may have one location or several."""
+    return value if isinstance(value, list | tuple) else () if value is None else (value,)
+
+
 def merge_profile(table: object, profiles: Mapping[str, Mapping[str, object]]) -> object:
     """Return a table ``[source]`` with the defaults of the profile that it names; other tables are returned unchanged.
 

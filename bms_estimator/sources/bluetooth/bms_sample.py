@@ -1,8 +1,7 @@
 """Readings from samples that aiobmsble reports."""
 
 import math
-from collections.abc import Iterable, Mapping
-from statistics import fmean
+from collections.abc import Mapping
 from typing import Any
 
 from bms_estimator.protocols.base.reading import Reading
@@ -14,25 +13,19 @@ def convert_sample(sample: Mapping[str, Any]) -> Reading | None:
     if math.isnan(voltage_v) or math.isnan(current_a):
         return None
     cells_v = tuple(_number(cell) for cell in sample.get("cell_voltages", ()))
-    return Reading(voltage_v, current_a, _temperature(sample), cells_v)
+    return Reading(voltage_v, current_a, _temperatures_c(sample), cells_v)
 
 
-def _temperature(sample: Mapping[str, Any]) -> float:
-    """Return the mean temperature of the sensors on cells [degC].
+def _temperatures_c(sample: Mapping[str, Any]) -> tuple[float, ...]:
+    """Return the temperatures of the sensors on cells [degC].
 
-    Without such sensors return the temperature of the BMS, or the mean of all sensors.
+    Without such sensors return the temperature of the BMS, or those of all sensors.
     """
     sensors = sample.get("temp_values", ())
     on_cells = [sensor for sensor in sensors if getattr(getattr(sensor, "type", None), "name", "") == "CELL"]
     if not on_cells and "temperature" in sample:
-        return _number(sample["temperature"])
-    return _mean(_number(sensor) for sensor in on_cells or sensors)
-
-
-def _mean(values: Iterable[float]) -> float:
-    """Return the mean of the finite values; NaN without any."""
-    numbers = [value for value in values if not math.isnan(value)]
-    return fmean(numbers) if numbers else math.nan
+        return (_number(sample["temperature"]),)
+    return tuple(map(_number, on_cells or sensors))
 
 
 def _number(value: Any) -> float:

@@ -119,7 +119,7 @@ class BleProducer(LineProducer):
             return None
         self._fault = None
         return sample_json_line(
-            reading.voltage_v, reading.current_a, temperature_c=reading.temperature_c, cells_v=reading.cells_v
+            reading.voltage_v, reading.current_a, temperatures_c=reading.temperatures_c, cells_v=reading.cells_v
         )
 
     async def _find(self) -> tuple[BLEDevice, type[BaseBMS]]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress, no_progress
-from bms_estimator.model.sample import SAMPLE, CellBlock, CurrentSign, SampleBlock
+from bms_estimator.model.sample import NO_PROBES, SAMPLE, CellBlock, CurrentSign, ProbeBlock, SampleBlock
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
@@ -113,6 +113,11 @@ class RawCapture:
         """Cell voltages of the last block; empty without any."""
         return self.decoder.cells
 
+    @property
+    def probes(self) -> ProbeBlock:
+        """Temperature probes of the last block; empty without a list of them."""
+        return self.decoder.probes
+
     def __iter__(self) -> Iterator[SampleBlock]:
         """Yield blocks of samples."""
         for batch in read_capture(self._path):
@@ -192,11 +197,16 @@ class Replay:
 
     async def _unpaced(self) -> AsyncIterator[ReceivedSamples]:
         for block in self.capture:
-            cells = self.capture.cells
+            cells, probes = self.capture.cells, self._probes
             before = self.fraction
             for part in _parts(block["time_s"], self._max_block_s):
                 self._advance(before, part.stop / block.size)
-                yield ReceivedSamples(block[part], cells[part])
+                yield ReceivedSamples(block[part], cells[part], probes[part])
+
+    @property
+    def _probes(self) -> ProbeBlock:
+        """Temperature probes of the last block, which only a raw capture has."""
+        return self.capture.probes if isinstance(self.capture, RawCapture) else NO_PROBES
 
     def _advance(self, before: float, fraction_of_block: float) -> None:
         """Set ``fraction`` within a block, which began at the fraction ``before``."""
@@ -213,7 +223,7 @@ class Replay:
                 end = int(np.searchsorted(due_s, now_s, side="right"))
                 if end > first:
                     self._advance(before, end / block.size)
-                    yield ReceivedSamples(block[first:end], self.capture.cells[first:end])
+                    yield ReceivedSamples(block[first:end], self.capture.cells[first:end], self._probes[first:end])
                     first = end
                 else:
                     await asyncio.sleep(min((due_s[first] - now_s) / speed + PACED_INTERVAL_S, 1.0))
@@ -289,8 +299,8 @@ def load_capture(
             of a spreadsheet's ``sheet``; None: recognize them.
 
     Returns:
-        ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor) and
-        ``status``, bits of ``SampleStatus``. Attributes ``note`` and ``warning`` say what was guessed about a table.
+        ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor),
+        ``temperature_min_c``, ``temperature_max_c`` (lowest and highest probe, with one probe equal to ``temperature_c``) and ``status``, bits of ``SampleStatus``. Attributes ``note`` and ``warning`` say what was guessed about a table.
 
     Raises:
         UserError: The file does not exist or cannot be read, a column is missing, or ``current_sign`` is not valid.

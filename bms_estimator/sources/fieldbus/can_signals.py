@@ -37,7 +37,7 @@ class FrameId(NamedTuple):
 
 
 SignalKey = tuple[str, int]
-"""Name of the quantity in ``[source]``, and cell number from 0; 0 for other quantities."""
+"""Name of the quantity in ``[source]``, and number of the cell or probe from 0; 0 for other quantities."""
 
 
 class _Frame(NamedTuple):
@@ -84,6 +84,7 @@ class CanDecoder:
             message = _find_message(key[0], signal.signal, database)
             frame_id = FrameId(message.frame_id, message.is_extended_frame)
             self._frames.setdefault(frame_id, _Frame(message, [])).signals.append((key, signal))
+        self._probe_count = len(settings.temperature)
         self._cell_count = sum(cells.count for cells in settings.cells)
         self._max_distance_s = min(MAX_DISTANCE_PERIODS * settings.interval_s, MAX_AGE_S)
         self._newest_values: dict[SignalKey, tuple[float, float]] = {}  # arrival time [s] and value
@@ -142,7 +143,7 @@ class CanDecoder:
         return Reading(
             self._newest_value("voltage", now_s, max_age_s=self._max_distance_s),
             self._newest_value("current", now_s, max_age_s=self._max_distance_s),
-            self._newest_value("temperature", now_s),
+            tuple(self._newest_value("temperature", now_s, number) for number in range(self._probe_count)),
             () if all(map(math.isnan, cells_v)) else cells_v,
         )
 
@@ -156,8 +157,7 @@ def _signals(settings: CanSource) -> Iterator[tuple[SignalKey, Signal]]:
     """Yield all signals of the settings."""
     yield ("voltage", 0), settings.voltage
     yield ("current", 0), settings.current
-    if settings.temperature is not None:
-        yield ("temperature", 0), settings.temperature
+    yield from ((("temperature", number), signal) for number, signal in enumerate(settings.temperature))
     members = [signal for cells in settings.cells for signal in cells.cell_signals()]
     yield from ((("cells", number), signal) for number, signal in enumerate(members))
 

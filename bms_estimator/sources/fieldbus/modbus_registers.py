@@ -53,10 +53,8 @@ class Request(NamedTuple):
 
 def list_values(settings: ModbusSource) -> tuple[RegisterQuantity, ...]:
     """Return the values to read from the device."""
-    single_registers = {"voltage": settings.voltage, "current": settings.current, "temperature": settings.temperature}
-    values = [
-        RegisterQuantity(quantity, register) for quantity, register in single_registers.items() if register is not None
-    ]
+    values = [RegisterQuantity("voltage", settings.voltage), RegisterQuantity("current", settings.current)]
+    values += [RegisterQuantity("temperature", register) for register in settings.temperature]
     if settings.cells is not None:
         values += [RegisterQuantity("cells", settings.cells.cell(number)) for number in range(settings.cells.count)]
     return tuple(values)
@@ -113,10 +111,9 @@ def decode_reading(values: Sequence[RegisterQuantity], words: Words) -> Reading 
     decoded: dict[str, list[float]] = {}
     for quantity, register in values:
         decoded.setdefault(quantity, []).append(decode(register, words))
-    (voltage_v,), (current_a,), (temperature_c,) = (
-        decoded.get(name, [math.nan]) for name in ("voltage", "current", "temperature")
-    )
+    (voltage_v,), (current_a,) = (decoded.get(name, [math.nan]) for name in ("voltage", "current"))
     if math.isnan(voltage_v) or math.isnan(current_a):
         return None
     cells_v = tuple(decoded.get("cells", ()))
-    return Reading(voltage_v, current_a, temperature_c, () if all(map(math.isnan, cells_v)) else cells_v)
+    temperatures_c = tuple(decoded.get("temperature", ()))
+    return Reading(voltage_v, current_a, temperatures_c, () if all(map(math.isnan, cells_v)) else cells_v)

@@ -31,7 +31,7 @@ class _Channels(NamedTuple):
 
     voltage: Channel
     current: Channel
-    temperature: Channel | None
+    temperatures: tuple[Channel, ...]
     amperes_per_unit: float
     """Current per unit of the current channel: [A/A], or [A/V] if the channel is a voltage over a shunt."""
     interval_s: float
@@ -120,10 +120,10 @@ class LinuxSensor(LineProducer):
         voltage, current = (
             find_channel(name, settings.chip, self._root) for name in (settings.voltage, settings.current)
         )
-        temperature = find_channel(settings.temperature, settings.chip, self._root) if settings.temperature else None
+        temperatures = tuple(find_channel(name, settings.chip, self._root) for name in settings.temperature)
         amperes_per_unit = settings.current_scale * self._amperes_per_unit(current)
         return _Channels(
-            voltage, current, temperature, amperes_per_unit, settings.interval_s or self._chip_interval_s()
+            voltage, current, temperatures, amperes_per_unit, settings.interval_s or self._chip_interval_s()
         )
 
     def _amperes_per_unit(self, current: Channel) -> float:
@@ -174,13 +174,13 @@ class LinuxSensor(LineProducer):
         """
         settings, self._fault = self._settings, None
         voltage, current = self._value(channels.voltage), self._value(channels.current)
-        temperature_c = self._value(channels.temperature) if channels.temperature else None
+        temperatures_c = [self._value(channel) for channel in channels.temperatures]
         if voltage is None or current is None:
             return b""
         return sample_json_line(
             settings.voltage_scale * voltage + settings.voltage_offset_v,
             channels.amperes_per_unit * current + settings.current_offset_a,
-            temperature_c=temperature_c,
+            temperatures_c=temperatures_c,
         )
 
     def _value(self, channel: Channel) -> float | None:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from bms_estimator.protocols.base.reading import sample_json_line
 from bms_estimator.settings.sources.mqtt import MqttSource, ValueLocation
 from bms_estimator.sources.mqtt.payload_value import (
+    CELL_PLACEHOLDER,
     MAX_CELL_NUMBER,
     InvalidValueError,
     cell_pattern,
@@ -21,6 +22,8 @@ REQUIRED_QUANTITIES = ("voltage", "current")
 REPEAT_PERIODS = 1.5
 """Time without a message after which the last current is used again if the publisher sends only changes, in sample periods. A
 regular message may be half a period late."""
+MAX_PROBE_NUMBER = 32
+"""Highest number of a temperature probe in a path or topic."""
 MAX_STATUS_CHARACTERS = 80
 """Maximum number of characters of the publisher's status that are shown."""
 
@@ -35,7 +38,9 @@ class _TopicBinding(NamedTuple):
     topic: str
     """Topic, which may contain ``{cell}``."""
     pattern: re.Pattern[str]
-    """Pattern of the topic. Its group, if any, is the cell number."""
+    """Pattern of the topic. Its group, if any, is the number of the cell or probe."""
+    place: int
+    """Number of the location in the settings."""
 
 
 class _TimestampedValue(NamedTuple):
@@ -57,14 +62,15 @@ class SampleAssembler:
     def __init__(self, settings: MqttSource) -> None:
         self._settings = settings
         self._bindings = [
-            _TopicBinding(quantity, location, settings.substitute(location.path), topic, cell_pattern(topic))
-            for quantity, location in settings.locations()
+            _TopicBinding(quantity, location, settings.substitute(location.path), topic, cell_pattern(topic), place)
+            for place, (quantity, location) in enumerate(settings.locations())
             for topic in settings.topics(location)
         ]
         self._availability_topic = settings.substitute(settings.availability_topic or "")
         self._offline_status = ""  # latest status from the publisher or its last will
         self._values: dict[str, _TimestampedValue] = {}
         self._cells: dict[int, _TimestampedValue] = {}
+        self._probes: dict[tuple[int, int], _TimestampedValue] = {}  # by numbers of the location and of the probe
         self._faults: dict[str, str] = {}  # latest error of each quantity
         self._unused_arrival_s: dict[str, float] = {}  # arrival times of voltage and current since the last sample
         self._repeat_s = math.inf  # time at which the last current is used again
@@ -146,7 +152,7 @@ class SampleAssembler:
             try:
                 self._store_value(binding, payload, cell, now_s)
             except InvalidValueError as error:
-                self._remove(binding.quantity, cell)
+                self._remove(binding, cell)
                 self._counters[error.counter] += 1
                 self._faults[binding.quantity] = f"{binding.quantity}: {topic}: {error}"
             else:
@@ -170,7 +176,7 @@ class SampleAssembler:
         return sample_json_line(
             voltage_v,
             current_a,
-            temperature_c=self._value("temperature", now_s, self._settings.slow_max_age_s),
+            temperatures_c=self._probes_c(now_s),
             cells_v=self._cells_v(now_s),
             time_s=self._value("time", now_s, self._settings.settle_s),  # an older time belongs to an earlier sample
             voltage_held=voltage_held,
@@ -188,7 +194,9 @@ class SampleAssembler:
         Raises:
             InvalidValueError: The payload has no valid value; nothing is stored.
         """
-        if binding.quantity != "cells":
+        if binding.quantity == "temperature":
+            self._store_probes(binding, payload, cell, now_s)
+        elif binding.quantity != "cells":
             self._values[binding.quantity] = _TimestampedValue(
                 read_value(payload, binding.location, binding.path), now_s
             )
@@ -202,11 +210,27 @@ class SampleAssembler:
         elif 1 <= cell <= MAX_CELL_NUMBER:
             self._cells[cell] = _TimestampedValue(read_value(payload, binding.location, binding.path), now_s)
 
-    def _remove(self, quantity: str, cell: int | None) -> None:
+    def _store_probes(self, binding: _TopicBinding, payload: bytes, probe: int | None, now_s: float) -> None:
+        """Store the temperatures of a payload, as ``_store_value``. A location without ``{probe}`` has one probe."""
+        if probe is None and CELL_PLACEHOLDER.search(binding.path):
+            readings_c = read_cells(payload, binding.location, binding.path)
+        else:
+            readings_c = {1 if probe is None else probe: read_value(payload, binding.location, binding.path)}
+        self._probes |= {
+            (binding.place, number): _TimestampedValue(reading_c, now_s)
+            for number, reading_c in readings_c.items()
+            if 1 <= number <= MAX_PROBE_NUMBER
+        }
+
+    def _remove(self, binding: _TopicBinding, cell: int | None) -> None:
         """Remove the stored value of a quantity.
 
-        For ``cells``, remove the voltage of ``cell``, or of all cells without ``cell``.
+        For ``cells`` and ``temperature``, remove that of the cell or probe ``cell``, or of all of the location without ``cell``.
         """
+        quantity = binding.quantity
+        for place, number in self._probes:
+            if quantity == "temperature" and place == binding.place and cell in (None, number):
+                self._probes[place, number] = _TimestampedValue(math.nan, -math.inf)
         self._values.pop(quantity, None)
         self._unused_arrival_s.pop(quantity, None)
         if quantity == "cells":
@@ -241,6 +265,13 @@ class SampleAssembler:
         max_age_s = self._settings.slow_max_age_s
         fresh = {cell: stored.value for cell, stored in self._cells.items() if now_s - stored.arrival_s <= max_age_s}
         return [fresh.get(cell, math.nan) for cell in range(1, max(fresh, default=0) + 1)]
+
+    def _probes_c(self, now_s: float) -> list[float]:
+        """Return the recent temperatures of all probes, location after location [C]; NaN for a probe without one."""
+        max_age_s = self._settings.slow_max_age_s
+        highest_numbers = dict(sorted(self._probes))  # by number of the location
+        slots = [self._probes.get((place, i + 1)) for place, count in highest_numbers.items() for i in range(count)]
+        return [slot.value if slot and now_s - slot.arrival_s <= max_age_s else math.nan for slot in slots]
 
     def _find_topics(self, *quantities: str) -> list[str]:
         return [binding.topic for binding in self._bindings if binding.quantity in quantities]

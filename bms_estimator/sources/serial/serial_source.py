@@ -164,7 +164,7 @@ class SerialSource:
                         self._silence_reason, self._rejected = None, False
                         self._silence_log.on_samples(self._monotonic())
                         self._port.reset_backoff()
-                    yield ReceivedSamples(block, self._decoder.cells)
+                    yield ReceivedSamples(block, self._decoder.cells, self._decoder.probes)
         if self._task is not None and not self._task.cancelled():
             self._task.result()
 

@@ -132,6 +132,7 @@ class AlarmEvaluator:
         suspects: InputFault,
         suspicions: Sequence[str],
         clock_fault: str = "",
+        probe_fault: str = "",
     ) -> None:
         """Evaluate all buffered samples.
 
@@ -141,6 +142,7 @@ class AlarmEvaluator:
             suspects: Input faults that the filter suspects now.
             suspicions: The suspected faults, one sentence each.
             clock_fault: Fault of the source's clock as a sentence; empty without one.
+            probe_fault: Fault of temperature probes as a sentence; empty without one.
         """
         if not self.rows:
             return
@@ -148,6 +150,8 @@ class AlarmEvaluator:
         samples, trace, forecasts, cells = self._buffer.take()
         if (samples["status"] & SampleStatus.WRONG_CLOCK).any():
             self._input_faults.add("time", "rate", clock_fault or WRONG_CLOCK_TEXT)
+        if probe_fault:
+            self._input_faults.add("temperature", "probe", probe_fault)
         self._alarms.set_suspects("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
         self._alarms.set_suspects("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
         if samples.size:

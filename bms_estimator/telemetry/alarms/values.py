@@ -19,12 +19,13 @@ def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> d
         charging_a: Minimum current into the pack that counts as charging [A].
     """
     lowest_v, highest_v = cells[:, 0], cells[:, 1]
-    voltage_v, temperature_c = samples["voltage_v"], samples["temperature_c"]
+    voltage_v = samples["voltage_v"]
+    coldest_c, hottest_c = _extreme_temperatures(samples)
     is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
     current_a = np.where(is_saturated, np.copysign(np.inf, samples["current_a"]), samples["current_a"])
-    # the temperature while charging; infinite while not charging, NaN if a quantity is not measured
-    charging_c = np.where(current_a <= -charging_a, temperature_c, np.inf)
-    charging_c[np.isnan(current_a) | np.isnan(temperature_c)] = np.nan
+    # the lowest temperature while charging; infinite while not charging, NaN if a quantity is not measured
+    charging_c = np.where(current_a <= -charging_a, coldest_c, np.inf)
+    charging_c[np.isnan(current_a) | np.isnan(coldest_c)] = np.nan
     return {
         "pack_over_voltage": voltage_v,
         "pack_under_voltage": voltage_v,
@@ -33,10 +34,20 @@ def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> d
         "cell_imbalance": highest_v - lowest_v,
         "discharge_over_current": current_a,
         "charge_over_current": -current_a,
-        "over_temperature": temperature_c,
-        "under_temperature": temperature_c,
+        "over_temperature": hottest_c,
+        "under_temperature": coldest_c,
         "charging_below_freezing": charging_c,
     }
+
+
+def _extreme_temperatures(samples: SampleBlock) -> tuple[Floats, Floats]:
+    """Return the temperatures of the coldest and of the hottest probe [C], each of shape (n,).
+
+    Samples of other programs may have only a mean temperature. Then their extremes do not enclose it.
+    """
+    mean_c, lowest_c, highest_c = (samples[f"temperature_{name}c"] for name in ("", "min_", "max_"))
+    has_extremes = (lowest_c <= mean_c) & (mean_c <= highest_c)
+    return np.where(has_extremes, lowest_c, mean_c), np.where(has_extremes, highest_c, mean_c)
 
 
 def estimated_values(

@@ -142,6 +142,15 @@ def test_the_lowest_cell_ends_a_discharge() -> None:
     assert pack.test.phase is Phase.REST
 
 
+def test_the_hottest_probe_is_compared_with_the_limit() -> None:
+    samples = np.zeros(3, dtype=SAMPLE)
+    samples["time_s"], samples["current_a"], samples["voltage_v"] = np.arange(3.0), 1.5, 3.9
+    samples["temperature_c"], samples["temperature_max_c"] = 30.0, 75.0
+    test = GuidedTest(SHORT, LIMITS)
+    test.feed(samples)
+    assert "The pack is at 75 °C" in test.warning
+
+
 @pytest.mark.parametrize(("current_a", "temperature_c"), [(7.0, 25.0), (1.5, 61.0)])
 def test_a_relay_disconnects_the_load_for_a_minute_after_a_limit_was_exceeded(current_a, temperature_c) -> None:
     pack = Pack(relay=True)

@@ -6,6 +6,7 @@ from pyarrow import parquet
 
 from bms_estimator import load_capture
 from tests.command_line import run
+from tests.telemetry.alarm_captures import Line, record
 
 BDF_HEADER = "Test Time / s,Voltage / V,Current / A,Surface Temperature / degC"
 
@@ -32,6 +33,17 @@ def test_columns_without_values_are_omitted(capsys, tmp_path, text):
     (tmp_path / "in.csv").write_text(text)
     assert run(capsys, "convert", tmp_path / "in.csv", "--out", tmp_path / "out.csv")[0] == 0
     assert (tmp_path / "out.csv").read_text() == text
+
+
+@pytest.mark.parametrize("name", ["out.csv", "out.parquet"])
+@pytest.mark.parametrize("coldest_c", [24.0, -30.0])
+def test_the_extremes_of_several_probes_are_restored_exactly(capsys, tmp_path, name, coldest_c):
+    line = Line(5, temperatures_c=(25.0, coldest_c, 61.0))  # an open probe sets a bit of the status
+    capture, out = record(tmp_path / "probes.bms", [line]), tmp_path / name
+    assert run(capsys, "convert", capture, "--out", out)[0] == 0
+    before, after = load_capture(capture), load_capture(out)
+    assert set(before["temperature_max_c"]) == {61.0}
+    assert all(np.array_equal(after[column], before[column], equal_nan=True) for column in before)
 
 
 @pytest.mark.parametrize("name", ["out.bdf", "out.bdf.gz", "out.bdf.csv", "out.bdf.csv.gz", "out.bdf.parquet"])

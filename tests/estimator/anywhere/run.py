@@ -52,7 +52,7 @@ def run_of(estimator: Estimator, samples: SampleBlock) -> Run:
     soc, innovation_v, variance_v2 = (f[n] for n in ("soc", "innovation_v", "innovation_variance"))
     samples_of_window = f["window"]["samples"]
     rows = np.zeros((samples.size, 5))
-    for n, (time_s, current_a, voltage_v, temperature_c, status) in enumerate(samples.tolist()):
+    for n, (time_s, current_a, voltage_v, temperature_c, *_, status) in enumerate(samples.tolist()):
         outcome = estimator.step(time_s, current_a, voltage_v, status, temperature_c)
         # An update of the filter empties the window of samples.
         updated = outcome is SampleOutcome.ACCEPTED and samples_of_window[0] == 0

@@ -75,7 +75,7 @@ def test_step_and_run_agree_with_held_currents_however_the_samples_are_divided()
     ran, stepped = Estimator(TRUTH, sampling=SAMPLING), Estimator(TRUTH, sampling=SAMPLING)
     for part in np.array_split(block, 7):
         ran.run(part)
-    for time_s, current_a, voltage_v, temperature_c, status in block.tolist():
+    for time_s, current_a, voltage_v, temperature_c, *_, status in block.tolist():
         stepped.step(time_s, current_a, voltage_v, status, temperature_c)
     assert ran.record.tobytes() == stepped.record.tobytes()
 

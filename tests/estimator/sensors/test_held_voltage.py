@@ -112,6 +112,6 @@ def test_step_and_run_agree_with_held_voltages() -> None:
     block = with_held_voltages(drive(hours=0.2)[0])
     ran, stepped = Estimator(TRUTH), Estimator(TRUTH)
     ran.run(block)
-    for time_s, current_a, voltage_v, temperature_c, status in block.tolist():
+    for time_s, current_a, voltage_v, temperature_c, *_, status in block.tolist():
         stepped.step(time_s, current_a, voltage_v, status, temperature_c)
     assert ran.record.tobytes() == stepped.record.tobytes()

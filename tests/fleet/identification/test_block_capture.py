@@ -17,7 +17,8 @@ def samples(first_s, count=60):
     block["time_s"] = first_s + np.arange(count)
     block["current_a"] = np.sin(block["time_s"] / 100.0)
     block["voltage_v"] = 3.7 - 0.01 * block["current_a"]
-    block["temperature_c"] = 25.0
+    for name in ("temperature_c", "temperature_min_c", "temperature_max_c"):
+        block[name] = 25.0
     return block
 
 

@@ -2,7 +2,7 @@
 
 from bms_estimator.edge import block
 
-VERSION = 3
+VERSION = 4
 """Version of the blocks."""
 VERSION_OFFSET = 4
 """Offset of the version in a block [bytes]."""

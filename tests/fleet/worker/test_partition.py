@@ -91,7 +91,7 @@ class MemoryCapture:
 async def test_final_state_equals_that_of_a_replay(stream, samples) -> None:
     deliver(stream, "a", blocks_of(samples))
     replayed = new_estimator(SETTINGS, CELL)
-    async for block, _ in Replay(MemoryCapture(samples)):
+    async for block, *_ in Replay(MemoryCapture(samples)):
         replayed.run(block)
     assert_state_equals(stream, "a", replayed.record)
 

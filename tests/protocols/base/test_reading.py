@@ -34,15 +34,14 @@ def test_voltage_and_current_are_read_from_common_formats(line: bytes) -> None:
     reading = read_line(line)
     assert reading is not None
     assert (reading.voltage_v, reading.current_a) == pytest.approx((13.3, 2.0))
-    assert math.isnan(reading.temperature_c)
-    assert reading.cells_v == ()
+    assert reading.temperatures_c == reading.cells_v == ()
 
 
 @pytest.mark.parametrize(
     "line", [b"6.6,-2,25.5", b"6,6;-2;25,5", b"V=6.6 I=-2 T=25.5C", b'{"volts": 6.6, "amps": -2, "temperature": 25.5}']
 )
 def test_temperature_is_read_from_common_formats(line: bytes) -> None:
-    assert read_line(line) == Reading(voltage_v=6.6, current_a=-2.0, temperature_c=25.5)
+    assert read_line(line) == Reading(voltage_v=6.6, current_a=-2.0, temperatures_c=(25.5,))
 
 
 @pytest.mark.parametrize(
@@ -129,7 +128,7 @@ def test_line_without_valid_voltage_and_current_is_rejected(line: bytes) -> None
 def test_temperature_is_nan_if_the_line_has_a_word_for_a_missing_value(line: bytes) -> None:
     reading = read_line(line)
     assert reading is not None
-    assert math.isnan(reading.temperature_c)
+    assert math.isnan(*reading.temperatures_c)
 
 
 def test_invalid_list_of_cells_is_ignored() -> None:

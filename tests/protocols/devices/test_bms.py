@@ -249,9 +249,75 @@ def test_older_jk_temperature_above_100_is_negative() -> None:
     assert sample["temperature_c"] == -5.0  # 105 means -5 degC; 140 means that the other probe is not connected
 
 
+@pytest.mark.parametrize(("byte", "celsius"), [(99, 99.0), (100, 0.0), (101, -1.0)])
+def test_byte_100_of_an_older_jk_is_minus_zero(byte: int, celsius: float) -> None:
+    frame = frames.JK_OLD.frames[:-4].replace(b"\x82\x00\x1c", bytes((0x82, 0, byte)))
+    device = make_decoder("jk")
+    decode(device, jk.with_old_checksum(frame))
+    assert device.probes["temperature_c"].tolist() == [[30.0, celsius]]
+
+
+def with_hot_probe(protocol: str) -> bytes:
+    """Return the published responses of a device with one of its probes at 90 degC."""
+    match protocol:
+        case "jbd":
+            data = bytearray(frames.JBD_BASIC)
+            data[-5:-3] = (jbd.ZERO_C + 900).to_bytes(2, "big")  # the last probe
+            data[-3:-1] = jbd.checksum(data[2:-3])
+            return bytes(data)
+        case "daly":
+            raw = bytes(daly.ZERO_C + celsius for celsius in (21, 21, 90, 22))
+            body = bytes((daly.START, 0x01, daly.PROBES, 8, 1)) + raw + bytes(daly.PROBES_PER_FRAME - len(raw))
+            return with_checksum(body) + frames.DALY_PACK
+        case "jk_old":
+            return jk.with_old_checksum(frames.JK_OLD.frames[:-4].replace(b"\x82\x00\x1c", b"\x82\x00\x5a"))
+        case _:
+            return newer_jk_response(0, deci_c_of_probe_5=900)
+
+
+@pytest.mark.parametrize(
+    ("name", "coldest_c"),
+    [("jbd", 22.3), ("daly", 21.0), ("jk_old", 30.0), ("jk_newer", 17.7)],
+    ids=lambda value: value,
+)
+def test_hottest_and_coldest_probe_are_part_of_the_sample(name: str, coldest_c: float) -> None:
+    (sample,), _ = decode(make_decoder(PROTOCOL_OF[name]), with_hot_probe(name))
+    assert (sample["temperature_max_c"], sample["temperature_min_c"]) == (90.0, coldest_c)
+
+
+def test_probes_of_a_newer_jk_have_the_numbers_of_its_maker() -> None:
+    device = make_decoder("jk")
+    decode(device, frames.JK_NEWER.frames)
+    np.testing.assert_equal(device.probes["temperature_c"], [[17.7, 17.7, np.nan, 17.9, 18.0]])
+    decode(device, newer_jk_response(2, probe_bits=0b110))  # an older board
+    np.testing.assert_equal(device.probes["temperature_c"], [[17.7, 17.7, np.nan, np.nan, np.nan]])
+
+
+@pytest.mark.parametrize(
+    ("name", "soc", "remaining_ah", "capacity_ah"),
+    [
+        ("jbd", 1.0, 4.98, 5.0),
+        ("daly", 0.922, math.nan, math.nan),
+        ("jk_old", 0.15, math.nan, 14.0),
+        ("jk_newer", 0.52, 1.043, 2.0),
+    ],
+)
+def test_soc_and_capacity_by_the_bms_are_decoded(
+    name: str, soc: float, remaining_ah: float, capacity_ah: float
+) -> None:
+    device = make_decoder(PROTOCOL_OF[name])
+    decode(device, PUBLISHED[name].frames)
+    assert device.last_reading is not None
+    assert device.last_reading[-3:] == pytest.approx((soc, remaining_ah, capacity_ah), nan_ok=True)
+
+
 def newer_jk_response(address: int, **values: int) -> bytes:
-    """Return the newer response of the pack with this address, with its ``millivolts`` or ``milliamperes`` if given."""
+    """Return the newer response of the pack with this address, with its ``millivolts``, ``milliamperes``, bits of the connected
+    probes or temperature of probe 5 if given."""
     frame = bytearray(frames.JK_NEWER_FRAME)
+    frame[214] = values.get("probe_bits", frame[214])
+    if "deci_c_of_probe_5" in values:
+        frame[258:260] = values["deci_c_of_probe_5"].to_bytes(2, "little")
     for name, offset in (("millivolts", 150), ("milliamperes", 158)):
         if name in values:
             frame[offset : offset + 4] = values[name].to_bytes(4, "little", signed=True)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
 from bms_estimator.protocols.devices.junctek import QUERY, JunctekProtocol
 from bms_estimator.protocols.devices.pylontech import PylontechProtocol
 from bms_estimator.protocols.devices.vedirect import VeDirectProtocol
@@ -127,6 +128,37 @@ def test_recorded_frames_are_decoded_with_a_current_that_is_positive_on_discharg
     )
     assert decoder.fault is None
     assert decoder.description is not None
+
+
+def test_lowest_and_highest_temperature_of_each_battery_are_part_of_the_sample() -> None:
+    (sample,) = PylontechProtocol().feed(1.0, US2000_PWR.replace(b"14000  3377", b"90000  3377"))
+    assert (sample["temperature_min_c"], sample["temperature_max_c"]) == (13.0, 90.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "soc", "remaining_ah"),
+    [
+        ("vedirect", BMV_DISCHARGING, 0.839, math.nan),
+        (
+            "vedirect",
+            BMV_DISCHARGING.replace(b"SOC\t839", b"SOC\t---").replace(b"Checksum\tq", b"Checksum\t\x8e"),
+            math.nan,
+            math.nan,
+        ),
+        ("junctek", KH_CHARGING, math.nan, 7.421),
+        ("pylontech", US5000_PWR, 0.81, math.nan),
+        ("pylontech", US2000_PWR, 0.89, math.nan),
+        ("pylontech", US5000_PWR.replace(b"81%", b"-"), math.nan, math.nan),
+    ],
+)
+def test_soc_and_remaining_charge_by_the_device_are_decoded(
+    name: str, data: bytes, soc: float, remaining_ah: float
+) -> None:
+    decoder = make_protocol(SensorSettings.model_validate({"protocol": name}))
+    assert decoder.feed(1.0, data).size == 1
+    assert isinstance(decoder, ReadingProtocol)
+    assert decoder.last_reading is not None
+    assert decoder.last_reading[-3:-1] == pytest.approx((soc, remaining_ah), nan_ok=True)
 
 
 def test_current_sign_setting_corrects_a_reversed_shunt() -> None:
@@ -305,7 +337,7 @@ async def test_simulated_device_is_read_by_the_serial_source(name: str, cell_cou
         sensor = SensorSettings.model_validate({"protocol": name, "port": meter.path})
         running = asyncio.create_task(meter.run())
         async with asyncio.timeout(LONG_S), SerialSource(sensor) as source:
-            async for block, cells_v in source:
+            async for block, cells_v, *_ in source:
                 assert voltages_and_currents(block) == [(49.87, -3.25)] * block.size
                 assert set(block["temperature_c"]) == {21.0}
                 if cells_v.shape[1] == cell_count:

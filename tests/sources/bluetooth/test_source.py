@@ -47,27 +47,25 @@ def test_current_of_a_reading_is_positive_on_charge() -> None:
     reading = convert_sample(JBD)
     assert reading is not None
     expected = Reading(
-        voltage_v=15.6, current_a=-2.87, temperature_c=22.133, cells_v=(3.43, 3.425, 3.432, 3.417), time_s=0.0
+        voltage_v=15.6, current_a=-2.87, temperatures_c=(22.133,), cells_v=(3.43, 3.425, 3.432, 3.417), time_s=0.0
     )
     assert reading._replace(time_s=0.0) == expected  # without a timestamp, time_s is NaN
     settings = Settings.model_validate({"source": {"kind": "ble", "name": "DP04S007L4S100A"}})
     assert settings.sensor.current_sign == "charge_positive"
 
 
-def test_temperature_is_the_mean_of_the_sensors_on_cells() -> None:
+def test_temperatures_are_those_of_the_sensors_on_cells() -> None:
     sensors = [Sensor(18.1, "CELL"), Sensor(18.3, "CELL"), Sensor(31.0, "MOSFET")]
     reading = convert_sample(JBD | {"temp_values": sensors})
     assert reading is not None
-    assert reading.temperature_c == pytest.approx(18.2)
+    assert reading.temperatures_c == (18.1, 18.3)
 
 
-@pytest.mark.parametrize(("sensors", "mean_c"), [([18.0, 19.0], 18.5), ([], math.nan), ([math.nan, 19.0], 19.0)])
-def test_without_sensors_on_cells_and_a_temperature_of_the_bms_all_sensors_are_averaged(
-    sensors: list[float], mean_c: float
-) -> None:
+@pytest.mark.parametrize("sensors", [[18.0, 19.0], []])
+def test_without_sensors_on_cells_and_a_temperature_of_the_bms_all_sensors_are_used(sensors: list[float]) -> None:
     reading = convert_sample({"voltage": 13.2, "current": 0, "temp_values": sensors})
     assert reading is not None
-    assert reading.temperature_c == pytest.approx(mean_c, nan_ok=True)
+    assert reading.temperatures_c == tuple(sensors)
     assert reading.cells_v == ()
 
 

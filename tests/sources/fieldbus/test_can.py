@@ -137,7 +137,7 @@ async def test_samples_of_a_profile_have_a_current_that_is_positive_on_discharge
         while "connected" not in (line_source.silence_reason or ""):  # noqa: ASYNC110 - it has no event for it
             await asyncio.sleep(0.001)
         sender.send(PYLONTECH_FRAME)
-        block, _ = await next_block
+        block, *_ = await next_block
         assert block[["current_a", "voltage_v", "temperature_c"]].tolist() == [(12.3, 52.34, 21.5)]
         assert line_source.silence_reason is None
 

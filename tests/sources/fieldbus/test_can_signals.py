@@ -96,7 +96,7 @@ def test_only_the_frame_of_the_profile_is_decoded() -> None:
     assert can_map.feed(0.0, 0x355, extended=False, data=bytes(4)) is None
     reading = can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA)
     assert reading is not None
-    assert reading[:4] == (52.34, -12.3, 21.5, ())
+    assert reading[:4] == (52.34, -12.3, (21.5,), ())
 
 
 def test_truncated_frame_gives_the_values_that_it_contains() -> None:
@@ -104,7 +104,7 @@ def test_truncated_frame_gives_the_values_that_it_contains() -> None:
     reading = can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:4])
     assert reading is not None
     assert reading[:2] == (52.34, -12.3)
-    assert math.isnan(reading.temperature_c)
+    assert math.isnan(*reading.temperatures_c)
     assert can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:2]) is None
     assert can_map.counters["short_frames"] == 2
 
@@ -130,7 +130,7 @@ def test_reading_needs_voltage_and_current_of_about_one_time_and_contains_recent
     assert can_map.missing == "source.voltage (frame 0x001)"
     reading = feed(1.0, volts, b"\x82")
     assert reading is not None
-    assert reading[:3] == (13.0, 0.5, 21.0)
+    assert reading[:3] == (13.0, 0.5, (21.0,))
     assert reading.cells_v[:2] == (3.2, 3.3)
     assert math.isnan(reading.cells_v[2])
     assert feed(2.0, volts, b"\x83") is None
@@ -146,7 +146,7 @@ def test_reading_needs_voltage_and_current_of_about_one_time_and_contains_recent
     late_reading = feed(13.5 + MAX_AGE_S, amperes, b"\x05")
     assert late_reading is not None
     assert (late_reading.voltage_v, late_reading.cells_v) == (13.1, ())
-    assert math.isnan(late_reading.temperature_c)
+    assert math.isnan(*late_reading.temperatures_c)
 
 
 def test_signals_of_a_dbc_file_are_decoded(dbc_source: CanSource) -> None:
@@ -162,7 +162,7 @@ def test_signals_of_a_dbc_file_are_decoded(dbc_source: CanSource) -> None:
     assert can_map.counters["short_frames"] == 1
     reading = can_map.feed(0.0, 0x500, extended=False, data=(4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
     assert reading is not None
-    assert reading[:4] == (400.1, 12.3, 25.0, (3.3, 3.301, 3.302))
+    assert reading[:4] == (400.1, 12.3, (25.0,), (3.3, 3.301, 3.302))
 
 
 @pytest.mark.parametrize(

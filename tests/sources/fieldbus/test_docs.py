@@ -33,4 +33,4 @@ def test_example_of_a_dbc_file_has_the_signals_of_the_settings_before_it(tmp_pat
     assert frames.feed(0.0, 0x18FF0001, extended=True, data=bytes.fromhex("e40ce50c")) is None
     reading = frames.feed(0.0, 0x6B0, extended=False, data=bytes.fromhex("ff85020815000000"))
     assert reading is not None
-    assert reading[:4] == (52.0, -12.3, 21.0, (3.3, 3.301))
+    assert reading[:4] == (52.0, -12.3, (21.0,), (3.3, 3.301))

@@ -59,12 +59,12 @@ async def test_device_with_a_profile_is_read_over_tcp_in_one_request() -> None:
 
 async def test_device_with_a_profile_is_read_over_a_serial_line(tmp_path: Path) -> None:
     registers = Registers(input_={0x1000 + i: 0 for i in range(17)} | {0x1100 + i: 3300 + i for i in range(26)})
-    registers.input |= {0x1000: 5320, 0x1001: 150, 0x1009: 2981}
+    registers.input |= {0x1000: 5320, 0x1001: 150, 0x1009: 2981, 0x100C: 3000, 0x100D: 2971}
     async with serial_device(registers, UNIT, tmp_path) as path:
         (line,) = await read_lines(ModbusProducer(source(profile="seplos-v3", unit=UNIT, port=str(path))), 1)
     assert line.pop("cells_v") == [round(3.3 + i / 1000, 3) for i in range(16)]
-    assert line == {"voltage_v": 53.2, "current_a": 1.5, "temperature_c": 24.95}
-    assert set(registers.requests) == {(4, 0x1000, 10), (4, 0x1100, 16)}
+    assert line == {"voltage_v": 53.2, "current_a": 1.5, "temperatures_c": [24.95, 26.85, 23.95]}
+    assert set(registers.requests) == {(4, 0x1000, 14), (4, 0x1100, 16)}
 
 
 async def test_rtu_frames_over_tcp_are_read() -> None:
@@ -216,7 +216,7 @@ async def test_samples_have_a_current_that_is_positive_on_discharge_and_continue
     async with asyncio.timeout(LONG_S), line_source:
         blocks = aiter(line_source)
         async with tcp_device(registers, UNIT, port):
-            block, _ = await anext(blocks)
+            block, *_ = await anext(blocks)
         assert block[["current_a", "voltage_v", "temperature_c"]].tolist() == [(12.3, 52.34, 21.5)]
         assert line_source.silence_reason is None
         async with tcp_device(registers, UNIT, port):

@@ -81,7 +81,7 @@ def test_device_with_a_profile_is_read_in_as_few_requests_as_possible() -> None:
     assert (request.table, request.address, request.words) == ("holding", 259, 4)
     assert request.described == "source.voltage, source.current, source.temperature (holding registers 259 to 262)"
     seplos = plan_requests(list_values(source(profile="seplos-v3")))
-    assert [(r.table, r.address, r.words) for r in seplos] == [("input", 0x1000, 10), ("input", 0x1100, 16)]
+    assert [(r.table, r.address, r.words) for r in seplos] == [("input", 0x1000, 14), ("input", 0x1100, 16)]
 
 
 def test_rejected_request_is_split_by_quantity_and_without_gaps() -> None:
@@ -100,12 +100,13 @@ def test_registers_of_devices_with_a_profile_are_decoded() -> None:
     )
     reading = decode_reading(list_values(victron), words_read)
     assert reading is not None
-    assert reading[:4] == (52.34, -12.3, -2.5, ())
+    assert reading[:4] == (52.34, -12.3, (-2.5,), ())
     seplos = source(profile="seplos-v3")
     words_read = {0x1000: 5320, 0x1001: 0xFF38, 0x1009: 2961} | {0x1100 + i: 3325 + i for i in range(16)}
     reading = decode_reading(list_values(seplos), {("input", address): word for address, word in words_read.items()})
     assert reading is not None
-    assert reading[:3] == (53.2, -2.0, 22.95)
+    assert reading[:2] == (53.2, -2.0)
+    assert reading.temperatures_c[0] == 22.95
     assert reading.cells_v == tuple(round(3.325 + i / 1000, 3) for i in range(16))
 
 
@@ -116,7 +117,7 @@ def test_nan_and_infinity_count_as_not_measured(raw: float) -> None:
     words_read = words(13.0, "float32") | words(1.5, "float32", address=2) | words(raw, "float32", address=4)
     reading = decode_reading(list_values(source_settings), words_read)
     assert reading is not None
-    assert math.isnan(reading.temperature_c)
+    assert math.isnan(*reading.temperatures_c)
     assert decode_reading(list_values(source_settings), words_read | words(raw, "float32")) is None
     assert decode_reading(list_values(source_settings), words_read | words(raw, "float32", address=2)) is None
 
@@ -137,7 +138,7 @@ def test_configured_absent_value_counts_as_not_measured() -> None:
     reading = decode_reading(list_values(source_settings), words_read)
     assert reading is not None
     assert (reading.current_a, reading.cells_v[0]) == (-1.0, 3.3)
-    assert math.isnan(reading.temperature_c)
+    assert math.isnan(*reading.temperatures_c)
     assert math.isnan(reading.cells_v[1])
     reading_without_cells = decode_reading(list_values(source_settings), words_read | {("holding", 3): 0})
     assert reading_without_cells is not None
@@ -173,8 +174,7 @@ def test_invalid_settings_are_rejected_with_a_reason(options: dict[str, object],
 def test_settings_override_the_profile() -> None:
     source_settings = source(profile="victron-gx", unit=3, temperature={"address": 61, "type": "int16", "scale": 0.1})
     assert source_settings.unit == 3
-    assert source_settings.temperature is not None
-    assert source_settings.temperature.address == 61
+    assert [register.address for register in source_settings.temperature] == [61]
     assert source_settings.voltage.address == 259
 
 
@@ -195,5 +195,5 @@ def test_zero_in_a_register_of_a_gx_device_counts_as_not_measured(
     reading = decode_reading(list_values(source(profile="victron-gx")), read | words(temperature, "int16", address=262))
     assert (reading is None) is (measured is None)
     if reading is not None and measured is not None:
-        temperature_c = None if math.isnan(reading.temperature_c) else reading.temperature_c
+        temperature_c = None if math.isnan(*reading.temperatures_c) else reading.temperatures_c[0]
         assert (reading.voltage_v, reading.current_a, temperature_c) == measured

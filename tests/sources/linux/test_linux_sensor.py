@@ -1,6 +1,5 @@
 """Linux sensors in a simulated sysfs: values in SI units, and files that fail, vanish, hang or contain no number."""
 
-import math
 import os
 import threading
 from collections.abc import AsyncGenerator
@@ -89,7 +88,7 @@ async def test_voltage_and_current_of_an_ads1115_and_temperature_of_another_chip
         ).iter_lines()
     )
     # 26,560 of 0.125 mV by the divider of 16; -640 of 7.8125 uV across 0.75 mohm
-    assert reading == Reading(voltage_v=53.12, current_a=-6.666667, temperature_c=21.5)
+    assert reading == Reading(voltage_v=53.12, current_a=-6.666667, temperatures_c=(21.5,))
 
 
 @pytest.mark.parametrize(
@@ -170,7 +169,7 @@ async def test_temperature_that_is_no_number_loses_no_sample(tmp_path: Path):
     hwmon(tmp_path, **INA226, temp1_input="nonsense")
     ina = sensor(tmp_path, temperature="temp1_input")
     reading = await read_first(ina.iter_lines())
-    assert math.isnan(reading.temperature_c)
+    assert reading.temperatures_c == ()
     assert ina.counters == {"read_errors": 0, "value_errors": 1}
 
 

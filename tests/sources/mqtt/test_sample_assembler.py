@@ -120,10 +120,10 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
             ("BE/spec_data", '{"cell_voltages":[3.701,3.702,3.700],"cell_balancing":[false,false,true]}'),
             (
                 "BE/info",
-                '{"bms_status":"ACTIVE","SOC":81.5,"temperature_max":21.5,"battery_current":-12.3,"battery_voltage":355.2}',
+                '{"bms_status":"ACTIVE","SOC":81.5,"temperature_max":21.5,"temperature_min":20.5,"battery_current":-12.3,"battery_voltage":355.2}',
             ),
         ],
-        {"voltage_v": 355.2, "current_a": -12.3, "temperature_c": 21.5, "cells_v": [3.701, 3.702, 3.7]},
+        {"voltage_v": 355.2, "current_a": -12.3, "temperatures_c": [21.5, 20.5], "cells_v": [3.701, 3.702, 3.7]},
         "charge_positive",
     ),
     "opendtu": (
@@ -253,7 +253,7 @@ def test_a_voltage_is_used_once_and_the_samples_of_later_currents_mark_it() -> N
         assembler.add_message(topic, payload, time_s, retained=False)
         for now_s in (time_s, time_s + 0.45, time_s + 0.55):
             block = decoder.feed(now_s, assembler.line(now_s))
-            samples += [(voltage_v, int(status)) for _, _, voltage_v, _, status in block.tolist()]
+            samples += block[["voltage_v", "status"]].tolist()
     measured = [voltage_v for voltage_v, status in samples if not status & SampleStatus.VOLTAGE_HELD]
     assert measured == [52.0, 51.0, 50.0]
     assert len(samples) >= 20
@@ -288,6 +288,29 @@ def test_the_values_of_a_publisher_that_sends_only_changes_hold_for_its_longest_
             repeated_s.append(now_s)
     assert repeated_s == [90.0, 180.0, 270.0, 360.0]
     assert feed(assembler, [("i", "2")], 500.0) == []  # the voltage is too old
+
+
+@pytest.mark.parametrize(
+    ("temperature", "messages", "temperatures_c"),
+    [
+        pytest.param({"topic": "t/{probe}"}, [("t/2", "22"), ("t/1", "21")], [21.0, 22.0], id="topics"),
+        pytest.param({"topic": "t/{probe}"}, [("t/3", "23"), ("t/1", "21")], [21.0, None, 23.0], id="missing"),
+        pytest.param({"topic": "t/{probe}"}, [("t/2", "22"), ("t/2", "null"), ("t/1", "21")], [21.0, None], id="null"),
+        pytest.param({"topic": "t/{probe}"}, [("t/0", "1"), ("t/33", "1"), ("t/x", "1")], None, id="no probes"),
+        pytest.param(
+            {"topic": "t", "path": "T{probe}"}, [("t", '{"T1":21,"T2":22,"TMOS":70}')], [21.0, 22.0], id="keys"
+        ),
+        pytest.param(
+            [{"topic": "t", "path": "0"}, {"topic": "u"}], [("u", "22"), ("t", "[21]")], [21.0, 22.0], id="list"
+        ),
+    ],
+)
+def test_all_temperature_probes_are_part_of_the_sample(
+    temperature: object, messages: Messages, temperatures_c: list[float | None] | None
+) -> None:
+    assembler = SampleAssembler(source(voltage={"topic": "v"}, current={"topic": "i"}, temperature=temperature))
+    (line,) = feed(assembler, [*messages, ("v", "52"), ("i", "1")])
+    assert line.get("temperatures_c") == temperatures_c
 
 
 def test_temperature_is_used_for_five_minutes() -> None:
@@ -394,7 +417,7 @@ def test_settings_override_the_profile() -> None:
     merged = source(profile="battery-emulator", current={"scale": -1}, temperature="temperature_min", interval_s=2)
     assert merged.current.topics == ("{prefix}/info{instance}",)
     assert (merged.current.path, merged.current.scale) == ("battery_current", -1.0)
-    assert merged.temperature.path == "temperature_min"
+    assert [location.path for location in merged.temperature] == ["temperature_min"]
     assert (merged.prefix, merged.period_s) == ("BE", 2.0)  # the prefix is that of the profile
 
 

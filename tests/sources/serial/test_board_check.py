@@ -37,7 +37,7 @@ async def run_source(source: SerialSource, blocks: list[SampleBlock]):
     """Run the source. Append its blocks to ``blocks``."""
 
     async def store_blocks() -> None:
-        async for block, _ in source:
+        async for block, *_ in source:
             blocks.append(block.copy())
 
     async with source:

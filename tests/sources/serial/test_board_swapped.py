@@ -123,7 +123,7 @@ async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Li
     ours, other = RunningBoard(OUR_SERIAL, OUR_DIVIDER), RunningBoard(OTHER_SERIAL, OTHER_DIVIDER, 50_000, 900.0)
 
     async def store_blocks() -> None:
-        async for block, _ in source:
+        async for block, *_ in source:
             blocks.append(block)
 
     async with source:

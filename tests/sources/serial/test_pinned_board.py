@@ -85,7 +85,7 @@ async def source(
     reader.blocks = []
 
     async def store_blocks() -> None:
-        async for block, _ in reader:
+        async for block, *_ in reader:
             reader.blocks.append(block.copy())
 
     async with reader:

@@ -49,7 +49,7 @@ async def take(source: SerialSource, min_samples: int) -> SampleBlock:
     """Return the next samples, at least ``min_samples``."""
     blocks: list[SampleBlock] = []
     async with asyncio.timeout(LONG_S):
-        async for block, _ in source:
+        async for block, *_ in source:
             blocks.append(block.copy())
             if sum(b.size for b in blocks) >= min_samples:
                 break
@@ -75,7 +75,7 @@ async def run_tasks(*tasks: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
 
 async def store_blocks(source: SerialSource, blocks: list[SampleBlock]) -> None:
     """Append all blocks of the source to ``blocks``."""
-    async for block, _ in source:
+    async for block, *_ in source:
         blocks.append(block.copy())
 
 

@@ -53,6 +53,8 @@ class Role(Enum):
     CURRENT = "current"
     VOLTAGE = "voltage"
     TEMPERATURE = "temperature"
+    TEMPERATURE_MIN = "lowest temperature"
+    TEMPERATURE_MAX = "highest temperature"
     STATE = "state"
     CHARGE_CURRENT = "charge current"
     STATUS = "status"
@@ -227,7 +229,7 @@ class LayoutFinder:
 
 
 def _own_columns(header: Sequence[str]) -> dict[ColumnRole, Column]:
-    """Return the columns that only tables of this project have: cell voltages and the status.
+    """Return the columns that only tables of this project have: cell voltages, extremes of the temperature probes and the status.
 
     ``fleet capture`` writes exactly the columns of a sample and of the cells; the status of another table has another meaning.
     """
@@ -236,7 +238,10 @@ def _own_columns(header: Sequence[str]) -> dict[ColumnRole, Column]:
         CellVoltage(number): Column(header.index(name), name, SI_UNITS["voltage"])
         for number, name in enumerate(cells, 1)
     }
-    if {*header} - {*cells} == {*(SAMPLE.names or ())}:
+    extremes = {Role.TEMPERATURE_MIN: "temperature_min_c", Role.TEMPERATURE_MAX: "temperature_max_c"}
+    if {"temperature_c", *extremes.values()} <= {*header}:
+        columns |= {role: Column(header.index(name), name, SI_UNITS["temperature"]) for role, name in extremes.items()}
+    if ({*header} - {*cells}) | {*extremes.values()} == {*(SAMPLE.names or ())}:
         columns[Role.STATUS] = Column(header.index("status"), "status", Unit(""))
     return columns
 

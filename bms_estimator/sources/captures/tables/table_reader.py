@@ -99,7 +99,7 @@ class Table:
                 samples["current_a"] = np.where(np.abs(state) == 1.0, directed, samples["current_a"])
             if self._layout.dialect is not OWN:  # this project's tables hold the time stamps that a source delivered
                 before = _separate_steps(before, samples)
-            self.implausible += remove_implausible(samples["temperature_c"], MIN_C, MAX_C)
+            self.implausible += remove_implausible_temperatures(samples)
             self.cells = cell_voltages(raw, self._layout)
             yield samples
 
@@ -135,9 +135,18 @@ def to_samples(raw: RawBlock, layout: Layout) -> SampleBlock:
         discharge_a, charge_a = np.abs(values[Role.CURRENT]), np.abs(values[Role.CHARGE_CURRENT])
         samples["current_a"] = np.nan_to_num(discharge_a) - np.nan_to_num(charge_a)
     samples["temperature_c"] = values.get(Role.TEMPERATURE, np.nan)
+    samples["temperature_min_c"] = values.get(Role.TEMPERATURE_MIN, samples["temperature_c"])
+    samples["temperature_max_c"] = values.get(Role.TEMPERATURE_MAX, samples["temperature_c"])
     if Role.STATUS in values:
         samples["status"] = np.nan_to_num(values[Role.STATUS]).clip(0.0, np.iinfo(np.uint32).max)
     return samples
+
+
+def remove_implausible_temperatures(samples: SampleBlock) -> int:
+    """Replace implausible temperatures with NaN in place; return the number of samples with an implausible ``temperature_c``."""
+    for name in ("temperature_min_c", "temperature_max_c"):
+        remove_implausible(samples[name], MIN_C, MAX_C)
+    return remove_implausible(samples["temperature_c"], MIN_C, MAX_C)
 
 
 def cell_voltages(raw: RawBlock, layout: Layout) -> CellBlock:

@@ -1,0 +1,159 @@
+"""Check of temperature probes: which of them are faulty, and the temperatures of a sample. It does no I/O."""
+
+import math
+from collections.abc import Sequence
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+
+from bms_estimator.model.sample import MAX_C, MIN_C, NO_PROBES, PROBE, ProbeBlock, SampleBlock, SampleStatus
+
+STEP_K = 30.0
+"""Change of a probe that is believed at once [K]. The delays of the alarms suppress single glitches of this size."""
+NEAR_K = 10.0
+"""Maximum change to a reading that usually means an open or shorted probe, if the probe really has this temperature [K]."""
+RATE_K_PER_S = 20.0
+"""Maximum rate of a probe [K/s]. In thermal runaway a probe on a cell rises by several K/s."""
+APART_K = 30.0
+"""Maximum difference of a sound probe from the median of all probes [K]. The project's choice, twice what the cells of a pack
+usually differ by."""
+HOT_C = 45.0
+"""Temperature above which the last reading of a probe still counts after the probe has failed [C]. Heat destroys probes, and the
+usual charging limit of cells is 45 C."""
+_FIELDS = ("temperature_c", "temperature_min_c", "temperature_max_c")
+"""Fields of a sample for the temperatures of ``CheckedProbes``, in their order."""
+OPEN_OR_SHORT_C = (-40.0, -30.0, 127.0)
+"""Plausible readings that devices report for an open or shorted probe [C]; 255, -273 and 3276.7 are not plausible anyway."""
+OPEN_OR_SHORT_TOLERANCE_K = 0.2
+"""Maximum deviation from such a reading [K], caused by conversion from kelvin."""
+
+
+class CheckedProbes(NamedTuple):
+    """Temperatures of a sample [C], NaN without a credible probe."""
+
+    mean_c: float
+    lowest_c: float
+    highest_c: float
+    faulty: tuple[bool, ...]
+    """True for each faulty probe."""
+
+
+class ProbeCheck:
+    """Check of the probes of one device, in the order of its samples.
+
+    A faulty probe is excluded from mean and extremes, with two exceptions on the safe side. The highest temperature includes a hot
+    probe that is far above the others, and the last hot reading of a probe that failed. If the probes differ and the majority
+    does not show which one is wrong, all count.
+
+    Attributes:
+        faults: Number of times that a probe became faulty.
+    """
+
+    def __init__(self) -> None:
+        self._probes: list[_Probe] = []
+        self.faults = 0
+
+    def apply(self, block: SampleBlock, rows_c: Sequence[Sequence[float]]) -> ProbeBlock:
+        """Set the temperatures of samples, and the bit ``PROBE_FAULT`` of their status. Return the probes of each sample.
+
+        Args:
+            block: Samples with their times and the other bits of their status; changed in place.
+            rows_c: Readings of the probes for each sample.
+        """
+        checked = [self.check(time_s, row_c) for time_s, row_c in zip(block["time_s"].tolist(), rows_c, strict=True)]
+        for name, field in zip(CheckedProbes._fields, _FIELDS, strict=False):
+            block[field] = [getattr(each, name) for each in checked]
+        faults = [SampleStatus.PROBE_FAULT if any(each.faulty) else 0 for each in checked]
+        block["status"] |= np.array(faults, dtype=block["status"].dtype)
+        return probe_block(
+            [list(zip(row_c, each.faulty, strict=True)) for row_c, each in zip(rows_c, checked, strict=True)]
+        )
+
+    def check(self, time_s: float, readings_c: Sequence[float]) -> CheckedProbes:
+        """Check the readings of a sample.
+
+        Args:
+            time_s: Time of the sample [s].
+            readings_c: Reading of each probe [C], always in the same order; NaN: absent.
+        """
+        self._probes += [_Probe() for _ in range(len(readings_c) - len(self._probes))]
+        credible = {
+            n: reading_c for n, reading_c in enumerate(readings_c) if self._probes[n].is_credible(time_s, reading_c)
+        }
+        outliers, suspects = _far_apart(credible)
+        typical_c = [reading_c for n, reading_c in credible.items() if n not in outliers]
+        held_c = [
+            probe.credible_c for n, probe in enumerate(self._probes) if n not in credible and probe.credible_c > HOT_C
+        ]
+        faulty = tuple(
+            n in suspects or (n not in credible and not math.isnan(reading_c)) for n, reading_c in enumerate(readings_c)
+        )
+        for probe, is_faulty in zip(self._probes, faulty, strict=False):
+            self.faults += is_faulty and not probe.was_faulty
+            probe.was_faulty = is_faulty
+        if not typical_c:
+            return CheckedProbes(math.nan, math.nan, math.nan, faulty)
+        highest_c = max(*credible.values(), *held_c, -math.inf)
+        return CheckedProbes(sum(typical_c) / len(typical_c), min(typical_c), highest_c, faulty)
+
+
+def probe_block(rows: Sequence[Sequence[tuple[float, bool]]]) -> ProbeBlock:
+    """Return the probes of samples. Rows with fewer probes are filled up with absent ones."""
+    probes = max(map(len, rows), default=0)
+    if probes == 0:
+        return NO_PROBES
+    return np.array([[*row, *[(math.nan, False)] * (probes - len(row))] for row in rows], dtype=PROBE)
+
+
+class _Probe:
+    """One temperature probe.
+
+    Attributes:
+        credible_c: Last credible reading [C]; NaN without one.
+        was_faulty: True if the probe was faulty in the last sample.
+    """
+
+    def __init__(self) -> None:
+        self.credible_c, self.was_faulty = math.nan, False
+        self._credible_s = 0.0
+        self._doubted_c = math.nan  # previous reading if it was not credible
+
+    def is_credible(self, time_s: float, reading_c: float) -> bool:
+        """Return True if a reading is possible. An impossible change needs confirmation by the next reading."""
+        possible = self._is_possible(time_s, reading_c)
+        if possible:
+            self.credible_c, self._credible_s, self._doubted_c = reading_c, time_s, math.nan
+        elif not math.isnan(reading_c):
+            self._doubted_c = reading_c
+        return possible
+
+    def _is_possible(self, time_s: float, reading_c: float) -> bool:
+        change_k = reading_c - self.credible_c
+        if not MIN_C <= reading_c <= MAX_C:
+            return False
+        if any(abs(reading_c - each) <= OPEN_OR_SHORT_TOLERANCE_K for each in OPEN_OR_SHORT_C):
+            return abs(change_k) <= NEAR_K
+        if math.isnan(change_k) or abs(change_k) <= STEP_K:
+            return True
+        if not math.isnan(self._doubted_c):  # only as far as the previous reading confirms the change
+            confirmed_k = math.copysign(1.0, change_k) * (self._doubted_c - self.credible_c)
+            if confirmed_k < 0.0:
+                return False
+            change_k = min(abs(change_k), confirmed_k)
+        return abs(change_k) <= STEP_K + RATE_K_PER_S * max(time_s - self._credible_s, 0.0)
+
+
+def _far_apart(readings_c: dict[int, float]) -> tuple[set[int], set[int]]:
+    """Return the numbers of the probes that differ from most others, and of those that are suspected.
+
+    If the majority does not show which probe is wrong, none differs from it, and the lowest and the highest are suspected.
+    """
+    if not readings_c or max(readings_c.values()) - min(readings_c.values()) <= APART_K:
+        return set(), set()
+    middle_c = median(readings_c.values())
+    outliers = {n for n, reading_c in readings_c.items() if abs(reading_c - middle_c) > APART_K}
+    if outliers and 2 * len(outliers) < len(readings_c):
+        return outliers, outliers
+    by_temperature = sorted(readings_c, key=readings_c.__getitem__)
+    return set(), {by_temperature[0], by_temperature[-1]}

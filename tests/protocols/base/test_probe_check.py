@@ -1,0 +1,107 @@
+"""Check of temperature probes: the temperatures of samples, and which probes are faulty."""
+
+import math
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bms_estimator.protocols.base.probe_check import CheckedProbes, ProbeCheck
+
+NAN = math.nan
+
+
+def check_each_second(*rows_c: Sequence[float]) -> list[CheckedProbes]:
+    """Return the results for samples at 1 Hz."""
+    probes = ProbeCheck()
+    return [probes.check(float(time_s), row_c) for time_s, row_c in enumerate(rows_c)]
+
+
+@pytest.mark.parametrize(
+    ("readings_c", "mean_lowest_highest_c", "faulty"),
+    [
+        pytest.param([25.0], (25.0, 25.0, 25.0), (), id="one probe"),
+        pytest.param([20.0, 22.0, NAN], (21.0, 20.0, 22.0), (), id="absent probe"),
+        pytest.param([25.0, 25.0, 90.0, 25.0], (25.0, 25.0, 90.0), (2,), id="hot probe counts for the highest"),
+        pytest.param([25.0, -15.0, 25.0], (25.0, 25.0, 25.0), (1,), id="cold outlier"),
+        pytest.param([25.0, -15.0], (5.0, -15.0, 25.0), (0, 1), id="of two probes none is known to be right"),
+        pytest.param([25.0, 25.0, -15.0, -15.0], (5.0, -15.0, 25.0), (1, 2), id="two against two"),
+        pytest.param([25.0, -30.0, -39.9, 127.0], (25.0, 25.0, 25.0), (1, 2, 3), id="open and shorted probes"),
+        pytest.param([-273.1, 255.0, 3276.7, 20.0], (20.0, 20.0, 20.0), (0, 1, 2), id="impossible readings"),
+        pytest.param([-40.0], (NAN, NAN, NAN), (0,), id="only an open probe"),
+        pytest.param([], (NAN, NAN, NAN), (), id="no probe"),
+    ],
+)
+def test_temperatures_are_those_of_the_credible_probes(
+    readings_c: list[float], mean_lowest_highest_c: tuple[float, ...], faulty: tuple[int, ...]
+) -> None:
+    (result,) = check_each_second(readings_c)
+    assert result[:3] == pytest.approx(mean_lowest_highest_c, nan_ok=True)
+    assert tuple(n for n, is_faulty in enumerate(result.faulty) if is_faulty) == faulty
+
+
+@pytest.mark.parametrize("rate_k_per_s", [1.0, 8.0, 20.0, 50.0])
+def test_a_probe_in_thermal_runaway_counts_from_the_first_sample_on(rate_k_per_s: float) -> None:
+    hot_c = [min(25.0 + rate_k_per_s * second, 180.0) for second in range(60)]
+    results = check_each_second(*([25.0, 25.0, reading_c, 25.0] for reading_c in hot_c))
+    assert [result.highest_c for result in results] == hot_c
+
+
+def test_a_jump_that_stays_is_believed_within_seconds() -> None:
+    results = check_each_second([25.0, 25.0], *[[25.0, 90.0]] * 5)
+    assert [result.highest_c for result in results] == [25.0, 25.0, 90.0, 90.0, 90.0, 90.0]
+    assert results[1].faulty == (False, True)
+
+
+def test_a_rise_that_is_faster_than_possible_but_goes_on_is_believed() -> None:
+    results = check_each_second(*([reading_c] for reading_c in (25.0, 80.0, 140.0, 190.0)))
+    assert results[-1].highest_c == 190.0
+
+
+def test_a_single_glitch_is_excluded_and_the_next_reading_is_believed() -> None:
+    results = check_each_second([25.0], [85.0], [25.1], [-28.0], [25.2])
+    assert [result.highest_c for result in results] == pytest.approx([25.0, NAN, 25.1, NAN, 25.2], nan_ok=True)
+
+
+def test_a_probe_that_bounces_is_never_believed_and_counts_as_one_fault() -> None:
+    probes = ProbeCheck()
+    rows_c = [[25.0, 25.0, 25.0], *[[25.0, 25.0, 100.0 if n % 2 else -50.0] for n in range(200)]]
+    results = [probes.check(float(n), row_c) for n, row_c in enumerate(rows_c)]
+    assert {result.highest_c for result in results} == {result.lowest_c for result in results} == {25.0}
+    assert probes.faults == 1
+
+
+def test_a_probe_that_really_cools_to_the_reading_of_an_open_one_is_believed() -> None:
+    results = check_each_second(*([20.0 - second] for second in range(65)))
+    assert results[50].lowest_c == -30.0
+    assert results[60].lowest_c == -40.0
+    assert not any(any(result.faulty) for result in results)
+
+
+@pytest.mark.parametrize("failed_c", [-40.0, NAN, 300.0])
+def test_a_probe_that_fails_while_hot_still_counts_for_the_highest(failed_c: float) -> None:
+    rise = [[25.0, 25.0 + 10.0 * second] for second in range(8)]
+    results = check_each_second(*rise, *[[25.0, failed_c]] * 100, [25.0, 40.0], [25.0, 40.0])
+    assert results[100].highest_c == 95.0
+    assert results[100].mean_c == 25.0
+    assert results[-1].highest_c == 40.0  # the probe is credible again
+
+
+def test_a_sample_after_a_long_gap_may_have_any_plausible_temperature() -> None:
+    probes = ProbeCheck()
+    probes.check(0.0, [25.0])
+    assert probes.check(60.0, [75.0]).highest_c == 75.0
+
+
+@given(
+    st.lists(st.lists(st.floats(), max_size=6), max_size=30),
+    st.lists(st.floats(min_value=-10.0, max_value=100.0), min_size=30, max_size=30),
+)
+def test_any_readings_give_ordered_temperatures(rows_c: list[list[float]], steps_s: list[float]) -> None:
+    probes, time_s = ProbeCheck(), 0.0
+    for row_c, step_s in zip(rows_c, steps_s, strict=False):
+        time_s += step_s
+        mean_c, lowest_c, highest_c, faulty = probes.check(time_s, row_c)
+        assert len(faulty) == len(row_c)
+        assert math.isnan(mean_c) or -60.0 <= lowest_c <= mean_c + 1e-9 <= highest_c + 2e-9 <= 200.0 + 1e-6
