@@ -138,7 +138,9 @@ class _Hook:
         raise NotImplementedError
 
     def covers(self, name: str) -> bool:
-        """Return True if the hook is for this alarm. ``hook_failed`` must be listed by name."""
+        """Return True if the hook is for this alarm: ``alarm_state_lost`` always, ``hook_failed`` only if listed."""
+        if name == "alarm_state_lost":
+            return True
         return name in self._settings.alarms if self._settings.alarms else name != "hook_failed"
 
     def on_alarm_change(self, change: Change) -> None:

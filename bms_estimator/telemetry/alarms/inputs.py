@@ -108,9 +108,9 @@ class Inputs:
         """
         for name, each in self._inputs.items():
             max_count, lost = saved.get(name, (0, False))
-            if not 0 <= int(max_count) <= max(self.series, 1) or not isinstance(lost, bool):
+            if not isinstance(max_count, int) or max_count < 0 or not isinstance(lost, bool):
                 raise ValueError(f"{name}: measured = {max_count}, lost = {lost}")
-            each.max_count, each.lost = int(max_count), lost
+            each.max_count, each.lost = min(max_count, max(self.series, 1)), lost  # ``series`` may have been edited
 
 
 def count_values(values: Floats) -> Counts:
