@@ -1,6 +1,11 @@
-"""Changes of the estimator's state since its checkpoint: a file of one disk block, so that frequent saves wear no SD card."""
+"""Changes of the estimator's state since its checkpoint, in two files of one disk block each, which are written in turn.
+
+Frequent saves thus wear an SD card little: overwriting a block changes neither the folder nor the file's length. A power
+failure damages at most the block that is being written, and the other one has the state before it.
+"""
 
 import json
+import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -11,15 +16,16 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.checksum import add_checksum, verify_checksum
+from bms_estimator.checkpoint.checksum import CHECKSUM_BYTES, add_checksum, verify_checksum
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.process.private_file import read_private, write_private
 
-CHANGES_SUFFIX = ".changes"
-"""End of the name of the file."""
-MAX_FILE_BYTES = 1 << 17
-"""Maximum size of the file [bytes]. A normal file has 2 to 4 kB."""
+CHANGES_SUFFIXES = ".changes-0", ".changes-1"
+"""Ends of the names of the files."""
+BLOCK_BYTES = 4096
+"""Size of a file [bytes], a block of ext4. With up to five hypotheses the changes have 2 to 3.5 kB. More do not fit, and the
+checkpoint is saved."""
 WHOLE_S = 300.0
 """Maximum age of the checkpoint whose changes are saved [s]. A kill loses what the fields of ``_is_slow`` learned since."""
 MAX_SOC_CHANGE = 0.05
@@ -52,18 +58,19 @@ class Changes(NamedTuple):
 
 
 class ChangesFile:
-    """File of the changes since one checkpoint.
+    """Files of the changes since one checkpoint.
 
     Args:
-        path: The file, beside the checkpoint.
+        checkpoint: Path of the checkpoint.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, checkpoint: Path) -> None:
+        self._paths = [checkpoint.with_suffix(suffix) for suffix in CHANGES_SUFFIXES]
         self._base: Base | None = None
+        self._saves = 0
 
     def set_base(self, base: Base) -> None:
-        """Set the checkpoint to which the next changes refer. Its token makes the present file invalid."""
+        """Set the checkpoint to which the next changes refer. Its token makes the present files invalid."""
         self._base = base
 
     def save(self, state: NDArray[np.void], curves: Mapping[str, NDArray[Any]], now: BootTimestamp) -> bool:
@@ -73,9 +80,6 @@ class ChangesFile:
             state: Shape (1,), dtype ESTIMATOR_STATE.
             curves: Arrays of the fit to whose curves the state is relative.
             now: Present time.
-
-        Raises:
-            OSError: The file cannot be written.
         """
         if self._base is None or not _is_small_change(self._base, state, curves, now):
             return False
@@ -84,31 +88,56 @@ class ChangesFile:
             if _is_slow(name):
                 values[...] = 0  # compressed to a few bytes
         changed["filter"]["mean"][0, int(state["filter"]["count"][0]) :] = 0.0  # values of merged hypotheses
-        head = json.dumps({"token": self._base.token, **asdict(now)}).encode()
-        write_private(self._path, add_checksum(head + b"\n" + zlib.compress(changed.tobytes(), LEVEL)))
+        self._saves += 1
+        head = json.dumps({"token": self._base.token, "saves": self._saves, **asdict(now)}).encode()
+        body = head + b"\n" + zlib.compress(changed.tobytes(), LEVEL)
+        block = add_checksum(body.ljust(BLOCK_BYTES - CHECKSUM_BYTES, b"\0"))
+        if len(block) > BLOCK_BYTES:
+            return False
+        try:
+            _overwrite(self._paths[self._saves % 2], block)
+        except OSError:
+            return False  # the save of the checkpoint reports what is wrong with the disk
         return True
 
     def load(self, token: str, dtype: np.dtype[Any]) -> Changes | None:
-        """Read the changes since a checkpoint; None without any. A damaged file is logged and ignored.
+        """Read the newest changes since a checkpoint; None without any. A damaged file is logged and ignored.
 
         Args:
             token: Identifier of the checkpoint.
             dtype: Dtype of the checkpoint's state.
         """
-        try:
-            head, _, packed = verify_checksum(read_private(self._path, MAX_FILE_BYTES)).partition(b"\n")
-            values = json.loads(head)
-            if values.pop("token") != token:
-                return None
-            state = np.frombuffer(bytearray(zlib.decompress(packed)), dtype)
-            return Changes({n: v for n, v in fields(state) if not _is_slow(n)}, BootTimestamp(**values))
-        except FileNotFoundError:
-            return None
-        except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            log.warning(
-                "changes since the checkpoint are damaged and not used", file=str(self._path), reason=str(error)
-            )
-            return None
+        newest, newest_saves = None, 0
+        for path in self._paths:
+            try:
+                head, _, packed = verify_checksum(read_private(path, BLOCK_BYTES)).partition(b"\n")
+                values = json.loads(head)
+                saves = values.pop("saves")
+                if values.pop("token") == token and saves > newest_saves:
+                    state = np.frombuffer(bytearray(zlib.decompressobj().decompress(packed)), dtype)
+                    changed = {name: value for name, value in fields(state) if not _is_slow(name)}
+                    newest, newest_saves = Changes(changed, BootTimestamp(**values)), saves
+            except FileNotFoundError:
+                continue
+            except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
+                log.warning("changes since the checkpoint are damaged and not used", file=str(path), reason=str(error))
+        return newest
+
+
+def _overwrite(path: Path, block: bytes) -> None:
+    """Overwrite a file of one block in place, and sync it to disk.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except FileNotFoundError:
+        write_private(path, block)
+        return
+    with open(descriptor, "wb", buffering=0) as file:  # noqa: PTH123 - a descriptor has no Path
+        file.write(block)
+        os.fdatasync(file.fileno())
 
 
 def _is_small_change(

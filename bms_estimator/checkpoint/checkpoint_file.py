@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIX, Base, ChangesFile
+from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, Base, ChangesFile
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX
 from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity, without_observer
 from bms_estimator.checkpoint.run_file import RunFile
@@ -84,7 +84,7 @@ class CheckpointFile:
         self._longest_days = settings.state.longest_days
         self._is_later = False  # the file has a later format
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
-        self._changes = ChangesFile(self.path.with_suffix(CHANGES_SUFFIX))
+        self._changes = ChangesFile(self.path)
         self.run_file = RunFile(folder, self._name, lambda: now().wall_s)
         """Counters and alarms of the pack."""
         self.disk_free_mib: float | None = None
@@ -205,7 +205,7 @@ class CheckpointFile:
         others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
         for path in others[MAX_FILES - 1 :]:
             path.unlink(missing_ok=True)
-            for suffix in (SUFFIX, LOAD_SUFFIX, CHANGES_SUFFIX):
+            for suffix in (SUFFIX, LOAD_SUFFIX, *CHANGES_SUFFIXES):
                 path.with_suffix(suffix).unlink(missing_ok=True)
 
 

@@ -2,6 +2,9 @@
 
 import zlib
 
+CHECKSUM_BYTES = 9
+"""Length of the first line [bytes]."""
+
 
 def add_checksum(body: bytes) -> bytes:
     """Return ``body`` after a line with its CRC-32."""

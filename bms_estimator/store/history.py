@@ -1,7 +1,7 @@
 """History of a pack: one-minute rows and events, for the configured number of days.
 
-Each minute and each event is written in a transaction outside the event loop. ``kill -9`` loses the open minute and
-rows that are not on disk yet.
+Minutes and events are written in a transaction outside the event loop, at once or ``WRITE_S`` after the previous
+transaction. ``kill -9`` loses the open minute and what is not written yet.
 """
 
 import asyncio
@@ -17,6 +17,9 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, measured_time, minute_start
 
+WRITE_S = 30.0
+"""Minimum interval between two writes [s], so that a flapping alarm does not wear the disk. It is that of the database's
+fsyncs, so that a power failure loses no more."""
 MINUTES_A_DAY = 1440
 """Number of minutes in a day."""
 WAITING_MINUTES = 2 * MINUTES_A_DAY
@@ -72,7 +75,7 @@ class History:
         self._events: deque[tuple[int, Event]] = deque(maxlen=WAITING_EVENTS)
         self._run_id, self._last_number = secrets.token_hex(8), 0
         self._due = asyncio.Event()
-        self._closing = False
+        self._closing = asyncio.Event()
         # number of rows written since old rows were last removed; this value makes the first write remove them
         self._rows_since_prune = MINUTES_A_DAY
         self._task: asyncio.Task[None] | None = None
@@ -87,7 +90,7 @@ class History:
         if self._task is None:
             return
         self._close_minute()
-        self._closing = True
+        self._closing.set()
         self._database.begin_shutdown()
         self._due.set()
         await self._task
@@ -125,13 +128,16 @@ class History:
 
     async def _write_repeatedly(self) -> None:
         """Write each minute and event. After a failure, retry with the next minute or event, or after a minute."""
-        while not self._closing:
+        while not self._closing.is_set():
             with contextlib.suppress(TimeoutError):  # without samples no minute ends, but a failed write is retried
                 async with asyncio.timeout(MINUTE_S):
                     await self._due.wait()
             self._due.clear()
-            if not self._closing:
+            if not self._closing.is_set():
                 await self._write()
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(WRITE_S):
+                        await self._closing.wait()
         await self._write()
 
     async def _write(self) -> None:
