@@ -28,7 +28,7 @@ BLOCK_BYTES = 4096
 checkpoint is saved."""
 WHOLE_S = 300.0
 """Maximum age of the checkpoint whose changes are saved [s]. A kill loses what the fields of ``_is_slow`` learned since."""
-MAX_SOC_CHANGE = 0.05
+MAX_SOC_CHANGE = 0.1
 """Maximum change of the SOC since the checkpoint. The covariances depend on the slope of the OCV at the SOC."""
 MAX_STD_RATIO = 1.1
 """Maximum growth of the SOC's std since the checkpoint. A restart has the std of the checkpoint, which would be too small."""

@@ -1,7 +1,7 @@
 """History of a pack: one-minute rows and events, for the configured number of days.
 
-Minutes and events are written in a transaction outside the event loop, at once or ``WRITE_S`` after the previous
-transaction. ``kill -9`` loses the open minute and what is not written yet.
+Two minutes are written in one transaction, and an event at once or ``WRITE_S`` after the previous transaction, outside the
+event loop. ``kill -9`` loses the open minute and what is not written yet.
 """
 
 import asyncio
@@ -20,6 +20,8 @@ from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoc
 WRITE_S = 30.0
 """Minimum interval between two writes [s], so that a flapping alarm does not wear the disk. It is that of the database's
 fsyncs, so that a power failure loses no more."""
+WRITTEN_ROWS = 2
+"""Number of rows in a transaction, because each transaction writes about nine disk blocks, whatever its number of rows."""
 MINUTES_A_DAY = 1440
 """Number of minutes in a day."""
 WAITING_MINUTES = 2 * MINUTES_A_DAY
@@ -120,17 +122,18 @@ class History:
         self._open = None
         if row is not None:
             self._minutes.append((self._next_number(), row))
-            self._due.set()
+            if len(self._minutes) >= WRITTEN_ROWS:
+                self._due.set()
 
     def _next_number(self) -> int:
         self._last_number += 1
         return self._last_number
 
     async def _write_repeatedly(self) -> None:
-        """Write each minute and event. After a failure, retry with the next minute or event, or after a minute."""
+        """Write minutes and events. After a failure, retry with the next ones, or after ``WRITTEN_ROWS`` minutes."""
         while not self._closing.is_set():
             with contextlib.suppress(TimeoutError):  # without samples no minute ends, but a failed write is retried
-                async with asyncio.timeout(MINUTE_S):
+                async with asyncio.timeout(WRITTEN_ROWS * MINUTE_S):
                     await self._due.wait()
             self._due.clear()
             if not self._closing.is_set():

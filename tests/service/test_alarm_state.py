@@ -22,9 +22,12 @@ from bms_estimator.service import checkpoint_writer
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import lacks_alarm
 from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
+from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
+from bms_estimator.telemetry.alarms.inputs import Inputs
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS, edit_settings
 from tests.checkpoint.test_identity import CHECKPOINT_FILE
 from tests.collector import Collector
@@ -207,7 +210,7 @@ DAMAGES: dict[str, Callable[[bytes], bytes] | None] = {
 """Damages of the run file, and contents that hide a raised alarm."""
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("damage", ["deleted", "one bit", "NaN"])
 async def test_lost_alarms_keep_the_relay_at_its_level_until_they_are_acknowledged(folder: Path, damage: str) -> None:
     file, edit = folder / "pack.run", DAMAGES[damage]
     if edit is None:
@@ -228,6 +231,28 @@ async def test_lost_alarms_keep_the_relay_at_its_level_until_they_are_acknowledg
     assert all(acknowledged.relay)
     assert acknowledged.messages == ["alarm_state_lost cleared "]
     assert all((await run(folder, NORMAL)).relay)
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_alarms_are_recognized(latched: Path, tmp_path: Path, damage: str) -> None:
+    shutil.copy(latched / "pack.run", tmp_path)
+    shutil.copy(CheckpointFile(latched, SETTINGS, CELL).path, tmp_path)
+    file, edit = CheckpointFile(tmp_path, SETTINGS, CELL).run_file, DAMAGES[damage]
+    if edit is None:
+        file.path.unlink()
+    else:
+        file.path.write_bytes(edit(file.path.read_bytes()))
+    saved = file.load()
+    assert saved.lost_reason or restore_fails(saved.counters.alarms)
+
+
+def restore_fails(alarms: str) -> bool:
+    """Return True if an evaluator reports that alarms are missing, or raises an exception."""
+    evaluator = AlarmEvaluator(monitored_alarms(SETTINGS, CELL), 0.1, 5.0, Inputs(10.0, 1), 10.0)
+    try:
+        return bool(evaluator.restore(alarms))
+    except Exception:  # noqa: BLE001 - the monitor catches any exception
+        return True
 
 
 async def test_a_damaged_file_with_alarms_is_renamed(folder: Path) -> None:
