@@ -132,7 +132,7 @@ class CheckpointFile:
         packed = io.BytesIO()
         np.savez_compressed(packed, format=FORMAT, **content)
         write_private(self.path, packed.getbuffer())
-        self._changes.set_base(Base(token, state, curves, now))
+        self._changes.set_base(Base(token, state.copy(), curves, now))
         self._remove_oldest()
 
     def load(self) -> CheckpointContent:
