@@ -117,7 +117,7 @@ class CheckpointFile:
         disk = os.statvfs(self.path.parent)
         self.disk_free_mib = disk.f_bavail * disk.f_frsize / 2**20
         now, curves = self._now(), curves or {}
-        if not whole and self._changes.save(state, curves, now):
+        if not whole and self.path.exists() and self._changes.save(state, curves, now):
             return
         token = secrets.token_hex(8)
         content = {
