@@ -30,9 +30,11 @@ CHECK_S = 1.0
 """Interval of the check for a change of SOC or alarms [s]."""
 DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
-ALARM_SAVE_S = 10.0
+ALARM_SAVE_S = 30.0
 """Minimum interval before a save for an alarm that only ended, so that a flapping alarm does not wear the disk [s]. A restart
-within this time raises the alarm again. It is also the interval between retries of a failed save."""
+within this time raises the alarm again."""
+RETRY_S = 10.0
+"""Interval between retries of a failed save of the alarms [s]."""
 LOAD_SAVE_S = 300.0
 """Interval between two saves of the observed load [s]. A crash loses at most the load of this time."""
 FINAL_SAVE_S = 20.0
@@ -99,7 +101,7 @@ class CheckpointWriter:
         run_failed, run_tried_s = not await self._save_counters(), loop.time()
         while True:
             await asyncio.sleep(min(CHECK_S, self._interval_s))
-            run_delay_s = ALARM_SAVE_S if run_failed else self._delay_of_counters_s
+            run_delay_s = RETRY_S if run_failed else self._delay_of_counters_s
             if loop.time() >= run_tried_s + run_delay_s:
                 run_failed, run_tried_s = not await self._save_counters(), loop.time()
             if loop.time() >= tried_s + self._interval_s or (self._needs_save and not failed):

@@ -336,7 +336,7 @@ async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full
 ) -> None:
     """The checkpoint interval is 1e6 s. The process is killed, which is the same as to read the file before the end."""
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
-    monkeypatch.setattr(checkpoint_writer, "ALARM_SAVE_S", 0.02)
+    monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
     settings = edit_settings("state", checkpoint_s=1e6)
     blocked = tmp_path / "state"
     blocked.write_text("a file instead of the folder")
