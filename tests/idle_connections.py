@@ -157,7 +157,7 @@ async def _wait_for_checkpoint(folder: Path) -> None:
 
 
 def _checkpoint_time_s(folder: Path) -> float:
-    return max((path.stat().st_mtime for path in folder.glob("attic-*.npz")), default=0.0)
+    return max((path.stat().st_mtime for path in folder.glob("attic-*")), default=0.0)
 
 
 async def _measure_outcome(folder: Path, port: int, *urls: str) -> Outcome:

@@ -5,72 +5,48 @@ with other fields is installed.
 """
 
 import io
-import json
 import math
 import os
 import re
+import secrets
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import structlog
 from numpy.typing import NDArray
 
+from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, Base, ChangesFile
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX
 from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity, without_observer
+from bms_estimator.checkpoint.run_file import RunFile
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.payloads.totals import Totals
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
 from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
-from bms_estimator.telemetry.lifetime_totals import new_totals
 
-FORMAT = 7
+FORMAT = 8
 """Version of the file's layout. Increment it when a field changes its meaning, and migrate files of the previous
 version."""
+FORMER_FORMAT = 7
+"""Version of files that also contain counters and alarms. ``RunFile`` migrates these."""
 DAY_S = 86400.0
 """Length of a day [s]."""
 MAX_FILE_BYTES = 1 << 20
-"""Maximum size of a checkpoint file [bytes]. A normal file has about 100 kB."""
+"""Maximum size of a checkpoint file [bytes]. A file of the former format has about 112 kB."""
 MAX_FILES = 8
 """Maximum number of checkpoint files of one pack; older ones are deleted."""
 REJECTED = "refused: "
 """Prefix of the reason for rejecting a file."""
 MAX_LATER_FILES = 4
 """Maximum number of quarantined files of later formats, which serve a return to the later version."""
-_COUNTER_FIELDS = "restarts", "total", "clean", "alarms"
-"""Field names of the run counters in the file."""
 _CELLS = "cells."
 """Prefix of the names of the arrays of single cells in the file."""
 _CURVES = "fit."
 """Prefix of the names of the fit's arrays in the file."""
-MAX_COUNT = 1e15
-"""Maximum plausible value of a counter: the number of samples of 30,000 years at 1,000 a second."""
-
-log = structlog.get_logger(__name__)
-
-
-@dataclass(frozen=True)
-class RunCounters:
-    """Counters of the runs that wrote a checkpoint.
-
-    Attributes:
-        restarts: Number of starts that found a checkpoint.
-        total: Totals over all runs.
-        clean: True if the last run ended without a crash or kill; False while it runs.
-        alarms: State of the alarms, in the format of ``AlarmEvaluator.saved_state``.
-    """
-
-    restarts: int
-    total: Totals
-    clean: bool = False
-    alarms: str = ""
 
 
 @dataclass(frozen=True)
@@ -81,8 +57,6 @@ class CheckpointContent:
     """Fields of ESTIMATOR_STATE by their names, as from ``fields``; empty if the file was rejected."""
     unseen_s: float
     """Time since the state was saved [s]; infinite if unknown."""
-    counters: RunCounters
-    """Counters including this start; zero if the file belongs to another pack or cannot be read."""
     reason: str
     """Reason for the rejection; empty if the file is valid."""
     curves: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -108,82 +82,70 @@ class CheckpointFile:
         self._name, self._now = settings.pack.name, now
         self._identity, self._observer = pack_identity(settings, cell), observer_identity(settings, cell)
         self._longest_days = settings.state.longest_days
-        self._content: dict[str, Any] = {}  # fields of the file other than the run counters
         self._is_later = False  # the file has a later format
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
+        self._changes = ChangesFile(self.path)
+        self.run_file = RunFile(folder, self._name, lambda: now().wall_s)
+        """Counters and alarms of the pack."""
         self.disk_free_mib: float | None = None
         """Free space on the disk at the last write [MiB]."""
         self.thread = DiskThread("checkpoint")
-        """Thread for ``save`` and ``update_counters``. A call that timed out still finishes before the next one."""
-        self.saved: tuple[int, float] | None = None
-        """Number of samples and SOC of the last saved state; None before the first save of this run."""
+        """Thread for all writes of the pack's state. A call that timed out still finishes before the next one."""
 
     def save(
         self,
         state: NDArray[np.void],
-        counters: RunCounters,
         curves: Mapping[str, NDArray[Any]] | None = None,
         cells: Mapping[str, NDArray[Any]] | None = None,
+        *,
+        whole: bool = False,
     ) -> None:
-        """Write the file atomically: after a power cut either the old or the new file exists.
+        """Write the file, or only its changes, atomically: after a power cut either the old or the new state exists.
 
         A missing folder is created.
 
         Args:
             state: Shape (1,), dtype ESTIMATOR_STATE.
-            counters: Counters of this and earlier runs.
             curves: Arrays of the fit to whose curves the state is relative; None or empty: those of the cell file.
             cells: State of the estimators of single cells; None or empty without cell voltages.
+            whole: True: write the whole file.
 
         Raises:
             OSError: The file cannot be written.
         """
-        content = {"identity": self._identity, "observer": self._observer, "state": state, **asdict(self._now())}
-        content |= {f"{_CURVES}{name}": array for name, array in (curves or {}).items()}
-        content |= {f"{_CELLS}{name}": array for name, array in (cells or {}).items()}
-        self._write(content, counters)
-
-    def update_counters(self, counters: RunCounters) -> None:
-        """Update the run counters in an existing file without changing the state and its save time.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
-        if self._content:
-            self._write(self._content, counters)
-
-    def _write(self, content: dict[str, Any], counters: RunCounters) -> None:
-        packed = io.BytesIO()
-        counter_fields: dict[str, Any] = {
-            "restarts": counters.restarts,
-            "total": counters.total.model_dump_json(),
-            "clean": counters.clean,
-            "alarms": counters.alarms,
-        }
-        np.savez(packed, format=FORMAT, **counter_fields, **content)
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         disk = os.statvfs(self.path.parent)
         self.disk_free_mib = disk.f_bavail * disk.f_frsize / 2**20
+        now, curves = self._now(), curves or {}
+        if not whole and self.path.exists() and self._changes.save(state, curves, now):
+            return
+        token = secrets.token_hex(8)
+        content = {
+            "identity": self._identity,
+            "observer": self._observer,
+            "token": token,
+            "state": state,
+            **asdict(now),
+        }
+        content |= {f"{_CURVES}{name}": array for name, array in curves.items()}
+        content |= {f"{_CELLS}{name}": array for name, array in (cells or {}).items()}
+        packed = io.BytesIO()
+        np.savez_compressed(packed, format=FORMAT, **content)
         write_private(self.path, packed.getbuffer())
-        self._content = content
+        self._changes.set_base(Base(token, state.copy(), curves, now))
         self._remove_oldest()
 
     def load(self) -> CheckpointContent:
         """Read the file. An error is returned as the result's ``reason``."""
-        zero_counters = RunCounters(0, new_totals(self._now().wall_s))
         try:
             with np.load(io.BytesIO(read_private(self.path, MAX_FILE_BYTES)), allow_pickle=False) as file:
                 return self._validate(file)
         except FileNotFoundError:
-            return CheckpointContent({}, 0.0, zero_counters, "none found")
-        except _RejectedError as error:
-            return CheckpointContent({}, 0.0, error.counters or zero_counters, f"{REJECTED}{error}")
-        except UnsafeFileError as error:
-            return CheckpointContent({}, 0.0, zero_counters, f"{REJECTED}{error}")
+            return CheckpointContent({}, 0.0, "none found")
+        except (_RejectedError, UnsafeFileError) as error:
+            return CheckpointContent({}, 0.0, f"{REJECTED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return CheckpointContent(
-                {}, 0.0, zero_counters, f"{REJECTED}damaged, perhaps by a power cut ({type(error).__name__})"
-            )
+            return CheckpointContent({}, 0.0, f"{REJECTED}damaged, perhaps by a power cut ({type(error).__name__})")
 
     def quarantine(self) -> str:
         """Rename a rejected file, so that the next save does not overwrite it. Return a description for the user.
@@ -197,7 +159,6 @@ class CheckpointFile:
             paths = [self.path.with_name(f"{self._name}.later-{n}.npz") for n in range(1, MAX_LATER_FILES + 1)]
             unused_paths = (path for path in paths if not path.exists())
             quarantined = next(unused_paths, paths[-1])  # without an unused name the last file is overwritten
-        self._content = {}
         try:
             self.path.replace(quarantined)
         except OSError as error:
@@ -216,27 +177,26 @@ class CheckpointFile:
         Raises:
             _RejectedError: The file has another format or identity, or is too old.
         """
-        now_s, version = self._now().wall_s, int(content["format"])
-        is_ours = str(content.get("identity", "")) == self._identity
+        version = int(content["format"])
         self._is_later = version > FORMAT
-        if version != FORMAT:
-            counters = _next_counters(content, now_s) if is_ours and self._is_later else None
-            raise _RejectedError(f"format {version}, this version reads {FORMAT}", counters)
-        if not is_ours:
+        if version not in (FORMER_FORMAT, FORMAT):
+            raise _RejectedError(f"format {version}, this version reads {FORMAT}")
+        if str(content["identity"]) != self._identity:
             raise _RejectedError("it belongs to another pack or cell")
         file = dict(content)
         state = dict(fields(file["state"]))
         saved = BootTimestamp(
             float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"])
         )
-        unseen_s, counters = self._now().since(saved), _next_counters(file, now_s)
+        if version == FORMAT and (changes := self._changes.load(str(file["token"]), file["state"].dtype)):
+            state, saved = state | changes.state, changes.saved
+        unseen_s = self._now().since(saved)
         if self._longest_days is not None and self._longest_days * DAY_S < unseen_s < math.inf:
             days = f"{unseen_s / DAY_S:.1f} days old"
-            raise _RejectedError(f"it is {days}, state.longest_days is {self._longest_days:g}", counters)
-        self._content = {name: v for name, v in file.items() if name not in ("format", *_COUNTER_FIELDS)}
+            raise _RejectedError(f"it is {days}, state.longest_days is {self._longest_days:g}")
         if str(file["observer"]) != self._observer:
             state = without_observer(state)
-        return CheckpointContent(state, unseen_s, counters, "", _with_prefix(file, _CURVES), _with_prefix(file, _CELLS))
+        return CheckpointContent(state, unseen_s, "", _with_prefix(file, _CURVES), _with_prefix(file, _CELLS))
 
     def _remove_oldest(self) -> None:
         """Remove the pack's oldest files beyond ``MAX_FILES``, because each configured cell leaves a file."""
@@ -245,45 +205,14 @@ class CheckpointFile:
         others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
         for path in others[MAX_FILES - 1 :]:
             path.unlink(missing_ok=True)
-            for suffix in (SUFFIX, LOAD_SUFFIX):
+            for suffix in (SUFFIX, LOAD_SUFFIX, *CHANGES_SUFFIXES):
                 path.with_suffix(suffix).unlink(missing_ok=True)
 
 
 class _RejectedError(Exception):
-    """Reason for rejecting a checkpoint, with the counters that remain valid."""
-
-    def __init__(self, reason: str, counters: RunCounters | None = None) -> None:
-        super().__init__(reason)
-        self.counters = counters
+    """Reason for rejecting a checkpoint."""
 
 
 def _with_prefix(file: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
     """Return the arrays whose names begin with ``prefix``, without it."""
     return {name.removeprefix(prefix): v for name, v in file.items() if name.startswith(prefix)}
-
-
-def _next_counters(file: Mapping[str, NDArray[Any]], now_s: float) -> RunCounters:
-    """Return the run counters of a file, including this start. Invalid counters restart from zero at ``now_s``."""
-    try:
-        return _read_counters(file)
-    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-        log.warning("the checkpoint's counters are invalid and restart from zero", reason=str(error))
-        return RunCounters(1, new_totals(now_s))
-
-
-def _read_counters(file: Mapping[str, NDArray[Any]]) -> RunCounters:
-    """Read the run counters of a file and add this start; a missing counter is 0.
-
-    Raises:
-        ArithmeticError, LookupError, TypeError, ValueError: A counter is damaged or implausible.
-    """
-    stored = json.loads(str(file["total"]))
-    total = Totals.model_validate({name: stored[name] for name in Totals.model_fields if name in stored})
-    datetime.fromisoformat(total.since)
-    restarts, crashes = int(file["restarts"]) + 1, total.crashes + (not file["clean"])
-    values = {"restarts": restarts, "crashes": crashes, "unseen_s": total.unseen_s, **total.samples}
-    values |= ChargeEnergy.from_totals(total)._asdict()
-    implausible = [f"{name} = {value}" for name, value in values.items() if not 0 <= value <= MAX_COUNT]
-    if implausible:
-        raise ValueError(", ".join(implausible))
-    return RunCounters(restarts, total.model_copy(update={"crashes": crashes}), alarms=str(file.get("alarms", "")))

@@ -156,14 +156,23 @@ class AlarmMonitor:
         self._report_changes()
         return acknowledged
 
-    def restore(self, saved_state: str) -> None:
+    def restore(self, saved_state: str) -> str:
         """Restore the ``alarms.saved_state`` of an earlier run.
 
-        Raises:
-            ValueError, TypeError, LookupError: The saved state is damaged.
+        Returns:
+            Reason for which raised alarms may be missing; empty if the alarms are complete.
         """
-        self.alarms.restore(saved_state)
+        try:
+            lost_reason = self.alarms.restore(saved_state)
+        except Exception as error:  # noqa: BLE001 - a damaged state may raise anything, and is reported
+            lost_reason = f"the saved state of the alarms is damaged ({error!r})"
         self.report = self.alarms.report()
+        return lost_reason
+
+    def raise_state_lost(self, reason: str) -> None:
+        """Raise ``alarm_state_lost``, and pass it to the callback."""
+        self.alarms.raise_state_lost(reason, self._clock.wall())
+        self._report_changes()
 
     def _counts(self) -> SampleCounts:
         """Return the sample counters.

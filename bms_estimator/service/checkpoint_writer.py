@@ -1,6 +1,7 @@
-"""Writer of checkpoints: after the first sample, when the SOC changes, at intervals, and at the end."""
+"""Writer of a pack's state: after the first sample, when SOC or alarms change, at intervals, and at the end."""
 
 import asyncio
+import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -9,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile
 from bms_estimator.checkpoint.history_file import HistoryFile
+from bms_estimator.checkpoint.run_file import RunCounters
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.forecast.forecaster import Forecaster
@@ -18,7 +20,7 @@ from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.publisher import Publisher
-from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
+from bms_estimator.telemetry.alarms.evaluator import INPUTS, SILENCE, AlarmEvaluator
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 
@@ -28,6 +30,11 @@ CHECK_S = 1.0
 """Interval of the check for a change of SOC or alarms [s]."""
 DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
+ALARM_SAVE_S = 30.0
+"""Minimum interval before a save for an alarm that only ended, so that a flapping alarm does not wear the disk [s]. A restart
+within this time raises the alarm again."""
+RETRY_S = 10.0
+"""Interval between retries of a failed save of the alarms [s]."""
 LOAD_SAVE_S = 300.0
 """Interval between two saves of the observed load [s]. A crash loses at most the load of this time."""
 FINAL_SAVE_S = 20.0
@@ -51,7 +58,7 @@ class CheckpointWriter:
         estimator: Estimator; read only.
         publisher: Publishes the outcome of each save.
         totals: Totals over restarts.
-        restarts: Number of starts that found a checkpoint.
+        restarts: Number of starts that found files of an earlier run.
         interval_s: Maximum interval between two saves [s].
         pack_model: Slow fit, whose history is saved when its ``revision`` changes; None: no history.
         history: File of the history; None: no history.
@@ -80,21 +87,24 @@ class CheckpointWriter:
         self._discarded = 0  # number of histories whose files were set aside
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
         self._totals, self._restarts = totals, restarts
-        self._saved_alarms = self._alarms.saved_state
+        self._saved_counters: RunCounters | None = None
+        """Counters and alarms of the last save; None before the first save of this run."""
         publisher.saved_flow = totals.flow
         self._saved_fit = pack_model.fit if pack_model else None  # fit of the saved state
         self._saved_progress: tuple[int, float] | None = None
         """Samples and SOC (``_progress``) of the last saved state; None: this run has not saved a state."""
 
     async def run(self) -> None:
-        """Save at each interval, and earlier after the first sample, a change of the SOC, or a change of a latching alarm."""
-        # until the final save marks the file as clean, the next start counts this run as crashed
-        counters = self._counters(clean=False)
-        await self._write(lambda: self._checkpoint.update_counters(counters))
+        """Save at each interval, and earlier after the first sample, a change of the SOC, or a raised alarm."""
         loop = asyncio.get_running_loop()
         tried_s, failed, load_tried_s = -math.inf, False, loop.time()
+        # until the final save marks the run as clean, the next start counts it as crashed
+        run_failed, run_tried_s = not await self._save_counters(), loop.time()
         while True:
             await asyncio.sleep(min(CHECK_S, self._interval_s))
+            run_delay_s = RETRY_S if run_failed else self._delay_of_counters_s
+            if loop.time() >= run_tried_s + run_delay_s:
+                run_failed, run_tried_s = not await self._save_counters(), loop.time()
             if loop.time() >= tried_s + self._interval_s or (self._needs_save and not failed):
                 history_saved = await self._save_history()
                 failed = not (await self._save() and history_saved)
@@ -111,7 +121,8 @@ class CheckpointWriter:
         """
         try:
             async with asyncio.timeout(FINAL_SAVE_S):
-                await self._save(clean=clean)
+                await self._save(whole=True)
+                await self._save_counters(clean=clean)
                 await self._save_history(is_last=True)
                 await self._save_load()
         except TimeoutError:
@@ -124,7 +135,7 @@ class CheckpointWriter:
     @property
     def _needs_save(self) -> bool:
         """True if the state has changed enough to be saved before the interval ends."""
-        if self._saved_progress is None or self._saved_alarms != self._alarms.saved_state:
+        if self._saved_progress is None:
             return True
         if self._pack_model and self._pack_model.revision != self._saved_revision:
             return True
@@ -136,23 +147,45 @@ class CheckpointWriter:
         state = self._estimator.state[0]
         return int(state["samples"]), float(np.nan_to_num(state["soc"]))
 
-    async def _save(self, *, clean: bool = False) -> bool:
+    @property
+    def _delay_of_counters_s(self) -> float:
+        """Minimum interval between the last save of counters and alarms, and the next one [s]."""
+        if self._saved_counters is None:
+            return 0.0
+        saved, alarms = self._saved_counters.alarms, self._alarms.saved_state
+        if alarms == saved:
+            return self._interval_s
+        return 0.0 if lacks_alarm(saved, alarms) else min(ALARM_SAVE_S, self._interval_s)
+
+    async def _save_counters(self, *, clean: bool = False) -> bool:
+        """Save counters and alarms if they have changed. Return False if they cannot be written."""
+        counters = RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state)
+        file = self._checkpoint.run_file
+        if counters == self._saved_counters:
+            return True
+        if not await self._write(lambda: file.save(counters), file.path):
+            self._publisher.saved_flow = None  # the unsaved totals are published
+            return False
+        self._saved_counters = counters
+        self._publisher.saved_flow = ChargeEnergy.from_totals(counters.total)
+        return True
+
+    async def _save(self, *, whole: bool = False) -> bool:
         """Save the state if it has changed. Return False if it cannot be written.
 
         An unchanged state is not saved again: a new save time would hide the gap since the last sample.
+
+        Args:
+            whole: True: write all of it, not only its changes.
         """
-        progress, counters = self._progress, self._counters(clean=clean)
+        progress = self._progress
         if not progress[0] or (progress == self._saved_progress and not self._curves_changed):
-            if clean or self._saved_alarms != counters.alarms:
-                return await self._write_with_counters(counters, lambda: self._checkpoint.update_counters(counters))
             return True
         state, fit = self._estimator.record.copy(), self._pack_model.fit if self._pack_model else None
         curves, cells = curve_arrays(fit), self._cells.saved_state if self._cells else None
-        if not await self._write_with_counters(counters, lambda: self._checkpoint.save(state, counters, curves, cells)):
-            self._publisher.saved_flow = None  # the unsaved totals are published
+        if not await self._write(lambda: self._checkpoint.save(state, curves, cells, whole=whole)):
             return False
         self._publisher.checkpoint, self._saved_progress, self._saved_fit = "saved", progress, fit
-        self._publisher.saved_flow = ChargeEnergy.from_totals(counters.total)
         return True
 
     async def _save_history(self, *, is_last: bool = False) -> bool:
@@ -193,16 +226,6 @@ class CheckpointWriter:
         """True if the state is relative to other curves than the saved one."""
         return self._pack_model is not None and self._pack_model.fit is not self._saved_fit
 
-    def _counters(self, *, clean: bool) -> RunCounters:
-        return RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state)
-
-    async def _write_with_counters(self, counters: RunCounters, write: Callable[[], None]) -> bool:
-        """Call ``write``, which also writes the counters. Return False if it fails."""
-        written = await self._write(write)
-        if written:
-            self._saved_alarms = counters.alarms
-        return written
-
     async def _write(self, write: Callable[[], None], path: Path | None = None) -> bool:
         """Call ``write``, which writes ``path`` or the checkpoint, in the disk's thread. Return False if it fails."""
         file = str(path or self._checkpoint.path)
@@ -220,3 +243,18 @@ class CheckpointWriter:
             log.warning("checkpoint cannot be saved", file=file, error=str(error))
             return False
         return True
+
+
+def lacks_alarm(saved: str, present: str) -> bool:
+    """Return True if a restart from ``saved`` would lack an alarm, a measured quantity or an acknowledgement.
+
+    Args:
+        saved: Saved state of the alarms, as from ``AlarmEvaluator.saved_state``.
+        present: Present state of the alarms.
+    """
+    before, after = json.loads(saved or "{}"), json.loads(present or "{}")
+    if any(before.pop(key, None) != after.pop(key, None) for key in (INPUTS, SILENCE)):
+        return True
+    return any(
+        name not in before or before[name]["acknowledged"] != each["acknowledged"] for name, each in after.items()
+    )

@@ -39,7 +39,9 @@ class Hook(ABC):
         """Short description, without the arguments of a program, which may hold secrets."""
 
     def covers(self, name: str) -> bool:
-        """Return True if the hook is for this alarm. ``hook_failed`` must be listed by name."""
+        """Return True if the hook is for this alarm: ``alarm_state_lost`` always, ``hook_failed`` only if listed."""
+        if name == "alarm_state_lost":
+            return True
         return name in self.settings.alarms if self.settings.alarms else name != "hook_failed"
 
     def on_alarm_change(self, alarm: Alarm) -> None:

@@ -30,7 +30,7 @@ from bms_estimator.service.fit_thread import FitThread, new_slow_fit
 from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.request_handlers import RequestHandlers
-from bms_estimator.service.restored_pack import restore_pack
+from bms_estimator.service.restored_pack import read_counters, restore_pack
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.sink import Sink
@@ -100,7 +100,9 @@ async def run_estimation_loop(
     cells = CellEstimator(estimator)
     fit_thread = FitThread(clock, fit_executor)
     pack_model = new_slow_fit(settings, estimator, submit=fit_thread.submit, on_failure=fit_thread.log_failure)
-    counters, outcome = restore_pack(estimator, pack_model, checkpoint, history, clock, cells)
+    saved_run = read_counters(checkpoint, clock)
+    counters = saved_run.counters
+    outcome = restore_pack(estimator, pack_model, checkpoint, history, cells)
     restored_s = since_boot()
     forecaster = new_forecaster(settings, cell, estimator, pack_model, cells)
     seen_load = SeenLoad(forecaster, load_file) if forecaster and load_file else None
@@ -128,8 +130,12 @@ async def run_estimation_loop(
         on_alarm=hooks.on_alarm_change,
         forecaster=forecaster,
     )
-    _restore_alarms(publisher, counters.alarms)
+    unrestored = publisher.alarm_monitor.restore(counters.alarms)
     hooks.restore_active(publisher.alarm_monitor.report)
+    if (
+        lost_reason := saved_run.lost_reason or unrestored
+    ):  # after the restored alarms, because the hooks announce this one
+        publisher.alarm_monitor.raise_state_lost(lost_reason)
     if requests is not None:
         RequestHandlers(estimator, publisher, current_zero, pack_model, forecaster).register(requests)
     interval_s = settings.state.checkpoint_s
@@ -257,11 +263,3 @@ def _restore_load(seen: SeenLoad) -> None:
         log.warning("the observed load is damaged and was not restored", file=file, reason=reason)
     else:
         log.info("load", file=file, seconds=seen.forecaster.load.seconds)
-
-
-def _restore_alarms(publisher: Publisher, saved: str) -> None:
-    """Restore the alarms of an earlier run; damaged ones are logged and dropped."""
-    try:
-        publisher.alarm_monitor.restore(saved)
-    except (ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
-        log.warning("the alarms of the checkpoint are damaged and were not restored", reason=str(error))

@@ -69,7 +69,7 @@ class Publisher:
         sinks: Destinations of the snapshots.
         clock: The clocks.
         totals: Totals over restarts; default: new totals.
-        restarts: Number of starts that found a checkpoint.
+        restarts: Number of starts that found files of an earlier run.
         checkpoint: Outcome of restoring the checkpoint at the start.
         delivery: Counters of sent messages and received requests.
         source_health: Returns the health of the source; None: not reported.
@@ -87,7 +87,7 @@ class Publisher:
         checkpoint: Outcome of the last restore or save of a checkpoint.
         disk_free_mib: Free space in the state folder [MiB].
         log_lines_lost: Number of log lines dropped since start.
-        saved_flow: Charge and energy in the last checkpoint; None without one.
+        saved_flow: Saved charge and energy; None if they are not saved.
         latest: The last estimate.
         snapshot: The last snapshot.
     """

@@ -4,9 +4,10 @@ import math
 
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointContent, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointContent, CheckpointFile
 from bms_estimator.checkpoint.history_file import HistoryFile, RejectedHistoryError
 from bms_estimator.checkpoint.restore import restore_state
+from bms_estimator.checkpoint.run_file import RunCounters, SavedRun
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.clock import Clock
@@ -26,9 +27,8 @@ def restore_pack(
     pack_model: SlowFit | None,
     checkpoint: CheckpointFile | None,
     history: HistoryFile | None,
-    clock: Clock,
     cells: CellEstimator | None = None,
-) -> tuple[RunCounters, str]:
+) -> str:
     """Restore a valid checkpoint and a valid history; rejected files are quarantined.
 
     The curves are adopted first, because the state is relative to them. The history is resumed last, because it depends on
@@ -39,14 +39,13 @@ def restore_pack(
         pack_model: New slow fit of the estimator; None: the estimator runs without one.
         checkpoint: File of the state; None: the state is not saved.
         history: File of the history; None: the history is not saved.
-        clock: The clocks.
         cells: New estimators of the single cells; None: none.
 
     Returns:
-        Counters of earlier runs, and the outcome of the checkpoint as text.
+        Outcome of the checkpoint as text.
     """
     if checkpoint is None:
-        return RunCounters(0, new_totals(clock.wall())), "off"
+        return "off"
     content = checkpoint.load()
     state_fit = _fit_of_state(content)
     if pack_model:
@@ -75,7 +74,20 @@ def restore_pack(
         outcome = f"{outcome}; {checkpoint.quarantine()}"
     write_log = log.warning if refused else log.info
     write_log("checkpoint", file=str(checkpoint.path), outcome=outcome)
-    return content.counters, outcome
+    return outcome
+
+
+def read_counters(checkpoint: CheckpointFile | None, clock: Clock) -> SavedRun:
+    """Return counters and alarms of earlier runs. A damaged file is quarantined."""
+    if checkpoint is None:
+        return SavedRun(RunCounters(0, new_totals(clock.wall())))
+    file = checkpoint.run_file
+    saved = file.load()
+    if saved.is_damaged:
+        log.warning(
+            "counters and alarms", file=str(file.path), outcome=f"{REJECTED}{saved.lost_reason}; {file.quarantine()}"
+        )
+    return saved
 
 
 def _fit_of_state(content: CheckpointContent) -> PackFit | None:

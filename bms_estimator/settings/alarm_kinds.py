@@ -112,5 +112,9 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
     "hook_failed": AlarmKind(
         "the last run of an alarm hook failed", "check the hook, and do by hand what it should have done"
     ),
+    "alarm_state_lost": AlarmKind(
+        "raised alarms of an earlier run may be missing, so that all hooks count an alarm",
+        "check the pack, then acknowledge this alarm",
+    ),
 }
 """All alarms by name."""

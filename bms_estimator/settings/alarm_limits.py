@@ -40,6 +40,11 @@ class AlarmDefinition(NamedTuple):
         return ALARM_KINDS[self.name]
 
 
+STATE_LOST = AlarmDefinition("alarm_state_lost", "critical", 1.0, 1.0, 0.0, 0.0, latch=True)
+"""Alarm that replaces lost alarms of earlier runs. It has no settings, so that it cannot be switched off. Its limit has no
+meaning."""
+
+
 class VoltageLimits(NamedTuple):
     """Default voltage limits of a cell [V], and the levels at which their alarms end [V]."""
 
@@ -110,8 +115,9 @@ def monitored_alarms(settings: Settings, cell: PackModel) -> tuple[AlarmDefiniti
         UserError: A clear level lies beyond its limit.
     """
     defaults = _defaults(settings, cell)
-    definitions = (_definition(name, getattr(settings.alarms, name), defaults[name]) for name in ALARMS)
-    return tuple(each for each in definitions if each is not None)
+    configured = (name for name in ALARMS if name != STATE_LOST.name)
+    definitions = (_definition(name, getattr(settings.alarms, name), defaults[name]) for name in configured)
+    return (*(each for each in definitions if each is not None), STATE_LOST)
 
 
 def short_limit_a(settings: Settings, cell: PackModel) -> float:

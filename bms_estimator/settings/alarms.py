@@ -29,6 +29,7 @@ AlarmName = Literal[
     "model_mismatch",
     "link_lost",
     "hook_failed",
+    "alarm_state_lost",
 ]
 ALARMS: tuple[AlarmName, ...] = get_args(AlarmName)
 """Names of all alarms, in the order in which they are shown."""
@@ -235,7 +236,9 @@ class AlarmSettings(Strict):
         if not isinstance(table, dict):
             return table
         return {
-            name: _merge_rule(cls.model_fields[name].default, value) if name in ALARMS else value
+            name: _merge_rule(cls.model_fields[name].default, value)
+            if name in ALARMS and name in cls.model_fields
+            else value
             for name, value in table.items()
         }
 

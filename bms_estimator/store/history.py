@@ -1,7 +1,7 @@
 """History of a pack: one-minute rows and events, for the configured number of days.
 
-Each minute and each event is written in a transaction outside the event loop. ``kill -9`` loses the open minute and
-rows that are not on disk yet.
+Two minutes are written in one transaction, and an event at once or ``WRITE_S`` after the previous transaction, outside the
+event loop. ``kill -9`` loses the open minute and what is not written yet.
 """
 
 import asyncio
@@ -17,6 +17,11 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, measured_time, minute_start
 
+WRITE_S = 30.0
+"""Minimum interval between two writes [s], so that a flapping alarm does not wear the disk. It is that of the database's
+fsyncs, so that a power failure loses no more."""
+WRITTEN_ROWS = 2
+"""Number of rows in a transaction, because each transaction writes about nine disk blocks, whatever its number of rows."""
 MINUTES_A_DAY = 1440
 """Number of minutes in a day."""
 WAITING_MINUTES = 2 * MINUTES_A_DAY
@@ -72,7 +77,7 @@ class History:
         self._events: deque[tuple[int, Event]] = deque(maxlen=WAITING_EVENTS)
         self._run_id, self._last_number = secrets.token_hex(8), 0
         self._due = asyncio.Event()
-        self._closing = False
+        self._closing = asyncio.Event()
         # number of rows written since old rows were last removed; this value makes the first write remove them
         self._rows_since_prune = MINUTES_A_DAY
         self._task: asyncio.Task[None] | None = None
@@ -87,7 +92,7 @@ class History:
         if self._task is None:
             return
         self._close_minute()
-        self._closing = True
+        self._closing.set()
         self._database.begin_shutdown()
         self._due.set()
         await self._task
@@ -117,21 +122,25 @@ class History:
         self._open = None
         if row is not None:
             self._minutes.append((self._next_number(), row))
-            self._due.set()
+            if len(self._minutes) >= WRITTEN_ROWS:
+                self._due.set()
 
     def _next_number(self) -> int:
         self._last_number += 1
         return self._last_number
 
     async def _write_repeatedly(self) -> None:
-        """Write each minute and event. After a failure, retry with the next minute or event, or after a minute."""
-        while not self._closing:
+        """Write minutes and events. After a failure, retry with the next ones, or after ``WRITTEN_ROWS`` minutes."""
+        while not self._closing.is_set():
             with contextlib.suppress(TimeoutError):  # without samples no minute ends, but a failed write is retried
-                async with asyncio.timeout(MINUTE_S):
+                async with asyncio.timeout(WRITTEN_ROWS * MINUTE_S):
                     await self._due.wait()
             self._due.clear()
-            if not self._closing:
+            if not self._closing.is_set():
                 await self._write()
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(WRITE_S):
+                        await self._closing.wait()
         await self._write()
 
     async def _write(self) -> None:

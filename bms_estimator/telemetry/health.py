@@ -124,7 +124,7 @@ def make_health_payload(
         now_s: Wall clock [s since 1970].
         uptime_s: Time since the service started [s].
         loop_lag_s: Longest delay of the event loop since the last report [s].
-        restarts: Starts that found a checkpoint.
+        restarts: Starts that found files of an earlier run.
         checkpoint: Result of restoring the last checkpoint.
         sensor_message: Reason why no fresh values arrive; None while fresh values arrive.
         delivery: Counters of sent messages and received requests.

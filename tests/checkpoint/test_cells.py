@@ -6,20 +6,18 @@ import numpy as np
 import structlog
 from numpy.lib import recfunctions as rfn
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import NEW_FIELDS, CellEstimator
-from bms_estimator.model.clock import Clock
 from bms_estimator.service.restored_pack import restore_pack
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.simulated_pack import SimulatedPack
 
 
 def saved_checkpoint(folder: Path, pack: SimulatedPack) -> CheckpointFile:
     """Save a checkpoint of a pack; return its file for the next run."""
     file = CheckpointFile(folder, Settings(), pack.model)
-    file.save(pack.estimator.record, RunCounters(0, new_totals(0.0)), cells=pack.cells.saved_state)
+    file.save(pack.estimator.record, cells=pack.cells.saved_state)
     return CheckpointFile(folder, Settings(), pack.model)
 
 
@@ -27,7 +25,7 @@ def restarted(file: CheckpointFile, pack: SimulatedPack) -> CellEstimator:
     """Return the estimators of the cells of the next run."""
     estimator = Estimator(pack.model)
     cells = CellEstimator(estimator)
-    restore_pack(estimator, None, file, None, Clock(), cells)
+    restore_pack(estimator, None, file, None, cells)
     return cells
 
 
@@ -60,7 +58,7 @@ def test_a_state_without_hypotheses_of_a_former_version_is_restored(tmp_path: Pa
         former = [name for name in records.dtype.names or () if name not in NEW_FIELDS]
         saved[key] = rfn.repack_fields(records[former])
     file = CheckpointFile(tmp_path, Settings(), pack.model)
-    file.save(pack.estimator.record, RunCounters(0, new_totals(0.0)), cells=saved)
+    file.save(pack.estimator.record, cells=saved)
     cells = restarted(CheckpointFile(tmp_path, Settings(), pack.model), pack)
     assert cells.deviations
     assert pack.cells.deviations
@@ -71,5 +69,5 @@ def test_a_checkpoint_without_cell_voltages_starts_the_cells_anew(tmp_path: Path
     pack = SimulatedPack()
     pack.run(1)
     file = CheckpointFile(tmp_path, Settings(), pack.model)
-    file.save(pack.estimator.record, RunCounters(0, new_totals(0.0)))
+    file.save(pack.estimator.record)
     assert restarted(CheckpointFile(tmp_path, Settings(), pack.model), pack).deviations is None

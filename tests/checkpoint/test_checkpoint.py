@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.lib.recfunctions import repack_fields
 
-from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_FILES, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_FILES, CheckpointFile
 from bms_estimator.checkpoint.identity import fields, pack_identity
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
@@ -28,15 +28,12 @@ from bms_estimator.model.payloads.health import Health
 from bms_estimator.service import checkpoint_writer, live_loop
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
 
 CELL = load_cell("chen_mora")
 SETTINGS = Settings.model_validate({"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}})
-NEW_COUNTERS = RunCounters(0, new_totals(0.0))
-"""Counters of a first run."""
 
 
 def edit_settings(section: str, **values: Any) -> Settings:
@@ -134,7 +131,7 @@ async def test_the_gap_of_a_restart_lasts_until_the_first_valid_sample(
 )
 async def test_a_learned_state_is_restored_after_a_change_of_settings(tmp_path: Path, settings: Settings) -> None:
     learned = learned_estimator()
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW_COUNTERS)
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record)
     run = await run_samples(tmp_path, settings, samples=1)
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
     assert run.estimator.record["map"].tobytes() == learned.record["map"].tobytes()
@@ -149,7 +146,7 @@ async def test_parameters_of_the_learning_law_are_restored_only_under_the_same_s
         learned.step(float(i), 0.3 * (i // 60 % 2), 3.8 - 0.03 * (i // 60 % 2))
     theta = learned.record[0]["learning"]["theta"].copy()
     assert theta.any()
-    CheckpointFile(tmp_path, settings, CELL).save(learned.record, NEW_COUNTERS)
+    CheckpointFile(tmp_path, settings, CELL).save(learned.record)
     restored = await run_samples(tmp_path, settings, samples=1)
     assert (restored.estimator.record[0]["learning"]["theta"] == theta).all()
     assert restored.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
@@ -160,7 +157,7 @@ async def test_parameters_of_the_learning_law_are_restored_only_under_the_same_s
 async def test_a_checkpoint_without_the_fields_of_the_learning_law_is_restored(tmp_path: Path) -> None:
     learned = learned_estimator()
     file = CheckpointFile(tmp_path, SETTINGS, CELL)
-    file.save(learned.record, NEW_COUNTERS)
+    file.save(learned.record)
     with np.load(file.path) as saved:
         state = saved["state"]
         without_learning = dict(saved) | {
@@ -173,7 +170,7 @@ async def test_a_checkpoint_without_the_fields_of_the_learning_law_is_restored(t
 
 async def test_a_learned_state_is_restored_after_a_change_of_the_cells_name_and_description(tmp_path: Path) -> None:
     learned = learned_estimator()
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, NEW_COUNTERS)
+    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record)
     described = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"name": "mine", "description": "new"})})
     run = await run_samples(tmp_path, cell=described, samples=2)
     assert run.health.checkpoint == f"restored: SOC {learned.state['soc'][0]:.4f}"
@@ -243,17 +240,11 @@ def test_filter_states_of_a_version_without_ocv_states_are_restored() -> None:
     assert (good_mean[NODE:] == 0.0).all()
 
 
-def save_as(
-    version: int,
-    file: CheckpointFile,
-    estimator: Estimator,
-    monkeypatch: pytest.MonkeyPatch,
-    counters: RunCounters = NEW_COUNTERS,
-) -> None:
+def save_as(version: int, file: CheckpointFile, estimator: Estimator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Save a checkpoint with the number ``version`` of its format."""
     with monkeypatch.context() as patch:
         patch.setattr("bms_estimator.checkpoint.checkpoint_file.FORMAT", version)
-        file.save(estimator.record, counters)
+        file.save(estimator.record, whole=True)
 
 
 @pytest.mark.parametrize("damage", ["other cell", "nan", "range", "truncated", "garbage", "earlier", "pipe"])
@@ -269,17 +260,17 @@ async def test_an_invalid_checkpoint_is_set_aside_with_the_reason(
         estimator.state["a"][0][3], reason = np.nan, "refused: a of the observer is not finite"
     if damage == "range":
         estimator.state["soc"], reason = 1.7, r"refused: soc = 1.7 is outside 0.0..1.0"
-    file.save(estimator.record, NEW_COUNTERS)
+    file.save(estimator.record)
     if damage == "other cell":
         other = CheckpointFile(tmp_path, SETTINGS, CELL.pack(2, 1))
-        other.save(estimator.record, NEW_COUNTERS)
+        other.save(estimator.record)
         other.path.replace(file.path)
         reason = "refused: it belongs to another pack or cell"
     if damage in ("truncated", "garbage"):
         file.path.write_bytes(file.path.read_bytes()[:500] if damage == "truncated" else bytes(range(256)) * 8)
     if damage == "earlier":
-        save_as(FORMAT - 1, file, estimator, monkeypatch)
-        reason = f"refused: format {FORMAT - 1}, this version reads {FORMAT}"
+        save_as(FORMAT - 2, file, estimator, monkeypatch)
+        reason = f"refused: format {FORMAT - 2}, this version reads {FORMAT}"
     if damage == "pipe":  # opening it for reading would block until a writer comes
         file.path.unlink()
         os.mkfifo(file.path)
@@ -295,7 +286,7 @@ async def test_an_invalid_checkpoint_is_set_aside_with_the_reason(
 async def test_each_cell_has_its_own_checkpoint(tmp_path: Path) -> None:
     cells = [CELL, CELL.pack(2, 1), CELL.pack(3, 1), CELL]
     runs = [await run_samples(tmp_path, cell=cell) for cell in cells]
-    assert [run.health.restarts for run in runs] == [0, 0, 0, 1]
+    assert [run.health.restarts for run in runs] == [0, 1, 2, 3]
     last = runs[-1].estimator
     assert last.state["soc_coulomb"][0] == pytest.approx(0.3 - last.record["unseen_s"][0] / 3600.0, abs=1e-6)
 
@@ -306,7 +297,7 @@ def test_the_oldest_checkpoints_of_a_pack_name_are_removed_above_the_maximum_num
     (tmp_path / "pack-2-0123abcd.npz").write_bytes(b"of another pack")
     for series in range(1, MAX_FILES + 4):
         file = CheckpointFile(tmp_path, SETTINGS, CELL.pack(series, 1))
-        file.save(estimator.record, NEW_COUNTERS)
+        file.save(estimator.record)
         os.utime(file.path, (series, series))
     names = {path.name for path in tmp_path.iterdir()}
     assert len(names) == MAX_FILES + 1
@@ -318,7 +309,7 @@ def test_a_checkpoint_is_private_and_a_symlink_at_its_temporary_name_is_not_foll
     file, victim = CheckpointFile(tmp_path, SETTINGS, CELL), tmp_path / "victim"
     victim.write_text("precious")
     file.path.with_suffix(".new").symlink_to(victim)
-    file.save(new_estimator(SETTINGS, CELL).record, NEW_COUNTERS)
+    file.save(new_estimator(SETTINGS, CELL).record)
     assert victim.read_text() == "precious"
     assert stat.S_IMODE(file.path.lstat().st_mode) == 0o600
 
@@ -368,11 +359,11 @@ async def test_the_final_save_waits_for_a_running_save(tmp_path: Path) -> None:
     saving, began, release, saved_samples = threading.Lock(), threading.Event(), threading.Event(), []
 
     class SlowDisk(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters, curves: Any = None, cells: Any = None) -> None:
+        def save(self, state: Any, curves: Any = None, cells: Any = None, *, whole: bool = False) -> None:
             assert saving.acquire(blocking=False), "two saves at once"
             began.set()
             assert release.wait(LONG_S)
-            super().save(state, counters, curves, cells)
+            super().save(state, curves, cells, whole=whole)
             saved_samples.append(int(state["observer"]["samples"][0]))
             saving.release()
 
@@ -402,14 +393,14 @@ async def test_changes_of_the_soc_are_saved_before_a_long_checkpoint_interval_ha
     loop = asyncio.get_running_loop()
 
     class ReportingFile(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters, curves: Any = None, cells: Any = None) -> None:
-            super().save(state, counters, curves, cells)
+        def save(self, state: Any, curves: Any = None, cells: Any = None, *, whole: bool = False) -> None:
+            super().save(state, curves, cells, whole=whole)
             loop.call_soon_threadsafe(saved.put_nowait, float(state["observer"]["soc"][0]))
 
     class ReportingWriter(checkpoint_writer.CheckpointWriter):
-        async def _save(self, *, clean: bool = False) -> bool:
+        async def _save(self, *, whole: bool = False) -> bool:
             first_call.set()
-            return await super()._save(clean=clean)
+            return await super()._save(whole=whole)
 
     first_call = asyncio.Event()
     monkeypatch.setattr(live_loop, "CheckpointWriter", ReportingWriter)
@@ -453,8 +444,8 @@ async def test_a_save_on_a_full_disk_is_not_retried_at_each_change_of_the_soc(
     attempts = []
 
     class FullDiskFile(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters, *_: Any) -> None:
-            attempts.append((state, counters))
+        def save(self, state: Any, *_: Any, **_whole: bool) -> None:
+            attempts.append(state)
             raise OSError(errno.ENOSPC, "No space left on device")
 
     settings = Settings.model_validate(
@@ -479,8 +470,8 @@ async def test_an_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch
     saved_samples = []
 
     class CountingFile(CheckpointFile):
-        def save(self, state: Any, counters: RunCounters, curves: Any = None, cells: Any = None) -> None:
-            super().save(state, counters, curves, cells)
+        def save(self, state: Any, curves: Any = None, cells: Any = None, *, whole: bool = False) -> None:
+            super().save(state, curves, cells, whole=whole)
             saved_samples.append(state["observer"]["samples"][0])
 
     async with run_with_frequent_saves(CountingFile(tmp_path, SETTINGS, CELL)) as (source, sink, _):
@@ -511,7 +502,7 @@ async def test_the_state_is_saved_when_an_error_ends_the_loop(tmp_path: Path) ->
     content = file.load()
     assert content.reason == ""
     assert content.state["observer.samples"] == 1
-    assert content.counters.total.crashes == 1
+    assert file.run_file.load().counters.total.crashes == 1
 
 
 async def test_the_final_save_does_not_wait_for_a_slow_broker(tmp_path: Path) -> None:

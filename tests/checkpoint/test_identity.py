@@ -55,5 +55,6 @@ def test_a_checkpoint_of_format_7_is_restored(tmp_path: Path) -> None:
     checkpoint.path.write_bytes(CHECKPOINT_FILE.read_bytes())
     restored = checkpoint.load()
     assert restored.reason == ""
-    assert restored.counters.restarts == 4
+    counters, lost_reason, is_damaged = checkpoint.run_file.load()
+    assert (counters.restarts, lost_reason, is_damaged) == (4, "", False)
     assert restored.state["observer.soc"][0] == 0.3709922542638329

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp, synchronised
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.lifetime_totals import new_totals
 
 CELL, SETTINGS = load_cell("chen_mora"), Settings()
 TIME_ERROR = 5
@@ -36,7 +35,7 @@ def test_the_age_of_a_checkpoint_is_read_from_a_clock_that_can_be_trusted_and_is
 ) -> None:
     estimator = new_estimator(SETTINGS, CELL)
     estimator.step(0.0, 0.1, 3.8)
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record, RunCounters(0, new_totals(0.0)))
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record)
     later = replace(SAVED, **changes)
     assert CheckpointFile(tmp_path, SETTINGS, CELL, lambda: later).load().unseen_s == unseen_s
 

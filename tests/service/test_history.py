@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_LATER_FILES, CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_LATER_FILES, CheckpointFile
+from bms_estimator.checkpoint.run_file import RunCounters, RunFile
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.payloads.totals import Totals
 from bms_estimator.process.boot_clock import BootTimestamp
@@ -23,7 +24,6 @@ from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import gap_lengths
 from tests.checkpoint.test_checkpoint import (
     CELL,
-    NEW_COUNTERS,
     SETTINGS,
     edit_settings,
     learned_estimator,
@@ -97,43 +97,47 @@ async def test_charge_and_energy_are_published_only_once_saved_so_that_a_kill_do
 ) -> None:
     release = threading.Event()
 
-    class SlowDisk(CheckpointFile):
-        def save(self, state: Any, ledger: RunCounters, curves: Any = None, cells: Any = None) -> None:
-            assert release.wait(LONG_S)
-            super().save(state, ledger, curves, cells)
+    class SlowDisk(RunFile):
+        def save(self, counters: RunCounters) -> None:
+            assert not counters.total.samples or release.wait(LONG_S)
+            super().save(counters)
 
-    file = SlowDisk(tmp_path, SETTINGS, CELL)
+    file = CheckpointFile(tmp_path, SETTINGS, CELL)
+    file.run_file = SlowDisk(tmp_path, "pack", lambda: clock_at(0.0).wall_s)
     async with run_with_frequent_saves(file) as (source, sink, _):
         source.give(*((float(s), 2.0, 3.8) for s in range(1801)))
         last = await sink.until(lambda s: s.health.total.charge_out_ah > 0.9)
         published = [s.estimate.charge_out_ah for s in sink.snapshots if s.estimate]
-        saved = CheckpointFile(tmp_path, SETTINGS, CELL).load().counters.total.charge_out_ah
+        saved = file.run_file.load().counters.total.charge_out_ah
         release.set()
     assert last.health.samples["samples"] == 1801
     assert set(published) == {saved} == {0.0}
-    assert file.load().counters.total.charge_out_ah == pytest.approx(1.0)
+    assert file.run_file.load().counters.total.charge_out_ah == pytest.approx(1.0)
 
 
 async def test_a_run_without_usable_samples_does_not_change_the_age_of_the_saved_state(tmp_path: Path) -> None:
     await run_at(0.0, tmp_path, (0.0, 0.1, 3.8))
     await run_at(1.0, tmp_path, (0.0, 0.1, 9.9))  # out of range
-    loaded = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(2.0)).load()
-    assert loaded.unseen_s == pytest.approx(7200.0)
-    assert loaded.counters.restarts == 2
-    assert loaded.counters.total.samples["dropped_range"] == 1
+    file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(2.0))
+    counters = file.run_file.load().counters
+    assert file.load().unseen_s == pytest.approx(7200.0)
+    assert counters.restarts == 2
+    assert counters.total.samples["dropped_range"] == 1
 
 
 async def run_and_kill(folder: Path, *, with_a_sample: bool) -> None:
     """Run a service that ends without its final save, as after a kill."""
 
-    class Killed(CheckpointFile):
-        def _write(self, content: dict[str, Any], ledger: RunCounters) -> None:
-            if not ledger.clean:
-                super()._write(content, ledger)
+    class Killed(RunFile):
+        def save(self, counters: RunCounters) -> None:
+            if not counters.clean:
+                super().save(counters)
                 written.set()
 
     written = threading.Event()
-    async with run_with_frequent_saves(Killed(folder, SETTINGS, CELL)) as (source, _, _):
+    file = CheckpointFile(folder, SETTINGS, CELL)
+    file.run_file = Killed(folder, "pack", lambda: clock_at(0.0).wall_s)
+    async with run_with_frequent_saves(file) as (source, _, _):
         if with_a_sample:
             source.give((0.0, 0.1, 3.8))
         assert await asyncio.to_thread(written.wait, LONG_S)
@@ -151,7 +155,7 @@ async def test_a_start_after_an_unclean_end_counts_as_a_crash(tmp_path: Path) ->
 
 
 async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: Path) -> None:
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0)).save(learned_estimator().record, NEW_COUNTERS)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0)).save(learned_estimator().record)
     for hours, settings, reason in (
         (24 * 400.0, SETTINGS, ""),  # without a limit
         (47.0, edit_settings("state", longest_days=2.0), ""),
@@ -169,7 +173,8 @@ COUNTERS = RunCounters(
 
 async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0))
-    file.save(learned_estimator().record, COUNTERS)
+    file.save(learned_estimator().record)
+    file.run_file.save(COUNTERS)
     _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edit_settings("state", longest_days=2.0))
     assert (last.health.restarts, last.health.total.crashes, last.health.total.samples["samples"]) == (7, 2, 71)
 
@@ -182,7 +187,8 @@ async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_co
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
     for attempt in range(MAX_LATER_FILES + 1):
         counters = dataclasses.replace(COUNTERS, restarts=6 + attempt)
-        save_as(FORMAT + 1, file, learned_estimator(), monkeypatch, counters)
+        save_as(FORMAT + 1, file, learned_estimator(), monkeypatch)
+        file.run_file.save(counters)
         inodes.append(file.path.stat().st_ino)
         health = (await run_samples(tmp_path, samples=1)).health
         files = min(attempt + 1, MAX_LATER_FILES)
@@ -226,7 +232,9 @@ async def test_implausible_counters_are_reset_and_the_state_is_restored(
 ) -> None:
     learned = learned_estimator()
     total = COUNTERS.total.model_copy(update=implausible)
-    CheckpointFile(tmp_path, SETTINGS, CELL).save(learned.record, dataclasses.replace(COUNTERS, total=total))
+    file = CheckpointFile(tmp_path, SETTINGS, CELL)
+    file.save(learned.record)
+    file.run_file.save(dataclasses.replace(COUNTERS, total=total))
     with capture_logs() as lines:
         health = (await run_samples(tmp_path, samples=1)).health
     assert "restart from zero" in lines[0]["event"]
@@ -261,7 +269,7 @@ async def test_a_hanging_disk_delays_neither_estimates_nor_shutdown(
     release = threading.Event()
 
     class HungFile(CheckpointFile):
-        def save(self, *_: Any) -> None:
+        def save(self, *_: Any, **_whole: bool) -> None:
             release.wait()
 
     with capture_logs() as lines:
@@ -286,7 +294,7 @@ async def test_after_a_gap_of_a_week_the_soc_is_estimated_from_the_voltage(tmp_p
     estimator = new_estimator(SETTINGS, CELL)
     for second in range(600):
         estimator.step(float(second), 0.0, 3.75)
-    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0)).save(estimator.record, NEW_COUNTERS)
+    CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0)).save(estimator.record)
     restored, _ = await run_at(24.0 * 7.0, tmp_path, *((float(i), 0.0, 3.95) for i in range(60)))
     fresh = new_estimator(Settings(), CELL)  # its SOC is that of its first voltage
     fresh.step(0.0, 0.0, 3.95)

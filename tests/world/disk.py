@@ -80,9 +80,12 @@ class Disk:
     @contextmanager
     def installed(self) -> Iterator[None]:
         """Replace the file functions of ``os`` in this process."""
-        originals = {name: getattr(os, name) for name in ("open", "fsync", "replace", "rename", "unlink", "remove")}
+        originals = {
+            name: getattr(os, name) for name in ("open", "fsync", "fdatasync", "replace", "rename", "unlink", "remove")
+        }
         try:
             os.open, os.fsync = self._open(originals["open"]), self._fsync(originals["fsync"])
+            os.fdatasync = self._fsync(originals["fdatasync"])
             os.replace = os.rename = self._replace(originals["replace"])
             os.unlink = os.remove = self._unlink(originals["unlink"])
             yield

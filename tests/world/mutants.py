@@ -26,17 +26,17 @@ def no_resend_after_reconnect() -> Iterator[None]:
 @contextlib.contextmanager
 def no_fsync() -> Iterator[None]:
     """Rename a checkpoint before its bytes are synced."""
-    original = CheckpointFile._write
+    original = CheckpointFile.save
 
-    def write(self: CheckpointFile, *arguments: Any) -> None:
+    def save(self: CheckpointFile, *arguments: Any, **named: Any) -> None:
         original_fsync, os.fsync = os.fsync, lambda _: None
         try:
-            original(self, *arguments)
+            original(self, *arguments, **named)
         finally:
             os.fsync = original_fsync
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(CheckpointFile, "_write", write)
+        patch.setattr(CheckpointFile, "save", save)
         yield
 
 

@@ -14,7 +14,7 @@ from bms_estimator.telemetry.alarms.message import AlarmMessage, Change, alarm_p
 from bms_estimator.telemetry.alarms.state import AlarmState, AlarmTransition, RaisedAlarm
 from bms_estimator.telemetry.alarms.unwatched import UnwatchedAlarms
 
-ALWAYS_WATCHED: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost"))
+ALWAYS_WATCHED: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost", "alarm_state_lost"))
 """Alarms that are watched even before the first sample."""
 
 
@@ -67,7 +67,12 @@ class AlarmList:
     def saved_state(self) -> dict[str, Any]:
         """Raised alarms for ``restore`` after a restart."""
         return {
-            name: {**state.raised._asdict(), "gone": state.cause_cleared, "acknowledged": state.acknowledged}
+            name: {
+                **state.raised._asdict(),
+                "gone": state.cause_cleared,
+                "acknowledged": state.acknowledged,
+                "severity": state.definition.severity,
+            }
             for name, state in self.states.items()
             if state.raised is not None
         }
@@ -181,23 +186,29 @@ class AlarmList:
             or name in ALWAYS_WATCHED
         )
 
-    def restore(self, saved: Mapping[AlarmName, Any], unwatched: UnwatchedAlarms) -> None:
+    def restore(self, saved: Mapping[AlarmName, Any], unwatched: UnwatchedAlarms) -> list[AlarmName]:
         """Restore the ``saved_state`` of an earlier run and the alarms that cannot be watched.
+
+        Returns:
+            Names of raised critical alarms that are not monitored, because of edited settings or of another version.
 
         Raises:
             ValueError, TypeError, LookupError: The saved state is damaged.
         """
         self._unwatched = unwatched
         for name, entry in saved.items():
-            state = self.states.get(name)
-            if state is None or (entry["gone"] and not state.definition.latch):
-                continue
-            since_s, value = float(entry["since_s"]), entry["value"]
+            since_s, value, flags = float(entry["since_s"]), entry["value"], (entry["gone"], entry["acknowledged"])
             iso_utc(since_s)  # raises ValueError for a time that cannot be published
             if value is not None and not math.isfinite(value):
                 raise ValueError(f"{name}: value = {value}")
-            raised = RaisedAlarm(since_s, None if value is None else float(value))
-            state.restore(raised, cause_cleared=bool(entry["gone"]), acknowledged=bool(entry["acknowledged"]))
+            if not all(isinstance(flag, bool) for flag in flags):
+                raise TypeError(f"{name}: gone, acknowledged = {flags}")
+            if name in self.states:
+                raised = RaisedAlarm(since_s, None if value is None else float(value))
+                self.states[name].restore(raised, cause_cleared=flags[0], acknowledged=flags[1])
+        missing = [name for name in saved if name not in self.states]
+        # checkpoints of a former version contain no severity
+        return [name for name in missing if saved[name].get("severity", "critical") == "critical"]
 
     def _record(self, state: AlarmState, transitions: Iterable[AlarmTransition]) -> None:
         """Record transitions for ``changes``, and raised alarms for ``report``."""

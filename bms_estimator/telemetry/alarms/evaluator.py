@@ -20,7 +20,7 @@ from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
-from bms_estimator.settings.alarm_limits import AlarmDefinition
+from bms_estimator.settings.alarm_limits import STATE_LOST, AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.alarm_list import AlarmList
 from bms_estimator.telemetry.alarms.collapse_risk import collapse_risks, time_left_text
@@ -287,17 +287,33 @@ class AlarmEvaluator:
         """
         return self._alarms.report()
 
-    def restore(self, saved_state: str) -> None:
+    def restore(self, saved_state: str) -> str:
         """Restore the ``saved_state`` of an earlier run.
 
+        Returns:
+            Reason for which raised critical alarms are missing; empty if none are.
+
         Raises:
-            ValueError, TypeError, LookupError: The saved state is damaged.
+            ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError: The saved state is damaged.
         """
         entries = json.loads(saved_state or "{}")
         self._inputs.restore(entries.pop(INPUTS, {}))
         self._silence_reason = str(entries.pop(SILENCE, ""))
         unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, {})
-        self._alarms.restore(entries, unwatched)
+        missing = self._alarms.restore(entries, unwatched)
+        self._save_state()
+        return f"no longer monitored, but raised before the restart: {', '.join(missing)}" if missing else ""
+
+    def raise_state_lost(self, reason: str, now_s: float) -> None:
+        """Raise ``alarm_state_lost`` until it is acknowledged.
+
+        Args:
+            reason: Reason for which raised alarms may be missing.
+            now_s: Wall clock [s since 1970].
+        """
+        self._alarms.set_reasons(STATE_LOST.name, reason)
+        self._alarms.raise_at(STATE_LOST.name, self._at_s, RaisedAlarm(now_s, None))
+        self._alarms.states[STATE_LOST.name].cause_cleared = True  # an acknowledgement ends it at once
         self._save_state()
 
     def _evaluate_samples(self, samples: SampleBlock, cells: Floats, wall_offset_s: float) -> None:

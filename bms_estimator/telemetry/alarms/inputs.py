@@ -121,9 +121,10 @@ class Inputs:
         """
         for name, each in self._inputs.items():
             max_count, lost = saved.get(name, (0, False))
-            if int(max_count) < 0 or not isinstance(lost, bool):
+            if not isinstance(max_count, int) or max_count < 0 or not isinstance(lost, bool):
                 raise ValueError(f"{name}: measured = {max_count}, lost = {lost}")
-            each.max_count, each.lost = min(int(max_count), self.series if name == "cells" else 1), lost
+            each.max_count = min(max_count, self.series if name == "cells" else 1)  # ``series`` may have been edited
+            each.lost = lost
 
 
 def count_values(values: Floats) -> Counts:

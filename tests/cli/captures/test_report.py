@@ -11,7 +11,7 @@ import re
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.history_file import HistoryFile as FitHistoryFile
 from bms_estimator.cli.main import main
 from bms_estimator.cli.options.pack_options import load_pack
@@ -20,7 +20,6 @@ from bms_estimator.pack_model.fit import fit
 from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.saved import history_arrays
 from bms_estimator.sources.captures.replay import load_capture
-from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.calibration.simulated_load import TRUTH, capture, steps
 from tests.command_line import run
 from tests.pack_model.histories import Truth, cell_curves, measured_rows, with_voltages
@@ -148,7 +147,7 @@ def test_page_on_a_history_has_the_learned_parameters_of_the_checkpoint(tmp_path
     settings, model = load_pack(tmp_path / "pack.toml")
     estimator = new_estimator(settings, model)
     estimator.run(load_capture(steps_csv).rows)
-    CheckpointFile(tmp_path, settings, model).save(estimator.record, RunCounters(0, new_totals(0.0)))
+    CheckpointFile(tmp_path, settings, model).save(estimator.record)
     asyncio.run(record_history(tmp_path / "shed.sqlite", [snapshot_at(0.0), snapshot_at(90.0)]))
     arguments = ("--pack", tmp_path / "pack.toml", "--folder", tmp_path, "--out", tmp_path / "report.html")
     code, _, err = run(capsys, "report", *arguments)

@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import TableOcv, load_cell
-from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.command_line import run
 from tests.estimator.anywhere.cases import OXIDE, Case, capture
 
@@ -43,7 +42,7 @@ def pack(tmp_path_factory) -> Path:
     estimator = new_estimator(settings, cell)
     estimator.run(simulate_discharge(1).samples)
     (folder / "state").mkdir()
-    CheckpointFile(folder / "state", settings, cell).save(estimator.record, RunCounters(0, new_totals(0.0)))
+    CheckpointFile(folder / "state", settings, cell).save(estimator.record)
     return file
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import new_estimator
@@ -16,7 +16,6 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
-from bms_estimator.telemetry.lifetime_totals import new_totals
 from tests.command_line import run
 
 CELL = "ncr18650"
@@ -48,7 +47,7 @@ def pack(tmp_path_factory: pytest.TempPathFactory, samples: SampleBlock) -> Path
     assert forecaster
     forecaster.run(samples)
     (folder / "state").mkdir()
-    CheckpointFile(folder / "state", settings, cell).save(estimator.record, RunCounters(0, new_totals(0.0)))
+    CheckpointFile(folder / "state", settings, cell).save(estimator.record)
     HistoryFile(folder / "state", settings, cell, LOAD_SUFFIX).save(load_arrays(forecaster.load, forecaster.past))
     return file
 

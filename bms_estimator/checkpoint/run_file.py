@@ -1,0 +1,175 @@
+"""File with counters and alarms of a pack. It has the pack's name only, so that no edited setting loses them."""
+
+import io
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import structlog
+
+from bms_estimator.checkpoint.checksum import add_checksum, verify_checksum
+from bms_estimator.model.payloads.totals import Totals
+from bms_estimator.process.private_file import read_private, write_private
+from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.lifetime_totals import new_totals
+
+FORMAT = 1
+"""Version of the file's layout. Increment it when a key changes its meaning."""
+MAX_FILE_BYTES = 1 << 16
+"""Maximum size of the file [bytes]. A file with all alarms raised has about 4 kB."""
+MAX_CHECKPOINT_BYTES = 1 << 20
+"""Maximum size of a checkpoint of a former version [bytes]. A normal one has about 112 kB."""
+MAX_COUNT = 1e15
+"""Maximum plausible value of a counter: the number of samples of 30,000 years at 1,000 a second."""
+
+log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True)
+class RunCounters:
+    """Counters of the runs of a pack, and its alarms.
+
+    Attributes:
+        restarts: Number of starts that found files of an earlier run.
+        total: Totals over all runs.
+        clean: True if the last run ended without a crash or kill; False while it runs.
+        alarms: State of the alarms, in the format of ``AlarmEvaluator.saved_state``.
+    """
+
+    restarts: int
+    total: Totals
+    clean: bool = False
+    alarms: str = ""
+
+
+class SavedRun(NamedTuple):
+    """Result of reading the counters of earlier runs."""
+
+    counters: RunCounters
+    """Counters including this start."""
+    lost_reason: str = ""
+    """Reason for which raised alarms may be missing; empty if the alarms are complete."""
+    is_damaged: bool = False
+    """True if there is a file that cannot be used."""
+
+
+class RunFile:
+    """Counters and alarms of one pack, ``<pack.name>.run``.
+
+    Args:
+        folder: Folder of the file.
+        name: Name of the pack.
+        wall_s: Wall clock [s since 1970].
+    """
+
+    def __init__(self, folder: Path, name: str, wall_s: Callable[[], float]) -> None:
+        self._name, self._wall_s = name, wall_s
+        self.path = folder / f"{name}.run"
+
+    def save(self, counters: RunCounters) -> None:
+        """Write the file atomically. A missing folder is created.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        values = {"format": FORMAT, **vars(counters), "total": counters.total.model_dump()}
+        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_private(self.path, add_checksum(json.dumps(values).encode()))
+
+    def load(self) -> SavedRun:
+        """Read the file. Without a usable file, read the pack's newest checkpoint of a version that stored counters there."""
+        try:
+            values = json.loads(verify_checksum(read_private(self.path, MAX_FILE_BYTES)))
+            if values["format"] != FORMAT:
+                raise ValueError(f"format {values['format']}, this version reads {FORMAT}")  # noqa: TRY301 - one handler
+            return SavedRun(self._next_counters(values))
+        except FileNotFoundError:
+            return self._load_former()
+        except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
+            former = self._load_former().counters
+            return SavedRun(former, f"{self.path.name} is damaged ({error})", is_damaged=True)
+
+    def quarantine(self) -> str:
+        """Rename a damaged file, so that the next save does not overwrite it. Return a description for the user."""
+        quarantined = self.path.with_name(f"{self._name}.refused.run")
+        try:
+            self.path.replace(quarantined)
+        except OSError as error:
+            return f"it cannot be set aside: {error}"
+        return f"set aside as {quarantined.name}"
+
+    def _load_former(self) -> SavedRun:
+        """Return the counters of the pack's newest readable checkpoint of a former version, whatever its identity."""
+        lost_reason = ""
+        for path in self._checkpoints():
+            try:
+                with np.load(io.BytesIO(read_private(path, MAX_CHECKPOINT_BYTES)), allow_pickle=False) as file:
+                    values = {
+                        "restarts": int(file["restarts"]),
+                        "total": json.loads(str(file["total"])),
+                        "clean": bool(file["clean"]),
+                        "alarms": str(file["alarms"]) if "alarms" in file else "",
+                    }
+            except Exception:  # noqa: BLE001 - a damaged file may raise anything; an older one may be readable
+                lost_reason = f"{self.path.name} is missing, and {path.name} has no readable alarms"
+            else:
+                return SavedRun(self._next_counters(values), lost_reason)
+        if not lost_reason and self._has_other_files():
+            lost_reason = f"{self.path.name} is missing beside other files of the pack"
+        return SavedRun(RunCounters(int(bool(lost_reason)), new_totals(self._wall_s())), lost_reason)
+
+    def _checkpoints(self) -> list[Path]:
+        """Return all checkpoints of the pack, also quarantined ones, newest first."""
+        pattern = re.compile(rf"{re.escape(self._name)}(-[0-9a-f]{{8}}|\.refused|\.later-\d)\.npz")
+        paths = [path for path in self._folder_content() if pattern.fullmatch(path.name)]
+        return sorted(paths, key=lambda path: path.lstat().st_mtime_ns, reverse=True)
+
+    def _has_other_files(self) -> bool:
+        """Return True if an earlier run has left a history, a load, a database or a damaged file with counters."""
+        pattern = re.compile(rf"{re.escape(self._name)}(-[0-9a-f]{{8}})?\.(.*\.npz|sqlite.*|refused\.run)")
+        return any(pattern.fullmatch(path.name) for path in self._folder_content())
+
+    def _folder_content(self) -> list[Path]:
+        try:
+            return list(self.path.parent.iterdir())
+        except OSError:
+            return []
+
+    def _next_counters(self, values: Mapping[str, Any]) -> RunCounters:
+        """Return saved counters, including this start. Invalid counters restart from zero; the alarms remain.
+
+        Raises:
+            LookupError, TypeError: The alarms are damaged.
+        """
+        alarms = values["alarms"]
+        if not isinstance(alarms, str):
+            raise TypeError(f"alarms = {alarms!r}")
+        try:
+            restarts, total = _read_counters(values)
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+            log.warning("the saved counters are invalid and restart from zero", reason=str(error))
+            restarts, total = 1, new_totals(self._wall_s())
+        return RunCounters(restarts, total, alarms=alarms)
+
+
+def _read_counters(values: Mapping[str, Any]) -> tuple[int, Totals]:
+    """Return the number of restarts and the totals of saved counters, including this start.
+
+    Raises:
+        ArithmeticError, LookupError, TypeError, ValueError: A counter is damaged or implausible.
+    """
+    stored = values["total"]
+    total = Totals.model_validate({name: stored[name] for name in Totals.model_fields if name in stored})
+    datetime.fromisoformat(total.since)
+    restarts, crashes = int(values["restarts"]) + 1, total.crashes + (not values["clean"])
+    counts = {"restarts": restarts, "crashes": crashes, "unseen_s": total.unseen_s, **total.samples}
+    counts |= ChargeEnergy.from_totals(total)._asdict()
+    implausible = [f"{name} = {value}" for name, value in counts.items() if not 0 <= value <= MAX_COUNT]
+    if implausible:
+        raise ValueError(", ".join(implausible))
+    return restarts, total.model_copy(update={"crashes": crashes})

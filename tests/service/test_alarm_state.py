@@ -1,0 +1,370 @@
+"""Raised alarms, lost sensors and counters over a restart, after edited settings and with damaged or missing files."""
+
+import asyncio
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.checksum import add_checksum
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.events import events
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.protocols.base.relay import Relay
+from bms_estimator.service import checkpoint_writer
+from bms_estimator.service.alarm_hooks import AlarmHooks
+from bms_estimator.service.checkpoint_writer import lacks_alarm
+from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.settings.alarm_limits import monitored_alarms
+from bms_estimator.settings.alarms import AlarmHook
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sinks.mqtt.requests import RequestDispatcher
+from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
+from bms_estimator.telemetry.alarms.inputs import Inputs
+from tests.checkpoint.test_checkpoint import CELL, SETTINGS, edit_settings
+from tests.checkpoint.test_identity import CHECKPOINT_FILE
+from tests.collector import Collector
+from tests.patience import LONG_S
+from tests.scripted_source import ScriptedSource
+
+OVER_VOLTAGE = [(float(t), 0.0, 4.4 if t < 5 else 3.8, 25.0, 0) for t in range(20)]
+"""Samples that raise ``pack_over_voltage``, whose cause is then gone: it is latched."""
+NORMAL = [(float(t), 0.0, 3.8, 25.0, 0) for t in range(5)]
+NO_TEMPERATURE = [(float(t), 0.0, 3.8, 25.0 if t < 3 else math.nan, 0) for t in range(20)]
+HOOKS = (
+    {"alarms": ["pack_over_voltage", "over_temperature"], "relay": "low"},
+    {"alarms": ["soc_low"], "topic": "alarm", "payload": "$name $state $text"},
+)
+"""Hooks of the tests. The second hook is for none of the raised alarms."""
+
+
+class Run(NamedTuple):
+    """Result of a run of the service."""
+
+    alarms: dict[str, Alarm]
+    """Alarms in the last snapshot."""
+    relay: list[bool]
+    """Levels of the relay commands: True is high, which connects the load."""
+    messages: list[str]
+    """Messages of the topic hook."""
+    events: list[str]
+    """Texts of the events ``alarm_raised``."""
+    restarts: int
+    checkpoint: str
+
+
+async def run(
+    folder: Path,
+    rows: list[tuple[float, float, float, float, int]],
+    settings: Settings = SETTINGS,
+    cell: CellModel = CELL,
+    until: Callable[[dict[str, Alarm]], bool] = lambda _: True,
+    acknowledge: str = "",
+) -> Run:
+    """Run the service over samples, at least until the alarms fulfil a condition."""
+    source, sink, relay, messages = ScriptedSource(), Collector(), list[bool](), list[str]()
+
+    async def set_relay(command: Relay) -> None:
+        relay.append(command.high)
+
+    hooks = AlarmHooks(
+        [AlarmHook.model_validate(table) for table in HOOKS],
+        "pack",
+        lambda _, payload: messages.append(payload.decode()),
+        set_relay,
+    )
+    requests = RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",))
+    task = asyncio.create_task(
+        run_estimation_loop(
+            settings,
+            cell,
+            source=source,
+            sinks=[sink],
+            stop=asyncio.Event(),
+            checkpoint=CheckpointFile(folder, settings, cell),
+            hooks=hooks,
+            requests=requests,
+        )
+    )
+    volts = cell.cell.series_count
+    source.give(*((t, a, v * volts, c, s) for t, a, v, c, s in rows))
+    await sink.until(lambda s: s.estimate is not None and until(by_name(s.alarms)))
+    if acknowledge:
+        await requests.handle("acknowledge_alarm", json.dumps({"name": acknowledge}).encode())
+        await sink.until(lambda s: not by_name(s.alarms)[acknowledge].active)
+        relay.clear()
+    async with asyncio.timeout(LONG_S):
+        while not relay:  # noqa: ASYNC110 - a relay has no event
+            await asyncio.sleep(0.01)
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+    pairs = zip([None, *sink.snapshots[:-1]], sink.snapshots, strict=True)
+    raised = [each.text for pair in pairs for each in events(*pair) if each.name == "alarm_raised"]
+    health = sink.snapshots[0].health
+    return Run(by_name(sink.snapshots[-1].alarms), relay, messages, raised, health.restarts, health.checkpoint)
+
+
+def by_name(alarms: tuple[Alarm, ...]) -> dict[str, Alarm]:
+    return {alarm.name: alarm for alarm in alarms}
+
+
+def is_latched(alarms: dict[str, Alarm]) -> bool:
+    return "pack_over_voltage" in alarms and alarms["pack_over_voltage"].latched
+
+
+def is_temperature_lost(alarms: dict[str, Alarm]) -> bool:
+    return "over_temperature" in alarms and not alarms["over_temperature"].watched
+
+
+@pytest.fixture(scope="module")
+def latched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """State folder of a run with a latched over-voltage."""
+    folder = tmp_path_factory.mktemp("latched")
+    asyncio.run(run(folder, OVER_VOLTAGE, until=is_latched))
+    return folder
+
+
+@pytest.fixture
+def folder(latched: Path, tmp_path: Path) -> Path:
+    """Copy of the state folder with a latched over-voltage."""
+    return Path(shutil.copytree(latched, tmp_path / "state"))
+
+
+def edit_cell(**values: Any) -> CellModel:
+    return CELL.model_copy(update={"cell": CELL.cell.model_copy(update=values)})
+
+
+EDITS: dict[str, tuple[Settings, CellModel]] = {
+    "none": (SETTINGS, CELL),
+    "capacity": (SETTINGS, edit_cell(capacity_ah=0.5)),
+    "series": (SETTINGS, CELL.pack(2, 1)),
+    "sign": (edit_settings("sensor", current_sign="charge_positive"), CELL),
+    "curve": (SETTINGS, CELL.model_copy(update={"ocv": CELL.ocv.model_copy(update={"constant_v": 3.7})})),
+    "latch": (edit_settings("alarms", pack_over_voltage={"latch": False}), CELL),
+}
+"""Edited settings."""
+
+
+@pytest.mark.parametrize("edit", EDITS)
+async def test_a_latched_alarm_keeps_the_relay_at_its_level_after_edited_settings(folder: Path, edit: str) -> None:
+    settings, cell = EDITS[edit]
+    restarted = await run(folder, NORMAL, settings, cell)
+    assert is_latched(restarted.alarms)
+    assert not any(restarted.relay)
+    assert not restarted.alarms["alarm_state_lost"].active
+    assert (restarted.restarts, restarted.messages) == (1, [])
+
+
+@pytest.mark.parametrize("damage", ["deleted", "damaged"])
+async def test_alarms_and_counters_continue_without_the_checkpoint(folder: Path, damage: str) -> None:
+    checkpoint = CheckpointFile(folder, SETTINGS, CELL).path
+    if damage == "deleted":
+        checkpoint.unlink()
+    else:
+        checkpoint.write_bytes(b"damaged")
+    restarted = await run(folder, NORMAL)
+    assert is_latched(restarted.alarms)
+    assert not any(restarted.relay)
+    assert restarted.restarts == 1
+    assert not restarted.checkpoint.startswith("restored")
+
+
+def flip_bit(content: bytes) -> bytes:
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 1
+    return bytes(flipped)
+
+
+def with_alarms(alarms: Any) -> Callable[[bytes], bytes]:
+    """Return an edit of the run file that replaces the alarms and has a valid checksum."""
+    return lambda content: add_checksum(
+        json.dumps(json.loads(content.partition(b"\n")[2]) | {"alarms": alarms}).encode()
+    )
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes] | None] = {
+    "deleted": None,
+    "empty": lambda _: b"",
+    "truncated": lambda content: content[:-9],
+    "zeroed": lambda content: bytes(len(content)),
+    "one bit": flip_bit,
+    "another format": lambda _: add_checksum(b'{"format": 99}'),
+    "no text": with_alarms(None),
+    "no JSON": with_alarms("{"),
+    "no object": with_alarms("[1]"),
+    "NaN": with_alarms('{"pack_over_voltage": {"since_s": NaN, "value": 1, "gone": true, "acknowledged": false}}'),
+    "wrong type": with_alarms('{"pack_over_voltage": {"since_s": 1, "value": 1, "gone": 1, "acknowledged": false}}'),
+    "missing key": with_alarms('{"pack_over_voltage": {}}'),
+    "wrong inputs": with_alarms('{"inputs": {"temperature": [true]}}'),
+    "unknown critical alarm": with_alarms(
+        '{"fire": {"since_s": 1, "value": 1, "gone": true, "acknowledged": false, "severity": "critical"}}'
+    ),
+}
+"""Damages of the run file, and contents that hide a raised alarm."""
+
+
+@pytest.mark.parametrize("damage", ["deleted", "one bit", "NaN"])
+async def test_lost_alarms_keep_the_relay_at_its_level_until_they_are_acknowledged(folder: Path, damage: str) -> None:
+    file, edit = folder / "pack.run", DAMAGES[damage]
+    if edit is None:
+        file.unlink()
+    else:
+        file.write_bytes(edit(file.read_bytes()))
+    restarted = await run(folder, NORMAL)
+    lost = restarted.alarms["alarm_state_lost"]
+    assert (lost.active, lost.severity) == (True, "critical")
+    assert not any(restarted.relay)
+    assert [text.split(" ")[:2] for text in restarted.messages] == [["alarm_state_lost", "raised"]]
+    assert [text for text in restarted.events if text.startswith("alarm_state_lost: ")]
+    again = await run(folder, NORMAL)
+    assert again.alarms["alarm_state_lost"].active
+    assert not any(again.relay)
+    assert (again.messages, again.events) == ([], [])
+    acknowledged = await run(folder, NORMAL, acknowledge="alarm_state_lost")
+    assert all(acknowledged.relay)
+    assert acknowledged.messages == ["alarm_state_lost cleared "]
+    assert all((await run(folder, NORMAL)).relay)
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_alarms_are_recognized(latched: Path, tmp_path: Path, damage: str) -> None:
+    shutil.copy(latched / "pack.run", tmp_path)
+    shutil.copy(CheckpointFile(latched, SETTINGS, CELL).path, tmp_path)
+    file, edit = CheckpointFile(tmp_path, SETTINGS, CELL).run_file, DAMAGES[damage]
+    if edit is None:
+        file.path.unlink()
+    else:
+        file.path.write_bytes(edit(file.path.read_bytes()))
+    saved = file.load()
+    assert saved.lost_reason or restore_fails(saved.counters.alarms)
+
+
+def restore_fails(alarms: str) -> bool:
+    """Return True if an evaluator reports that alarms are missing, or raises an exception."""
+    evaluator = AlarmEvaluator(monitored_alarms(SETTINGS, CELL), 0.1, 5.0, Inputs(10.0, 1), 10.0)
+    try:
+        return bool(evaluator.restore(alarms))
+    except Exception:  # noqa: BLE001 - the monitor catches any exception
+        return True
+
+
+async def test_a_damaged_file_with_alarms_is_renamed(folder: Path) -> None:
+    (folder / "pack.run").write_bytes(b"damaged")
+    await run(folder, NORMAL)
+    assert (folder / "pack.refused.run").read_bytes() == b"damaged"
+
+
+async def test_a_first_start_raises_no_alarm_and_neither_does_one_beside_another_pack(tmp_path: Path) -> None:
+    (tmp_path / "pack-2.sqlite").write_bytes(b"of another pack")
+    (tmp_path / "pack-2-0123abcd.npz").write_bytes(b"of another pack")
+    first = await run(tmp_path, NORMAL)
+    assert not first.alarms["alarm_state_lost"].active
+    assert all(first.relay)
+    assert first.restarts == 0
+
+
+async def test_an_alarm_that_is_disabled_while_it_is_raised_needs_an_acknowledgement(folder: Path) -> None:
+    disabled = edit_settings("alarms", pack_over_voltage={"enabled": False})
+    restarted = await run(folder, NORMAL, disabled)
+    assert restarted.alarms["alarm_state_lost"].text.endswith(
+        "no longer monitored, but raised before the restart: pack_over_voltage"
+    )
+    assert not any(restarted.relay)
+
+
+async def test_a_raised_warning_of_another_version_is_dropped(folder: Path) -> None:
+    file = folder / "pack.run"
+    entry = {"since_s": 1.0, "value": None, "gone": False, "acknowledged": False, "severity": "warning"}
+    file.write_bytes(with_alarms(json.dumps({"moisture": entry}))(file.read_bytes()))
+    assert all((await run(folder, NORMAL)).relay)
+
+
+def write_former_checkpoint(path: Path, alarms: dict[str, Any]) -> None:
+    """Write a checkpoint of the former format, which contains counters and alarms, for another identity."""
+    with np.load(CHECKPOINT_FILE) as file:
+        np.savez(path, **(dict(file) | {"alarms": json.dumps(alarms), "identity": "0123abcd"}))
+
+
+RAISED = {"pack_over_voltage": {"since_s": 1.7e9, "value": 4.4, "gone": True, "acknowledged": False}}
+"""Latched alarm in the former format."""
+
+
+async def test_after_an_upgrade_alarms_and_counters_come_from_the_newest_readable_checkpoint(tmp_path: Path) -> None:
+    write_former_checkpoint(tmp_path / "pack-0123abcd.npz", RAISED | {"inputs": {"temperature": [1, True]}})
+    restarted = await run(tmp_path, NORMAL)
+    assert is_latched(restarted.alarms)
+    assert not restarted.alarms["alarm_state_lost"].active
+    assert not any(restarted.relay)
+    assert restarted.restarts == 4
+
+
+async def test_an_upgrade_beside_a_newer_damaged_checkpoint_takes_the_safe_side(tmp_path: Path) -> None:
+    write_former_checkpoint(tmp_path / "pack-0123abcd.npz", {})
+    (tmp_path / "pack-4567cdef.npz").write_bytes(b"damaged")
+    restarted = await run(tmp_path, NORMAL)
+    assert restarted.alarms["alarm_state_lost"].active
+    assert not any(restarted.relay)
+    assert restarted.restarts == 4
+
+
+@pytest.mark.parametrize("edit", ["none", "capacity", "series"])
+async def test_a_lost_sensor_stays_lost_after_edited_settings(tmp_path: Path, edit: str) -> None:
+    await run(tmp_path, NO_TEMPERATURE, until=is_temperature_lost)
+    restarted = await run(tmp_path, [(float(t), 0.0, 3.8, math.nan, 0) for t in range(5)], *EDITS[edit])
+    assert is_temperature_lost(restarted.alarms)
+    assert not any(restarted.relay)
+
+
+async def test_fewer_cells_in_series_than_measured_before_drop_no_alarm(tmp_path: Path) -> None:
+    file = CheckpointFile(tmp_path, SETTINGS, CELL).run_file
+    saved = file.load().counters
+    state = json.dumps(RAISED | {"inputs": {"cells": [16, False]}})
+    file.save(type(saved)(saved.restarts, saved.total, clean=True, alarms=state))
+    restarted = await run(tmp_path, NORMAL, cell=CELL.pack(4, 1))
+    assert is_latched(restarted.alarms)
+
+
+async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The checkpoint interval is 1e6 s. The process is killed, which is the same as to read the file before the end."""
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
+    settings = edit_settings("state", checkpoint_s=1e6)
+    blocked = tmp_path / "state"
+    blocked.write_text("a file instead of the folder")
+    source, sink = ScriptedSource(), Collector()
+    checkpoint = CheckpointFile(blocked, settings, CELL)
+    task = asyncio.create_task(
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    source.give(*OVER_VOLTAGE)
+    await sink.until(lambda s: is_latched(by_name(s.alarms)))
+    await sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved"))
+    blocked.unlink()
+    async with asyncio.timeout(LONG_S):
+        while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+
+
+def alarm_state(**acknowledged: bool) -> str:
+    return json.dumps({name: {"acknowledged": flag} for name, flag in acknowledged.items()})
+
+
+def test_only_what_a_restart_would_lack_is_saved_at_once() -> None:
+    assert lacks_alarm("", alarm_state(a=False))
+    assert lacks_alarm(alarm_state(a=False), alarm_state(a=True))
+    assert lacks_alarm(alarm_state(a=True), alarm_state(a=False))
+    assert lacks_alarm("{}", '{"inputs": {"temperature": [1, true]}}')
+    assert lacks_alarm("{}", '{"silence": "no samples"}')
+    assert not lacks_alarm(alarm_state(a=False, b=False), alarm_state(b=False))
+    assert not lacks_alarm(alarm_state(a=False), "")
