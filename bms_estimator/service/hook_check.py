@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Iterator
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.settings.alarm_limits import STATE_LOST
 from bms_estimator.settings.alarms import ALARMS, AlarmHook, AlarmSettings
 from bms_estimator.settings.pack import Settings
 
@@ -48,7 +49,8 @@ def _relay_warnings(hook: AlarmHook, alarms: AlarmSettings) -> Iterator[str]:
             f"when_silent: not set, so the board switches its pin to {hook.relay}, as in an alarm, after "
             f'{hook.silent_s} s without the service; write {hook.relay!r} to confirm, or "keep"'
         )
-    critical = [name for name in hook.alarms or ALARMS if getattr(alarms, name).severity == "critical"]
+    names = hook.alarms or ALARMS
+    critical = [name for name in names if name == STATE_LOST.name or getattr(alarms, name).severity == "critical"]
     if hook.relay == "high" and critical:
         yield (
             f'relay = "high": the pin is low after each reset and without power, which connects the load during an alarm; '

@@ -5,6 +5,7 @@ import contextlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import structlog
 
@@ -39,6 +40,9 @@ from bms_estimator.sources.source import ReadTap
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import History
 from bms_estimator.store.outbox import Outbox
+
+if TYPE_CHECKING:
+    from bms_estimator.sources.line_source import LineSource
 
 log = structlog.get_logger(__name__)
 
@@ -83,7 +87,10 @@ async def run_pack_service(
         all_sinks.append(History(database, days=settings.store.history_days))
     requests = RequestDispatcher(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = KnownBoardFile(folder, settings.pack.name) if folder else None
-    source = open_line_source(settings, tap=tap) or SerialSource(settings.sensor, tap=tap, board_file=memory)
+    board: SerialSource | None = None
+    source: LineSource | SerialSource | None = open_line_source(settings, tap=tap)
+    if source is None:
+        source = board = SerialSource(settings.sensor, tap=tap, board_file=memory)
     outbox = Outbox(database, max_messages=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     mqtt: MqttSink | None = None
@@ -99,12 +106,11 @@ async def run_pack_service(
             alarms=[each.name for each in monitored_alarms(settings, cell)],
         )
         all_sinks.insert(0, mqtt)  # so that no other sink delays the messages
-    board = source if isinstance(source, SerialSource) and has_relay(settings) else None
     hooks = AlarmHooks(
         settings.alarms.hook,
         settings.pack.name,
         mqtt.publish_raw if mqtt else None,
-        board,
+        board if has_relay(settings) else None,
         list_file=HookListFile(folder, settings.pack.name) if folder else None,
     )
     if settings.page is not None:

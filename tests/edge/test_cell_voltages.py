@@ -15,7 +15,9 @@ STORE_ID_NS = 10**18
 def samples(count):
     rows = np.zeros(count, SAMPLE)
     rows["time_s"] = np.arange(count)
-    rows["voltage_v"], rows["current_a"], rows["temperature_c"] = 52.8, 5.0, 25.0
+    rows["voltage_v"], rows["current_a"] = 52.8, 5.0
+    for name in ("temperature_c", "temperature_min_c", "temperature_max_c"):
+        rows[name] = 25.0
     return rows
 
 
