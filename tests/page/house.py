@@ -103,6 +103,7 @@ protocol = "text"
 rate_hz = {rate_hz}
 [mqtt]
 url = "{broker.url}"
+commands = ["set_soc"]
 [page]
 listen = "127.0.0.1:{port}"
 [state]

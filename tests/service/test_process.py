@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+import time
 from asyncio.subprocess import Process
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import IO, Any
 import numpy as np
 import pytest
 
+from bms_estimator.checkpoint.run_file import RunFile
 from tests.command_line import PROGRAM, running_program
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
@@ -186,8 +188,8 @@ async def test_a_stopping_service_saves_its_checkpoint_although_its_broker_hangs
     board.cancel()
     (checkpoint,) = checkpoints(state_home)
     with np.load(checkpoint) as saved:
-        assert saved["clean"]
         assert saved["state"]["observer"]["samples"][0] >= state["frames_received"]
+    assert RunFile(checkpoint.parent, "pack", time.time).load().counters.total.crashes == 0
 
 
 async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shutdown(

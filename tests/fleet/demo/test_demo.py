@@ -17,7 +17,7 @@ def test_demo_names_faulty_packs_and_loses_no_block_when_a_worker_is_killed() ->
     output = " ".join(process.stdout.split())
     assert "ada and bob share the packs in 64 partitions" in output
     assert "page http://127.0.0.1:" in output
-    assert "dead letter: version 3; this program reads versions 1 to 2" in output
+    assert "dead letter: version 4; this program reads versions 1 to 3" in output
     assert "report it 13." in output
     assert "names cell 7: it is 60 mV below the mean" in output
     assert "ada is killed (kill -9)" in output
