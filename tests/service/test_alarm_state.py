@@ -60,6 +60,18 @@ class Run(NamedTuple):
     checkpoint: str
 
 
+class RecordingBoard:
+    """Board that records the levels of its relay commands."""
+
+    boots = 0
+
+    def __init__(self) -> None:
+        self.levels = list[bool]()
+
+    async def relay(self, relay: Relay, _boots: int) -> None:
+        self.levels.append(relay.high)
+
+
 async def run(
     folder: Path,
     rows: list[tuple[float, float, float, float, int]],
@@ -69,16 +81,13 @@ async def run(
     acknowledge: str = "",
 ) -> Run:
     """Run the service over samples, at least until the alarms fulfil a condition."""
-    source, sink, relay, messages = ScriptedSource(), Collector(), list[bool](), list[str]()
-
-    async def set_relay(command: Relay) -> None:
-        relay.append(command.high)
-
+    source, sink, board, messages = ScriptedSource(), Collector(), RecordingBoard(), list[str]()
+    relay = board.levels
     hooks = AlarmHooks(
         [AlarmHook.model_validate(table) for table in HOOKS],
         "pack",
         lambda _, payload: messages.append(payload.decode()),
-        set_relay,
+        board,
     )
     requests = RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",))
     task = asyncio.create_task(
