@@ -87,7 +87,7 @@ class AlarmEvaluator:
         self._inputs, self._silence_limit_s = inputs, silence_limit_s
         self._bounds, self._input_faults = bounds, InputFaults()
         self._silence_reason = ""  # reason why no samples arrive; empty while they do
-        self._has_samples = False  # True after the first sample of this run
+        self._resumed_s: float | None = None  # time of the first sample after the silence; None: none yet
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
         self._weak_cell_intervals = SampleIntervals(math.inf)  # no interval is a gap, because a weak cell remains weak
         self._cell_intervals = SampleIntervals(CELLS_GAP_S)
@@ -146,7 +146,6 @@ class AlarmEvaluator:
         """
         if not self.rows:
             return
-        self._has_samples = True
         samples, trace, forecasts, cells = self._buffer.take()
         if (samples["status"] & SampleStatus.WRONG_CLOCK).any():
             self._input_faults.add("time", "rate", clock_fault or WRONG_CLOCK_TEXT)
@@ -170,9 +169,11 @@ class AlarmEvaluator:
             now_s: Wall clock [s since 1970].
             reason: Reason for the silence; empty if unknown.
         """
-        # a silence restored from an earlier run lasts until the first sample of this run
-        is_restored = bool(self._silence_reason) and not self._has_samples
-        is_silent = silent_s >= self._silence_limit_s or is_restored
+        is_silent = silent_s >= self._silence_limit_s
+        if is_silent:
+            self._resumed_s = None
+        elif self._silence_reason:  # alarms are raised before it ends, so that a relay does not close in between
+            is_silent = self._resumed_s is None or self._at_s - self._resumed_s < self._inputs.lost_s
         if is_silent != bool(self._silence_reason):
             self._silence_reason = (reason or "no samples arrive") if is_silent else ""
             self._update_unwatched(self._at_s)
@@ -326,6 +327,7 @@ class AlarmEvaluator:
         """
         times_s = samples["time_s"]
         self._at_s = float(times_s[-1])
+        self._resumed_s = float(times_s[0]) if self._resumed_s is None else min(self._resumed_s, self._at_s)
         passed_s, observed_s = self._sample_intervals.measure(times_s)
         samples, cells, unusable = self._without_impossible(samples, cells)
         for name, series in measured_values(samples, cells, self._charging_a).items():
