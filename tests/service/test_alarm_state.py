@@ -340,6 +340,25 @@ async def test_fewer_cells_in_series_than_measured_before_drop_no_alarm(tmp_path
     assert is_latched(restarted.alarms)
 
 
+async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 1e6)
+    settings = edit_settings("state", checkpoint_s=1e6)
+    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, settings, CELL)
+    task = asyncio.create_task(
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    async with asyncio.timeout(LONG_S):
+        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+        source.give(*OVER_VOLTAGE)
+        while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+
+
 async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
