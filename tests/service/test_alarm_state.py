@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -321,6 +322,36 @@ async def test_an_upgrade_beside_a_newer_damaged_checkpoint_takes_the_safe_side(
     assert restarted.alarms["alarm_state_lost"].active
     assert not any(restarted.relay)
     assert restarted.restarts == 4
+
+
+def remove_run_file(folder: Path) -> None:
+    (folder / "pack.run").unlink()
+
+
+def interrupt_quarantine(folder: Path) -> None:
+    """Leave only a refused file, as if the service had been killed before its first save."""
+    (folder / "pack.run").rename(folder / "pack.refused.run")
+    for path in folder.glob("pack-*"):
+        path.unlink()
+
+
+def return_from_former_version(folder: Path) -> None:
+    """Leave a file without alarms that is older than the checkpoint of the former version."""
+    file = folder / "pack.run"
+    file.write_bytes(with_alarms("")(file.read_bytes()))
+    os.utime(file, (1e9, 1e9))
+
+
+@pytest.mark.parametrize("edit", [remove_run_file, interrupt_quarantine, return_from_former_version])
+async def test_a_checkpoint_of_a_former_version_does_not_hide_lost_alarms(
+    folder: Path, edit: Callable[[Path], None]
+) -> None:
+    edit(folder)
+    write_former_checkpoint(folder / "pack-0123abcd.npz", {})
+    os.utime(folder / "pack-0123abcd.npz", (4e9, 4e9))
+    restarted = await run(folder, NORMAL)
+    assert restarted.alarms["alarm_state_lost"].active
+    assert not any(restarted.relay)
 
 
 @pytest.mark.parametrize("edit", ["none", "capacity", "series"])
