@@ -57,6 +57,8 @@ class SavedRun(NamedTuple):
     """Reason for which raised alarms may be missing; empty if the alarms are complete."""
     is_damaged: bool = False
     """True if there is a file that cannot be used."""
+    crashed: bool = False
+    """True if the last run crashed or was killed."""
 
 
 class RunFile:
@@ -89,7 +91,8 @@ class RunFile:
             values = json.loads(verify_checksum(read_private(self.path, MAX_FILE_BYTES)))
             if values["format"] != FORMAT:
                 raise ValueError(f"format {values['format']}, this version reads {FORMAT}")  # noqa: TRY301 - one handler
-            return SavedRun(self._next_counters(values), self._newer_former())
+            crashed = values.get("clean") is not True
+            return SavedRun(self._next_counters(values), self._newer_former(), crashed=crashed)
         except FileNotFoundError:
             return self._load_former()
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported

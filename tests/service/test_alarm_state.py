@@ -265,6 +265,13 @@ def restore_fails(alarms: str) -> bool:
         return True
 
 
+def test_a_crashed_run_is_recognized(folder: Path) -> None:
+    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    assert not file.load().crashed
+    file.save(file.load().counters)
+    assert file.load().crashed
+
+
 async def test_a_damaged_file_with_alarms_is_renamed(folder: Path) -> None:
     (folder / "pack.run").write_bytes(b"damaged")
     await run(folder, NORMAL)
