@@ -496,11 +496,12 @@ async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None
     assert after.transitions("sensor_fault") == [(10.0, True)]
 
 
-def add_samples(alarms: AlarmEvaluator, *times_s: float, temperature_c: float = NAN) -> None:
+def add_samples(alarms: AlarmEvaluator, *times_s: float, temperature_c: float = NAN, status: int = 0) -> None:
     """Evaluate samples of a pack at rest."""
     block = np.zeros(len(times_s), dtype=SAMPLE)
     block["time_s"], block["voltage_v"], block["temperature_c"] = times_s, 7.4, temperature_c
     block["temperature_min_c"] = block["temperature_max_c"] = temperature_c
+    block["status"] = status
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
     alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
 
@@ -520,6 +521,16 @@ def test_alarms_are_unwatched_during_silence_and_the_first_10_s_of_samples() -> 
         assert (over_voltage.watched, over_voltage.unwatched_reason) == (is_watched, None if is_watched else "no cable")
         assert reported["link_lost"].watched
         assert "over_temperature" not in reported, "it was never measured"
+
+
+@pytest.mark.parametrize(("status", "watched"), [(SampleStatus.PROBE_FAULT, False), (SampleStatus(0), True)])
+def test_a_temperature_that_only_faulty_probes_measure_is_lost_from_the_start_and_an_absent_one_is_not(
+    status: SampleStatus, watched: bool
+) -> None:
+    alarms = make_evaluator()
+    for time_s in range(20):
+        add_samples(alarms, float(time_s), status=int(status))
+    assert ("over_temperature" not in alarms.unwatched_critical) == watched
 
 
 def test_a_relay_does_not_close_between_a_silence_and_an_alarm_whose_cause_arose_meanwhile() -> None:

@@ -337,6 +337,10 @@ class AlarmEvaluator:
         self._alarms.update("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
         counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
         counts["cells"] = cells[:, 2].astype(np.int64)
+        # with only faulty probes the temperature counts as missing also if it was never measured
+        unusable["temperature"] = ((samples["status"] & SampleStatus.PROBE_FAULT) != 0) & np.isnan(
+            samples["temperature_c"]
+        )
         for quantity, rows in unusable.items():
             counts[quantity][rows] = UNUSABLE
         for at_s in self._inputs.update(times_s, observed_s, counts):
