@@ -1,5 +1,6 @@
 """File with counters and alarms of a pack. It has the pack's name only, so that no edited setting loses them."""
 
+import contextlib
 import io
 import json
 import re
@@ -56,6 +57,8 @@ class SavedRun(NamedTuple):
     """Reason for which raised alarms may be missing; empty if the alarms are complete."""
     is_damaged: bool = False
     """True if there is a file that cannot be used."""
+    crashed: bool = False
+    """True if the last run crashed or was killed."""
 
 
 class RunFile:
@@ -70,6 +73,7 @@ class RunFile:
     def __init__(self, folder: Path, name: str, wall_s: Callable[[], float]) -> None:
         self._name, self._wall_s = name, wall_s
         self.path = folder / f"{name}.run"
+        self._refused = folder / f"{name}.refused.run"
 
     def save(self, counters: RunCounters) -> None:
         """Write the file atomically. A missing folder is created.
@@ -87,7 +91,8 @@ class RunFile:
             values = json.loads(verify_checksum(read_private(self.path, MAX_FILE_BYTES)))
             if values["format"] != FORMAT:
                 raise ValueError(f"format {values['format']}, this version reads {FORMAT}")  # noqa: TRY301 - one handler
-            return SavedRun(self._next_counters(values))
+            crashed = values.get("clean") is not True
+            return SavedRun(self._next_counters(values), self._newer_former(), crashed=crashed)
         except FileNotFoundError:
             return self._load_former()
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
@@ -96,32 +101,38 @@ class RunFile:
 
     def quarantine(self) -> str:
         """Rename a damaged file, so that the next save does not overwrite it. Return a description for the user."""
-        quarantined = self.path.with_name(f"{self._name}.refused.run")
         try:
-            self.path.replace(quarantined)
+            self.path.replace(self._refused)
         except OSError as error:
             return f"it cannot be set aside: {error}"
-        return f"set aside as {quarantined.name}"
+        return f"set aside as {self._refused.name}"
 
     def _load_former(self) -> SavedRun:
         """Return the counters of the pack's newest readable checkpoint of a former version, whatever its identity."""
-        lost_reason = ""
+        former, lost_reason = None, ""
         for path in self._checkpoints():
             try:
-                with np.load(io.BytesIO(read_private(path, MAX_CHECKPOINT_BYTES)), allow_pickle=False) as file:
-                    values = {
-                        "restarts": int(file["restarts"]),
-                        "total": json.loads(str(file["total"])),
-                        "clean": bool(file["clean"]),
-                        "alarms": str(file["alarms"]) if "alarms" in file else "",
-                    }
-            except Exception:  # noqa: BLE001 - a damaged file may raise anything; an older one may be readable
-                lost_reason = f"{self.path.name} is missing, and {path.name} has no readable alarms"
+                values = _former_counters(path)
+            except Exception as error:  # noqa: BLE001 - a damaged file may raise anything; an older one may be readable
+                if former is None or isinstance(error, KeyError):  # a checkpoint without counters was beside the file
+                    lost_reason = f"{self.path.name} is missing, and {path.name} has no readable alarms"
             else:
-                return SavedRun(self._next_counters(values), lost_reason)
-        if not lost_reason and self._has_other_files():
+                former = former or values
+        if not lost_reason and (self._refused.exists() if former else self._has_other_files()):
             lost_reason = f"{self.path.name} is missing beside other files of the pack"
+        if former:
+            return SavedRun(self._next_counters(former), lost_reason)
         return SavedRun(RunCounters(int(bool(lost_reason)), new_totals(self._wall_s())), lost_reason)
+
+    def _newer_former(self) -> str:
+        """Return a reason if a former version, which does not know this file, has saved alarms after it; otherwise an empty text."""
+        saved_ns = self.path.stat().st_mtime_ns
+        for path in self._checkpoints():
+            if path.lstat().st_mtime_ns > saved_ns:
+                with contextlib.suppress(Exception):  # the content of a damaged file does not count
+                    _former_counters(path)
+                    return f"{path.name} of a former version is newer than {self.path.name}"
+        return ""
 
     def _checkpoints(self) -> list[Path]:
         """Return all checkpoints of the pack, also quarantined ones, newest first."""
@@ -155,6 +166,21 @@ class RunFile:
             log.warning("the saved counters are invalid and restart from zero", reason=str(error))
             restarts, total = 1, new_totals(self._wall_s())
         return RunCounters(restarts, total, alarms=alarms)
+
+
+def _former_counters(path: Path) -> dict[str, Any]:
+    """Return the counters and alarms in a checkpoint of a former version.
+
+    Raises:
+        Exception: The file has none (KeyError), or is damaged.
+    """
+    with np.load(io.BytesIO(read_private(path, MAX_CHECKPOINT_BYTES)), allow_pickle=False) as file:
+        return {
+            "restarts": int(file["restarts"]),
+            "total": json.loads(str(file["total"])),
+            "clean": bool(file["clean"]),
+            "alarms": str(file["alarms"]) if "alarms" in file else "",
+        }
 
 
 def _read_counters(values: Mapping[str, Any]) -> tuple[int, Totals]:

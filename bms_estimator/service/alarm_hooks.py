@@ -73,17 +73,22 @@ class AlarmHooks:
             if hook.covers(change.alarm.name):
                 hook.on_alarm_change(change.alarm)
 
-    def restore_active(self, alarms: Sequence[Alarm]) -> None:
+    def restore_active(self, alarms: Sequence[Alarm], *, crashed: bool = False) -> None:
         """Restore the alarms of an earlier run.
 
-        Jobs of these alarms are not repeated, but the relay is set to its level. A hook that the earlier run did not have
-        gets its jobs. If a hook had failed in the earlier run, all jobs are repeated, so that none is lost.
+        Jobs of these alarms are not repeated, but the relay is set to its level. A hook that the earlier run did not have, or
+        whose jobs were not finished, gets its jobs. If a hook had failed in the earlier run, all jobs are repeated, so that
+        none is lost.
+
+        Args:
+            alarms: All alarms.
+            crashed: True if the earlier run crashed or was killed, perhaps with unfinished jobs. All jobs are repeated.
         """
         raised = [alarm for alarm in alarms if counts_as_raised(alarm)]
         failed = [alarm for alarm in raised if alarm.name == "hook_failed"]
         added = self._list_file.replace([hook.settings for hook in self._hooks]) if self._list_file else []
         for hook in self._hooks:
-            if failed or hook.settings in added:
+            if failed or crashed or hook.settings in added:
                 for alarm in raised:
                     if alarm not in failed and hook.covers(alarm.name):
                         hook.on_alarm_change(alarm)
@@ -105,3 +110,6 @@ class AlarmHooks:
             for task in late:
                 task.cancel()
             await asyncio.gather(*late, return_exceptions=True)
+        unfinished = [hook.settings for hook in self._hooks if hook.is_busy]
+        if self._list_file and unfinished:
+            self._list_file.remove(unfinished)

@@ -1,5 +1,6 @@
 """Monitor that evaluates the alarms of a pack with and without samples, and reports their changes."""
 
+import asyncio
 import math
 from collections.abc import Callable
 
@@ -56,6 +57,7 @@ class AlarmMonitor:
         alarms: The monitored alarms and their states.
         report: All alarms as of the last evaluation. An alarm that was raised and has ended since the previous one is
             reported as raised.
+        changed: Event that is set with each change of an alarm.
 
     Raises:
         UserError: A setting of the alarms is not valid for the pack (``watched``).
@@ -89,6 +91,7 @@ class AlarmMonitor:
             PackBounds.of(cell),
         )
         self.report = self.alarms.report()
+        self.changed = asyncio.Event()
         # arrival of the last sample, accepted or not, on the monotonic clock and on the wall clock [s]
         self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
@@ -197,4 +200,5 @@ class AlarmMonitor:
             else:
                 log.info("alarm cleared", alarm=alarm.name)
             self._on_alarm(change)
+            self.changed.set()
         return bool(changes)

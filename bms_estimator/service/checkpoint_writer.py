@@ -1,6 +1,7 @@
 """Writer of a pack's state: after the first sample, when SOC or alarms change, at intervals, and at the end."""
 
 import asyncio
+import contextlib
 import json
 import math
 from collections.abc import Callable
@@ -27,7 +28,7 @@ from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 SOC_CHANGE = 0.002
 """Change of the SOC that triggers a save. If the service is killed, no larger change is lost."""
 CHECK_S = 1.0
-"""Interval of the check for a change of SOC or alarms [s]."""
+"""Interval of the check for a change of the SOC or an acknowledgement [s]. A raised alarm is saved at once."""
 DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
 ALARM_SAVE_S = 30.0
@@ -101,7 +102,7 @@ class CheckpointWriter:
         # until the final save marks the run as clean, the next start counts it as crashed
         run_failed, run_tried_s = not await self._save_counters(), loop.time()
         while True:
-            await asyncio.sleep(min(CHECK_S, self._interval_s))
+            await self._wait_for_alarm(min(CHECK_S, self._interval_s))
             run_delay_s = RETRY_S if run_failed else self._delay_of_counters_s
             if loop.time() >= run_tried_s + run_delay_s:
                 run_failed, run_tried_s = not await self._save_counters(), loop.time()
@@ -112,6 +113,14 @@ class CheckpointWriter:
             if loop.time() >= load_tried_s + LOAD_SAVE_S:
                 await self._save_load()
                 load_tried_s = loop.time()
+
+    async def _wait_for_alarm(self, pause_s: float) -> None:
+        """Wait for ``pause_s``, or until an alarm changes: its cause may be about to cut the power of this computer."""
+        changed = self._publisher.alarm_monitor.changed
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(pause_s):
+                await changed.wait()
+        changed.clear()
 
     async def save_final(self, *, clean: bool) -> None:
         """Save at the end of a run; give up after ``FINAL_SAVE_S``.

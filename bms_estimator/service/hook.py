@@ -38,6 +38,11 @@ class Hook(ABC):
     def description(self) -> str:
         """Short description, without the arguments of a program, which may hold secrets."""
 
+    @property
+    def is_busy(self) -> bool:
+        """True while a job is running or waiting."""
+        return False
+
     def covers(self, name: str) -> bool:
         """Return True if the hook is for this alarm: ``alarm_state_lost`` always, ``hook_failed`` only if listed."""
         if name == "alarm_state_lost":

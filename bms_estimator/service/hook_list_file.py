@@ -14,6 +14,8 @@ from bms_estimator.settings.alarms import AlarmHook
 MAX_FILE_BYTES = 65_536
 """Maximum size of the file [bytes], about 900 hooks."""
 
+REMOVE_S = 2.0
+"""Maximum wait for a slow disk at the end of the service [s]."""
 THREAD_NAME = "hook list"
 """Name of the thread that writes the file."""
 
@@ -42,6 +44,14 @@ class HookListFile:
             # in a thread of its own, so that a hung disk does not block the service
             Thread(target=self._save, args=(hashes,), name=THREAD_NAME, daemon=True).start()
         return [hook for hook, each in zip(hooks, hashes, strict=True) if known is not None and each not in known]
+
+    def remove(self, hooks: Sequence[AlarmHook]) -> None:
+        """Remove hooks, so that they count as new at the next start. Waits at most ``REMOVE_S`` for the disk."""
+        removed = {_hash(hook) for hook in hooks}
+        hashes = [str(each) for each in self._load() or () if each not in removed]
+        thread = Thread(target=self._save, args=(hashes,), name=THREAD_NAME, daemon=True)
+        thread.start()
+        thread.join(REMOVE_S)
 
     def _save(self, hashes: Sequence[str]) -> None:
         try:

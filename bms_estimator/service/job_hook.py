@@ -111,6 +111,12 @@ class JobHook(Hook):
         super().__init__(settings)
         self._device = device
         self._jobs = HookJobs(settings.on, self._raised)
+        self._is_running = False  # a job is running, or the service has ended it
+
+    @property
+    def is_busy(self) -> bool:
+        """True while a job is running or waiting."""
+        return self._is_running or self._jobs.next() is not None
 
     def _on_transition(self, alarm: Alarm) -> None:
         self._jobs.add(alarm)
@@ -123,7 +129,11 @@ class JobHook(Hook):
             while (job := self._jobs.take()) is not None:
                 if self.settings.dry_run:
                     log.warning("alarm hook, dry run", would=self.description, alarm=job.alarm.name, state=job.state)
-                elif await self._run_job(job):
+                    continue
+                self._is_running = True
+                is_started = await self._run_job(job)
+                self._is_running = False
+                if is_started:
                     backoff.reset()
                 else:
                     await self._retry_later(job, backoff.next_s())

@@ -131,7 +131,7 @@ async def run_estimation_loop(
         forecaster=forecaster,
     )
     unrestored = publisher.alarm_monitor.restore(counters.alarms)
-    hooks.restore_active(publisher.alarm_monitor.report)
+    hooks.restore_active(publisher.alarm_monitor.report, crashed=saved_run.crashed)
     if (
         lost_reason := saved_run.lost_reason or unrestored
     ):  # after the restored alarms, because the hooks announce this one

@@ -55,6 +55,6 @@ def test_a_checkpoint_of_format_7_is_restored(tmp_path: Path) -> None:
     checkpoint.path.write_bytes(CHECKPOINT_FILE.read_bytes())
     restored = checkpoint.load()
     assert restored.reason == ""
-    counters, lost_reason, is_damaged = checkpoint.run_file.load()
-    assert (counters.restarts, lost_reason, is_damaged) == (4, "", False)
+    saved = checkpoint.run_file.load()
+    assert (saved.counters.restarts, saved.lost_reason, saved.is_damaged) == (4, "", False)
     assert restored.state["observer.soc"][0] == 0.3709922542638329

@@ -17,7 +17,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.health import HookHealth
-from bms_estimator.service import job_hook
+from bms_estimator.service import alarm_hooks, job_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import hook_warnings
 from bms_estimator.service.hook_list_file import THREAD_NAME, HookListFile
@@ -136,6 +136,38 @@ async def test_an_alarm_reported_in_an_earlier_run_is_not_reported_again_and_its
         running.restore_active([RAISED])
         running.on_alarm_change(Change(at_s=0.0, alarm=CLEARED))
         assert await wait_for_lines(out, 1) == ["soc_low cleared"]
+
+
+async def test_an_alarm_that_waits_for_a_program_at_a_restart_is_reported_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(alarm_hooks, "CLOSE_S", 0.01)
+    out, list_file = tmp_path / "out", HookListFile(tmp_path, "pack")
+    script = write_program(tmp_path / "script", f'echo "$BMS_NAME" >> {out}; [ ! -e {tmp_path}/hang ] || sleep 1000')
+    (tmp_path / "hang").touch()
+    critical = RAISED.model_copy(update={"name": "cell_over_voltage", "severity": "critical"})
+    async with run_hooks({"run": [script]}, list_file=list_file) as running:
+        running.restore_active([])
+        join_writers()
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
+        await wait_for_lines(out, 1)
+        running.on_alarm_change(Change(at_s=0.0, alarm=critical))
+    (tmp_path / "hang").unlink()
+    async with run_hooks({"run": [script]}, list_file=list_file) as running:
+        running.restore_active([RAISED, critical])
+        assert await wait_for_lines(out, 3) == ["soc_low", "cell_over_voltage", "soc_low"]
+
+
+async def test_all_raised_alarms_are_reported_after_a_crash(tmp_path: Path) -> None:
+    output: list[bytes] = []
+    list_file = HookListFile(tmp_path, "pack")
+    for crashed in (False, True):
+        async with run_hooks(
+            {"topic": "load/set", "payload": "$name"}, publish=lambda _, text: output.append(text), list_file=list_file
+        ) as running:
+            running.restore_active([RAISED], crashed=crashed)
+        join_writers()
+    assert output == [b"soc_low"]
 
 
 async def test_a_hook_that_was_added_or_changed_before_a_restart_acts_on_an_alarm_that_is_already_raised(

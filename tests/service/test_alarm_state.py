@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -60,6 +61,18 @@ class Run(NamedTuple):
     checkpoint: str
 
 
+class RecordingBoard:
+    """Board that records the levels of its relay commands."""
+
+    boots = 0
+
+    def __init__(self) -> None:
+        self.levels = list[bool]()
+
+    async def relay(self, relay: Relay, _boots: int) -> None:
+        self.levels.append(relay.high)
+
+
 async def run(
     folder: Path,
     rows: list[tuple[float, float, float, float, int]],
@@ -69,16 +82,13 @@ async def run(
     acknowledge: str = "",
 ) -> Run:
     """Run the service over samples, at least until the alarms fulfil a condition."""
-    source, sink, relay, messages = ScriptedSource(), Collector(), list[bool](), list[str]()
-
-    async def set_relay(command: Relay) -> None:
-        relay.append(command.high)
-
+    source, sink, board, messages = ScriptedSource(), Collector(), RecordingBoard(), list[str]()
+    relay = board.levels
     hooks = AlarmHooks(
         [AlarmHook.model_validate(table) for table in HOOKS],
         "pack",
         lambda _, payload: messages.append(payload.decode()),
-        set_relay,
+        board,
     )
     requests = RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",))
     task = asyncio.create_task(
@@ -255,6 +265,13 @@ def restore_fails(alarms: str) -> bool:
         return True
 
 
+def test_a_crashed_run_is_recognized(folder: Path) -> None:
+    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    assert not file.load().crashed
+    file.save(file.load().counters)
+    assert file.load().crashed
+
+
 async def test_a_damaged_file_with_alarms_is_renamed(folder: Path) -> None:
     (folder / "pack.run").write_bytes(b"damaged")
     await run(folder, NORMAL)
@@ -314,6 +331,36 @@ async def test_an_upgrade_beside_a_newer_damaged_checkpoint_takes_the_safe_side(
     assert restarted.restarts == 4
 
 
+def remove_run_file(folder: Path) -> None:
+    (folder / "pack.run").unlink()
+
+
+def interrupt_quarantine(folder: Path) -> None:
+    """Leave only a refused file, as if the service had been killed before its first save."""
+    (folder / "pack.run").rename(folder / "pack.refused.run")
+    for path in folder.glob("pack-*"):
+        path.unlink()
+
+
+def return_from_former_version(folder: Path) -> None:
+    """Leave a file without alarms that is older than the checkpoint of the former version."""
+    file = folder / "pack.run"
+    file.write_bytes(with_alarms("")(file.read_bytes()))
+    os.utime(file, (1e9, 1e9))
+
+
+@pytest.mark.parametrize("edit", [remove_run_file, interrupt_quarantine, return_from_former_version])
+async def test_a_checkpoint_of_a_former_version_does_not_hide_lost_alarms(
+    folder: Path, edit: Callable[[Path], None]
+) -> None:
+    edit(folder)
+    write_former_checkpoint(folder / "pack-0123abcd.npz", {})
+    os.utime(folder / "pack-0123abcd.npz", (4e9, 4e9))
+    restarted = await run(folder, NORMAL)
+    assert restarted.alarms["alarm_state_lost"].active
+    assert not any(restarted.relay)
+
+
 @pytest.mark.parametrize("edit", ["none", "capacity", "series"])
 async def test_a_lost_sensor_stays_lost_after_edited_settings(tmp_path: Path, edit: str) -> None:
     await run(tmp_path, NO_TEMPERATURE, until=is_temperature_lost)
@@ -329,6 +376,25 @@ async def test_fewer_cells_in_series_than_measured_before_drop_no_alarm(tmp_path
     file.save(type(saved)(saved.restarts, saved.total, clean=True, alarms=state))
     restarted = await run(tmp_path, NORMAL, cell=CELL.pack(4, 1))
     assert is_latched(restarted.alarms)
+
+
+async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 1e6)
+    settings = edit_settings("state", checkpoint_s=1e6)
+    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, settings, CELL)
+    task = asyncio.create_task(
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    async with asyncio.timeout(LONG_S):
+        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+        source.give(*OVER_VOLTAGE)
+        while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
 
 
 async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full(

@@ -496,35 +496,61 @@ async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None
     assert after.transitions("sensor_fault") == [(10.0, True)]
 
 
-def test_alarms_are_unwatched_during_silence() -> None:
-    alarms = make_evaluator()
-    block = np.zeros(1, dtype=SAMPLE)
-    block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
+def add_samples(alarms: AlarmEvaluator, *times_s: float, temperature_c: float = NAN, status: int = 0) -> None:
+    """Evaluate samples of a pack at rest."""
+    block = np.zeros(len(times_s), dtype=SAMPLE)
+    block["time_s"], block["voltage_v"], block["temperature_c"] = times_s, 7.4, temperature_c
+    block["temperature_min_c"] = block["temperature_max_c"] = temperature_c
+    block["status"] = status
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
     alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
-    # Duration of the silence [s], and the expected state of an alarm.
-    silences = [(9.9, True, None), (10.0, False, "no cable"), (0.1, True, None)]
-    for silent_s, is_watched, reason in silences:
+
+
+def test_alarms_are_unwatched_during_silence_and_the_first_10_s_of_samples() -> None:
+    alarms = make_evaluator()
+    add_samples(alarms, 0.0)
+    # Time of a sample [s], None: no sample; duration of the silence [s], and the expected state of an alarm.
+    steps = [(None, 9.9, True), (None, 10.0, False), (20.0, 0.0, False), (None, 10.0, False), (50.0, 0.0, False)]
+    steps += [(50.0 + after_s, 0.0, after_s >= 10.0) for after_s in (5.0, 9.9, 10.0)]
+    for time_s, silent_s, is_watched in steps:
+        if time_s is not None:
+            add_samples(alarms, time_s)
         alarms.on_silence(silent_s, WALL_S, "no cable")
         reported = {alarm.name: alarm for alarm in alarms.report()}
         over_voltage = reported["pack_over_voltage"]
-        assert (over_voltage.watched, over_voltage.unwatched_reason) == (is_watched, reason)
+        assert (over_voltage.watched, over_voltage.unwatched_reason) == (is_watched, None if is_watched else "no cable")
         assert reported["link_lost"].watched
         assert "over_temperature" not in reported, "it was never measured"
 
 
-def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_a_sample_arrives() -> None:
+@pytest.mark.parametrize(("status", "watched"), [(SampleStatus.PROBE_FAULT, False), (SampleStatus(0), True)])
+def test_a_temperature_that_only_faulty_probes_measure_is_lost_from_the_start_and_an_absent_one_is_not(
+    status: SampleStatus, watched: bool
+) -> None:
+    alarms = make_evaluator()
+    for time_s in range(20):
+        add_samples(alarms, float(time_s), status=int(status))
+    assert ("over_temperature" not in alarms.unwatched_critical) == watched
+
+
+def test_a_relay_does_not_close_between_a_silence_and_an_alarm_whose_cause_arose_meanwhile() -> None:
+    alarms = make_evaluator()
+    add_samples(alarms, 0.0, temperature_c=25.0)
+    alarms.on_silence(10.0, WALL_S, "no cable")
+    for time_s in range(20, 40):
+        add_samples(alarms, float(time_s), temperature_c=80.0)
+        alarms.on_silence(0.0, WALL_S, "")
+        assert {"over_temperature"} & {*alarms.unwatched_critical, *alarms.active}
+
+
+def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_samples_arrive() -> None:
     before, after = (make_evaluator() for _ in range(2))
-    block = np.zeros(1, dtype=SAMPLE)
-    block["current_a"], block["voltage_v"], block["temperature_c"] = 1.0, 7.4, NAN
-    before.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    before.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    add_samples(before, 0.0)
     before.on_silence(10.0, WALL_S, "no cable")
     after.restore(before.saved_state)
     after.on_silence(0.0, WALL_S, "")
     assert "pack_over_voltage" in after.unwatched_critical, "no sample has come since the restart"
-    after.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    after.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    add_samples(after, 0.0, 10.0)
     after.on_silence(0.0, WALL_S, "")
     changed = {change.alarm.name: change for change in after.changes()}
     assert (changed["pack_over_voltage"].field, changed["pack_over_voltage"].alarm.watched) == ("watched", True)

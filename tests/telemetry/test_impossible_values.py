@@ -63,6 +63,16 @@ async def test_an_impossible_value_raises_only_sensor_fault_with_a_hint(
     assert not result.changes[-1].alarm.active
 
 
+@pytest.mark.parametrize(("good_s", "raises"), [(1, True), (4, True), (60, False)])
+async def test_an_intermittent_impossible_value_raises_sensor_fault_and_a_single_one_does_not(
+    tmp_path: Path, good_s: int, raises: bool
+) -> None:
+    good = GOOD._replace(seconds=good_s)
+    path = record(tmp_path / "capture.bms", [GOOD, *[good._replace(voltage_v=1e9, seconds=1), good] * 12])
+    transitions = (await replayed(path, settings(), LFP)).transitions("sensor_fault")
+    assert [is_raised for _, is_raised in transitions] == [True] * raises
+
+
 POSSIBLE = {
     "blown fuse": (Line(30, voltage_v=0.0, cells_v=()), {"pack_under_voltage", "sensor_fault"}),
     "dead pack": (Line(30, voltage_v=0.1, cells_v=(0.0,) * 16), {"pack_under_voltage", "cell_under_voltage"}),

@@ -94,8 +94,9 @@ class ProbeCheck:
             probe.was_faulty = is_faulty
         if not typical_c:
             return CheckedProbes(math.nan, math.nan, math.nan, faulty)
-        highest_c = max(*credible.values(), *held_c, -math.inf)
-        return CheckedProbes(sum(typical_c) / len(typical_c), min(typical_c), highest_c, faulty)
+        lowest_c, highest_c = min(typical_c), max(*credible.values(), *held_c, -math.inf)
+        mean_c = min(max(sum(typical_c) / len(typical_c), lowest_c), highest_c)  # a rounded mean may lie outside
+        return CheckedProbes(mean_c, lowest_c, highest_c, faulty)
 
 
 def probe_block(rows: Sequence[Sequence[tuple[float, bool]]]) -> ProbeBlock:

@@ -26,7 +26,7 @@ from bms_estimator.telemetry.alarms.alarm_list import AlarmList
 from bms_estimator.telemetry.alarms.collapse_risk import collapse_risks, time_left_text
 from bms_estimator.telemetry.alarms.faulty_fraction import FaultyFraction, SampleCounts
 from bms_estimator.telemetry.alarms.input_faults import InputFaults
-from bms_estimator.telemetry.alarms.inputs import Inputs, count_values
+from bms_estimator.telemetry.alarms.inputs import RARE_FRACTION, Inputs, count_values
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.sample_buffer import UNUSABLE, SampleBuffer
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
@@ -87,7 +87,7 @@ class AlarmEvaluator:
         self._inputs, self._silence_limit_s = inputs, silence_limit_s
         self._bounds, self._input_faults = bounds, InputFaults()
         self._silence_reason = ""  # reason why no samples arrive; empty while they do
-        self._has_samples = False  # True after the first sample of this run
+        self._resumed_s: float | None = None  # time of the first sample after the silence; None: none yet
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
         self._weak_cell_intervals = SampleIntervals(math.inf)  # no interval is a gap, because a weak cell remains weak
         self._cell_intervals = SampleIntervals(CELLS_GAP_S)
@@ -95,6 +95,7 @@ class AlarmEvaluator:
         self._buffer = SampleBuffer()
         self._faulty_fraction = FaultyFraction()
         self._at_s = 0.0  # time of the last sample
+        self._faulty_s = -math.inf  # time of the last sample with a fault of the input
         self._mismatch_suspected = False
         self._soc_known = False  # True if the SOC was known at the last row of the trace
         self.saved_state = ""
@@ -146,7 +147,6 @@ class AlarmEvaluator:
         """
         if not self.rows:
             return
-        self._has_samples = True
         samples, trace, forecasts, cells = self._buffer.take()
         if (samples["status"] & SampleStatus.WRONG_CLOCK).any():
             self._input_faults.add("time", "rate", clock_fault or WRONG_CLOCK_TEXT)
@@ -170,9 +170,11 @@ class AlarmEvaluator:
             now_s: Wall clock [s since 1970].
             reason: Reason for the silence; empty if unknown.
         """
-        # a silence restored from an earlier run lasts until the first sample of this run
-        is_restored = bool(self._silence_reason) and not self._has_samples
-        is_silent = silent_s >= self._silence_limit_s or is_restored
+        is_silent = silent_s >= self._silence_limit_s
+        if is_silent:
+            self._resumed_s = None
+        elif self._silence_reason:  # alarms are raised before it ends, so that a relay does not close in between
+            is_silent = self._resumed_s is None or self._at_s - self._resumed_s < self._inputs.lost_s
         if is_silent != bool(self._silence_reason):
             self._silence_reason = (reason or "no samples arrive") if is_silent else ""
             self._update_unwatched(self._at_s)
@@ -326,6 +328,7 @@ class AlarmEvaluator:
         """
         times_s = samples["time_s"]
         self._at_s = float(times_s[-1])
+        self._resumed_s = float(times_s[0]) if self._resumed_s is None else min(self._resumed_s, self._at_s)
         passed_s, observed_s = self._sample_intervals.measure(times_s)
         samples, cells, unusable = self._without_impossible(samples, cells)
         for name, series in measured_values(samples, cells, self._charging_a).items():
@@ -334,6 +337,10 @@ class AlarmEvaluator:
         self._alarms.update("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
         counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
         counts["cells"] = cells[:, 2].astype(np.int64)
+        # with only faulty probes the temperature counts as missing also if it was never measured
+        unusable["temperature"] = ((samples["status"] & SampleStatus.PROBE_FAULT) != 0) & np.isnan(
+            samples["temperature_c"]
+        )
         for quantity, rows in unusable.items():
             counts[quantity][rows] = UNUSABLE
         for at_s in self._inputs.update(times_s, observed_s, counts):
@@ -380,7 +387,9 @@ class AlarmEvaluator:
         texts = self._input_faults.texts.items()
         self._alarms.set_input_faults(*(text for name, text in texts if name not in self._inputs.lost))
         if suspects & SENSOR_SUSPECTS or has_fault or self._is_blinded() or self._alarms.board_reason:
-            value = math.inf  # above every limit
+            value, self._faulty_s = math.inf, at_s  # above every limit
+        elif at_s - self._faulty_s <= RARE_FRACTION * self._inputs.lost_s and state and state.raised is None:
+            value = math.nan  # a sample without a fault does not restart the delay of an intermittent one
         self._alarms.update("sensor_fault", np.array([at_s]), observed_s, np.array([value]), wall_offset_s)
 
     def _evaluate_estimates(
