@@ -13,14 +13,14 @@ from bms_estimator.model.sample import MAX_CELL_V, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import Quantity
 
 MAX_C_RATE = 100.0
-"""Highest possible current as a C-rate [1/h]. Power cells give 50 C. A current above 100 C is a short circuit, which ends in a
-second, by the fuse or by the cell."""
+"""Highest possible current as a C-rate [1/h]. Power cells give 50 C. A higher current is a short circuit, which
+the fuse or the cell ends within a second."""
 MAX_CURRENT_RATIO = 10.0
 """Highest possible current of a fuel cell in multiples of its maximum current. Its limiting current density is lower."""
 MIN_MEAN_V = -1.0
-"""Lowest possible mean voltage of the cells of a pack [V]. Reversed cells reach it, and never all at once."""
-MEAN_V = 1.0, 5.0
-"""Range of the mean voltage of cells that are not destroyed [V], of all chemistries."""
+"""Lowest possible mean voltage of the cells of a pack [V]. A reversed cell reaches it, but never all cells at once."""
+MEAN_RANGE_V = 1.0, 5.0
+"""Range of the mean voltage of undamaged cells of any chemistry [V]."""
 MAX_SUM_DIFFERENCE = 0.2
 """Highest possible difference between the pack's voltage and the sum of its cells, as a fraction of the higher one. Wires and
 contactors drop a few percent."""
@@ -85,7 +85,9 @@ class PackBounds(NamedTuple):
         differs = (count == self.series) & (
             np.abs(pack_mean_v - mean_v) > MAX_SUM_DIFFERENCE * np.maximum(np.abs(pack_mean_v), np.abs(mean_v))
         )
-        pack_is_usual, cells_are_usual = ((MEAN_V[0] <= v) & (v <= MEAN_V[1]) for v in (pack_mean_v, mean_v))
+        pack_is_usual, cells_are_usual = (
+            (MEAN_RANGE_V[0] <= v) & (v <= MEAN_RANGE_V[1]) for v in (pack_mean_v, mean_v)
+        )
         cells_agree = highest_v - lowest_v <= MAX_SPREAD_V
         is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
         found: dict[Quantity, ImpossibleValue] = {}
