@@ -88,30 +88,33 @@ class PackBounds(NamedTuple):
         pack_is_usual, cells_are_usual = (
             (MEAN_RANGE_V[0] <= v) & (v <= MEAN_RANGE_V[1]) for v in (pack_mean_v, mean_v)
         )
+        contradicts = differs & cells_are_usual
         cells_agree = highest_v - lowest_v <= MAX_SPREAD_V
         is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
         found: dict[Quantity, ImpossibleValue] = {}
-        rows = is_outside | (differs & cells_are_usual & (~pack_is_usual | cells_agree))
+        rows = is_outside | (contradicts & (~pack_is_usual | cells_agree))
         if rows.any():
             last = np.flatnonzero(rows)[-1]
-            sum_v = self.series * float(mean_v[last]) if differs[last] and cells_are_usual[last] else math.nan
-            found["voltage"] = ImpossibleValue(rows, *self._voltage_cause(float(voltage_v[last]), sum_v))
+            sum_v = self.series * float(mean_v[last]) if contradicts[last] else math.nan
+            found["voltage"] = ImpossibleValue(rows, *self._describe_voltage(float(voltage_v[last]), sum_v))
         rows = differs & pack_is_usual & ~cells_are_usual
         if rows.any():
             last = np.flatnonzero(rows)[-1]
-            sum_v, pack_v = self.series * float(mean_v[last]), float(voltage_v[last])
-            kind = factor_text(sum_v / pack_v) or "are the wires of the cells connected?"
-            text = f"the cell voltages cannot be true: their sum is {sum_v:.6g} V, and the pack has {pack_v:.6g} V"
-            found["cells"] = ImpossibleValue(rows, kind, f"{text} ({kind})")
+            found["cells"] = ImpossibleValue(
+                rows, *_describe_cells(self.series * float(mean_v[last]), float(voltage_v[last]))
+            )
         rows = (np.abs(current_a) > self.max_a) & ~is_saturated
         if rows.any():
-            ampere = float(current_a[rows][-1])
-            kind = current_cause(ampere, self.range_a)
-            text = f"the current cannot be true: {ampere:.6g} A, and at most {self.max_a:.6g} A are possible"
-            found["current"] = ImpossibleValue(rows, kind, f"{text} ({kind})")
+            found["current"] = ImpossibleValue(rows, *self._describe_current(float(current_a[rows][-1])))
         return found
 
-    def _voltage_cause(self, volt: float, sum_v: float) -> tuple[str, str]:
+    def _describe_current(self, ampere: float) -> tuple[str, str]:
+        """Return the likely cause of an impossible current [A], and a sentence with it."""
+        kind = _current_cause(ampere, self.range_a)
+        text = f"the current cannot be true: {ampere:.6g} A, and at most {self.max_a:.6g} A are possible"
+        return kind, f"{text} ({kind})"
+
+    def _describe_voltage(self, volt: float, sum_v: float) -> tuple[str, str]:
         """Return the likely cause of an impossible voltage, and a sentence with it.
 
         Args:
@@ -120,7 +123,7 @@ class PackBounds(NamedTuple):
         """
         text = f"the pack's voltage cannot be true: {volt:.6g} V"
         if math.isfinite(sum_v):
-            kind = factor_text(volt / sum_v) or (
+            kind = _factor_question(volt / sum_v) or (
                 "is the output switched off, or is another voltage measured?"
                 if volt >= 0.0
                 else "are the wires reversed?"
@@ -129,7 +132,7 @@ class PackBounds(NamedTuple):
         low_v, high_v = self.range_v
         fitting = next((factor for factor in FACTORS if low_v <= volt / factor <= high_v), None)
         if fitting:
-            kind = factor_text(fitting)
+            kind = _factor_question(fitting)
         elif abs(volt) >= MIN_SWAPPED:
             kind = "are the words of a 32-bit number swapped?"
         else:
@@ -137,7 +140,19 @@ class PackBounds(NamedTuple):
         return kind, f"{text} of {self.series} cells in series ({kind})"
 
 
-def current_cause(ampere: float, range_a: float) -> str:
+def _describe_cells(sum_v: float, pack_v: float) -> tuple[str, str]:
+    """Return the likely cause of impossible cell voltages, and a sentence with it.
+
+    Args:
+        sum_v: Sum of the cell voltages [V].
+        pack_v: Voltage of the pack [V].
+    """
+    kind = _factor_question(sum_v / pack_v) or "are the wires of the cells connected?"
+    text = f"the cell voltages cannot be true: their sum is {sum_v:.6g} V, and the pack has {pack_v:.6g} V"
+    return kind, f"{text} ({kind})"
+
+
+def _current_cause(ampere: float, range_a: float) -> str:
     """Return the likely cause of an impossible current, as a question.
 
     Args:
@@ -158,7 +173,7 @@ def current_cause(ampere: float, range_a: float) -> str:
     )
 
 
-def factor_text(ratio: float) -> str:
+def _factor_question(ratio: float) -> str:
     """Return the question for a value that is wrong by one of ``FACTORS``; empty for another ratio to the true value."""
     for factor in FACTORS:
         for fault in (factor, 1 / factor):
