@@ -22,18 +22,18 @@ from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.process.private_file import read_private, write_private
 
 CHANGES_SUFFIXES = ".changes-0", ".changes-1"
-"""Ends of the names of the files."""
+"""Suffixes of the two files."""
 BLOCK_BYTES = 4096
 """Size of a file [bytes], a block of ext4. With up to five hypotheses the changes have 2 to 3.5 kB. More do not fit, and the
 checkpoint is saved."""
-WHOLE_S = 300.0
-"""Maximum age of the checkpoint whose changes are saved [s]. A kill loses what the fields of ``_is_slow`` learned since."""
+MAX_BASE_AGE_S = 300.0
+"""Maximum age of the checkpoint whose changes are saved [s]. A kill loses what the omitted fields learned since."""
 MAX_SOC_CHANGE = 0.1
 """Maximum change of the SOC since the checkpoint. The covariances depend on the slope of the OCV at the SOC."""
 MAX_STD_RATIO = 1.1
 """Maximum growth of the SOC's std since the checkpoint. A restart has the std of the checkpoint, which would be too small."""
-LEVEL = 9
-"""Level of compression by zlib. Level 6 makes the file 1 % larger."""
+ZLIB_LEVEL = 9
+"""Compression level. Level 6 makes the file 1 % larger."""
 
 log = structlog.get_logger(__name__)
 
@@ -74,7 +74,7 @@ class ChangesFile:
         self._base = base
 
     def save(self, state: NDArray[np.void], curves: Mapping[str, NDArray[Any]], now: BootTimestamp) -> bool:
-        """Write the fields of ``state`` that change fast. Return False if the checkpoint must be saved instead.
+        """Write the changed fields of ``state``. Return False if the checkpoint must be saved instead.
 
         Args:
             state: Shape (1,), dtype ESTIMATOR_STATE.
@@ -85,12 +85,12 @@ class ChangesFile:
             return False
         changed = state.copy()
         for name, values in fields(changed):
-            if _is_slow(name):
+            if _is_omitted(name):
                 values[...] = 0  # compressed to a few bytes
         changed["filter"]["mean"][0, int(state["filter"]["count"][0]) :] = 0.0  # values of merged hypotheses
         self._saves += 1
         head = json.dumps({"token": self._base.token, "saves": self._saves, **asdict(now)}).encode()
-        body = head + b"\n" + zlib.compress(changed.tobytes(), LEVEL)
+        body = head + b"\n" + zlib.compress(changed.tobytes(), ZLIB_LEVEL)
         block = add_checksum(body.ljust(BLOCK_BYTES - CHECKSUM_BYTES, b"\0"))
         if len(block) > BLOCK_BYTES:
             return False
@@ -115,7 +115,7 @@ class ChangesFile:
                 saves = values.pop("saves")
                 if values.pop("token") == token and saves > newest_saves:
                     state = np.frombuffer(bytearray(zlib.decompressobj().decompress(packed)), dtype)
-                    changed = {name: value for name, value in fields(state) if not _is_slow(name)}
+                    changed = {name: value for name, value in fields(state) if not _is_omitted(name)}
                     newest, newest_saves = Changes(changed, BootTimestamp(**values)), saves
             except FileNotFoundError:
                 continue
@@ -143,24 +143,24 @@ def _overwrite(path: Path, block: bytes) -> None:
 def _is_small_change(
     base: Base, state: NDArray[np.void], curves: Mapping[str, NDArray[Any]], now: BootTimestamp
 ) -> bool:
-    """Return True if the slow fields of a recent checkpoint are still valid with the fast fields of ``state``."""
-    if not 0.0 <= now.since(base.saved) < WHOLE_S:
+    """Return True if the omitted fields of a recent checkpoint are still valid with the other fields of ``state``."""
+    if not 0.0 <= now.since(base.saved) < MAX_BASE_AGE_S:
         return False
     if curves.keys() != base.curves.keys() or not all(
         np.array_equal(curves[name], base.curves[name]) for name in curves
     ):
         return False
-    f, g = base.state[0]["filter"], state[0]["filter"]
+    saved, present = base.state[0]["filter"], state[0]["filter"]
     soc_change = abs(state[0]["observer"]["soc"] - base.state[0]["observer"]["soc"])
-    has_same_hypotheses = g["seeded_s"] >= f["seeded_s"] and all(
-        f[name] == g[name] for name in ("count", "started", "reopened", "exchanged")
+    has_same_hypotheses = present["seeded_s"] >= saved["seeded_s"] and all(
+        saved[name] == present[name] for name in ("count", "started", "reopened", "exchanged")
     )
-    # NaN, without a filter or a SOC, is no change
-    return has_same_hypotheses and not (g["soc_std"] > MAX_STD_RATIO * f["soc_std"] or soc_change > MAX_SOC_CHANGE)
+    has_grown = present["soc_std"] > MAX_STD_RATIO * saved["soc_std"]
+    return has_same_hypotheses and not (has_grown or soc_change > MAX_SOC_CHANGE)  # NaN is no change
 
 
-def _is_slow(name: str) -> bool:
-    """Return True for fields that change slowly, are large, or are computed again for each sample."""
+def _is_omitted(name: str) -> bool:
+    """Return True for fields that are not saved, because they change slowly, are large, or are computed again for each sample."""
     return name in (
         "filter.covariance",
         "filter.ohm",

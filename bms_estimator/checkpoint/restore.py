@@ -57,7 +57,7 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
 
 
 def _restore(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
-    """Restore an estimator as ``restore_state`` does. If the state is invalid, the estimator may be changed in part."""
+    """Restore an estimator as ``restore_state`` does. An invalid state may leave the estimator partly changed."""
     estimator.step(time_s=0.0, current_a=0.0, voltage_v=estimator.cell.cell.nominal_voltage_v)
     after_first_sample = estimator.record.copy()
     filter_was_on = bool(saved.get("filter.started", np.zeros(1))[0])
@@ -170,7 +170,7 @@ def _invalid_counter_reason(record: NDArray[np.void]) -> str:
 
 
 def _has_valid_history(h: np.void) -> bool:
-    """Return True if the rows that the slow fit has not taken yet are valid, and the present row can be completed."""
+    """Return True if the rows that wait for the slow fit are valid, and the present row can be completed."""
     try:
         checked_rows(h["rows"][: int(h["count"])])
     except ValueError:

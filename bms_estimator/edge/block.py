@@ -40,8 +40,8 @@ VERSION = 3
 """Newest version of the format that this program reads."""
 _VERSION_WITHOUT_CELLS, _VERSION_WITH_CELLS, _VERSION_WITH_PROBES = 1, 2, 3
 MAX_PROBE_SAMPLES = 4_000
-"""Maximum number of samples of a block of version 3. With 52 bytes for each incompressible sample, the block stays below the server's
-limit. A longer block has only the mean temperature."""
+"""Maximum number of samples of a block of version 3. At 52 bytes for each incompressible sample, the block stays below the server's
+limit. A longer block contains only the mean temperature."""
 MAX_SAMPLES = 65_535
 """Maximum number of samples of a block."""
 MAX_NUMBER = 2**63

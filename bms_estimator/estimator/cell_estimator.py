@@ -122,7 +122,7 @@ class CellEstimator:
     def run(self, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
         """Process a block of samples.
 
-        The estimators start with a sample that lacks at most one cell voltage. Before, no sample has an effect.
+        The estimators start with the first sample that lacks at most one cell voltage. Earlier samples have no effect.
 
         Args:
             samples: Samples, shape (n,), dtype SAMPLE.
@@ -132,7 +132,7 @@ class CellEstimator:
         """
         if not self._enabled or not trace.size or not (cells_v.size or self.cells.size):
             return
-        if cells_v.shape != (samples.size, self._series):  # unmeasured cells
+        if cells_v.shape != (samples.size, self._series):  # the other cells are not measured
             measured_v, cells_v = cells_v, np.full((samples.size, self._series), np.nan)
             cells_v[: len(measured_v), : measured_v.shape[1]] = measured_v
         if not self.cells.size:

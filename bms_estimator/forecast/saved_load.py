@@ -34,7 +34,7 @@ def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]
 def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Restore a load.
 
-    An earlier version saved too small a largest current for seconds in which the current fell. It is raised to their mean.
+    An earlier version saved a maximum current below the mean for seconds in which the current fell. The mean replaces it.
 
     Args:
         load: Empty load to fill; unchanged if the arrays are invalid.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bms_estimator.model.errors import UserError
 
-_LINK = "{}: is a symbolic link, which might lead to a file of another user; replace it by the file"
+_LINK = "{}: is a symbolic link, which may lead to another user's file; replace it with the file"
 
 
 @dataclass(frozen=True)

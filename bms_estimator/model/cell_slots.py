@@ -15,14 +15,14 @@ class CellSlots:
     """Cell slots of one device.
 
     Many devices report more slots than their pack has cells. The live slots are the cells if there are as many of them as
-    cells in series. These slots remain the cells when a cell fails. Before, the first slots are the cells. The selection
-    depends on the order of the samples, and not on their division into blocks.
+    cells in series. These slots remain the cells when a cell fails. Until then the first slots are the cells. The division of
+    the samples into blocks does not change the selection.
 
     Args:
         series: Number of cells in series.
 
     Attributes:
-        fault: Description of samples of the last block with more live slots than cells in series; empty without any.
+        fault: Fault of the last block if it has more live slots than cells in series, as a sentence; empty otherwise.
     """
 
     def __init__(self, series: int) -> None:
@@ -56,7 +56,7 @@ class CellSlots:
         if count > self._series:
             self.fault = (
                 f"{count} cells are measured, but the pack has {self._series} in series: correct pack.series. "
-                "Without it the single cells have neither alarms nor estimates"
+                "Until then, single cells have neither alarms nor estimates"
             )
             return np.full((len(slots_v), self._series), np.nan)
         if count == self._series:

@@ -217,7 +217,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 def without_secrets(text: str) -> str:
     """Return a text in which *** replaces the user name and password of a URL.
 
-    Everything before the last @ is replaced, and in a URL without a host the password, which is in the place of the port.
+    Everything before the last @ is replaced. In a URL without @, a text in place of the port may be the password and is replaced.
     """
     text = re.sub(r".*@", "***@", text, flags=re.DOTALL)
     return re.sub(r"(://[^\s/:\[]*):(?!\d{1,5}(?!\w))[^\s/,'\"]+", r"\1:***", text)

@@ -41,8 +41,8 @@ MIN_THROUGHPUT_SOC = 1.0
 """Minimum throughput of the history for the adoption of a fit with a large std of the SOC [SOC]. In a shorter history several
 separate SOCs may be possible, which the filter's hypotheses represent and the single normal distribution of a fit does not."""
 MAX_FAILED_FITS = 3
-"""Number of successive failed fits after which the history is discarded. A fit may fail for lack of rows, but a history with an
-odd value would make each fit fail for ever."""
+"""Number of successive failed fits after which the history is discarded. A fit may fail for lack of rows. A history with an
+implausible value makes every fit fail."""
 MIN_CHANGE = 0.01
 """Minimum change of the SOC, or of the ratio of the capacity to the declared one, that is reported as an event."""
 
@@ -81,7 +81,7 @@ class SlowFit:
         submit: Runs a fit, for example in another thread, and returns its future.
         interval_s: Maximum interval between two fits, on the clock of the samples [s]. A history that is younger than
             ``interval_s / INTERVAL_OF_AGE`` is fitted more often. Infinite: no fits.
-        on_failure: Called with the exception of a failed fit, or of the processing of rows. The previous fit stays in use.
+        on_failure: Called with an exception in a fit or in the processing of rows. The previous fit stays in use.
 
     Attributes:
         history: Rows of this and earlier runs.
@@ -90,7 +90,7 @@ class SlowFit:
         fit: The adopted fit, whose curves the filter uses; None: the filter uses the curves of the cell file.
         fits: Number of adopted fits.
         late: Number of fits that were not done when due, so that they were adopted at a later sample.
-        failed: Number of exceptions of fits and of the processing of rows.
+        failed: Number of exceptions in fits and in the processing of rows.
         discarded: Number of histories that were discarded because of such exceptions.
         changes: Number of fits that changed the SOC or the capacity by more than ``MIN_CHANGE``.
         last_change: The last of these changes; None: no change yet.
@@ -111,7 +111,7 @@ class SlowFit:
         self.bank = BankMonitor(self.cell) if self.cell.series > 1.0 else None
         self.fit: PackFit | None = None
         self.fits = self.late = self.failed = self.changes = self.revision = self.unsaved_rows = self.discarded = 0
-        self._failed_in_row = 0  # number of failed fits since the last successful one
+        self._successive_failures = 0  # number of failed fits since the last successful one
         self.last_change: FitChange | None = None
         self._submit, self._interval_s, self._on_failure = submit, interval_s, on_failure
         self._pending: Future[PackFit] | None = None
@@ -226,7 +226,7 @@ class SlowFit:
     def _discard_history(self) -> None:
         """Discard history and last fit. The adopted fit stays in use, as after a restart without the history's file."""
         self._pending, self.saved_fit, self.history = None, None, History()
-        self._is_late, self._new_rows, self._failed_in_row = False, 0, 0
+        self._is_late, self._new_rows, self._successive_failures = False, 0, 0
         if self.bank:
             self.bank.reset()
         self.discarded += 1
@@ -278,12 +278,12 @@ class SlowFit:
             fitted = done.result()
             if self._is_adoptable(fitted):
                 self.adopt(fitted)
-            self.saved_fit, self._failed_in_row = fitted, 0
+            self.saved_fit, self._successive_failures = fitted, 0
         except Exception as error:  # noqa: BLE001 - a failed fit must not end the estimator
             estimator.record[...], estimator.settings_record[...], self.fit = before
-            self._failed_in_row += 1
+            self._successive_failures += 1
             self._report_failure(error)
-            if self._failed_in_row == MAX_FAILED_FITS:
+            if self._successive_failures == MAX_FAILED_FITS:
                 self._discard_history()
         self.unsaved_rows = 0
         self.revision += 1

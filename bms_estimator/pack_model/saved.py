@@ -1,7 +1,7 @@
 """Conversion of history and fit to arrays that can be saved, and back.
 
-A file may contain any values, so that all fields are checked for type, shape and range. An odd value would otherwise end the
-service at each start, or at a later fit.
+A file may contain any values, so that all fields are checked for type, shape and range. An implausible value would otherwise end
+the service at each start, or at a later fit.
 """
 
 import math
@@ -32,17 +32,17 @@ MAX_CHARGE_AS = 1e12
 MAX_VOLTAGE_V, MAX_CURRENT_A, MAX_TEMPERATURE_C = 1e5, 1e6, 1e3
 """Maximum plausible absolute values of a pack's voltage [V], current [A] and temperature [degC]."""
 _FILTER_SOC = (-0.1, 1.1)
-"""Range of an SOC of the filter, which limits it to -0.05..1.05."""
+"""Plausible range of an SOC of the filter, which limits it to -0.05..1.05."""
 _FITTED_SOC = (-2.0, 3.0)
-"""Range of an SOC of a fit, which has no limits."""
-MAX_LN_RATIO = 20.0
+"""Plausible range of a fitted SOC, which the fit does not limit."""
+MAX_RESULT = 20.0
 """Maximum plausible absolute value of a result of a fit: an SOC, a voltage of one cell [V], or ln of a ratio."""
 MAX_COST = 1e15
 """Maximum plausible absolute cost of a fit."""
 ROUNDING_S = 1.0
 """Maximum decrease of the time between two rows by the rounding of merged rows [s]."""
 _TIME, _SEGMENT, _CHARGE = (0.0, MAX_TIME_S), (0.0, MAX_SEGMENT), (-MAX_CHARGE_AS, MAX_CHARGE_AS)
-_CURRENT, _VARIANCE, _RESULT = (-MAX_CURRENT_A, MAX_CURRENT_A), (0.0, MAX_CURRENT_A**2), (-MAX_LN_RATIO, MAX_LN_RATIO)
+_CURRENT, _VARIANCE, _RESULT = (-MAX_CURRENT_A, MAX_CURRENT_A), (0.0, MAX_CURRENT_A**2), (-MAX_RESULT, MAX_RESULT)
 _ROW_RANGES = {
     "elapsed_s": _TIME,
     "duration_s": _TIME,
@@ -81,10 +81,10 @@ _FIT_RANGES = {
     "segment": _SEGMENT,
     "charge_as": _CHARGE,
     "mean": _RESULT,
-    "covariance": (-(MAX_LN_RATIO**2), MAX_LN_RATIO**2),
+    "covariance": (-(MAX_RESULT**2), MAX_RESULT**2),
     "curve_v": _RESULT,
     "ln_r": _RESULT,
-    "hysteresis": (0.0, math.exp(MAX_LN_RATIO)),
+    "hysteresis": (0.0, math.exp(MAX_RESULT)),
     "cost": (-MAX_COST, MAX_COST),
     "first_segment": _SEGMENT,
     "row_elapsed_s": _TIME,
@@ -126,7 +126,7 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
         values[name] = value if shape else float(value)
     covariance = values["covariance"]
     if not np.allclose(covariance, covariance.T) or (np.diag(covariance) < 0.0).any():
-        raise ValueError("covariance of the fit is damaged")
+        raise ValueError("the covariance of the fit is damaged")
     if values["first_segment"] > values["segment"]:
         raise ValueError("the fit begins after its last segment")
     none = np.zeros(0)
@@ -241,7 +241,7 @@ def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
     if elapsed_s.shape != soc.shape or elapsed_s.ndim != 1 or not 0 < elapsed_s.size <= 2 * MAX_ROWS:
         raise ValueError("the SOCs of the fit are damaged")
     if curves.ndim != 2 or curves.shape[1] != _CURVE_UNKNOWNS or not 0 < curves.shape[0] <= SAVED_MINIMA:
-        raise ValueError("curves of the fit is damaged")
+        raise ValueError("the curves of the fit are damaged")
     if not history.rows.size or fit.segment > history.rows["segment"][-1]:
-        raise ValueError("the fit is later than the rows")
+        raise ValueError("the fit is newer than the rows")
     return history, replace(fit, row_elapsed_s=elapsed_s, row_soc=soc, curves=tuple(curves))

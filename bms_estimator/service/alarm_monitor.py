@@ -18,12 +18,11 @@ from bms_estimator.settings.alarm_limits import min_charge_current_a, monitored_
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples, Source
-from bms_estimator.telemetry.alarms.board_resets import BoardResets
 from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST, AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.alarms.probe_faults import ProbeFaults
+from bms_estimator.telemetry.alarms.sensor_faults import BoardResets, ProbeFaults
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.impossible import PackBounds

@@ -32,8 +32,8 @@ CHECK_S = 1.0
 DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
 ALARM_SAVE_S = 30.0
-"""Minimum interval before a save for an alarm that only ended, so that a flapping alarm does not wear the disk [s]. A restart
-within this time raises the alarm again."""
+"""Minimum interval before a save for an alarm that only ended, so that a flapping alarm does not wear the disk [s]. A kill
+within this time raises the alarm again at the next start."""
 RETRY_S = 10.0
 """Interval between retries of a failed save of the alarms [s]."""
 LOAD_SAVE_S = 300.0
@@ -85,7 +85,7 @@ class CheckpointWriter:
         self._samples_of_saved_load = 0
         self._pack_model, self._history = pack_model, history
         self._saved_revision = pack_model.revision if pack_model else 0
-        self._discarded = 0  # number of histories whose files were set aside
+        self._discarded = 0  # number of histories whose files were quarantined
         self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
         self._totals, self._restarts = totals, restarts
         self._saved_counters: RunCounters | None = None
@@ -158,7 +158,7 @@ class CheckpointWriter:
 
     @property
     def _delay_of_counters_s(self) -> float:
-        """Minimum interval between the last save of counters and alarms, and the next one [s]."""
+        """Minimum interval between two saves of counters and alarms [s]; 0 if the next one is urgent."""
         if self._saved_counters is None:
             return 0.0
         saved, alarms = self._saved_counters.alarms, self._alarms.saved_state
@@ -185,7 +185,7 @@ class CheckpointWriter:
         An unchanged state is not saved again: a new save time would hide the gap since the last sample.
 
         Args:
-            whole: True: write all of it, not only its changes.
+            whole: True: write the whole file, not only changes.
         """
         progress = self._progress
         if not progress[0] or (progress == self._saved_progress and not self._curves_changed):

@@ -62,7 +62,7 @@ def _job_warnings(hook: AlarmHook, _: AlarmSettings) -> Iterator[str]:
     if hook.run and shutil.which(hook.run[0]) is None:
         yield f"run = {hook.run[0]}: no such program here, or it may not be run"
     if hook.run and hook.timeout_s > LONG_RUN_S:
-        yield f"timeout_s = {hook.timeout_s:g}: so long a new critical alarm may wait for a program that is running"
+        yield f"timeout_s = {hook.timeout_s:g}: a new critical alarm may wait this long for a running program"
     if "cleared" in hook.on and len(hook.alarms) != 1:
         yield (
             "on: with several alarms, cleared is reported while others are still raised; use "

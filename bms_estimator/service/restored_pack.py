@@ -62,11 +62,11 @@ def restore_pack(
         gap_s = content.unseen_s if restored else math.inf
         try:
             pack_model.resume(gap_s, restored=restored)
-        except Exception as error:  # noqa: BLE001 - an odd value of the file must not end the service at each start
+        except Exception as error:  # noqa: BLE001 - a damaged file must not end the service at each start
             _reject_history(history, error)
             pack_model.load(History(), None, state_fit)
             h = estimator.record["history"]
-            h["count"] = h["sums"]["duration_s"] = 0  # rows that the history lacks
+            h["count"] = h["sums"]["duration_s"] = 0  # without the earlier rows of the discarded history
             pack_model.resume(gap_s, restored=restored)
     if cells and restored and (reason := cells.restore(content.cells, content.unseen_s)):
         log.warning("the state of the single cells was dropped", reason=reason)
@@ -117,7 +117,7 @@ def _load_history(file: HistoryFile | None) -> tuple[History, PackFit | None]:
         if arrays is None:
             return History(), None
         history, fit = history_of(arrays)
-    except Exception as error:  # noqa: BLE001 - an odd value of the file must not end the service at each start
+    except Exception as error:  # noqa: BLE001 - a damaged file must not end the service at each start
         _reject_history(file, error)
         return History(), None
     log.info("history", file=str(file.path), outcome=f"restored: {history.rows.size} rows")

@@ -34,7 +34,7 @@ AlarmName = Literal[
 ALARMS: tuple[AlarmName, ...] = get_args(AlarmName)
 """Names of all alarms, in the order in which they are shown."""
 HookEvent = Literal["raised", "cleared", "first_raised", "last_cleared"]
-"""Change at which a hook acts: of one alarm, or of the number of its raised alarms from and to zero."""
+"""Event at which a hook acts: a change of one of its alarms, the first raised alarm, or the end of the last one."""
 PAYLOAD_FIELDS = ("json", "device", "state", "name", "severity", "since", "value", "limit", "unit", "text", "raised")
 """Fields that the payload of a hook's message may contain, such as $state. ``state`` is ``raised`` or ``cleared``, and
 ``raised`` the names of the hook's raised alarms."""

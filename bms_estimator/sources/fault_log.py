@@ -17,8 +17,7 @@ normal on MQTT. Sources log reconnects and rejected devices (``unadmitted_bytes`
 """
 
 _LOGGED_ONCE = {"implausible": "implausible_temperatures", "implausible_cells": "implausible_cell_voltages"}
-"""Name in the log by counter of values that a device sends for what it does not measure. They are logged only once, because
-they come with each sample."""
+"""Name in the log by counter. These counters are logged only once, because a device may send a placeholder with each sample."""
 
 log = structlog.get_logger(__name__)
 
@@ -44,7 +43,7 @@ class FaultLog:
 
 
 class SilenceLog:
-    """Log of the reasons why no samples arrive: each reason once until samples arrive, however often the reasons alternate."""
+    """Log of the reasons why no samples arrive. Each reason is logged once until samples arrive, even if reasons alternate."""
 
     def __init__(self) -> None:
         self._logged_s: dict[str, float] = {}

@@ -13,14 +13,14 @@ from bms_estimator.model.sample import MAX_CELL_V, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import Quantity
 
 MAX_C_RATE = 100.0
-"""Highest possible current as a C-rate [1/h]. Power cells give 50 C. A current above 100 C is a short circuit, which ends in a
-second, by the fuse or by the cell."""
+"""Highest possible current as a C-rate [1/h]. Power cells give 50 C. A higher current is a short circuit, which
+the fuse or the cell ends within a second."""
 MAX_CURRENT_RATIO = 10.0
 """Highest possible current of a fuel cell in multiples of its maximum current. Its limiting current density is lower."""
 MIN_MEAN_V = -1.0
-"""Lowest possible mean voltage of the cells of a pack [V]. Reversed cells reach it, and never all at once."""
-MEAN_V = 1.0, 5.0
-"""Range of the mean voltage of cells that are not destroyed [V], of all chemistries."""
+"""Lowest possible mean voltage of the cells of a pack [V]. A reversed cell reaches it, but never all cells at once."""
+MEAN_RANGE_V = 1.0, 5.0
+"""Range of the mean voltage of undamaged cells of any chemistry [V]."""
 MAX_SUM_DIFFERENCE = 0.2
 """Highest possible difference between the pack's voltage and the sum of its cells, as a fraction of the higher one. Wires and
 contactors drop a few percent."""
@@ -85,31 +85,36 @@ class PackBounds(NamedTuple):
         differs = (count == self.series) & (
             np.abs(pack_mean_v - mean_v) > MAX_SUM_DIFFERENCE * np.maximum(np.abs(pack_mean_v), np.abs(mean_v))
         )
-        pack_is_usual, cells_are_usual = ((MEAN_V[0] <= v) & (v <= MEAN_V[1]) for v in (pack_mean_v, mean_v))
+        pack_is_usual, cells_are_usual = (
+            (MEAN_RANGE_V[0] <= v) & (v <= MEAN_RANGE_V[1]) for v in (pack_mean_v, mean_v)
+        )
+        contradicts = differs & cells_are_usual
         cells_agree = highest_v - lowest_v <= MAX_SPREAD_V
         is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
         found: dict[Quantity, ImpossibleValue] = {}
-        rows = is_outside | (differs & cells_are_usual & (~pack_is_usual | cells_agree))
+        rows = is_outside | (contradicts & (~pack_is_usual | cells_agree))
         if rows.any():
             last = np.flatnonzero(rows)[-1]
-            sum_v = self.series * float(mean_v[last]) if differs[last] and cells_are_usual[last] else math.nan
-            found["voltage"] = ImpossibleValue(rows, *self._voltage_cause(float(voltage_v[last]), sum_v))
+            sum_v = self.series * float(mean_v[last]) if contradicts[last] else math.nan
+            found["voltage"] = ImpossibleValue(rows, *self._describe_voltage(float(voltage_v[last]), sum_v))
         rows = differs & pack_is_usual & ~cells_are_usual
         if rows.any():
             last = np.flatnonzero(rows)[-1]
-            sum_v, pack_v = self.series * float(mean_v[last]), float(voltage_v[last])
-            kind = factor_text(sum_v / pack_v) or "are the wires of the cells connected?"
-            text = f"the cell voltages cannot be true: their sum is {sum_v:.6g} V, and the pack has {pack_v:.6g} V"
-            found["cells"] = ImpossibleValue(rows, kind, f"{text} ({kind})")
+            found["cells"] = ImpossibleValue(
+                rows, *_describe_cells(self.series * float(mean_v[last]), float(voltage_v[last]))
+            )
         rows = (np.abs(current_a) > self.max_a) & ~is_saturated
         if rows.any():
-            ampere = float(current_a[rows][-1])
-            kind = current_cause(ampere, self.range_a)
-            text = f"the current cannot be true: {ampere:.6g} A, and at most {self.max_a:.6g} A are possible"
-            found["current"] = ImpossibleValue(rows, kind, f"{text} ({kind})")
+            found["current"] = ImpossibleValue(rows, *self._describe_current(float(current_a[rows][-1])))
         return found
 
-    def _voltage_cause(self, volt: float, sum_v: float) -> tuple[str, str]:
+    def _describe_current(self, ampere: float) -> tuple[str, str]:
+        """Return the likely cause of an impossible current [A], and a sentence with it."""
+        kind = _current_cause(ampere, self.range_a)
+        text = f"the current cannot be true: {ampere:.6g} A, and at most {self.max_a:.6g} A are possible"
+        return kind, f"{text} ({kind})"
+
+    def _describe_voltage(self, volt: float, sum_v: float) -> tuple[str, str]:
         """Return the likely cause of an impossible voltage, and a sentence with it.
 
         Args:
@@ -118,7 +123,7 @@ class PackBounds(NamedTuple):
         """
         text = f"the pack's voltage cannot be true: {volt:.6g} V"
         if math.isfinite(sum_v):
-            kind = factor_text(volt / sum_v) or (
+            kind = _factor_question(volt / sum_v) or (
                 "is the output switched off, or is another voltage measured?"
                 if volt >= 0.0
                 else "are the wires reversed?"
@@ -127,7 +132,7 @@ class PackBounds(NamedTuple):
         low_v, high_v = self.range_v
         fitting = next((factor for factor in FACTORS if low_v <= volt / factor <= high_v), None)
         if fitting:
-            kind = factor_text(fitting)
+            kind = _factor_question(fitting)
         elif abs(volt) >= MIN_SWAPPED:
             kind = "are the words of a 32-bit number swapped?"
         else:
@@ -135,7 +140,19 @@ class PackBounds(NamedTuple):
         return kind, f"{text} of {self.series} cells in series ({kind})"
 
 
-def current_cause(ampere: float, range_a: float) -> str:
+def _describe_cells(sum_v: float, pack_v: float) -> tuple[str, str]:
+    """Return the likely cause of impossible cell voltages, and a sentence with it.
+
+    Args:
+        sum_v: Sum of the cell voltages [V].
+        pack_v: Voltage of the pack [V].
+    """
+    kind = _factor_question(sum_v / pack_v) or "are the wires of the cells connected?"
+    text = f"the cell voltages cannot be true: their sum is {sum_v:.6g} V, and the pack has {pack_v:.6g} V"
+    return kind, f"{text} ({kind})"
+
+
+def _current_cause(ampere: float, range_a: float) -> str:
     """Return the likely cause of an impossible current, as a question.
 
     Args:
@@ -156,7 +173,7 @@ def current_cause(ampere: float, range_a: float) -> str:
     )
 
 
-def factor_text(ratio: float) -> str:
+def _factor_question(ratio: float) -> str:
     """Return the question for a value that is wrong by one of ``FACTORS``; empty for another ratio to the true value."""
     for factor in FACTORS:
         for fault in (factor, 1 / factor):

@@ -118,7 +118,7 @@ def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _probes(probes: ProbeBlock) -> dict[str, Any]:
-    """Return the fields of several temperature probes, shape (m,)."""
+    """Return the fields about temperature probes; None without several."""
     if probes.size < 2:
         return {"temperatures_c": None, "faulty_probes": None}
     return {

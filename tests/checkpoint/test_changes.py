@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.changes_file import BLOCK_BYTES, CHANGES_SUFFIXES, MAX_SOC_CHANGE, WHOLE_S
+from bms_estimator.checkpoint.changes_file import BLOCK_BYTES, CHANGES_SUFFIXES, MAX_BASE_AGE_S, MAX_SOC_CHANGE
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.checkpoint.restore import restore_state
@@ -96,7 +96,7 @@ def _jump(pack: SavedPack) -> None:
 
 
 def _wait(pack: SavedPack) -> None:
-    pack.now_s += WHOLE_S
+    pack.now_s += MAX_BASE_AGE_S
 
 
 def _merge(pack: SavedPack) -> None:

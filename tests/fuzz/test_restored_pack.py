@@ -1,4 +1,4 @@
-"""A pack that is restored from files with odd values runs on: an exception would end its service at each start."""
+"""Restart of a pack from files with implausible values. An exception would end its service at each start."""
 
 import warnings
 from concurrent.futures import Future
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile, RunCounters
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX, HistoryFile
 from bms_estimator.checkpoint.identity import fields
 from bms_estimator.checkpoint.load_file import restore_seen_load
@@ -22,7 +22,6 @@ from bms_estimator.kernels.cells.records import BANK as BANK_STATE
 from bms_estimator.kernels.cells.records import CELL as CELL_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.clock import Clock
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning, solve
@@ -32,7 +31,6 @@ from bms_estimator.pack_model.saved import curve_arrays, history_arrays, neutral
 from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.service.restored_pack import restore_pack
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.lifetime_totals import new_totals
 
 SERIES = 4
 SETTINGS = Settings.model_validate({"pack": {"cell": "ncr18650", "series": SERIES, "initial_soc": 0.9}})
@@ -42,12 +40,12 @@ STEP_S = 10.0
 FIT_S = 1800.0
 """Interval between two fits [s]."""
 STATE_SUFFIX = ".npz"
-"""End of the name of the checkpoint."""
+"""Suffix of the checkpoint."""
 STEM = CheckpointFile(Path(), SETTINGS, CELL).path.stem
-"""Begin of the names of all files."""
+"""Stem of the names of all files."""
 Arrays = dict[str, np.ndarray]
 Files = dict[str, Arrays]
-"""Arrays of each file, by the end of its name."""
+"""Arrays of each file, by its suffix."""
 Change = float | str | tuple[int, ...]
 """Number that replaces one or all numbers of an array, or another type or shape of the array."""
 CHANGES: tuple[Change, ...] = (
@@ -56,7 +54,7 @@ CHANGES: tuple[Change, ...] = (
     *((), (0,), (1,), (3,), (2, 2)),
 )
 Place = tuple[str, str, str]
-"""End of a file's name, name of an array, and field of a structured array (empty for another array)."""
+"""Suffix of a file, name of an array, and field of a structured array (empty for another array)."""
 RECORDS = {
     (STATE_SUFFIX, "state"): ESTIMATOR_STATE,
     (STATE_SUFFIX, "cells.cells"): CELL_STATE,
@@ -66,10 +64,10 @@ RECORDS = {
 }
 """Types of the structured arrays."""
 FIT_FIELDS = tuple(curve_arrays(neutral_fit()))
-COUNTERS = ("restarts", "total", "clean", "alarms", "observer", "wall_s", "synchronised", "boot_s", "boot")
+METADATA = ("observer", "token", "wall_s", "synchronised", "boot_s", "boot")
 PLACES: tuple[Place, ...] = (
     *((file, name, field) for (file, name), record in RECORDS.items() for field, _ in fields(np.zeros(1, record))),
-    *((STATE_SUFFIX, name, "") for name in (*COUNTERS, *(f"fit.{name}" for name in FIT_FIELDS))),
+    *((STATE_SUFFIX, name, "") for name in (*METADATA, *(f"fit.{name}" for name in FIT_FIELDS))),
     *((SUFFIX, name, "") for name in (*FIT_FIELDS, *(f"bank_{name}" for name in FIT_FIELDS))),
     *((SUFFIX, name, "") for name in ("weak_cell_times", "row_elapsed_s", "row_soc", "curves")),
     *((LOAD_SUFFIX, name, "") for name in ("mean_a", "max_a", "filtered_a", "last_a", "rest_s")),
@@ -100,7 +98,7 @@ class Pack:
             CellEstimator(self.estimator),
             SlowFit(self.estimator, interval_s=FIT_S, submit=submit),
         )
-        restore_pack(self.estimator, self.slow_fit, self.checkpoint, self.history, Clock(), self.cells)
+        restore_pack(self.estimator, self.slow_fit, self.checkpoint, self.history, self.cells)
         forecaster = new_forecaster(SETTINGS, CELL, self.estimator, self.slow_fit, self.cells)
         assert forecaster
         self.forecaster = forecaster
@@ -108,8 +106,7 @@ class Pack:
 
     def save(self) -> None:
         """Write all files."""
-        fit, counters = self.slow_fit.fit, RunCounters(1, new_totals(0.0))
-        self.checkpoint.save(self.estimator.record, counters, curve_arrays(fit), self.cells.saved_state)
+        self.checkpoint.save(self.estimator.record, curve_arrays(self.slow_fit.fit), self.cells.saved_state)
         self.history.save(history_arrays(self.slow_fit.history, self.slow_fit.saved_fit))
         self.load.save(load_arrays(self.forecaster.load, self.forecaster.past))
 
@@ -178,20 +175,20 @@ def with_change(files: Files, place: Place, change: Change, index: int) -> Files
     array = files[file][name]
     if field:
         if isinstance(change, str | tuple):
-            odd = array[[*array.dtype.names[:-1]]].copy()  # a field is missing
+            edited = array[[*array.dtype.names[:-1]]].copy()  # a field is missing
         else:
-            odd = array.copy()
-            view = dict(fields(odd))[field]
+            edited = array.copy()
+            view = dict(fields(edited))[field]
             view[...] = changed(view, change, index)
     else:
-        odd = changed(array, change, index)
-    return {**files, file: {**files[file], name: odd}}
+        edited = changed(array, change, index)
+    return {**files, file: {**files[file], name: edited}}
 
 
 @example((SUFFIX, "rows", "segment"), 1e300, 0)
 @example((SUFFIX, "rows", "soc"), np.nan, 0)
 @given(st.sampled_from(PLACES), st.sampled_from(CHANGES), st.integers(0, 1 << 16))
-def test_a_pack_with_an_odd_value_in_one_file_runs_on(
+def test_a_pack_with_an_implausible_value_in_one_file_runs_on(
     tmp_path_factory: pytest.TempPathFactory, seed: Path, place: Place, change: Change, index: int
 ) -> None:
     folder = tmp_path_factory.mktemp("pack")

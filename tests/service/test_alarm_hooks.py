@@ -490,7 +490,7 @@ async def test_the_arguments_of_a_program_are_neither_published_nor_logged(tmp_p
         ({"run": ["true"], "alarms": ["soc_low"]}, []),
         (
             {"run": ["true"], "on": ["raised"], "timeout_s": 61},
-            ["timeout_s = 61: so long a new critical alarm may wait"],
+            ["timeout_s = 61: a new critical alarm may wait this long"],
         ),
     ],
 )

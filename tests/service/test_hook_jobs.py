@@ -1,10 +1,15 @@
 """Waiting jobs of a hook."""
 
+from typing import TYPE_CHECKING
+
 import pytest
 
-from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.service.job_hook import HookJobs
 from bms_estimator.settings.alarms import HookEvent
+from tests.sinks.snapshots import SOC_LOW_ALARM
+
+if TYPE_CHECKING:
+    from bms_estimator.model.payloads.alarm import Alarm
 
 
 class Hook:
@@ -18,17 +23,8 @@ class Hook:
         """Raise (``+name``) or clear (``-name``) alarms. Those with a name in capitals are critical."""
         for change in changes:
             name, is_raised = change[1:], change[0] == "+"
-            alarm = Alarm(
-                name=name,
-                severity="critical" if name.isupper() else "warning",
-                active=is_raised,
-                latched=False,
-                since=None,
-                value=None,
-                limit=None,
-                unit=None,
-                text="",
-            )
+            severity = "critical" if name.isupper() else "warning"
+            alarm = SOC_LOW_ALARM.model_copy(update={"name": name, "severity": severity, "active": is_raised})
             if is_raised:
                 self._raised[name] = alarm
             else:

@@ -16,18 +16,9 @@ from bms_estimator.service.relay_hook import FIRST_HOLD_S
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.telemetry.alarms.message import Change
 from tests.patience import LONG_S
+from tests.sinks.snapshots import SOC_LOW_ALARM
 
-ALARM = Alarm(
-    name="pack_over_voltage",
-    severity="critical",
-    active=True,
-    latched=True,
-    since=None,
-    value=None,
-    limit=None,
-    unit=None,
-    text="",
-)
+ALARM = SOC_LOW_ALARM.model_copy(update={"name": "pack_over_voltage", "severity": "critical"})
 
 
 class Board:

@@ -14,7 +14,7 @@ from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
-from bms_estimator.telemetry.alarms.unknown import NO_MARGIN, UNKNOWN_SOC
+from bms_estimator.telemetry.alarms.values import NO_MARGIN, UNKNOWN_SOC
 from tests.telemetry.alarm_captures import PACK, WALL_S, settings
 
 

@@ -90,7 +90,7 @@ class GuidedTest:
             cells_v: Voltages of the device's cell slots; empty if unknown.
         """
         selected_v = self._slots.select(cells_v)
-        # with more cells than in series, each of them may end the discharge
+        # with more live slots than cells in series, the lowest of all slots may end the discharge
         for average in self._averager.feed(samples, cells_v if self._slots.fault else selected_v):
             self._advance(average)
 

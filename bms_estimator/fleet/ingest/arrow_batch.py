@@ -16,7 +16,7 @@ from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, V
 _HEADER, _LENGTH, _NODES, _COMPRESSION = 2, 0, 1, 3
 """Indices of fields: ``header`` of the table ``Message``; ``length``, ``nodes``, ``compression`` of the table ``RecordBatch``."""
 _NODE = struct.Struct("<qq")
-"""Number of values of a column, or of the elements of its lists, and number of its missing values."""
+"""Layout of a node: number of values of a column or of its lists, and number of missing values."""
 
 
 def decode_arrow(payload: bytes) -> BatchColumns:
@@ -118,13 +118,13 @@ def _count_values(metadata: bytes) -> int:
         raise BatchError("the Arrow record batch is compressed: send it uncompressed")
     length = _field(metadata, record_batch, _LENGTH)
     (rows,) = struct.unpack_from("<q", metadata, length) if length else (0,)
-    counts = [rows, *(count for count, _ in _NODE.iter_unpack(_structs(metadata, record_batch)))]
+    counts = [rows, *(count for count, _ in _NODE.iter_unpack(_node_bytes(metadata, record_batch)))]
     if min(counts) < 0:
         raise BatchError("damaged Arrow IPC: a negative number of values")
     return sum(counts)
 
 
-def _structs(metadata: bytes, record_batch: int) -> bytes:
+def _node_bytes(metadata: bytes, record_batch: int) -> bytes:
     """Return the vector ``nodes`` of a record batch."""
     field = _field(metadata, record_batch, _NODES)
     if not field:

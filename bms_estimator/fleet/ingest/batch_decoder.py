@@ -25,7 +25,7 @@ def decode_batch(payload: bytes) -> BatchColumns:
 
         return decode_arrow(payload[8:] if payload.startswith(_ARROW_FILE) else payload)
     try:
-        document = json.loads(payload, object_pairs_hook=_object)
+        document = json.loads(payload, object_pairs_hook=_unique_members)
     except BatchError:
         raise
     except (ValueError, RecursionError) as error:
@@ -37,8 +37,8 @@ def decode_batch(payload: bytes) -> BatchColumns:
     return columns
 
 
-def _object(members: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object.
+def _unique_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the members of a JSON object.
 
     Raises:
         BatchError: Several members have the same name.

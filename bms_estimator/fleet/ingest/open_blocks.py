@@ -75,7 +75,7 @@ class OpenBlocks:
     def add(self, pack: str, batch: BatchSamples, arrival_s: float, now_s: float, sequence: int) -> Selection:
         """Add the new samples of a batch, and return them with the numbers of dropped samples.
 
-        An exception changes nothing, so that it belongs to this batch only.
+        If a block cannot be encoded, nothing changes, so that only this batch is rejected.
 
         Args:
             pack: Name of the pack, whose position is set.

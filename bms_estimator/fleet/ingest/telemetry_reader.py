@@ -70,14 +70,14 @@ class TelemetryReader:
         return self._failures >= MAX_FAILURES
 
     async def check(self, processed: int) -> range | None:
-        """Remove processed messages, and set the position if the server has lost messages or recreated the stream.
+        """Remove processed messages. Set the position if the server has lost messages or recreated the stream.
 
         Args:
             processed: Sequence number up to which messages are removed.
 
         Returns:
-            Sequence numbers of messages that were lost before they were read, if the position was set; otherwise None. After
-            a change of the position the server has none of the processed messages.
+            Sequence numbers of unread messages that the server has lost, if the position was set; otherwise None. After a
+            change of the position the server has none of the processed messages.
 
         Raises:
             MissingStreamError: The stream does not exist.
@@ -112,9 +112,7 @@ class TelemetryReader:
         info = await self._request("INFO", {})
         state, created = info["state"], str(info["created"])
         if created != self.stream:
-            first = max(
-                1, state["first_seq"]
-            )  # 0 for a new stream; later numbers after a loss of this process's folder
+            first = max(1, state["first_seq"])  # 0 in a new stream; above 1 if this process has lost its folder
             self.stream, self.sequence, self._purged, self._last = created, first - 1, 0, 0
             return unread
         self._last = state["last_seq"]

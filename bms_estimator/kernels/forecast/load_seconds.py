@@ -73,8 +73,8 @@ def begin_second(load: Record) -> None:
 def add_step(load: Record, step_s: float, mean_a: float, end_a: float, one_c_a: float) -> None:
     """Divide a step between two rows among the seconds that it spans.
 
-    The mean current counts in all of them, for their mean and for their largest current. The current at the end of the step,
-    ``end_a`` [A], also counts for the largest current of the second that contains it.
+    The mean current counts for the mean and the largest current of all of them. The current at the end of the step, ``end_a``
+    [A], also counts for the largest current of the second that contains it.
     """
     while load.part_s + step_s >= 1.0:
         part_s = 1.0 - load.part_s

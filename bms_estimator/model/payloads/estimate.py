@@ -31,10 +31,10 @@ class Estimate(Payload):
         Field(description="mean temperature [C]; null without a sensor")
     )
     temperatures_c: list[float | None] | None = Field(
-        description="readings of all temperature probes at the last sample [C]; null for an absent probe, or with a single one"
+        description="readings of all temperature probes at the last sample [C], null for an absent probe; null with a single probe"
     )
     faulty_probes: list[int] | None = Field(
-        description="numbers of the faulty temperature probes at the last sample, from 1; null with a single one"
+        description="numbers of the faulty temperature probes at the last sample, starting at 1; null with a single probe"
     )
     cell_lowest_v: Annotated[
         float | None, Quantity(Entity("Lowest cell, voltage", "V", 3, 0.005, "voltage"), packs="with cell voltages")
@@ -68,8 +68,8 @@ class Estimate(Payload):
         "charge drawn; null without the identifier"
     )
     soc_known: bool = Field(
-        description="true: soc_std has fallen below 0.12, and not risen above 0.15 since, or there is no identifier; false: soc is "
-        "not shown, and no alarm judges it"
+        description="true if soc_std was below 0.12 and has not risen above 0.15 since, and always without the identifier; false: "
+        "soc is not shown, and no alarm uses it"
     )
     soc_coulomb: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
         description="state of charge by coulomb counting alone, 0..1"
@@ -188,7 +188,7 @@ class Estimate(Payload):
     stability_margin: Annotated[
         float | None, Quantity(raw_entity("Stability margin", None, 3), packs="batteries", prometheus="ratio")
     ] = Field(
-        description="soc - max(delta_1, delta_2); null unless soc_known, and if the model is stable at each SOC (neither is above 0)"
+        description="soc - max(delta_1, delta_2); null unless soc_known is true and delta_1 or delta_2 is above 0"
     )
     adaptive_gain_k: Annotated[float | None, Quantity(raw_entity("Adaptive gain k", "V²s", 6))] = Field(
         description="adaptive gain state k, (3.13) [V^2 s]"

@@ -34,7 +34,7 @@ class Point(NamedTuple):
     device_s: float
     """Timestamp by the device's clock."""
     time_s: float
-    """Time that the sample was given."""
+    """Time that was assigned to the sample."""
 
     @property
     def delay_s(self) -> float:
@@ -47,7 +47,7 @@ class ClockRate:
 
     Jitter and bursts do not change the least delay. A clock that was set changes it once. After an outage, a publisher that
     sends its backlog seems to have a fast clock, but its delay does not fall below the least one before the outage. Only a
-    backlog that is being sent when the first sample arrives looks like a fast clock until it is sent.
+    backlog that is being sent at the first sample looks like a fast clock, until all of it is sent.
 
     Attributes:
         fault: Description of a wrong rate; empty while the clock is usable.
@@ -75,7 +75,7 @@ class ClockRate:
         """Close the present window if it is complete at ``arrival_s`` [s].
 
         Returns:
-            The point from which on the times of the samples are wrong, if a wrong rate is detected now; otherwise None.
+            First point with wrong times if a wrong rate is detected now; otherwise None.
         """
         if self._open is None or arrival_s - self._begin_s < WINDOW_S:
             return None
@@ -84,7 +84,7 @@ class ClockRate:
             self._restart(point)
             return None
         self._points.append(point)
-        if self._has_reversed(self._steps_s()):
+        if _has_reversed(self._steps_s()):
             self._restart(point)
         steps_s = self._steps_s()
         if self.fault:
@@ -100,12 +100,8 @@ class ClockRate:
         """Return the drifts between successive windows [s]."""
         return [_drift_s(a, b) for a, b in itertools.pairwise(self._points)]
 
-    def _has_reversed(self, steps_s: list[float]) -> bool:
-        """Return True if the last step is opposite to the drift before it."""
-        return len(steps_s) > 1 and steps_s[-1] * sum(steps_s[:-1]) < 0.0
-
     def _is_outage(self, point: Point) -> bool:
-        """Return True if samples were missing for long before the window of ``point``."""
+        """Return True if there was an outage before the window of ``point``."""
         before_s, self._spacing_s = self._spacing_s, point.arrival_s - self._points[-1].arrival_s
         return self._spacing_s > MAX_SPACING_RATIO * max(before_s, WINDOW_S)
 
@@ -124,6 +120,11 @@ class ClockRate:
         span_s = self._points[-1].arrival_s - self._points[0].arrival_s
         is_drift = beyond_largest_s >= max(MIN_DRIFT_S, MAX_RATE_ERROR * span_s * (1.0 - 1.0 / len(steps_s)))
         return is_drift and (steps_s[-1] > 0.0 or is_below_floor)
+
+
+def _has_reversed(steps_s: list[float]) -> bool:
+    """Return True if the last step is opposite to the drift before it."""
+    return len(steps_s) > 1 and steps_s[-1] * sum(steps_s[:-1]) < 0.0
 
 
 def _drift_s(before: Point, after: Point) -> float:

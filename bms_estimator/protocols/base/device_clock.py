@@ -51,7 +51,7 @@ class DeviceClock:
         return self._last_s
 
     def _advance(self, arrival_s: float, device_s: float, wrong_since: Point | None) -> None:
-        """Advance ``_last_s``. ``wrong_since`` is the point from which on a wrong clock has given the times, if it was just detected."""
+        """Advance ``_last_s``. If a wrong rate was just detected, ``wrong_since`` is the first point with wrong times."""
         step_s, delay_s = device_s - self._device_s, arrival_s - device_s
         elapsed_s = 0.0 if math.isnan(self._arrival_s) else max(arrival_s - self._arrival_s, 0.0)
         if self._rate.fault:

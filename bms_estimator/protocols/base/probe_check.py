@@ -10,21 +10,21 @@ import numpy as np
 from bms_estimator.model.sample import MAX_C, MIN_C, NO_PROBES, PROBE, ProbeBlock, SampleBlock, SampleStatus
 
 STEP_K = 30.0
-"""Change of a probe that is believed at once [K]. The delays of the alarms suppress single glitches of this size."""
+"""Change of a probe that is accepted at once [K]. The delays of the alarms suppress single glitches of this size."""
 NEAR_K = 10.0
-"""Maximum change to a reading that usually means an open or shorted probe, if the probe really has this temperature [K]."""
+"""Maximum change to a reading of ``OPEN_OR_SHORT_C`` that is accepted [K]."""
 RATE_K_PER_S = 20.0
 """Maximum rate of a probe [K/s]. In thermal runaway a probe on a cell rises by several K/s."""
-APART_K = 30.0
-"""Maximum difference of a sound probe from the median of all probes [K]. The project's choice, twice what the cells of a pack
-usually differ by."""
+MAX_DEVIATION_K = 30.0
+"""Maximum difference of a sound probe from the median of all probes [K]. The project's choice, twice the usual difference
+between the cells of a pack."""
 HOT_C = 45.0
 """Temperature above which the last reading of a probe still counts after the probe has failed [C]. Heat destroys probes, and the
 usual charging limit of cells is 45 C."""
 _FIELDS = ("temperature_c", "temperature_min_c", "temperature_max_c")
 """Fields of a sample for the temperatures of ``CheckedProbes``, in their order."""
 OPEN_OR_SHORT_C = (-40.0, -30.0, 127.0)
-"""Plausible readings that devices report for an open or shorted probe [C]; 255, -273 and 3276.7 are not plausible anyway."""
+"""Plausible readings that devices report for an open or shorted probe [C]; 255, -273 and 3276.7 are implausible anyway."""
 OPEN_OR_SHORT_TOLERANCE_K = 0.2
 """Maximum deviation from such a reading [K], caused by conversion from kelvin."""
 
@@ -81,7 +81,7 @@ class ProbeCheck:
         credible = {
             n: reading_c for n, reading_c in enumerate(readings_c) if self._probes[n].is_credible(time_s, reading_c)
         }
-        outliers, suspects = _far_apart(credible)
+        outliers, suspects = _find_outliers(credible)
         typical_c = [reading_c for n, reading_c in credible.items() if n not in outliers]
         held_c = [
             probe.credible_c for n, probe in enumerate(self._probes) if n not in credible and probe.credible_c > HOT_C
@@ -145,15 +145,15 @@ class _Probe:
         return abs(change_k) <= STEP_K + RATE_K_PER_S * max(time_s - self._credible_s, 0.0)
 
 
-def _far_apart(readings_c: dict[int, float]) -> tuple[set[int], set[int]]:
-    """Return the numbers of the probes that differ from most others, and of those that are suspected.
+def _find_outliers(readings_c: dict[int, float]) -> tuple[set[int], set[int]]:
+    """Return the numbers of the outliers, and of all suspected probes.
 
-    If the majority does not show which probe is wrong, none differs from it, and the lowest and the highest are suspected.
+    If the majority does not show which probe is wrong, there is no outlier, and the lowest and the highest are suspected.
     """
-    if not readings_c or max(readings_c.values()) - min(readings_c.values()) <= APART_K:
+    if not readings_c or max(readings_c.values()) - min(readings_c.values()) <= MAX_DEVIATION_K:
         return set(), set()
     middle_c = median(readings_c.values())
-    outliers = {n for n, reading_c in readings_c.items() if abs(reading_c - middle_c) > APART_K}
+    outliers = {n for n, reading_c in readings_c.items() if abs(reading_c - middle_c) > MAX_DEVIATION_K}
     if outliers and 2 * len(outliers) < len(readings_c):
         return outliers, outliers
     by_temperature = sorted(readings_c, key=readings_c.__getitem__)

@@ -69,7 +69,7 @@ class ValueLocation(Strict):
 def _merge_location(default: Any, configured: dict[str, Any]) -> Any:
     """Return a location with the settings of the profile that are not configured.
 
-    If the profile has several locations, a configured topic or path replaces all of them.
+    A configured topic or path replaces all locations of the profile.
     """
     defaults = [default] if isinstance(default, dict) else default
     merged = [{**each, **configured} for each in defaults]
@@ -214,7 +214,7 @@ class MqttSource(BaseSource):
             yield from ((name, location) for location in locations)
 
     def substitute(self, text: str) -> str:
-        """Substitute prefix and instance in a topic or a path. ``{probe}`` becomes ``{cell}``, the placeholder of a number."""
+        """Substitute prefix and instance in a topic or a path. ``{probe}`` becomes ``{cell}``, the only placeholder of a number."""
         text = text.replace("{probe}", "{cell}")
         return text.replace("{prefix}", self.prefix or "").replace("{instance}", self.instance)
 

@@ -31,7 +31,7 @@ class BaseSource(Strict):
 
 
 def as_tuple(value: object) -> object:
-    """Return a list as it is, and another value as the only item of a tuple: a quantity may have one location or several."""
+    """Return a list unchanged, and another value as a tuple of one item, because a quantity may have one location or several."""
     return value if isinstance(value, list | tuple) else () if value is None else (value,)
 
 

@@ -173,7 +173,7 @@ def _current_sign_attribute(root: str, positive_direction: str) -> dict[str, str
 
 
 def _alarm(name: str, root: str) -> dict[str, Any]:
-    """Return the sensor of an alarm. While it is not raised, it is off, unknown with its value, or unavailable if not monitored."""
+    """Return the sensor of an alarm: on while raised; otherwise off, unknown like its value, or unavailable if not monitored."""
     topic = f"{root}/alarm/{name}"
     return {
         "platform": "binary_sensor",

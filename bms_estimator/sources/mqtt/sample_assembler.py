@@ -39,8 +39,8 @@ class _TopicBinding(NamedTuple):
     """Topic, which may contain ``{cell}``."""
     pattern: re.Pattern[str]
     """Pattern of the topic. Its group, if any, is the number of the cell or probe."""
-    place: int
-    """Number of the location in the settings."""
+    location_index: int
+    """Index of the location in the settings."""
 
 
 class _TimestampedValue(NamedTuple):
@@ -62,15 +62,15 @@ class SampleAssembler:
     def __init__(self, settings: MqttSource) -> None:
         self._settings = settings
         self._bindings = [
-            _TopicBinding(quantity, location, settings.substitute(location.path), topic, cell_pattern(topic), place)
-            for place, (quantity, location) in enumerate(settings.locations())
+            _TopicBinding(quantity, location, settings.substitute(location.path), topic, cell_pattern(topic), index)
+            for index, (quantity, location) in enumerate(settings.locations())
             for topic in settings.topics(location)
         ]
         self._availability_topic = settings.substitute(settings.availability_topic or "")
         self._offline_status = ""  # latest status from the publisher or its last will
         self._values: dict[str, _TimestampedValue] = {}
         self._cells: dict[int, _TimestampedValue] = {}
-        self._probes: dict[tuple[int, int], _TimestampedValue] = {}  # by numbers of the location and of the probe
+        self._probes: dict[tuple[int, int], _TimestampedValue] = {}  # by index of the location and number of the probe
         self._faults: dict[str, str] = {}  # latest error of each quantity
         self._unused_arrival_s: dict[str, float] = {}  # arrival times of voltage and current since the last sample
         self._repeat_s = math.inf  # time at which the last current is used again
@@ -217,7 +217,7 @@ class SampleAssembler:
         else:
             readings_c = {1 if probe is None else probe: read_value(payload, binding.location, binding.path)}
         self._probes |= {
-            (binding.place, number): _TimestampedValue(reading_c, now_s)
+            (binding.location_index, number): _TimestampedValue(reading_c, now_s)
             for number, reading_c in readings_c.items()
             if 1 <= number <= MAX_PROBE_NUMBER
         }
@@ -228,9 +228,9 @@ class SampleAssembler:
         For ``cells`` and ``temperature``, remove that of the cell or probe ``cell``, or of all of the location without ``cell``.
         """
         quantity = binding.quantity
-        for place, number in self._probes:
-            if quantity == "temperature" and place == binding.place and cell in (None, number):
-                self._probes[place, number] = _TimestampedValue(math.nan, -math.inf)
+        for index, number in self._probes:
+            if quantity == "temperature" and index == binding.location_index and cell in (None, number):
+                self._probes[index, number] = _TimestampedValue(math.nan, -math.inf)
         self._values.pop(quantity, None)
         self._unused_arrival_s.pop(quantity, None)
         if quantity == "cells":
@@ -267,10 +267,10 @@ class SampleAssembler:
         return [fresh.get(cell, math.nan) for cell in range(1, max(fresh, default=0) + 1)]
 
     def _probes_c(self, now_s: float) -> list[float]:
-        """Return the recent temperatures of all probes, location after location [C]; NaN for a probe without one."""
+        """Return the recent temperatures of all probes in the order of the locations [C]; NaN for a probe without one."""
         max_age_s = self._settings.slow_max_age_s
-        highest_numbers = dict(sorted(self._probes))  # by number of the location
-        slots = [self._probes.get((place, i + 1)) for place, count in highest_numbers.items() for i in range(count)]
+        counts = dict(sorted(self._probes))  # highest number of a probe by index of the location
+        slots = [self._probes.get((index, i + 1)) for index, count in counts.items() for i in range(count)]
         return [slot.value if slot and now_s - slot.arrival_s <= max_age_s else math.nan for slot in slots]
 
     def _find_topics(self, *quantities: str) -> list[str]:

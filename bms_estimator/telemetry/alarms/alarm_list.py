@@ -60,7 +60,7 @@ class AlarmList:
 
     @property
     def unwatched_critical(self) -> tuple[AlarmName, ...]:
-        """Names of critical alarms that cannot be watched although their quantities were measured before, or are unusable."""
+        """Names of critical alarms that cannot be watched, because a quantity is lost or unusable."""
         return tuple(name for name in self._unwatched.reasons if self.states[name].definition.severity == "critical")
 
     @property
@@ -207,7 +207,7 @@ class AlarmList:
                 raised = RaisedAlarm(since_s, None if value is None else float(value))
                 self.states[name].restore(raised, cause_cleared=flags[0], acknowledged=flags[1])
         missing = [name for name in saved if name not in self.states]
-        # checkpoints of a former version contain no severity
+        # a former version saved no severity
         return [name for name in missing if saved[name].get("severity", "critical") == "critical"]
 
     def _record(self, state: AlarmState, transitions: Iterable[AlarmTransition]) -> None:

@@ -25,15 +25,14 @@ from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.alarm_list import AlarmList
 from bms_estimator.telemetry.alarms.collapse_risk import collapse_risks, time_left_text
 from bms_estimator.telemetry.alarms.faulty_fraction import FaultyFraction, SampleCounts
-from bms_estimator.telemetry.alarms.input_faults import InputFaults
 from bms_estimator.telemetry.alarms.inputs import RARE_FRACTION, Inputs, count_values
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.sample_buffer import UNUSABLE, SampleBuffer
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
+from bms_estimator.telemetry.alarms.sensor_faults import FaultTexts
 from bms_estimator.telemetry.alarms.state import RaisedAlarm
-from bms_estimator.telemetry.alarms.unknown import find_unknown
 from bms_estimator.telemetry.alarms.unwatched import find_unwatched
-from bms_estimator.telemetry.alarms.values import estimated_values, measured_values
+from bms_estimator.telemetry.alarms.values import estimated_values, find_unknown, measured_values
 from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
 from bms_estimator.telemetry.impossible import PackBounds
 
@@ -85,7 +84,7 @@ class AlarmEvaluator:
         self._alarms = AlarmList(definitions, inputs.lost_s)
         self._charging_a = charging_a
         self._inputs, self._silence_limit_s = inputs, silence_limit_s
-        self._bounds, self._input_faults = bounds, InputFaults()
+        self._bounds, self._input_faults = bounds, FaultTexts()
         self._silence_reason = ""  # reason why no samples arrive; empty while they do
         self._resumed_s: float | None = None  # time of the first sample after the silence; None: none yet
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)

@@ -13,9 +13,9 @@ from bms_estimator.settings.alarm_kinds import Quantity
 Counts = NDArray[np.int64]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 """All measured quantities."""
-RARE_FRACTION = 0.5
-"""Maximum time between two values that counts toward the end of a loss although samples between them lack the quantity, as a
-fraction of ``lost_s``. It is below 1, so that a sensor that almost counts as lost does not end its loss."""
+MAX_SPACING_FRACTION = 0.5
+"""Maximum interval between two values that ends a loss although samples between them lack the quantity, as a fraction of
+``lost_s``. Below 1, so that a sensor that is almost lost again stays lost."""
 
 
 @dataclass
@@ -59,7 +59,7 @@ class _Input:
             if self._missing_s >= lost_s:
                 self.lost, self._restored_s = True, None
         elif self.lost:
-            continues = follows_value or self._value_age_s <= RARE_FRACTION * lost_s
+            continues = follows_value or self._value_age_s <= MAX_SPACING_FRACTION * lost_s
             self._restored_s = (
                 self._restored_s + self._value_age_s if continues and self._restored_s is not None else 0.0
             )

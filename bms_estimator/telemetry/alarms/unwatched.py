@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarms import AlarmName
-from bms_estimator.telemetry.alarms.input_faults import FaultyInput
 from bms_estimator.telemetry.alarms.inputs import Inputs
+from bms_estimator.telemetry.alarms.sensor_faults import FaultyInput
 
 LOSS_TEXTS: dict[FaultyInput, str] = {
     "voltage": "the voltage is no longer measured",

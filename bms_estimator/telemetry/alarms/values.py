@@ -1,13 +1,23 @@
-"""Values of the alarms on measured quantities and on estimates."""
+"""Values of the alarms on measured quantities and on estimates, and reasons why such a value is not known."""
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.kernels.accumulators.soc_certainty import MIN_UNKNOWN_STD
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.stability_margin import applicable_margin
+
+SOC_ALARMS: tuple[AlarmName, ...] = ("soc_low", "stability_margin_low")
+"""Alarms that need a known SOC. The probability of ``collapse_risk`` includes the uncertainty of the SOC."""
+UNKNOWN_SOC = f"the SOC is not known yet: it is known once its standard deviation has fallen below {100.0 * MIN_UNKNOWN_STD:.0f} %"
+"""Reason of ``SOC_ALARMS``."""
+NO_MARGIN = "the margin does not apply: the cell model is stable at each SOC"
+"""Reason of ``stability_margin_low`` with a known SOC."""
 
 
 def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> dict[AlarmName, Floats]:
@@ -43,7 +53,7 @@ def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> d
 def _extreme_temperatures(samples: SampleBlock) -> tuple[Floats, Floats]:
     """Return the temperatures of the coldest and of the hottest probe [C], each of shape (n,).
 
-    Samples of other programs may have only a mean temperature. Then their extremes do not enclose it.
+    Samples of other programs may have only a mean temperature, and extremes that do not enclose it. The mean is then used.
     """
     mean_c, lowest_c, highest_c = (samples[f"temperature_{name}c"] for name in ("", "min_", "max_"))
     has_extremes = (lowest_c <= mean_c) & (mean_c <= highest_c)
@@ -66,3 +76,19 @@ def estimated_values(
         "stability_margin_low": applicable_margin(trace, soc_known),
         "model_mismatch": np.where(is_mismatch, np.inf, np.abs(trace["innovation_v"])),
     }
+
+
+def find_unknown(row: np.void, *, soc_known: bool) -> dict[AlarmName, str]:
+    """Return the alarms whose value is not known although the quantities that they need are measured, each with the reason.
+
+    A fuel cell has no such alarm, because it has no SOC.
+
+    Args:
+        row: The last estimate, dtype TRACE.
+        soc_known: True if its SOC is known.
+    """
+    if math.isnan(row["soc"]):
+        return {}
+    if not soc_known:
+        return dict.fromkeys(SOC_ALARMS, UNKNOWN_SOC)
+    return {"stability_margin_low": NO_MARGIN} if np.isnan(applicable_margin(row, soc_known)) else {}

@@ -1,0 +1,111 @@
+"""Faults that raise the alarm ``sensor_fault``: of the input, of temperature probes, and repeated resets of the board."""
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from bms_estimator.model.sample import ProbeBlock, SampleBlock, SampleStatus
+from bms_estimator.settings.alarm_kinds import Quantity
+
+FaultyInput = Quantity | Literal["time"]
+"""Faulty quantity of the samples."""
+PROBE_TEXT = "a temperature probe is broken or loose, or far from the others: check it"
+"""Fault of temperature probes, and its remedy."""
+RESET_WINDOW_S = 1800.0
+"""Time within which resets count as repeated [s]. It covers three resets at the longest waiting time of the relay."""
+MIN_RESETS = 3
+"""Number of resets within ``RESET_WINDOW_S`` that raise the alarm. A cable that is plugged in again causes one."""
+RESETS_TEXT = f"the board was reset at least {MIN_RESETS} times within {RESET_WINDOW_S / 60:.0f} min; check its supply and its cable"
+"""Description of repeated resets, and the remedy."""
+
+
+class _Fault(NamedTuple):
+    kind: str
+    text: str
+
+
+class FaultTexts:
+    """Faults by quantity. The text of a fault changes only with its kind, because its numbers change often."""
+
+    def __init__(self) -> None:
+        self._faults: dict[FaultyInput, _Fault] = {}
+        self._present: set[FaultyInput] = set()
+
+    def add(self, name: FaultyInput, kind: str, text: str) -> None:
+        """Add a fault of the present interval.
+
+        Args:
+            name: Faulty quantity.
+            kind: Kind of the fault.
+            text: Description with numbers, a sentence.
+        """
+        self._present.add(name)
+        if name not in self._faults or self._faults[name].kind != kind:
+            self._faults[name] = _Fault(kind, text)
+
+    def update(self, *, keep: bool) -> bool:
+        """Begin the next interval. Return True if the last one had a fault.
+
+        Args:
+            keep: True: keep the texts of faults that have ended.
+        """
+        present, self._present = self._present, set()
+        if not keep:
+            self._faults = {name: fault for name, fault in self._faults.items() if name in present}
+        return bool(present)
+
+    @property
+    def texts(self) -> Mapping[FaultyInput, str]:
+        """Description of each fault, by quantity."""
+        return {name: fault.text for name, fault in self._faults.items()}
+
+
+class ProbeFaults:
+    """Faulty temperature probes since the last evaluation of the alarms."""
+
+    def __init__(self) -> None:
+        self._is_faulty, self._readings_c = False, dict[int, float]()
+
+    def add(self, samples: SampleBlock, probes: ProbeBlock) -> None:
+        """Add samples and their probes, which may be empty."""
+        if not (samples["status"] & SampleStatus.PROBE_FAULT).any():
+            return
+        self._is_faulty = True
+        for row, column in np.argwhere(probes["faulty"]).tolist():
+            self._readings_c[column + 1] = float(probes[row, column]["temperature_c"])
+
+    def take(self) -> str:
+        """Return and clear the faulty probes, as one sentence with their last readings; empty without any.
+
+        The sentence names no probe if the samples were received without a list of their probes.
+        """
+        is_faulty, readings_c = self._is_faulty, self._readings_c
+        self._is_faulty, self._readings_c = False, {}
+        if not is_faulty:
+            return ""
+        names = ", ".join(
+            f"probe {number} reads {reading_c:.4g} °C" for number, reading_c in sorted(readings_c.items())
+        )
+        return f"{names}: {PROBE_TEXT}" if names else PROBE_TEXT
+
+
+class BoardResets:
+    """Times of the last resets of the sensor board."""
+
+    def __init__(self) -> None:
+        self._resets = 0
+        self._times_s = deque[float](maxlen=MIN_RESETS)
+
+    def update(self, resets: int, now_s: float) -> str:
+        """Return ``RESETS_TEXT`` while resets are repeated, otherwise an empty text.
+
+        Args:
+            resets: Number of resets since start.
+            now_s: Monotonic clock [s].
+        """
+        self._times_s.extend([now_s] * min(resets - self._resets, MIN_RESETS))
+        self._resets = resets
+        is_repeated = len(self._times_s) == MIN_RESETS and now_s - self._times_s[0] < RESET_WINDOW_S
+        return RESETS_TEXT if is_repeated else ""
