@@ -25,7 +25,7 @@ from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.alarm_list import AlarmList
 from bms_estimator.telemetry.alarms.collapse_risk import collapse_risks, time_left_text
 from bms_estimator.telemetry.alarms.faulty_fraction import FaultyFraction, SampleCounts
-from bms_estimator.telemetry.alarms.inputs import RARE_FRACTION, Inputs, count_values
+from bms_estimator.telemetry.alarms.inputs import MAX_SPACING_FRACTION, Inputs, count_values
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.sample_buffer import UNUSABLE, SampleBuffer
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
@@ -387,7 +387,7 @@ class AlarmEvaluator:
         self._alarms.set_input_faults(*(text for name, text in texts if name not in self._inputs.lost))
         if suspects & SENSOR_SUSPECTS or has_fault or self._is_blinded() or self._alarms.board_reason:
             value, self._faulty_s = math.inf, at_s  # above every limit
-        elif at_s - self._faulty_s <= RARE_FRACTION * self._inputs.lost_s and state and state.raised is None:
+        elif at_s - self._faulty_s <= MAX_SPACING_FRACTION * self._inputs.lost_s and state and state.raised is None:
             value = math.nan  # a sample without a fault does not restart the delay of an intermittent one
         self._alarms.update("sensor_fault", np.array([at_s]), observed_s, np.array([value]), wall_offset_s)
 
