@@ -88,9 +88,7 @@ class RunFile:
     def load(self) -> SavedRun:
         """Read the file. Without a usable file, read the pack's newest checkpoint of a version that stored counters there."""
         try:
-            values = json.loads(verify_checksum(read_private(self.path, MAX_FILE_BYTES)))
-            if values["format"] != FORMAT:
-                raise ValueError(f"format {values['format']}, this version reads {FORMAT}")  # noqa: TRY301 - one handler
+            values = _read(self.path)
             crashed = values.get("clean") is not True
             return SavedRun(self._next_counters(values), self._newer_former(), crashed=crashed)
         except FileNotFoundError:
@@ -120,6 +118,8 @@ class RunFile:
                 former = former or values
         if not lost_reason and (self._refused.exists() if former else self._has_other_files()):
             lost_reason = f"{self.path.name} is missing beside other files of the pack"
+        if not former and not lost_reason:
+            lost_reason = self._other_pack_with_alarm()
         if former:
             return SavedRun(self._next_counters(former), lost_reason)
         return SavedRun(RunCounters(int(bool(lost_reason)), new_totals(self._wall_s())), lost_reason)
@@ -145,6 +145,17 @@ class RunFile:
         pattern = re.compile(rf"{re.escape(self._name)}(-[0-9a-f]{{8}})?\.(.*\.npz|sqlite.*|refused\.run)")
         return any(pattern.fullmatch(path.name) for path in self._folder_content())
 
+    def _other_pack_with_alarm(self) -> str:
+        """Return a reason if another pack has a raised critical alarm or a lost sensor: this one may be that pack, renamed."""
+        for path in self._folder_content():
+            if path.suffix == ".run" and not path.name.endswith(".refused.run"):
+                with contextlib.suppress(Exception):  # a damaged file concerns the other pack
+                    alarms = json.loads(_read(path)["alarms"] or "{}")
+                    inputs = alarms.pop("inputs", {}).values()
+                    if any(lost for _, lost in inputs) or '"severity": "critical"' in json.dumps(alarms):
+                        return f"{path.stem} has an alarm in {path.name}, and this pack may be {path.stem}, renamed"
+        return ""
+
     def _folder_content(self) -> list[Path]:
         try:
             return list(self.path.parent.iterdir())
@@ -166,6 +177,18 @@ class RunFile:
             log.warning("the saved counters are invalid and restart from zero", reason=str(error))
             restarts, total = 1, new_totals(self._wall_s())
         return RunCounters(restarts, total, alarms=alarms)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Read a file with counters and alarms.
+
+    Raises:
+        Exception: The file is missing (FileNotFoundError), damaged, or has another format.
+    """
+    values: dict[str, Any] = json.loads(verify_checksum(read_private(path, MAX_FILE_BYTES)))
+    if values["format"] != FORMAT:
+        raise ValueError(f"format {values['format']}, this version reads {FORMAT}")
+    return values
 
 
 def _former_counters(path: Path) -> dict[str, Any]:

@@ -287,6 +287,12 @@ async def test_a_first_start_raises_no_alarm_and_neither_does_one_beside_another
     assert first.restarts == 0
 
 
+async def test_a_renamed_pack_takes_the_safe_side_while_its_former_name_has_an_alarm(folder: Path) -> None:
+    renamed = await run(folder, NORMAL, edit_settings("pack", name="renamed"))
+    assert "pack has an alarm in pack.run" in renamed.alarms["alarm_state_lost"].text
+    assert not any(renamed.relay)
+
+
 async def test_an_alarm_that_is_disabled_while_it_is_raised_needs_an_acknowledgement(folder: Path) -> None:
     disabled = edit_settings("alarms", pack_over_voltage={"enabled": False})
     restarted = await run(folder, NORMAL, disabled)
