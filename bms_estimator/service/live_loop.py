@@ -132,9 +132,8 @@ async def run_estimation_loop(
     )
     unrestored = publisher.alarm_monitor.restore(counters.alarms)
     hooks.restore_active(publisher.alarm_monitor.report, crashed=saved_run.crashed)
-    if (
-        lost_reason := saved_run.lost_reason or unrestored
-    ):  # after the restored alarms, because the hooks announce this one
+    if lost_reason := saved_run.lost_reason or unrestored:
+        # after the restored alarms, because the hooks announce this one
         publisher.alarm_monitor.raise_state_lost(lost_reason)
     if requests is not None:
         RequestHandlers(estimator, publisher, current_zero, pack_model, forecaster).register(requests)

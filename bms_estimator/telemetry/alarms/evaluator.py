@@ -364,10 +364,13 @@ class AlarmEvaluator:
 
     def _update_unwatched(self, at_s: float) -> None:
         """Update the alarms that cannot be watched at ``at_s`` on the samples' clock [s]."""
-        texts = self._input_faults.texts
-        unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, texts)
-        self._alarms.set_input_faults(*(text for name, text in texts.items() if name not in self._inputs.lost))
+        unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, self._input_faults.texts)
+        self._set_input_faults()
         self._alarms.set_unwatched(unwatched, at_s)
+
+    def _set_input_faults(self) -> None:
+        texts = self._input_faults.texts.items()
+        self._alarms.set_input_faults(*(text for name, text in texts if name not in self._inputs.lost))
 
     def _is_blinded(self) -> bool:
         """Return True if a quantity is lost that a critical alarm needs."""
@@ -383,8 +386,7 @@ class AlarmEvaluator:
         observed_s, value = fraction
         state = self._alarms.states.get("sensor_fault")
         has_fault = self._input_faults.update(keep=state is not None and state.raised is not None)
-        texts = self._input_faults.texts.items()
-        self._alarms.set_input_faults(*(text for name, text in texts if name not in self._inputs.lost))
+        self._set_input_faults()
         if suspects & SENSOR_SUSPECTS or has_fault or self._is_blinded() or self._alarms.board_reason:
             value, self._faulty_s = math.inf, at_s  # above every limit
         elif at_s - self._faulty_s <= MAX_SPACING_FRACTION * self._inputs.lost_s and state and state.raised is None:
