@@ -341,6 +341,12 @@ def remove_run_file(folder: Path) -> None:
     (folder / "pack.run").unlink()
 
 
+def copy_from_another_pack(folder: Path) -> None:
+    another = CheckpointFile(folder, edit_settings("pack", name="another"), CELL).run_file
+    another.save(another.load().counters)
+    another.path.replace(folder / "pack.run")
+
+
 def interrupt_quarantine(folder: Path) -> None:
     """Leave only a refused file, as if the service had been killed before its first save."""
     (folder / "pack.run").rename(folder / "pack.refused.run")
@@ -355,7 +361,9 @@ def return_from_former_version(folder: Path) -> None:
     os.utime(file, (1e9, 1e9))
 
 
-@pytest.mark.parametrize("edit", [remove_run_file, interrupt_quarantine, return_from_former_version])
+@pytest.mark.parametrize(
+    "edit", [copy_from_another_pack, remove_run_file, interrupt_quarantine, return_from_former_version]
+)
 async def test_a_checkpoint_of_a_former_version_does_not_hide_lost_alarms(
     folder: Path, edit: Callable[[Path], None]
 ) -> None:
