@@ -411,6 +411,26 @@ async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
     await asyncio.wait_for(task, LONG_S)
 
 
+async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    settings = edit_settings("state", checkpoint_s=1e6)
+    source, checkpoint = ScriptedSource(), CheckpointFile(folder, settings, CELL)
+    task = asyncio.create_task(
+        run_estimation_loop(settings, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    async with asyncio.timeout(LONG_S):
+        while json.loads(checkpoint.run_file.path.read_bytes().partition(b"\n")[2])["clean"]:  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+        shutil.rmtree(folder)
+        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+
+
 async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
