@@ -81,7 +81,7 @@ class RunFile:
         Raises:
             OSError: The file cannot be written.
         """
-        values = {"format": FORMAT, **vars(counters), "total": counters.total.model_dump()}
+        values = {"format": FORMAT, "name": self._name, **vars(counters), "total": counters.total.model_dump()}
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_private(self.path, add_checksum(json.dumps(values).encode()))
 
@@ -89,6 +89,8 @@ class RunFile:
         """Read the file. Without a usable file, read the pack's newest checkpoint of a version that stored counters there."""
         try:
             values = _read(self.path)
+            if (name := values.get("name", self._name)) != self._name:
+                raise ValueError(f"it belongs to the pack {name}")  # noqa: TRY301 - one handler
             crashed = values.get("clean") is not True
             return SavedRun(self._next_counters(values), self._newer_former(), crashed=crashed)
         except FileNotFoundError:

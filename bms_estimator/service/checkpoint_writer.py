@@ -104,6 +104,8 @@ class CheckpointWriter:
         while True:
             await self._wait_for_alarm(min(CHECK_S, self._interval_s))
             run_delay_s = RETRY_S if run_failed else self._delay_of_counters_s
+            if not run_failed and await self._is_run_file_missing():
+                self._saved_counters, run_delay_s = None, 0.0
             if loop.time() >= run_tried_s + run_delay_s:
                 run_failed, run_tried_s = not await self._save_counters(), loop.time()
             if loop.time() >= tried_s + self._interval_s or (self._needs_save and not failed):
@@ -165,6 +167,11 @@ class CheckpointWriter:
         if alarms == saved:
             return self._interval_s
         return 0.0 if lacks_alarm(saved, alarms) else min(ALARM_SAVE_S, self._interval_s)
+
+    async def _is_run_file_missing(self) -> bool:
+        """Return True if the file with counters and alarms was deleted."""
+        path = self._checkpoint.run_file.path
+        return not await asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, path.exists)
 
     async def _save_counters(self, *, clean: bool = False) -> bool:
         """Save counters and alarms if they have changed. Return False if they cannot be written."""

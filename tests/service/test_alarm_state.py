@@ -341,6 +341,12 @@ def remove_run_file(folder: Path) -> None:
     (folder / "pack.run").unlink()
 
 
+def copy_from_another_pack(folder: Path) -> None:
+    another = CheckpointFile(folder, edit_settings("pack", name="another"), CELL).run_file
+    another.save(another.load().counters)
+    another.path.replace(folder / "pack.run")
+
+
 def interrupt_quarantine(folder: Path) -> None:
     """Leave only a refused file, as if the service had been killed before its first save."""
     (folder / "pack.run").rename(folder / "pack.refused.run")
@@ -355,7 +361,9 @@ def return_from_former_version(folder: Path) -> None:
     os.utime(file, (1e9, 1e9))
 
 
-@pytest.mark.parametrize("edit", [remove_run_file, interrupt_quarantine, return_from_former_version])
+@pytest.mark.parametrize(
+    "edit", [copy_from_another_pack, remove_run_file, interrupt_quarantine, return_from_former_version]
+)
 async def test_a_checkpoint_of_a_former_version_does_not_hide_lost_alarms(
     folder: Path, edit: Callable[[Path], None]
 ) -> None:
@@ -399,6 +407,26 @@ async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
         source.give(*OVER_VOLTAGE)
         while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
             await asyncio.sleep(0.01)
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+
+
+async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    settings = edit_settings("state", checkpoint_s=1e6)
+    source, checkpoint = ScriptedSource(), CheckpointFile(folder, settings, CELL)
+    task = asyncio.create_task(
+        run_estimation_loop(settings, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    async with asyncio.timeout(LONG_S):
+        while json.loads(checkpoint.run_file.path.read_bytes().partition(b"\n")[2])["clean"]:  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+        shutil.rmtree(folder)
+        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
     source.finish()
     await asyncio.wait_for(task, LONG_S)
 
