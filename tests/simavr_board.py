@@ -139,7 +139,7 @@ class FirmwareBoard:
 
 
 @functools.cache
-def _build_firmware() -> str:
+def build_firmware() -> str:
     """Build firmware and simulator once. Return the reason if that is impossible, otherwise an empty text."""
     if subprocess.run([ROOT / ".ci" / "can-simulate"], check=False).returncode != 0:
         return "no simavr or no compiler for the AVR here: make apt"
@@ -150,7 +150,7 @@ def _build_firmware() -> str:
 @pytest.fixture(scope="session")
 def firmware() -> None:
     """Skip the test if the firmware cannot be built or simulated."""
-    if reason := _build_firmware():
+    if reason := build_firmware():
         pytest.skip(reason)
 
 

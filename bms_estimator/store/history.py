@@ -1,6 +1,6 @@
 """History of a pack: one-minute rows and events, for the configured number of days.
 
-Two minutes are written in one transaction, and an event at once or ``WRITE_S`` after the previous transaction, outside the
+Four minutes are written in one transaction, and an event at once or ``WRITE_S`` after the previous transaction, outside the
 event loop. ``kill -9`` loses the open minute and what is not written yet.
 """
 
@@ -17,10 +17,10 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, measured_time, minute_start
 
-WRITE_S = 30.0
-"""Minimum interval between two writes [s], so that a flapping alarm does not wear the disk. It is that of the database's
-fsyncs, so that a power failure loses no more."""
-WRITTEN_ROWS = 2
+WRITE_S = 60.0
+"""Minimum interval between two writes [s], so that a flapping alarm does not wear the disk. Each of them is synced to disk,
+because it is longer than that of the database's fsyncs."""
+WRITTEN_ROWS = 4
 """Number of rows in a transaction, because each transaction writes about nine disk blocks, whatever its number of rows."""
 MINUTES_A_DAY = 1440
 """Number of minutes in a day."""

@@ -4,6 +4,7 @@ import asyncio
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -26,6 +27,10 @@ RESETS = 30
 """Number of resets of the board while the alarm is latched."""
 SAMPLES = 30
 """Number of samples between two resets, in which a service that does not wait would switch the relay."""
+
+MAX_RISES = {"low": 0, "high": 1}
+"""Maximum number of times that the pin goes high, by the hook's level. If low is safe, the pin stays low. If high is safe, one
+more attempt follows the first reset."""
 
 
 class PinMonitor:
@@ -59,16 +64,24 @@ def raised(snapshot: Snapshot) -> dict[str, str]:
     return {alarm.name: alarm.text for alarm in snapshot.alarms if alarm.active}
 
 
-@pytest.mark.parametrize(("relay", "max_rises"), [("low", 0), ("high", 1)])
-async def test_a_board_in_a_reset_loop_does_not_chatter_its_relay_and_raises_alarms(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, relay: str, max_rises: int
-) -> None:
-    """Low is the safe level: the pin stays low. High is safe: one more attempt follows the first reset."""
-    monkeypatch.setattr(relay_hook, "RELAY_S", 0.02)  # several commands between two resets of the accelerated board
-    monkeypatch.setattr(relay_hook, "RESET_POLL_S", 0.02)
-    readings = write_readings(tmp_path / "readings.csv", [(0.0, LOAD_A, 25.9, 25.0)])
+class ResetLoop(NamedTuple):
+    """Result of the resets."""
+
+    rises: int
+    """Number of times that the pin went high since the first reset."""
+    texts: dict[str, str]
+    """Texts of the raised alarms, by name."""
+    relay_resets: int
+    """Number of resets that undid a relay level, by the health message."""
+
+
+async def reset_loop(folder: Path, relay: str) -> ResetLoop:
+    """Reset the board ``RESETS`` times while an alarm is latched whose hook sets the relay."""
+    readings = write_readings(folder / "readings.csv", [(0.0, LOAD_A, 25.9, 25.0)])
     pin, sink, stop = PinMonitor(), Collector(), asyncio.Event()
-    with SimavrBoard(readings, speed=10.0, relay=True) as board:
+    with pytest.MonkeyPatch.context() as patch, SimavrBoard(readings, speed=10.0, relay=True) as board:
+        patch.setattr(relay_hook, "RELAY_S", 0.02)  # several commands between two resets of the accelerated board
+        patch.setattr(relay_hook, "RESET_POLL_S", 0.02)
         settings = Settings.model_validate(
             {
                 "sensor": {"port": board.path},
@@ -94,10 +107,15 @@ async def test_a_board_in_a_reset_loop_does_not_chatter_its_relay_and_raises_ala
             os.close(line)
         stop.set()
         await asyncio.wait_for(service, LONG_S)
-    texts = raised(snapshot)
-    assert pin.rises - rises <= max_rises
-    assert "was reset after a relay command" in texts["hook_failed"]
-    assert "reset at least 3 times" in texts["sensor_fault"]
-    assert "pack_over_voltage" in texts
     assert snapshot.health.hooks is not None
-    assert snapshot.health.hooks.relay_resets >= RESETS - 1
+    return ResetLoop(pin.rises - rises, raised(snapshot), snapshot.health.hooks.relay_resets)
+
+
+@pytest.mark.parametrize("relay", MAX_RISES)
+async def test_a_board_in_a_reset_loop_does_not_chatter_its_relay_and_raises_alarms(tmp_path: Path, relay: str) -> None:
+    loop = await reset_loop(tmp_path, relay)
+    assert loop.rises <= MAX_RISES[relay]
+    assert "was reset after a relay command" in loop.texts["hook_failed"]
+    assert "reset at least 3 times" in loop.texts["sensor_fault"]
+    assert "pack_over_voltage" in loop.texts
+    assert loop.relay_resets >= RESETS - 1

@@ -224,6 +224,7 @@ class DatabaseWithLostResults(Database):
 
 async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path, monkeypatch):
     monkeypatch.setattr(history_module, "WRITE_S", 0.0)
+    monkeypatch.setattr(history_module, "WRITTEN_ROWS", 2)
     async with DatabaseWithLostResults(path, retry_s=0.0) as database, History(database, days=366) as history:
         database.remaining = 2
         for second in range(0, 190, 10):

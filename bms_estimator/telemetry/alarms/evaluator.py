@@ -297,7 +297,8 @@ class AlarmEvaluator:
         Raises:
             ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError: The saved state is damaged.
         """
-        entries = json.loads(saved_state or "{}")
+        text = json.dumps(json.loads(saved_state or "{}"), ensure_ascii=False)
+        entries = json.loads(text.encode(errors="replace"))  # half of a UTF-16 pair could not be published
         self._inputs.restore(entries.pop(INPUTS, {}))
         self._silence_reason = str(entries.pop(SILENCE, ""))
         unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, {})

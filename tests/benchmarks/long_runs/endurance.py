@@ -1,9 +1,9 @@
-"""Load test: thousands of frames a second over a PTY, a day of serial bytes, attacks, and a lost sensor.
+"""Load test: thousands of frames a second over a PTY, a day of serial bytes, attacks, a lost sensor, and wear of the disk.
 
 The attacks are idle connections to the HTTP listeners of service, dashboard and fleet page while their broker or server is
-restarted, and an edge of a fleet that misuses its token.
+restarted, an edge of a fleet that misuses its token, and those of ``attacks``.
 
-make load ARGS="--rate 5000 --minutes 10 --hours 24 --no-idle --lost 10 --attack-s 20"
+make load ARGS="--rate 5000 --minutes 10 --hours 24 --no-idle --lost 10 --attack-s 20 --wear-minutes 18"
 """
 
 import argparse
@@ -28,8 +28,9 @@ from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
+from tests.benchmarks import disk_wear
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V
-from tests.benchmarks.long_runs import edge_token, lost_sensor
+from tests.benchmarks.long_runs import attacks, edge_token, lost_sensor
 from tests.benchmarks.table import Row, show
 from tests.benchmarks.wire import hello, sample_frames
 from tests.fleet.nats_cluster import running
@@ -223,6 +224,8 @@ def process_bytes(rate_hz: int, seconds: float) -> tuple[BoardProtocol, Estimato
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
     """Measure all requested parts."""
+    if options.attacks:
+        yield from attacks.rows()
     if options.idle:
         yield from idle_rows()
     if options.lost:
@@ -263,6 +266,8 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         yield Row("  resident memory", "flat", growth, rss_mib[-1] - rss_mib[warm_hours - 1] < MAX_GROWTH_MIB)
     if options.attack_s:
         yield from edge_token.rows(options.attack_s)
+    if options.wear_minutes:
+        yield from disk_wear.rows(options.wear_minutes)
 
 
 def idle_rows() -> Iterator[Row]:
@@ -320,6 +325,15 @@ def main() -> None:
         "--idle", action=argparse.BooleanOptionalAction, default=True, help="attack with idle connections"
     )
     parser.add_argument("--lost", type=float, default=10.0, help="delay of the alarm for a lost sensor [s]; 0: skip it")
+    parser.add_argument(
+        "--attacks",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="attack with resets of the board, a flapping warning and an Arrow batch",
+    )
+    parser.add_argument(
+        "--wear-minutes", type=float, default=18.0, help="duration of the wear of the disk [min]; 0: skip it"
+    )
     sys.exit(not show(rows(parser.parse_args())))
 
 
