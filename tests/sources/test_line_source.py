@@ -67,7 +67,7 @@ async def wait_for_message(source: LineSource, expected: str) -> None:
 
 def lines(*voltages_v: float) -> list[bytes]:
     """Return the lines of a producer after it has connected: one for each voltage, with a current of -2 A."""
-    samples = [sample_json_line(v, -2.0, temperature_c=21.5, cells_v=[v / 16, None]) for v in voltages_v]
+    samples = [sample_json_line(v, -2.0, temperatures_c=[21.5], cells_v=[v / 16, None]) for v in voltages_v]
     return [CONNECTED, *samples]
 
 
