@@ -49,6 +49,11 @@ def _relay_warnings(hook: AlarmHook, alarms: AlarmSettings) -> Iterator[str]:
             f"when_silent: not set, so the board switches its pin to {hook.relay}, as in an alarm, after "
             f'{hook.silent_s} s without the service; write {hook.relay!r} to confirm, or "keep"'
         )
+    elif hook.when_silent not in (hook.relay, "keep"):
+        yield (
+            f"when_silent = {hook.when_silent!r}: the board ends the level of an alarm {hook.silent_s} s after the service has "
+            f"stopped; write {hook.relay!r}"
+        )
     names = hook.alarms or ALARMS
     critical = [name for name in names if name == STATE_LOST.name or getattr(alarms, name).severity == "critical"]
     if hook.relay == "high" and critical:

@@ -479,6 +479,11 @@ async def test_the_arguments_of_a_program_are_neither_published_nor_logged(tmp_p
     ("hook", "warnings"),
     [
         ({"relay": "low", "when_silent": "low"}, []),
+        ({"relay": "low", "when_silent": "keep"}, []),
+        (
+            {"relay": "low", "when_silent": "high"},
+            ["when_silent = 'high': the board ends the level of an alarm 30 s after"],
+        ),
         ({"relay": "low"}, ["when_silent: not set, so the board switches its pin to low, as in an alarm, after 30 s"]),
         (
             {"relay": "high", "when_silent": "high"},

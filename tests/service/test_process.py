@@ -187,6 +187,7 @@ async def test_a_stopping_service_saves_its_checkpoint_although_its_broker_hangs
         await live.wait("bms/pack/availability", lambda payload: payload == b"offline", skip=messages_before)
     board.cancel()
     (checkpoint,) = checkpoints(state_home)
+    assert b'"clean": true' in checkpoint.with_name("pack.run").read_bytes()
     with np.load(checkpoint) as saved:
         assert saved["state"]["observer"]["samples"][0] >= state["frames_received"]
     assert RunFile(checkpoint.parent, "pack", time.time).load().counters.total.crashes == 0
