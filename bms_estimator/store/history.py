@@ -18,8 +18,8 @@ from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.minute import MINUTE_S, Minute, MinuteAccumulator, epoch_s, measured_time, minute_start
 
 WRITE_S = 60.0
-"""Minimum interval between two writes [s], so that a flapping alarm does not wear the disk. Each of them is synced to disk,
-because it is longer than that of the database's fsyncs."""
+"""Minimum interval between two writes [s], so that a flapping alarm does not wear the disk. Each write is synced to
+disk, because ``WRITE_S`` is longer than the interval between the database's fsyncs."""
 WRITTEN_ROWS = 4
 """Number of rows in a transaction, because each transaction writes about nine disk blocks, whatever its number of rows."""
 MINUTES_A_DAY = 1440

@@ -225,7 +225,8 @@ class SampleAssembler:
     def _remove(self, binding: _TopicBinding, cell: int | None) -> None:
         """Remove the stored value of a quantity.
 
-        For ``cells`` and ``temperature``, remove that of the cell or probe ``cell``, or of all of the location without ``cell``.
+        For ``cells`` and ``temperature``, remove the value of the cell or probe number ``cell``. Without a number, remove the
+        values of all cells, or of all probes of the topic.
         """
         quantity = binding.quantity
         for index, number in self._probes:
