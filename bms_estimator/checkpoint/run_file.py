@@ -1,6 +1,7 @@
 """File with counters and alarms of a pack. It has the pack's name only, so that no edited setting loses them."""
 
 import contextlib
+import errno
 import io
 import json
 import re
@@ -15,7 +16,7 @@ import structlog
 
 from bms_estimator.checkpoint.checksum import add_checksum, verify_checksum
 from bms_estimator.model.payloads.totals import Totals
-from bms_estimator.process.private_file import read_private, write_private
+from bms_estimator.process.private_file import overwrite_private, read_private, write_private
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import new_totals
 
@@ -76,14 +77,21 @@ class RunFile:
         self._refused = folder / f"{name}.refused.run"
 
     def save(self, counters: RunCounters) -> None:
-        """Write the file atomically. A missing folder is created.
+        """Write the file atomically, or overwrite it on a full disk. A missing folder is created.
 
         Raises:
             OSError: The file cannot be written.
         """
         values = {"format": FORMAT, "name": self._name, **vars(counters), "total": counters.total.model_dump()}
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_private(self.path, add_checksum(json.dumps(values).encode()))
+        content = add_checksum(json.dumps(values).encode())
+        try:
+            write_private(self.path, content)
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            # a raised alarm must not wait for free space; a power failure meanwhile damages the file, which is the safe side
+            overwrite_private(self.path, content)
 
     def load(self) -> SavedRun:
         """Read the file. Without a usable file, read the pack's newest checkpoint of a version that stored counters there."""

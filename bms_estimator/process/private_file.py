@@ -57,5 +57,18 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
         os.close(folder)
 
 
+def overwrite_private(path: Path, content: bytes) -> None:
+    """Overwrite an existing file in place, and sync it to disk. It needs no free space unless the content grows by a block.
+
+    Raises:
+        OSError: The file is missing, a symbolic link, or cannot be written. Its content may be damaged.
+    """
+    with open(os.open(path, os.O_WRONLY | os.O_NOFOLLOW), "wb") as file:  # noqa: PTH123 - a descriptor has no Path
+        file.write(content)
+        file.truncate()
+        file.flush()
+        os.fsync(file.fileno())
+
+
 def _open_private(path: str, flags: int) -> int:
     return os.open(path, flags, 0o600)

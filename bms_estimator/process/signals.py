@@ -5,13 +5,15 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import structlog
 
 from bms_estimator.process.stderr_writer import stderr
 
 log = structlog.get_logger(__name__)
+_acknowledges: list[Callable[[], object]] = []
+"""Functions that SIGUSR1 calls, one for each pack of this process."""
 
 
 def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
@@ -27,13 +29,30 @@ def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
 
 
 @contextlib.contextmanager
+def acknowledge_on_signal(acknowledge: Callable[[], object]) -> Iterator[None]:
+    """Call a function on SIGUSR1, as well as those of the other packs of this process."""
+    _acknowledges.append(acknowledge)
+    asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, _acknowledge_all)
+    try:
+        yield
+    finally:
+        _acknowledges.remove(acknowledge)
+
+
+def _acknowledge_all() -> None:
+    for acknowledge in _acknowledges:
+        acknowledge()
+
+
+@contextlib.contextmanager
 def startup_signals() -> Iterator[None]:
     """Exit with code 0 on SIGTERM or SIGHUP until an event loop handles them. There is no state to save yet.
 
-    An ignored SIGHUP stays ignored, as under nohup.
+    SIGUSR1 is ignored, because no alarm is known yet. An ignored SIGHUP stays ignored, as under nohup.
     """
     unignored = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
     previous_handlers = {number: signal.signal(number, _end) for number in unignored}
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
     try:
         yield
     finally:

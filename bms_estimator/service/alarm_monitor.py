@@ -22,7 +22,7 @@ from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST, AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.alarms.sensor_faults import BoardResets, ProbeFaults
+from bms_estimator.telemetry.alarms.sensor_faults import BoardResets
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.impossible import PackBounds
@@ -94,7 +94,6 @@ class AlarmMonitor:
         # arrival of the last sample, accepted or not, on the monotonic clock and on the wall clock [s]
         self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
-        self._probe_faults = ProbeFaults()
 
     def add(
         self,
@@ -116,8 +115,7 @@ class AlarmMonitor:
         Returns:
             True if an alarm has changed.
         """
-        self.alarms.add(received.samples, trace, received.cells_v, forecasts, cells_fault)
-        self._probe_faults.add(received.samples, received.probes)
+        self.alarms.add(received.samples, trace, received.cells_v, forecasts, cells_fault, received.probes)
         self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
         is_due = now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS
         return is_due and self.evaluate(now_s)
@@ -135,9 +133,7 @@ class AlarmMonitor:
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
-        self.alarms.evaluate(
-            self._arrival_s, self._counts(), suspects, texts, self._source.clock_fault, self._probe_faults.take()
-        )
+        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts, self._source.clock_fault)
         self.alarms.evaluate_weak_cell(self._weakest_cell().deviation_std, self._arrival_s)
         cells = self._cells.deviations if self._cells else None
         if cells is not None and cells is not self._cells_seen:
@@ -157,6 +153,10 @@ class AlarmMonitor:
         acknowledged = self.alarms.acknowledge(name)
         self._report_changes()
         return acknowledged
+
+    def acknowledge_on_signal(self) -> None:
+        """Acknowledge all alarms, because a person on this machine requested it with a signal."""
+        log.info("alarms acknowledged by SIGUSR1", alarms=self.acknowledge(None))
 
     def restore(self, saved_state: str) -> str:
         """Restore the ``alarms.saved_state`` of an earlier run.

@@ -21,7 +21,7 @@ from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.publisher import Publisher
-from bms_estimator.telemetry.alarms.evaluator import INPUTS, SILENCE, AlarmEvaluator
+from bms_estimator.telemetry.alarms.evaluator import INPUTS, PENDING, PROBES, SILENCE, AlarmEvaluator
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 
@@ -262,7 +262,7 @@ class CheckpointWriter:
 
 
 def lacks_alarm(saved: str, present: str) -> bool:
-    """Return True if a restart from ``saved`` would lack an alarm, a measured quantity or an acknowledgement.
+    """Return True if a restart from ``saved`` would lack an alarm, a delay, a measured quantity or an acknowledgement.
 
     Args:
         saved: Saved state of the alarms, as from ``AlarmEvaluator.saved_state``.
@@ -271,6 +271,9 @@ def lacks_alarm(saved: str, present: str) -> bool:
     before, after = json.loads(saved or "{}"), json.loads(present or "{}")
     if any(before.pop(key, None) != after.pop(key, None) for key in (INPUTS, SILENCE)):
         return True
+    if set(after.pop(PENDING, [])) - set(before.pop(PENDING, [])):
+        return True
+    after.pop(PROBES, None)  # saved with an alarm
     return any(
         name not in before or before[name]["acknowledged"] != each["acknowledged"] for name, each in after.items()
     )

@@ -21,6 +21,7 @@ from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads.health import RecordingHealth
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.process.signals import acknowledge_on_signal
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
@@ -159,6 +160,7 @@ async def run_estimation_loop(
             await stack.enter_async_context(sink)
         await stack.enter_async_context(source)
         await stack.enter_async_context(hooks)
+        stack.enter_context(acknowledge_on_signal(publisher.alarm_monitor.acknowledge_on_signal))
         notifier.ready(name)
         tasks = [
             _estimate(

@@ -1,10 +1,12 @@
 """Raised alarms, lost sensors and counters over a restart, after edited settings and with damaged or missing files."""
 
 import asyncio
+import dataclasses
 import json
 import math
 import os
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -80,8 +82,19 @@ async def run(
     cell: CellModel = CELL,
     until: Callable[[dict[str, Alarm]], bool] = lambda _: True,
     acknowledge: str = "",
+    signal_after: asyncio.Barrier | None = None,
 ) -> Run:
-    """Run the service over samples, at least until the alarms fulfil a condition."""
+    """Run the service over samples, at least until the alarms fulfil a condition.
+
+    Args:
+        folder: State folder.
+        rows: Samples, as for ``ScriptedSource.give``.
+        settings: Settings of the pack.
+        cell: Model of the pack.
+        until: Condition.
+        acknowledge: Alarm to acknowledge; empty: none.
+        signal_after: Barrier, after which one of the packs that wait there acknowledges with a signal; None: with a request.
+    """
     source, sink, board, messages = ScriptedSource(), Collector(), RecordingBoard(), list[str]()
     relay = board.levels
     hooks = AlarmHooks(
@@ -107,7 +120,10 @@ async def run(
     source.give(*((t, a, v * volts, c, s) for t, a, v, c, s in rows))
     await sink.until(lambda s: s.estimate is not None and until(by_name(s.alarms)))
     if acknowledge:
-        await requests.handle("acknowledge_alarm", json.dumps({"name": acknowledge}).encode())
+        if signal_after is None:
+            await requests.handle("acknowledge_alarm", json.dumps({"name": acknowledge}).encode())
+        elif await signal_after.wait() == 0:
+            os.kill(os.getpid(), signal.SIGUSR1)
         await sink.until(lambda s: not by_name(s.alarms)[acknowledge].active)
         relay.clear()
     async with asyncio.timeout(LONG_S):
@@ -456,6 +472,41 @@ async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full
     await asyncio.wait_for(task, LONG_S)
 
 
+async def test_a_kill_within_the_delay_of_an_alarm_does_not_restart_the_delay(tmp_path: Path) -> None:
+    source, checkpoint = ScriptedSource(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    task = asyncio.create_task(
+        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    source.give(*OVER_VOLTAGE[:1])
+    async with asyncio.timeout(LONG_S):
+        while "pending" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+    killed = Path(shutil.copytree(tmp_path, tmp_path / "killed"))
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+    restarted = await run(killed, OVER_VOLTAGE[:1])
+    assert restarted.alarms["pack_over_voltage"].active
+    assert not any(restarted.relay[1:])
+
+
+async def test_an_alarm_is_saved_on_a_full_disk(folder: Path, full_disk: Path) -> None:
+    path = (full_disk / "file").rename(full_disk / "pack.run")  # the only block of this disk
+    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    counters = file.load().counters
+    shutil.copy(file.path, path)
+    full = CheckpointFile(full_disk, SETTINGS, CELL).run_file
+    full.save(dataclasses.replace(counters, alarms=json.dumps(RAISED)))
+    assert full.load().counters.alarms == json.dumps(RAISED)
+    assert not full.load().lost_reason
+
+
+async def test_a_signal_acknowledges_the_alarms_of_all_packs(folder: Path, tmp_path: Path) -> None:
+    another = Path(shutil.copytree(folder, tmp_path / "another"))
+    both = asyncio.Barrier(2)
+    packs = (run(each, NORMAL, acknowledge="pack_over_voltage", signal_after=both) for each in (folder, another))
+    assert all(all(each.relay) for each in await asyncio.gather(*packs))
+
+
 def alarm_state(**acknowledged: bool) -> str:
     return json.dumps({name: {"acknowledged": flag} for name, flag in acknowledged.items()})
 
@@ -468,3 +519,5 @@ def test_only_what_a_restart_would_lack_is_saved_at_once() -> None:
     assert lacks_alarm("{}", '{"silence": "no samples"}')
     assert not lacks_alarm(alarm_state(a=False, b=False), alarm_state(b=False))
     assert not lacks_alarm(alarm_state(a=False), "")
+    assert lacks_alarm("", '{"pending": ["a"]}')
+    assert not lacks_alarm('{"pending": ["a"]}', "")

@@ -558,6 +558,51 @@ def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_samples_arr
     assert "silence" not in json.loads(after.saved_state)
 
 
+HEATING = [Line(1, temperatures_c=(25.0, 25.0 + 10.0 * second)) for second in range(5)]
+"""Rise of one probe to the limit of ``over_temperature``, for less than its delay."""
+
+
+@pytest.mark.parametrize("failed_c", [(25.0, -40.0), (25.0, 300.0), (25.0,), (25.0, 127.0)])
+async def test_a_pack_stays_hot_over_a_restart_while_the_probe_that_was_hot_is_faulty_or_missing(
+    tmp_path: Path, failed_c: tuple[float, ...]
+) -> None:
+    fails = record(tmp_path / "one.bms", [*HEATING, Line(100, temperatures_c=failed_c)])
+    before = await replayed(fails, settings())
+    assert before.transitions("over_temperature") == [(14.0, True)], (
+        "5 s of the delay of 10 s are with the faulty probe"
+    )
+    failed = record(tmp_path / "two.bms", [Line(100, temperatures_c=failed_c)])
+    after = await replayed(failed, settings(), saved_state=before.saved_state, begin_s=WALL_S + 1000.0)
+    assert after.transitions("over_temperature") == []
+    cool = record(tmp_path / "three.bms", [Line(100, temperatures_c=(25.0, 26.0))])
+    cooled = await replayed(cool, settings(), saved_state=after.saved_state, begin_s=WALL_S + 2000.0)
+    assert [active for _, active in cooled.transitions("over_temperature")] == [False]
+
+
+def test_an_acknowledged_over_temperature_ends_although_a_probe_is_faulty() -> None:
+    alarms = make_evaluator()
+    add_samples(alarms, *range(20), temperature_c=70.0)
+    alarms.acknowledge("over_temperature")
+    add_samples(alarms, *range(20, 100), temperature_c=25.0, status=int(SampleStatus.PROBE_FAULT))
+    assert "over_temperature" not in alarms.active
+
+
+def test_restarts_within_the_delay_of_a_critical_alarm_do_not_prevent_it() -> None:
+    before, after = (make_evaluator({"cell_over_voltage": {"severity": "warning"}}) for _ in range(2))
+    add_samples(before, 0.0, 1.0, temperature_c=70.0)
+    assert not before.active
+    after.restore(before.saved_state)
+    add_samples(after, 0.0, temperature_c=NAN)
+    assert not after.active, "no value has confirmed the pending alarm"
+    add_samples(after, 1.0, temperature_c=70.0)
+    assert after.active == ("over_temperature",)
+    after = make_evaluator()
+    after.restore(before.saved_state)
+    add_samples(after, 0.0, temperature_c=25.0)
+    add_samples(after, 1.0, 2.0, temperature_c=70.0)
+    assert not after.active, "a value below the limit restarts the delay"
+
+
 def test_damaged_saved_quantities_are_rejected() -> None:
     alarms = make_evaluator()
     with pytest.raises(ValueError, match="temperature: measured = -1"):

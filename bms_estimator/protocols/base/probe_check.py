@@ -18,9 +18,6 @@ RATE_K_PER_S = 20.0
 MAX_DEVIATION_K = 30.0
 """Maximum difference of a sound probe from the median of all probes [K]. The project's choice, twice the usual difference
 between the cells of a pack."""
-HOT_C = 45.0
-"""Temperature above which the last reading of a probe still counts after the probe has failed [C]. Heat destroys probes, and the
-usual charging limit of cells is 45 C."""
 _FIELDS = ("temperature_c", "temperature_min_c", "temperature_max_c")
 """Fields of a sample for the temperatures of ``CheckedProbes``, in their order."""
 OPEN_OR_SHORT_C = (-40.0, -30.0, 127.0)
@@ -42,9 +39,8 @@ class CheckedProbes(NamedTuple):
 class ProbeCheck:
     """Check of the probes of one device, in the order of its samples.
 
-    A faulty probe is excluded from mean and extremes, with two exceptions on the safe side. The highest temperature includes a hot
-    probe that is far above the others, and the last hot reading of a probe that failed. If the probes differ and the majority
-    does not show which one is wrong, all count.
+    A faulty probe is excluded from mean and extremes, with one exception on the safe side: the highest temperature includes a
+    hot probe that is far above the others. If the probes differ and the majority does not show which one is wrong, all count.
 
     Attributes:
         faults: Number of times that a probe became faulty.
@@ -83,9 +79,6 @@ class ProbeCheck:
         }
         outliers, suspects = _find_outliers(credible)
         typical_c = [reading_c for n, reading_c in credible.items() if n not in outliers]
-        held_c = [
-            probe.credible_c for n, probe in enumerate(self._probes) if n not in credible and probe.credible_c > HOT_C
-        ]
         faulty = tuple(
             n in suspects or (n not in credible and not math.isnan(reading_c)) for n, reading_c in enumerate(readings_c)
         )
@@ -94,7 +87,7 @@ class ProbeCheck:
             probe.was_faulty = is_faulty
         if not typical_c:
             return CheckedProbes(math.nan, math.nan, math.nan, faulty)
-        lowest_c, highest_c = min(typical_c), max(*credible.values(), *held_c, -math.inf)
+        lowest_c, highest_c = min(typical_c), max(credible.values())
         mean_c = min(max(sum(typical_c) / len(typical_c), lowest_c), highest_c)  # a rounded mean may lie outside
         return CheckedProbes(mean_c, lowest_c, highest_c, faulty)
 

@@ -4,6 +4,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import InputFault
@@ -77,6 +80,13 @@ class AlarmList:
             if state.raised is not None
         }
 
+    @property
+    def pending(self) -> list[AlarmName]:
+        """Critical alarms whose delay runs."""
+        return [
+            name for name, each in self.states.items() if each.is_pending and each.definition.severity == "critical"
+        ]
+
     def update(
         self,
         name: AlarmName,
@@ -85,6 +95,7 @@ class AlarmList:
         values: Floats,
         wall_offset_s: float,
         reason_at: Callable[[float], str] | None = None,
+        uncertain: NDArray[np.bool_] | None = None,
     ) -> None:
         """Process values of one alarm, if it is defined.
 
@@ -95,11 +106,12 @@ class AlarmList:
             values: Values in the unit of the limit, NaN if not measured, shape (n,).
             wall_offset_s: Wall clock minus the samples' clock [s].
             reason_at: Function that returns the cause of an alarm that was raised at a time on the samples' clock [s].
+            uncertain: True where the true value may be beyond the limit, as in ``AlarmState.update``.
         """
         state = self.states.get(name)
         if state is None:
             return
-        for transition in state.update(times_s, steps_s, values, wall_offset_s):
+        for transition in state.update(times_s, steps_s, values, wall_offset_s, uncertain):
             if transition.raised is not None and reason_at is not None:
                 self.set_reasons(name, reason_at(transition.at_s))
             self._record(state, [transition])

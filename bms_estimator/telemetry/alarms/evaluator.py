@@ -18,7 +18,7 @@ from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.alarm import Alarm
-from bms_estimator.model.sample import CellBlock, SampleBlock, SampleStatus
+from bms_estimator.model.sample import NO_PROBES, CellBlock, ProbeBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarm_limits import STATE_LOST, AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
@@ -29,7 +29,7 @@ from bms_estimator.telemetry.alarms.inputs import MAX_SPACING_FRACTION, Inputs, 
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.sample_buffer import UNUSABLE, SampleBuffer
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
-from bms_estimator.telemetry.alarms.sensor_faults import FaultTexts
+from bms_estimator.telemetry.alarms.sensor_faults import FaultTexts, ProbeFaults
 from bms_estimator.telemetry.alarms.state import RaisedAlarm
 from bms_estimator.telemetry.alarms.unwatched import find_unwatched
 from bms_estimator.telemetry.alarms.values import estimated_values, find_unknown, measured_values
@@ -43,9 +43,14 @@ SENSOR_SUSPECTS = (
 MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV
 """Input faults that raise ``model_mismatch``."""
 INPUTS = "inputs"
-"""Key of the measured quantities in the saved state. All other keys but ``SILENCE`` are names of alarms."""
+"""Key of the measured quantities in the saved state."""
 SILENCE = "silence"
 """Key of the reason why no samples arrived, in the saved state."""
+PENDING = "pending"
+"""Key of the critical alarms whose delay runs, in the saved state."""
+PROBES = "probes"
+"""Key of the number of temperature probes while ``over_temperature`` is raised or pending, in the saved state. All keys but these
+four are names of alarms."""
 CELLS_GAP_S = 60.0
 """Minimum length of a gap between two evaluations of the single cells [s]."""
 NO_FORECAST = unknown_values()
@@ -84,7 +89,7 @@ class AlarmEvaluator:
         self._alarms = AlarmList(definitions, inputs.lost_s)
         self._charging_a = charging_a
         self._inputs, self._silence_limit_s = inputs, silence_limit_s
-        self._bounds, self._input_faults = bounds, FaultTexts()
+        self._bounds, self._input_faults, self._probe_faults = bounds, FaultTexts(), ProbeFaults()
         self._silence_reason = ""  # reason why no samples arrive; empty while they do
         self._resumed_s: float | None = None  # time of the first sample after the silence; None: none yet
         self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
@@ -111,6 +116,7 @@ class AlarmEvaluator:
         cells: CellBlock,
         forecasts: ForecastRows = NO_FORECAST,
         cells_fault: str = "",
+        probes: ProbeBlock = NO_PROBES,
     ) -> None:
         """Buffer a block of samples for ``evaluate``.
 
@@ -120,7 +126,9 @@ class AlarmEvaluator:
             cells: Their cell voltages [V]; empty without any.
             forecasts: Forecast at each row of ``trace``.
             cells_fault: Reason why the cell voltages cannot be used; empty if they can.
+            probes: Their temperature probes; empty without any.
         """
+        block = self._probe_faults.add(block, probes)
         self._buffer.add(block, trace, cells, forecasts, cells_usable=not cells_fault)
         if cells_fault:
             self._input_faults.add("cells", cells_fault, cells_fault)
@@ -132,7 +140,6 @@ class AlarmEvaluator:
         suspects: InputFault,
         suspicions: Sequence[str],
         clock_fault: str = "",
-        probe_fault: str = "",
     ) -> None:
         """Evaluate all buffered samples.
 
@@ -142,14 +149,13 @@ class AlarmEvaluator:
             suspects: Input faults that the filter suspects now.
             suspicions: The suspected faults, one sentence each.
             clock_fault: Fault of the source's clock as a sentence; empty without one.
-            probe_fault: Fault of temperature probes as a sentence; empty without one.
         """
         if not self.rows:
             return
         samples, trace, forecasts, cells = self._buffer.take()
         if (samples["status"] & SampleStatus.WRONG_CLOCK).any():
             self._input_faults.add("time", "rate", clock_fault or WRONG_CLOCK_TEXT)
-        if probe_fault:
+        if probe_fault := self._probe_faults.take():
             self._input_faults.add("temperature", "probe", probe_fault)
         self._alarms.set_suspects("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
         self._alarms.set_suspects("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
@@ -301,8 +307,13 @@ class AlarmEvaluator:
         entries = json.loads(text.encode(errors="replace"))  # half of a UTF-16 pair could not be published
         self._inputs.restore(entries.pop(INPUTS, {}))
         self._silence_reason = str(entries.pop(SILENCE, ""))
+        self._probe_faults.expected = int(entries.pop(PROBES, 0))
+        pending = list(entries.pop(PENDING, []))
         unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, {})
         missing = self._alarms.restore(entries, unwatched)
+        for name in pending:
+            if state := self._alarms.states.get(name):
+                state.resume_delay()
         self._save_state()
         return f"no longer monitored, but raised before the restart: {', '.join(missing)}" if missing else ""
 
@@ -331,16 +342,17 @@ class AlarmEvaluator:
         self._resumed_s = float(times_s[0]) if self._resumed_s is None else min(self._resumed_s, self._at_s)
         passed_s, observed_s = self._sample_intervals.measure(times_s)
         samples, cells, unusable = self._without_impossible(samples, cells)
+        has_probe_fault = (samples["status"] & SampleStatus.PROBE_FAULT) != 0
         for name, series in measured_values(samples, cells, self._charging_a).items():
-            self._alarms.update(name, times_s, observed_s, series, wall_offset_s)
+            # heat destroys probes, so that with a faulty one the pack may still be as hot as before
+            uncertain = has_probe_fault if name == "over_temperature" else None
+            self._alarms.update(name, times_s, observed_s, series, wall_offset_s, uncertain=uncertain)
         gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # duration of the gap before each sample [s]; 0: no gap
         self._alarms.update("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
         counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
         counts["cells"] = cells[:, 2].astype(np.int64)
         # with only faulty probes the temperature counts as missing also if it was never measured
-        unusable["temperature"] = ((samples["status"] & SampleStatus.PROBE_FAULT) != 0) & np.isnan(
-            samples["temperature_c"]
-        )
+        unusable["temperature"] = has_probe_fault & np.isnan(samples["temperature_c"])
         for quantity, rows in unusable.items():
             counts[quantity][rows] = UNUSABLE
         for at_s in self._inputs.update(times_s, observed_s, counts):
@@ -430,4 +442,8 @@ class AlarmEvaluator:
             saved[INPUTS] = inputs
         if self._silence_reason:
             saved[SILENCE] = self._silence_reason
+        if pending := self._alarms.pending:
+            saved[PENDING] = pending
+        if self._probe_faults.expected and "over_temperature" in (*self._alarms.active, *pending):
+            saved[PROBES] = self._probe_faults.expected
         self.saved_state = json.dumps(saved) if saved else ""

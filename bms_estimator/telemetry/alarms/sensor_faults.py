@@ -11,7 +11,7 @@ from bms_estimator.settings.alarm_kinds import Quantity
 
 FaultyInput = Quantity | Literal["time"]
 """Faulty quantity of the samples."""
-PROBE_TEXT = "a temperature probe is broken or loose, or far from the others: check it"
+PROBE_TEXT = "a temperature probe is broken, loose or missing, or far from the others: check it"
 """Fault of temperature probes, and its remedy."""
 RESET_WINDOW_S = 1800.0
 """Time within which resets count as repeated [s]. It covers three resets at the longest waiting time of the relay."""
@@ -63,18 +63,33 @@ class FaultTexts:
 
 
 class ProbeFaults:
-    """Faulty temperature probes since the last evaluation of the alarms."""
+    """Faulty and missing temperature probes since the last evaluation of the alarms.
+
+    Attributes:
+        expected: Largest number of probes in a sample so far. Samples with fewer probes have a missing one.
+    """
 
     def __init__(self) -> None:
+        self.expected = 0
         self._is_faulty, self._readings_c = False, dict[int, float]()
 
-    def add(self, samples: SampleBlock, probes: ProbeBlock) -> None:
-        """Add samples and their probes, which may be empty."""
+    def add(self, samples: SampleBlock, probes: ProbeBlock) -> SampleBlock:
+        """Add samples and their probes, which may be empty. Return the samples with ``PROBE_FAULT`` also for missing probes."""
+        if probes.size:
+            present = np.count_nonzero(np.isfinite(probes["temperature_c"]), axis=1)
+            expected = np.maximum.accumulate(np.maximum(present, self.expected))
+            self.expected = int(expected[-1])
+            # without any probe the whole temperature is missing, which is not a fault of probes
+            missing = (present > 0) & (present < expected)
+            if missing.any():
+                samples = samples.copy()
+                samples["status"] |= np.where(missing, SampleStatus.PROBE_FAULT, 0).astype(samples["status"].dtype)
         if not (samples["status"] & SampleStatus.PROBE_FAULT).any():
-            return
+            return samples
         self._is_faulty = True
         for row, column in np.argwhere(probes["faulty"]).tolist():
             self._readings_c[column + 1] = float(probes[row, column]["temperature_c"])
+        return samples
 
     def take(self) -> str:
         """Return and clear the faulty probes, as one sentence with their last readings; empty without any.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.model.arrays import Floats
 from bms_estimator.settings.alarm_limits import AlarmDefinition
@@ -52,7 +53,19 @@ class AlarmState:
     _held_s: float | None = None
     """Time for which the condition of the next state has held [s]; None: it does not hold."""
 
-    def update(self, times_s: Floats, steps_s: Floats, values: Floats, wall_offset_s: float) -> list[AlarmTransition]:
+    @property
+    def is_pending(self) -> bool:
+        """True while the delay before the alarm runs."""
+        return self.raised is None and self._held_s is not None
+
+    def update(
+        self,
+        times_s: Floats,
+        steps_s: Floats,
+        values: Floats,
+        wall_offset_s: float,
+        uncertain: NDArray[np.bool_] | None = None,
+    ) -> list[AlarmTransition]:
         """Process values in the order of their arrival.
 
         Args:
@@ -60,6 +73,8 @@ class AlarmState:
             steps_s: Interval since the previous sample [s], 0 after a gap, which does not count toward delays; shape (n,).
             values: Values in the unit of the limit, shape (n,). NaN (not measured) neither raises nor ends the alarm.
             wall_offset_s: Wall clock minus the samples' clock [s].
+            uncertain: True where the true value may be beyond the limit, shape (n,). Such a value neither ends the alarm nor its
+                delay, unless the alarm is acknowledged. None: nowhere.
 
         Returns:
             Transitions, oldest first.
@@ -71,7 +86,11 @@ class AlarmState:
             self.has_value = self.has_value or not bool(np.isnan(values).all())
             return []
         transitions = []
-        for at_s, step_s, value in zip(times_s.tolist(), steps_s.tolist(), signed.tolist(), strict=True):
+        are_uncertain = [False] * values.size if uncertain is None else uncertain.tolist()
+        rows = zip(times_s.tolist(), steps_s.tolist(), signed.tolist(), are_uncertain, strict=True)
+        for at_s, step_s, measured, is_uncertain in rows:
+            keeps_state = is_uncertain and (self.is_pending or (self.raised and not self.acknowledged))
+            value = max(sign * self.definition.limit, measured) if keeps_state else measured
             if math.isnan(value):
                 self._missing_s += step_s
                 continue
@@ -100,6 +119,11 @@ class AlarmState:
         """Restore the state of an earlier run."""
         self.raised, self.cause_cleared, self.acknowledged = raised, cause_cleared, acknowledged
         self._held_s = None
+
+    def resume_delay(self) -> None:
+        """Resume the delay of an earlier run. It counts as elapsed, so that a crash loop cannot prevent the alarm."""
+        if self.raised is None:
+            self._held_s = math.inf
 
     def _is_due(self, signed: float, step_s: float, sign: float) -> bool:
         """Return True if the condition of the next state has held long enough."""

@@ -79,15 +79,6 @@ def test_a_probe_that_really_cools_to_the_reading_of_an_open_one_is_believed() -
     assert not any(any(result.faulty) for result in results)
 
 
-@pytest.mark.parametrize("failed_c", [-40.0, NAN, 300.0])
-def test_a_probe_that_fails_while_hot_still_counts_for_the_highest(failed_c: float) -> None:
-    rise = [[25.0, 25.0 + 10.0 * second] for second in range(8)]
-    results = check_each_second(*rise, *[[25.0, failed_c]] * 100, [25.0, 40.0], [25.0, 40.0])
-    assert results[100].highest_c == 95.0
-    assert results[100].mean_c == 25.0
-    assert results[-1].highest_c == 40.0  # the probe is credible again
-
-
 def test_a_sample_after_a_long_gap_may_have_any_plausible_temperature() -> None:
     probes = ProbeCheck()
     probes.check(0.0, [25.0])
