@@ -41,12 +41,14 @@ class RunCounters:
         total: Totals over all runs.
         clean: True if the last run ended without a crash or kill; False while it runs.
         alarms: State of the alarms, in the format of ``AlarmEvaluator.saved_state``.
+        hooks: Hashes of the alarm hooks without unfinished jobs at a clean end; None: unknown.
     """
 
     restarts: int
     total: Totals
     clean: bool = False
     alarms: str = ""
+    hooks: list[str] | None = None
 
 
 class SavedRun(NamedTuple):
@@ -186,7 +188,8 @@ class RunFile:
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
             log.warning("the saved counters are invalid and restart from zero", reason=str(error))
             restarts, total = 1, new_totals(self._wall_s())
-        return RunCounters(restarts, total, alarms=alarms)
+        hooks = values.get("hooks")
+        return RunCounters(restarts, total, alarms=alarms, hooks=hooks if isinstance(hooks, list) else None)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Alarm hooks: actions when an alarm is raised or ends. Each hook runs in a task of its own and delays nothing else."""
 
 import asyncio
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Callable, Collection, Sequence
 from typing import Self
 
 from bms_estimator.model.clock import since_boot
@@ -9,7 +10,6 @@ from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.service.hook import Hook, counts_as_raised
 from bms_estimator.service.hook_check import require_output
-from bms_estimator.service.hook_list_file import HookListFile
 from bms_estimator.service.job_hook import CommandHook, PublishHook, PublishRaw
 from bms_estimator.service.relay_hook import RelayBoard, RelayHook
 from bms_estimator.settings.alarms import AlarmHook
@@ -28,7 +28,6 @@ class AlarmHooks:
         publish: Publishes a message; None without a broker.
         board: Board with a relay pin; None without one.
         clock: Time since boot of the host [s].
-        list_file: File with the hooks of the last start; None: no hook counts as new.
 
     Raises:
         UserError: A hook needs something that is missing.
@@ -41,9 +40,7 @@ class AlarmHooks:
         publish: PublishRaw | None,
         board: RelayBoard | None,
         clock: Callable[[], float] = since_boot,
-        list_file: HookListFile | None = None,
     ) -> None:
-        self._list_file = list_file
         self._hooks: list[Hook] = []
         for i, hook in enumerate(hooks):
             require_output(i, hook, broker=publish is not None, relay=board is not None)
@@ -73,7 +70,14 @@ class AlarmHooks:
             if hook.covers(change.alarm.name):
                 hook.on_alarm_change(change.alarm)
 
-    def restore_active(self, alarms: Sequence[Alarm], *, crashed: bool = False) -> None:
+    @property
+    def idle_hashes(self) -> list[str]:
+        """Hashes of the hooks without unfinished jobs."""
+        return [_hash(hook.settings) for hook in self._hooks if not hook.is_busy]
+
+    def restore_active(
+        self, alarms: Sequence[Alarm], known: Collection[str] | None = None, *, crashed: bool = False
+    ) -> None:
         """Restore the alarms of an earlier run.
 
         Jobs of these alarms are not repeated, but the relay is set to its level. A hook that the earlier run did not have, or
@@ -82,13 +86,14 @@ class AlarmHooks:
 
         Args:
             alarms: All alarms.
+            known: ``idle_hashes`` at the end of the earlier run; None: no hook counts as new.
             crashed: True if the earlier run crashed or was killed, perhaps with unfinished jobs. All jobs are repeated.
         """
         raised = [alarm for alarm in alarms if counts_as_raised(alarm)]
         failed = [alarm for alarm in raised if alarm.name == "hook_failed"]
-        added = self._list_file.replace([hook.settings for hook in self._hooks]) if self._list_file else []
         for hook in self._hooks:
-            if failed or crashed or hook.settings in added:
+            is_new = known is not None and _hash(hook.settings) not in known
+            if failed or crashed or is_new:
                 for alarm in raised:
                     if alarm not in failed and hook.covers(alarm.name):
                         hook.on_alarm_change(alarm)
@@ -110,6 +115,11 @@ class AlarmHooks:
             for task in late:
                 task.cancel()
             await asyncio.gather(*late, return_exceptions=True)
-        unfinished = [hook.settings for hook in self._hooks if hook.is_busy]
-        if self._list_file and unfinished:
-            self._list_file.remove(unfinished)
+
+
+def _hash(hook: AlarmHook) -> str:
+    """Return a hash of the settings that differ from the defaults, which a later version with more settings reproduces.
+
+    A hash, because a hook's arguments may hold secrets.
+    """
+    return hashlib.sha256(hook.model_dump_json(exclude_defaults=True).encode()).hexdigest()[:16]

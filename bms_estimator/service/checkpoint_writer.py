@@ -20,6 +20,7 @@ from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
+from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.telemetry.alarms.evaluator import INPUTS, PENDING, PROBES, SILENCE, AlarmEvaluator
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
@@ -65,6 +66,7 @@ class CheckpointWriter:
         history: File of the history; None: no history.
         seen_load: Observed load, which is saved every ``LOAD_SAVE_S``; None: it is not saved.
         cells: Estimators of the single cells; read only; None: none.
+        hooks: Alarm hooks; read only.
     """
 
     def __init__(
@@ -80,8 +82,9 @@ class CheckpointWriter:
         history: HistoryFile | None = None,
         seen_load: SeenLoad | None = None,
         cells: CellEstimator | None = None,
+        hooks: AlarmHooks,
     ) -> None:
-        self._interval_s, self._seen_load, self._cells = interval_s, seen_load, cells
+        self._interval_s, self._seen_load, self._cells, self._hooks = interval_s, seen_load, cells, hooks
         self._samples_of_saved_load = 0
         self._pack_model, self._history = pack_model, history
         self._saved_revision = pack_model.revision if pack_model else 0
@@ -175,7 +178,8 @@ class CheckpointWriter:
 
     async def _save_counters(self, *, clean: bool = False) -> bool:
         """Save counters and alarms if they have changed. Return False if they cannot be written."""
-        counters = RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state)
+        hooks = self._hooks.idle_hashes if clean else None  # after a crash all hooks repeat their jobs
+        counters = RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state, hooks)
         file = self._checkpoint.run_file
         if counters == self._saved_counters:
             return True

@@ -132,7 +132,7 @@ async def run_estimation_loop(
         forecaster=forecaster,
     )
     unrestored = publisher.alarm_monitor.restore(counters.alarms)
-    hooks.restore_active(publisher.alarm_monitor.report, crashed=saved_run.crashed)
+    hooks.restore_active(publisher.alarm_monitor.report, counters.hooks, crashed=saved_run.crashed)
     if lost_reason := saved_run.lost_reason or unrestored:
         # after the restored alarms, because the hooks announce this one
         publisher.alarm_monitor.raise_state_lost(lost_reason)
@@ -151,6 +151,7 @@ async def run_estimation_loop(
             history=history,
             seen_load=seen_load,
             cells=cells,
+            hooks=hooks,
         )
         if checkpoint
         else None

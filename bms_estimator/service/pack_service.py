@@ -24,7 +24,6 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import has_relay
-from bms_estimator.service.hook_list_file import HookListFile
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.pack import Settings
@@ -111,7 +110,6 @@ async def run_pack_service(
         settings.pack.name,
         mqtt.publish_raw if mqtt else None,
         board if has_relay(settings) else None,
-        list_file=HookListFile(folder, settings.pack.name) if folder else None,
     )
     if settings.page is not None:
         history = database.path if database and settings.store.history_days else None

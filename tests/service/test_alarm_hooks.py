@@ -4,7 +4,6 @@ import asyncio
 import json
 import math
 import resource
-import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -20,7 +19,6 @@ from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.service import alarm_hooks, job_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import hook_warnings
-from bms_estimator.service.hook_list_file import THREAD_NAME, HookListFile
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
@@ -92,13 +90,6 @@ def _is_running(process: int) -> bool:
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-def join_writers() -> None:
-    """Wait until the list of hooks is written."""
-    for thread in threading.enumerate():
-        if thread.name == THREAD_NAME:
-            thread.join(LONG_S)
-
-
 def lines_of(path: Path) -> list[str]:
     """Return the lines of a file; none if it does not exist."""
     return path.read_text().splitlines() if path.exists() else []
@@ -142,64 +133,42 @@ async def test_an_alarm_that_waits_for_a_program_at_a_restart_is_reported_after_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(alarm_hooks, "CLOSE_S", 0.01)
-    out, list_file = tmp_path / "out", HookListFile(tmp_path, "pack")
+    out = tmp_path / "out"
     script = write_program(tmp_path / "script", f'echo "$BMS_NAME" >> {out}; [ ! -e {tmp_path}/hang ] || sleep 1000')
     (tmp_path / "hang").touch()
     critical = RAISED.model_copy(update={"name": "cell_over_voltage", "severity": "critical"})
-    async with run_hooks({"run": [script]}, list_file=list_file) as running:
-        running.restore_active([])
-        join_writers()
+    async with run_hooks({"run": [script]}) as running:
         running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         await wait_for_lines(out, 1)
         running.on_alarm_change(Change(at_s=0.0, alarm=critical))
+        known = running.idle_hashes
     (tmp_path / "hang").unlink()
-    async with run_hooks({"run": [script]}, list_file=list_file) as running:
-        running.restore_active([RAISED, critical])
+    async with run_hooks({"run": [script]}) as running:
+        running.restore_active([RAISED, critical], known)
         assert await wait_for_lines(out, 3) == ["soc_low", "cell_over_voltage", "soc_low"]
 
 
-async def test_all_raised_alarms_are_reported_after_a_crash(tmp_path: Path) -> None:
+async def test_all_raised_alarms_are_reported_after_a_crash() -> None:
     output: list[bytes] = []
-    list_file = HookListFile(tmp_path, "pack")
     for crashed in (False, True):
         async with run_hooks(
-            {"topic": "load/set", "payload": "$name"}, publish=lambda _, text: output.append(text), list_file=list_file
+            {"topic": "load/set", "payload": "$name"}, publish=lambda _, text: output.append(text)
         ) as running:
-            running.restore_active([RAISED], crashed=crashed)
-        join_writers()
+            running.restore_active([RAISED], running.idle_hashes, crashed=crashed)
     assert output == [b"soc_low"]
 
 
-async def test_a_hook_that_was_added_or_changed_before_a_restart_acts_on_an_alarm_that_is_already_raised(
-    tmp_path: Path,
-) -> None:
+async def test_a_hook_that_was_added_or_changed_before_a_restart_acts_on_an_alarm_that_is_already_raised() -> None:
     output: list[str] = []
     first, second = ({"topic": topic, "payload": f"{topic} $name"} for topic in ("first", "second"))
     dry_run = first | {"dry_run": True}
-    options = {
-        "publish": lambda _, payload: output.append(payload.decode()),
-        "list_file": HookListFile(tmp_path, "pack"),
-    }
+    known: list[str] | None = None
     for tables in ((first,), (first,), (first, second), (dry_run, second), (first, second)):
-        async with run_hooks(*tables, **options) as running:
-            running.restore_active([RAISED])
-        join_writers()
+        async with run_hooks(*tables, publish=lambda _, payload: output.append(payload.decode())) as running:
+            running.restore_active([RAISED], known)
+        known = running.idle_hashes
         output.append("restart")
     assert output == [*["restart"] * 2, "second soc_low", *["restart"] * 2, "first soc_low", "restart"]
-
-
-async def test_a_damaged_list_of_hooks_makes_every_hook_act_again(tmp_path: Path) -> None:
-    output: list[bytes] = []
-    for content in ("[", '{"a": 1}', "\0" * 100):
-        (tmp_path / "pack.hooks.json").write_text(content)
-        async with run_hooks(
-            {"topic": "load/set", "payload": "$name"},
-            publish=lambda _, payload: output.append(payload),
-            list_file=HookListFile(tmp_path, "pack"),
-        ) as running:
-            running.restore_active([RAISED])
-        join_writers()
-    assert output == [b"soc_low"] * 3
 
 
 async def test_a_hook_runs_only_for_its_alarms_and_states(tmp_path: Path) -> None:

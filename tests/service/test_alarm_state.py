@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,6 +83,7 @@ async def run(
     until: Callable[[dict[str, Alarm]], bool] = lambda _: True,
     acknowledge: str = "",
     signal_after: asyncio.Barrier | None = None,
+    added_hooks: Sequence[dict[str, Any]] = (),
 ) -> Run:
     """Run the service over samples, at least until the alarms fulfil a condition.
 
@@ -94,11 +95,12 @@ async def run(
         until: Condition.
         acknowledge: Alarm to acknowledge; empty: none.
         signal_after: Barrier, after which one of the packs that wait there acknowledges with a signal; None: with a request.
+        added_hooks: Hooks besides ``HOOKS``.
     """
     source, sink, board, messages = ScriptedSource(), Collector(), RecordingBoard(), list[str]()
     relay = board.levels
     hooks = AlarmHooks(
-        [AlarmHook.model_validate(table) for table in HOOKS],
+        [AlarmHook.model_validate(table) for table in (*HOOKS, *added_hooks)],
         "pack",
         lambda _, payload: messages.append(payload.decode()),
         board,
@@ -498,6 +500,12 @@ async def test_an_alarm_is_saved_on_a_full_disk(folder: Path, full_disk: Path) -
     full.save(dataclasses.replace(counters, alarms=json.dumps(RAISED)))
     assert full.load().counters.alarms == json.dumps(RAISED)
     assert not full.load().lost_reason
+
+
+async def test_a_hook_that_is_added_before_a_restart_acts_on_a_raised_alarm(folder: Path) -> None:
+    added = {"alarms": ["pack_over_voltage"], "topic": "added", "payload": "$name $state"}
+    assert (await run(folder, NORMAL, added_hooks=[added])).messages == ["pack_over_voltage raised"]
+    assert (await run(folder, NORMAL, added_hooks=[added])).messages == []
 
 
 async def test_a_signal_acknowledges_the_alarms_of_all_packs(folder: Path, tmp_path: Path) -> None:
