@@ -11,10 +11,10 @@ from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.settings.alarm_limits import monitored_alarms
+from bms_estimator.telemetry.alarms.estimate_alarms import NO_MARGIN, UNKNOWN_SOC
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
-from bms_estimator.telemetry.alarms.values import NO_MARGIN, UNKNOWN_SOC
 from tests.telemetry.alarm_captures import PACK, WALL_S, settings
 
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import ForecastRows, unknown_values
-from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.alarm import Alarm
@@ -23,25 +22,24 @@ from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarm_limits import STATE_LOST, AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.alarm_list import AlarmList
-from bms_estimator.telemetry.alarms.collapse_risk import collapse_risks, time_left_text
+from bms_estimator.telemetry.alarms.cell_alarms import CellAlarms
+from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, EstimateAlarms
 from bms_estimator.telemetry.alarms.faulty_fraction import FaultyFraction, SampleCounts
 from bms_estimator.telemetry.alarms.inputs import MAX_SPACING_FRACTION, Inputs, count_values
+from bms_estimator.telemetry.alarms.measured_values import measured_values
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.sample_buffer import UNUSABLE, SampleBuffer
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
 from bms_estimator.telemetry.alarms.sensor_faults import FaultTexts, ProbeFaults
 from bms_estimator.telemetry.alarms.state import RaisedAlarm
 from bms_estimator.telemetry.alarms.unwatched import find_unwatched
-from bms_estimator.telemetry.alarms.values import estimated_values, find_unknown, measured_values
-from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
+from bms_estimator.telemetry.cells import CellFaults
 from bms_estimator.telemetry.impossible import PackBounds
 
 SENSOR_SUSPECTS = (
     InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
 )
 """Input faults that raise ``sensor_fault``."""
-MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV
-"""Input faults that raise ``model_mismatch``."""
 INPUTS = "inputs"
 """Key of the measured quantities in the saved state."""
 SILENCE = "silence"
@@ -51,8 +49,6 @@ PENDING = "pending"
 PROBES = "probes"
 """Key of the number of temperature probes while ``over_temperature`` is raised or pending, in the saved state. All keys but these
 four are names of alarms."""
-CELLS_GAP_S = 60.0
-"""Minimum length of a gap between two evaluations of the single cells [s]."""
 NO_FORECAST = unknown_values()
 """Forecast at all samples of a pack without a forecaster."""
 WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
@@ -92,16 +88,12 @@ class AlarmEvaluator:
         self._bounds, self._input_faults, self._probe_faults = bounds, FaultTexts(), ProbeFaults()
         self._silence_reason = ""  # reason why no samples arrive; empty while they do
         self._resumed_s: float | None = None  # time of the first sample after the silence; None: none yet
-        self._sample_intervals, self._trace_intervals = SampleIntervals(gap_s), SampleIntervals(gap_s)
-        self._weak_cell_intervals = SampleIntervals(math.inf)  # no interval is a gap, because a weak cell remains weak
-        self._cell_intervals = SampleIntervals(CELLS_GAP_S)
-        self._described: dict[AlarmName, CellFault] = {}  # fault that the text of an alarm of the cells describes
+        self._sample_intervals = SampleIntervals(gap_s)
+        self._estimates, self._cells = EstimateAlarms(self._alarms, charging_a, gap_s), CellAlarms(self._alarms)
         self._buffer = SampleBuffer()
         self._faulty_fraction = FaultyFraction()
         self._at_s = 0.0  # time of the last sample
         self._faulty_s = -math.inf  # time of the last sample with a fault of the input
-        self._mismatch_suspected = False
-        self._soc_known = False  # True if the SOC was known at the last row of the trace
         self.saved_state = ""
 
     @property
@@ -164,7 +156,7 @@ class AlarmEvaluator:
             self._evaluate_samples(samples, cells, wall_offset_s)
             self._evaluate_faulty_fraction(float(samples["time_s"][-1]), counts, suspects, wall_offset_s)
         if trace.size:
-            self._evaluate_estimates(trace, forecasts, suspects, arrival_s - float(trace["time_s"][-1]))
+            self._estimates.evaluate(trace, forecasts, suspects, arrival_s - float(trace["time_s"][-1]))
         self._save_state()
 
     def on_silence(self, silent_s: float, now_s: float, reason: str) -> None:
@@ -234,9 +226,7 @@ class AlarmEvaluator:
             arrival_s: Arrival of the last sample on the wall clock [s since 1970].
         """
         if not math.isnan(deviation_std):
-            time_s = np.array([self._at_s])
-            _, observed_s = self._weak_cell_intervals.measure(time_s)
-            self._alarms.update("weak_cell", time_s, observed_s, np.array([deviation_std]), arrival_s - self._at_s)
+            self._cells.evaluate_weak_cell(deviation_std, self._at_s, arrival_s - self._at_s)
             self._save_state()
 
     def evaluate_cells(self, faults: CellFaults, arrival_s: float) -> None:
@@ -246,17 +236,7 @@ class AlarmEvaluator:
             faults: Faults at the last sample.
             arrival_s: Arrival of this sample on the wall clock [s since 1970].
         """
-        times_s = np.array([faults.at_s])
-        _, observed_s = self._cell_intervals.measure(times_s)
-        values: dict[AlarmName, CellFault] = {"cell_short": faults.short, "cell_sensor_fault": faults.reading}
-        for name, fault in values.items():
-            state = self._alarms.states.get(name)
-            # the text of a raised alarm changes only with the kinds of its faults, because its numbers change often
-            described = self._described.get(name, NO_CELL_FAULT)
-            if state is not None and (state.raised is None or (fault.kinds and fault.kinds != described.kinds)):
-                self._alarms.set_reasons(name, *fault.texts)
-                self._described[name] = fault
-            self._alarms.update(name, times_s, observed_s, np.array([fault.value]), arrival_s - faults.at_s)
+        self._cells.evaluate(faults, arrival_s - faults.at_s)
         self._save_state()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
@@ -405,35 +385,6 @@ class AlarmEvaluator:
         elif at_s - self._faulty_s <= MAX_SPACING_FRACTION * self._inputs.lost_s and state and state.raised is None:
             value = math.nan  # a sample without a fault does not restart the delay of an intermittent one
         self._alarms.update("sensor_fault", np.array([at_s]), observed_s, np.array([value]), wall_offset_s)
-
-    def _evaluate_estimates(
-        self, trace: TraceBlock, forecasts: ForecastRows, suspects: InputFault, wall_offset_s: float
-    ) -> None:
-        """Evaluate the alarms on estimates.
-
-        Args:
-            trace: Shape (n,), dtype TRACE.
-            forecasts: Forecast at each row of the trace, shape (n,), dtype FORECAST.
-            suspects: Input faults that the filter suspects now.
-            wall_offset_s: Wall clock minus the samples' clock [s].
-        """
-        times_s = trace["time_s"]
-        _, observed_s = self._trace_intervals.measure(times_s)
-        is_mismatch = (trace["lock"] == 0) | self._mismatch_suspected
-        self._mismatch_suspected = bool(suspects & MODEL_SUSPECTS)
-        # a new suspicion counts from the last sample on, because its start is unknown
-        is_mismatch[-1] |= self._mismatch_suspected
-        soc_known = known_rows(trace, self._soc_known)
-        self._soc_known = bool(soc_known[-1])
-        self._alarms.set_unknown(find_unknown(trace[-1], soc_known=self._soc_known))
-        for name, series in estimated_values(trace, is_mismatch, soc_known).items():
-            self._alarms.update(name, times_s, observed_s, series, wall_offset_s)
-        risks = collapse_risks(forecasts, trace["current_a"] <= -self._charging_a)
-
-        def reason_at(at_s: float) -> str:
-            return time_left_text(forecasts[int(np.flatnonzero(times_s == at_s)[-1])])
-
-        self._alarms.update("collapse_risk", times_s, observed_s, risks, wall_offset_s, reason_at)
 
     def _save_state(self) -> None:
         """Update ``saved_state``. With it, a relay that an alarm has opened stays open over a restart."""
