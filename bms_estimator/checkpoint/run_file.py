@@ -1,7 +1,6 @@
 """File with counters and alarms of a pack. It has the pack's name only, so that no edited setting loses them."""
 
 import contextlib
-import errno
 import io
 import json
 import re
@@ -41,7 +40,7 @@ class RunCounters:
         total: Totals over all runs.
         clean: True if the last run ended without a crash or kill; False while it runs.
         alarms: State of the alarms, in the format of ``AlarmEvaluator.saved_state``.
-        hooks: Hashes of the alarm hooks without unfinished jobs at a clean end; None: unknown.
+        hooks: Hashes of the alarm hooks without unfinished or failed jobs at a clean end; None: unknown.
     """
 
     restarts: int
@@ -79,19 +78,17 @@ class RunFile:
         self._refused = folder / f"{name}.refused.run"
 
     def save(self, counters: RunCounters) -> None:
-        """Write the file atomically, or overwrite it on a full disk. A missing folder is created.
+        """Write the file atomically, or overwrite it on a full disk or in a read-only folder. A missing folder is created.
 
         Raises:
             OSError: The file cannot be written.
         """
         values = {"format": FORMAT, "name": self._name, **vars(counters), "total": counters.total.model_dump()}
-        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         content = add_checksum(json.dumps(values).encode())
         try:
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             write_private(self.path, content)
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
+        except OSError:
             # a raised alarm must not wait for free space; a power failure meanwhile damages the file, which is the safe side
             overwrite_private(self.path, content)
 

@@ -29,6 +29,9 @@ class AlarmHooks:
         board: Board with a relay pin; None without one.
         clock: Time since boot of the host [s].
 
+    Attributes:
+        is_watching: Returns True once due alarms would be raised (``AlarmEvaluator.is_watching``).
+
     Raises:
         UserError: A hook needs something that is missing.
     """
@@ -41,13 +44,14 @@ class AlarmHooks:
         board: RelayBoard | None,
         clock: Callable[[], float] = since_boot,
     ) -> None:
+        self.is_watching: Callable[[], bool] = lambda: True
         self._hooks: list[Hook] = []
         for i, hook in enumerate(hooks):
             require_output(i, hook, broker=publish is not None, relay=board is not None)
             if hook.topic and publish:
                 self._hooks.append(PublishHook(hook, device, hook.topic, publish))
             elif hook.relay and board:
-                self._hooks.append(RelayHook(hook, board, clock))
+                self._hooks.append(RelayHook(hook, board, clock, lambda: self.is_watching()))  # noqa: PLW0108 - set later
             else:
                 self._hooks.append(CommandHook(hook, device))
         self._tasks: list[asyncio.Task[None]] = []
@@ -71,9 +75,9 @@ class AlarmHooks:
                 hook.on_alarm_change(change.alarm)
 
     @property
-    def idle_hashes(self) -> list[str]:
-        """Hashes of the hooks without unfinished jobs."""
-        return [_hash(hook.settings) for hook in self._hooks if not hook.is_busy]
+    def finished_hashes(self) -> list[str]:
+        """Hashes of the hooks without unfinished or failed jobs."""
+        return [_hash(hook.settings) for hook in self._hooks if not (hook.is_busy or hook.error)]
 
     def restore_active(
         self, alarms: Sequence[Alarm], known: Collection[str] | None = None, *, crashed: bool = False
@@ -86,7 +90,7 @@ class AlarmHooks:
 
         Args:
             alarms: All alarms.
-            known: ``idle_hashes`` at the end of the earlier run; None: no hook counts as new.
+            known: ``finished_hashes`` at the end of the earlier run; None: no hook counts as new.
             crashed: True if the earlier run crashed or was killed, perhaps with unfinished jobs. All jobs are repeated.
         """
         raised = [alarm for alarm in alarms if counts_as_raised(alarm)]

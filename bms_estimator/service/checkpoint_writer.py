@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -174,11 +175,11 @@ class CheckpointWriter:
     async def _is_run_file_missing(self) -> bool:
         """Return True if the file with counters and alarms was deleted."""
         path = self._checkpoint.run_file.path
-        return not await asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, path.exists)
+        return not await asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, os.path.exists, path)
 
     async def _save_counters(self, *, clean: bool = False) -> bool:
         """Save counters and alarms if they have changed. Return False if they cannot be written."""
-        hooks = self._hooks.idle_hashes if clean else None  # after a crash all hooks repeat their jobs
+        hooks = self._hooks.finished_hashes if clean else None  # after a crash all hooks repeat their jobs
         counters = RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state, hooks)
         file = self._checkpoint.run_file
         if counters == self._saved_counters:
@@ -279,5 +280,8 @@ def lacks_alarm(saved: str, present: str) -> bool:
         return True
     after.pop(PROBES, None)  # saved with an alarm
     return any(
-        name not in before or before[name]["acknowledged"] != each["acknowledged"] for name, each in after.items()
+        name not in before
+        or before[name]["acknowledged"] != each["acknowledged"]
+        or (before[name]["gone"] and not each["gone"])
+        for name, each in after.items()
     )

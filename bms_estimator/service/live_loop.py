@@ -132,6 +132,7 @@ async def run_estimation_loop(
         forecaster=forecaster,
     )
     unrestored = publisher.alarm_monitor.restore(counters.alarms)
+    hooks.is_watching = lambda: publisher.alarm_monitor.alarms.is_watching
     hooks.restore_active(publisher.alarm_monitor.report, counters.hooks, crashed=saved_run.crashed)
     if lost_reason := saved_run.lost_reason or unrestored:
         # after the restored alarms, because the hooks announce this one

@@ -116,11 +116,16 @@ class RelayHook(Hook):
         settings: Settings of the hook.
         board: The board.
         clock: Time since boot of the host [s].
+        is_watching: Returns True once due alarms would be raised. Before that, the level without an alarm is not sent, so that a
+            restart or a crash loop connects no load.
     """
 
-    def __init__(self, settings: AlarmHook, board: RelayBoard, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, settings: AlarmHook, board: RelayBoard, clock: Callable[[], float], is_watching: Callable[[], bool]
+    ) -> None:
         super().__init__(settings)
-        self._board, self._clock = board, clock
+        self._board, self._clock, self._is_watching = board, clock, is_watching
+        self._has_watched = False
         self._hold = RelayHold(low_is_safe=settings.relay == "low")
 
     @property
@@ -168,6 +173,9 @@ class RelayHook(Hook):
 
     async def _send_level(self) -> str:
         """Send the level that is allowed now. Return why the board does not confirm it; empty if it does."""
+        self._has_watched = self._has_watched or self._is_watching()
+        if not (self._raised or self._has_watched):
+            return ""
         level = self._hold.level(high=self._wants_high, now_s=self._clock())
         if level is None:
             return ""

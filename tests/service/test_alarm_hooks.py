@@ -141,11 +141,23 @@ async def test_an_alarm_that_waits_for_a_program_at_a_restart_is_reported_after_
         running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
         await wait_for_lines(out, 1)
         running.on_alarm_change(Change(at_s=0.0, alarm=critical))
-        known = running.idle_hashes
+        known = running.finished_hashes
     (tmp_path / "hang").unlink()
     async with run_hooks({"run": [script]}) as running:
         running.restore_active([RAISED, critical], known)
         assert await wait_for_lines(out, 3) == ["soc_low", "cell_over_voltage", "soc_low"]
+
+
+async def test_a_program_that_failed_before_a_restart_runs_again(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    script = write_program(tmp_path / "script", f"echo run >> {out}; exit 1")
+    async with run_hooks({"run": [script]}) as running:
+        running.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
+        await wait_for_health(running, lambda health: bool(health.failing))
+        known = running.finished_hashes
+    async with run_hooks({"run": [script]}) as running:
+        running.restore_active([RAISED], known)
+        await wait_for_lines(out, 2)
 
 
 async def test_all_raised_alarms_are_reported_after_a_crash() -> None:
@@ -154,7 +166,7 @@ async def test_all_raised_alarms_are_reported_after_a_crash() -> None:
         async with run_hooks(
             {"topic": "load/set", "payload": "$name"}, publish=lambda _, text: output.append(text)
         ) as running:
-            running.restore_active([RAISED], running.idle_hashes, crashed=crashed)
+            running.restore_active([RAISED], running.finished_hashes, crashed=crashed)
     assert output == [b"soc_low"]
 
 
@@ -166,7 +178,7 @@ async def test_a_hook_that_was_added_or_changed_before_a_restart_acts_on_an_alar
     for tables in ((first,), (first,), (first, second), (dry_run, second), (first, second)):
         async with run_hooks(*tables, publish=lambda _, payload: output.append(payload.decode())) as running:
             running.restore_active([RAISED], known)
-        known = running.idle_hashes
+        known = running.finished_hashes
         output.append("restart")
     assert output == [*["restart"] * 2, "second soc_low", *["restart"] * 2, "first soc_low", "restart"]
 

@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import signal
+import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +40,8 @@ from tests.scripted_source import ScriptedSource
 
 OVER_VOLTAGE = [(float(t), 0.0, 4.4 if t < 5 else 3.8, 25.0, 0) for t in range(20)]
 """Samples that raise ``pack_over_voltage``, whose cause is then gone: it is latched."""
-NORMAL = [(float(t), 0.0, 3.8, 25.0, 0) for t in range(5)]
+NORMAL = [(float(t), 0.0, 3.8, 25.0, 0) for t in range(12)]
+"""Samples without an alarm, long enough for the relay to follow the alarms."""
 NO_TEMPERATURE = [(float(t), 0.0, 3.8, 25.0 if t < 3 else math.nan, 0) for t in range(20)]
 HOOKS = (
     {"alarms": ["pack_over_voltage", "over_temperature"], "relay": "low"},
@@ -491,7 +493,18 @@ async def test_a_kill_within_the_delay_of_an_alarm_does_not_restart_the_delay(tm
     assert not any(restarted.relay[1:])
 
 
-async def test_an_alarm_is_saved_on_a_full_disk(folder: Path, full_disk: Path) -> None:
+def test_an_alarm_is_saved_in_a_folder_that_cannot_be_written(folder: Path) -> None:
+    if os.geteuid() != 0 or subprocess.run(["chattr", "+i", folder], check=False).returncode != 0:
+        pytest.skip("no folder can be made immutable here")
+    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    try:
+        file.save(dataclasses.replace(file.load().counters, alarms=json.dumps(RAISED | {"silence": "no samples"})))
+    finally:
+        subprocess.run(["chattr", "-i", folder], check=True)
+    assert "silence" in file.load().counters.alarms
+
+
+def test_an_alarm_is_saved_on_a_full_disk(folder: Path, full_disk: Path) -> None:
     path = (full_disk / "file").rename(full_disk / "pack.run")  # the only block of this disk
     file = CheckpointFile(folder, SETTINGS, CELL).run_file
     counters = file.load().counters
@@ -500,6 +513,15 @@ async def test_an_alarm_is_saved_on_a_full_disk(folder: Path, full_disk: Path) -
     full.save(dataclasses.replace(counters, alarms=json.dumps(RAISED)))
     assert full.load().counters.alarms == json.dumps(RAISED)
     assert not full.load().lost_reason
+
+
+async def test_a_restart_connects_the_load_only_once_a_due_alarm_would_be_raised(tmp_path: Path) -> None:
+    """The delay of ``over_temperature`` is 10 s."""
+    hot = [(float(t), 0.0, 3.8, 70.0, 0) for t in range(20)]
+    assert not any((await run(tmp_path / "first", hot, until=lambda a: a["over_temperature"].active)).relay)
+    folder = tmp_path / "second"
+    assert all((await run(folder, NORMAL)).relay)
+    assert not any((await run(folder, hot, until=lambda a: a["over_temperature"].active)).relay)
 
 
 async def test_a_hook_that_is_added_before_a_restart_acts_on_a_raised_alarm(folder: Path) -> None:
@@ -516,7 +538,7 @@ async def test_a_signal_acknowledges_the_alarms_of_all_packs(folder: Path, tmp_p
 
 
 def alarm_state(**acknowledged: bool) -> str:
-    return json.dumps({name: {"acknowledged": flag} for name, flag in acknowledged.items()})
+    return json.dumps({name: {"acknowledged": flag, "gone": flag} for name, flag in acknowledged.items()})
 
 
 def test_only_what_a_restart_would_lack_is_saved_at_once() -> None:
@@ -527,5 +549,8 @@ def test_only_what_a_restart_would_lack_is_saved_at_once() -> None:
     assert lacks_alarm("{}", '{"silence": "no samples"}')
     assert not lacks_alarm(alarm_state(a=False, b=False), alarm_state(b=False))
     assert not lacks_alarm(alarm_state(a=False), "")
+    gone, returned = (json.dumps({"a": {"acknowledged": False, "gone": flag}}) for flag in (True, False))
+    assert lacks_alarm(gone, returned)
+    assert not lacks_alarm(returned, gone)
     assert lacks_alarm("", '{"pending": ["a"]}')
     assert not lacks_alarm('{"pending": ["a"]}', "")

@@ -550,7 +550,7 @@ def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_samples_arr
     after.restore(before.saved_state)
     after.on_silence(0.0, WALL_S, "")
     assert "pack_over_voltage" in after.unwatched_critical, "no sample has come since the restart"
-    add_samples(after, 0.0, 10.0)
+    add_samples(after, *range(11))
     after.on_silence(0.0, WALL_S, "")
     changed = {change.alarm.name: change for change in after.changes()}
     assert (changed["pack_over_voltage"].field, changed["pack_over_voltage"].alarm.watched) == ("watched", True)

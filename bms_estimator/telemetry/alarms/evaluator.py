@@ -87,7 +87,9 @@ class AlarmEvaluator:
         self._inputs, self._silence_limit_s = inputs, silence_limit_s
         self._bounds, self._input_faults, self._probe_faults = bounds, FaultTexts(), ProbeFaults()
         self._silence_reason = ""  # reason why no samples arrive; empty while they do
-        self._resumed_s: float | None = None  # time of the first sample after the silence; None: none yet
+        self._watched_s: float | None = (
+            None  # duration of the samples since the start or the last silence, without gaps
+        )
         self._sample_intervals = SampleIntervals(gap_s)
         self._estimates, self._cells = EstimateAlarms(self._alarms, charging_a, gap_s), CellAlarms(self._alarms)
         self._buffer = SampleBuffer()
@@ -95,6 +97,14 @@ class AlarmEvaluator:
         self._at_s = 0.0  # time of the last sample
         self._faulty_s = -math.inf  # time of the last sample with a fault of the input
         self.saved_state = ""
+
+    @property
+    def is_watching(self) -> bool:
+        """True if samples have arrived for ``lost_s`` since the start or a silence, and no delay of a critical alarm runs.
+
+        A relay may only then follow the alarms, because before that a due alarm may not be raised yet.
+        """
+        return (self._watched_s or 0.0) >= self._inputs.lost_s and not self._alarms.pending
 
     @property
     def rows(self) -> int:
@@ -169,9 +179,9 @@ class AlarmEvaluator:
         """
         is_silent = silent_s >= self._silence_limit_s
         if is_silent:
-            self._resumed_s = None
+            self._watched_s = None
         elif self._silence_reason:  # alarms are raised before it ends, so that a relay does not close in between
-            is_silent = self._resumed_s is None or self._at_s - self._resumed_s < self._inputs.lost_s
+            is_silent = not self.is_watching
         if is_silent != bool(self._silence_reason):
             self._silence_reason = (reason or "no samples arrive") if is_silent else ""
             self._update_unwatched(self._at_s)
@@ -319,8 +329,9 @@ class AlarmEvaluator:
         """
         times_s = samples["time_s"]
         self._at_s = float(times_s[-1])
-        self._resumed_s = float(times_s[0]) if self._resumed_s is None else min(self._resumed_s, self._at_s)
         passed_s, observed_s = self._sample_intervals.measure(times_s)
+        # the interval before the first sample is a part of the silence
+        self._watched_s = float(observed_s[1:].sum() if self._watched_s is None else self._watched_s + observed_s.sum())
         samples, cells, unusable = self._without_impossible(samples, cells)
         has_probe_fault = (samples["status"] & SampleStatus.PROBE_FAULT) != 0
         for name, series in measured_values(samples, cells, self._charging_a).items():
