@@ -52,7 +52,11 @@ CAPTURES: dict[str, tuple[list[Line], dict[str, Any], list[tuple[float, bool]]]]
     ),
     "discharge_over_current": ([Line(30), Line(20, current_a=55.0), Line(80)], {}, [(40.0, True)]),
     "charge_over_current": ([Line(30), Line(20, current_a=-11.0), Line(80)], {}, [(40.0, True)]),
-    "over_temperature": ([Line(30), Line(20, temperature_c=61.0), Line(80)], {}, [(40.0, True), (110.0, False)]),
+    "over_temperature": (
+        [Line(30), Line(20, temperature_c=61.0), Line(40, temperature_c=57.0), Line(80, temperature_c=53.0)],
+        {},
+        [(40.0, True), (150.0, False)],
+    ),
     "under_temperature": ([Line(30), Line(20, temperature_c=-21.0), Line(80)], {}, [(40.0, True), (110.0, False)]),
     "charging_below_freezing": (
         [Line(30, temperature_c=-5.0), Line(20, temperature_c=-5.0, current_a=-2.0), Line(30, temperature_c=-5.0)],
@@ -99,10 +103,12 @@ async def test_one_hot_probe_of_four_raises_the_alarm_and_is_named(tmp_path: Pat
     lines = [
         *rise,
         Line(20, temperatures_c=(25.0, 97.0, 25.0, 25.0)),
+        *(Line(1, temperatures_c=(25.0, 97.0 - 0.5 * n, 25.0, 25.0)) for n in range(94)),
         Line(70, temperatures_c=(25.0, 50.0, 25.0, 25.0)),
     ]
     result = await replayed(record(tmp_path / "capture.bms", lines), settings())
-    assert result.transitions("over_temperature") == [(15.0, True), (90.0, False)]  # above 60 degC from 5 s to 30 s
+    # above 60 degC from 5 s on, below 55 degC from 115 s on
+    assert result.transitions("over_temperature") == [(15.0, True), (175.0, False)]
     texts = [
         change.alarm.text for change in result.changes if change.alarm.name == "sensor_fault" and change.alarm.active
     ]
@@ -577,6 +583,18 @@ async def test_a_pack_stays_hot_over_a_restart_while_the_probe_that_was_hot_is_f
     cool = record(tmp_path / "three.bms", [Line(100, temperatures_c=(25.0, 26.0))])
     cooled = await replayed(cool, settings(), saved_state=after.saved_state, begin_s=WALL_S + 2000.0)
     assert [active for _, active in cooled.transitions("over_temperature")] == [False]
+
+
+@pytest.mark.parametrize("others_c", [(), (30.0,)])
+async def test_a_pack_stays_hot_while_the_hot_probe_reads_cold_sooner_than_it_can_cool(
+    tmp_path: Path, others_c: tuple[float, ...]
+) -> None:
+    heating = [Line(1, temperatures_c=(*others_c, 30.0 + 10.0 * second)) for second in range(4)]
+    lines = [*heating, Line(20, temperatures_c=(*others_c, 60.0)), Line(120, temperatures_c=(*others_c, 0.0))]
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings())
+    assert result.transitions("over_temperature") == [(13.0, True)]
+    texts = [change.alarm.text for change in result.changes if change.alarm.name == "sensor_fault"]
+    assert any(f"probe {len(others_c) + 1} reads 0 °C" in text for text in texts)
 
 
 def test_an_acknowledged_over_temperature_ends_although_a_probe_is_faulty() -> None:

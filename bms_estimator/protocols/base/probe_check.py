@@ -15,6 +15,15 @@ NEAR_K = 10.0
 """Maximum change to a reading of ``OPEN_OR_SHORT_C`` that is accepted [K]."""
 RATE_K_PER_S = 20.0
 """Maximum rate of a probe [K/s]. In thermal runaway a probe on a cell rises by several K/s."""
+HOT_C = 45.0
+"""Temperature above which a fall is checked [C]. It is the usual limit of charging; cells are seldom hotter."""
+SUSTAINED_S = 10.0
+"""Time for which a probe must have been hot [s], the default delay of ``over_temperature``. Glitches are shorter."""
+COOLING_K_PER_S = 0.5
+"""Maximum rate at which a hot probe cools [K/s]. A cell of 70 J/K loses 5 W to forced air, and cools by less than 0.1 K/s. The
+margin is for probes on busbars and transistors."""
+COOLING_TOLERANCE_K = 5.0
+"""Maximum reading below that cooling [K], for noise and resolution."""
 MAX_DEVIATION_K = 30.0
 """Maximum difference of a sound probe from the median of all probes [K]. The project's choice, twice the usual difference
 between the cells of a pack."""
@@ -112,15 +121,30 @@ class _Probe:
         self.credible_c, self.was_faulty = math.nan, False
         self._credible_s = 0.0
         self._doubted_c = math.nan  # previous reading if it was not credible
+        self._hot_c, self._hot_s = -math.inf, 0.0  # last temperature above ``HOT_C`` that was sustained, and its time
+        self._rise_c, self._rise_s = math.inf, 0.0  # lowest of the hotter readings since then, time of the first
 
     def is_credible(self, time_s: float, reading_c: float) -> bool:
         """Return True if a reading is possible. An impossible change needs confirmation by the next reading."""
-        possible = self._is_possible(time_s, reading_c)
+        cooled_c = self._hot_c - COOLING_K_PER_S * (time_s - self._hot_s)
+        possible = self._is_possible(time_s, reading_c) and reading_c >= cooled_c - COOLING_TOLERANCE_K
         if possible:
             self.credible_c, self._credible_s, self._doubted_c = reading_c, time_s, math.nan
+            self._follow_heat(time_s, reading_c, cooled_c)
         elif not math.isnan(reading_c):
             self._doubted_c = reading_c
         return possible
+
+    def _follow_heat(self, time_s: float, reading_c: float, cooled_c: float) -> None:
+        """Update the sustained temperature. ``cooled_c`` is the lowest one to which the probe can have cooled since then [C]."""
+        if reading_c <= max(HOT_C, cooled_c):
+            self._rise_c = math.inf
+            return
+        if math.isinf(self._rise_c):
+            self._rise_s = time_s
+        self._rise_c = min(self._rise_c, reading_c)
+        if time_s - self._rise_s >= SUSTAINED_S:
+            self._hot_c, self._hot_s, self._rise_c = self._rise_c, time_s, math.inf
 
     def _is_possible(self, time_s: float, reading_c: float) -> bool:
         change_k = reading_c - self.credible_c

@@ -85,6 +85,36 @@ def test_a_sample_after_a_long_gap_may_have_any_plausible_temperature() -> None:
     assert probes.check(60.0, [75.0]).highest_c == 75.0
 
 
+@pytest.mark.parametrize("others_c", [[], [30.0]])
+def test_a_hot_probe_is_faulty_until_it_can_have_cooled_to_its_reading(others_c: list[float]) -> None:
+    results = check_each_second(*[[*others_c, 70.0]] * 20, *[[*others_c, 0.0]] * 200)
+    faulty_s = [second for second, result in enumerate(results) if result.faulty[-1] and second >= 20]
+    assert faulty_s[0] == 20
+    assert faulty_s[-1] == pytest.approx(19 + (70.0 - 5.0) / 0.5, abs=11.0)  # the sustained 70 degC are up to 10 s old
+    assert faulty_s == list(range(20, faulty_s[-1] + 1))
+
+
+def test_a_hot_probe_cools_through_a_gap() -> None:
+    probes = ProbeCheck()
+    for second in range(20):
+        probes.check(float(second), [70.0])
+    assert probes.check(60.0, [20.0]).faulty == (True,)
+    assert probes.check(150.0, [20.0]) == CheckedProbes(20.0, 20.0, 20.0, (False,))
+
+
+def test_a_probe_that_heats_up_and_cools_is_credible() -> None:
+    rise_c = [25.0 + 2.0 * second for second in range(30)]
+    cooling_c = [rise_c[-1] - 0.5 * second for second in range(120)]
+    results = check_each_second(*([reading_c + second % 3] for second, reading_c in enumerate(rise_c + cooling_c)))
+    assert not any(result.faulty[0] for result in results)
+
+
+@pytest.mark.parametrize("usual_c", [25.0, 46.0, 60.0])
+def test_glitches_of_a_few_samples_do_not_count_as_hot(usual_c: float) -> None:
+    results = check_each_second(*[[usual_c]] * 30, *[[usual_c + 29.0]] * 5, *[[usual_c]] * 30)
+    assert not any(result.faulty[0] for result in results)
+
+
 @given(
     st.lists(st.lists(st.floats(), max_size=6), max_size=30),
     st.lists(st.floats(min_value=-10.0, max_value=100.0), min_size=30, max_size=30),
