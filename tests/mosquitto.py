@@ -55,6 +55,11 @@ class Broker:
             time.sleep(0.02)
         raise AssertionError("mosquitto did not start")
 
+    def reload(self) -> None:
+        """Make the server read its access list again."""
+        assert self._process
+        self._process.send_signal(signal.SIGHUP)
+
     def freeze(self) -> None:
         """Suspend the server, so that it answers nothing while the kernel still accepts connections."""
         assert self._process

@@ -158,7 +158,7 @@ class BlockStore:
                 self._unacknowledged |= {number for number, _ in page.blocks}
                 return [QueuedMessage(number, self._message(number, data)) for number, data in page.blocks]
 
-    def acknowledge(self, number: int) -> None:
+    def acknowledge(self, number: int, rejection: str = "") -> None:  # noqa: ARG002
         """Record that the broker has acknowledged a block. It stays stored, because the server may still lose it."""
         self._unacknowledged.discard(number)
 

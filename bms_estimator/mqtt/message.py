@@ -1,6 +1,10 @@
 """Messages for a broker."""
 
+from collections.abc import Callable
 from typing import NamedTuple
+
+OnResult = Callable[[str], object]
+"""Callback for the result of a message: the reason why the message was rejected or lost, or "" if it was acknowledged."""
 
 
 class Message(NamedTuple):

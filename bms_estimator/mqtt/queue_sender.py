@@ -34,8 +34,8 @@ class MessageQueue(Protocol):
     async def take(self, most: int) -> Sequence[QueuedMessage]:
         """Wait for a message, then return up to ``most`` of the oldest that were not returned since ``rewind``."""
 
-    def acknowledge(self, number: int) -> None:
-        """Record that the broker has acknowledged a message."""
+    def acknowledge(self, number: int, rejection: str = "") -> None:
+        """Record that the broker has acknowledged a message, or the reason why it has permanently rejected the message."""
 
     def rewind(self) -> None:
         """Make ``take`` return all unacknowledged messages again, in order, after a lost connection."""
@@ -120,7 +120,7 @@ class QueueSender:
         if rejection is not None and rejection.is_retryable:
             return False
         self._rejected += rejection is not None
-        self._outbox.acknowledge(queued.number)
+        self._outbox.acknowledge(queued.number, rejection.reason if rejection else "")
         self._update_stats()
         self._acknowledged.set()
         return True

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 import structlog
 
 from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.mqtt.message import OnResult
 from bms_estimator.process.backoff import Backoff
 from bms_estimator.service.hook import Hook
 from bms_estimator.service.hook_process import StartError, program_environment, run_program
@@ -19,8 +20,8 @@ from bms_estimator.settings.alarms import AlarmHook, HookEvent
 FIRST_RETRY_S = 0.5
 """First delay before the retry of a program that could not be started [s]. Each retry doubles the delay, up to 30 s."""
 
-PublishRaw = Callable[[str, bytes], None]
-"""Publishes a payload on a topic."""
+PublishRaw = Callable[[str, bytes, OnResult], None]
+"""Publishes a payload on a topic, and calls back with the result."""
 
 State = Literal["raised", "cleared"]
 _ANY = ""
@@ -212,7 +213,7 @@ class CommandHook(JobHook):
 
 
 class PublishHook(JobHook):
-    """Publishes a message.
+    """Publishes a message. The job is done once the broker has acknowledged the message.
 
     Args:
         settings: Settings of the hook.
@@ -224,13 +225,46 @@ class PublishHook(JobHook):
     def __init__(self, settings: AlarmHook, device: str, topic: str, publish: PublishRaw) -> None:
         super().__init__(settings, device)
         self._topic, self._publish = topic, publish
+        self._backoff = Backoff(FIRST_RETRY_S)
+        self._unfinished: set[asyncio.Task[None]] = set()  # one task for each message without a final result
 
     @property
     def description(self) -> str:
         """Description with the topic."""
         return f"publish on {self._topic}"
 
+    @property
+    def is_busy(self) -> bool:
+        """True while a job is waiting, or a message is not acknowledged."""
+        return super().is_busy or bool(self._unfinished)
+
     async def _run_job(self, job: Job) -> bool:
-        self._publish(self._topic, Template(self.settings.payload).substitute(self._fields(job)).encode())
-        self._succeed()
+        """Queue the message at once, so that a shutdown saves it, and await its result in a task."""
+        result: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        payload = Template(self.settings.payload).substitute(self._fields(job)).encode()
+        self._publish(self._topic, payload, result.set_result)
+        task = asyncio.create_task(self._await_result(job, result), name="alarm hook message")
+        self._unfinished.add(task)
+        task.add_done_callback(self._unfinished.discard)
         return True
+
+    async def _await_result(self, job: Job, result: asyncio.Future[str]) -> None:
+        """Await the result of a message. Repeat the job of a rejected or lost message, unless its alarm has changed."""
+        if not (await asyncio.wait([result], timeout=self.settings.timeout_s))[0]:
+            self._fail_with_log(
+                job, f"not acknowledged by the broker within {self.settings.timeout_s:g} s; still queued"
+            )
+            await asyncio.wait([result])  # unlike awaiting the future, this does not cancel it at a shutdown
+        if reason := result.result():
+            self._fail_with_log(job, f"not delivered: {reason}")
+            await asyncio.sleep(self._backoff.next_s())
+            self._jobs.put_back(job)
+            self._wake.set()
+        else:
+            self._succeed()
+            self._backoff.reset()
+
+    def _fail_with_log(self, job: Job, error: str) -> None:
+        if error != self.error:  # each retry of a denied message fails
+            log.warning("alarm hook: a message is not delivered", hook=self.description, reason=error)
+        self._fail(job, error)

@@ -119,7 +119,9 @@ class AlarmHook(Strict):
         default=None, description="program to run and its arguments; no shell is used"
     )
     timeout_s: Annotated[float, Field(gt=0, le=3600)] = Field(
-        default=10.0, description="time after which the program and its child processes are killed"
+        default=10.0,
+        description="time after which the program and its child processes are killed, or after which a message that the "
+        "broker has not acknowledged makes the hook fail",
     )
     pass_environment: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = Field(
         default=(), description="names of further environment variables of the service that are passed to the program"

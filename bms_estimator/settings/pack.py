@@ -125,7 +125,7 @@ class StoreSettings(Strict):
 
     outbox_messages: Annotated[int, Field(ge=1, le=10_000_000)] = Field(
         default=90_000,
-        description="maximum number of queued estimates and events; the default is a day of estimates at 1 Hz. A full queue drops its oldest message",
+        description="maximum number of queued estimates and events; the default is a day of estimates at 1 Hz. A full queue drops its oldest message, and messages of hooks last",
     )
     history_days: Annotated[int, Field(ge=0, le=36_600)] = Field(
         default=366, description="length of the stored history [days]; 0: no history"

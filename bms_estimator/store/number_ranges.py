@@ -43,13 +43,15 @@ class NumberRanges:
             self._ranges.append(range(number, number + 1))
         self._count += 1
 
-    def pop(self) -> int:
-        """Remove and return the lowest number."""
-        lowest = self._ranges.popleft()
-        if len(lowest) > 1:
-            self._ranges.appendleft(lowest[1:])
+    def remove(self, number: int) -> None:
+        """Remove a number, which must be present."""
+        i = next(i for i, each in enumerate(self._ranges) if number in each)
+        whole = self._ranges[i]
+        del self._ranges[i]
+        for part in (range(number + 1, whole.stop), range(whole.start, number)):
+            if part:
+                self._ranges.insert(i, part)
         self._count -= 1
-        return lowest.start
 
     def take_before(self, end: int) -> "NumberRanges":
         """Remove and return all numbers below ``end``."""

@@ -10,7 +10,7 @@ import contextlib
 from collections import deque
 from typing import Self
 
-from bms_estimator.mqtt.message import Message, QueuedMessage
+from bms_estimator.mqtt.message import Message, OnResult, QueuedMessage
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox_queue import PAGE, OutboxQueue
 from bms_estimator.store.outbox_table import OutboxResult, OutboxTransaction, read_backlog
@@ -29,7 +29,8 @@ class Outbox:
 
     Args:
         database: Database for messages during an outage; None: memory only.
-        max_messages: Maximum number of queued messages; beyond it the oldest one not in flight is dropped.
+        max_messages: Maximum number of queued messages; beyond it the oldest one not in flight is dropped. Messages with
+            an ``on_result`` are dropped last.
 
     Attributes:
         connected: True if a broker is connected, as set by the sender.
@@ -71,11 +72,11 @@ class Outbox:
         self._sync_requested.set()
         await self._task
 
-    def put(self, message: Message) -> None:
-        """Queue a message without waiting for the disk."""
+    def put(self, message: Message, on_result: OnResult | None = None) -> None:
+        """Queue a message without waiting for the disk. ``on_result`` receives its result, unless this process ends before."""
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
-        self._queue.put(message)
+        self._queue.put(message, on_result)
         self._wake_taker()
 
     async def take(self, most: int) -> list[QueuedMessage]:
@@ -88,9 +89,9 @@ class Outbox:
             self._sync_requested.set()
         return taken
 
-    def acknowledge(self, number: int) -> None:
-        """Record that the broker has acknowledged a message."""
-        self._queue.acknowledge(number)
+    def acknowledge(self, number: int, rejection: str = "") -> None:
+        """Record that the broker has acknowledged a message, or the reason why it has permanently rejected the message."""
+        self._queue.acknowledge(number, rejection)
 
     def rewind(self) -> None:
         """Make ``take`` return all unacknowledged messages again, in order, after a lost connection."""

@@ -5,11 +5,11 @@ disk only), or in the tail. New messages enter the tail. While no message is sto
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain
 
-from bms_estimator.mqtt.message import Message, QueuedMessage
+from bms_estimator.mqtt.message import Message, OnResult, QueuedMessage
 from bms_estimator.store.number_ranges import NumberRanges
 
 MAX_TAIL = 4096
@@ -28,6 +28,7 @@ class OutboxQueue:
 
     Attributes:
         max_messages: Maximum number of queued messages. Beyond this number, the oldest message that is not in flight is dropped.
+        on_result: Callbacks of the messages whose result is awaited, by number. These messages are dropped last.
         dropped: Number of dropped and lost messages.
         next_number: Number of the next message.
         in_flight: Messages that were taken and are not acknowledged yet.
@@ -38,6 +39,7 @@ class OutboxQueue:
     """
 
     max_messages: int
+    on_result: dict[int, OnResult] = field(default_factory=dict)
     dropped: int = 0
     next_number: int = 0
     in_flight: dict[int, QueuedMessage] = field(default_factory=dict)
@@ -71,15 +73,16 @@ class OutboxQueue:
         """True if the next page should be read from disk."""
         return bool(self.stored) and len(self._ready) < PAGE // 2
 
-    def put(self, message: Message) -> None:
-        """Append a message."""
+    def put(self, message: Message, on_result: OnResult | None = None) -> None:
+        """Append a message, whose result ``on_result`` receives."""
+        if on_result:
+            self.on_result[self.next_number] = on_result
         self._tail.append(QueuedMessage(self.next_number, message))
         self.next_number += 1
         if self.waiting > self.max_messages:
             self._drop_oldest()
         if len(self._tail) > MAX_TAIL:
-            self._forget(self._tail.popleft().number)
-            self.dropped += 1
+            self._drop_oldest(only_tail=True)
 
     def take_next(self, most: int) -> list[QueuedMessage]:
         """Return up to ``most`` of the oldest messages in memory, which are then in flight."""
@@ -89,10 +92,11 @@ class OutboxQueue:
         self.in_flight |= {queued.number: queued for queued in taken}
         return taken
 
-    def acknowledge(self, number: int) -> None:
-        """Record that a message is acknowledged."""
+    def acknowledge(self, number: int, rejection: str = "") -> None:
+        """Record that a message is acknowledged, or the reason why it is permanently rejected."""
         if self.in_flight.pop(number, None):
             self._forget(number)
+            self._report(number, rejection)
 
     def rewind(self) -> None:
         """Make the messages in flight ready again."""
@@ -126,7 +130,7 @@ class OutboxQueue:
         read = {queued.number: queued for queued in rows if queued.number in wanted}
         self._ready.extend(read.values())
         self._written.update(read)
-        self._count_lost(len(wanted) - len(read))
+        self._count_lost(wanted, read)
 
     def prepend_backlog(self, ranges: NumberRanges) -> int:
         """Insert messages that an earlier run left on disk before all messages of this run.
@@ -143,6 +147,7 @@ class OutboxQueue:
             return -first  # in an empty table, numbers begin at 0
         span = ranges.end - ranges.first
         self._tail = deque(QueuedMessage(queued.number + span, queued.message) for queued in self._tail)
+        self.on_result = {number + span: on_result for number, on_result in self.on_result.items()}
         self.next_number += span
         self.stored = ranges.shifted(first - ranges.first)
         for _ in range(self.waiting - self.max_messages):
@@ -151,9 +156,8 @@ class OutboxQueue:
 
     def retain_stored(self, ranges: NumberRanges) -> None:
         """Remove the stored messages that are not in ``ranges``, and count them as lost."""
-        before = len(self.stored)
-        self.stored = self.stored.intersection(ranges)
-        self._count_lost(before - len(self.stored))
+        before, self.stored = self.stored, self.stored.intersection(ranges)
+        self._count_lost(before, self.stored)
 
     def gaps(self) -> list[tuple[int, int]]:
         """Return ranges of numbers that are no longer queued, as half-open intervals."""
@@ -174,20 +178,40 @@ class OutboxQueue:
             self._written.discard(number)
             self.has_stale_rows = True
 
-    def _count_lost(self, count: int) -> None:
-        """Count stored messages that cannot be read. Their rows may still exist and are deleted later."""
-        if count:
+    def _report(self, number: int, reason: str) -> None:
+        """Pass the result of a message to its callback, if it has one."""
+        if on_result := self.on_result.pop(number, None):
+            on_result(reason)
+
+    def _count_lost(self, stored: NumberRanges, remaining: Collection[int] | NumberRanges) -> None:
+        """Count the stored messages that do not remain. Their rows may still exist and are deleted later."""
+        if count := len(stored) - len(remaining):
             self.dropped += count
             self.has_stale_rows = True
+        for number in [each for each in self.on_result if each in stored and each not in remaining]:
+            self._report(number, "lost because the disk is damaged")
 
-    def _drop_oldest(self) -> None:
-        if self._ready:
-            self._forget(self._ready.popleft().number)
-        elif self.stored:
-            self.stored.pop()
-            self.has_stale_rows = True
-        elif self._tail:
-            self._forget(self._tail.popleft().number)
-        else:
+    def _drop_oldest(self, *, only_tail: bool = False) -> None:
+        """Drop the oldest message that is not in flight, if possible one whose result is not awaited."""
+        number = next((each for each in self._droppable(only_tail) if each not in self.on_result), None)
+        if number is None:
+            number = next(self._droppable(only_tail), None)
+        if number is None:
             return
+        if number in self.stored:
+            self.stored.remove(number)
+            self.has_stale_rows = True
+        for messages in (self._ready, self._tail):
+            if dropped := next((each for each in messages if each.number == number), None):
+                messages.remove(dropped)
+                self._forget(number)
+                break
         self.dropped += 1
+        self._report(number, "dropped because the queue is full")
+
+    def _droppable(self, only_tail: bool) -> Iterator[int]:
+        """Iterate over the numbers of the messages that are not in flight, the oldest first."""
+        if not only_tail:
+            yield from (queued.number for queued in self._ready)
+            yield from chain.from_iterable(self.stored)
+        yield from (queued.number for queued in self._tail)

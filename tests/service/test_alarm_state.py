@@ -37,6 +37,7 @@ from tests.checkpoint.test_identity import CHECKPOINT_FILE
 from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
+from tests.service.test_alarm_hooks import acknowledge_in
 
 OVER_VOLTAGE = [(float(t), 0.0, 4.4 if t < 5 else 3.8, 25.0, 0) for t in range(20)]
 """Samples that raise ``pack_over_voltage``, whose cause is then gone: it is latched."""
@@ -104,7 +105,7 @@ async def run(
     hooks = AlarmHooks(
         [AlarmHook.model_validate(table) for table in (*HOOKS, *added_hooks)],
         "pack",
-        lambda _, payload: messages.append(payload.decode()),
+        acknowledge_in(messages),
         board,
     )
     requests = RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",))

@@ -33,9 +33,7 @@ def test_operations_agree_with_those_of_sets(some: set[int], other: set[int], en
     rest = ranges_of(some)
     assert numbers_in(rest.take_before(end)) == {number for number in some if number < end}
     assert numbers_in(rest) == {number for number in some if number >= end}
-
-
-def test_pop_returns_the_lowest_number() -> None:
-    ranges = ranges_of({1, 2, 5})
-    assert (ranges.first, ranges.end, [ranges.pop() for _ in range(3)]) == (1, 6, [1, 2, 5])
-    assert not ranges
+    for number in some & other:
+        rest = ranges_of(some)
+        rest.remove(number)
+        assert numbers_in(rest) == some - {number}

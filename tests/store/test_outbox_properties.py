@@ -22,6 +22,7 @@ from bms_estimator.store.outbox import Outbox
 
 PAGE = 4
 """Size of a page of the queue [messages]; small, so that the tests read many pages."""
+FULL = "dropped because the queue is full"
 OPERATIONS = st.lists(st.sampled_from(["put", "take", "acknowledge first", "acknowledge last", "rewind"]), max_size=5)
 
 
@@ -56,6 +57,7 @@ class OutboxMachine(RuleBasedStateMachine):
         pending: Numbers that the broker must still receive, in order.
         in_flight: Numbers in flight, with their queue numbers.
         on_disk: Numbers that must be on disk since the last write.
+        results: Results of the messages that this process has put, by number. Each third message awaits its result.
         strict: True while order and counts are checked. A disk fault ends it until the next restart.
     """
 
@@ -72,6 +74,7 @@ class OutboxMachine(RuleBasedStateMachine):
         self.in_flight: dict[int, int] = {}
         self.on_disk: set[int] = set()
         self.acknowledged: set[int] = set()
+        self.results: dict[int, list[str]] = {}
         self.strict = True
 
     @initialize(max_messages=st.sampled_from([6, 15, 10_000]))
@@ -92,12 +95,19 @@ class OutboxMachine(RuleBasedStateMachine):
     @rule(count=st.integers(1, 9))
     def put(self, count: int) -> None:
         for _ in range(count):
-            self.outbox.put(Message("t", str(self.next_number).encode(), 1, retain=False))
-            self.pending.append(self.next_number)
+            number = self.next_number
             self.next_number += 1
+            if number % 3 == 0:
+                self.results[number] = []
+            message = Message("t", str(number).encode(), 1, retain=False)
+            self.outbox.put(message, self.results[number].append if number in self.results else None)
+            self.pending.append(number)
             if len(self.pending) > self.max_messages:
-                self.pending.remove(next(number for number in self.pending if number not in self.in_flight))
+                droppable = [number for number in self.pending if number not in self.in_flight]
+                dropped = min(droppable, key=lambda number: number in self.results)
+                self.pending.remove(dropped)
                 self.dropped_count += 1
+                assert self.results.get(dropped, [FULL]) == [FULL]
 
     @precondition(lambda self: len(self.pending) > len(self.in_flight) and len(self.in_flight) < 5)
     @rule(most=st.integers(1, 3))
@@ -127,6 +137,7 @@ class OutboxMachine(RuleBasedStateMachine):
         self.outbox.acknowledge(self.in_flight.pop(number))
         self.pending.remove(number)
         self.acknowledged.add(number)
+        assert self.results.get(number, [""]) == [""]
 
     @rule()
     def rewind(self) -> None:
@@ -190,11 +201,13 @@ class OutboxMachine(RuleBasedStateMachine):
         if self.strict:
             assert [number for number in stored if number in self.pending] == [n for n in self.pending if n in stored]
         self.pending, self.on_disk, self.in_flight, self.strict = stored, set(stored), {}, True
+        self.results = {}
         self.open()
 
     @invariant()
     def counts_agree(self) -> None:
         if hasattr(self, "outbox") and self.strict:
+            assert all(self.results[number] == [] for number in self.pending if number in self.results)
             assert self.outbox.waiting == len(self.pending)
             assert self.outbox.dropped == self.dropped_count
 

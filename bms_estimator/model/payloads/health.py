@@ -52,10 +52,10 @@ class EdgeHealth(Payload):
 class HookHealth(Payload):
     """Alarm hooks, since start."""
 
-    done: int = Field(description="programs that ended with exit code 0, and published messages")
+    done: int = Field(description="programs that ended with exit code 0, and messages that the broker has acknowledged")
     failures: int = Field(
-        description="failed runs: a program that was not started, was killed or returned another exit code, or a relay level that the board "
-        "rejected or that a reset undid"
+        description="failed runs: a program that was not started, was killed or returned another exit code, a message that the "
+        "broker denied or did not acknowledge in time, or a relay level that the board rejected or that a reset undid"
     )
     failing: list[str] = Field(description="hooks whose last run failed, with the reason")
     relay_resets: Annotated[int, Quantity(prometheus="counter")] = Field(

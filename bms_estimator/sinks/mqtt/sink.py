@@ -18,7 +18,7 @@ from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, ReceivedMessage
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.denied_topics import DeniedTopics
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.message import Message, OnResult
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.queue_sender import QueueSender
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
@@ -110,9 +110,9 @@ class MqttSink:
         self._unsent = self._last = snapshot
         self._wake.set()
 
-    def publish_raw(self, topic: str, payload: bytes) -> None:
-        """Publish a message of another component at QoS 1, queued during an outage like states."""
-        self._outbox_sender.put([Message(topic, payload, 1, retain=False)])
+    def publish_raw(self, topic: str, payload: bytes, on_result: OnResult) -> None:
+        """Publish a message of another component at QoS 1, queued during an outage like states, and report its result."""
+        self._outbox_sender.put([Message(topic, payload, 1, retain=False)], on_result)
 
     async def __aenter__(self) -> Self:
         """Start connecting to the broker."""
@@ -239,8 +239,8 @@ class OutboxSender(QueueSender):
         super().__init__(outbox, delivery, denied, first_delay_s)
         self._filled = outbox
 
-    def put(self, messages: Iterable[Message]) -> None:
-        """Queue messages until the broker acknowledges them."""
+    def put(self, messages: Iterable[Message], on_result: OnResult | None = None) -> None:
+        """Queue messages until the broker acknowledges them. ``on_result`` receives the result of each."""
         for message in messages:
-            self._filled.put(message)
+            self._filled.put(message, on_result)
         self._update_stats()
