@@ -68,7 +68,7 @@ class SampleStatus(IntFlag):
     CURRENT_HELD = 64
     """The current repeats an earlier measurement. Voltage and temperature are new."""
     WRONG_CLOCK = 128
-    """The time is the arrival time, because the device's clock runs at a wrong rate."""
+    """The time is the arrival time, because the device's clock is wrong."""
     PROBE_FAULT = 256
     """A temperature probe is faulty."""
 

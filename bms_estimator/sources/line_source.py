@@ -133,7 +133,7 @@ class LineSource:
 
     @property
     def clock_fault(self) -> str:
-        """Description of a wrong rate of the device's clock; empty without one."""
+        """Description of a fault of the device's clock; empty without one."""
         return self._decoder.clock_fault
 
     current_zero: None = None

@@ -66,7 +66,7 @@ class Source(Protocol):
 
     @property
     def clock_fault(self) -> str:
-        """Description of a wrong rate of the device's clock; empty without one."""
+        """Description of a fault of the device's clock; empty without one."""
 
     def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks of samples; none of them is empty."""

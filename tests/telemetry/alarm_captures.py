@@ -47,9 +47,10 @@ class Line(NamedTuple):
     silent: bool = False
     """True: the board prints nothing."""
 
-    def text(self) -> bytes:
-        """Return the printed line."""
+    def text(self, time_s: float = math.nan) -> bytes:
+        """Return the printed line, with the board's time unless it is NaN."""
         reading: dict[str, Any] = {"voltage": self.voltage_v, "current": self.current_a}
+        reading |= {} if math.isnan(time_s) else {"time_s": time_s}
         if self.temperatures_c:
             reading["temperatures_c"] = self.temperatures_c
         elif self.temperature_c is not None:
@@ -77,15 +78,22 @@ class ReplayResult:
         return [(round(change.at_s, 3), change.alarm.watched) for change in changes]
 
 
-def record(path: Path, lines: Iterable[Line], period_s: float = 1.0) -> Path:
-    """Write a raw capture of these parts; return its path. ``period_s`` is the time between two printed lines [s]."""
+def record(path: Path, lines: Iterable[Line], period_s: float = 1.0, jitter_s: float = math.nan) -> Path:
+    """Write a raw capture of these parts; return its path.
+
+    Args:
+        path: Path of the capture.
+        lines: Parts of the capture.
+        period_s: Time between two printed lines [s].
+        jitter_s: Amount by which each second printed time is ahead [s]; NaN: no times are printed.
+    """
     arrival_s = 100.0  # any time
     writer = CaptureWriter(path, make_header(settings().sensor))
     writer.write(arrival_s, b"\n")  # the decoder skips all bytes up to the first end of a line
     for line in lines:
-        for _ in range(round(line.seconds / period_s)):
+        for n in range(round(line.seconds / period_s)):
             if not line.silent:
-                writer.write(arrival_s, line.text())
+                writer.write(arrival_s, line.text(arrival_s + jitter_s * (n % 2)))
             arrival_s += period_s
     writer.close()
     return path

@@ -19,6 +19,7 @@ from bms_estimator.model.events import events
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
+from bms_estimator.protocols.base.device_clock import MAX_LEAD_S
 from bms_estimator.settings.alarm_limits import AlarmDefinition, implausible_limits, monitored_alarms
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
@@ -562,6 +563,24 @@ def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_samples_arr
     assert (changed["pack_over_voltage"].field, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
     assert after.unwatched_critical == ()
     assert "silence" not in json.loads(after.saved_state)
+
+
+@pytest.mark.parametrize("jitter_s", [0.5, 3.0])
+async def test_times_with_jitter_neither_shorten_delays_nor_count_charge_twice(tmp_path: Path, jitter_s: float) -> None:
+    hot_s = 70
+    lines = [Line(hot_s, temperature_c=61.0, current_a=10.0), Line(100, temperature_c=54.0, current_a=10.0)]
+    capture = record(tmp_path / "capture.bms", lines, period_s=0.1, jitter_s=jitter_s)
+    result = await replayed(capture, settings(**WITHOUT_IDENTIFIER))
+    (raised_s, _), (ended_s, _) = result.transitions("over_temperature")
+    assert raised_s == pytest.approx(10.0, abs=MAX_LEAD_S)
+    # these are sample times, which lead the arrivals by a constant
+    assert ended_s == pytest.approx(hot_s + 60.0, abs=2.0 * MAX_LEAD_S)
+    texts = [change.alarm.text for change in result.changes if change.alarm.name == "sensor_fault"]
+    assert any("the times of the source jump again and again" in text for text in texts)
+    (*_, last) = (snapshot.estimate.soc for snapshot in result.snapshots if snapshot.estimate)
+    assert 0.5 - last == pytest.approx(170.0 / 3600.0, abs=2.0 * MAX_LEAD_S / 3600.0)
+    at_once = await replayed(capture, settings(**WITHOUT_IDENTIFIER), at_once=True)
+    assert at_once.transitions("over_temperature") == [(raised_s, True), (ended_s, False)]
 
 
 HEATING = [Line(1, temperatures_c=(25.0, 25.0 + 10.0 * second)) for second in range(5)]

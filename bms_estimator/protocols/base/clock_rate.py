@@ -1,4 +1,4 @@
-"""Check of the rate of a device's clock against the arrival times of its samples."""
+"""Check of a device's clock against the arrival times of its samples: its rate, and repeated jumps."""
 
 import itertools
 from collections import deque
@@ -15,7 +15,14 @@ MIN_DRIFT_S = 2.0
 MAX_SPACING_RATIO = 2.5
 """Maximum ratio of two successive intervals between windows. A larger one shows an outage."""
 RIGHT_STEPS = 3
-"""Number of successive windows without drift after which a clock is usable again."""
+"""Number of successive windows without drift and large jumps after which a clock is usable again."""
+MAX_JUMP_RATE = 0.8
+"""Maximum sum of the jumps in a window per time, if three successive windows exceed it. A clock that is set once jumps in one
+window. Samples at 1 Hz that overtake each other by up to 3 s reach 0.7 in one of three."""
+_JUMPS_TEXT = (
+    "the times of the source jump again and again, and the arrival times are used instead; let only one device send, "
+    "correct its clock, or do not send its times"
+)
 _UNITS = {
     1e3: "milliseconds read as seconds",
     1e6: "microseconds read as seconds",
@@ -43,14 +50,14 @@ class Point(NamedTuple):
 
 
 class ClockRate:
-    """Rate of a device's clock, from the least delayed sample of each window.
+    """Rate of a device's clock, from the least delayed sample of each window, and its jumps.
 
     Jitter and bursts do not change the least delay. A clock that was set changes it once. After an outage, a publisher that
     sends its backlog seems to have a fast clock, but its delay does not fall below the least one before the outage. Only a
     backlog that is being sent at the first sample looks like a fast clock, until all of it is sent.
 
     Attributes:
-        fault: Description of a wrong rate; empty while the clock is usable.
+        fault: Description of a wrong rate or of repeated jumps; empty while the clock is usable.
     """
 
     def __init__(self) -> None:
@@ -59,6 +66,8 @@ class ClockRate:
         self._floor_s = float("inf")  # least delay before ``_points``
         self._open: Point | None = None  # of the present window
         self._begin_s = self._spacing_s = 0.0
+        self._jumps_s = 0.0  # sum of the jumps in the present window
+        self._jumping: deque[bool] = deque(maxlen=RIGHT_STEPS)  # True for each window with large jumps
 
     def add(self, point: Point) -> None:
         """Add a sample to the present window."""
@@ -67,33 +76,39 @@ class ClockRate:
         if self._open is None or point.delay_s <= self._open.delay_s:
             self._open = point
 
-    def on_jump(self) -> None:
-        """Forget the least delay, because the device's clock was set."""
+    def on_jump(self, size_s: float) -> None:
+        """Add a jump to the present window [s]. Forget the least delay, because the device's clock was set."""
         self._floor_s = float("inf")
+        self._jumps_s += size_s
 
     def check(self, arrival_s: float) -> Point | None:
         """Close the present window if it is complete at ``arrival_s`` [s].
 
         Returns:
-            First point with wrong times if a wrong rate is detected now; otherwise None.
+            First point with wrong times if a wrong clock is detected now; otherwise None.
         """
         if self._open is None or arrival_s - self._begin_s < WINDOW_S:
             return None
         point, self._open = self._open, None
+        self._jumping.append(self._jumps_s >= MAX_JUMP_RATE * (arrival_s - self._begin_s))
+        self._jumps_s = 0.0
         if self._points and self._is_outage(point):
             self._restart(point)
-            return None
-        self._points.append(point)
+        else:
+            self._points.append(point)
         if _has_reversed(self._steps_s()):
             self._restart(point)
         steps_s = self._steps_s()
         if self.fault:
             recent = steps_s[-RIGHT_STEPS:]
-            self.fault = self.fault if len(recent) < RIGHT_STEPS or any(recent) else ""
+            self.fault = self.fault if len(recent) < RIGHT_STEPS or any(recent) or any(self._jumping) else ""
         elif self._is_wrong(steps_s):
             first = self._points[0]
             self.fault = _text((point.device_s - first.device_s) / (point.arrival_s - first.arrival_s))
             return first
+        elif len(self._jumping) == RIGHT_STEPS and all(self._jumping):
+            self.fault = _JUMPS_TEXT
+            return self._points[0]
         return None
 
     def _steps_s(self) -> list[float]:

@@ -66,7 +66,7 @@ class DeviceProtocol(ABC):
 
     @property
     def clock_fault(self) -> str:
-        """Description of a wrong rate of the device's clock, whose times are then not used; empty without one."""
+        """Description of a fault of the device's clock, whose times are then not used; empty without one."""
         return ""
 
     @property

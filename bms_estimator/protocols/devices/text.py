@@ -89,7 +89,7 @@ class TextProtocol(DeviceProtocol):
 
     @property
     def clock_fault(self) -> str:
-        """Description of a wrong rate of the times in the lines, which are then not used; empty without one."""
+        """Description of a fault of the times in the lines, which are then not used; empty without one."""
         return self._clock.fault
 
     def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:

@@ -179,7 +179,7 @@ class Replay:
 
     @property
     def clock_fault(self) -> str:
-        """Description of a wrong rate of the device's clock when it was recorded; empty without one and for a table."""
+        """Description of a fault of the device's clock when it was recorded; empty without one and for a table."""
         return self._decoder.clock_fault if self._decoder else ""
 
     async def __aenter__(self) -> Self:

@@ -49,6 +49,23 @@ def test_a_wrong_rate_is_detected_and_arrival_times_are_used(
     assert (faults[99] != "", clock.fault) == (True, "")
 
 
+def test_repeated_jumps_are_a_fault_until_they_end():
+    jitter_s = [3.0, -3.0] * 500
+    stamps = [(n / 10, n / 10 + offset_s) for n, offset_s in enumerate(jitter_s + [0.0] * 1000)]
+    clock, times_s, faults = run(stamps)
+    assert faults[299] == ""
+    assert "jump again and again" in faults[310]
+    assert np.diff(times_s[310:]) == pytest.approx(0.1)
+    assert "jump again and again" in faults[999]
+    assert clock.fault == ""
+
+
+def test_two_devices_that_send_to_one_topic_are_a_fault():
+    for offset_s in (2.0, 40.0, 3600.0):
+        clock, _, _ = run((60 * n, 60 * n + offset_s * (n % 2) * 60) for n in range(20))
+        assert "let only one device send" in clock.fault
+
+
 RNG = np.random.default_rng(1)
 USABLE: dict[str, Stamps] = {
     "drift of 300 ppm": [(s, 1.0003 * s) for s in range(2000)],

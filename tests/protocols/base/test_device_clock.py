@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.protocols.base.device_clock import DeviceClock
+from bms_estimator.protocols.base.device_clock import MAX_LEAD_S, START_S, DeviceClock
 from bms_estimator.protocols.devices.text import TextProtocol
 
 
@@ -59,6 +59,50 @@ def test_sample_time_never_decreases(arrival_steps_and_stamps: list[tuple[float,
         time_s = clock.sample_time(arrival_s, stamp_s)
         assert time_s >= last_s
         last_s = time_s
+
+
+OFFSETS_S: dict[str, list[float]] = {
+    "jitter of 3 s": [0.0, 3.0],
+    "jitter of 0.5 s": [-0.5, 0.5],
+    "saw-tooth of 5 s": [0.1 * n for n in range(50)],
+    "two devices 2 s apart": [0.0, 2.0],
+    "two devices 1 h apart": [0.0, 3600.0],
+    "three devices": [0.0, 4.0, 2.0],
+}
+
+
+@pytest.mark.parametrize("period_s", [0.1, 1.0])
+@pytest.mark.parametrize("offsets_s", OFFSETS_S.values(), ids=OFFSETS_S)
+def test_jumping_timestamps_do_not_make_the_time_run_fast(offsets_s: list[float], period_s: float):
+    clock, arrivals_s = DeviceClock(), [period_s * n for n in range(6000)]
+    times_s = [clock.sample_time(s, s + offset_s) for s, offset_s in zip(arrivals_s, itertools.cycle(offsets_s))]
+    assert times_s[-1] - times_s[600] == pytest.approx(arrivals_s[-1] - arrivals_s[600], abs=MAX_LEAD_S)
+    assert times_s[-1] == pytest.approx(arrivals_s[-1], abs=2.0 * MAX_LEAD_S)
+
+
+@given(
+    steps_s=st.lists(st.sampled_from([0.0, 0.02, 0.1, 1.0, 12.0, 60.0, 4000.0]), min_size=1, max_size=20),
+    offsets_s=st.lists(st.floats(-10.0, 10.0) | st.sampled_from([nan, 3600.0, -1e9]), min_size=1, max_size=40),
+    rate=st.sampled_from([0.0, 0.5, 0.97, 1.0, 1.0003, 1.04, 2.0, 1000.0]),
+)
+def test_no_timestamps_make_the_time_lead_the_arrivals_by_more_than_a_constant(
+    steps_s: list[float], offsets_s: list[float], rate: float
+):
+    clock, arrival_s, start_lead_s = DeviceClock(), 0.0, 0.0
+    for step_s, offset_s in itertools.islice(zip(itertools.cycle(steps_s), itertools.cycle(offsets_s)), 500):
+        lead_s = clock.sample_time(arrival_s, rate * arrival_s + offset_s) - arrival_s
+        assert lead_s <= start_lead_s + MAX_LEAD_S + 1e-6
+        if arrival_s <= START_S:  # a backlog that is being sent at the first sample
+            start_lead_s = max(start_lead_s, lead_s)
+        arrival_s += step_s
+
+
+def test_a_clock_that_is_set_in_a_backlog_leaves_the_samples_their_own_times():
+    clock = DeviceClock()
+    arrivals_s = [s if s < 200 or s > 500 else 501 for s in range(1000)]
+    times_s = [clock.sample_time(float(a), s - (3600.0 if s > 300 else 0.0)) for s, a in enumerate(arrivals_s)]
+    assert [b - a for a, b in itertools.pairwise(times_s)] == [float(s != 300) for s in range(999)]
+    assert (clock.jumps, clock.fault) == (1, "")
 
 
 def test_timestamp_of_a_text_line_gives_the_sample_time():
