@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from bms_estimator.cli.lazy_group import LazyCommand, LazyGroup
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.version import __version__
 
 COMMANDS = {
@@ -178,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit.
 
     Exit codes: 0 success; 1 an internal error (with traceback), a closed stdout, a full or broken disk, or a fault that
-    ``doctor`` found; 2 an error that the user can correct; 130 interrupted.
+    ``doctor`` found; 2 an error that the user can correct; 75 (EX_TEMPFAIL) a fault of the environment that may end; 130 interrupted.
 
     Args:
         arguments: Arguments without the program's name; None: those of the process.
@@ -189,7 +189,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _run(arguments)
     except UserError as error:
-        _exit_with_error(str(error), 1 if _is_disk_fault(error) else 2)
+        _exit_with_error(
+            str(error), 1 if _is_disk_fault(error) else os.EX_TEMPFAIL if isinstance(error, TemporaryError) else 2
+        )
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
         if package not in EXTRAS:

@@ -1,5 +1,6 @@
 """Check of the service: systemd unit installed, running, and the outcome of its last run."""
 
+import os
 from collections.abc import Iterator
 
 from bms_estimator.doctor.finding import Finding, fault, ok, warning
@@ -46,4 +47,6 @@ def describe_unit(unit: SystemdUnit) -> Finding:
 
 def _ending(unit: SystemdUnit) -> str:
     """Return how the last run of a unit ended."""
+    if unit.exit_status == os.EX_TEMPFAIL:
+        return f"a fault of the environment, such as a missing folder or file, or another process (status {unit.exit_status})"
     return f"{unit.result}, status {unit.exit_status}"

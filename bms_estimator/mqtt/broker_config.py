@@ -8,7 +8,7 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from bms_estimator.model.config_file import without_secrets
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.systemd import credential
 from bms_estimator.settings.broker import BrokerSettings
 
@@ -59,7 +59,7 @@ def password(settings: BrokerSettings) -> str | None:
     try:
         return credential(settings.password_file).read_text(encoding="utf-8").rstrip("\r\n")
     except OSError as error:
-        raise UserError(
+        raise TemporaryError(
             f"{section}.password_file = {settings.password_file}: cannot be read: {error.strerror}"
         ) from None
     except UnicodeDecodeError:  # its text would show bytes of the password
@@ -76,7 +76,8 @@ def tls_context(settings: BrokerSettings) -> ssl.SSLContext:
     try:
         context = ssl.create_default_context(cafile=settings.ca_file)
     except OSError as error:  # includes ssl.SSLError
-        raise UserError(f"{section}.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
+        kind = UserError if isinstance(error, ssl.SSLError) else TemporaryError
+        raise kind(f"{section}.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     if settings.cert_file is not None:
         _load_client_certificate(context, settings, settings.cert_file)
@@ -134,7 +135,7 @@ def _load_client_certificate(context: ssl.SSLContext, settings: BrokerSettings, 
         try:
             credential(path).read_bytes()
         except OSError as error:
-            raise UserError(f"{section}.{name} = {path}: cannot be read: {error.strerror}") from None
+            raise TemporaryError(f"{section}.{name} = {path}: cannot be read: {error.strerror}") from None
     try:
         # without a password callback, OpenSSL would prompt on the terminal
         context.load_cert_chain(

@@ -11,7 +11,7 @@ import socket
 from collections.abc import Iterable
 from urllib.parse import urlsplit
 
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.systemd import credential
 from bms_estimator.settings.page import PageSettings
 
@@ -84,7 +84,7 @@ def _token(settings: PageSettings) -> str | None:
     try:
         token = credential(name).read_text(encoding="utf-8").strip()
     except OSError as error:
-        raise UserError(f"page.token_file = {name}: cannot be read: {error.strerror}") from None
+        raise TemporaryError(f"page.token_file = {name}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:  # the text of the error would show bytes of the token
         raise UserError(f"page.token_file = {name}: cannot be read: not UTF-8 text") from None
     if len(token) < MIN_TOKEN_CHARACTERS:

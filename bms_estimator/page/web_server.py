@@ -16,7 +16,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.page.access_control import HEADERS, AccessControl, make_access_control
 from bms_estimator.page.event_stream import LatestValues, Reader
 from bms_estimator.process.listener import CONNECTIONS, Listener
-from bms_estimator.settings.page import ListenAddress, PageSettings
+from bms_estimator.settings.page import PageSettings
 
 PING_S = 5.0
 """Interval of keep-alive events to a silent reader [s]; the page counts the connection as lost after three of them."""
@@ -24,8 +24,6 @@ WRITE_S = 30.0
 """Time without progress after which a reader is disconnected [s]."""
 MAX_STREAMS = 32
 """Maximum number of concurrent event streams."""
-RETRY_S = 10.0
-"""Retry interval of an address that cannot be listened on [s]."""
 COOKIE_S = 31_536_000
 """Lifetime of the cookie, one year [s]."""
 SHUTDOWN_TIMEOUT_S = 1.0
@@ -103,7 +101,6 @@ class WebServer:
         self._streams: dict[Reader, _Stream] = {}
         self._runner: web.AppRunner | None = None
         self._listener: Listener | None = None
-        self._task: asyncio.Task[None] | None = None
 
     @property
     def url(self) -> str:
@@ -126,51 +123,30 @@ class WebServer:
             app.router.add_post(path, handler)
         self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=SHUTDOWN_TIMEOUT_S)
         await self._runner.setup()
+        self._listener = Listener(cast("web.Server", self._runner.server))
+        host, port = self._configured_address.host, self._configured_address.port
+        if self._retry:
+            await self._listener.open_or_retry(host, port, "page", self._on_open)
+            return self
         try:
-            await self._listen(self._runner)
+            self._on_open(await self._listener.open(host, port))
         except OSError as error:
-            if not self._retry:
-                await self._runner.cleanup()
-                raise UserError(
-                    f"page.listen = {_address_text(self._configured_address)}: {error.strerror}; name another one"
-                ) from None
-            log.warning(
-                "the page is not served yet", listen=_address_text(self._configured_address), reason=error.strerror
-            )
-            self._task = asyncio.create_task(self._listen_later(self._runner), name="page")
+            await self._runner.cleanup()
+            raise UserError(f"page.listen = {host}:{port}: {error.strerror}; name another one") from None
         return self
 
     async def __aexit__(self, *_: object) -> None:
         """End all streams and connections, and stop listening."""
-        if self._task:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
         self._latest.close()
         if self._listener:
             await self._listener.close()
         if self._runner:
             await self._runner.cleanup()
 
-    async def _listen(self, runner: web.AppRunner) -> None:
-        """Listen on the address.
-
-        Raises:
-            OSError: The address cannot be listened on.
-        """
-        listener = Listener(cast("web.Server", runner.server))
-        port = await listener.open(self._configured_address.host, self._configured_address.port)
-        self._listener = listener
+    def _on_open(self, port: int) -> None:
         self._listening = self._configured_address._replace(port=port)
         log.info("live page", url=self.url)
         self._on_listening(self.url)
-
-    async def _listen_later(self, runner: web.AppRunner) -> None:
-        while True:
-            await asyncio.sleep(RETRY_S)
-            try:
-                return await self._listen(runner)
-            except OSError:  # the first failure was logged
-                continue
 
     @web.middleware
     async def _exempt_connection(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -261,7 +237,3 @@ async def _protect(_: web.Request, response: web.StreamResponse) -> None:
 def _load_file(file: File) -> _LoadedFile:
     body = file.path.read_bytes()
     return _LoadedFile(body, file.media_type, f'"{hashlib.sha256(body).hexdigest()[:16]}"')
-
-
-def _address_text(listen: ListenAddress) -> str:
-    return f"{listen.host}:{listen.port}"

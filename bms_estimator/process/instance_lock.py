@@ -12,7 +12,7 @@ from pathlib import Path
 
 import structlog
 
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError
 
 ROOT_USER = 0
 """User id of root."""
@@ -42,7 +42,7 @@ def instance_lock(folder: Path, pack: str) -> Iterator[None]:
         pack: Name of the pack.
 
     Raises:
-        UserError: Another process serves the pack.
+        TemporaryError: Another process serves the pack.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as lock:
         try:
@@ -67,7 +67,7 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
     """Bind the name of the lock, unless a service has it.
 
     Raises:
-        UserError: A service has the name.
+        TemporaryError: A service has the name.
         OSError: The system rejects the name.
     """
     name, process_id = _name(folder, pack), None
@@ -92,7 +92,7 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
             return
         process_id = process
         break
-    raise UserError(
+    raise TemporaryError(
         f"{pack}: this pack is served already, by {f'process {process_id}' if process_id else 'another process'}"
     )
 

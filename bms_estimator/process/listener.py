@@ -26,6 +26,8 @@ LOG_S = 60.0
 """Minimum time between two log lines on failed accepts [s]."""
 RETRY_S = 1.0
 """Delay after a failed accept [s]."""
+OPEN_RETRY_S = 10.0
+"""Retry interval of an address that cannot be listened on [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -158,6 +160,7 @@ class Listener:
         self._sockets: list[socket.socket] = []
         self._connecting: set[asyncio.Task[None]] = set()
         self._resuming: dict[socket.socket, asyncio.TimerHandle] = {}
+        self._opening: asyncio.Task[None] | None = None
         self._log_time_s = -LOG_S
 
     async def open(self, host: str, port: int) -> int:
@@ -180,8 +183,33 @@ class Listener:
             self._resume(each)
         return port
 
+    async def open_or_retry(self, host: str, port: int, name: str, on_open: Callable[[int], object] = int) -> None:
+        """Listen. If the address is in use or does not exist yet, log it, return, and retry every ``OPEN_RETRY_S``.
+
+        Args:
+            host: Address.
+            port: Port.
+            name: Name of the service in the log.
+            on_open: Called with the port once the address is listened on.
+        """
+        try:
+            on_open(await self.open(host, port))
+        except OSError as error:
+            log.warning("cannot listen yet; retrying", service=name, host=host, port=port, reason=error.strerror)
+            self._opening = asyncio.create_task(self._open_later(host, port, on_open), name="listener")
+
+    async def _open_later(self, host: str, port: int, on_open: Callable[[int], object]) -> None:
+        while True:
+            await asyncio.sleep(OPEN_RETRY_S)
+            with contextlib.suppress(OSError):  # the first failure was logged
+                on_open(await self.open(host, port))
+                return
+
     async def close(self) -> None:
         """Stop accepting. The server closes the open connections."""
+        if self._opening:
+            self._opening.cancel()
+            await asyncio.wait([self._opening])
         for timer in self._resuming.values():
             timer.cancel()
         self._resuming.clear()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import structlog
 
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError
 from bms_estimator.settings.pack import Settings
 
 log = structlog.get_logger(__name__)
@@ -27,7 +27,7 @@ def state_folder(settings: Settings) -> Path:
     If a folder that the settings do not name cannot be created, a warning is logged, and a later save reports the error.
 
     Raises:
-        UserError: The folder of the settings cannot be created.
+        TemporaryError: The folder of the settings cannot be created.
     """
     folder = state_folder_path(settings)
     try:
@@ -36,6 +36,6 @@ def state_folder(settings: Settings) -> Path:
     except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home folder
         reason = error.strerror if isinstance(error, OSError) else str(error)
         if settings.state.folder:
-            raise UserError(f"state.folder = {folder}: {reason}") from error
+            raise TemporaryError(f"state.folder = {folder}: {reason}") from error
         log.warning("the state will be lost at a restart", folder=str(folder), reason=reason)
     return folder

@@ -41,7 +41,7 @@ async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None
             folder = state_folder(settings)
             await run_pack_service(settings, cell, stop=stop, folder=folder, notifier=notifier, pages=pages)
         except UserError as error:
-            raise UserError(f"{settings.pack.name}: {error}") from error
+            raise type(error)(f"{settings.pack.name}: {error}") from error  # its type determines the exit code
         finally:
             stop.set()
 

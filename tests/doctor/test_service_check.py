@@ -30,6 +30,12 @@ def test_only_installed_units_count() -> None:
             "is starting; the last run ended with watchdog, status 6",
             "journalctl",
         ),
+        (
+            {"ActiveState": "activating", "Result": "exit-code", "ExecMainStatus": "75"},
+            Level.WARNING,
+            "is starting; the last run ended with a fault of the environment",
+            "journalctl",
+        ),
         ({"ActiveState": "inactive"}, Level.FAULT, "is stopped", "systemctl start"),
         (
             {"ActiveState": "failed", "Result": "exit-code", "ExecMainStatus": "2"},

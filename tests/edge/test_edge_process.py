@@ -149,7 +149,7 @@ def test_config_check_reads_the_password_file_of_the_server(tmp_path: Path, caps
     path, password_file = tmp_path / "pack.toml", tmp_path / "password"
     path.write_text(f'[edge]\nusername = "a"\npassword_file = "{password_file}"\n')
     code, _, err = run(capsys, "config", "check", path)
-    assert code == 2
+    assert code == 75
     assert err == f"error: edge.password_file = {password_file}: cannot be read: No such file or directory\n"
     password_file.write_text("secret")
     password_file.chmod(0o644)

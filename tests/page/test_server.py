@@ -18,6 +18,7 @@ from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import FILES, STATIC, PageServer
 from bms_estimator.page.page_sink import Pages, PageSink
+from bms_estimator.process import listener
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.store.minute import epoch_s
 from tests.patience import LONG_S
@@ -233,7 +234,7 @@ async def test_a_pack_without_a_database_has_no_history(tmp_path, hub, history):
 
 
 async def test_address_in_use_is_an_error_or_retried_by_a_patient_server(hub, history, monkeypatch):
-    monkeypatch.setattr(web_server, "RETRY_S", 0.05)
+    monkeypatch.setattr(listener, "OPEN_RETRY_S", 0.05)
     opened = asyncio.Queue[str]()
     with socket.create_server(("127.0.0.1", 0)) as occupant:
         settings = PageSettings(listen=f"127.0.0.1:{occupant.getsockname()[1]}")

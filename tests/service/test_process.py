@@ -5,6 +5,7 @@ import contextlib
 import json
 import os
 import signal
+import socket
 import sys
 import time
 from asyncio.subprocess import Process
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.run_file import RunFile
+from bms_estimator.process.instance_lock import instance_lock
 from tests.command_line import PROGRAM, running_program
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
@@ -23,7 +25,7 @@ from tests.serial_line import Line
 
 
 def pack_file(folder: Path, line: Line, broker: Broker, name: str = "pack", state: str = "") -> Path:
-    """Write a pack file. ``state`` is its section ``[state]``. Return its path."""
+    """Write a pack file. ``state`` is its section ``[state]``, or others. Return its path."""
     path = folder / f"{name}.toml"
     path.write_text(
         f"""
@@ -250,6 +252,58 @@ async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_r
         output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
         assert await process.wait() == 1  # systemd does not restart the service after exit code 2
     assert output == f"error: state.folder = {folder}: No space left on device\n"
+
+
+async def test_a_state_folder_that_cannot_be_created_yet_gives_exit_code_75(
+    tmp_path: Path, line: Line, broker: Broker
+) -> None:
+    (tmp_path / "mount").touch()
+    folder = tmp_path / "mount" / "state"
+    pack = pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{folder}"')
+    for others in ((), (pack_file(tmp_path, Line(tmp_path / "other board"), broker, "other"),)):
+        async with service(pack, *others) as process:
+            assert process.stderr
+            output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
+            assert await process.wait() == os.EX_TEMPFAIL, "systemd does not restart the service after exit code 2"
+        assert f"state.folder = {folder}: Not a directory\n" in output
+
+
+async def test_a_password_file_that_cannot_be_read_yet_gives_exit_code_75(
+    tmp_path: Path, line: Line, broker: Broker
+) -> None:
+    missing = tmp_path / "not mounted" / "password"
+    pack = pack_file(tmp_path, line, broker, state=f'username = "meter"\npassword_file = "{missing}"')
+    async with service(pack) as process:
+        assert process.stderr
+        output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
+        assert await process.wait() == os.EX_TEMPFAIL
+    assert output.endswith(f"error: mqtt.password_file = {missing}: cannot be read: No such file or directory\n")
+
+
+async def test_a_pack_that_another_process_serves_gives_exit_code_75(
+    tmp_path: Path, line: Line, broker: Broker, state_home: Path
+) -> None:
+    (state_home / "bms-estimator").mkdir(parents=True)
+    with instance_lock(state_home / "bms-estimator", "pack"):
+        async with service(pack_file(tmp_path, line, broker)) as process:
+            assert process.stderr
+            output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
+            assert await process.wait() == os.EX_TEMPFAIL
+    assert output.endswith(f"error: pack: this pack is served already, by process {os.getpid()}\n")
+
+
+async def test_an_occupied_address_for_prometheus_ends_no_pack(
+    tmp_path: Path, line: Line, broker: Broker, state_home: Path
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as occupant:
+        section = f'[prometheus]\nlisten = "127.0.0.1:{occupant.getsockname()[1]}"'
+        shed = pack_file(tmp_path, Line(tmp_path / "other board"), broker, "shed")
+        packs = [pack_file(tmp_path, line, broker, "house", section), shed]
+        async with Listener(broker) as live, service(*packs) as process:
+            for name in ("house", "shed"):
+                await live.wait(f"bms/{name}/health")
+            lines = await stop_service(process)
+    assert [each["pack"] for each in lines if each.get("service") == "metrics"] == ["house"]
 
 
 async def test_two_packs_in_one_process_have_boards_topics_log_lines_and_checkpoints_of_their_own(

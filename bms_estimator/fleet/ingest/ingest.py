@@ -19,7 +19,7 @@ from bms_estimator.fleet.nats.connection import error_text
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.nats.streams import make_telemetry_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
 
@@ -115,7 +115,7 @@ class Ingest:
                 await self._save()
         except (*RETRYABLE_ERRORS, UserError) as error:
             if self._nc.is_closed:
-                raise UserError("the server has closed the connection: check --creds") from None
+                raise TemporaryError("the server has closed the connection: check --creds") from None
             if (reason := error_text(error)) != self._trouble:
                 log.warning("batches cannot be received; trying again", reason=reason)
             self._trouble = reason

@@ -20,7 +20,7 @@ from bms_estimator.fleet.nats.connection import close, connect, error_text
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import NoAnswerError, make_telemetry_stream, partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.process.tasks import end, until_first_ends
 from bms_estimator.sources.captures.tables.layout import ColumnMap
@@ -98,7 +98,7 @@ async def _start(options: Options) -> tuple[Client, int, PackBucket]:
             await bucket.refresh()
         except (*RETRYABLE_ERRORS, UserError) as error:
             if nc.is_closed:
-                raise UserError(f"the server {options.servers} has closed the connection: check --creds") from None
+                raise TemporaryError(f"the server {options.servers} has closed the connection: check --creds") from None
             if (text := error_text(error)) != last_reason:
                 log.warning("waiting", reason=text)
             last_reason = text
@@ -131,18 +131,18 @@ def lock_folder(folder: Path) -> Iterator[None]:
     """Lock the folder against other processes.
 
     Raises:
-        UserError: Another process uses the folder, or the folder cannot be written.
+        TemporaryError: Another process uses the folder, or the folder cannot be written.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         descriptor = os.open(folder / ".lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        raise UserError(f"--folder {folder}: cannot be written: {error.strerror}") from error
+        raise TemporaryError(f"--folder {folder}: cannot be written: {error.strerror}") from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
     except BlockingIOError:
-        raise UserError(
+        raise TemporaryError(
             f"--folder {folder}: another `fleet ingest` uses it; end it, or choose another folder"
         ) from None
     finally:

@@ -16,7 +16,7 @@ from nats.errors import NoRespondersError
 from nats.errors import TimeoutError as NatsTimeoutError
 
 from bms_estimator.edge import subjects
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -273,8 +273,10 @@ async def _request(nc: Client, operation: str, request: dict[str, Any]) -> dict[
     return decoded if isinstance(decoded, dict) else {}
 
 
-def _rejection(name: str, response: dict[str, Any]) -> UserError:
-    return UserError(f"the server rejects the stream {name}: {response['error'].get('description', response['error'])}")
+def _rejection(name: str, response: dict[str, Any]) -> TemporaryError:
+    return TemporaryError(
+        f"the server rejects the stream {name}: {response['error'].get('description', response['error'])}"
+    )
 
 
 def _ns(seconds: float) -> int:

@@ -31,7 +31,7 @@ from bms_estimator.fleet.queries.parquet_files import (
     write,
 )
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 
 DURABLE = "collector"
 """Name of the durable consumer, with which a collector continues where the previous one ended."""
@@ -115,7 +115,7 @@ class Collector:
         except nats.errors.Error as error:
             self._subscription = None
             if self._nc.is_closed:
-                raise UserError("the server has closed the connection: check --creds") from None
+                raise TemporaryError("the server has closed the connection: check --creds") from None
             await self._wait_after_error("rows cannot be fetched from the server", error, stop)
             return ()
 
@@ -183,18 +183,18 @@ def only_collector(folder: Path) -> Iterator[None]:
     """Lock the folder against other collectors, and remove unfinished files of a killed one.
 
     Raises:
-        UserError: Another collector writes there, or the folder cannot be written.
+        TemporaryError: Another collector writes there, or the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder / ".collector", os.O_CREAT | os.O_RDWR, 0o644)
     except OSError as error:
-        raise UserError(f"--folder {folder}: cannot be written: {error.strerror}") from error
+        raise TemporaryError(f"--folder {folder}: cannot be written: {error.strerror}") from error
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise UserError(
+            raise TemporaryError(
                 f"--folder {folder}: another collector writes there; end it, or choose another folder"
             ) from None
         for each in (folder, folder / QUARANTINE_FOLDER):

@@ -21,7 +21,7 @@ from bms_estimator.fleet.server import jwt_claims
 from bms_estimator.fleet.server.disk_space import GB
 from bms_estimator.fleet.server.jwt_claims import ACCOUNT, BEARERS, OPERATOR, Key, Role, Tenant
 from bms_estimator.fleet.server.nats_config import Accounts
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.fleet import TenantSettings
 
@@ -154,4 +154,4 @@ def _write(path: Path, content: bytes) -> None:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_private(path, content)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from error
+        raise TemporaryError(f"{path}: cannot be written: {error.strerror}") from error

@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 from bms_estimator.fleet.nats.stream_sizes import StreamSizes, stream_sizes
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.settings.fleet import FleetSettings, TenantSettings
 
 GB = 1_000_000_000
@@ -59,7 +59,7 @@ def check_disk_space(settings: FleetSettings, folder: Path, available: int, copi
         )
     fraction = USABLE_FRACTION if limit_gb is None else 1.0
     if needed > fraction * available:
-        raise UserError(
+        raise TemporaryError(
             f"{folder}: the streams need {needed / GB:.1f} GB, but may use only {fraction * available / GB:.1f} GB, "
             f"{fraction:.0%} of the free space: choose a larger disk by --folder, "
             "or reduce packs or outage_days, of the server or of a tenant"

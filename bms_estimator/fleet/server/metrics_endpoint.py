@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from bms_estimator.fleet.server.nats_config import Node
 from bms_estimator.fleet.server.node_watch import NodeWatch
-from bms_estimator.model.errors import UserError
 from bms_estimator.settings.page import parse_listen
 
 if TYPE_CHECKING:
@@ -22,9 +21,6 @@ async def metrics_endpoint(listen: str | None, node: Node, watch: NodeWatch) -> 
         listen: Address, host:port; None: no metrics.
         node: Settings of the node.
         watch: Source of the values.
-
-    Raises:
-        UserError: The address cannot be used.
     """
     if listen is None:
         yield
@@ -35,9 +31,5 @@ async def metrics_endpoint(listen: str | None, node: Node, watch: NodeWatch) -> 
     async def collect() -> "Iterable[Metric]":
         return families(*await asyncio.gather(watch.node_state(node), watch.tenant_states()))
 
-    async with contextlib.AsyncExitStack() as stack:
-        try:
-            await stack.enter_async_context(MetricsServer(*parse_listen(listen), collect))
-        except OSError as error:
-            raise UserError(f"server.metrics = {listen}: {error.strerror}") from None
+    async with MetricsServer(*parse_listen(listen), collect):
         yield

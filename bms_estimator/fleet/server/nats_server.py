@@ -25,7 +25,7 @@ from bms_estimator.fleet.server.node_watch import NodeWatch
 from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
 from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.child_process import ends_with_us
 from bms_estimator.process.private_file import write_private
 
@@ -175,4 +175,4 @@ def _write(path: Path, text: str) -> None:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_private(path, text.encode())
     except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from error
+        raise TemporaryError(f"{path}: cannot be written: {error.strerror}") from error

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 
 MIN_VERSION = (2, 11)
 """Minimum supported version, which introduced pinned consumers."""
@@ -33,7 +33,7 @@ def find_server() -> Path:
             [program, "-v"], capture_output=True, text=True, check=True, timeout=VERSION_TIMEOUT_S
         ).stdout
     except (OSError, subprocess.SubprocessError) as error:
-        raise UserError(f"{program}: does not report its version: {error}; {INSTALL}") from None
+        raise TemporaryError(f"{program}: does not report its version: {error}; {INSTALL}") from None
     version = re.search(r"v(\d+)\.(\d+)", output)
     if not version or (int(version[1]), int(version[2])) < MIN_VERSION:
         minimum = ".".join(map(str, MIN_VERSION))

@@ -12,7 +12,7 @@ from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.local_client import connect
 from bms_estimator.fleet.server.nats_config import Node
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_of
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.settings.fleet import TenantSettings
 
 
@@ -40,7 +40,7 @@ async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant
     except TimeoutError:
         raise NoAnswerError(f"{node.nats}: the server does not accept the connection in time") from None
     except (NatsError, OSError) as error:
-        raise UserError(f"{node.nats}: the server rejects the connection: {error}") from None
+        raise TemporaryError(f"{node.nats}: the server rejects the connection: {error}") from None
     try:
         await make_streams(
             nc,
@@ -58,6 +58,6 @@ async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant
             if "insufficient" in str(error)
             else ""
         )
-        raise UserError(f"{f'tenant {name}: ' if name else ''}{error}{hint}") from None
+        raise type(error)(f"{f'tenant {name}: ' if name else ''}{error}{hint}") from None
     finally:
         await close(nc)

@@ -26,7 +26,7 @@ from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
 from bms_estimator.fleet.worker.tenant_stores import TenantStores, open_stores
 from bms_estimator.fleet.worker.unknown_packs import UnknownPacks
 from bms_estimator.fleet.worker.unsaved_check import UnsavedCheck
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import end, until_first_ends
 
@@ -102,10 +102,10 @@ def _raise_if_closed(nc: Client, options: Options) -> None:
     """Raise an error if the connection is closed and will not be restored.
 
     Raises:
-        UserError: The server has closed the connection permanently.
+        TemporaryError: The server has closed the connection permanently.
     """
     if nc.is_closed:
-        raise UserError(f"the server {options.servers} has closed the connection: check --creds")
+        raise TemporaryError(f"the server {options.servers} has closed the connection: check --creds")
 
 
 class Worker:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Self
 
 import structlog
 
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.process.backoff import FIRST_DELAY_S, Backoff
 from bms_estimator.process.disk_thread import DiskThread
@@ -185,7 +185,8 @@ def target(settings: InfluxSettings) -> Target:
         try:
             context = ssl.create_default_context(cafile=settings.ca_file)
         except OSError as error:  # includes ssl.SSLError
-            raise UserError(f"influx.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
+            kind = UserError if isinstance(error, ssl.SSLError) else TemporaryError
+            raise kind(f"influx.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
     headers = {"Content-Type": "text/plain; charset=utf-8"} | authorization
     return Target(f"{settings.url.rstrip('/')}{path}?{urllib.parse.urlencode(query)}", headers, context)
 
@@ -216,7 +217,7 @@ def _secret(key: str, path: Path) -> str:
     try:
         secret = credential(path).read_text(encoding="utf-8").strip()
     except OSError as error:
-        raise UserError(f"influx.{key} = {path}: cannot be read: {error.strerror}") from None
+        raise TemporaryError(f"influx.{key} = {path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:  # its text would show bytes of the secret
         raise UserError(f"influx.{key} = {path}: cannot be read: not UTF-8 text") from None
     if not secret.isprintable():

@@ -26,14 +26,11 @@ class _Scrape(Collector):
 
 
 class MetricsServer:
-    """Server on one address while the context lasts.
+    """Server on one address while the context lasts. An address that is in use or does not exist yet is retried.
 
     Args:
         host, port: Listening address.
         collect: Returns the metrics; called at each scrape.
-
-    Raises:
-        OSError: The address cannot be listened on.
     """
 
     def __init__(self, host: str, port: int, collect: Callable[[], Awaitable[Iterable[Metric]]]) -> None:
@@ -44,7 +41,7 @@ class MetricsServer:
         """Start listening."""
         server = web.Server(self._answer)
         listener = Listener(server)
-        await listener.open(self._host, self._port)
+        await listener.open_or_retry(self._host, self._port, "metrics")
         self._stack.push_async_callback(server.shutdown, CLOSING_S)
         self._stack.push_async_callback(listener.close)
         return self

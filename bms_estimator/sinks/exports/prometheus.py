@@ -5,7 +5,6 @@ from typing import Self
 
 from prometheus_client.core import Metric
 
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.exports import PrometheusSettings
 from bms_estimator.sinks.exports.metrics_server import MetricsServer
@@ -20,7 +19,6 @@ class PrometheusSink:
     """
 
     def __init__(self, settings: PrometheusSettings) -> None:
-        self._settings = settings
         self._last: Snapshot | None = None
         self._server = MetricsServer(settings.host, settings.port, self._collect)
 
@@ -30,16 +28,8 @@ class PrometheusSink:
         self._last = snapshot._replace(estimate=estimate)
 
     async def __aenter__(self) -> Self:
-        """Start listening.
-
-        Raises:
-            UserError: The address cannot be used.
-        """
-        try:
-            await self._server.__aenter__()
-        except OSError as error:
-            problem = f"prometheus.listen = {self._settings.listen}: {error.strerror}"
-            raise UserError(f"{problem}; each pack needs an address of its own") from None
+        """Start listening."""
+        await self._server.__aenter__()
         return self
 
     async def __aexit__(self, *_: object) -> None:

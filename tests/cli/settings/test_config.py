@@ -265,7 +265,7 @@ def test_check_finds_a_credential_by_its_name(pack, tmp_path, capsys, monkeypatc
 def test_check_fails_on_a_missing_password_file(pack, tmp_path, capsys):
     pack.write_text(f'[mqtt]\npassword_file = "{tmp_path / "none"}"\n')
     code, _, err = run(capsys, "config", "check", pack)
-    assert code == 2
+    assert code == 75
     assert "mqtt.password_file" in err
     assert "cannot be read" in err
 
@@ -282,7 +282,7 @@ def test_check_fails_on_a_missing_token_file_and_warns_about_a_token_in_the_cred
     pack.write_text(f'[influx]\nbucket = "bms"\ntoken_file = "{tmp_path / "none"}"\n')
     code, _, err = run(capsys, "config", "check", pack)
     assert (code, err) == (
-        2,
+        75,
         f"error: influx.token_file = {tmp_path / 'none'}: cannot be read: No such file or directory\n",
     )
     pack.write_text('[influx]\nbucket = "bms"\ntoken_file = "influx-token"\n')

@@ -8,13 +8,15 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import aiomqtt
 import nats
 import pytest
+from structlog.testing import capture_logs
 
 from bms_estimator.fleet.metrics.definitions import NODE, TENANT, WORKER
-from tests.command_line import run
+from bms_estimator.fleet.server.metrics_endpoint import metrics_endpoint
 from tests.fleet.serve_process import ServeProcess
 from tests.fleet.workers import PERIOD_S, SAMPLES, Process, block, load_packs, send
 from tests.free_port import free_port
@@ -186,6 +188,9 @@ async def test_sessions_of_mqtt_clients_are_counted(fleet: Fleet) -> None:
         await asyncio.to_thread(fleet.wait, lambda values: values["bms_fleet_mqtt_sessions",] >= 1.0)
 
 
-def test_occupied_address_is_an_error(fleet: Fleet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = run(capsys, "fleet", "serve", "--metrics", fleet.metrics, "--folder", tmp_path)
-    assert (code, err) == (2, f"error: server.metrics = {fleet.metrics}: Address already in use\n")
+async def test_an_occupied_address_does_not_end_the_server(fleet: Fleet) -> None:
+    nothing: Any = None  # no metrics are read
+    with capture_logs() as lines:
+        async with metrics_endpoint(fleet.metrics, nothing, nothing):
+            pass
+    assert [line["reason"] for line in lines] == ["Address already in use"]

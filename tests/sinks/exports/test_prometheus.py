@@ -1,17 +1,20 @@
 """Prometheus sink: real scrapes, parsed by the library and checked by promtool if installed."""
 
 import asyncio
+import contextlib
 import socket
 import threading
 import urllib.request
 from typing import Any
 
+import aiohttp
 import pytest
+from structlog.testing import capture_logs
 
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.process import listener
 from bms_estimator.settings.exports import PrometheusSettings
 from tests.free_port import free_port
 from tests.patience import LONG_S
@@ -95,11 +98,22 @@ async def test_unknown_and_stale_values_have_no_metrics() -> None:
     assert ("bms_soc_ratio",) not in values(await scrape(STACK_SNAPSHOT))
 
 
-async def test_occupied_address_raises_an_error() -> None:
+async def test_an_occupied_address_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listener, "OPEN_RETRY_S", 0.02)
     settings = PrometheusSettings(listen=f"127.0.0.1:{free_port()}")
-    async with PrometheusSink(settings):
-        with pytest.raises(UserError, match="each pack needs an address of its own"):
-            await PrometheusSink(settings).__aenter__()
+    with capture_logs() as lines:
+        async with PrometheusSink(settings) as occupant, PrometheusSink(settings) as sink:
+            sink.publish(CELL_SNAPSHOT)
+            await occupant.__aexit__()
+            async with asyncio.timeout(LONG_S), aiohttp.ClientSession() as session:
+                text = ""
+                while "bms_soc_ratio" not in text:
+                    with contextlib.suppress(aiohttp.ClientError):
+                        async with session.get(f"http://{settings.listen}/metrics") as response:
+                            text = await response.text()
+        async with PrometheusSink(settings), PrometheusSink(settings):
+            pass  # ends while it retries
+    assert [(line["service"], line["reason"]) for line in lines] == 2 * [("metrics", "Address already in use")]
 
 
 def test_metric_tables_contain_only_fields_of_the_payloads() -> None:
