@@ -86,8 +86,8 @@ MappedColumns = Annotated[
         "--map",
         parser=parse_column_map,
         metavar="time=COLUMN,...",
-        help="columns of a table with unknown names, for time, current, voltage and, optionally, temperature; "
-        "sheet=SHEET chooses a sheet of a spreadsheet",
+        help="columns of a table for some of time, current, voltage and temperature; a unit may follow a name, as in "
+        "'time=Time [ms]'; sheet=SHEET chooses a sheet of a spreadsheet",
         show_default=False,
     ),
 ]

@@ -159,8 +159,7 @@ class BatchReader:
         return Layout(layout.dialect, roles), Column(header.index(cells[0]), cells[0], unit)
 
     def _sign_of(self, layout: Layout) -> CurrentSign:
-        by_format = layout.dialect.current_sign if layout.dialect else None
-        return self._current_sign or by_format or "discharge_positive"
+        return self._current_sign or layout.dialect.current_sign or "discharge_positive"
 
 
 def _reason(error: UserError) -> str:

@@ -295,8 +295,8 @@ def load_capture(
             arrays. A table has the columns of this project or of a cycler.
         current_sign: Direction of positive current, ``discharge_positive`` or ``charge_positive``; None: the
             format's direction; if it defines none, the direction that the voltage shows, otherwise discharge.
-        column_map: Names of a table's columns for ``time``, ``current``, ``voltage`` and, optionally, ``temperature``, and
-            of a spreadsheet's ``sheet``; None: recognize them.
+        column_map: Names of a table's columns for some of ``time``, ``current``, ``voltage`` and ``temperature``, and
+            of a spreadsheet's ``sheet``; the others are recognized.
 
     Returns:
         ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor),

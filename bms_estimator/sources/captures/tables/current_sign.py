@@ -88,7 +88,7 @@ def _defined_direction(layout: Layout, configured: Sign) -> CurrentDirection | N
 
     A table with this project's columns may come from the pack itself; therefore the settings of its sensor decide first.
     """
-    if layout.dialect and layout.dialect.current_sign:
+    if layout.dialect.current_sign:
         return CurrentDirection(layout.dialect.current_sign, f"convention of {layout.dialect.name}")
     if configured.sensor:
         return CurrentDirection(configured.sensor, "sensor.current_sign")

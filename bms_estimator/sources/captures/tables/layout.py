@@ -30,8 +30,8 @@ REQUIRED: tuple[Quantity, ...] = ("time", "current", "voltage")
 """Quantities that a table must have."""
 SHEET: Literal["sheet"] = "sheet"
 """Key of the sheet of a spreadsheet in a ``ColumnMap``."""
-MAP_SYNTAX = "time=COLUMN,current=COLUMN,voltage=COLUMN[,temperature=COLUMN][,sheet=SHEET]"
-MAP_HELP = f"--map {MAP_SYNTAX} (in Python: column_map)"
+MAP_SYNTAX = "one or more of time=COLUMN,current=COLUMN,voltage=COLUMN,temperature=COLUMN,sheet=SHEET"
+MAP_HELP = "--map time=COLUMN,current=COLUMN,voltage=COLUMN (in Python: column_map)"
 MAX_SHOWN_COLUMNS = 30
 """Maximum number of column names in a message."""
 MAX_SHOWN_CHARACTERS = 40
@@ -101,12 +101,14 @@ class Layout:
     """Columns of a sample in a table.
 
     Attributes:
-        dialect: Dialect of the table; None if the user named the columns.
+        dialect: Dialect of the table.
         columns: The columns by role.
+        has_given_columns: True if the user named columns.
     """
 
-    dialect: Dialect | None
+    dialect: Dialect
     columns: Mapping[ColumnRole, Column]
+    has_given_columns: bool = False
 
     @property
     def cells(self) -> tuple[CellVoltage, ...]:
@@ -119,7 +121,7 @@ class LayoutFinder:
 
     Args:
         path: Name of the table for messages.
-        column_map: Column names and sheet that the user gave; without columns the dialect is recognized.
+        column_map: Column names and sheet that the user gave. The dialect determines the other columns.
 
     Attributes:
         sheet: Name of the sheet that the user gave; None: the sheet is recognized.
@@ -138,11 +140,13 @@ class LayoutFinder:
         Raises:
             UserError: Several columns have the same name, or the unit of a column is not known.
         """
-        if self._map:
-            return self._apply_map(header)
-        names = [split_unit(cell) for cell in header]
+        cells = [cell.strip() for cell in header]
+        given = self._given_columns(cells)
+        if len(given) < len(self._map):
+            return None
+        names = [split_unit(cell) for cell in cells]
         for dialect in DIALECTS:
-            if dialect.matches(header, names) and (layout := self._apply_dialect(dialect, header, names)):
+            if dialect.matches(cells, names) and (layout := self._apply_dialect(dialect, cells, names, given)):
                 return layout
         rank = (len(REQUIRED) - len(_missing(names)), len(header))
         if rank > self._closest_rank:
@@ -151,7 +155,7 @@ class LayoutFinder:
 
     def no_header(self) -> UserError:
         """Return the error for a table without a header. It names the columns of the line that is most similar to a header."""
-        if self._map:
+        if self._map and not self._closest_header:
             return UserError(f"{self._path}: no line names the columns {', '.join(self._map.values())}")
         header, (found, width) = self._closest_header, self._closest_rank
         needed = f"{','.join(OWN.signatures[0])}[,temperature_c], the columns of a program in docs/cell/captures.md, or {MAP_HELP}"
@@ -161,71 +165,72 @@ class LayoutFinder:
         columns = ", ".join(cell.strip()[:MAX_SHOWN_CHARACTERS] for cell in header[:MAX_SHOWN_COLUMNS])
         return UserError(f"{self._path}: no column of {missing}; found {columns}; needed: {needed}")
 
-    def _apply_map(self, header: Sequence[str]) -> Layout | None:
-        """Return the layout with the columns that the user named; None if the header lacks one of them."""
-        cells = [cell.strip() for cell in header]
-        if not set(self._map.values()) <= set(cells):
-            return None
-        columns = dict[ColumnRole, Column]()
-        for quantity, name in self._map.items():
+    def _given_columns(self, cells: Sequence[str]) -> dict[Quantity, Column]:
+        """Return the columns that the user named and the header has. A name may be followed by a unit in square brackets."""
+        columns = dict[Quantity, Column]()
+        for quantity, given in self._map.items():
+            name, unit = (given, None) if given in cells else _split_given_unit(given)
             if cells.count(name) > 1:
                 raise UserError(f"{self._path}: {cells.count(name)} columns are named {name}: rename all but one")
-            columns[Role(quantity)] = self._column(quantity, cells.index(name), cells, split_unit(name))
-        return Layout(None, columns)
+            if name in cells:
+                columns[quantity] = self._column(quantity, cells.index(name), name, unit or split_unit(name).unit)
+        return columns
 
-    def _apply_dialect(self, dialect: Dialect, header: Sequence[str], names: Sequence[ColumnName]) -> Layout | None:
-        """Return the layout of a dialect; None if the header lacks a required column."""
-        cells = [cell.strip() for cell in header]
+    def _apply_dialect(
+        self, dialect: Dialect, cells: Sequence[str], names: Sequence[ColumnName], given: Mapping[Quantity, Column]
+    ) -> Layout | None:
+        """Return the layout of a dialect with the given columns; None if the header lacks a required column."""
         columns = dict[ColumnRole, Column]()
         for quantity in QUANTITIES:
-            index = self._find_index(getattr(dialect, quantity), cells, names)
-            if index is not None:
-                columns[Role(quantity)] = self._column(quantity, index, cells, names[index])
+            indices = _find_indices(getattr(dialect, quantity), names)
+            if quantity in given:
+                columns[Role(quantity)] = given[quantity]
+            elif len(indices) > 1 and quantity in REQUIRED:
+                several = " and ".join(cells[index] for index in indices)
+                raise UserError(f"{self._path}: {several}: choose one of these columns by {MAP_HELP}")
+            elif indices:
+                columns[Role(quantity)] = self._column(quantity, indices[0], cells[indices[0]], names[indices[0]].unit)
             elif quantity in REQUIRED:
                 return None
         if dialect is OWN:
             columns |= _own_columns(cells)
         current_name = names[columns[Role.CURRENT].index].name
-        return Layout(dialect, columns | self._sign_columns(dialect, cells, names, current_name))
+        return Layout(dialect, columns | self._sign_columns(dialect, cells, names, current_name), bool(given))
 
     def _sign_columns(
         self, dialect: Dialect, cells: Sequence[str], names: Sequence[ColumnName], current_name: str
     ) -> dict[ColumnRole, Column]:
         """Return the optional columns that determine the sign of the current."""
         columns = dict[ColumnRole, Column]()
-        state = self._find_index(dialect.state, cells, names)
-        if state is not None:
+        for state in _find_indices(dialect.state, names)[:1]:
             columns[Role.STATE] = Column(state, cells[state], Unit(""), kind=CellKind.DIRECTION)
-        charge = self._find_index(dialect.charge_current, cells, names)
-        if charge is not None and current_name in DISCHARGE_CURRENTS:
-            columns[Role.CHARGE_CURRENT] = self._column("current", charge, cells, names[charge])
+        if current_name in DISCHARGE_CURRENTS:
+            for charge in _find_indices(dialect.charge_current, names)[:1]:
+                columns[Role.CHARGE_CURRENT] = self._column("current", charge, cells[charge], names[charge].unit)
         return columns
 
-    def _find_index(self, wanted: Sequence[str], cells: Sequence[str], names: Sequence[ColumnName]) -> int | None:
-        """Return the index of the first of the wanted names that a header has.
-
-        Raises:
-            UserError: Several columns have this name.
-        """
-        for name in wanted:
-            indices = [index for index, column in enumerate(names) if column.name == fold(name)]
-            if len(indices) > 1:
-                columns = " and ".join(cells[index] for index in indices)
-                raise UserError(f"{self._path}: {columns}: choose one of these columns by {MAP_HELP}")
-            if indices:
-                return indices[0]
-        return None
-
-    def _column(self, quantity: Quantity, index: int, cells: Sequence[str], name: ColumnName) -> Column:
-        if name.unit is None:
-            return Column(index, cells[index], SI_UNITS[quantity], assumed=True)
-        unit = find_unit(quantity, name.unit)
+    def _column(self, quantity: Quantity, index: int, name: str, unit_text: str | None) -> Column:
+        if unit_text is None:
+            return Column(index, name, SI_UNITS[quantity], assumed=True)
+        unit = find_unit(quantity, unit_text)
         if unit is None:
             raise UserError(
-                f"{self._path}: column {cells[index]}: {name.unit!r} is not a unit of {quantity} that is supported; "
+                f"{self._path}: column {name}: {unit_text!r} is not a unit of {quantity} that is supported; "
                 f"convert it, or name other columns by {MAP_HELP}"
             )
-        return Column(index, cells[index], unit)
+        return Column(index, name, unit)
+
+
+def _find_indices(wanted: Sequence[str], names: Sequence[ColumnName]) -> list[int]:
+    """Return the indices of the columns with the first of the wanted names that a header has; an empty list if it has none."""
+    found = ([index for index, column in enumerate(names) if column.name == fold(name)] for name in wanted)
+    return next(filter(None, found), [])
+
+
+def _split_given_unit(given: str) -> tuple[str, str | None]:
+    """Return the name and the unit of a column that a user gave as ``name [unit]``."""
+    name, bracket, unit = given.rpartition(" [")
+    return (name, unit.removesuffix("]")) if bracket else (given, None)
 
 
 def _own_columns(header: Sequence[str]) -> dict[ColumnRole, Column]:
@@ -271,17 +276,16 @@ def with_time_kind(layout: Layout, kind: CellKind) -> Layout:
 
 
 def parse_column_map(text: str) -> ColumnMap:
-    """Parse ``MAP_SYNTAX``, or ``sheet=SHEET`` alone. Names may contain commas.
+    """Parse ``MAP_SYNTAX``. Names may contain commas.
 
     Raises:
-        UserError: A quantity is missing, unknown or given twice.
+        UserError: A quantity is unknown, is given twice, or has no column.
     """
     keys = (*QUANTITIES, SHEET)
     parts = re.split(rf",(?=(?:{'|'.join(keys)})=)", text)
     pairs = [tuple(part.partition("=")[::2]) for part in parts]
     names = dict(pairs)
-    is_complete = set(REQUIRED) <= set(names) or set(names) == {SHEET}
-    if len(names) < len(pairs) or not is_complete or not set(names) <= set(keys) or not all(names.values()):
+    if len(names) < len(pairs) or not set(names) <= set(keys) or not all(names.values()):
         raise UserError(f"--map {text}: must be {MAP_SYNTAX}")
     return {key: names[key].strip() for key in keys if key in names}
 

@@ -21,7 +21,7 @@ from bms_estimator.sources.captures.tables.cycler_files import (
     read_biologic,
     read_neware,
 )
-from bms_estimator.sources.captures.tables.dialects import OWN
+from bms_estimator.sources.captures.tables.dialects import GENERIC, OWN
 from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layout, LayoutFinder, RawBlock, Role
 from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
@@ -64,6 +64,7 @@ class Table:
         configured: Direction of positive current that the user configured.
 
     Attributes:
+        layout: Columns of the table.
         implausible: Number of implausible temperatures in the rows read so far.
         cells: Cell voltages of the last block.
         note: Description of dialect, columns and sign; empty for a table with this project's columns.
@@ -71,11 +72,12 @@ class Table:
     """
 
     def __init__(self, reader: TableReader, configured: Sign) -> None:
-        self._reader, self._layout = reader, reader.layout
+        self._reader, self.layout = reader, reader.layout
         self.implausible, self.cells = 0, NO_CELLS
         response = None if configured.option else voltage_response(self._first_rows())
-        self._direction = find_direction(self._layout, configured, response)
-        self.note = "" if self._layout.dialect is OWN else _note(reader, self._direction.text)
+        self._direction = find_direction(self.layout, configured, response)
+        is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
+        self.note = "" if is_own else _note(reader, self._direction.text)
         self.warning = self._direction.warning
 
     @property
@@ -97,18 +99,18 @@ class Table:
                 state = raw[Role.STATE]
                 directed = state * np.abs(samples["current_a"])
                 samples["current_a"] = np.where(np.abs(state) == 1.0, directed, samples["current_a"])
-            if self._layout.dialect is not OWN:  # this project's tables hold the time stamps that a source delivered
+            if self.layout.dialect is not OWN:  # this project's tables hold the time stamps that a source delivered
                 before = _separate_steps(before, samples)
             self.implausible += remove_implausible_temperatures(samples)
-            self.cells = cell_voltages(raw, self._layout)
+            self.cells = cell_voltages(raw, self.layout)
             yield samples
 
     def _blocks_as_signed_in_table(self) -> Iterator[tuple[RawBlock, SampleBlock]]:
         """Yield blocks as read, and their samples, whose current has the sign of the table."""
         start_s = None
         for raw in self._reader.blocks():
-            samples = to_samples(raw, self._layout)
-            if self._layout.columns[Role.TIME].kind is CellKind.DATE_TIME:
+            samples = to_samples(raw, self.layout)
+            if self.layout.columns[Role.TIME].kind is CellKind.DATE_TIME:
                 start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
                 samples["time_s"] -= start_s
             yield raw, samples
@@ -187,7 +189,10 @@ def _first_finite(values: NDArray[np.float64]) -> float:
 def _note(reader: TableReader, direction: str) -> str:
     """Return the dialect, the columns with their units and the sign of the current, as text."""
     layout = reader.layout
-    name = "given columns" if layout.dialect is None else layout.dialect.name
+    name = " with ".join(
+        [layout.dialect.name] * (layout.dialect is not GENERIC or not layout.has_given_columns)
+        + ["given columns"] * layout.has_given_columns
+    )
     columns = [
         _column_text(role, layout.columns[role]) + (f", {direction}" if role is Role.CURRENT else "")
         for role in _SHOWN_ROLES
