@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal, NamedTuple, get_args
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from bms_estimator.model.cell_voltage_columns import present_columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.sources.captures.tables.cell_values import CellKind
-from bms_estimator.sources.captures.tables.dialects import DIALECTS, GENERIC, OWN, Dialect
+from bms_estimator.sources.captures.tables.cell_values import CellKind, parser, time_kind
+from bms_estimator.sources.captures.tables.dialects import CLOCKS, DIALECTS, GENERIC, OWN, Dialect
 from bms_estimator.sources.captures.tables.units import (
     SI_UNITS,
     ColumnName,
@@ -47,7 +47,7 @@ ColumnMap = Mapping[Quantity | Literal["sheet"], str]
 
 
 class Role(Enum):
-    """Meaning of a column: a ``Quantity``, the sign of the current (state, charge current), or the status bits of a sample."""
+    """Meaning of a column: a ``Quantity``, the sign of the current (state, charge current), a second time, or the status."""
 
     TIME = "time"
     CURRENT = "current"
@@ -56,6 +56,7 @@ class Role(Enum):
     TEMPERATURE_MIN = "lowest temperature"
     TEMPERATURE_MAX = "highest temperature"
     STATE = "state"
+    CLOCK = "second time"
     CHARGE_CURRENT = "charge current"
     STATUS = "status"
 
@@ -73,6 +74,8 @@ class CellVoltage(NamedTuple):
 
 
 ColumnRole = Role | CellVoltage
+TIME_ROLES = (Role.TIME, Role.CLOCK)
+"""Roles of columns with a time."""
 RawBlock = dict[ColumnRole, NDArray[np.float64]]
 """Columns of a block of rows, in the units of the table."""
 
@@ -87,6 +90,7 @@ class Column:
         unit: Unit of the numbers.
         assumed: True if the table does not state the unit.
         kind: Kind of the cells.
+        is_lenient: True if an invalid cell is a missing value.
     """
 
     index: int
@@ -94,6 +98,21 @@ class Column:
     unit: Unit
     assumed: bool = False
     kind: CellKind = CellKind.NUMBER
+    is_lenient: bool = False
+
+    def parser(self, *, decimal_comma: bool) -> Callable[[str], float]:
+        """Return the function that converts the cells; it raises ValueError or OverflowError unless ``is_lenient`` is set."""
+        parse = parser(self.kind, decimal_comma=decimal_comma)
+        if not self.is_lenient:
+            return parse
+
+        def parse_leniently(cell: str) -> float:
+            try:
+                return parse(cell)
+            except (ValueError, OverflowError):
+                return np.nan
+
+        return parse_leniently
 
 
 @dataclass(frozen=True)
@@ -189,11 +208,11 @@ class LayoutFinder:
                 several = " and ".join(cells[index] for index in indices)
                 raise UserError(f"{self._path}: {several}: choose one of these columns by {MAP_HELP}")
             elif indices:
-                columns[Role(quantity)] = self._column(quantity, indices[0], cells[indices[0]], names[indices[0]].unit)
+                unit = names[indices[0]].unit or (dialect.time_unit if quantity == "time" else None)
+                columns[Role(quantity)] = self._column(quantity, indices[0], cells[indices[0]], unit)
             elif quantity in REQUIRED:
                 return None
-        if dialect is OWN:
-            columns |= _own_columns(cells)
+        columns |= _own_columns(cells) if dialect is OWN else _clock_column(dialect, cells, names, columns[Role.TIME])
         current_name = names[columns[Role.CURRENT].index].name
         return Layout(dialect, columns | self._sign_columns(dialect, cells, names, current_name), bool(given))
 
@@ -251,6 +270,18 @@ def _own_columns(header: Sequence[str]) -> dict[ColumnRole, Column]:
     return columns
 
 
+def _clock_column(
+    dialect: Dialect, cells: Sequence[str], names: Sequence[ColumnName], time: Column
+) -> dict[ColumnRole, Column]:
+    """Return the second time column, if a table has one whose unit is known."""
+    wanted = [name for name in (*dialect.time, *CLOCKS) if fold(name) != names[time.index].name]
+    for index in _find_indices(wanted, names)[:1]:
+        unit = find_unit("time", names[index].unit or "s")
+        if unit is not None:
+            return {Role.CLOCK: Column(index, cells[index], unit, assumed=names[index].unit is None, is_lenient=True)}
+    return {}
+
+
 def with_units(layout: Layout, units_row: Sequence[str]) -> Layout | None:
     """Return the layout with the units in the row below the header; None if the row does not contain units."""
     if len(units_row) <= max(column.index for column in layout.columns.values()):
@@ -267,12 +298,31 @@ def with_units(layout: Layout, units_row: Sequence[str]) -> Layout | None:
     return dataclasses.replace(layout, columns=columns)
 
 
-def with_time_kind(layout: Layout, kind: CellKind) -> Layout:
-    """Return the layout with the kind of its time column replaced. Durations and time stamps are in seconds."""
-    time = layout.columns[Role.TIME]
-    unit = time.unit if kind is CellKind.NUMBER else SI_UNITS["time"]
-    column = dataclasses.replace(time, kind=kind, unit=unit, assumed=time.assumed and kind is CellKind.NUMBER)
-    return dataclasses.replace(layout, columns={**layout.columns, Role.TIME: column})
+def with_time_kinds(layout: Layout, cells_of: Callable[[Column], Iterable[str]]) -> Layout:
+    """Return the layout with the kinds of its time columns.
+
+    Args:
+        layout: Columns of the table.
+        cells_of: Function that returns the cells of a column.
+    """
+    kinds = {role: time_kind(cells_of(layout.columns[role])) for role in TIME_ROLES if role in layout.columns}
+    return with_column_kinds(layout, kinds)
+
+
+def with_column_kinds(layout: Layout, kinds: Mapping[Role, CellKind]) -> Layout:
+    """Return the layout with other kinds of its time columns. Durations and time stamps are in seconds."""
+    columns = dict(layout.columns)
+    for role, kind in kinds.items():
+        if kind is not CellKind.NUMBER:
+            columns[role] = dataclasses.replace(columns[role], kind=kind, unit=SI_UNITS["time"], assumed=False)
+    return dataclasses.replace(layout, columns=columns)
+
+
+def without_clock(layout: Layout) -> Layout:
+    """Return the layout without its second time column."""
+    columns = dict(layout.columns)
+    columns.pop(Role.CLOCK, None)
+    return dataclasses.replace(layout, columns=columns)
 
 
 def parse_column_map(text: str) -> ColumnMap:

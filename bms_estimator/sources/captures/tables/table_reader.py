@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import MAX_C, MIN_C, NO_CELLS, SAMPLE, CellBlock, SampleBlock, remove_implausible
-from bms_estimator.sources.captures.tables.cell_values import CellKind
+from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
 from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction, voltage_response
 from bms_estimator.sources.captures.tables.cycler_files import (
@@ -26,9 +26,10 @@ from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layo
 from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
 from bms_estimator.sources.captures.tables.text_table import TextTable
+from bms_estimator.sources.captures.tables.time_base import find_time_base
 
-SIGN_ROWS = 262_144
-"""Minimum number of rows at the beginning of a table from which the sign of the current is determined."""
+FIRST_ROWS = 262_144
+"""Minimum number of rows at the beginning of a table that determine its time base and the sign of the current."""
 STEP_S = 1e-6
 """Time that is inserted between two rows with the same time, between which the current steps [s]."""
 PARQUET_MAGIC, OLE_MAGIC = b"PAR1", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
@@ -40,9 +41,8 @@ EXCEL_MEMBER, OPEN_DOCUMENT_MEMBER = "[Content_Types].xml", "mimetype"
 class TableReader(Protocol):
     """Reader of the columns of a sample in a table."""
 
-    @property
-    def layout(self) -> Layout:
-        """Columns of the table."""
+    layout: Layout
+    """Columns that are read."""
 
     @property
     def description(self) -> str:
@@ -72,13 +72,17 @@ class Table:
     """
 
     def __init__(self, reader: TableReader, configured: Sign) -> None:
-        self._reader, self.layout = reader, reader.layout
+        self._reader = reader
         self.implausible, self.cells = 0, NO_CELLS
-        response = None if configured.option else voltage_response(self._first_rows())
+        first = _first_rows(reader)
+        time_base = find_time_base(reader.layout, first)
+        first[Role.TIME] = first[time_base.role]
+        self.layout = reader.layout = time_base.layout
+        response = None if configured.option else voltage_response(to_samples(first, self.layout))
         self._direction = find_direction(self.layout, configured, response)
         is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
-        self.note = "" if is_own else _note(reader, self._direction.text)
-        self.warning = self._direction.warning
+        self.note = "" if is_own else _note(reader, time_base.reason, self._direction.text)
+        self.warning = "; ".join(filter(None, (time_base.warning, self._direction.warning)))
 
     @property
     def fraction(self) -> float:
@@ -93,7 +97,12 @@ class Table:
         """
         self.implausible = 0
         before = np.empty(0, dtype=SAMPLE)
-        for raw, samples in self._blocks_as_signed_in_table():
+        start_s = None
+        for raw in self._reader.blocks():
+            samples = to_samples(raw, self.layout)
+            if self.layout.columns[Role.TIME].kind in DATES:
+                start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
+                samples["time_s"] -= start_s
             samples["current_a"] *= self._direction.factor
             if self._direction.by_state:
                 state = raw[Role.STATE]
@@ -105,25 +114,16 @@ class Table:
             self.cells = cell_voltages(raw, self.layout)
             yield samples
 
-    def _blocks_as_signed_in_table(self) -> Iterator[tuple[RawBlock, SampleBlock]]:
-        """Yield blocks as read, and their samples, whose current has the sign of the table."""
-        start_s = None
-        for raw in self._reader.blocks():
-            samples = to_samples(raw, self.layout)
-            if self.layout.columns[Role.TIME].kind is CellKind.DATE_TIME:
-                start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
-                samples["time_s"] -= start_s
-            yield raw, samples
 
-    def _first_rows(self) -> SampleBlock:
-        """Return samples at the beginning, at least ``SIGN_ROWS`` if the table has as many."""
-        blocks, rows = [], 0
-        for _, samples in self._blocks_as_signed_in_table():
-            blocks.append(samples)
-            rows += samples.size
-            if rows >= SIGN_ROWS:
-                break
-        return np.concatenate(blocks) if blocks else np.empty(0, dtype=SAMPLE)
+def _first_rows(reader: TableReader) -> RawBlock:
+    """Return rows at the beginning of a table, at least ``FIRST_ROWS`` if it has as many."""
+    blocks, rows = list[RawBlock](), 0
+    for raw in reader.blocks():
+        blocks.append(raw)
+        rows += raw[Role.TIME].size
+        if rows >= FIRST_ROWS:
+            break
+    return {role: np.concatenate([np.empty(0), *(raw[role] for raw in blocks)]) for role in reader.layout.columns}
 
 
 def to_samples(raw: RawBlock, layout: Layout) -> SampleBlock:
@@ -186,15 +186,16 @@ def _first_finite(values: NDArray[np.float64]) -> float:
     return float(finite[0]) if finite.size else 0.0
 
 
-def _note(reader: TableReader, direction: str) -> str:
-    """Return the dialect, the columns with their units and the sign of the current, as text."""
+def _note(reader: TableReader, time_reason: str, direction: str) -> str:
+    """Return the dialect, the columns with their units, the reason for the time and the sign of the current, as text."""
     layout = reader.layout
     name = " with ".join(
         [layout.dialect.name] * (layout.dialect is not GENERIC or not layout.has_given_columns)
         + ["given columns"] * layout.has_given_columns
     )
+    reasons = {Role.TIME: f" ({time_reason})" if time_reason else "", Role.CURRENT: f", {direction}"}
     columns = [
-        _column_text(role, layout.columns[role]) + (f", {direction}" if role is Role.CURRENT else "")
+        _column_text(role, layout.columns[role]) + reasons.get(role, "")
         for role in _SHOWN_ROLES
         if role in layout.columns
     ]

@@ -3,12 +3,12 @@
 import csv
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from io import TextIOWrapper
 
-from bms_estimator.sources.captures.tables.cell_values import CellKind, time_kind, uses_decimal_comma
-from bms_estimator.sources.captures.tables.layout import Layout, LayoutFinder, Role, with_time_kind, with_units
+from bms_estimator.sources.captures.tables.cell_values import CellKind, uses_decimal_comma
+from bms_estimator.sources.captures.tables.layout import Column, Layout, LayoutFinder, with_time_kinds, with_units
 
 MAX_HEADER_LINES = 2_000
 """Maximum number of lines up to the header."""
@@ -73,12 +73,15 @@ def find_format(text: TextIOWrapper, finder: LayoutFinder) -> TextFormat:
             layout = finder.find(header)
             if layout is not None:
                 text_format = TextFormat(layout, line, len(header), number + 1, separator)
-                return _probe(text_format, list(itertools.islice(text, PROBED_LINES)))
+                return _probe(text_format, list(itertools.islice(text, PROBED_LINES)), text)
     raise finder.no_header()
 
 
-def _probe(text_format: TextFormat, lines: Sequence[str]) -> TextFormat:
-    """Return the format completed by the first lines after the header: units, decimal sign and format of the time."""
+def _probe(text_format: TextFormat, lines: Sequence[str], rest: Iterable[str]) -> TextFormat:
+    """Return the format completed by the first lines after the header: units, decimal sign and format of the time.
+
+    The order of day and month follows from all dates, also from those in the ``rest`` of the lines.
+    """
     rows = [split_cells(line, text_format.separator) for line in lines if is_data(line)]
     first_line, layout = text_format.first_line, text_format.layout
     if rows and (layout_with_units := with_units(layout, rows[0])):
@@ -86,8 +89,12 @@ def _probe(text_format: TextFormat, lines: Sequence[str]) -> TextFormat:
         first_line += 1 + next(index for index, line in enumerate(lines) if is_data(line))
         rows = rows[1:]
     complete = [row for row in rows if len(row) > max(column.index for column in layout.columns.values())]
-    if complete:
-        layout = with_time_kind(layout, time_kind(complete[0][layout.columns[Role.TIME].index]))
+    later = (split_cells(line, text_format.separator) for line in rest)
+
+    def cells_of(column: Column) -> Iterator[str]:
+        return (row[column.index] for row in itertools.chain(complete, later) if len(row) > column.index)
+
+    layout = with_time_kinds(layout, cells_of)
     numeric = [column.index for column in layout.columns.values() if column.kind is CellKind.NUMBER]
     decimal_comma = uses_decimal_comma([row[index] for row in complete for index in numeric])
     return dataclasses.replace(text_format, layout=layout, first_line=first_line, decimal_comma=decimal_comma)

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind, parser
+from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind
 from bms_estimator.sources.captures.tables.layout import (
     BLOCK_ROWS,
     REQUIRED,
     Column,
     ColumnRole,
+    Layout,
     LayoutFinder,
     RawBlock,
     Role,
@@ -61,7 +62,7 @@ class TextTable:
             line = self._format.first_line
             for _ in itertools.islice(text, line - 1):
                 pass
-            row_parser = _RowParser(self._path, self._format)
+            row_parser = _RowParser(self._path, self._format, self.layout)
             count = 0
             while lines := list(itertools.islice(text, BLOCK_ROWS)):
                 values = self._fast_values(lines)
@@ -105,7 +106,7 @@ def _convert(column: Column, cells: NDArray[np.float64] | NDArray[np.str_]) -> N
     """Convert a column that numpy's parser has read as numbers or as text to floats."""
     if column.kind is CellKind.NUMBER:
         return cells.astype(np.float64)
-    parse = parser(column.kind, decimal_comma=False)
+    parse = column.parser(decimal_comma=False)
     if column.kind is CellKind.DIRECTION:  # few different words
         words, index = np.unique(cells, return_inverse=True)
         return np.array([parse(str(word)) for word in words])[index]
@@ -119,13 +120,12 @@ class _RowParser:
         pending_line: Number of the first line without a number after the last row; 0 without one.
     """
 
-    def __init__(self, path: Path, text_format: TextFormat) -> None:
-        self._path, self._format = path, text_format
+    def __init__(self, path: Path, text_format: TextFormat, layout: Layout) -> None:
+        self._path, self._format, self._columns = path, text_format, layout.columns
         self._parsers = {
-            role: parser(column.kind, decimal_comma=text_format.decimal_comma)
-            for role, column in text_format.layout.columns.items()
+            role: column.parser(decimal_comma=text_format.decimal_comma) for role, column in layout.columns.items()
         }
-        self._last_index = max(column.index for column in text_format.layout.columns.values())
+        self._last_index = max(column.index for column in layout.columns.values())
         self.pending_line, self._pending_text = 0, ""
 
     def parse(self, lines: Sequence[str], first_line: int) -> RawBlock:
@@ -144,7 +144,7 @@ class _RowParser:
             if self.pending_line:
                 raise self.pending_error()
             rows.append(self._row(cells, number))
-        return dict(zip(self._format.layout.columns, np.array(rows).T, strict=True)) if rows else {}
+        return dict(zip(self._columns, np.array(rows).T, strict=True)) if rows else {}
 
     def pending_error(self) -> UserError:
         """Return the error of a line without a number that rows follow."""
@@ -153,9 +153,8 @@ class _RowParser:
 
     def _has_no_value(self, cells: Sequence[str]) -> bool:
         """Return True if none of time, current and voltage can be read."""
-        columns = self._format.layout.columns
         for quantity in REQUIRED:
-            index = columns[Role(quantity)].index
+            index = self._columns[Role(quantity)].index
             if index < len(cells) and cells[index].strip():
                 try:
                     self._parsers[Role(quantity)](cells[index])
@@ -169,7 +168,7 @@ class _RowParser:
             raise UserError(
                 f"{self._path}: line {line}: {len(cells)} values, but the header has {self._format.width} columns"
             )
-        return [self._value(role, column, cells, line) for role, column in self._format.layout.columns.items()]
+        return [self._value(role, column, cells, line) for role, column in self._columns.items()]
 
     def _value(self, role: ColumnRole, column: Column, cells: Sequence[str], line: int) -> float:
         cell = cells[column.index]

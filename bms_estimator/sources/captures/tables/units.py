@@ -27,6 +27,7 @@ _SPELLINGS: dict[Quantity, dict[Unit, str]] = {
         SI_UNITS["time"]: "s sec secs second seconds sek",
         Unit("ms", 1e-3): "ms millisecond milliseconds",
         Unit("µs", 1e-6): "us microsecond microseconds",
+        Unit("ns", 1e-9): "ns nanosecond nanoseconds",
         Unit("min", 60.0): "min mins minute minutes",
         Unit("h", 3600.0): "h hr hrs hour hours",
         Unit("d", 86_400.0): "d day days",
@@ -51,6 +52,8 @@ _UNITS = {
     quantity: {word: unit for unit, words in spellings.items() for word in words.split()}
     for quantity, spellings in _SPELLINGS.items()
 }
+TIME_UNITS = tuple(_SPELLINGS["time"])
+"""Units of a time."""
 _UNIT_WORDS = frozenset(word for units in _UNITS.values() for word in units)
 _CHARACTERS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "º": "deg", "℃": "c", "Â": None, " ": None, "_": None})
 """Replacements before a unit is looked up. ``Â`` is left by UTF-8 text that was read as latin-1."""

@@ -1,0 +1,122 @@
+"""Time base of a table: the unit of a time column that states none, and the better of two time columns."""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.sources.captures.tables.cell_values import CellKind
+from bms_estimator.sources.captures.tables.layout import Column, Layout, RawBlock, Role, without_clock
+from bms_estimator.sources.captures.tables.units import TIME_UNITS, Unit
+
+FIRST_UNIX_S, LAST_UNIX_S = 9e8, 4e9
+"""Range of Unix times in a capture: 1998 to 2096 [s]."""
+MIN_BETTER_FRACTION = 0.1
+"""Minimum difference of the fractions of samples that are not later than all before, for a preference of the second column."""
+MAX_RATE_ERROR = 0.2
+"""Maximum relative difference of the rates of two time columns that agree."""
+CHUNKS = 8
+"""Number of parts of a table in which two time columns are compared. Their median excludes pauses of one of them."""
+MIN_PERIOD_S, MAX_PERIOD_S = 0.005, 600.0
+"""Range of the sample period [s]. With a period beyond it, the assumed unit is probably wrong."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeBase:
+    """Columns of a table with its decided time column.
+
+    Attributes:
+        layout: Columns without the second time column.
+        role: Role of the column that is the time.
+        reason: Reason for the column or for its unit, for messages; empty if the table states both.
+        warning: Contradiction, with its remedy; empty without one.
+    """
+
+    layout: Layout
+    role: Role = Role.TIME
+    reason: str = ""
+    warning: str = ""
+
+
+def find_time_base(layout: Layout, raw: RawBlock) -> TimeBase:
+    """Return the time base of a table.
+
+    Args:
+        layout: Columns of the table.
+        raw: Rows at its beginning.
+    """
+    time, clock = layout.columns[Role.TIME], layout.columns.get(Role.CLOCK)
+    if time.assumed and (unit := _unix_unit(raw[Role.TIME])) is not None:
+        return TimeBase(_with_time(layout, dataclasses.replace(time, unit=unit, assumed=False)), reason="Unix time")
+    rate = _rate(raw[Role.CLOCK] * clock.unit.factor, raw[Role.TIME]) if clock else None
+    if clock is None or clock.assumed or rate is None:
+        warning = _implausible_period(time, raw[Role.TIME]) if time.assumed else ""
+        return TimeBase(without_clock(layout), warning=warning)
+    unit = next((unit for unit in TIME_UNITS if _agrees(rate, unit.factor)), None) if time.assumed else time.unit
+    has_better_clock = _late_fraction(raw[Role.CLOCK]) < _late_fraction(raw[Role.TIME]) - MIN_BETTER_FRACTION
+    if has_better_clock:
+        return TimeBase(_with_time(layout, clock), Role.CLOCK, f'"{time.name}" repeats times, or goes back')
+    if unit is None or not _agrees(rate, unit.factor):
+        warning = (
+            f'the time "{time.name}" in {time.unit.symbol} disagrees with "{clock.name}", which advances by {rate:.3g} s for '
+            f'each unit: if so, use --map "time={clock.name}", or state the unit, as in --map "time={time.name} [min]"'
+        )
+        return TimeBase(without_clock(layout), warning=warning)
+    if not time.assumed:
+        return TimeBase(without_clock(layout))
+    return TimeBase(
+        _with_time(layout, dataclasses.replace(time, unit=unit, assumed=False)), reason=f'by "{clock.name}"'
+    )
+
+
+def _with_time(layout: Layout, time: Column) -> Layout:
+    return without_clock(dataclasses.replace(layout, columns={**layout.columns, Role.TIME: time}))
+
+
+def _unix_unit(values: Floats) -> Unit | None:
+    """Return the unit in which large numbers are Unix times; None for smaller numbers."""
+    finite = values[np.isfinite(values)]
+    middle = float(np.median(finite)) if finite.size else 0.0
+    units = (unit for unit in TIME_UNITS if unit.factor < 1.0)
+    return next((unit for unit in units if FIRST_UNIX_S <= middle * unit.factor < LAST_UNIX_S), None)
+
+
+def _rate(clock_s: Floats, values: Floats) -> float | None:
+    """Return the seconds of a clock for each unit of the time column; None if the rows do not determine it."""
+    valid = np.isfinite(clock_s) & np.isfinite(values)
+    advance_s, advance = np.diff(clock_s[valid]), np.diff(values[valid])
+    forward = (advance >= 0.0) & (advance_s >= 0.0)
+    parts = [
+        (part_s.sum(), part.sum())
+        for part_s, part in zip(
+            np.array_split(advance_s[forward], CHUNKS), np.array_split(advance[forward], CHUNKS), strict=True
+        )
+    ]
+    rates = [part_s / part for part_s, part in parts if part > 0.0]
+    rate = float(np.median(rates)) if rates else 0.0
+    return rate if 0.0 < rate < np.inf else None
+
+
+def _agrees(rate: float, factor: float) -> bool:
+    return abs(rate - factor) <= MAX_RATE_ERROR * factor
+
+
+def _late_fraction(values: Floats) -> float:
+    """Return the fraction of values that are not larger than all before."""
+    finite = values[np.isfinite(values)]
+    return float(np.mean(finite[1:] <= np.maximum.accumulate(finite)[:-1])) if finite.size > 1 else 1.0
+
+
+def _implausible_period(time: Column, values: Floats) -> str:
+    """Return a warning if the sample period is implausible in the assumed unit; otherwise an empty text."""
+    steps = np.diff(values[np.isfinite(values)])
+    period = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+    if time.kind is not CellKind.NUMBER or MIN_PERIOD_S <= period <= MAX_PERIOD_S:
+        return ""
+    unit = "ms" if period > MAX_PERIOD_S else "h"
+    return (
+        f'the samples are {period:g} s apart if the time "{time.name}" is in s, which the file does not state: state the '
+        f'unit, as in --map "time={time.name} [{unit}]"'
+    )
