@@ -36,7 +36,7 @@ def test_text_between_rows_is_an_error_with_its_line(tmp_path: Path) -> None:
 
 def test_row_that_is_cut_off_is_an_error_with_its_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"cell\.csv: line 3: 2 values, but the header has 3 columns"):
-        load(tmp_path / "cell.csv", f"{HEADER}0,1,3.7\n1,1\n")
+        load(tmp_path / "cell.csv", f"{HEADER}0,1,3.7\n1,1\n2,1,3.7\n")
 
 
 def test_empty_cell_is_a_missing_value(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ class ArrayTable:
         UserError: A column is missing or does not contain numbers.
     """
 
-    fraction = 1.0
+    fraction, warning = 1.0, ""
 
     def __init__(
         self, name: object, table: ColumnTable, finder: LayoutFinder, description: str = "table in memory"
@@ -80,7 +80,7 @@ class ParquetTable:
         UserError: The file cannot be read, or a column is missing.
     """
 
-    description = "Parquet"
+    description, warning = "Parquet", ""
 
     def __init__(self, path: Path, finder: LayoutFinder) -> None:
         self._path, self.fraction = path, 0.0

@@ -40,7 +40,17 @@ class Dialect:
         )
 
 
-CLOCKS = ("absolute time", "date time", "realtime", "date", "dpt time", "time stamp", "unix time", "prog time")
+CLOCKS = (
+    "absolute time",
+    "date time",
+    "realtime",
+    "date",
+    "dpt time",
+    "time stamp",
+    "unix time",
+    "date and time",
+    "prog time",
+)
 """Names of a second time column, which counts on over all steps of a test."""
 
 OWN = Dialect(
@@ -66,6 +76,8 @@ GENERIC = Dialect(
         "timestamp",
         "date time",
         "absolute time",
+        "date and time",
+        "date",
     ),
     current=(
         "current",
@@ -73,7 +85,9 @@ GENERIC = Dialect(
         "battery current",
         "i",
         "<i>",
+        "cur",
         "amps",
+        "pack amps",
         "strom",
         "discharge current",
         "entladestrom",
@@ -86,7 +100,10 @@ GENERIC = Dialect(
         "u",
         "v",
         "e",
+        "vol",
+        "volt",
         "volts",
+        "pack volts",
         "potential",
         "spannung",
     ),
@@ -132,6 +149,7 @@ DIALECTS = (
         signatures=(
             ("step type", "total time"),
             ("step type", "date"),
+            ("data point", "total time", "date"),
             ("step type", "absolute time"),
             ("step name", "absolute time"),
             ("step name", "realtime"),
@@ -208,6 +226,15 @@ DIALECTS = (
         voltage=("voltage measured",),
         temperature=("temperature measured",),
         signatures=(("time", "current measured", "voltage measured"),),
+        current_sign="charge_positive",
+    ),
+    Dialect(
+        "Novonix",
+        time=("run time",),
+        current=("current",),
+        voltage=("potential",),
+        temperature=("temperature", "circuit temperature"),
+        signatures=(("run time", "step time", "potential"),),
         current_sign="charge_positive",
     ),
     Dialect(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.cell_voltage_columns import present_columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.sources.captures.tables.cell_values import CellKind, parser, time_kind
+from bms_estimator.sources.captures.tables.cell_values import CellKind, parse_number, parser, time_kind
 from bms_estimator.sources.captures.tables.dialects import CLOCKS, DIALECTS, GENERIC, OWN, Dialect
 from bms_estimator.sources.captures.tables.units import (
     SI_UNITS,
@@ -135,6 +135,18 @@ class Layout:
         return tuple(role for role in self.columns if isinstance(role, CellVoltage))
 
 
+class _Header(NamedTuple):
+    """Line that may be a header, with the required quantities for which a dialect has no column in it."""
+
+    cells: Sequence[str]
+    dialect: Dialect
+    missing: Sequence[Quantity]
+
+    def rank(self) -> tuple[int, int]:
+        """Return the similarity to a header: number of quantities found, then number of columns."""
+        return -len(self.missing), len(self.cells)
+
+
 class LayoutFinder:
     """Finder of the columns of a sample in a header.
 
@@ -150,8 +162,8 @@ class LayoutFinder:
         given = column_map or {}
         self._path, self.sheet = path, given.get(SHEET)
         self._map: dict[Quantity, str] = {quantity: given[quantity] for quantity in QUANTITIES if quantity in given}
-        self._closest_header: Sequence[str] = ()
-        self._closest_rank = (0, 0)
+        self._closest = _Header((), GENERIC, REQUIRED)
+        self._first_numbers: Sequence[str] = ()
 
     def find(self, header: Sequence[str]) -> Layout | None:
         """Return the layout of a table with this header; None if it is not a header.
@@ -165,24 +177,59 @@ class LayoutFinder:
             return None
         names = [split_unit(cell) for cell in cells]
         for dialect in DIALECTS:
-            if dialect.matches(cells, names) and (layout := self._apply_dialect(dialect, cells, names, given)):
-                return layout
-        rank = (len(REQUIRED) - len(_missing(names)), len(header))
-        if rank > self._closest_rank:
-            self._closest_header, self._closest_rank = header, rank
+            if not dialect.matches(cells, names):
+                continue
+            missing = [q for q in REQUIRED if q not in given and not _find_indices(getattr(dialect, q), names)]
+            if not missing:
+                return self._apply_dialect(dialect, cells, names, given)
+            self._closest = max(self._closest, _Header(cells, dialect, missing), key=_Header.rank)
+        if not self._first_numbers and sum(map(_is_number, cells)) >= max(len(REQUIRED), 0.5 * len(cells)):
+            self._first_numbers = cells
         return None
 
     def no_header(self) -> UserError:
         """Return the error for a table without a header. It names the columns of the line that is most similar to a header."""
-        if self._map and not self._closest_header:
+        header, dialect, missing = self._closest
+        if self._map and not header:
             return UserError(f"{self._path}: no line names the columns {', '.join(self._map.values())}")
-        header, (found, width) = self._closest_header, self._closest_rank
         needed = f"{','.join(OWN.signatures[0])}[,temperature_c], the columns of a program in docs/cell/captures.md, or {MAP_HELP}"
-        if not found or width < len(REQUIRED) - 1:  # a line of text may contain a name by chance
+        if (
+            len(missing) == len(REQUIRED) or len(header) < len(REQUIRED) - 1
+        ):  # a line of text may contain a name by chance
+            if self._first_numbers:
+                return UserError(
+                    f"{self._path}: no line names the columns: add one above {_shown(self._first_numbers)}, with a name for each "
+                    f"of the {len(self._first_numbers)} columns, such as {','.join(OWN.signatures[0])}; columns that are not "
+                    "needed may have any other names"
+                )
             return UserError(f"{self._path}: not a capture: no line names the columns; needed: {needed}")
-        missing = " nor ".join(_missing([split_unit(cell) for cell in header]))
-        columns = ", ".join(cell.strip()[:MAX_SHOWN_CHARACTERS] for cell in header[:MAX_SHOWN_COLUMNS])
-        return UserError(f"{self._path}: no column of {missing}; found {columns}; needed: {needed}")
+        program = "" if dialect is GENERIC else f" in this export of {dialect.name}"
+        return UserError(
+            f"{self._path}: no column of {' nor '.join(missing)}{program}; found {_shown(header)}; needed: {needed}"
+        )
+
+    def with_units(self, layout: Layout, units_row: Sequence[str]) -> Layout | None:
+        """Return the layout with the units in the row below the header; None if the row does not contain units.
+
+        A column with an empty cell keeps its unit.
+
+        Raises:
+            UserError: The unit of a required column is not known.
+        """
+        columns, is_units_row = dict(layout.columns), False
+        for quantity in QUANTITIES:
+            column = columns.get(Role(quantity))
+            text = units_row[column.index].strip() if column and column.index < len(units_row) else ""
+            if column is None or not text:
+                continue
+            is_units_row |= find_unit(quantity, text) is not None
+            if not is_units_row:
+                return None
+            if with_unit := self._column(quantity, column.index, column.name, text):
+                columns[Role(quantity)] = with_unit
+            else:
+                del columns[Role(quantity)]
+        return dataclasses.replace(layout, columns=columns) if is_units_row else None
 
     def _given_columns(self, cells: Sequence[str]) -> dict[Quantity, Column]:
         """Return the columns that the user named and the header has. A name may be followed by a unit in square brackets."""
@@ -191,14 +238,16 @@ class LayoutFinder:
             name, unit = (given, None) if given in cells else _split_given_unit(given)
             if cells.count(name) > 1:
                 raise UserError(f"{self._path}: {cells.count(name)} columns are named {name}: rename all but one")
-            if name in cells:
-                columns[quantity] = self._column(quantity, cells.index(name), name, unit or split_unit(name).unit)
+            if name not in cells:
+                continue
+            if column := self._column(quantity, cells.index(name), name, unit or split_unit(name).unit):
+                columns[quantity] = column
         return columns
 
     def _apply_dialect(
         self, dialect: Dialect, cells: Sequence[str], names: Sequence[ColumnName], given: Mapping[Quantity, Column]
-    ) -> Layout | None:
-        """Return the layout of a dialect with the given columns; None if the header lacks a required column."""
+    ) -> Layout:
+        """Return the layout of a dialect with the given columns, for a header with all required columns."""
         columns = dict[ColumnRole, Column]()
         for quantity in QUANTITIES:
             indices = _find_indices(getattr(dialect, quantity), names)
@@ -209,9 +258,8 @@ class LayoutFinder:
                 raise UserError(f"{self._path}: {several}: choose one of these columns by {MAP_HELP}")
             elif indices:
                 unit = names[indices[0]].unit or (dialect.time_unit if quantity == "time" else None)
-                columns[Role(quantity)] = self._column(quantity, indices[0], cells[indices[0]], unit)
-            elif quantity in REQUIRED:
-                return None
+                if column := self._column(quantity, indices[0], cells[indices[0]], unit):
+                    columns[Role(quantity)] = column
         columns |= _own_columns(cells) if dialect is OWN else _clock_column(dialect, cells, names, columns[Role.TIME])
         current_name = names[columns[Role.CURRENT].index].name
         return Layout(dialect, columns | self._sign_columns(dialect, cells, names, current_name), bool(given))
@@ -225,24 +273,33 @@ class LayoutFinder:
             columns[Role.STATE] = Column(state, cells[state], Unit(""), kind=CellKind.DIRECTION)
         if current_name in DISCHARGE_CURRENTS:
             for charge in _find_indices(dialect.charge_current, names)[:1]:
-                columns[Role.CHARGE_CURRENT] = self._column("current", charge, cells[charge], names[charge].unit)
+                if column := self._column("current", charge, cells[charge], names[charge].unit):
+                    columns[Role.CHARGE_CURRENT] = column
         return columns
 
-    def _column(self, quantity: Quantity, index: int, name: str, unit_text: str | None) -> Column:
+    def _column(self, quantity: Quantity, index: int, name: str, unit_text: str | None) -> Column | None:
+        """Return a column with its unit; None if an optional column that the user did not name has an unknown unit.
+
+        Raises:
+            UserError: The unit of another column is not known.
+        """
         if unit_text is None:
             return Column(index, name, SI_UNITS[quantity], assumed=True)
         unit = find_unit(quantity, unit_text)
-        if unit is None:
+        if unit is None and (quantity in REQUIRED or quantity in self._map):
             raise UserError(
                 f"{self._path}: column {name}: {unit_text!r} is not a unit of {quantity} that is supported; "
                 f"convert it, or name other columns by {MAP_HELP}"
             )
-        return Column(index, name, unit)
+        return unit and Column(index, name, unit)
 
 
 def _find_indices(wanted: Sequence[str], names: Sequence[ColumnName]) -> list[int]:
     """Return the indices of the columns with the first of the wanted names that a header has; an empty list if it has none."""
-    found = ([index for index, column in enumerate(names) if column.name == fold(name)] for name in wanted)
+    found = (
+        [index for index, column in enumerate(names) if fold(name) in (column.name, column.full_name)]
+        for name in wanted
+    )
     return next(filter(None, found), [])
 
 
@@ -280,22 +337,6 @@ def _clock_column(
         if unit is not None:
             return {Role.CLOCK: Column(index, cells[index], unit, assumed=names[index].unit is None, is_lenient=True)}
     return {}
-
-
-def with_units(layout: Layout, units_row: Sequence[str]) -> Layout | None:
-    """Return the layout with the units in the row below the header; None if the row does not contain units."""
-    if len(units_row) <= max(column.index for column in layout.columns.values()):
-        return None
-    columns = dict(layout.columns)
-    for quantity in QUANTITIES:
-        column = columns.get(Role(quantity))
-        if column is None:
-            continue
-        unit = find_unit(quantity, units_row[column.index])
-        if unit is None:
-            return None
-        columns[Role(quantity)] = dataclasses.replace(column, unit=unit, assumed=False)
-    return dataclasses.replace(layout, columns=columns)
 
 
 def with_time_kinds(layout: Layout, cells_of: Callable[[Column], Iterable[str]]) -> Layout:
@@ -340,7 +381,13 @@ def parse_column_map(text: str) -> ColumnMap:
     return {key: names[key].strip() for key in keys if key in names}
 
 
-def _missing(names: Sequence[ColumnName]) -> list[Quantity]:
-    """Return the required quantities for which a header has no column of a usual name."""
-    present = {column.name for column in names}
-    return [quantity for quantity in REQUIRED if not present & {fold(name) for name in getattr(GENERIC, quantity)}]
+def _is_number(cell: str) -> bool:
+    try:
+        return bool(np.isfinite(parse_number(cell, decimal_comma=False)))
+    except (ValueError, OverflowError):
+        return False
+
+
+def _shown(cells: Sequence[str]) -> str:
+    """Return cells of a line for messages, limited in number and length."""
+    return ", ".join(cell[:MAX_SHOWN_CHARACTERS] for cell in cells[:MAX_SHOWN_COLUMNS])

@@ -21,7 +21,6 @@ from bms_estimator.sources.captures.tables.layout import (
     RawBlock,
     Role,
     with_time_kinds,
-    with_units,
 )
 
 MAX_HEADER_ROWS = 100
@@ -54,6 +53,8 @@ class Spreadsheet:
     Raises:
         UserError: The file cannot be read, no sheet has the columns, or several sheets have them.
     """
+
+    warning = ""
 
     def __init__(self, path: Path, finder: LayoutFinder) -> None:
         self._path, self.fraction = path, 0.0
@@ -122,7 +123,7 @@ class Spreadsheet:
             if layout is None:
                 continue
             below = rows[index + 1 :]
-            if below and (layout_with_units := with_units(layout, [_cell_text(cell) for cell in below[0]])):
+            if below and (layout_with_units := finder.with_units(layout, [_cell_text(cell) for cell in below[0]])):
                 layout, below = layout_with_units, below[1:]
             return _Sheet(name, with_time_kinds(layout, partial(_cell_texts, below)), below)
         return None

@@ -1,5 +1,6 @@
 """Captures as tables: the reader of a file by its first bytes, and the samples with the sign of their current."""
 
+import dataclasses
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -49,6 +50,10 @@ class TableReader(Protocol):
         """Kind of the file for messages."""
 
     @property
+    def warning(self) -> str:
+        """Fault of the rows that were read; empty without one."""
+
+    @property
     def fraction(self) -> float:
         """Fraction of the table that has been read, 0..1."""
 
@@ -68,7 +73,6 @@ class Table:
         implausible: Number of implausible temperatures in the rows read so far.
         cells: Cell voltages of the last block.
         note: Description of dialect, columns and sign; empty for a table with this project's columns.
-        warning: Contradiction between the sign of the current and the voltage; empty without one.
     """
 
     def __init__(self, reader: TableReader, configured: Sign) -> None:
@@ -77,12 +81,18 @@ class Table:
         first = _first_rows(reader)
         time_base = find_time_base(reader.layout, first)
         first[Role.TIME] = first[time_base.role]
-        self.layout = reader.layout = time_base.layout
+        layout, ignored = _without_zero_temperature(time_base.layout, first)
+        self.layout = reader.layout = layout
         response = None if configured.option else voltage_response(to_samples(first, self.layout))
         self._direction = find_direction(self.layout, configured, response)
         is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
-        self.note = "" if is_own else _note(reader, time_base.reason, self._direction.text)
-        self.warning = "; ".join(filter(None, (time_base.warning, self._direction.warning)))
+        self.note = "" if is_own else _note(reader, time_base.reason, self._direction.text) + ignored
+        self._warnings = (time_base.warning, self._direction.warning)
+
+    @property
+    def warning(self) -> str:
+        """Contradictions of time and sign, and faults of the rows read so far; empty without one."""
+        return "; ".join(filter(None, (*self._warnings, self._reader.warning)))
 
     @property
     def fraction(self) -> float:
@@ -124,6 +134,19 @@ def _first_rows(reader: TableReader) -> RawBlock:
         if rows >= FIRST_ROWS:
             break
     return {role: np.concatenate([np.empty(0), *(raw[role] for raw in blocks)]) for role in reader.layout.columns}
+
+
+def _without_zero_temperature(layout: Layout, first: RawBlock) -> tuple[Layout, str]:
+    """Return the layout without a temperature that is exactly 0 in each row, and a text that says so.
+
+    Programs write 0 if no probe is connected. Tables of this project have no such column then, and users name no such column.
+    """
+    is_zero = Role.TEMPERATURE in first and not np.nan_to_num(first[Role.TEMPERATURE], nan=0.0).any()
+    if not is_zero or layout.dialect is OWN or layout.has_given_columns:
+        return layout, ""
+    columns = dict(layout.columns)
+    temperature = columns.pop(Role.TEMPERATURE)
+    return dataclasses.replace(layout, columns=columns), f'; "{temperature.name}" is 0 in each row: no temperature'
 
 
 def to_samples(raw: RawBlock, layout: Layout) -> SampleBlock:

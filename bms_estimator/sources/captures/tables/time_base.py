@@ -55,9 +55,13 @@ def find_time_base(layout: Layout, raw: RawBlock) -> TimeBase:
         warning = _implausible_period(time, raw[Role.TIME]) if time.assumed else ""
         return TimeBase(without_clock(layout), warning=warning)
     unit = next((unit for unit in TIME_UNITS if _agrees(rate, unit.factor)), None) if time.assumed else time.unit
-    has_better_clock = _late_fraction(raw[Role.CLOCK]) < _late_fraction(raw[Role.TIME]) - MIN_BETTER_FRACTION
-    if has_better_clock:
-        return TimeBase(_with_time(layout, clock), Role.CLOCK, f'"{time.name}" repeats times, or goes back')
+    late, clock_late = (_late_fraction(raw[role], raw[Role.CURRENT]) for role in (Role.TIME, Role.CLOCK))
+    if clock_late < late - MIN_BETTER_FRACTION:
+        return TimeBase(
+            _with_time(layout, dataclasses.replace(clock, is_lenient=False)),
+            Role.CLOCK,
+            f'"{time.name}" repeats times, or goes back',
+        )
     if unit is None or not _agrees(rate, unit.factor):
         warning = (
             f'the time "{time.name}" in {time.unit.symbol} disagrees with "{clock.name}", which advances by {rate:.3g} s for '
@@ -103,10 +107,15 @@ def _agrees(rate: float, factor: float) -> bool:
     return abs(rate - factor) <= MAX_RATE_ERROR * factor
 
 
-def _late_fraction(values: Floats) -> float:
-    """Return the fraction of values that are not larger than all before."""
-    finite = values[np.isfinite(values)]
-    return float(np.mean(finite[1:] <= np.maximum.accumulate(finite)[:-1])) if finite.size > 1 else 1.0
+def _late_fraction(values: Floats, current: Floats) -> float:
+    """Return the fraction of times that are not larger than all before. Cyclers repeat a time where the current changes."""
+    valid = np.isfinite(values)
+    times, latest, changes = (
+        values[valid][1:],
+        np.maximum.accumulate(values[valid])[:-1],
+        np.diff(current[valid]) != 0.0,
+    )
+    return float(np.mean((times < latest) | ((times == latest) & ~changes))) if times.size else 1.0
 
 
 def _implausible_period(time: Column, values: Floats) -> str:
