@@ -266,6 +266,13 @@ def battery_archive(m: Measurement) -> str:
     return header + "\n" + text(rows)
 
 
+def unsigned(m: Measurement) -> str:
+    """Return a CSV of a hobby tester, which writes the magnitude of the current below a table of steps."""
+    preamble = "*Step,Mode,Capacity,Energy\n*1-1,D-CC,0.008,0.03\n*1-2,C-CV,0.004,0.02\n"
+    rows = zip(m.time_s, np.abs(m.current_a), m.voltage_v, strict=True)
+    return preamble + "Time(S),Cur(A),Vol(V)\n" + text(rows)
+
+
 def german(m: Measurement) -> str:
     """Return a CSV with German columns, semicolons, decimal commas and a row of units."""
     rows = zip(m.time_s / 60.0, 1e3 * m.charge_a, 1e3 * m.voltage_v, m.temperature_c, strict=True)
@@ -326,6 +333,7 @@ EXPORTS = (
     Export(bdf_labels, "Battery Data Format"),
     Export(bdf_names, "Battery Data Format", reader="bdf"),
     Export(battery_archive, "Battery Archive"),
+    Export(unsigned, "unknown program", has_temperature=False),
     Export(german, "unknown program", encoding="latin-1"),
     Export(separate_currents, "unknown program", has_temperature=False),
 )

@@ -1,6 +1,7 @@
 """Captures as tables: the reader of a file by its first bytes, and the samples with the sign of their current."""
 
 import dataclasses
+import math
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import MAX_C, MIN_C, NO_CELLS, SAMPLE, CellBlock, SampleBlock, remove_implausible
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
-from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction, voltage_response
+from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction
 from bms_estimator.sources.captures.tables.cycler_files import (
     MPR_MAGIC,
     NDA_MAGIC,
@@ -28,6 +29,7 @@ from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
 from bms_estimator.sources.captures.tables.text_table import TextTable
 from bms_estimator.sources.captures.tables.time_base import find_time_base
+from bms_estimator.sources.captures.tables.voltage_response import VoltageResponse, voltage_response
 
 FIRST_ROWS = 262_144
 """Minimum number of rows at the beginning of a table that determine its time base and the sign of the current."""
@@ -65,6 +67,7 @@ class Table:
     """Samples of a table; a ``Capture``.
 
     Args:
+        name: Name of the table for messages.
         reader: Reader of the columns.
         configured: Direction of positive current that the user configured.
 
@@ -75,7 +78,7 @@ class Table:
         note: Description of dialect, columns and sign; empty for a table with this project's columns.
     """
 
-    def __init__(self, reader: TableReader, configured: Sign) -> None:
+    def __init__(self, name: object, reader: TableReader, configured: Sign) -> None:
         self._reader = reader
         self.implausible, self.cells = 0, NO_CELLS
         first = _first_rows(reader)
@@ -83,8 +86,9 @@ class Table:
         first[Role.TIME] = first[time_base.role]
         layout, ignored = _without_zero_temperature(time_base.layout, first)
         self.layout = reader.layout = layout
-        response = None if configured.option else voltage_response(to_samples(first, self.layout))
-        self._direction = find_direction(self.layout, configured, response)
+        has_words = Role.STATE in first and bool((np.abs(first[Role.STATE]) == 1.0).any())
+        response = VoltageResponse() if configured.option else self._voltage_response(first, has_words=has_words)
+        self._direction = find_direction(name, self.layout, configured, response, has_words=has_words)
         is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
         self.note = "" if is_own else _note(reader, time_base.reason, self._direction.text) + ignored
         self._warnings = (time_base.warning, self._direction.warning)
@@ -107,13 +111,17 @@ class Table:
         """
         self.implausible = 0
         before = np.empty(0, dtype=SAMPLE)
-        start_s = None
+        start_s, rows = None, 0
         for raw in self._reader.blocks():
             samples = to_samples(raw, self.layout)
             if self.layout.columns[Role.TIME].kind in DATES:
                 start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
                 samples["time_s"] -= start_s
             samples["current_a"] *= self._direction.factor
+            if self._direction.row_factors is not None:
+                factors = self._direction.row_factors[rows : rows + samples.size]
+                samples["current_a"] = factors * np.abs(samples["current_a"])
+                rows += samples.size
             if self._direction.by_state:
                 state = raw[Role.STATE]
                 directed = state * np.abs(samples["current_a"])
@@ -124,14 +132,21 @@ class Table:
             self.cells = cell_voltages(raw, self.layout)
             yield samples
 
+    def _voltage_response(self, first: RawBlock, *, has_words: bool) -> VoltageResponse:
+        """Return the response of the voltage in the first rows; of all rows if the current has no sign."""
+        response = voltage_response(to_samples(first, self.layout))
+        if not response.has_no_sign or has_words or first[Role.TIME].size < FIRST_ROWS:
+            return response
+        return voltage_response(to_samples(_first_rows(self._reader, math.inf), self.layout))
 
-def _first_rows(reader: TableReader) -> RawBlock:
-    """Return rows at the beginning of a table, at least ``FIRST_ROWS`` if it has as many."""
+
+def _first_rows(reader: TableReader, min_rows: float = FIRST_ROWS) -> RawBlock:
+    """Return rows at the beginning of a table, at least ``min_rows`` if it has as many."""
     blocks, rows = list[RawBlock](), 0
     for raw in reader.blocks():
         blocks.append(raw)
         rows += raw[Role.TIME].size
-        if rows >= FIRST_ROWS:
+        if rows >= min_rows:
             break
     return {role: np.concatenate([np.empty(0), *(raw[role] for raw in blocks)]) for role in reader.layout.columns}
 
@@ -245,7 +260,7 @@ def open_table(path: Path, configured: Sign, column_map: ColumnMap | None = None
     reader = _open_reader(path, finder)
     if finder.sheet is not None and not isinstance(reader, Spreadsheet):
         raise UserError(f"{path}: sheet {finder.sheet} is given, but the file is not a spreadsheet")
-    return Table(reader, configured)
+    return Table(path, reader, configured)
 
 
 def _open_reader(path: Path, finder: LayoutFinder) -> TableReader:
@@ -287,4 +302,4 @@ def convert_table(table: ColumnTable, configured: Sign, column_map: ColumnMap | 
         UserError: A column is missing or does not contain numbers.
     """
     name = "the table"
-    return Table(ArrayTable(name, table, LayoutFinder(name, column_map)), configured)
+    return Table(name, ArrayTable(name, table, LayoutFinder(name, column_map)), configured)
