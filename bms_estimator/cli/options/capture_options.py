@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.model.cell import CellModel, battery_names, cell_names, with_name
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
@@ -78,6 +78,12 @@ TemperatureWithoutSensor = Annotated[
         parser=decimal(),
         help="temperature of the captures that have no column temperature_c [°C]; default: 25",
         show_default=False,
+    ),
+]
+Series = Annotated[
+    int | None,
+    typer.Option(
+        parser=whole(1), help="number of cells in series in the captures; default: the number in the settings, or 1"
     ),
 ]
 MappedColumns = Annotated[

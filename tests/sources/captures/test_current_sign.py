@@ -108,6 +108,14 @@ def test_settings_define_the_sign_of_a_table_without_one(tmp_path: Path) -> None
     np.testing.assert_allclose(samples["current_a"], M.current_a)
 
 
+def test_settings_without_a_sensor_do_not_define_the_sign(tmp_path: Path) -> None:
+    path = save(tmp_path / "cell.csv", "Time,Current,Voltage", M.charge_a)
+    capture = open_capture(path, SensorSettings())
+    (samples,) = capture
+    np.testing.assert_allclose(samples["current_a"], M.current_a)
+    assert "positive on charge (response of the voltage)" in capture.note
+
+
 @pytest.mark.parametrize(
     ("header", "current_a", "opposite"),
     [
