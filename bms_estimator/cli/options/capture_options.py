@@ -12,7 +12,8 @@ from bms_estimator.model.cell import CellModel, battery_names, cell_names, with_
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.sources.captures.tables.layout import ColumnMap, parse_column_map
+from bms_estimator.sources.captures.tables.layout import ColumnMap
+from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 
 AsJson = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
 """Option that prints the result as JSON."""

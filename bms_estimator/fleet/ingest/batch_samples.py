@@ -25,15 +25,8 @@ from bms_estimator.model.sample import (
 )
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind, date_order
 from bms_estimator.sources.captures.tables.column_tables import parse_column
-from bms_estimator.sources.captures.tables.layout import (
-    Column,
-    ColumnMap,
-    ColumnRole,
-    Layout,
-    LayoutFinder,
-    Role,
-    with_column_kinds,
-)
+from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, ColumnRole, Layout, Role, with_column_kinds
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 from bms_estimator.sources.captures.tables.table_reader import (
     cell_voltages,
     remove_implausible_temperatures,

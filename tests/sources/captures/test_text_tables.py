@@ -11,7 +11,8 @@ from bms_estimator import load_capture
 from bms_estimator.calibration.cleaning.rests import remove_glitches, soc_by_counting
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.replay import open_capture
-from bms_estimator.sources.captures.tables.layout import Role, parse_column_map
+from bms_estimator.sources.captures.tables.layout import Role
+from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 from bms_estimator.sources.captures.tables.table_reader import Table
 from tests.sources.captures.cycler_exports import EXPORTS, Export
 

@@ -14,11 +14,11 @@ from bms_estimator.sources.captures.tables.layout import (
     BLOCK_ROWS,
     TIME_ROLES,
     Column,
-    LayoutFinder,
     RawBlock,
     with_column_kinds,
     without_clock,
 )
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -13,15 +13,8 @@ import numpy as np
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.tables.cell_values import CellKind
 from bms_estimator.sources.captures.tables.column_tables import parse_column
-from bms_estimator.sources.captures.tables.layout import (
-    REQUIRED,
-    Column,
-    Layout,
-    LayoutFinder,
-    RawBlock,
-    Role,
-    with_time_kinds,
-)
+from bms_estimator.sources.captures.tables.layout import REQUIRED, Column, Layout, RawBlock, Role, with_time_kinds
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 
 MAX_HEADER_ROWS = 100
 """Maximum number of rows of a sheet that are searched for the header."""

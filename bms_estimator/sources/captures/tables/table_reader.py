@@ -24,7 +24,8 @@ from bms_estimator.sources.captures.tables.cycler_files import (
     read_neware,
 )
 from bms_estimator.sources.captures.tables.dialects import GENERIC, OWN
-from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layout, LayoutFinder, RawBlock, Role
+from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layout, RawBlock, Role
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
 from bms_estimator.sources.captures.tables.text_table import TextTable

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from io import TextIOWrapper
 
 from bms_estimator.sources.captures.tables.cell_values import CellKind, uses_decimal_comma
-from bms_estimator.sources.captures.tables.layout import Column, Layout, LayoutFinder, with_time_kinds
+from bms_estimator.sources.captures.tables.layout import Column, Layout, with_time_kinds
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 
 MAX_HEADER_LINES = 2_000
 """Maximum number of lines up to the header."""

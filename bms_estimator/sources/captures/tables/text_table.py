@@ -15,10 +15,10 @@ from bms_estimator.sources.captures.tables.layout import (
     Column,
     ColumnRole,
     Layout,
-    LayoutFinder,
     RawBlock,
     Role,
 )
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 from bms_estimator.sources.captures.tables.text_file import TextFile
 from bms_estimator.sources.captures.tables.text_format import (
     SEPARATORS,
