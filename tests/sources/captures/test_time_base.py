@@ -102,3 +102,30 @@ def test_px4_writes_microseconds_since_boot(tmp_path: Path) -> None:
     capture = load_capture(path)
     np.testing.assert_allclose(capture["time_s"], 123.456789 + 0.1 * SECONDS)
     assert (capture["current_a"] == 8.0).all()
+
+
+@pytest.mark.parametrize("date_format", ["%Y-%m-%d", "%d/%m/%Y", "%d.%m.%Y"])
+def test_times_of_the_day_follow_the_date_in_another_column(date_format: str, tmp_path: Path) -> None:
+    elapsed_s = 3600.0 * SECONDS
+    columns = {"Date": stamps(elapsed_s, date_format), "Time": stamps(elapsed_s, "%H:%M:%S")}
+    capture = load(tmp_path / "log.csv", columns)
+    np.testing.assert_array_equal(capture["time_s"], elapsed_s)
+    assert 'time "Time" as duration (after "Date")' in capture.note
+
+
+def test_a_time_since_the_start_does_not_follow_the_date(tmp_path: Path) -> None:
+    elapsed_s = 600.0 * SECONDS
+    columns = {
+        "Date": stamps(elapsed_s + 50_000.0, "%Y-%m-%d"),
+        "Test Time": [f"{int(s) // 3600:02d}:{int(s) // 60 % 60:02d}:00" for s in elapsed_s],
+    }
+    np.testing.assert_array_equal(load(tmp_path / "log.csv", columns)["time_s"], elapsed_s)
+
+
+def test_seconds_beyond_the_year_2096_are_a_warning_with_a_remedy(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = zip(1_700_000_000_000 + 1000 * SECONDS, CURRENT_A, VOLTAGE_V, strict=True)
+    path.write_text("time_s,current_a,voltage_v\n" + text(rows))
+    assert 'if it is Unix time, use --map "time=time_s [ms]"' in load_capture(path).warning
+    mapped = load_capture(path, column_map={"time": "time_s [ms]"})
+    np.testing.assert_array_equal(mapped["time_s"], 1.7e9 + SECONDS)

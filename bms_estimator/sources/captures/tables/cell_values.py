@@ -11,7 +11,8 @@ from bms_estimator.model.decimal_text import measured
 
 _DURATION = re.compile(r"(?:(\d{1,6})(?:\s*(?:days?,?|d|-)\s*|\s+))?(\d{1,6}):(\d{1,2}):(\d{1,2}(?:[.,]\d+)?)")
 _DATE_TIME = re.compile(
-    r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})[T ]+(\d{1,2}):(\d{1,2})(?::(\d{1,2})([.,:]\d+)?)?\s*([AP]M)?", re.IGNORECASE
+    r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?:[T ]+(\d{1,2}):(\d{1,2})(?::(\d{1,2})([.,:]\d+)?)?\s*([AP]M)?)?",
+    re.IGNORECASE,
 )
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _GROUPED_DIGITS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
@@ -73,7 +74,7 @@ def parse_duration(cell: str) -> float:
 
 
 def parse_date_time(cell: str, *, day_first: bool = False) -> float:
-    """Return the Unix time of a date and time [s]; UTC if the text has no time zone.
+    """Return the Unix time of a date and time [s]; UTC if the text has no time zone, midnight if it has no time.
 
     Formats are ISO 8601, year first, day first with periods, and with slashes or hyphens as ``day_first`` says.
 
@@ -91,10 +92,10 @@ def parse_date_time(cell: str, *, day_first: bool = False) -> float:
         day, month, year = int(first), int(second), int(third)
     else:
         month, day, year = int(first), int(second), int(third)
-    hours = int(hour) % 12 + 12 * (am_pm.upper() == "PM") if am_pm else int(hour)
+    hours = int(hour) % 12 + 12 * (am_pm.upper() == "PM") if am_pm else int(hour or 0)
     if year < 100:  # two digits
         year += 2000
-    whole = datetime(year, month, day, hours, int(minute), int(seconds or 0), tzinfo=UTC)
+    whole = datetime(year, month, day, hours, int(minute or 0), int(seconds or 0), tzinfo=UTC)
     return whole.timestamp() + (float(f"0.{fraction[1:]}") if fraction else 0.0)
 
 
@@ -139,7 +140,7 @@ def date_order(cells: Iterable[str]) -> CellKind:
             return CellKind.DATE_TIME
         if int(match[1]) > 12:
             return CellKind.DAY_FIRST
-        dates[f"{match[1]}/{match[3]}/{match[4]} 0:00"] = None
+        dates[f"{match[1]}/{match[3]}/{match[4]}"] = None
     try:
         lengths_s = [
             sum(abs(after - before) for before, after in itertools.pairwise(map(parse, dates)))

@@ -115,7 +115,7 @@ class Table:
         start_s, rows = None, 0
         for raw in self._reader.blocks():
             samples = to_samples(raw, self.layout)
-            if self.layout.columns[Role.TIME].kind in DATES:
+            if Role.CLOCK in self.layout.columns or self.layout.columns[Role.TIME].kind in DATES:
                 start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
                 samples["time_s"] -= start_s
             samples["current_a"] *= self._direction.factor
@@ -170,7 +170,7 @@ def to_samples(raw: RawBlock, layout: Layout) -> SampleBlock:
     with np.errstate(over="ignore"):  # infinite results are dropped like other invalid values
         values = {role: raw[role] * column.unit.factor + column.unit.offset for role, column in layout.columns.items()}
     samples = np.zeros(values[Role.TIME].size, dtype=SAMPLE)
-    samples["time_s"], samples["voltage_v"] = values[Role.TIME], values[Role.VOLTAGE]
+    samples["time_s"], samples["voltage_v"] = values[Role.TIME] + values.get(Role.CLOCK, 0.0), values[Role.VOLTAGE]
     samples["current_a"] = values[Role.CURRENT]
     if Role.CHARGE_CURRENT in values:
         discharge_a, charge_a = np.abs(values[Role.CURRENT]), np.abs(values[Role.CHARGE_CURRENT])

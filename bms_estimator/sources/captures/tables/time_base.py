@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.sources.captures.tables.cell_values import CellKind
+from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.layout import Column, Layout, RawBlock, Role, without_clock
 from bms_estimator.sources.captures.tables.units import TIME_UNITS, Unit
 
@@ -15,6 +15,7 @@ MIN_BETTER_FRACTION = 0.1
 """Minimum difference of the fractions of samples that are not later than all before, for a preference of the second column."""
 MAX_RATE_ERROR = 0.2
 """Maximum relative difference of the rates of two time columns that agree."""
+DAY_S = 86_400.0
 CHUNKS = 8
 """Number of parts of a table in which two time columns are compared. Their median excludes pauses of one of them."""
 MIN_PERIOD_S, MAX_PERIOD_S = 0.005, 600.0
@@ -28,7 +29,7 @@ class TimeBase:
     """Columns of a table with its decided time column.
 
     Attributes:
-        layout: Columns without the second time column.
+        layout: Columns without the second time column, unless it contains the dates of times of the day.
         role: Role of the column that is the time.
         reason: Reason for the column or for its unit, for messages; empty if the table states both.
         warning: Contradiction, with its remedy; empty without one.
@@ -48,35 +49,67 @@ def find_time_base(layout: Layout, raw: RawBlock) -> TimeBase:
         raw: Rows at its beginning.
     """
     time, clock = layout.columns[Role.TIME], layout.columns.get(Role.CLOCK)
-    if time.assumed and (unit := _unix_unit(raw[Role.TIME])) is not None:
-        return TimeBase(_with_time(layout, dataclasses.replace(time, unit=unit, assumed=False)), reason="Unix time")
-    rate = _rate(raw[Role.CLOCK] * clock.unit.factor, raw[Role.TIME]) if clock else None
-    if clock is None or clock.assumed or rate is None:
-        warning = _implausible_period(time, raw[Role.TIME]) if time.assumed else ""
-        return TimeBase(without_clock(layout), warning=warning)
-    unit = next((unit for unit in TIME_UNITS if _agrees(rate, unit.factor)), None) if time.assumed else time.unit
+    if clock is not None and time.kind is CellKind.DURATION and _is_time_of_day(clock, raw):
+        return TimeBase(layout, reason=f'after "{clock.name}"')
+    time_base = _by_unix_time(layout, time, raw[Role.TIME])
+    if time_base is None and clock is not None and not clock.assumed:
+        time_base = _by_clock(layout, time, clock, raw)
+    if time_base is not None:
+        return time_base
+    warning = _implausible_period(time, raw[Role.TIME]) if time.assumed else ""
+    return TimeBase(without_clock(layout), warning=warning)
+
+
+def _by_unix_time(layout: Layout, time: Column, values: Floats) -> TimeBase | None:
+    """Return the time base of Unix times in another unit than seconds; None for other times."""
+    unit = _unix_unit(values)
+    if unit is None or time.kind is not CellKind.NUMBER or unit == time.unit:
+        return None
+    if time.assumed:
+        return TimeBase(_with_unit(layout, time, unit), reason="Unix time")
+    warning = (
+        f'the time "{time.name}" in {time.unit.symbol} is beyond the year 2096: if it is Unix time, use '
+        f'--map "time={time.name} [{unit.symbol}]"'
+    )
+    return TimeBase(without_clock(layout), warning=warning)
+
+
+def _by_clock(layout: Layout, time: Column, clock: Column, raw: RawBlock) -> TimeBase | None:
+    """Return the time base that a second time column shows; None if it shows nothing."""
+    rate = _rate(raw[Role.CLOCK] * clock.unit.factor, raw[Role.TIME])
+    if rate is None:
+        return None
     late, clock_late = (_late_fraction(raw[role], raw[Role.CURRENT]) for role in (Role.TIME, Role.CLOCK))
     if clock_late < late - MIN_BETTER_FRACTION:
-        return TimeBase(
-            _with_time(layout, dataclasses.replace(clock, is_lenient=False)),
-            Role.CLOCK,
-            f'"{time.name}" repeats times, or goes back',
-        )
-    if unit is None or not _agrees(rate, unit.factor):
-        warning = (
-            f'the time "{time.name}" in {time.unit.symbol} disagrees with "{clock.name}", which advances by {rate:.3g} s for '
-            f'each unit: if so, use --map "time={clock.name}", or state the unit, as in --map "time={time.name} [min]"'
-        )
-        return TimeBase(without_clock(layout), warning=warning)
-    if not time.assumed:
-        return TimeBase(without_clock(layout))
-    return TimeBase(
-        _with_time(layout, dataclasses.replace(time, unit=unit, assumed=False)), reason=f'by "{clock.name}"'
+        with_clock = _with_time(layout, dataclasses.replace(clock, is_lenient=False))
+        return TimeBase(with_clock, Role.CLOCK, f'"{time.name}" repeats times, or goes back')
+    units = TIME_UNITS if time.assumed else (time.unit,)
+    unit = next((unit for unit in units if abs(rate - unit.factor) <= MAX_RATE_ERROR * unit.factor), None)
+    if unit is not None:
+        return TimeBase(_with_unit(layout, time, unit), reason=f'by "{clock.name}"' if time.assumed else "")
+    warning = (
+        f'the time "{time.name}" in {time.unit.symbol} disagrees with "{clock.name}", which advances by {rate:.3g} s for '
+        f'each unit: if so, use --map "time={clock.name}", or state the unit, as in --map "time={time.name} [min]"'
     )
+    return TimeBase(without_clock(layout), warning=warning)
+
+
+def _with_unit(layout: Layout, time: Column, unit: Unit) -> Layout:
+    return _with_time(layout, dataclasses.replace(time, unit=unit, assumed=False))
 
 
 def _with_time(layout: Layout, time: Column) -> Layout:
     return without_clock(dataclasses.replace(layout, columns={**layout.columns, Role.TIME: time}))
+
+
+def _is_time_of_day(clock: Column, raw: RawBlock) -> bool:
+    """Return True if the second column contains dates without a time, and the first one is not the time since the start."""
+    valid = np.isfinite(raw[Role.CLOCK]) & np.isfinite(raw[Role.TIME])
+    date_s, time_s = raw[Role.CLOCK][valid], raw[Role.TIME][valid]
+    if clock.kind not in DATES or not date_s.size or (date_s % DAY_S).any() or time_s.max() >= DAY_S:
+        return False
+    later_days = np.diff(date_s) > 0.0
+    return not later_days.any() or bool((np.diff(time_s)[later_days] < 0.0).any())
 
 
 def _unix_unit(values: Floats) -> Unit | None:
@@ -101,10 +134,6 @@ def _rate(clock_s: Floats, values: Floats) -> float | None:
     rates = [part_s / part for part_s, part in parts if part > 0.0]
     rate = float(np.median(rates)) if rates else 0.0
     return rate if 0.0 < rate < np.inf else None
-
-
-def _agrees(rate: float, factor: float) -> bool:
-    return abs(rate - factor) <= MAX_RATE_ERROR * factor
 
 
 def _late_fraction(values: Floats, current: Floats) -> float:
