@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.capture_checks import MIN_GAP_CHARGE, MIN_GAP_PERIODS
+from bms_estimator.calibration.cleaning.capture_checks import MIN_GAP_CHARGE
 from bms_estimator.calibration.cleaning.rests import remove_glitches, resting_samples, true_runs
 from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V, coldness
 from bms_estimator.calibration.ocv.relaxation_test import Rest, find_rests
@@ -18,6 +18,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C
 from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.time_faults import MIN_GAP_PERIODS
 
 MAX_ANCHOR_SOC_STD = 0.1
 """Maximum std of an anchor's SOC."""

@@ -73,6 +73,14 @@ class SampleStatus(IntFlag):
     """A temperature probe is faulty."""
 
 
+def fill_temperature(samples: SampleBlock, temperature_c: float | None) -> None:
+    """Set the temperature of samples that have none to ``temperature_c`` [°C], in place; None leaves them without one."""
+    names = ("temperature_c", "temperature_min_c", "temperature_max_c")
+    if temperature_c is not None and not any(np.isfinite(samples[name]).any() for name in names):
+        for name in names:
+            samples[name] = temperature_c
+
+
 def remove_implausible(values: NDArray[np.float64], low: float, high: float) -> int:
     """Replace values outside ``low``..``high`` with NaN in place; return their number."""
     implausible = (values < low) | (values > high)

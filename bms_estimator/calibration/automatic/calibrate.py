@@ -69,7 +69,6 @@ def calibrate(
     *,
     name: str,
     curves: Sequence[ExternalCurve] = (),
-    temperature_c: float | None = None,
     report: Report = ignore_report,
 ) -> Calibration:
     """Calibrate a cell by captures of any kind.
@@ -80,7 +79,6 @@ def calibrate(
         given: Cell with the rated capacity, such as a generic cell. It supplies the values that the captures do not determine.
         name: Name of the new cell.
         curves: Open-circuit voltages over SOC that were measured otherwise.
-        temperature_c: Temperature of captures without a sensor [°C]; None: 25 °C.
         report: Receives the finished fraction of the work and the name of the step.
 
     Raises:
@@ -94,7 +92,7 @@ def calibrate(
     if not curves:
         _require_usable_capture(recognized)
     split = hold_back(recognized)
-    fitter = ModelFitter(initial_cell, capacity, curves, name, temperature_c)
+    fitter = ModelFitter(initial_cell, capacity, curves, name)
     validated_model, model, notes = _fit_both(fitter, split, use_all(recognized), report)
     report(1.0, "validation")
     validations, failures = _validate_all(recognized, model)

@@ -51,14 +51,12 @@ class ModelFitter:
         capacity: Capacity of the cell.
         curves: Open-circuit voltages over SOC that were measured otherwise.
         name: Name of the new cell.
-        temperature_c: Temperature of captures without a sensor [°C]; None: 25 °C.
     """
 
     initial_cell: CellModel
     capacity: CapacityEstimate
     curves: Sequence[ExternalCurve]
     name: str
-    temperature_c: float | None
 
     def fit(self, data: Split, progress: Progress) -> FittedModel:
         """Fit the open-circuit voltage, and then the resistances.
@@ -78,7 +76,7 @@ class ModelFitter:
             return FittedModel(cell, ocv, None, "no capture has a current above 0.1 C")
         captures = [each.capture for each in data.resistances]
         try:
-            identification = identify(captures, cell, temperature_c=self.temperature_c, progress=progress)
+            identification = identify(captures, cell, progress=progress)
         except UserError as error:
             if ocv is None:
                 raise

@@ -8,6 +8,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.time_faults import MIN_GAP_PERIODS
 
 MIN_PEAK_C_RATE = 0.1
 """Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with a smaller one is useful only to
@@ -26,8 +27,6 @@ MAX_SOC_DEVIATION = 0.1
 ``MAX_VOLTAGE_DEVIATION_V`` is exceeded as well; both together are more than errors of the model explain."""
 MAX_VOLTAGE_DEVIATION_V = 0.1
 """Maximum deviation of a rested voltage from the OCV at the counted SOC, per cell [V]."""
-MIN_GAP_PERIODS = 10.0
-"""Minimum duration of a gap with unknown charge, in multiples of the median sample period."""
 MIN_GAP_CHARGE = 0.01
 """Minimum charge that the current before a gap would draw over it, as a fraction of the capacity."""
 MIN_DURATION_S = 30.0

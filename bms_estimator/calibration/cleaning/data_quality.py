@@ -4,13 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.capture_checks import MIN_GAP_PERIODS
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.time_faults import gap_s
 
-MIN_GAP_TO_LONG_PERIOD = 1.5
-"""Minimum duration of a gap in multiples of the 99th percentile of the sample period. The percentile excludes the longer
-period at which many loggers record rests."""
 ROUNDING_FRACTION = 1e-6
 """Difference of two values that counts as rounding, as a fraction of the largest magnitude."""
 
@@ -24,8 +21,7 @@ class DataQuality:
         duration_s: Time from the first to the last sample [s].
         period_s: Median time between two samples [s]; NaN for fewer than two.
         period_percentiles_s: 1st and 99th percentile of the time between two samples [s].
-        gaps: Number of intervals longer than ``MIN_GAP_PERIODS`` times the median period and
-            ``MIN_GAP_TO_LONG_PERIOD`` times the 99th percentile.
+        gaps: Number of intervals longer than ``time_faults.gap_s``.
         longest_gap_s: Longest interval between two samples [s].
         backward_steps: Number of samples whose time is before the previous sample's time.
         repeated_times: Number of samples with the time of the previous sample.
@@ -62,7 +58,7 @@ def data_quality(samples: SampleBlock) -> DataQuality:
         duration_s=float(time_s.max() - time_s.min()) if time_s.size else 0.0,
         period_s=period_s,
         period_percentiles_s=(float(short_s), float(long_s)),
-        gaps=int(np.count_nonzero(forward_s > max(MIN_GAP_PERIODS * period_s, MIN_GAP_TO_LONG_PERIOD * long_s))),
+        gaps=int(np.count_nonzero(step_s > gap_s(step_s))),
         longest_gap_s=float(forward_s.max(initial=0.0)),
         backward_steps=int(np.count_nonzero(step_s < 0.0)),
         repeated_times=int(np.count_nonzero(step_s == 0.0)),

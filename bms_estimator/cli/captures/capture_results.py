@@ -19,7 +19,7 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import SampleBlock, fill_temperature
 from bms_estimator.plot.thinning import kept_indices
 from bms_estimator.reports.capture_report import CaptureResult, Estimates
 from bms_estimator.settings.pack import Settings
@@ -42,6 +42,7 @@ def capture_result(
     model: CellModel,
     *,
     initial_soc: float | None,
+    temperature_c: float | None,
 ) -> CaptureResult:
     """Return the results for a capture.
 
@@ -52,6 +53,7 @@ def capture_result(
         settings: Settings of the estimator.
         model: Model of a cell or of a whole pack.
         initial_soc: SOC at the first sample, 0..1; None: from the voltage.
+        temperature_c: Temperature of a capture without a sensor [°C]; None: the default of the model.
 
     Raises:
         UserError: The capture cannot be read, or does not belong to the cell.
@@ -59,6 +61,7 @@ def capture_result(
     with show_compile_progress():
         rows = read_with_bar(file, opened)
         quality = data_quality(rows)  # first, because it needs memory for copies of columns
+        fill_temperature(rows, temperature_c)
         validation = validate(Columns(rows, name), model, initial_soc=initial_soc)
         estimator = new_estimator(settings, model)
     with progress_bar(f"estimating {name}") as bar:

@@ -8,7 +8,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses
+from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses, print_warnings
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     Force,
@@ -21,6 +21,7 @@ from bms_estimator.model.cell_voltage_columns import cell_voltage_columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
 from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.time_faults import TimeFaults
 from bms_estimator.sinks.trace_file import SINKS, CsvSink, TableSink, join_columns, table_sink
 from bms_estimator.sources.captures.replay import Capture, open_capture
 
@@ -46,16 +47,17 @@ def convert(
     The current is positive on discharge in this project's columns, and positive on charge in BDF.
     """
     check_output_file(out, [capture], force=force)
-    sink, rows = _sink(out), 0
+    sink, rows, faults = _sink(out), 0, TimeFaults()
     with capture_file(capture) as path, sink, long_file_bar("converting", path) as progress:
 
         def reopen() -> Capture:
             return open_capture(path, current_sign=current_sign, column_map=column_map)
 
         print_guesses(path.name, reopen())
-        for block in (_bdf_blocks if is_bdf_name(out.name) else _own_blocks)(reopen, progress):
+        for block in (_bdf_blocks if is_bdf_name(out.name) else _own_blocks)(reopen, progress, faults):
             sink.write(block)
             rows += block.size
+        print_warnings(path.name, faults.warnings)
     if rows == 0:
         raise UserError(f"{capture}: no samples")
     typer.echo(f"{out}: {rows:,} samples")
@@ -71,23 +73,25 @@ def _sink(out: Path) -> TableSink:
     return table_sink(out)
 
 
-def _blocks(capture: Capture, progress: Progress) -> Iterator[SampleBlock]:
-    """Yield the samples of a capture, and report the fraction of the file that has been read."""
+def _blocks(capture: Capture, progress: Progress, faults: TimeFaults) -> Iterator[SampleBlock]:
+    """Yield the samples of a capture, and report their times and the fraction of the file that has been read."""
     for block in capture:
+        faults.add(block["time_s"])
         yield block
         progress(capture.fraction)
 
 
-def _own_blocks(reopen: Callable[[], Capture], progress: Progress) -> Iterator[NDArray[np.void]]:
+def _own_blocks(reopen: Callable[[], Capture], progress: Progress, faults: TimeFaults) -> Iterator[NDArray[np.void]]:
     """Yield the samples of a capture without columns that have no value, which a first pass finds.
 
     Args:
         reopen: Function that opens the capture for one pass.
         progress: Receives the fraction of the file that has been converted.
+        faults: Receives the times.
     """
     columns, cells = _columns_with_values(reopen())
     capture = reopen()
-    for block in _blocks(capture, progress):
+    for block in _blocks(capture, progress, faults):
         samples = block[columns]
         yield join_columns(samples, cell_voltage_columns(capture.cells, block.size, cells)) if cells else samples
 
@@ -111,7 +115,7 @@ def _columns_with_values(capture: Capture) -> tuple[list[str], int]:
     return columns + [lowest, highest] * has_probes + [status] * has_status, cells
 
 
-def _bdf_blocks(reopen: Callable[[], Capture], progress: Progress) -> Iterator[NDArray[np.void]]:
+def _bdf_blocks(reopen: Callable[[], Capture], progress: Progress, faults: TimeFaults) -> Iterator[NDArray[np.void]]:
     """Yield the samples of a capture in the Battery Data Format.
 
     The first pass reads up to the first temperature, to decide whether the file has a column for it.
@@ -119,10 +123,11 @@ def _bdf_blocks(reopen: Callable[[], Capture], progress: Progress) -> Iterator[N
     Args:
         reopen: Function that opens the capture for one pass.
         progress: Receives the fraction of the file that has been converted.
+        faults: Receives the times.
     """
     with_temperature = any(np.isfinite(block["temperature_c"]).any() for block in reopen())
     first_s = None
-    for block in _blocks(reopen(), progress):
+    for block in _blocks(reopen(), progress, faults):
         if first_s is None:
             first_s = float(block["time_s"][0])
         yield bdf_rows(block, first_s, with_temperature=with_temperature)

@@ -17,7 +17,9 @@ from bms_estimator.cli.options.capture_options import (
     CapacityAh,
     Force,
     MappedColumns,
+    Series,
     SignOfCurrent,
+    TemperatureWithoutSensor,
     check_output_file,
     reject_duplicates,
     unique_names,
@@ -55,6 +57,8 @@ def report(
             show_default=False,
         ),
     ] = None,
+    series: Series = None,
+    temperature_c: TemperatureWithoutSensor = None,
     current_sign: SignOfCurrent = None,
     column_map: MappedColumns = None,
     days: Annotated[
@@ -82,7 +86,9 @@ def report(
             opened = open_captures(files, pack, current_sign, column_map)
             for file, capture in zip(files, opened, strict=True):
                 print_guesses(file.name, capture)
-            page = report_on_captures(files, opened, pack, cell, capacity_ah, soc)
+            page = report_on_captures(
+                files, opened, pack, cell, capacity_ah, soc, series=series, temperature_c=temperature_c
+            )
     else:
         page = _report_on_history(pack, folder, days)
     write_text(out, page.html())
@@ -106,6 +112,9 @@ def report_on_captures(
     cell: str | None,
     capacity_ah: float | None,
     soc: float | None,
+    *,
+    series: int | None,
+    temperature_c: float | None,
 ) -> ReportPage:
     """Return the page on captures and their cell's model.
 
@@ -116,15 +125,17 @@ def report_on_captures(
         cell: Cell; None: the pack's cell.
         capacity_ah: Capacity [Ah]; None: the capacity in the settings of the pack or in the cell file.
         soc: SOC at the first sample of each capture, 0..1; None: from the voltage.
+        series: Number of cells in series; None: the number in the settings.
+        temperature_c: Temperature of captures without a sensor [°C]; None: the default of the model.
     """
-    settings, model = pack_or_cell(pack, cell, capacity_ah)
+    settings, model = pack_or_cell(pack, cell, capacity_ah, series)
     if not isinstance(model, CellModel):
         raise UserError(f"{model.cell.name} is a fuel cell: report needs a battery")
     if soc is not None:
         settings = with_pack(settings, initial_soc=soc)
     names = unique_names([file.name for file in files], files)
     results = [
-        capture_result(file, name, capture, settings, model, initial_soc=soc)
+        capture_result(file, name, capture, settings, model, initial_soc=soc, temperature_c=temperature_c)
         for file, name, capture in zip(files, names, opened, strict=True)
     ]
     return capture_report(model, results, _now())

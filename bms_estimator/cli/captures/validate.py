@@ -21,11 +21,13 @@ from bms_estimator.cli.options.capture_options import (
     Force,
     MappedColumns,
     SignOfCurrent,
+    TemperatureWithoutSensor,
     check_output_file,
 )
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.model.arrays import Records, structured_array
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import fill_temperature
 from bms_estimator.sinks.trace_file import table_sink
 
 
@@ -39,6 +41,7 @@ def validate_command(
             parser=decimal(0.0, 1.0), help="SOC at the first sample; default: from the voltage of the first rest"
         ),
     ] = None,
+    temperature_c: TemperatureWithoutSensor = None,
     current_sign: SignOfCurrent = None,
     column_map: MappedColumns = None,
     out: Annotated[
@@ -56,6 +59,7 @@ def validate_command(
     """
     model = load_cell(cell, capacity_ah)
     (loaded,) = load_captures([capture], current_sign=current_sign, column_map=column_map)
+    fill_temperature(loaded.rows, temperature_c)
     if out is not None:
         check_output_file(out, [capture], force=force)
     residual_sink = table_sink(out) if out else None

@@ -23,6 +23,7 @@ from bms_estimator.cli.options.capture_options import (
     AsJson,
     Force,
     MappedColumns,
+    Series,
     SignOfCurrent,
     TemperatureWithoutSensor,
     check_output_file,
@@ -33,10 +34,9 @@ from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.config_file import write_text
-from bms_estimator.model.sample import CurrentSign
+from bms_estimator.model.sample import fill_temperature
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.sources.captures.curves import read_curve
-from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 
 class PlanName(StrEnum):
@@ -76,12 +76,7 @@ def calibrate_command(
             show_default=False,
         ),
     ] = None,
-    series: Annotated[
-        int | None,
-        typer.Option(
-            parser=whole(1), help="number of cells in series in the captures; default: the number in PACK.toml, or 1"
-        ),
-    ] = None,
+    series: Series = None,
     report: Annotated[
         Path | None,
         typer.Option(help="HTML file for a report on all captures with the new cell file", show_default=False),
@@ -147,13 +142,14 @@ def calibrate_command(
                 typer.echo("interrupted; the same command continues the test", err=True)
                 raise typer.Exit(130)
             captures, recorded = [capture], [session.write_capture(capture)]
+        for each in captures:
+            fill_temperature(each.rows, temperature_c)
         with progress_bar("calibrating") as bar:
             calibration = calibrate(
                 [given.scaled(each) for each in captures],
                 given.cell,
                 name=name_of(out),
                 curves=curves,
-                temperature_c=temperature_c,
                 report=bar.update,
             )
         write_cell(out, calibration.model.cell, remarks(calibration))
@@ -161,7 +157,16 @@ def calibrate_command(
             session.end()
         _print_result(out, calibration, as_json=as_json)
         if report is not None:
-            _write_report(report, [*files, *recorded], pack, out, calibration, current_sign, column_map)
+            from bms_estimator.cli.captures.report import open_captures, report_on_captures  # noqa: PLC0415 - optional packages
+
+            measured = [file for file in (*files, *recorded) if read_curve(file) is None]
+            opened = open_captures(measured, pack, current_sign, column_map)
+            capacity_ah = calibration.model.cell.cell.capacity_ah
+            page = report_on_captures(
+                measured, opened, pack, str(out), capacity_ah, None, series=given.series, temperature_c=temperature_c
+            )
+            write_text(report, page.html())
+            typer.echo(f"{report}: written", err=True)
 
 
 def _print_result(out: Path, calibration: Calibration, *, as_json: bool) -> None:
@@ -171,22 +176,3 @@ def _print_result(out: Path, calibration: Calibration, *, as_json: bool) -> None
         sys.stdout.write(json.dumps(json_result(out, calibration)) + "\n")
     else:
         Console().print(result_text(out, calibration))
-
-
-def _write_report(
-    report: Path,
-    captures: list[Path],
-    pack: Path | None,
-    cell: Path,
-    calibration: Calibration,
-    current_sign: CurrentSign | None,
-    column_map: ColumnMap | None,
-) -> None:
-    """Write a report on the captures with the new cell file."""
-    from bms_estimator.cli.captures.report import open_captures, report_on_captures  # noqa: PLC0415 - optional packages
-
-    files = [file for file in captures if read_curve(file) is None]
-    opened = open_captures(files, pack, current_sign, column_map)
-    page = report_on_captures(files, opened, pack, str(cell), calibration.model.cell.cell.capacity_ah, None)
-    write_text(report, page.html())
-    typer.echo(f"{report}: written", err=True)

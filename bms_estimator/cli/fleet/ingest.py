@@ -9,7 +9,8 @@ import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.sources.captures.tables.layout import ColumnMap, parse_column_map
+from bms_estimator.sources.captures.tables.layout import ColumnMap
+from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 
 GB = 10**9
 """Gigabyte [bytes]."""

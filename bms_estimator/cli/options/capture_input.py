@@ -10,6 +10,7 @@ from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.progress import Progress, no_progress
 from bms_estimator.model.sample import CurrentSign, SampleBlock
+from bms_estimator.model.time_faults import TimeFaults
 from bms_estimator.sources.captures.replay import Capture, open_capture, read_samples
 from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.sources.captures.tables.layout import ColumnMap
@@ -49,6 +50,9 @@ def load_captures(
             capture = open_capture(file, current_sign=current_sign, column_map=column_map)
             print_guesses(file.name, capture)
             rows = read_with_bar(file, capture)
+            faults = TimeFaults()
+            faults.add(rows["time_s"])
+            print_warnings(file.name, faults.warnings)
             loaded.append(Columns(rows, file.name, capture.note, capture.warning))
     return loaded
 
@@ -77,5 +81,10 @@ def print_guesses(name: str, capture: Capture) -> None:
     """Print on stderr what was guessed about a capture, and what contradicts it."""
     if capture.note:
         typer.echo(f"{name}: {capture.note}", err=True)
-    if capture.warning:
-        typer.echo(f"warning: {name}: {capture.warning}", err=True)
+    print_warnings(name, [capture.warning] if capture.warning else [])
+
+
+def print_warnings(name: str, warnings: Sequence[str]) -> None:
+    """Print warnings about a capture on stderr."""
+    for warning in warnings:
+        typer.echo(f"warning: {name}: {warning}", err=True)

@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.model.cell import CellModel, battery_names, cell_names, with_name
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.sources.captures.tables.layout import ColumnMap, parse_column_map
+from bms_estimator.sources.captures.tables.layout import ColumnMap
+from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 
 AsJson = Annotated[bool, typer.Option("--json", help="print the result as one JSON object")]
 """Option that prints the result as JSON."""
@@ -80,14 +81,20 @@ TemperatureWithoutSensor = Annotated[
         show_default=False,
     ),
 ]
+Series = Annotated[
+    int | None,
+    typer.Option(
+        parser=whole(1), help="number of cells in series in the captures; default: the number in the settings, or 1"
+    ),
+]
 MappedColumns = Annotated[
     ColumnMap | None,
     typer.Option(
         "--map",
         parser=parse_column_map,
         metavar="time=COLUMN,...",
-        help="columns of a table with unknown names, for time, current, voltage and, optionally, temperature; "
-        "sheet=SHEET chooses a sheet of a spreadsheet",
+        help="columns of a table for some of time, current, voltage and temperature; a unit may follow a name, as in "
+        "'time=Time [ms]'; sheet=SHEET chooses a sheet of a spreadsheet",
         show_default=False,
     ),
 ]

@@ -36,8 +36,10 @@ def single_cell_of(path: Path, settings: Settings) -> CellModel:
     return load_cell(_locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
-def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None) -> tuple[Settings, PackModel]:
-    """Load the settings of ``pack``. ``cell`` and ``capacity_ah`` [Ah] take precedence over the settings.
+def pack_or_cell(
+    pack: Path | None, cell: str | None, capacity_ah: float | None, series: int | None = None
+) -> tuple[Settings, PackModel]:
+    """Load the settings of ``pack``. ``cell``, ``capacity_ah`` [Ah] and ``series`` take precedence over the settings.
 
     Raises:
         UserError: Neither ``pack`` nor ``cell`` is given, or ``load_pack`` fails.
@@ -47,6 +49,8 @@ def pack_or_cell(pack: Path | None, cell: str | None, capacity_ah: float | None)
     settings = (
         load_settings(pack) if pack else Settings(sensor=SensorSettings(voltage_resolution_v=LABORATORY_RESOLUTION_V))
     )
+    if series is not None:
+        settings = with_pack(settings, series=series)
     if cell is None and pack is not None:
         cell = _locate_cell(pack, settings.pack.cell)
     if capacity_ah is None:

@@ -23,17 +23,10 @@ from bms_estimator.model.sample import (
     SampleBlock,
     remove_implausible,
 )
-from bms_estimator.sources.captures.tables.cell_values import CellKind
+from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind, date_order
 from bms_estimator.sources.captures.tables.column_tables import parse_column
-from bms_estimator.sources.captures.tables.layout import (
-    Column,
-    ColumnMap,
-    ColumnRole,
-    Layout,
-    LayoutFinder,
-    Role,
-    with_time_kind,
-)
+from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, ColumnRole, Layout, Role, with_column_kinds
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 from bms_estimator.sources.captures.tables.table_reader import (
     cell_voltages,
     remove_implausible_temperatures,
@@ -97,7 +90,7 @@ class BatchReader:
         """
         try:
             layout, cells = self._find_layout(tuple(columns))
-            layout = with_time_kind(layout, _time_kind(columns[layout.columns[Role.TIME].name]))
+            layout = with_column_kinds(layout, {Role.TIME: _time_kind(columns[layout.columns[Role.TIME].name])})
             raw = {role: _floats(column, columns[column.name]) for role, column in layout.columns.items()}
             if cells:
                 cells_v = _listed_cell_voltages(cells.name, columns[cells.name], cells.unit)
@@ -146,7 +139,7 @@ class BatchReader:
         roles: dict[ColumnRole, Column] = {
             role: Column(column.index, header[column.index], column.unit, column.assumed)
             for role, column in layout.columns.items()
-            if role is not Role.STATE
+            if role not in (Role.STATE, Role.CLOCK)
         }
         if len(layout.cells) > MAX_CELLS:
             raise UserError(f"{len(layout.cells)} columns of cell voltages: must be at most {MAX_CELLS}")
@@ -159,8 +152,7 @@ class BatchReader:
         return Layout(layout.dialect, roles), Column(header.index(cells[0]), cells[0], unit)
 
     def _sign_of(self, layout: Layout) -> CurrentSign:
-        by_format = layout.dialect.current_sign if layout.dialect else None
-        return self._current_sign or by_format or "discharge_positive"
+        return self._current_sign or layout.dialect.current_sign or "discharge_positive"
 
 
 def _reason(error: UserError) -> str:
@@ -222,7 +214,9 @@ def _time_kind(values: Values) -> CellKind:
     if isinstance(values, np.ndarray):
         return CellKind.DATE_TIME if values.dtype.kind == "M" else CellKind.NUMBER
     first = next((value for value in values if value is not None), None)
-    return CellKind.DATE_TIME if isinstance(first, str) else CellKind.NUMBER
+    return (
+        date_order(value for value in values if isinstance(value, str)) if isinstance(first, str) else CellKind.NUMBER
+    )
 
 
 def _floats(column: Column, values: Values) -> NDArray[np.float64]:
@@ -237,7 +231,7 @@ def _floats(column: Column, values: Values) -> NDArray[np.float64]:
             seconds = values.astype("datetime64[us]").astype(np.int64) / 1e6
             return np.where(np.isnat(values), np.nan, seconds)
         return values.astype(np.float64)
-    if column.kind is CellKind.DATE_TIME:
+    if column.kind in DATES:
         _check_each(column.name, values, str, column.kind.value)
         return parse_column(_TABLE_NAME, column, list(values))
     if not set(map(type, values)) <= _NUMBERS:

@@ -258,8 +258,8 @@ def open_capture(
 
     Args:
         path: The file.
-        sensor: Settings that decode a raw capture. Their current sign also applies to a table without one. If None, a raw
-            capture is decoded with the settings in its header.
+        sensor: Settings that decode a raw capture. If they contain the current sign or the device, their sign also applies to
+            a table without one. If None, a raw capture is decoded with the settings in its header.
         current_sign: Direction of positive current, which overrides ``sensor``, header, format and voltage.
         column_map: Columns of a table by quantity; None: recognize them by their names.
 
@@ -272,7 +272,8 @@ def open_capture(
         raise UserError(f"{path}: is empty")
     if is_capture(path):
         return RawCapture(path, sensor, current_sign)
-    return open_table(path, Sign(current_sign, sensor.current_sign if sensor else None), column_map)
+    has_sign = sensor is not None and not sensor.model_fields_set.isdisjoint({"current_sign", "protocol"})
+    return open_table(path, Sign(current_sign, sensor.current_sign if sensor and has_sign else None), column_map)
 
 
 def _why_no_file(path: Path) -> str:
@@ -295,8 +296,8 @@ def load_capture(
             arrays. A table has the columns of this project or of a cycler.
         current_sign: Direction of positive current, ``discharge_positive`` or ``charge_positive``; None: the
             format's direction; if it defines none, the direction that the voltage shows, otherwise discharge.
-        column_map: Names of a table's columns for ``time``, ``current``, ``voltage`` and, optionally, ``temperature``, and
-            of a spreadsheet's ``sheet``; None: recognize them.
+        column_map: Names of a table's columns for some of ``time``, ``current``, ``voltage`` and ``temperature``, and
+            of a spreadsheet's ``sheet``; the others are recognized.
 
     Returns:
         ``time_s``, ``current_a`` (positive on discharge), ``voltage_v``, ``temperature_c`` (NaN without a sensor),

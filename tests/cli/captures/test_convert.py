@@ -103,3 +103,17 @@ def test_a_missing_capture_is_an_error(capsys, tmp_path):
     code, _, err = run(capsys, "convert", tmp_path / "none.csv", "--out", tmp_path / "out.csv")
     assert (code, err) == (2, f"error: {tmp_path / 'none.csv'}: no such file\n")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["convert", "validate"])
+def test_steps_back_and_gaps_of_the_time_are_printed(
+    command: str, tmp_path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "cell.csv"
+    times_s = [*range(40), *range(38, 80), *range(4000, 4020)]
+    path.write_text("time_s,current_a,voltage_v\n" + "".join(f"{time_s},{time_s % 3},3.7\n" for time_s in times_s))
+    arguments = ["--out", tmp_path / "out.csv"] if command == "convert" else ["--cell", "ncr18650", "--soc", "0.5"]
+    code, _, err = run(capsys, command, path, *arguments)
+    assert code == 0, err
+    assert "warning: cell.csv: steps back in time: 1, the first from 39 to 38 s" in err
+    assert "warning: cell.csv: gaps without samples: 1, the longest of 3921 s after 79 s" in err

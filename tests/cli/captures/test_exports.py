@@ -54,7 +54,7 @@ def test_report_reads_an_export_from_standard_input(
     out = tmp_path / "report.html"
     code, _, err = run(capsys, "report", "-", "--cell", "ncr18650", "--map", column_map, "--out", out)
     assert code == 0, err
-    assert err.startswith("stdin: read as given columns")
+    assert err.startswith("stdin: read as Arbin with given columns")
     assert "report on stdin" in out.read_text(encoding="utf-8")
 
 
@@ -66,8 +66,8 @@ def test_mapped_columns_are_used_and_shown(tmp_path: Path, capsys: pytest.Captur
     column_map = "time=Test Time (s),current=Load (A),voltage=Voltage (V)"
     code, _, err = run(capsys, "replay", path, "--cell", "ncr18650", "--map", column_map)
     assert code == 0
-    assert "read as given columns" in err
-    assert 'current "Load (A)" in A, positive on charge (response of the voltage)' in err
+    assert "read as Arbin with given columns" in err
+    assert 'current "Load (A)" in A, positive on charge (convention of Arbin)' in err
 
 
 @pytest.mark.parametrize("command", READERS_OF_CAPTURES)

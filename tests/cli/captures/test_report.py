@@ -5,6 +5,7 @@ import contextlib
 import csv
 import html
 import io
+import json
 import math
 import re
 
@@ -249,3 +250,32 @@ def test_residuals_are_measured_less_modeled_voltage(tmp_path, capsys, steps_csv
 
 def test_page_has_the_rated_capacity_of_the_cell(page):
     assert f"Cell model ncr18650, {TRUTH.cell.capacity_ah:g} Ah" in text_of(page)
+
+
+def test_temperature_without_sensor_reaches_validation_and_report(tmp_path, capsys):
+    rows = capture(steps())
+    measured, unmeasured = rows.copy(), rows.copy()
+    measured["temperature_c"], unmeasured["temperature_c"] = 0.0, np.nan
+    paths = [write_table(tmp_path / "sensor.csv", measured), write_table(tmp_path / "no_sensor.csv", unmeasured)]
+    cell, option = ("--cell", "nmc", "--capacity-ah", "3"), ("--temperature-c", "0")
+    errors_mv, sentences = [], []
+    for path, options in zip((*paths, paths[1]), ((), option, ()), strict=True):
+        _, out, _ = run(capsys, "validate", path, *cell, "--json", *options)
+        errors_mv.append(json.loads(out)["voltage_rms_mv"])
+        _, out, _ = run(capsys, "report", path, *cell, "--out", tmp_path / "page.html", "--force", *options)
+        sentences.append(out.splitlines()[:-1])
+    assert (errors_mv[0], sentences[0]) == (errors_mv[1], sentences[1])
+    assert errors_mv[2] != errors_mv[0]
+
+
+def test_cells_in_series_reach_the_report(tmp_path, capsys):
+    rows = capture(steps())
+    rows["voltage_v"] *= 2.0
+    path, page = write_table(tmp_path / "two.csv", rows), tmp_path / "page.html"
+    code, _, err = run(capsys, "report", path, "--cell", "ncr18650", "--out", page)
+    assert (code, "check the cell file and its number of cells in series (calibrate, report: --series)" in err) == (
+        2,
+        True,
+    )
+    code, out, err = run(capsys, "report", path, "--cell", "ncr18650", "--series", "2", "--out", page)
+    assert (code, "(RMS per cell" in out) == (0, True), err

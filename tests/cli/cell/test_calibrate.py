@@ -259,3 +259,21 @@ def test_an_interrupted_test_of_another_pack_is_not_continued(capsys, tmp_path) 
     assert code == 2
     assert "(shed, 3 Ah, 1s1p; now mine, 3 Ah, 1s1p); give another --out" in err
     assert (tmp_path / "cell.calibration.json").read_text() == state
+
+
+def test_series_and_temperature_reach_fit_validation_and_report(capsys, data, tmp_path) -> None:
+    rows = [line.split(",") for line in _text_of(data / "lgm50" / "rate_0p1c_25c.csv.gz").splitlines()]
+    voltage = rows[0].index("voltage_v")
+    kept = [index for index, name in enumerate(rows[0]) if name in ("time_s", "current_a", "voltage_v")]
+    for row in rows[1:]:
+        row[voltage] = f"{2.0 * float(row[voltage]):.5f}"
+    path = tmp_path / "two.csv"
+    path.write_text("".join(",".join(row[index] for index in kept) + "\n" for row in rows))
+    out, report = tmp_path / "cell.toml", tmp_path / "report.html"
+    options = "--cell", "nmc", "--capacity", 5, "--series", 2, "--temperature-c", 10
+    code, printed, err = run(capsys, "calibrate", path, *options, "--out", out, "--report", report, "--json")
+    assert code == 0, err
+    result = json.loads(printed)
+    assert result["captures"][0]["temperature_c"] == 10.0
+    assert "temperatures other than 10 °C" in result["verdict"]
+    assert "temperatures other than 10 °C" in report.read_text(encoding="utf-8")

@@ -16,7 +16,7 @@ from bms_estimator.fleet.ingest.batch_columns import BatchError
 from bms_estimator.fleet.ingest.batch_decoder import decode_batch
 from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples, drop_reason, select_new, split_by_time
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
-from bms_estimator.sources.captures.tables.layout import parse_column_map
+from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 from tests.fleet.ingest.platform import arrow_batch, arrow_bytes, arrow_with_shared_columns, json_batch, samples_of
 
 ROWS = samples_of("p1", 5)

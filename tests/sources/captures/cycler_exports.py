@@ -92,6 +92,23 @@ def neware_layer(m: Measurement) -> str:
     return header + "\n" + text(rows)
 
 
+def neware_layered(m: Measurement) -> str:
+    """Return a CSV of BTSDA with a layer for cycles, one for steps and one for records."""
+    lines = [
+        "Cycle Index,Chg. Cap.(Ah),DChg. Cap.(Ah)",
+        ",Step Index,Step Number,Step Type,Step Time,Capacity(Ah)",
+        ",,DataPoint,Time,Total Time,Current(A),Voltage(V),Date",
+        "1,0.004,0.008,1465,0.10,1.34,00:01:20,00:00:20",
+    ]
+    states = m.states("CC DChg", "CC Chg", "Rest")
+    rows = zip(durations(m), durations(m), m.charge_a, m.voltage_v, stamps(m, "%Y-%m-%d %H:%M:%S"), strict=True)
+    for number, row in enumerate(rows):
+        if number == 0 or m.step[number] != m.step[number - 1]:
+            lines.append(f",{m.step[number] + 1},{m.step[number] + 1},{states[number]},00:00:20,0.001")
+        lines.append(f",,{number + 1}," + ",".join(map(str, row)))
+    return "\n".join(lines) + "\n"
+
+
 def neware_unsigned(m: Measurement) -> str:
     """Return a CSV of an older BTSDA: unsigned current in mA, state, date, encoded in GBK."""
     header = "Record number,State,Jump,Cycle,Steps,Current(mA),Voltage(V),Capacity(mAh),Energy(mWh),Relative Time(h:min:s.ms),Date(h:min:s.ms)"
@@ -173,6 +190,39 @@ def digatron(m: Measurement) -> str:
     return header + "\n" + text(rows)
 
 
+def lg_hg2(m: Measurement) -> str:
+    """Return a CSV of the LG HG2 data set: Digatron with a row of units, whose cells are empty for times and words."""
+    preamble = "\nMeasurement ID,551\nBattery Name,LG HG2\nStart Time,3/12/2024 11:59:30 PM\n"
+    header = "Time Stamp,Step,Status,Prog Time,Step Time,Cycle,Cycle Level,Procedure,Voltage,Current,Temperature,Capacity,WhAccu,Cnt,\n"
+    units = ",,,,,,,,[V],[A],[C],[Ah],[Wh],[Cnt],\n"
+    rows = zip(
+        stamps(m, "%m/%d/%Y %I:%M:%S %p"), m.step, m.states("DCH", "CHA", "PAU"), durations(m), durations(m), m.zeros,
+        m.zeros, ["HPPC"] * m.step.size, m.voltage_v, m.charge_a, m.temperature_c, m.zeros, m.zeros, m.zeros,
+        [""] * m.step.size, strict=True,
+    )  # fmt: skip
+    return preamble + header + units + text(rows)
+
+
+def novonix(m: Measurement) -> str:
+    """Return a CSV of a Novonix charger, with each line in quotes."""
+    lines = ["[Summary]", "Novonix HPC data file", "Capacity (Ah): 3.2", "[End Summary]", "[Data]"]
+    header = "Date and Time,Cycle Number,Step Number,Run Time (h), Step Time (h),Current (A),Potential (V),Capacity (Ah),Temperature (°C)"
+    rows = zip(
+        stamps(m, "%m/%d/%Y %I:%M:%S %p"), m.ones, m.step, m.time_s / 3600.0, m.time_s / 3600.0, m.charge_a, m.voltage_v,
+        m.zeros, m.temperature_c, strict=True,
+    )  # fmt: skip
+    return "".join(f'"{line}"\n' for line in [*lines, header, *text(rows).splitlines()])
+
+
+def leaf_spy(m: Measurement) -> str:
+    """Return a log of LeafSpy."""
+    header = "Date/Time,Lat,Long,SOC,Pack Volts,Pack Amps,Judgment Value\n"
+    rows = zip(
+        stamps(m, "%m/%d/%Y %H:%M:%S"), m.zeros, m.zeros, m.zeros, m.voltage_v, m.current_a, m.zeros, strict=True
+    )  # fmt: skip
+    return header + text(rows)
+
+
 def pybamm(m: Measurement) -> str:
     """Return a CSV of ``solution.save_data`` with the default variables of an older version."""
     header = "Time [s],Current [A],Terminal voltage [V],Discharge capacity [A.h],Volume-averaged cell temperature [K]"
@@ -214,6 +264,13 @@ def battery_archive(m: Measurement) -> str:
         20 + m.zeros, m.temperature_c, strict=True,
     )  # fmt: skip
     return header + "\n" + text(rows)
+
+
+def unsigned(m: Measurement) -> str:
+    """Return a CSV of a hobby tester, which writes the magnitude of the current below a table of steps."""
+    preamble = "*Step,Mode,Capacity,Energy\n*1-1,D-CC,0.008,0.03\n*1-2,C-CV,0.004,0.02\n"
+    rows = zip(m.time_s, np.abs(m.current_a), m.voltage_v, strict=True)
+    return preamble + "Time(S),Cur(A),Vol(V)\n" + text(rows)
 
 
 def german(m: Measurement) -> str:
@@ -259,6 +316,7 @@ class Export:
 EXPORTS = (
     Export(arbin, "Arbin", reader="arbin"),
     Export(neware_layer, "Neware", has_temperature=False, reader="neware"),
+    Export(neware_layered, "Neware", has_temperature=False),
     Export(neware_unsigned, "Neware", has_temperature=False),
     Export(neware_record, "Neware", encoding="latin-1"),
     Export(maccor, "Maccor", ".txt", has_temperature=False, reader="maccor"),
@@ -266,12 +324,16 @@ EXPORTS = (
     Export(biologic, "BioLogic", ".mpt", "latin-1", reader="biologic mpt"),
     Export(biologic_decimal_comma, "BioLogic", ".mpt", "latin-1", reader="biologic mpt"),
     Export(digatron, "Digatron", reader="digatron"),
+    Export(lg_hg2, "unknown program"),
+    Export(novonix, "Novonix"),
+    Export(leaf_spy, "unknown program", has_temperature=False),
     Export(pybamm, "PyBaMM"),
     Export(pybop, "PyBaMM or PyBOP", has_temperature=False),
     Export(nasa, "NASA"),
     Export(bdf_labels, "Battery Data Format"),
     Export(bdf_names, "Battery Data Format", reader="bdf"),
     Export(battery_archive, "Battery Archive"),
+    Export(unsigned, "unknown program", has_temperature=False),
     Export(german, "unknown program", encoding="latin-1"),
     Export(separate_currents, "unknown program", has_temperature=False),
 )

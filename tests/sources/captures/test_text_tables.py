@@ -11,8 +11,10 @@ from bms_estimator import load_capture
 from bms_estimator.calibration.cleaning.rests import remove_glitches, soc_by_counting
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.replay import open_capture
-from bms_estimator.sources.captures.tables.layout import parse_column_map
-from tests.sources.captures.cycler_exports import EXPORTS
+from bms_estimator.sources.captures.tables.layout import Role
+from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
+from bms_estimator.sources.captures.tables.table_reader import Table
+from tests.sources.captures.cycler_exports import EXPORTS, Export
 
 HEADER = "time_s,current_a,voltage_v\n"
 
@@ -35,7 +37,7 @@ def test_text_between_rows_is_an_error_with_its_line(tmp_path: Path) -> None:
 
 def test_row_that_is_cut_off_is_an_error_with_its_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"cell\.csv: line 3: 2 values, but the header has 3 columns"):
-        load(tmp_path / "cell.csv", f"{HEADER}0,1,3.7\n1,1\n")
+        load(tmp_path / "cell.csv", f"{HEADER}0,1,3.7\n1,1\n2,1,3.7\n")
 
 
 def test_empty_cell_is_a_missing_value(tmp_path: Path) -> None:
@@ -93,10 +95,30 @@ def test_columns_that_the_user_names_are_read_with_their_units(tmp_path: Path) -
     assert (columns["time_s"], columns["current_a"], columns["voltage_v"]) == ([60.0], [1.5], [3.8])
 
 
-@pytest.mark.parametrize("text", ["", "time=t", "time=t,current=i,voltage=", "time=t,current=i,current=j,voltage=u"])
-def test_incomplete_map_is_rejected_with_its_form(text: str) -> None:
-    with pytest.raises(UserError, match=r"--map .*: must be time=COLUMN,current=COLUMN,voltage=COLUMN"):
+@pytest.mark.parametrize("text", ["", "time", "time=t,voltage=", "time=t,current=i,current=j", "charge=q"])
+def test_invalid_map_is_rejected_with_its_form(text: str) -> None:
+    with pytest.raises(UserError, match=r"--map .*: must be one or more of time=COLUMN,current=COLUMN,voltage=COLUMN"):
         parse_column_map(text)
+
+
+@pytest.mark.parametrize("export", EXPORTS, ids=[export.write.__name__ for export in EXPORTS])
+def test_a_map_of_one_column_keeps_what_the_format_defines_for_the_others(export: Export, tmp_path: Path) -> None:
+    path = export.save(tmp_path)
+    capture = open_capture(path)
+    assert isinstance(capture, Table)
+    columns = {role: column.name for role, column in capture.layout.columns.items()}
+    for role in (Role.TIME, Role.CURRENT, Role.VOLTAGE):
+        mapped = load_capture(path, column_map={role.value: columns[role]})
+        for name, column in load_capture(path).items():
+            np.testing.assert_array_equal(mapped[name], column, err_msg=f"{role}: {name}")
+        assert "given columns (" in mapped.note
+
+
+def test_a_given_name_may_be_followed_by_a_unit(tmp_path: Path) -> None:
+    column_map = parse_column_map("time=Time [ms],current=Load (raw) [mA]")
+    content = "Time,Load (raw),Voltage\n0,1500,3.7\n2000,1500,3.6\n"
+    columns = load(tmp_path / "cell.csv", content, column_map=column_map, current_sign="discharge_positive")
+    assert (columns["time_s"], columns["current_a"]) == ([0.0, 2.0], [1.5, 1.5])
 
 
 def test_a_map_may_name_only_the_sheet() -> None:

@@ -1,7 +1,8 @@
 """Values of cells: numbers with decimal point or comma, durations, date-times, and words for charge and discharge."""
 
+import itertools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from enum import Enum
 from functools import partial
@@ -10,7 +11,8 @@ from bms_estimator.model.decimal_text import measured
 
 _DURATION = re.compile(r"(?:(\d{1,6})(?:\s*(?:days?,?|d|-)\s*|\s+))?(\d{1,6}):(\d{1,2}):(\d{1,2}(?:[.,]\d+)?)")
 _DATE_TIME = re.compile(
-    r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})[T ]+(\d{1,2}):(\d{1,2})(?::(\d{1,2})([.,:]\d+)?)?\s*([AP]M)?", re.IGNORECASE
+    r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?:[T ]+(\d{1,2}):(\d{1,2})(?::(\d{1,2})([.,:]\d+)?)?\s*([AP]M)?)?",
+    re.IGNORECASE,
 )
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _GROUPED_DIGITS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
@@ -30,7 +32,12 @@ class CellKind(Enum):
     NUMBER = "number"
     DURATION = "duration"
     DATE_TIME = "date and time"
+    DAY_FIRST = "date and time, day first"
     DIRECTION = "direction"
+
+
+DATES = frozenset({CellKind.DATE_TIME, CellKind.DAY_FIRST})
+"""Kinds of cells that become Unix times."""
 
 
 def parse_number(cell: str, *, decimal_comma: bool) -> float:
@@ -66,11 +73,10 @@ def parse_duration(cell: str) -> float:
     return 86_400.0 * int(days or 0) + 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))
 
 
-def parse_date_time(cell: str) -> float:
-    """Return the Unix time of a date and time [s]; UTC if the text has no time zone.
+def parse_date_time(cell: str, *, day_first: bool = False) -> float:
+    """Return the Unix time of a date and time [s]; UTC if the text has no time zone, midnight if it has no time.
 
-    Formats are ISO 8601, year first, day first with periods, and month first with slashes or hyphens. A first number
-    above 12 is the day.
+    Formats are ISO 8601, year first, day first with periods, and with slashes or hyphens as ``day_first`` says.
 
     Raises:
         ValueError: The text is not a date with time.
@@ -82,14 +88,14 @@ def parse_date_time(cell: str) -> float:
     first, separator, second, third, hour, minute, seconds, fraction, am_pm = match.groups()
     if len(first) == 4:
         year, month, day = int(first), int(second), int(third)
-    elif separator == "." or int(first) > 12:
+    elif separator == "." or day_first:
         day, month, year = int(first), int(second), int(third)
     else:
         month, day, year = int(first), int(second), int(third)
-    hours = int(hour) % 12 + 12 * (am_pm.upper() == "PM") if am_pm else int(hour)
+    hours = int(hour) % 12 + 12 * (am_pm.upper() == "PM") if am_pm else int(hour or 0)
     if year < 100:  # two digits
         year += 2000
-    whole = datetime(year, month, day, hours, int(minute), int(seconds or 0), tzinfo=UTC)
+    whole = datetime(year, month, day, hours, int(minute or 0), int(seconds or 0), tzinfo=UTC)
     return whole.timestamp() + (float(f"0.{fraction[1:]}") if fraction else 0.0)
 
 
@@ -108,23 +114,51 @@ def uses_decimal_comma(cells: list[str]) -> bool:
     return any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in cells) and not any("." in cell for cell in cells)
 
 
-def time_kind(cell: str) -> CellKind:
-    """Return the kind of a cell in the time column. An unknown kind counts as a number, whose parser reports the error."""
-    for kind in (CellKind.NUMBER, CellKind.DURATION, CellKind.DATE_TIME):
+def time_kind(cells: Iterable[str]) -> CellKind:
+    """Return the kind of the cells in a time column. An unknown kind counts as a number, whose parser reports the error."""
+    remaining = iter(cells)
+    cell = next(remaining, "")
+    for kind in (CellKind.NUMBER, CellKind.DURATION, CellKind.DATE_TIME, CellKind.DAY_FIRST):
         try:
             parser(kind, decimal_comma="," in cell)(cell)
         except (ValueError, OverflowError):
             continue
-        return kind
+        return kind if kind not in DATES else date_order(itertools.chain([cell], remaining))
     return CellKind.NUMBER
+
+
+def date_order(cells: Iterable[str]) -> CellKind:
+    """Return the kind of date-times, whose order of day and month is the same in all cells.
+
+    A number above 12 shows the order. Otherwise the order with the shorter steps between the dates is returned, and month first
+    for dates of a single day.
+    """
+    dates = dict[str, None]()
+    for cell in cells:
+        match = _DATE_TIME.fullmatch(cell.strip())
+        if not match or match[2] == "." or len(match[1]) == 4 or int(match[3]) > 12:
+            return CellKind.DATE_TIME
+        if int(match[1]) > 12:
+            return CellKind.DAY_FIRST
+        dates[f"{match[1]}/{match[3]}/{match[4]}"] = None
+    try:
+        lengths_s = [
+            sum(abs(after - before) for before, after in itertools.pairwise(map(parse, dates)))
+            for parse in (parse_date_time, partial(parse_date_time, day_first=True))
+        ]
+    except ValueError:
+        return CellKind.DATE_TIME
+    return CellKind.DAY_FIRST if lengths_s[1] < lengths_s[0] else CellKind.DATE_TIME
 
 
 def parser(kind: CellKind, *, decimal_comma: bool) -> Callable[[str], float]:
     """Return the function that converts the cells of a column; it raises ValueError or OverflowError."""
     if kind is CellKind.NUMBER:
         return partial(parse_number, decimal_comma=decimal_comma)
-    return {
+    parsers: dict[CellKind, Callable[[str], float]] = {
         CellKind.DURATION: parse_duration,
         CellKind.DATE_TIME: parse_date_time,
+        CellKind.DAY_FIRST: partial(parse_date_time, day_first=True),
         CellKind.DIRECTION: parse_direction,
-    }[kind]
+    }
+    return parsers[kind]

@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind, parser, time_kind
+from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind, time_kind
 from bms_estimator.sources.captures.tables.layout import (
     BLOCK_ROWS,
+    TIME_ROLES,
     Column,
-    LayoutFinder,
     RawBlock,
-    Role,
-    with_time_kind,
+    with_column_kinds,
+    without_clock,
 )
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -48,7 +49,7 @@ class ArrayTable:
         UserError: A column is missing or does not contain numbers.
     """
 
-    fraction = 1.0
+    fraction, warning = 1.0, ""
 
     def __init__(
         self, name: object, table: ColumnTable, finder: LayoutFinder, description: str = "table in memory"
@@ -58,9 +59,9 @@ class ArrayTable:
         layout = finder.find([str(column) for column in header])
         if layout is None:
             raise finder.no_header()
-        self.layout = layout
+        self.layout = without_clock(layout)  # its kind of cells is not known
         self._columns = {
-            role: to_floats(name, column, table[header[column.index]]) for role, column in layout.columns.items()
+            role: to_floats(name, column, table[header[column.index]]) for role, column in self.layout.columns.items()
         }
 
     def blocks(self) -> Iterator[RawBlock]:
@@ -79,7 +80,7 @@ class ParquetTable:
         UserError: The file cannot be read, or a column is missing.
     """
 
-    description = "Parquet"
+    description, warning = "Parquet", ""
 
     def __init__(self, path: Path, finder: LayoutFinder) -> None:
         self._path, self.fraction = path, 0.0
@@ -89,7 +90,8 @@ class ParquetTable:
                 raise finder.no_header()
             if file.metadata.num_rows == 0:
                 raise UserError(f"{path}: no samples")
-            self.layout = with_time_kind(layout, _time_kind(file, layout.columns[Role.TIME]))
+            kinds = {role: _time_kind(file, layout.columns[role]) for role in TIME_ROLES if role in layout.columns}
+            self.layout = with_column_kinds(layout, kinds)
 
     def blocks(self) -> Iterator[RawBlock]:
         """Yield blocks of at most ``BLOCK_ROWS`` rows.
@@ -138,7 +140,8 @@ def _time_kind(file: "pa.parquet.ParquetFile", column: Column) -> CellKind:
         return CellKind.DATE_TIME
     if not _is_text(column_type):
         return CellKind.NUMBER
-    return time_kind(next(file.iter_batches(1, columns=[column.name])).column(0)[0].as_py() or "")
+    batches = file.iter_batches(columns=[column.name])
+    return time_kind(cell for batch in batches for cell in batch.column(0).to_pylist() if cell)
 
 
 def _is_text(column_type: "pa.DataType") -> bool:
@@ -165,6 +168,8 @@ def _parquet_values(path: Path, column: Column, values: "pa.Array", first_row: i
             return np.zeros(len(values))
         return np.asarray(values.cast(pa.float64()).to_numpy(zero_copy_only=False))
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
+        if column.is_lenient:
+            return np.full(len(values), np.nan)
         raise UserError(f"{path}: column {column.name} is {values.type}: must be numbers") from None
 
 
@@ -174,7 +179,7 @@ def parse_column(path: object, column: Column, cells: list[str | None], first_ro
     Raises:
         UserError: A cell is not valid; the message names its row.
     """
-    parse = parser(column.kind, decimal_comma=False)
+    parse = column.parser(decimal_comma=False)
     values = np.full(len(cells), np.nan)
     for row, cell in enumerate(cells):
         if cell is None:

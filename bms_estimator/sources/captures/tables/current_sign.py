@@ -2,23 +2,13 @@
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from bms_estimator.model.sample import CurrentSign, SampleBlock
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.captures.tables.dialects import OWN
 from bms_estimator.sources.captures.tables.layout import Layout, Role
+from bms_estimator.sources.captures.tables.voltage_response import VoltageResponse
 
-STEP_FRACTION = 0.1
-"""Minimum change of the current that counts as a step, as a fraction of its range."""
-MIN_STEPS = 2
-"""Minimum number of steps for a decision. A single step may be a glitch."""
-AGREEING_FRACTION = 0.8
-"""Fraction of the steps to which the voltage must respond in the same direction."""
-MIN_CORRELATION = 0.7
-"""Minimum correlation of voltage and charge for a decision, if there are too few steps."""
-MIN_TREND_ROWS = 20
-"""Minimum number of samples for a decision by the correlation of voltage and charge."""
 SIGN_TEXTS: dict[CurrentSign, str] = {
     "discharge_positive": "positive on discharge",
     "charge_positive": "positive on charge",
@@ -41,6 +31,8 @@ class CurrentDirection(NamedTuple):
     reason: str
     by_state: bool = False
     """True if words in a state column give the direction of each row."""
+    row_factors: Floats | None = None
+    """Factors of the rows, 1 on discharge and -1 on charge, of a current without a sign; None for a current with a sign."""
     warning: str = ""
     """Contradiction between the direction and the voltage; empty without one."""
 
@@ -52,35 +44,65 @@ class CurrentDirection(NamedTuple):
     @property
     def text(self) -> str:
         """Direction and reason for messages."""
-        return f"{'signed' if self.by_state else SIGN_TEXTS[self.sign]} ({self.reason})"
+        is_directed = self.by_state or self.row_factors is not None
+        return f"{'signed' if is_directed else SIGN_TEXTS[self.sign]} ({self.reason})"
 
 
-def find_direction(layout: Layout, configured: Sign, response: CurrentSign | None) -> CurrentDirection:
+def find_direction(
+    name: object, layout: Layout, configured: Sign, response: VoltageResponse, *, has_words: bool
+) -> CurrentDirection:
     """Return the direction of positive current in a table.
 
     Args:
+        name: Name of the table for messages.
         layout: Columns of the table.
         configured: Direction that the user configured.
-        response: Direction that the voltage shows, by ``voltage_response``; None: it shows none.
+        response: Direction that the voltage shows.
+        has_words: True if the state column has words for charge or discharge.
+
+    Raises:
+        UserError: The current has no sign, and the voltage does not show the direction of each load.
     """
     if configured.option:
         return CurrentDirection(configured.option, "--current-sign")
     if Role.CHARGE_CURRENT in layout.columns:
         return CurrentDirection("discharge_positive", "separate columns of charge and discharge")
     direction = _defined_direction(layout, configured)
-    if direction is None and response is not None:
-        direction = CurrentDirection(response, "response of the voltage")
+    if direction is None and response.sign is not None:
+        direction = CurrentDirection(response.sign, "response of the voltage")
     if direction is None:
         direction = CurrentDirection("discharge_positive", "assumed: the file does not show it; --current-sign sets it")
-    if Role.STATE in layout.columns:
+    if has_words:
         return CurrentDirection(direction.sign, f"column {layout.columns[Role.STATE].name}", by_state=True)
-    if response is None or response == direction.sign:
+    if response.has_no_sign:
+        return _direct_by_voltage(name, layout, direction, response)
+    if response.sign is None or response.sign == direction.sign:
         return direction
     warning = (
         f"the current should be {SIGN_TEXTS[direction.sign]} ({direction.reason}), but the voltage shows that it is "
-        f"{SIGN_TEXTS[response]}: if so, use --current-sign {response}"
+        f"{SIGN_TEXTS[response.sign]}: if so, use --current-sign {response.sign}"
     )
     return direction._replace(warning=warning)
+
+
+def _direct_by_voltage(
+    name: object, layout: Layout, direction: CurrentDirection, response: VoltageResponse
+) -> CurrentDirection:
+    """Return the direction of a current without a sign. In a table with this project's columns it stays, with a warning.
+
+    Raises:
+        UserError: The voltage does not show the direction of each load.
+    """
+    found = "the current has no sign, although the voltage shows charge and discharge"
+    remedy = "export a signed current or a column of states, or give a file for each direction, with --current-sign"
+    if layout.dialect is OWN:
+        return direction._replace(warning=f"{found}: {remedy}")
+    if response.row_factors is None:
+        raise UserError(
+            f"{name}: the current has no sign, and the voltage does not show the direction of each load: {remedy}"
+        )
+    reason = "unsigned in the file; the voltage shows the direction of each load"
+    return CurrentDirection("discharge_positive", reason, row_factors=response.row_factors)
 
 
 def _defined_direction(layout: Layout, configured: Sign) -> CurrentDirection | None:
@@ -88,55 +110,10 @@ def _defined_direction(layout: Layout, configured: Sign) -> CurrentDirection | N
 
     A table with this project's columns may come from the pack itself; therefore the settings of its sensor decide first.
     """
-    if layout.dialect and layout.dialect.current_sign:
+    if layout.dialect.current_sign:
         return CurrentDirection(layout.dialect.current_sign, f"convention of {layout.dialect.name}")
     if configured.sensor:
         return CurrentDirection(configured.sensor, "sensor.current_sign")
     if layout.dialect is OWN:
         return CurrentDirection("discharge_positive", f"convention of {OWN.name}")
     return None
-
-
-def voltage_response(samples: SampleBlock) -> CurrentSign | None:
-    """Return the direction of positive current that a battery's voltage shows.
-
-    The voltage falls when the discharge current rises in a step. If the current has too few steps, the direction follows
-    from the correlation of the voltage with the charge, because the voltage falls during a discharge.
-
-    Args:
-        samples: Samples with the current as in the table.
-
-    Returns:
-        None if the voltage shows no direction.
-    """
-    rows = samples[
-        np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"]) & np.isfinite(samples["time_s"])
-    ]
-    if rows.size < MIN_STEPS + 1:
-        return None
-    with np.errstate(all="ignore"):  # values near the largest float overflow
-        response = _step_response(rows["current_a"], rows["voltage_v"]) or _charge_response(rows)
-    return None if response == 0 else "charge_positive" if response > 0 else "discharge_positive"
-
-
-def _step_response(current_a: NDArray[np.float64], voltage_v: NDArray[np.float64]) -> int:
-    """Return 1 if the voltage rises in steps of the current upward, -1 if it falls, 0 if there are too few steps."""
-    current_step_a, voltage_step_v = np.diff(current_a), np.diff(voltage_v)
-    range_a = float(np.ptp(current_a))
-    is_step = (np.abs(current_step_a) >= STEP_FRACTION * range_a) & (voltage_step_v != 0.0) & (current_step_a != 0.0)
-    rising = np.sign(current_step_a[is_step]) == np.sign(voltage_step_v[is_step])
-    if rising.size < MIN_STEPS:
-        return 0
-    fraction = float(np.mean(rising))
-    return 1 if fraction >= AGREEING_FRACTION else -1 if fraction <= 1.0 - AGREEING_FRACTION else 0
-
-
-def _charge_response(rows: SampleBlock) -> int:
-    """Return 1 if the voltage rises with the integral of the current, -1 if it falls, 0 if neither is clear."""
-    steps_s = np.diff(rows["time_s"]).clip(min=0.0)
-    charge_as = np.cumsum(rows["current_a"][1:] * steps_s)
-    voltage_v = rows["voltage_v"][1:]
-    if rows.size < MIN_TREND_ROWS or not np.ptp(charge_as) > 0.0 or not np.ptp(voltage_v) > 0.0:
-        return 0
-    correlation = float(np.corrcoef(charge_as, voltage_v)[0, 1])
-    return int(np.sign(correlation)) if abs(correlation) >= MIN_CORRELATION else 0  # 0 also if it is NaN

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable
-from bms_estimator.sources.captures.tables.layout import LayoutFinder
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 
 NDA_MAGIC = b"NEWARE"
 """First bytes of Neware's .nda files."""

@@ -26,6 +26,8 @@ class Dialect:
     """Columns of the charge current, if ``current`` contains only the discharge current."""
     signatures: tuple[tuple[str, ...], ...] = ((),)
     """Sets of column names, with or without their units. A table that has all names of a set has this dialect."""
+    time_unit: str | None = None
+    """Unit of the time if the column states none; None: not defined by the format."""
     current_sign: CurrentSign | None = None
     """Direction of positive current; None: not defined by the format."""
 
@@ -37,6 +39,19 @@ class Dialect:
             for signature in self.signatures
         )
 
+
+CLOCKS = (
+    "absolute time",
+    "date time",
+    "realtime",
+    "date",
+    "dpt time",
+    "time stamp",
+    "unix time",
+    "date and time",
+    "prog time",
+)
+"""Names of a second time column, which counts on over all steps of a test."""
 
 OWN = Dialect(
     "bms_estimator",
@@ -61,6 +76,8 @@ GENERIC = Dialect(
         "timestamp",
         "date time",
         "absolute time",
+        "date and time",
+        "date",
     ),
     current=(
         "current",
@@ -68,7 +85,9 @@ GENERIC = Dialect(
         "battery current",
         "i",
         "<i>",
+        "cur",
         "amps",
+        "pack amps",
         "strom",
         "discharge current",
         "entladestrom",
@@ -81,7 +100,10 @@ GENERIC = Dialect(
         "u",
         "v",
         "e",
+        "vol",
+        "volt",
         "volts",
+        "pack volts",
         "potential",
         "spannung",
     ),
@@ -127,6 +149,7 @@ DIALECTS = (
         signatures=(
             ("step type", "total time"),
             ("step type", "date"),
+            ("data point", "total time", "date"),
             ("step type", "absolute time"),
             ("step name", "absolute time"),
             ("step name", "realtime"),
@@ -204,6 +227,25 @@ DIALECTS = (
         temperature=("temperature measured",),
         signatures=(("time", "current measured", "voltage measured"),),
         current_sign="charge_positive",
+    ),
+    Dialect(
+        "Novonix",
+        time=("run time",),
+        current=("current",),
+        voltage=("potential",),
+        temperature=("temperature", "circuit temperature"),
+        signatures=(("run time", "step time", "potential"),),
+        current_sign="charge_positive",
+    ),
+    Dialect(
+        "PX4",
+        time=("timestamp",),
+        current=("current",),
+        voltage=("voltage",),
+        temperature=("temperature",),
+        signatures=(("timestamp", "voltage_v", "current_a", "cell_count"),),
+        time_unit="us",
+        current_sign="discharge_positive",
     ),
     GENERIC,
 )

@@ -4,24 +4,17 @@ import itertools
 import re
 from collections.abc import Iterator, Sequence
 from datetime import date, datetime, time, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.tables.cell_values import CellKind, time_kind
+from bms_estimator.sources.captures.tables.cell_values import CellKind
 from bms_estimator.sources.captures.tables.column_tables import parse_column
-from bms_estimator.sources.captures.tables.layout import (
-    REQUIRED,
-    Column,
-    Layout,
-    LayoutFinder,
-    RawBlock,
-    Role,
-    with_time_kind,
-    with_units,
-)
+from bms_estimator.sources.captures.tables.layout import REQUIRED, Column, Layout, RawBlock, Role, with_time_kinds
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 
 MAX_HEADER_ROWS = 100
 """Maximum number of rows of a sheet that are searched for the header."""
@@ -53,6 +46,8 @@ class Spreadsheet:
     Raises:
         UserError: The file cannot be read, no sheet has the columns, or several sheets have them.
     """
+
+    warning = ""
 
     def __init__(self, path: Path, finder: LayoutFinder) -> None:
         self._path, self.fraction = path, 0.0
@@ -121,12 +116,14 @@ class Spreadsheet:
             if layout is None:
                 continue
             below = rows[index + 1 :]
-            if below and (layout_with_units := with_units(layout, [_cell_text(cell) for cell in below[0]])):
+            if below and (layout_with_units := finder.with_units(layout, [_cell_text(cell) for cell in below[0]])):
                 layout, below = layout_with_units, below[1:]
-            if below:
-                layout = with_time_kind(layout, time_kind(_cell_text(below[0][layout.columns[Role.TIME].index])))
-            return _Sheet(name, layout, below)
+            return _Sheet(name, with_time_kinds(layout, partial(_cell_texts, below)), below)
         return None
+
+
+def _cell_texts(rows: Sequence[_Row], column: Column) -> Iterator[str]:
+    return (_cell_text(row[column.index]) for row in rows if row[column.index] != "")
 
 
 def _cell_text(cell: Any) -> str:

@@ -1,5 +1,7 @@
 """Captures as tables: the reader of a file by its first bytes, and the samples with the sign of their current."""
 
+import dataclasses
+import math
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -11,9 +13,9 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import MAX_C, MIN_C, NO_CELLS, SAMPLE, CellBlock, SampleBlock, remove_implausible
-from bms_estimator.sources.captures.tables.cell_values import CellKind
+from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
-from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction, voltage_response
+from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction
 from bms_estimator.sources.captures.tables.cycler_files import (
     MPR_MAGIC,
     NDA_MAGIC,
@@ -21,14 +23,17 @@ from bms_estimator.sources.captures.tables.cycler_files import (
     read_biologic,
     read_neware,
 )
-from bms_estimator.sources.captures.tables.dialects import OWN
-from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layout, LayoutFinder, RawBlock, Role
+from bms_estimator.sources.captures.tables.dialects import GENERIC, OWN
+from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layout, RawBlock, Role
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
 from bms_estimator.sources.captures.tables.text_table import TextTable
+from bms_estimator.sources.captures.tables.time_base import find_time_base
+from bms_estimator.sources.captures.tables.voltage_response import VoltageResponse, voltage_response
 
-SIGN_ROWS = 262_144
-"""Minimum number of rows at the beginning of a table from which the sign of the current is determined."""
+FIRST_ROWS = 262_144
+"""Minimum number of rows at the beginning of a table that determine its time base and the sign of the current."""
 STEP_S = 1e-6
 """Time that is inserted between two rows with the same time, between which the current steps [s]."""
 PARQUET_MAGIC, OLE_MAGIC = b"PAR1", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
@@ -40,13 +45,16 @@ EXCEL_MEMBER, OPEN_DOCUMENT_MEMBER = "[Content_Types].xml", "mimetype"
 class TableReader(Protocol):
     """Reader of the columns of a sample in a table."""
 
-    @property
-    def layout(self) -> Layout:
-        """Columns of the table."""
+    layout: Layout
+    """Columns that are read."""
 
     @property
     def description(self) -> str:
         """Kind of the file for messages."""
+
+    @property
+    def warning(self) -> str:
+        """Fault of the rows that were read; empty without one."""
 
     @property
     def fraction(self) -> float:
@@ -60,23 +68,36 @@ class Table:
     """Samples of a table; a ``Capture``.
 
     Args:
+        name: Name of the table for messages.
         reader: Reader of the columns.
         configured: Direction of positive current that the user configured.
 
     Attributes:
+        layout: Columns of the table.
         implausible: Number of implausible temperatures in the rows read so far.
         cells: Cell voltages of the last block.
         note: Description of dialect, columns and sign; empty for a table with this project's columns.
-        warning: Contradiction between the sign of the current and the voltage; empty without one.
     """
 
-    def __init__(self, reader: TableReader, configured: Sign) -> None:
-        self._reader, self._layout = reader, reader.layout
+    def __init__(self, name: object, reader: TableReader, configured: Sign) -> None:
+        self._reader = reader
         self.implausible, self.cells = 0, NO_CELLS
-        response = None if configured.option else voltage_response(self._first_rows())
-        self._direction = find_direction(self._layout, configured, response)
-        self.note = "" if self._layout.dialect is OWN else _note(reader, self._direction.text)
-        self.warning = self._direction.warning
+        first = _first_rows(reader)
+        time_base = find_time_base(reader.layout, first)
+        first[Role.TIME] = first[time_base.role]
+        layout, ignored = _without_zero_temperature(time_base.layout, first)
+        self.layout = reader.layout = layout
+        has_words = Role.STATE in first and bool((np.abs(first[Role.STATE]) == 1.0).any())
+        response = VoltageResponse() if configured.option else self._voltage_response(first, has_words=has_words)
+        self._direction = find_direction(name, self.layout, configured, response, has_words=has_words)
+        is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
+        self.note = "" if is_own else _note(reader, time_base.reason, self._direction.text) + ignored
+        self._warnings = (time_base.warning, self._direction.warning)
+
+    @property
+    def warning(self) -> str:
+        """Contradictions of time and sign, and faults of the rows read so far; empty without one."""
+        return "; ".join(filter(None, (*self._warnings, self._reader.warning)))
 
     @property
     def fraction(self) -> float:
@@ -91,37 +112,57 @@ class Table:
         """
         self.implausible = 0
         before = np.empty(0, dtype=SAMPLE)
-        for raw, samples in self._blocks_as_signed_in_table():
+        start_s, rows = None, 0
+        for raw in self._reader.blocks():
+            samples = to_samples(raw, self.layout)
+            if Role.CLOCK in self.layout.columns or self.layout.columns[Role.TIME].kind in DATES:
+                start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
+                samples["time_s"] -= start_s
             samples["current_a"] *= self._direction.factor
+            if self._direction.row_factors is not None:
+                factors = self._direction.row_factors[rows : rows + samples.size]
+                samples["current_a"] = factors * np.abs(samples["current_a"])
+                rows += samples.size
             if self._direction.by_state:
                 state = raw[Role.STATE]
                 directed = state * np.abs(samples["current_a"])
                 samples["current_a"] = np.where(np.abs(state) == 1.0, directed, samples["current_a"])
-            if self._layout.dialect is not OWN:  # this project's tables hold the time stamps that a source delivered
+            if self.layout.dialect is not OWN:  # this project's tables hold the time stamps that a source delivered
                 before = _separate_steps(before, samples)
             self.implausible += remove_implausible_temperatures(samples)
-            self.cells = cell_voltages(raw, self._layout)
+            self.cells = cell_voltages(raw, self.layout)
             yield samples
 
-    def _blocks_as_signed_in_table(self) -> Iterator[tuple[RawBlock, SampleBlock]]:
-        """Yield blocks as read, and their samples, whose current has the sign of the table."""
-        start_s = None
-        for raw in self._reader.blocks():
-            samples = to_samples(raw, self._layout)
-            if self._layout.columns[Role.TIME].kind is CellKind.DATE_TIME:
-                start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
-                samples["time_s"] -= start_s
-            yield raw, samples
+    def _voltage_response(self, first: RawBlock, *, has_words: bool) -> VoltageResponse:
+        """Return the response of the voltage in the first rows; of all rows if the current has no sign."""
+        response = voltage_response(to_samples(first, self.layout))
+        if not response.has_no_sign or has_words or first[Role.TIME].size < FIRST_ROWS:
+            return response
+        return voltage_response(to_samples(_first_rows(self._reader, math.inf), self.layout))
 
-    def _first_rows(self) -> SampleBlock:
-        """Return samples at the beginning, at least ``SIGN_ROWS`` if the table has as many."""
-        blocks, rows = [], 0
-        for _, samples in self._blocks_as_signed_in_table():
-            blocks.append(samples)
-            rows += samples.size
-            if rows >= SIGN_ROWS:
-                break
-        return np.concatenate(blocks) if blocks else np.empty(0, dtype=SAMPLE)
+
+def _first_rows(reader: TableReader, min_rows: float = FIRST_ROWS) -> RawBlock:
+    """Return rows at the beginning of a table, at least ``min_rows`` if it has as many."""
+    blocks, rows = list[RawBlock](), 0
+    for raw in reader.blocks():
+        blocks.append(raw)
+        rows += raw[Role.TIME].size
+        if rows >= min_rows:
+            break
+    return {role: np.concatenate([np.empty(0), *(raw[role] for raw in blocks)]) for role in reader.layout.columns}
+
+
+def _without_zero_temperature(layout: Layout, first: RawBlock) -> tuple[Layout, str]:
+    """Return the layout without a temperature that is exactly 0 in each row, and a text that says so.
+
+    Programs write 0 if no probe is connected. Tables of this project have no such column then, and users name no such column.
+    """
+    is_zero = Role.TEMPERATURE in first and not np.nan_to_num(first[Role.TEMPERATURE], nan=0.0).any()
+    if not is_zero or layout.dialect is OWN or layout.has_given_columns:
+        return layout, ""
+    columns = dict(layout.columns)
+    temperature = columns.pop(Role.TEMPERATURE)
+    return dataclasses.replace(layout, columns=columns), f'; "{temperature.name}" is 0 in each row: no temperature'
 
 
 def to_samples(raw: RawBlock, layout: Layout) -> SampleBlock:
@@ -129,7 +170,7 @@ def to_samples(raw: RawBlock, layout: Layout) -> SampleBlock:
     with np.errstate(over="ignore"):  # infinite results are dropped like other invalid values
         values = {role: raw[role] * column.unit.factor + column.unit.offset for role, column in layout.columns.items()}
     samples = np.zeros(values[Role.TIME].size, dtype=SAMPLE)
-    samples["time_s"], samples["voltage_v"] = values[Role.TIME], values[Role.VOLTAGE]
+    samples["time_s"], samples["voltage_v"] = values[Role.TIME] + values.get(Role.CLOCK, 0.0), values[Role.VOLTAGE]
     samples["current_a"] = values[Role.CURRENT]
     if Role.CHARGE_CURRENT in values:
         discharge_a, charge_a = np.abs(values[Role.CURRENT]), np.abs(values[Role.CHARGE_CURRENT])
@@ -184,12 +225,16 @@ def _first_finite(values: NDArray[np.float64]) -> float:
     return float(finite[0]) if finite.size else 0.0
 
 
-def _note(reader: TableReader, direction: str) -> str:
-    """Return the dialect, the columns with their units and the sign of the current, as text."""
+def _note(reader: TableReader, time_reason: str, direction: str) -> str:
+    """Return the dialect, the columns with their units, the reason for the time and the sign of the current, as text."""
     layout = reader.layout
-    name = "given columns" if layout.dialect is None else layout.dialect.name
+    name = " with ".join(
+        [layout.dialect.name] * (layout.dialect is not GENERIC or not layout.has_given_columns)
+        + ["given columns"] * layout.has_given_columns
+    )
+    reasons = {Role.TIME: f" ({time_reason})" if time_reason else "", Role.CURRENT: f", {direction}"}
     columns = [
-        _column_text(role, layout.columns[role]) + (f", {direction}" if role is Role.CURRENT else "")
+        _column_text(role, layout.columns[role]) + reasons.get(role, "")
         for role in _SHOWN_ROLES
         if role in layout.columns
     ]
@@ -216,7 +261,7 @@ def open_table(path: Path, configured: Sign, column_map: ColumnMap | None = None
     reader = _open_reader(path, finder)
     if finder.sheet is not None and not isinstance(reader, Spreadsheet):
         raise UserError(f"{path}: sheet {finder.sheet} is given, but the file is not a spreadsheet")
-    return Table(reader, configured)
+    return Table(path, reader, configured)
 
 
 def _open_reader(path: Path, finder: LayoutFinder) -> TableReader:
@@ -258,4 +303,4 @@ def convert_table(table: ColumnTable, configured: Sign, column_map: ColumnMap | 
         UserError: A column is missing or does not contain numbers.
     """
     name = "the table"
-    return Table(ArrayTable(name, table, LayoutFinder(name, column_map)), configured)
+    return Table(name, ArrayTable(name, table, LayoutFinder(name, column_map)), configured)

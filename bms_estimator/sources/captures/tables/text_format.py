@@ -3,12 +3,13 @@
 import csv
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from io import TextIOWrapper
 
-from bms_estimator.sources.captures.tables.cell_values import CellKind, time_kind, uses_decimal_comma
-from bms_estimator.sources.captures.tables.layout import Layout, LayoutFinder, Role, with_time_kind, with_units
+from bms_estimator.sources.captures.tables.cell_values import CellKind, uses_decimal_comma
+from bms_estimator.sources.captures.tables.layout import Column, Layout, with_time_kinds
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 
 MAX_HEADER_LINES = 2_000
 """Maximum number of lines up to the header."""
@@ -31,6 +32,8 @@ class TextFormat:
         first_line: Number of the first line after header and units, counted from 1.
         separator: Separator of columns.
         decimal_comma: True if the decimal separator is a comma.
+        is_quoted: True if each line is in quotes as a whole.
+        upper_layers: Number of columns at the left that belong to upper layers, such as cycles and steps, and are empty in rows.
     """
 
     layout: Layout
@@ -39,11 +42,21 @@ class TextFormat:
     first_line: int
     separator: str
     decimal_comma: bool = False
+    is_quoted: bool = False
+    upper_layers: int = 0
 
 
 def is_data(line: str) -> bool:
     """Return True if a line is neither empty nor a comment."""
     return bool(line.strip()) and not line.startswith("#")
+
+
+def unquoted(line: str) -> str:
+    """Return a line that is in quotes as a whole without them, and another line as it is."""
+    text = line.strip()
+    inner = text[1:-1].replace('""', "")
+    is_quoted = len(text) > 1 and text[0] == text[-1] == '"' and '"' not in inner
+    return text[1:-1].replace('""', '"') if is_quoted else line
 
 
 def split_cells(line: str, separator: str) -> list[str]:
@@ -68,26 +81,44 @@ def find_format(text: TextIOWrapper, finder: LayoutFinder) -> TextFormat:
             raise finder.no_header()
         if not is_data(line):
             continue
+        names = unquoted(line)
         for separator in SEPARATORS:
-            header = split_cells(line, separator)
+            header = split_cells(names, separator)
             layout = finder.find(header)
             if layout is not None:
-                text_format = TextFormat(layout, line, len(header), number + 1, separator)
-                return _probe(text_format, list(itertools.islice(text, PROBED_LINES)))
+                text_format = TextFormat(layout, names, len(header), number + 1, separator, is_quoted=names != line)
+                return _probe(text_format, text, finder, header)
     raise finder.no_header()
 
 
-def _probe(text_format: TextFormat, lines: Sequence[str]) -> TextFormat:
-    """Return the format completed by the first lines after the header: units, decimal sign and format of the time."""
+def _probe(text_format: TextFormat, text: TextIOWrapper, finder: LayoutFinder, header: Sequence[str]) -> TextFormat:
+    """Return the format completed by the first lines after the header: units, layers, decimal sign and format of the time.
+
+    The order of day and month follows from the dates of all lines.
+    """
+    unquoted_text = map(unquoted, text) if text_format.is_quoted else text
+    lines = list(itertools.islice(unquoted_text, PROBED_LINES))
     rows = [split_cells(line, text_format.separator) for line in lines if is_data(line)]
     first_line, layout = text_format.first_line, text_format.layout
-    if rows and (layout_with_units := with_units(layout, rows[0])):
+    if rows and (layout_with_units := finder.with_units(layout, rows[0])):
         layout = layout_with_units
         first_line += 1 + next(index for index, line in enumerate(lines) if is_data(line))
         rows = rows[1:]
+    upper_layers = next(index for index, cell in enumerate(header) if cell.strip())
+    if not any(
+        row and not any(row[:upper_layers]) for row in rows
+    ):  # the column without a name is the index of the rows
+        upper_layers = 0
+    rows = [row for row in rows if not any(row[:upper_layers])]
     complete = [row for row in rows if len(row) > max(column.index for column in layout.columns.values())]
-    if complete:
-        layout = with_time_kind(layout, time_kind(complete[0][layout.columns[Role.TIME].index]))
+    later = (split_cells(line, text_format.separator) for line in unquoted_text)
+
+    def cells_of(column: Column) -> Iterator[str]:
+        return (row[column.index] for row in itertools.chain(complete, later) if len(row) > column.index)
+
+    layout = with_time_kinds(layout, cells_of)
     numeric = [column.index for column in layout.columns.values() if column.kind is CellKind.NUMBER]
     decimal_comma = uses_decimal_comma([row[index] for row in complete for index in numeric])
-    return dataclasses.replace(text_format, layout=layout, first_line=first_line, decimal_comma=decimal_comma)
+    return dataclasses.replace(
+        text_format, layout=layout, first_line=first_line, decimal_comma=decimal_comma, upper_layers=upper_layers
+    )

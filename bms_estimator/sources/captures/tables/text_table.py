@@ -8,18 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind, parser
+from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind
 from bms_estimator.sources.captures.tables.layout import (
     BLOCK_ROWS,
     REQUIRED,
     Column,
     ColumnRole,
-    LayoutFinder,
+    Layout,
     RawBlock,
     Role,
 )
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 from bms_estimator.sources.captures.tables.text_file import TextFile
-from bms_estimator.sources.captures.tables.text_format import SEPARATORS, TextFormat, find_format, is_data, split_cells
+from bms_estimator.sources.captures.tables.text_format import (
+    SEPARATORS,
+    TextFormat,
+    find_format,
+    is_data,
+    split_cells,
+    unquoted,
+)
 
 TEXT_DTYPE = f"U{MAX_TEXT_CHARACTERS}"
 
@@ -36,7 +44,7 @@ class TextTable:
     """
 
     def __init__(self, path: Path, finder: LayoutFinder) -> None:
-        self._path, self._file = path, TextFile(path)
+        self._path, self._file, self.warning = path, TextFile(path), ""
         with self._file.open() as text:
             self._format = find_format(text, finder)
         self.layout = self._format.layout
@@ -52,7 +60,8 @@ class TextTable:
     def blocks(self) -> Iterator[RawBlock]:
         """Yield blocks of at most ``BLOCK_ROWS`` rows.
 
-        Repeated headers, and lines without a number after the last row, are ignored.
+        Repeated headers with the lines without a number above them, and such lines after the last row, are ignored, and a last
+        row that is cut off.
 
         Raises:
             UserError: A row is not valid; the message names file, line and column.
@@ -61,24 +70,28 @@ class TextTable:
             line = self._format.first_line
             for _ in itertools.islice(text, line - 1):
                 pass
-            row_parser = _RowParser(self._path, self._format)
+            row_parser = _RowParser(self._path, self._format, self.layout)
             count = 0
-            while lines := list(itertools.islice(text, BLOCK_ROWS)):
+            rest = map(unquoted, text) if self._format.is_quoted else text
+            while lines := list(itertools.islice(rest, BLOCK_ROWS)):
                 values = self._fast_values(lines)
                 if values is None:
                     values = row_parser.parse(lines, line)
-                elif row_parser.pending_line:
-                    raise row_parser.pending_error()
+                elif row_parser.pending_error:
+                    raise row_parser.pending_error
                 line += len(lines)
                 if values and values[Role.TIME].size:
                     count += values[Role.TIME].size
                     yield values
+            self.warning = row_parser.cut_line
             if count == 0:
                 raise UserError(f"{self._path}: no samples after the header in line {self._format.first_line - 1}")
 
     def _fast_values(self, lines: Sequence[str]) -> RawBlock | None:
         """Return the columns of some lines with numpy's fast parser; None if a line has an empty cell or is not a row."""
         columns = self.layout.columns
+        if self._format.upper_layers:
+            return None
         if self._format.decimal_comma:
             if self._format.separator == ",":  # numbers are quoted, so that only the CSV parser separates them
                 return None
@@ -105,7 +118,7 @@ def _convert(column: Column, cells: NDArray[np.float64] | NDArray[np.str_]) -> N
     """Convert a column that numpy's parser has read as numbers or as text to floats."""
     if column.kind is CellKind.NUMBER:
         return cells.astype(np.float64)
-    parse = parser(column.kind, decimal_comma=False)
+    parse = column.parser(decimal_comma=False)
     if column.kind is CellKind.DIRECTION:  # few different words
         words, index = np.unique(cells, return_inverse=True)
         return np.array([parse(str(word)) for word in words])[index]
@@ -116,46 +129,48 @@ class _RowParser:
     """Parser of rows cell by cell, which names line and column of an error.
 
     Attributes:
-        pending_line: Number of the first line without a number after the last row; 0 without one.
+        pending_error: Error of the first line that is not a row after the last row, if rows follow; None without one.
+        cut_line: Description of a row that is cut off, if it is the last; empty without one.
     """
 
-    def __init__(self, path: Path, text_format: TextFormat) -> None:
-        self._path, self._format = path, text_format
+    def __init__(self, path: Path, text_format: TextFormat, layout: Layout) -> None:
+        self._path, self._format, self._columns = path, text_format, layout.columns
         self._parsers = {
-            role: parser(column.kind, decimal_comma=text_format.decimal_comma)
-            for role, column in text_format.layout.columns.items()
+            role: column.parser(decimal_comma=text_format.decimal_comma) for role, column in layout.columns.items()
         }
-        self._last_index = max(column.index for column in text_format.layout.columns.values())
-        self.pending_line, self._pending_text = 0, ""
+        self._last_index = max(column.index for column in layout.columns.values())
+        self.pending_error: UserError | None = None
+        self.cut_line = ""
 
     def parse(self, lines: Sequence[str], first_line: int) -> RawBlock:
         """Return the columns of some lines."""
         rows = []
         for number, line in enumerate(lines, first_line):
-            if not is_data(line) or line.strip() == self._format.header.strip():
+            if not is_data(line):
+                continue
+            if line.strip() == self._format.header.strip():  # the program was restarted, and wrote its preamble again
+                self.pending_error = None
                 continue
             cells = split_cells(line, self._format.separator)
-            if not any(cell.strip() for cell in cells):
+            if not any(cell.strip() for cell in cells) or any(cells[: self._format.upper_layers]):
                 continue
+            if self.pending_error and not self._has_no_value(cells):
+                raise self.pending_error
             if self._has_no_value(cells):
-                if not self.pending_line:
-                    self.pending_line, self._pending_text = number, line
-                continue
-            if self.pending_line:
-                raise self.pending_error()
-            rows.append(self._row(cells, number))
-        return dict(zip(self._format.layout.columns, np.array(rows).T, strict=True)) if rows else {}
-
-    def pending_error(self) -> UserError:
-        """Return the error of a line without a number that rows follow."""
-        text = self._pending_text.strip()[:MAX_TEXT_CHARACTERS]
-        return UserError(f"{self._path}: line {self.pending_line}: {text!r}: not a row of numbers, though rows follow")
+                text = f"{line.strip()[:MAX_TEXT_CHARACTERS]!r}: not a row of numbers, though rows follow"
+                self.pending_error = self.pending_error or UserError(f"{self._path}: line {number}: {text}")
+            elif len(cells) <= self._last_index:
+                text = f"line {number}: {len(cells)} values, but the header has {self._format.width} columns"
+                self.pending_error = UserError(f"{self._path}: {text}")
+                self.cut_line = f"{text}: the last row is cut off, and not used"
+            else:
+                rows.append(self._row(cells, number))
+        return dict(zip(self._columns, np.array(rows).T, strict=True)) if rows else {}
 
     def _has_no_value(self, cells: Sequence[str]) -> bool:
         """Return True if none of time, current and voltage can be read."""
-        columns = self._format.layout.columns
         for quantity in REQUIRED:
-            index = columns[Role(quantity)].index
+            index = self._columns[Role(quantity)].index
             if index < len(cells) and cells[index].strip():
                 try:
                     self._parsers[Role(quantity)](cells[index])
@@ -165,11 +180,7 @@ class _RowParser:
         return True
 
     def _row(self, cells: Sequence[str], line: int) -> list[float]:
-        if len(cells) <= self._last_index:
-            raise UserError(
-                f"{self._path}: line {line}: {len(cells)} values, but the header has {self._format.width} columns"
-            )
-        return [self._value(role, column, cells, line) for role, column in self._format.layout.columns.items()]
+        return [self._value(role, column, cells, line) for role, column in self._columns.items()]
 
     def _value(self, role: ColumnRole, column: Column, cells: Sequence[str], line: int) -> float:
         cell = cells[column.index]

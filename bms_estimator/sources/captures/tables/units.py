@@ -27,6 +27,7 @@ _SPELLINGS: dict[Quantity, dict[Unit, str]] = {
         SI_UNITS["time"]: "s sec secs second seconds sek",
         Unit("ms", 1e-3): "ms millisecond milliseconds",
         Unit("µs", 1e-6): "us microsecond microseconds",
+        Unit("ns", 1e-9): "ns nanosecond nanoseconds",
         Unit("min", 60.0): "min mins minute minutes",
         Unit("h", 3600.0): "h hr hrs hour hours",
         Unit("d", 86_400.0): "d day days",
@@ -51,9 +52,13 @@ _UNITS = {
     quantity: {word: unit for unit, words in spellings.items() for word in words.split()}
     for quantity, spellings in _SPELLINGS.items()
 }
+TIME_UNITS = tuple(_SPELLINGS["time"])
+"""Units of a time."""
 _UNIT_WORDS = frozenset(word for units in _UNITS.values() for word in units)
-_CHARACTERS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "º": "deg", "℃": "c", "Â": None, " ": None, "_": None})
-"""Replacements before a unit is looked up. ``Â`` is left by UTF-8 text that was read as latin-1."""
+_CHARACTERS = str.maketrans(
+    {"µ": "u", "μ": "u", "°": "deg", "º": "deg", "℃": "c", "Â": None, "\ufffd": "deg", " ": None, "_": None}
+)
+"""Replacements before a unit is looked up. UTF-8 that was read as latin-1 leaves ``Â``; a lost ``°`` leaves U+FFFD."""
 _GBK_CELSIUS = "¡æ"
 """Character ℃ in the Chinese encoding GBK, read as latin-1."""
 _STAMP = re.compile(r"[:\-].*s|y{2,4}.*m", re.IGNORECASE)
@@ -61,7 +66,9 @@ _STAMP = re.compile(r"[:\-].*s|y{2,4}.*m", re.IGNORECASE)
 _BRACKETED = re.compile(r"(?P<name>[^()\[\]]+)[(\[](?P<unit>[^()\[\]]*)[)\]]\s*")
 _SEPARATED = re.compile(r"(?P<name>.+)[/#](?P<unit>[^/#]+)")
 _LAST_WORD = re.compile(r"(?P<name>.+)[_ ](?P<unit>[^_ ]+)")
-_IGNORED = re.compile(r"[\s_.~\-]+")
+_IGNORED = re.compile(r"[\s_.~/\-]+")
+_NOT_UNITS = frozenset({"time", "date"})
+"""Words after a slash that belong to the name, as in ``Date/Time``."""
 
 
 class ColumnName(NamedTuple):
@@ -69,10 +76,12 @@ class ColumnName(NamedTuple):
 
     name: str
     unit: str | None
+    full_name: str
+    """Name with the unit, which belongs to the name in headers such as ``Pack Volts``."""
 
 
 def fold(name: str) -> str:
-    """Return a name in lower case, without spaces and the characters ``_``, ``-``, ``.`` and ``~``."""
+    """Return a name in lower case, without spaces and the characters ``_``, ``-``, ``.``, ``/`` and ``~``."""
     return _IGNORED.sub("", name.lower())
 
 
@@ -81,9 +90,11 @@ def split_unit(header: str) -> ColumnName:
     text = header.strip()
     for pattern in (_BRACKETED, _SEPARATED, _LAST_WORD):
         match = pattern.fullmatch(text)
-        if match and (pattern is not _LAST_WORD or match["unit"].lower() in _UNIT_WORDS):
-            return ColumnName(fold(match["name"]), match["unit"].strip())
-    return ColumnName(fold(text), text if text.lower() in _UNIT_WORDS else None)
+        if not match or match["unit"].strip().lower() in _NOT_UNITS:
+            continue
+        if pattern is not _LAST_WORD or match["unit"].lower() in _UNIT_WORDS:
+            return ColumnName(fold(match["name"]), match["unit"].strip(), fold(text))
+    return ColumnName(fold(text), text if text.lower() in _UNIT_WORDS else None, fold(text))
 
 
 def find_unit(quantity: Quantity, text: str) -> Unit | None:
