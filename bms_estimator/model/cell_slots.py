@@ -9,6 +9,9 @@ from bms_estimator.model.sample import CellBlock
 MIN_CELL_V, MAX_CELL_V = 0.1, 6.0
 """Range of the absolute voltage of a live cell [V]. Empty slots read 0 V, a few millivolts of noise, or the largest number of
 their format. No single cell exceeds 5 V."""
+MIN_SAMPLES = 10
+"""Minimum number of samples with a wrong number of cells before ``CellSlots`` gives a reason. A device may report its cells in
+several responses, so that the first samples have a part of them."""
 
 
 class CellSlots:
@@ -26,7 +29,29 @@ class CellSlots:
     """
 
     def __init__(self, series: int) -> None:
-        self._series, self._slots, self.fault = series, np.arange(series), ""
+        self._series, self._slots = series, np.arange(series)
+        self.fault = self._excess_text = ""
+        self._excess_samples = 0  # number of successive samples with too many live slots
+        # number of samples with live slots and their largest number of these, as long as they are too few
+        self._samples = self._max_cells = 0
+
+    @property
+    def reason(self) -> str:
+        """Reason why single cells have no estimates, as a sentence; empty if they have, and in the first samples."""
+        if self._excess_samples >= MIN_SAMPLES:
+            return self._excess_text
+        if self._samples < MIN_SAMPLES or self._has_enough:
+            return ""
+        consequence = "or measure the others. Until then, single cells have no estimates, and the others no alarms"
+        return f"{self._wrong_number(self._max_cells)}, {consequence}"
+
+    def _wrong_number(self, count: int) -> str:
+        return f"{count} cells are measured, but the pack has {self._series} in series: correct pack.series"
+
+    @property
+    def _has_enough(self) -> bool:
+        """True if the estimators of single cells have started, with a sample that lacks at most one cell."""
+        return self._max_cells >= self._series - 1
 
     def select(self, cells_v: CellBlock) -> CellBlock:
         """Return the voltages of the cells [V], shape (n, m) with at most ``series`` columns.
@@ -38,8 +63,15 @@ class CellSlots:
             cells_v: Voltages of the slots [V], NaN if not measured, shape (n, slots).
         """
         self.fault = ""
-        is_within_series = cells_v.shape[1] <= self._series and self._slots[-1] < self._series
-        if is_within_series or not cells_v.size:
+        if not cells_v.size:
+            return cells_v
+        if not self._has_enough:
+            counts = is_live(cells_v).sum(axis=1)
+            counts[counts > self._series] = 0
+            self._samples += int(np.count_nonzero(counts))
+            self._max_cells = max(self._max_cells, int(counts.max()))
+        if cells_v.shape[1] <= self._series and self._slots[-1] < self._series:
+            self._excess_samples = 0
             return cells_v
         missing = max(int(self._slots[-1]) + 1 - cells_v.shape[1], 0)
         slots_v = np.pad(cells_v, ((0, 0), (0, missing)), constant_values=np.nan)
@@ -54,11 +86,10 @@ class CellSlots:
         """Return the voltages of the cells of samples with the same live slots [V]."""
         count = int(live.sum())
         if count > self._series:
-            self.fault = (
-                f"{count} cells are measured, but the pack has {self._series} in series: correct pack.series. "
-                "Until then, single cells have neither alarms nor estimates"
-            )
+            self.fault = f"{self._wrong_number(count)}. Until then, single cells have neither alarms nor estimates"
+            self._excess_samples, self._excess_text = self._excess_samples + len(slots_v), self.fault
             return np.full((len(slots_v), self._series), np.nan)
+        self._excess_samples = 0
         if count == self._series:
             self._slots = np.flatnonzero(live)
         return slots_v[:, self._slots]

@@ -37,6 +37,11 @@ ADOPT_DELAY_S = 120.0
 another thread. A replay waits for the fit, and adopts it at the same sample."""
 MIN_ROWS = 8
 """Minimum number of new rows for a fit."""
+MAX_UNKNOWN_CURRENT = 0.05
+"""Maximum variance of the current at the times of the voltages, as a fraction of its mean square, for a fit. An error of the current
+makes the fitted resistances too small by about this fraction, because least squares assume exact currents. The error of the resistances
+then distorts OCV and capacity. The fraction is 0.02 for a load that changes every 20 s if voltage and current come every 10 s, 5 s apart,
+and 0.2 to 0.3 if they come every 60 s, 30 s apart."""
 MIN_THROUGHPUT_SOC = 1.0
 """Minimum throughput of the history for the adoption of a fit with a large std of the SOC [SOC]. In a shorter history several
 separate SOCs may be possible, which the filter's hypotheses represent and the single normal distribution of a fit does not."""
@@ -257,9 +262,9 @@ class SlowFit:
             self._is_late = True
 
     def _begin_fit(self) -> None:
-        """Begin a fit if there is enough new data, and set the time of the next event."""
+        """Begin a fit if there is enough new data with known currents, and set the time of the next event."""
         h = self._h
-        if self._new_rows >= MIN_ROWS:
+        if self._new_rows >= MIN_ROWS and unknown_current(self.history.rows) <= MAX_UNKNOWN_CURRENT:
             self._new_rows = 0
             rows, previous = self.history.rows, self.saved_fit
             self._pending = self._submit(lambda: fit(self.cell, rows, previous))
@@ -315,3 +320,13 @@ class SlowFit:
             adopt_curves(settings[0], self.estimator.cell_file_settings, fitted)
         if f["started"]:
             keep_series_resistance(f, before, present_ohm(settings[0], f))
+
+
+def unknown_current(rows: NDArray[np.void]) -> float:
+    """Return the variance of the current at the times of the voltages, divided by its mean square; 0 without a current.
+
+    Args:
+        rows: Shape (n,), dtype HISTORY_ROW.
+    """
+    square_a2s = float(rows["duration_s"] @ rows["current_a"] ** 2)
+    return float(rows["duration_s"] @ rows["skew_a2"]) / square_a2s if square_a2s > 0.0 else 0.0

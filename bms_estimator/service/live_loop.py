@@ -219,9 +219,13 @@ async def _estimate(
         restored_s: Time since boot at which the state was restored [s].
         slots: Cell slots of the source.
     """
-    unseen_s = estimator.record["unseen_s"].copy()
+    unseen_s, logged_reason = estimator.record["unseen_s"].copy(), ""
     async for each in source:
         received = each._replace(cells_v=slots.select(each.cells_v))
+        if slots.reason != logged_reason:
+            logged_reason = slots.reason
+            if logged_reason:
+                log.warning("no estimates of single cells", reason=logged_reason)
         if estimator.state["started"][0] and not estimator.state["samples"][0]:
             # the gap before the first sample after a restart also includes the wait for that sample
             estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s

@@ -9,11 +9,19 @@ MIN_LOG_INTERVAL_S = 30.0
 """Minimum interval between two log lines on faults, or on one reason [s]."""
 MAX_REASONS = 16
 """Maximum number of reasons that are logged without a minimum interval. More reasons are noise in a device's text."""
-_NORMAL_EVENTS = ("bytes_received", "unadmitted_bytes", "frames_received", "before_hello", "reconnects", "retained")
+_NORMAL_EVENTS = (
+    "bytes_received",
+    "unadmitted_bytes",
+    "frames_received",
+    "before_hello",
+    "reconnects",
+    "retained",
+    "missing",
+)
 """Counters of normal events, which are not logged here.
 
-Bytes and samples before the hello are normal if opening the port does not reset the board. Retained messages are
-normal on MQTT. Sources log reconnects and rejected devices (``unadmitted_bytes``) themselves.
+Bytes and samples before the hello are normal if opening the port does not reset the board. Retained messages and messages
+with only a part of the values are normal on MQTT. Sources log reconnects and rejected devices (``unadmitted_bytes``) themselves.
 """
 
 _LOGGED_ONCE = {"implausible": "implausible_temperatures", "implausible_cells": "implausible_cell_voltages"}

@@ -5,6 +5,7 @@ import pytest
 
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.sample import NO_CELLS
+from bms_estimator.protocols.base.device_protocol import cell_block
 
 NAN = np.nan
 LIVE = [3.31, 3.32, 3.33, 3.34]
@@ -42,3 +43,31 @@ def test_the_selection_does_not_depend_on_the_division_into_blocks() -> None:
     expected = whole.select(cells_v)
     selected = np.concatenate([parts.select(cells_v[first : first + 7]) for first in range(0, 300, 7)])
     assert selected.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("length", [1, 30])
+@pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        (
+            [[3.3] * 14] * 30,
+            "14 cells are measured, but the pack has 16 in series: correct pack.series, or measure the others",
+        ),
+        ([[*[3.3] * 14, 0.0, NAN]] * 30, "14 cells are measured"),
+        ([[3.3] * 15] * 30, ""),
+        ([[3.3] * 6] * 9, ""),
+        ([[3.3] * 6] * 20 + [[3.3] * 16], ""),
+        ([[3.3] * 18] * 30, "18 cells are measured, but the pack has 16 in series: correct pack.series. Until then"),
+        ([[3.3] * 18] * 15 + [[3.3] * 14] * 15, "14 cells are measured"),
+        ([[3.3] * 18] * 15 + [[3.3] * 16] * 15, ""),
+        ([[]] * 30, ""),
+    ],
+)
+def test_a_wrong_number_of_cells_is_the_reason_for_no_estimates_live_and_in_a_replay(
+    rows: list[list[float]], reason: str, length: int
+) -> None:
+    slots = CellSlots(16)
+    for first in range(0, len(rows), length):
+        slots.select(cell_block(rows[first : first + length]))
+    assert slots.reason.startswith(reason)
+    assert bool(slots.reason) == bool(reason)

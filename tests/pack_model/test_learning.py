@@ -11,13 +11,14 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET, SOC, STATES
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import FitError, PackFit
 from bms_estimator.pack_model.handover import FILTER_STATES
 from bms_estimator.pack_model.learning import SlowFit, run_now
+from bms_estimator.settings.sampling import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured
 from tests.pack_model.quick_fit import quick_fit
 
@@ -61,6 +62,23 @@ def test_blocks_of_any_size_give_the_same_trace(
     assert slow_fit.fits == whole[0].fits >= 2
     assert trace.tobytes() == whole[1].tobytes()
     assert slow_fit.estimator.record.tobytes() == whole[0].estimator.record.tobytes()
+
+
+@pytest.mark.parametrize(("period_s", "is_fitted"), [(10, True), (60, False)])
+def test_there_is_no_fit_while_the_current_at_the_times_of_the_voltages_is_unknown(
+    period_s: int, is_fitted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A load changes every 20 s. Voltage and current come in turn, half a period apart."""
+    monkeypatch.setattr(learning, "fit", quick_fit)
+    rng = np.random.default_rng(1)
+    current_a = np.repeat(rng.uniform(0.0, 1.0, 900), 20) * TRUTH.cell.capacity_ah
+    current_a[9000:] *= -1.0
+    samples = measured(current_a, 0.9, rng)[0][:: period_s // 2].copy()
+    samples["status"][::2], samples["status"][1::2] = SampleStatus.CURRENT_HELD, SampleStatus.VOLTAGE_HELD
+    slow_fit = SlowFit(Estimator(TRUTH, sampling=Sampling(period_s=period_s)), interval_s=INTERVAL_S)
+    slow_fit.run(samples)
+    assert slow_fit.history.rows.size > 5 * learning.MIN_ROWS
+    assert bool(slow_fit.fits) == is_fitted
 
 
 def test_fit_that_fails_leaves_the_previous_one_in_use(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:

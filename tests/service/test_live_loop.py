@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
@@ -190,6 +191,18 @@ async def test_the_drift_of_the_board_s_clock_is_published_once_it_is_measured()
         assert (await run.sink.until(lambda _: True)).health.clock_ppm is None
         run.source.clock_ppm = 3012.5
         await run.sink.until(lambda s: s.health.clock_ppm == 3012.5)
+
+
+async def test_a_wrong_number_of_cells_is_logged_once() -> None:
+    with capture_logs() as lines:
+        async with run_loop(cell=CELL.pack(4, 1)) as run:
+            for time_s in range(30):
+                samples = np.array([(time_s, 1.0, 14.8, np.nan, np.nan, np.nan, 0)], dtype=SAMPLE)
+                run.source.give_block(samples, np.full((1, 2), 3.7))
+            await run.end()
+    reasons = [line["reason"] for line in lines if line["event"] == "no estimates of single cells"]
+    assert len(reasons) == 1
+    assert reasons[0].startswith("2 cells are measured, but the pack has 4 in series")
 
 
 async def test_the_reason_for_missing_samples_is_published() -> None:

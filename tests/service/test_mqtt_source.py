@@ -3,8 +3,9 @@
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Coroutine
 from pathlib import Path
+from typing import Any
 
 import aiomqtt
 from structlog.testing import capture_logs
@@ -121,7 +122,7 @@ async def check_invalid_payloads(broker: Broker, listener: Listener) -> None:
     await publish(broker, "unavailable", "nan")
     reason = f"esphome-jk jk-bms by MQTT, {broker.url}: voltage: jk-bms/sensor/jk-bms_total_voltage/state: no number: "
     health = await listener.wait_json(HEALTH_TOPIC, lambda h: (h["sensor_message"] or "").startswith(reason), skip=skip)
-    assert health["line"]["no_number"] >= 2
+    assert health["line"]["missing"] >= 2
     assert not health["sensor_online"]
 
 
@@ -138,11 +139,21 @@ async def test_a_publisher_that_needs_requests_is_polled(broker: Broker) -> None
                         payload = '{"value":%s}' % ("null" if value is None else value)
                         await client.publish(f"N/c0619ab/battery/1/{name}", payload)
 
+    with capture_logs() as lines:
+        await check_polling(broker, pack_settings, answer_requests())
+    absences = [line["reason"] for line in lines if line["event"].startswith("a message has no value")]
+    assert absences == ["temperature: N/c0619ab/battery/1/Dc/0/Temperature: no number: None"]
+    assert not [line for line in lines if line["event"] == "faults on the line"]
+
+
+async def check_polling(broker: Broker, pack_settings: Settings, answers: Coroutine[Any, Any, None]) -> None:
+    """Check that the service polls a device, which has no temperature sensor."""
     async with Listener(broker) as listener, serving(pack_settings):
-        device = asyncio.create_task(answer_requests())
+        device = asyncio.create_task(answers)
         try:
             state = await listener.wait_json(STATE_TOPIC)
             assert (state["voltage_v"], state["current_a"], state["temperature_c"]) == (52.5, 4.0, None)
+            await listener.wait_json(HEALTH_TOPIC, lambda h: h["line"]["missing"] > 1)
             keepalive = await listener.wait("R/c0619ab/keepalive")
             assert keepalive == b'{"keepalive-options":["suppress-republish"]}'
         finally:

@@ -1,8 +1,8 @@
-"""Log of the reasons why no samples arrive."""
+"""Logs of the faults of a line, and of the reasons why no samples arrive."""
 
 from structlog.testing import capture_logs
 
-from bms_estimator.sources.fault_log import MAX_REASONS, MIN_LOG_INTERVAL_S, SilenceLog
+from bms_estimator.sources.fault_log import MAX_REASONS, MIN_LOG_INTERVAL_S, FaultLog, SilenceLog
 
 
 def logged_reasons(log: SilenceLog, reasons: list[str], begin_s: float = 0.0) -> list[str]:
@@ -32,3 +32,12 @@ def test_a_reason_that_samples_interrupt_is_logged_at_intervals() -> None:
 def test_reasons_that_always_differ_are_logged_at_intervals() -> None:
     reasons = [f"noise {number}" for number in range(1000)]
     assert MAX_REASONS < len(logged_reasons(SilenceLog(), reasons)) <= MAX_REASONS + 1000 / MIN_LOG_INTERVAL_S
+
+
+def test_normal_events_are_not_logged_as_faults() -> None:
+    log = FaultLog()
+    with capture_logs() as lines:
+        for second in range(100):
+            log.check({"missing": second, "retained": second, "no_number": 0}, float(second))
+        log.check({"missing": 100, "retained": 100, "no_number": 1}, 100.0)
+    assert [line["event"] for line in lines] == ["faults on the line"]

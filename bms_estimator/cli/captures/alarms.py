@@ -144,6 +144,8 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
             trace = forecaster.run(received.samples, received.cells_v) if forecaster else runner.run(received.samples)
             monitor.add(received, trace, now_s, forecaster.rows if forecaster else NO_FORECAST, slots.fault)
             bar.update(source.fraction)
+    if slots.reason:
+        typer.echo(f"warning: no estimates of single cells: {slots.reason}", err=True)
     monitor.evaluate(now_s)
     raised_alarms = _pair_changes(changes)
     latched = {alarm.name for alarm in monitor.report if alarm.latched}

@@ -193,6 +193,8 @@ async def _replay(
             publisher.publish_last()
     for kind, text in errors.items():
         typer.echo(f"warning: a fit of the pack's model failed: {kind}: {text}", err=True)
+    if slots.reason:
+        typer.echo(f"warning: no estimates of single cells: {slots.reason}", err=True)
     limit_a = short_limit_a(settings, model)
     result = summary.result(estimator, pack_model, forecaster, cells, limit_a, source.samples, wall_s)
     return replace(result, impossible=impossible, temperatures_dropped=source.counters.get("implausible", 0))

@@ -30,6 +30,9 @@ CONVERSIONS: Mapping[Unit, tuple[float, float]] = {
 """Factor and offset that convert a value to V, A, C or s, by unit. Values in other units are not converted."""
 STALE_PERIODS, MIN_STALE_S = 3.0, 30.0
 """Default age at which a voltage or current is stale: in sample periods, and its minimum [s]."""
+ABSENT_PERIODS = 2.0
+"""Default age at which a temperature or cell voltage that was in each message and is no longer is stale, in sample periods. One
+message without it is tolerated."""
 DEFAULT_RESOLUTION_V = 0.01
 """Voltage resolution of a publisher without a profile [V]."""
 
@@ -123,7 +126,7 @@ class MqttSource(BaseSource):
     )
     max_age_s: Positive | None = Field(
         default=None,
-        description="maximum age of a voltage or current in a sample; default: three times interval_s, and at least 30 s; one interval_s longer than max_silent_s if that is set",
+        description="maximum age of a voltage or current in a sample; default: three times interval_s, and at least 30 s; one interval_s longer than max_silent_s if that is set. Also maximum age of a temperature or cell voltage that was in each message and is then null or absent; default: twice interval_s",
     )
     max_silent_s: Positive | None = Field(
         default=None,
@@ -232,6 +235,11 @@ class MqttSource(BaseSource):
         """Maximum age of a voltage or current in a sample [s]."""
         default_s = max(STALE_PERIODS * self.interval_s, MIN_STALE_S, (self.max_silent_s or 0.0) + self.interval_s)
         return self.max_age_s or default_s
+
+    @property
+    def absent_s(self) -> float:
+        """Maximum age of a temperature or cell voltage that was in each message and is no longer [s]."""
+        return self.max_age_s or ABSENT_PERIODS * self.interval_s
 
     @property
     def short_description(self) -> str:

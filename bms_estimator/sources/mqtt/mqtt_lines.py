@@ -58,6 +58,7 @@ class MqttProducer(LineProducer):
         self._broker, self._brokers = configured[0], itertools.cycle(configured)
         self._connect = connect or BrokerConnector(mqtt)
         self._has_conflict = False
+        self._logged_quantities = set[str]()
         self._lost_messages: Counter[str] = Counter({"too_long": 0, "overflow": 0})
         self._options = ConnectOptions(
             f"bms-source-{secrets.token_hex(4)}",
@@ -120,6 +121,7 @@ class MqttProducer(LineProducer):
                         message.topic, message.payload, self._monotonic(), retained=message.retain
                     )
                     self._log_conflict()
+                    self._log_faults()
                 if line := self._assembler.line(self._monotonic()):
                     yield line
         finally:
@@ -150,6 +152,12 @@ class MqttProducer(LineProducer):
             log.warning("two publishers write the same topic; stop one of them", values=conflict)
         else:
             log.info("one publisher writes the topic again")
+
+    def _log_faults(self) -> None:
+        """Log the first message without a value of each quantity. It may be normal, for example without a temperature sensor."""
+        for quantity in self._assembler.faults.keys() - self._logged_quantities:
+            self._logged_quantities.add(quantity)
+            log.info("a message has no value; not logged again", reason=self._assembler.faults[quantity])
 
     def _count_lost(self, kind: str, _topic: str) -> None:
         self._lost_messages[kind] += 1

@@ -16,6 +16,8 @@ MAX_CELL_NUMBER = 400
 """Highest cell number in a path or topic."""
 MAX_INDEX_DIGITS = 9
 """Number of digits of a list index that are compared with the length of the list. No list has an index with more digits."""
+NO_VALUE = frozenset(("", "null", "none", "nan", "unavailable", "unknown"))
+"""Texts with which publishers report a sensor without a value, in lower case."""
 CELL_PLACEHOLDER = re.compile(r"\{cell\}")
 
 
@@ -28,6 +30,12 @@ class InvalidValueError(Exception):
 
 class MissingError(InvalidValueError):
     """The payload is JSON, but the path does not exist in it."""
+
+    counter = "missing"
+
+
+class NullError(InvalidValueError):
+    """The payload says that there is no value."""
 
     counter = "missing"
 
@@ -113,6 +121,8 @@ def _value_at(value: Any, path: str) -> Any:
 
 
 def _to_si(value: Any, location: ValueLocation) -> float:
+    if value is None or (isinstance(value, str) and value.strip().lower() in NO_VALUE):
+        raise NullError(f"no number: {_shorten(value)}")
     if location.unit == "iso":
         return _epoch_s(value)
     try:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from bms_estimator.protocols.base.reading import sample_json_line
@@ -11,6 +11,7 @@ from bms_estimator.sources.mqtt.payload_value import (
     CELL_PLACEHOLDER,
     MAX_CELL_NUMBER,
     InvalidValueError,
+    MissingError,
     cell_pattern,
     read_cells,
     read_value,
@@ -22,6 +23,9 @@ REQUIRED_QUANTITIES = ("voltage", "current")
 REPEAT_PERIODS = 1.5
 """Time without a message after which the last current is used again if the publisher sends only changes, in sample periods. A
 regular message may be half a period late."""
+REGULAR_MESSAGES = 10
+"""Number of successive messages with a temperature or cell voltage after which its absence from a message means that it is no
+longer measured. A publisher that sends only a part of its values in each message rarely reaches it."""
 MAX_PROBE_NUMBER = 32
 """Highest number of a temperature probe in a path or topic."""
 MAX_STATUS_CHARACTERS = 80
@@ -40,14 +44,27 @@ class _TopicBinding(NamedTuple):
     pattern: re.Pattern[str]
     """Pattern of the topic. Its group, if any, is the number of the cell or probe."""
     location_index: int
-    """Index of the location in the settings."""
+    """Index of the location of a temperature in the settings; 0 for other quantities."""
 
 
-class _TimestampedValue(NamedTuple):
-    """A value and its arrival time [s]."""
+class _StoredValue(NamedTuple):
+    """Last value of a quantity, a cell or a probe.
+
+    Attributes:
+        value: Value in SI units.
+        arrival_s: Arrival time [s].
+        expiry_s: Time after which the value is too old for a sample [s].
+        messages: Number of successive messages of its topic that had a value.
+    """
 
     value: float
     arrival_s: float
+    expiry_s: float
+    messages: int
+
+
+_Key = tuple[str, int, int]
+"""Quantity, index of its location, and number of the cell or probe; 1 for a quantity with a single value."""
 
 
 class SampleAssembler:
@@ -56,22 +73,36 @@ class SampleAssembler:
     A sample is complete when voltage and current have arrived. If only one of them arrives within ``settle_s``, the last
     value of the other is used up to ``stale_s``, because some publishers send only changes. The line marks a value that
     an earlier sample has used, because the estimator must not use a voltage twice, or with a current of another time.
-    Retained messages are rejected, because their age is unknown.
+    A message that lacks a quantity does not erase its last value, because some publishers send only a part of their values in
+    each message. Retained messages are rejected, because their age is unknown.
+
+    Attributes:
+        faults: Latest error of each quantity without a value in its last message, by name of the quantity.
     """
 
     def __init__(self, settings: MqttSource) -> None:
         self._settings = settings
         self._bindings = [
-            _TopicBinding(quantity, location, settings.substitute(location.path), topic, cell_pattern(topic), index)
+            _TopicBinding(
+                quantity,
+                location,
+                settings.substitute(location.path),
+                topic,
+                cell_pattern(topic),
+                index if quantity == "temperature" else 0,
+            )
             for index, (quantity, location) in enumerate(settings.locations())
             for topic in settings.topics(location)
         ]
         self._availability_topic = settings.substitute(settings.availability_topic or "")
         self._offline_status = ""  # latest status from the publisher or its last will
-        self._values: dict[str, _TimestampedValue] = {}
-        self._cells: dict[int, _TimestampedValue] = {}
-        self._probes: dict[tuple[int, int], _TimestampedValue] = {}  # by index of the location and number of the probe
-        self._faults: dict[str, str] = {}  # latest error of each quantity
+        self._max_age_s = dict.fromkeys(settings.quantities, settings.slow_max_age_s) | {
+            **dict.fromkeys(REQUIRED_QUANTITIES, settings.stale_s),
+            "time": settings.settle_s,  # an older time belongs to an earlier sample
+        }
+        self._values: dict[_Key, _StoredValue] = {}
+        self._irregular = set[tuple[str, int]]()  # quantities and indices of locations that a message lacked
+        self.faults: dict[str, str] = {}
         self._unused_arrival_s: dict[str, float] = {}  # arrival times of voltage and current since the last sample
         self._repeat_s = math.inf  # time at which the last current is used again
         self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale", "publisher_errors"), 0)
@@ -114,13 +145,13 @@ class SampleAssembler:
         """Reason why no sample is complete; None if unknown."""
         if self._offline_status:
             return f"the publisher reports {self._offline_status} on {self._availability_topic}"
-        errors = [fault for name in REQUIRED_QUANTITIES if (fault := self._faults.get(name))]
+        errors = [fault for name in REQUIRED_QUANTITIES if (fault := self.faults.get(name))]
         if errors:
             return "; ".join(errors)
-        if not self._values:
+        absent = [name for name in REQUIRED_QUANTITIES if (name, 0, 1) not in self._values]
+        if len(absent) == len(REQUIRED_QUANTITIES):
             retained = " but retained messages" if self._counters["retained"] else ""
             return f"no message on {', '.join(dict.fromkeys(self._find_topics(*REQUIRED_QUANTITIES)))}{retained}"
-        absent = [name for name in REQUIRED_QUANTITIES if name not in self._values]
         return f"{absent[0]}: no message on {', '.join(self._find_topics(absent[0]))}" if absent else None
 
     def wait_s(self, now_s: float) -> float | None:
@@ -148,15 +179,17 @@ class SampleAssembler:
             return
         has_conflict = False
         for binding, match in bindings:
-            cell = int(match[1]) if match.re.groups else None
+            number = int(match[1]) if match.re.groups else None
             try:
-                self._store_value(binding, payload, cell, now_s)
+                self._store_values(binding, _read(binding, payload, number), now_s)
             except InvalidValueError as error:
-                self._remove(binding, cell)
+                location = binding.quantity, binding.location_index
+                keys = [key for key in self._values if key[:2] == location and number in (None, key[2])]
+                self._set_absent(location, keys, is_null=not isinstance(error, MissingError))
                 self._counters[error.counter] += 1
-                self._faults[binding.quantity] = f"{binding.quantity}: {topic}: {error}"
+                self.faults[binding.quantity] = f"{binding.quantity}: {topic}: {error}"
             else:
-                self._faults.pop(binding.quantity, None)
+                self.faults.pop(binding.quantity, None)
                 has_conflict |= self._update_conflict(binding, now_s)
         self._counters["publisher_errors"] += has_conflict
 
@@ -166,7 +199,7 @@ class SampleAssembler:
             return b""
         voltage_held, current_held = "voltage" not in self._unused_arrival_s, self._current_is_old()
         self._unused_arrival_s.clear()
-        voltage_v, current_a = (self._value(name, now_s, self._settings.stale_s) for name in REQUIRED_QUANTITIES)
+        voltage_v, current_a = (self._value(name, now_s) for name in REQUIRED_QUANTITIES)
         if voltage_v is None or current_a is None:
             self._count_stale("current" if current_a is None else "voltage")
             self._repeat_s = math.inf
@@ -178,72 +211,54 @@ class SampleAssembler:
             current_a,
             temperatures_c=self._probes_c(now_s),
             cells_v=self._cells_v(now_s),
-            time_s=self._value("time", now_s, self._settings.settle_s),  # an older time belongs to an earlier sample
+            time_s=self._value("time", now_s),
             voltage_held=voltage_held,
             current_held=current_held,
         )
 
     def _current_is_old(self) -> bool:
         """Return True if a new voltage has no current within ``settle_s``."""
-        current, voltage_s = self._values.get("current"), self._unused_arrival_s.get("voltage")
+        current, voltage_s = self._values.get(("current", 0, 1)), self._unused_arrival_s.get("voltage")
         return current is not None and voltage_s is not None and voltage_s - current.arrival_s > self._settings.settle_s
 
-    def _store_value(self, binding: _TopicBinding, payload: bytes, cell: int | None, now_s: float) -> None:
-        """Store the values of a payload.
+    def _store_values(self, binding: _TopicBinding, readings: Mapping[int, float], now_s: float) -> None:
+        """Store the values of a message by number of the cell or probe. NaN is an absent value."""
+        location = binding.quantity, binding.location_index
+        nulls = [(*location, number) for number, value in readings.items() if math.isnan(value)]
+        if nulls:
+            self._set_absent(location, nulls, is_null=True)
+        for number, value in readings.items():
+            highest = MAX_PROBE_NUMBER if binding.quantity == "temperature" else MAX_CELL_NUMBER
+            if 1 <= number <= highest and not math.isnan(value):
+                key = (*location, number)
+                messages = self._values[key].messages + 1 if key in self._values else 1
+                self._values[key] = _StoredValue(value, now_s, now_s + self._max_age_s[binding.quantity], messages)
+        if binding.quantity in REQUIRED_QUANTITIES:
+            self._unused_arrival_s.setdefault(binding.quantity, now_s)
 
-        Raises:
-            InvalidValueError: The payload has no valid value; nothing is stored.
+    def _set_absent(self, location: tuple[str, int], keys: Iterable[_Key], *, is_null: bool) -> None:
+        """Let temperatures or cell voltages expire earlier that a message lacks, unless the publisher often omits them.
+
+        Args:
+            location: Quantity and index of its location.
+            keys: Keys of the values that the message lacks.
+            is_null: True if the message has null or another invalid value in their place, which is a loss unless an earlier
+                message lacked the quantity, too. An absent key is a loss only after ``REGULAR_MESSAGES``.
         """
-        if binding.quantity == "temperature":
-            self._store_probes(binding, payload, cell, now_s)
-        elif binding.quantity != "cells":
-            self._values[binding.quantity] = _TimestampedValue(
-                read_value(payload, binding.location, binding.path), now_s
-            )
-            if binding.quantity in REQUIRED_QUANTITIES:
-                self._unused_arrival_s.setdefault(binding.quantity, now_s)
-        elif cell is None:
-            self._cells |= {
-                number: _TimestampedValue(v, now_s)
-                for number, v in read_cells(payload, binding.location, binding.path).items()
-            }
-        elif 1 <= cell <= MAX_CELL_NUMBER:
-            self._cells[cell] = _TimestampedValue(read_value(payload, binding.location, binding.path), now_s)
-
-    def _store_probes(self, binding: _TopicBinding, payload: bytes, probe: int | None, now_s: float) -> None:
-        """Store the temperatures of a payload, as ``_store_value``. A location without ``{probe}`` has one probe."""
-        if probe is None and CELL_PLACEHOLDER.search(binding.path):
-            readings_c = read_cells(payload, binding.location, binding.path)
-        else:
-            readings_c = {1 if probe is None else probe: read_value(payload, binding.location, binding.path)}
-        self._probes |= {
-            (binding.location_index, number): _TimestampedValue(reading_c, now_s)
-            for number, reading_c in readings_c.items()
-            if 1 <= number <= MAX_PROBE_NUMBER
-        }
-
-    def _remove(self, binding: _TopicBinding, cell: int | None) -> None:
-        """Remove the stored value of a quantity.
-
-        For ``cells`` and ``temperature``, remove the value of the cell or probe number ``cell``. Without a number, remove the
-        values of all cells, or of all probes of the topic.
-        """
-        quantity = binding.quantity
-        for index, number in self._probes:
-            if quantity == "temperature" and index == binding.location_index and cell in (None, number):
-                self._probes[index, number] = _TimestampedValue(math.nan, -math.inf)
-        self._values.pop(quantity, None)
-        self._unused_arrival_s.pop(quantity, None)
-        if quantity == "cells":
-            removed = tuple(self._cells) if cell is None else (cell,)
-            for each in removed:
-                self._cells.pop(each, None)
+        is_loss = is_null and location not in self._irregular
+        for key in keys:
+            stored = self._values.get(key)
+            if stored and location[0] not in REQUIRED_QUANTITIES:
+                is_regular = is_loss or stored.messages >= REGULAR_MESSAGES
+                limit_s = stored.arrival_s + (self._settings.absent_s if is_regular else math.inf)
+                self._values[key] = stored._replace(expiry_s=min(stored.expiry_s, limit_s), messages=0)
+        self._irregular.add(location)
 
     def _update_conflict(self, binding: _TopicBinding, now_s: float) -> bool:
         """Add the latest value of a topic to its conflict detector. Return True if two publishers write to the topic."""
         key = binding.quantity, binding.topic
         detector = self._detectors.get(key)
-        if detector is None or not detector.add(self._values[binding.quantity].value, now_s):
+        if detector is None or not detector.add(self._values[binding.quantity, 0, 1].value, now_s):
             self._conflicts.pop(key, None)
             return False
         self._conflicts[key] = f"{binding.topic}: {binding.quantity} {detector.text}"
@@ -252,30 +267,47 @@ class SampleAssembler:
     def _count_stale(self, name: str) -> None:
         """Count a sample that lacks voltage or current."""
         self._counters["stale"] += 1
-        if name in self._values:
+        if (name, 0, 1) in self._values:
             topics = ", ".join(self._find_topics(name))
-            self._faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.stale_s:g} s")
+            self.faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.stale_s:g} s")
 
-    def _value(self, name: str, now_s: float, max_age_s: float) -> float | None:
-        """Return a value unless it is older than ``max_age_s``."""
-        stored = self._values.get(name)
-        return stored.value if stored and now_s - stored.arrival_s <= max_age_s else None
+    def _value(self, name: str, now_s: float) -> float | None:
+        """Return a value unless it is too old."""
+        stored = self._values.get((name, 0, 1))
+        return stored.value if stored and now_s <= stored.expiry_s else None
 
     def _cells_v(self, now_s: float) -> list[float]:
         """Return the voltages from cell 1 to the last cell with a recent value [V]; NaN for a cell without one."""
-        max_age_s = self._settings.slow_max_age_s
-        fresh = {cell: stored.value for cell, stored in self._cells.items() if now_s - stored.arrival_s <= max_age_s}
-        return [fresh.get(cell, math.nan) for cell in range(1, max(fresh, default=0) + 1)]
+        cells = {key[2]: each for key, each in self._values.items() if key[0] == "cells" and now_s <= each.expiry_s}
+        return [cells[number].value if number in cells else math.nan for number in range(1, max(cells, default=0) + 1)]
 
     def _probes_c(self, now_s: float) -> list[float]:
         """Return the recent temperatures of all probes in the order of the locations [C]; NaN for a probe without one."""
-        max_age_s = self._settings.slow_max_age_s
-        counts = dict(sorted(self._probes))  # highest number of a probe by index of the location
-        slots = [self._probes.get((index, i + 1)) for index, count in counts.items() for i in range(count)]
-        return [slot.value if slot and now_s - slot.arrival_s <= max_age_s else math.nan for slot in slots]
+        probes = sorted(key for key in self._values if key[0] == "temperature")
+        counts = {index: number for _, index, number in probes}  # highest number of a probe by index of the location
+        keys = [("temperature", index, i + 1) for index, count in counts.items() for i in range(count)]
+        slots = [self._values.get(key) for key in keys]
+        return [slot.value if slot and now_s <= slot.expiry_s else math.nan for slot in slots]
 
     def _find_topics(self, *quantities: str) -> list[str]:
         return [binding.topic for binding in self._bindings if binding.quantity in quantities]
+
+
+def _read(binding: _TopicBinding, payload: bytes, number: int | None) -> Mapping[int, float]:
+    """Return the values of a payload by number of the cell or probe; 1 for a quantity with a single value.
+
+    Args:
+        binding: Quantity and its location.
+        payload: Received payload.
+        number: Number of the cell or probe in the topic; None without one.
+
+    Raises:
+        InvalidValueError: The payload has no valid value.
+    """
+    has_numbers = binding.quantity == "cells" or CELL_PLACEHOLDER.search(binding.path)
+    if number is None and has_numbers:
+        return read_cells(payload, binding.location, binding.path)
+    return {1 if number is None else number: read_value(payload, binding.location, binding.path)}
 
 
 def _topic_filter(topic: str) -> str:

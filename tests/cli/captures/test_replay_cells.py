@@ -72,6 +72,17 @@ def test_the_terminal_shows_the_cells_with_the_weakest_first(
     assert next(line.split()[0] for line in lines if "mA" in line) == "2"
 
 
+@pytest.mark.parametrize("command", ["replay", "alarms"])
+def test_a_wrong_number_of_cells_is_named_as_the_reason_for_no_values_of_cells(
+    pack: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    pack.write_text(pack.read_text().replace("series = 3", "series = 5"))
+    code, text, err = run(capsys, command, recorded(tmp_path, with_cells=True), "--pack", pack, "--json")
+    assert code == 0
+    assert "no estimates of single cells: 3 cells are measured, but the pack has 5 in series" in err
+    assert not json.loads(text).get("cells")
+
+
 def test_a_capture_without_cell_voltages_has_no_values_of_cells(
     pack: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,6 +5,7 @@ The payloads have the formats of the projects in ``settings/sources/mqtt_profile
 
 import json
 import random
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -295,7 +296,7 @@ def test_the_values_of_a_publisher_that_sends_only_changes_hold_for_its_longest_
     [
         pytest.param({"topic": "t/{probe}"}, [("t/2", "22"), ("t/1", "21")], [21.0, 22.0], id="topics"),
         pytest.param({"topic": "t/{probe}"}, [("t/3", "23"), ("t/1", "21")], [21.0, None, 23.0], id="missing"),
-        pytest.param({"topic": "t/{probe}"}, [("t/2", "22"), ("t/2", "null"), ("t/1", "21")], [21.0, None], id="null"),
+        pytest.param({"topic": "t/{probe}"}, [("t/2", "22"), ("t/2", "null"), ("t/1", "21")], [21.0, 22.0], id="null"),
         pytest.param({"topic": "t/{probe}"}, [("t/0", "1"), ("t/33", "1"), ("t/x", "1")], None, id="no probes"),
         pytest.param(
             {"topic": "t", "path": "T{probe}"}, [("t", '{"T1":21,"T2":22,"TMOS":70}')], [21.0, 22.0], id="keys"
@@ -337,9 +338,9 @@ def test_retained_values_are_ignored_but_a_retained_availability_is_reported() -
     ("payload", "counter", "reason"),
     [
         ('{"i": 1}', "missing", "voltage: home/pack: u: not in {'i': 1}"),
-        ('{"u": "unavailable", "i": 1}', "no_number", "no number: 'unavailable'"),
-        ('{"u": null, "i": 1}', "no_number", "no number: None"),
-        ('{"u": NaN, "i": 1}', "no_number", "no number: 'NaN'"),
+        ('{"u": "unavailable", "i": 1}', "missing", "no number: 'unavailable'"),
+        ('{"u": null, "i": 1}', "missing", "no number: None"),
+        ('{"u": NaN, "i": 1}', "missing", "no number: 'NaN'"),
         ('{"u": true, "i": 1}', "no_number", "no number: True"),
         ('{"u": [], "i": 1}', "no_number", "no number: []"),
         ('{"u": 1e999, "i": 1}', "no_number", "no number: inf"),
@@ -523,17 +524,63 @@ def test_second_publisher_at_random_times_is_detected() -> None:
     assert 100.0 < times_s[0] < 115.0
 
 
-def test_cell_voltages_that_become_null_or_unavailable_are_removed_from_the_sample() -> None:
-    one_topic = SampleAssembler(json_source(cells="cells"))
-    payloads = ('{"u": 52.0, "i": 1.0, "cells": [3.3, 3.4]}', '{"u": 52.0, "i": 1.0, "cells": null}')
-    first, lost = feed(one_topic, [("home/pack", payload) for payload in payloads])
-    assert (first["cells_v"], "cells_v" in lost) == ([3.3, 3.4], False)
-    topic_per_cell = SampleAssembler(json_source(cells={"topic": "home/cell/{cell}"}))
-    pack = ("home/pack", '{"u": 52.0, "i": 1.0}')
-    before, after = feed(
-        topic_per_cell, [("home/cell/1", "3.3"), ("home/cell/2", "3.4"), pack, ("home/cell/1", "unavailable"), pack]
-    )
-    assert (before["cells_v"], after["cells_v"]) == ([3.3, 3.4], [None, 3.4])
+def feed_each_second(assembler: SampleAssembler, messages: Iterable[Messages], begin_s: float = 0.0) -> list[Any]:
+    """Feed messages, one list each second. Return the last sample of each second, or None."""
+    seconds = [feed(assembler, each, begin_s + second) for second, each in enumerate(messages)]
+    return [samples[-1] if samples else None for samples in seconds]
+
+
+@pytest.mark.parametrize("absent", ["", ', "t": null, "u": null', ', "t": "unavailable", "u": NaN'])
+def test_values_of_a_publisher_that_sends_a_part_of_them_in_each_message_hold(absent: str) -> None:
+    """The payloads have a part of the values, and the others are absent or null."""
+    assembler = SampleAssembler(json_source(temperature="t", interval_s=1.0))
+    payloads = ['{"u": 52.0, "i": null}', '{"t": 21.5, "u": null}', *[f'{{"i": 1.0{absent}}}'] * 20]
+    samples = feed_each_second(assembler, [[("home/pack", payload)] for payload in payloads])
+    held = {"voltage_v": 52.0, "current_a": 1.0, "temperature_c": 21.5, "voltage_held": 1}
+    assert samples == [None, None, *[held] * 20]
+    assert assembler.line(60.0) == b""
+    (after,) = feed(assembler, [("home/pack", '{"u": 52.0}'), ("home/pack", '{"i": 1.0}')], 299.0)
+    assert after == {"voltage_v": 52.0, "current_a": 1.0, "temperature_c": 21.5}
+    (late,) = feed(assembler, [("home/pack", '{"u": 52.0}'), ("home/pack", '{"i": 1.0}')], 302.0)
+    assert "temperature_c" not in late
+
+
+REGULAR_PAYLOAD: dict[str, object] = {"u": 52.0, "i": 1.0, "t": 21.5, "c": [3.3, 3.4]}
+
+
+@pytest.mark.parametrize("messages", [1, 10])
+@pytest.mark.parametrize(
+    ("absent", "max_age_s", "held_s"),
+    [({"t": None}, None, 2), ({"c": None}, None, 2), ({"t": "nan", "c": [None, None]}, None, 2), ({"t": None}, 20, 20)],
+)
+def test_a_value_of_each_message_is_removed_when_it_stays_null(
+    absent: dict[str, object], max_age_s: float | None, held_s: int, messages: int
+) -> None:
+    assembler = SampleAssembler(json_source(temperature="t", cells="c", interval_s=1.0, max_age_s=max_age_s))
+    regular = [[("home/pack", json.dumps(REGULAR_PAYLOAD))]] * messages
+    without = [[("home/pack", json.dumps(REGULAR_PAYLOAD | absent))]] * (held_s + 10)
+    whole = feed_each_second(assembler, regular)[-1]
+    samples = feed_each_second(assembler, without, float(messages))
+    removed = {"temperature_c"} if "t" in absent else set()
+    removed |= {"cells_v"} if "c" in absent else set()
+    assert samples[:held_s] == [whole] * held_s
+    assert samples[held_s:] == [{name: whole[name] for name in whole if name not in removed}] * 10
+    assert feed_each_second(assembler, regular, 100.0)[0] == whole
+
+
+def test_a_key_that_disappears_from_the_messages_counts_as_null() -> None:
+    assembler = SampleAssembler(json_source(temperature="t", interval_s=1.0))
+    feed_each_second(assembler, [[("home/pack", '{"u": 52.0, "i": 1.0, "t": 21.5}')]] * 10)
+    samples = feed_each_second(assembler, [[("home/pack", '{"u": 52.0, "i": 1.0}')]] * 3, 10.0)
+    assert ["temperature_c" in sample for sample in samples] == [True, True, False]
+
+
+def test_one_cell_voltage_that_stays_null_is_removed_from_the_sample() -> None:
+    assembler = SampleAssembler(json_source(cells={"topic": "home/cell/{cell}"}, interval_s=1.0))
+    pack, second = ("home/pack", '{"u": 52.0, "i": 1.0}'), ("home/cell/2", "3.4")
+    feed_each_second(assembler, [[("home/cell/1", "3.3"), second, pack]] * 10)
+    samples = feed_each_second(assembler, [[("home/cell/1", "unavailable"), second, pack]] * 3, 10.0)
+    assert [sample["cells_v"] for sample in samples] == [[3.3, 3.4], [3.3, 3.4], [None, 3.4]]
 
 
 def test_cell_slots_of_an_esphome_node_without_a_cell_are_no_cells() -> None:
