@@ -36,6 +36,27 @@ def test_absurd_currents_leave_the_estimate_of_a_run_without_their_samples(glitc
     assert estimator.record["checks"]["suspects"][0] & InputFault.OUTLIERS
 
 
+def test_doubtful_samples_leave_the_same_state_however_the_samples_are_divided() -> None:
+    block, _ = pulses(0.9, hours=0.5)
+    rng = np.random.default_rng(1)
+    doubtful = rng.random(block.size) < 0.3
+    block["current_a"][doubtful] = rng.choice([12.0, -12.0, 6.0, 65.53], int(doubtful.sum()))
+    in_one_block, stepped, in_blocks = (Estimator(TRUTH) for _ in range(3))
+    in_one_block.run(block)
+    for x in block:
+        stepped.step(*(float(x[name]) for name in ("time_s", "current_a", "voltage_v")), 0, float(x["temperature_c"]))
+    for part in np.array_split(block, 37):
+        in_blocks.run(part)
+    assert in_one_block.record.tobytes() == stepped.record.tobytes() == in_blocks.record.tobytes()
+    state = in_one_block.state[0]
+    assert state["dropped_contradicted"] > 0
+    waiting = in_one_block.record[0]["current_check"]["waiting"]
+    assert (
+        sum(state[name] for name in state.dtype.names if name.startswith("dropped_")) + state["samples"] + waiting
+        == block.size
+    )
+
+
 @pytest.mark.parametrize("offset_a", WRAPPED_A.values(), ids=WRAPPED_A)
 @pytest.mark.parametrize("capacity_ah", [100.0, 280.0])
 def test_a_small_charge_that_wraps_around_is_not_integrated(offset_a: float, capacity_ah: float) -> None:
@@ -47,6 +68,28 @@ def test_a_small_charge_that_wraps_around_is_not_integrated(offset_a: float, cap
     estimator.run(block)
     counted = 0.5 + 3.0 * 599.0 / (3600.0 * capacity_ah)
     assert estimator.state["soc_coulomb"][0] == pytest.approx(counted, abs=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_a_current_around_zero_that_often_wraps_around_is_not_integrated(share: float) -> None:
+    block = np.zeros(3600, SAMPLE)
+    block["time_s"], block["temperature_c"], block["voltage_v"] = np.arange(3600.0), 25.0, 53.0
+    wraps = np.random.default_rng(1).random(block.size) < share
+    wraps[0] = False
+    block["current_a"] = np.where(wraps, 655.35, 0.0)
+    estimator = Estimator(load_cell("lfp", 100.0).pack(16, 1), initial_soc=0.5)
+    estimator.run(block)
+    assert estimator.state["soc_coulomb"][0] == 0.5
+    assert estimator.state["dropped_contradicted"][0] == wraps.sum()
+    assert estimator.record["checks"]["suspects"][0] & InputFault.OUTLIERS
+
+
+def test_a_load_near_the_end_of_the_range_counts_once_the_voltage_follows() -> None:
+    estimator = Estimator(load_cell("lfp", 100.0).pack(16, 1), initial_soc=0.5)
+    estimator.step(0.0, 0.0, 53.0)
+    assert estimator.step(1.0, 650.0, 53.0) is SampleOutcome.CONTRADICTED
+    assert estimator.step(2.0, 650.0, 50.0) is SampleOutcome.ACCEPTED
+    assert estimator.state["soc_coulomb"][0] == pytest.approx(0.5 - 650.0 / (3600.0 * 100.0))
 
 
 @pytest.mark.parametrize("length", [1, 2, 60])
