@@ -4,7 +4,7 @@ The console prints text: ``pwr`` a table of all batteries in parallel, ``bat N``
 prompt follows each table. Voltages in mV, currents in mA and positive on charge, temperatures in thousandths of a degree
 Celsius.
 There is no checksum, and a reading is a sum over batteries. A table is therefore accepted only if it ends with the success
-message, its rows are numbered without a gap, each row has all columns of the header, and no battery is missing that was
+message, its rows are numbered without a gap, no row has more columns than the header, and no battery is missing that was
 present before.
 """
 
@@ -33,6 +33,8 @@ ECHO = re.compile(r"\bbat\s+([0-9]{1,2})\b")
 """Echo of a query of cells, with the number of the battery."""
 MAX_SHOWN_BYTES = 60
 """Maximum number of characters of an unexpected text that are shown."""
+STACK, CELLS = "Power", ("Battery", "Bat")
+"""First column of the table of ``pwr``, and of those of ``bat`` by older and newer firmware."""
 SUCCESS = "Command completed"
 """Beginning of the success message."""
 MAX_BATTERIES = 16
@@ -134,8 +136,7 @@ class PylontechProtocol(ReadingProtocol):
     def _parse(self, arrival_s: float, answer: str) -> Reading | None:
         """Parse a response: return the reading of ``pwr``; store the cells of ``bat`` and return None."""
         lines = [line.split() for line in re.split(r"[\r\n]+", answer) if line.strip()]
-        # the table of ``pwr`` begins with Power, that of ``bat`` with Battery
-        header = next((n for n, line in enumerate(lines) if line[:2] in (["Power", "Volt"], ["Battery", "Volt"])), None)
+        header = next((n for n, line in enumerate(lines) if line[0] in (STACK, *CELLS) and line[1:2] == ["Volt"]), None)
         if header is None:
             if "Unknown command" in answer or "Invalid" in answer:
                 self._count_fault(
@@ -154,12 +155,12 @@ class PylontechProtocol(ReadingProtocol):
             self._count_fault("length_errors", "a table is cut off")
             return None
         # batteries are numbered from 1, cells from 0 or 1
-        first = 0 if lines[header][0] == "Battery" and rows[0][0] == "0" else 1
+        first = 0 if lines[header][0] in CELLS and rows[0][0] == "0" else 1
         if (lost := next((n for n, row in enumerate(rows, first) if row[0] != str(n)), None)) is not None:
             self._count_fault("length_errors", f"row {lost} of a table is missing")
             return None
         try:
-            if lines[header][0] == "Battery":
+            if lines[header][0] in CELLS:
                 self._store_cells(arrival_s, answer, rows)
                 return None
             return self._stack_reading(arrival_s, lines[header], rows)
@@ -180,7 +181,7 @@ class PylontechProtocol(ReadingProtocol):
         """Return the reading of all batteries in parallel; None if none is present, or if one is missing.
 
         Raises:
-            ValueError, LookupError: A row cannot be parsed, or has other columns than the header or another row.
+            ValueError, LookupError: A row cannot be parsed, or has more columns than the header.
         """
         columns = (names.index(name) for name in ("Volt", "Curr", "Tempr", "Tlow", "Thigh"))
         voltage, current, temperature, lowest_temperature, highest_temperature = columns
@@ -188,7 +189,7 @@ class PylontechProtocol(ReadingProtocol):
         if not present:
             self._count_fault("text_errors", "the console reports no present battery")
             return None
-        if len({len(row) for row in present}) > 1 or len(present[0]) > len(names) + names.count(TIME):
+        if max(map(len, present)) > len(names) + names.count(TIME):  # a master may leave the SOC of other batteries out
             raise ValueError(names)
         batteries = tuple(int(row[0]) for row in present)
         if (missing := set(self._batteries) - set(batteries)) and arrival_s - self._table_s < MAX_MISSING_S:

@@ -259,14 +259,7 @@ INCOMPLETE = {
         [STACK[0], STACK[1][:70] + STACK[2][20:], *STACK[3:]],
         "row 3 of a table is missing",
     ),
-    "last battery merged with an absent one": (
-        [
-            *STACK[:3],
-            STACK[3][:70] + STACK[4][20:],
-            *(f"{n}{row[1:]}" for n, row in zip("567", STACK[5:], strict=True)),
-        ],
-        "cannot be parsed",
-    ),
+    "last rows merged by an overflow": ([*STACK[:2], STACK[2][:70] + STACK[3][20:]], "cannot be parsed"),
     "battery absent": ([*STACK[:3], absent_row(4), *STACK[4:]], "no values of battery 4"),
     "batteries absent": ([*STACK[:2], absent_row(3), absent_row(4), *STACK[4:]], "no values of battery 3 and 4"),
 }
@@ -294,6 +287,25 @@ def test_a_battery_that_is_absent_for_an_hour_counts_as_removed_and_a_new_one_co
     assert decoder.feed(3602.0, stack_response(STACK))["current_a"].tolist() == [STACK_CURRENT_A]
 
 
+def test_a_stack_whose_master_leaves_out_the_soc_of_the_others_is_read() -> None:
+    decoder = PylontechProtocol()
+    without_soc = [STACK[0], *(row.replace("81%", "   ") for row in STACK[1:])]
+    assert decoder.feed(1.0, stack_response(without_soc))["current_a"].tolist() == [STACK_CURRENT_A]
+    assert decoder.last_reading is not None
+    assert math.isnan(decoder.last_reading.soc)
+
+
+def test_cells_of_newer_firmware_are_read() -> None:
+    head = b"bat 1\n\r@\r\r\nBat  Volt Curr    Tempr   V.State T.State AH(mAH)             Bal\r\r\n"
+    rows = [
+        b"%-4d %d -144    18800   Normal  Normal   68%%      33819 mAH   N" % row for row in enumerate(US2000_CELLS_MV)
+    ]
+    decoder = PylontechProtocol()
+    decoder.feed(1.0, head + b"\r\r\n".join(rows) + US2000_END + US5000_PWR)
+    assert decoder.cells.tolist() == [pytest.approx([mv / 1000 for mv in US2000_CELLS_MV])]
+    assert decoder.fault is None
+
+
 def test_cells_of_a_table_with_a_lost_row_are_not_used() -> None:
     decoder = PylontechProtocol()
     complete = bat_response(1, US2000_CELLS_MV)
@@ -317,11 +329,14 @@ def test_own_requests_that_the_adapter_of_a_junctek_returns_are_named() -> None:
 
 
 RS485_FRAME = b"~20024642E00202FD33\r"
-BAT_TABLE = b"Bat      Volt     Curr     Tempr\r\n1        49874    -642     19100\r\n"
+UNIT_TABLE = b"Unit     Volt     Curr     Tempr\r\n1        49874    -642     19100\r\n"
 UNEXPECTED = {
     "frames of the RS-485 port": (RS485_FRAME, "connect to the console port"),
-    "table of another command": (b"@\r\n" + BAT_TABLE + US2000_END, "Power, Volt of a master's console: Bat Volt Curr"),
-    "table without a prompt": (BAT_TABLE, "another device or port? It begins: Bat Volt Curr Tempr"),
+    "table of another command": (
+        b"@\r\n" + UNIT_TABLE + US2000_END,
+        "Power, Volt of a master's console: Unit Volt Curr",
+    ),
+    "table without a prompt": (UNIT_TABLE, "another device or port? It begins: Unit Volt Curr Tempr"),
     "wrong baud rate": (bytes(range(128, 256)), "baud rate is 115200"),
 }
 """Bytes that are no response of a Pylontech console, and part of the reported fault."""
