@@ -10,7 +10,7 @@ from bms_estimator.estimator.anchor_settings import anchor_settings
 from bms_estimator.estimator.filter_settings import filter_settings, max_ohm, unmeasured_s
 from bms_estimator.estimator.fuel_cell_settings import fuel_cell_settings
 from bms_estimator.estimator.learning_settings import learning_settings
-from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, PARAMETERS, emf
+from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, PARAMETERS, emf, r_s, r_tl, r_ts
 from bms_estimator.kernels.cell_model.current_interpolation import PERIODS
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, series_coefficients
 from bms_estimator.kernels.observer.nussbaum import Nussbaum
@@ -34,6 +34,12 @@ CONVERGED_ERROR = 2.0
 """Default error below which the observer counts as converged, in multiples of the larger of dead zone and converter step."""
 GAP_S = 5.0
 """Duration of a step above which it counts as a gap [s]; for a slow source, ``PERIODS`` of its periods."""
+CHECKED_C = 0.5
+"""Change of the current up to which the voltage need not follow, as a C-rate. The charge of a wrong sample is small."""
+VISIBLE_DROP_V = 0.01
+"""Ohmic drop of one cell up to which the voltage need not follow [V]."""
+VISIBLE_STEPS = 3.0
+"""Ohmic drop up to which the voltage need not follow, in steps of the voltage converter."""
 IMPROVED_INDICES = range(1, 13)
 """Indices of the a_i that the improved method adapts (Algorithm 1 of the thesis). a13..a15 follow from (4.2)."""
 
@@ -118,6 +124,13 @@ def observer_settings(
     gain_and_limits(p, cell.cell, observer, voltage_resolution_v)
     p["capacity_as"] = cell.cell.capacity_ah * 3600.0
     p["ocv_v"], p["ocv_slope_v"] = ocv_grid(cell)
+    p["check_ohm"] = r_s(0.5, cell.a)
+    p["check_slow_ohm"] = r_ts(0.5, cell.a) + r_tl(0.5, cell.a)
+    p["check_v"] = max(
+        p["check_ohm"] * CHECKED_C * cell.cell.capacity_ah,
+        VISIBLE_DROP_V * cell.cell.series_count,
+        VISIBLE_STEPS * voltage_resolution_v,
+    )
     _adaptation(p, cell, observer)
     # the improved method has the output (4.1), which does not contain R_s
     p["output_r_s"] = 0.0 if observer.law == "improved" else 1.0

@@ -7,6 +7,7 @@ import numpy as np
 
 from bms_estimator.kernels.accumulators.history import HISTORY
 from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS
+from bms_estimator.kernels.current_check import CURRENT_CHECK
 from bms_estimator.kernels.kalman_filter.anchors import ANCHOR_SETTINGS, ANCHORS
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_FIT, ELEMENT_MAP, ELEMENTS
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import EQUIVALENT
@@ -46,6 +47,7 @@ ESTIMATOR_STATE = np.dtype(
     [
         ("observer", OBSERVER_STATE),
         ("pending", PENDING_VOLTAGE),
+        ("current_check", CURRENT_CHECK),
         ("learning", LEARNING_STATE),
         ("series_resistance", SERIES_RESISTANCE),
         ("filter", EKF_STATE),

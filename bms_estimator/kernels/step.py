@@ -8,7 +8,7 @@ from enum import IntEnum
 
 from bms_estimator.kernels.accumulators.history import needs_caller
 from bms_estimator.kernels.cell_model.chen_mora import soc_from_ocv
-from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
+from bms_estimator.kernels.current_check import accept_waiting, is_doubtful, max_step, set_reference
 from bms_estimator.kernels.identifier import identifier_step
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
 from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
@@ -34,6 +34,7 @@ class SampleOutcome(IntEnum):
     OUT_OF_RANGE = 2
     REPEATED = 3
     SATURATED = 4
+    CONTRADICTED = 5
 
 
 # constants of the compiled functions, plain integers
@@ -42,6 +43,7 @@ _NOT_FINITE = int(SampleOutcome.NOT_FINITE)
 _OUT_OF_RANGE = int(SampleOutcome.OUT_OF_RANGE)
 _REPEATED = int(SampleOutcome.REPEATED)
 _SATURATED = int(SampleOutcome.SATURATED)
+_CONTRADICTED = int(SampleOutcome.CONTRADICTED)
 _SATURATED_BITS = int(SampleStatus.VOLTAGE_SATURATED | SampleStatus.CURRENT_SATURATED)
 MAX_TIME_S = 1e30
 """Maximum magnitude of a time stamp [s]. The squares of longer gaps could overflow."""
@@ -87,6 +89,9 @@ def step(
     sample initializes the estimator with its voltage in any case. The observer of the thesis has the voltage as its only
     input, which it holds between measurements.
 
+    A sample with a current that the voltage does not follow waits for the next ones (``current_check``). If they confirm it,
+    it is used without its voltage.
+
     A sample with a held current is stored until the next measured current, because the current at its time is then
     interpolated. Until then only the last of several such voltages is stored.
 
@@ -106,8 +111,11 @@ def step(
     outcome = validate_sample(s, p, time_s, current_a, voltage_v, status)
     if outcome != _ACCEPTED:
         return outcome
+    if is_doubtful(state[0], p, time_s - s.time_s, current_a, voltage_v, status):
+        return _CONTRADICTED
     s.samples += 1
     if not s.started:
+        set_reference(state[0].current_check, current_a, voltage_v, 0)
         initialize(s, p, time_s, current_a, voltage_v)
         initialize_state(state[0], settings[0], current_a, voltage_v, temperature_c)
         return outcome
@@ -118,6 +126,8 @@ def step(
         if not status & _VOLTAGE_HELD:
             pending.age_s, pending.voltage_v = dt_s, voltage_v
         return outcome
+    dt_s -= advance_to_waiting(state, settings, dt_s, current_a, voltage_v, temperature_c)
+    set_reference(state[0].current_check, current_a, voltage_v, status)
     pending_s, pending.age_s = pending.age_s, 0.0
     s.time_s = time_s
     new_clock = dt_s == -math.inf  # ``Estimator.resume`` has set the time of the last sample to infinity
@@ -187,12 +197,28 @@ def advance(
 
 
 @njit(cache=True)
+def advance_to_waiting(
+    state: Records, settings: Records, dt_s: float, current_a: float, voltage_v: float, temperature_c: float
+) -> float:
+    """Advance to the samples that waited, if this sample confirms them. Return the time step to them [s]; 0 without any.
+
+    Their voltages are not used, because they did not belong to their currents. Parameters are those of ``advance``.
+    """
+    if not accept_waiting(state[0], settings[0].observer, dt_s, current_a, voltage_v):
+        return 0.0
+    d = state[0].current_check
+    state[0].pending.age_s = 0.0
+    advance(state, settings, d.age_s, False, d.current_a, math.nan, d.voltage_v, temperature_c)
+    return float(d.age_s)
+
+
+@njit(cache=True)
 def is_gap(s: Record, p: Record, dt_s: float) -> bool:
     """Return True if samples are missing in a step of ``dt_s``, and count the gap.
 
     ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
     """
-    gap = dt_s > max(p.gap_s, GAP_RATIO * s.step_s)
+    gap = dt_s > max_step(s, p)
     s.step_s = dt_s
     if gap:
         s.gaps += 1

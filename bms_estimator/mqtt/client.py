@@ -79,14 +79,20 @@ class Client(aiomqtt.Client):
         protocol: MQTT version.
         options: Connect options.
         timeouts: Timeouts after which the connection counts as lost.
+        section: Settings section of the broker, for errors.
     """
 
     def __init__(
-        self, arguments: dict[str, Any], protocol: ProtocolVersion, options: ConnectOptions, timeouts: Timeouts
+        self,
+        arguments: dict[str, Any],
+        protocol: ProtocolVersion,
+        options: ConnectOptions,
+        timeouts: Timeouts,
+        section: str,
     ) -> None:
         limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
         limit.MaximumPacketSize = options.max_bytes
-        self._is_5 = protocol is ProtocolVersion.V5
+        self._section, self._is_5 = section, protocol is ProtocolVersion.V5
         super().__init__(
             **arguments,
             protocol=protocol,
@@ -148,7 +154,7 @@ class Client(aiomqtt.Client):
         except aiomqtt.MqttError as error:
             raise BrokerConnectionError(f"no subscription: {error}") from None
         return {
-            topic: describe_reason(answer)
+            topic: describe_reason(answer, self._section)
             for topic, answer in zip(topics, answers, strict=False)
             if isinstance(answer, ReasonCode) and answer.is_failure
         }
@@ -202,7 +208,7 @@ class Client(aiomqtt.Client):
         properties: Properties | None = None,
     ) -> None:
         if flags.is_disconnect_packet_from_server:
-            self._why = describe_reason(reason_code)
+            self._why = describe_reason(reason_code, self._section)
         elif reason_code == "Keep alive timeout":
             self._why = "the broker did not answer a ping"
         if self._abandoned:
@@ -241,7 +247,7 @@ class Client(aiomqtt.Client):
         answer = self._answers.get(mid)
         if answer is not None and not answer.done():
             answer.set_result(
-                PublishRejection(describe_reason(reason_code), not is_final(reason_code))
+                PublishRejection(describe_reason(reason_code, self._section), not is_final(reason_code))
                 if reason_code.is_failure
                 else None
             )
@@ -249,14 +255,16 @@ class Client(aiomqtt.Client):
 
 @contextlib.asynccontextmanager
 async def open_client(
-    arguments: dict[str, Any], protocol: ProtocolVersion, options: ConnectOptions, timeouts: Timeouts
+    arguments: dict[str, Any], protocol: ProtocolVersion, options: ConnectOptions, timeouts: Timeouts, section: str
 ) -> AsyncIterator[Client]:
     """Connect for the duration of the context. Leaving it by an exception makes the broker publish the will.
+
+    The parameters are those of ``Client``.
 
     Raises:
         aiomqtt.MqttError: The broker cannot be reached, or refuses.
     """
-    client = Client(arguments, protocol, options, timeouts)
+    client = Client(arguments, protocol, options, timeouts, section)
     try:
         await client.__aenter__()
     except BaseException:
@@ -271,10 +279,10 @@ async def open_client(
         await client.end_session()
 
 
-def failure_reason(error: aiomqtt.MqttError) -> str:
-    """Return the reason for which a connection failed."""
+def failure_reason(error: aiomqtt.MqttError, section: str) -> str:
+    """Return the reason for which a connection to the broker of a settings section failed."""
     if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
-        return describe_reason(error.rc)
+        return describe_reason(error.rc, section)
     return str(error)
 
 

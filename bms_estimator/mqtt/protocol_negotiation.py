@@ -51,7 +51,7 @@ class BrokerConnector:
             except UserError as error:
                 raise BrokerConnectionError(str(error)) from None
             except aiomqtt.MqttError as error:
-                raise BrokerConnectionError(failure_reason(error)) from None
+                raise BrokerConnectionError(failure_reason(error, self._settings.section)) from None
             yield client
 
     async def _connect(
@@ -61,12 +61,14 @@ class BrokerConnector:
         try:
             async with asyncio.timeout(self._timeouts.connect_s):
                 try:
-                    return await stack.enter_async_context(open_client(arguments, protocol, options, self._timeouts))
+                    return await stack.enter_async_context(
+                        open_client(arguments, protocol, options, self._timeouts, self._settings.section)
+                    )
                 except aiomqtt.MqttError as error:
                     if protocol is ProtocolVersion.V311 or not should_retry_with_v311(error):
                         raise
                 client = await stack.enter_async_context(
-                    open_client(arguments, ProtocolVersion.V311, options, self._timeouts)
+                    open_client(arguments, ProtocolVersion.V311, options, self._timeouts, self._settings.section)
                 )
                 self._v311_urls.add(url)  # a rejected attempt costs the broker a second TLS handshake
                 return client

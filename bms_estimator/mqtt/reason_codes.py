@@ -6,7 +6,8 @@ UNSUPPORTED_VERSION = 132
 """CONNACK code of a broker without MQTT 5."""
 
 _NOT_ALLOWED = (
-    "name or password wrong, or not allowed; see mqtt.username, mqtt.password_file and the broker's access list"
+    "name or password wrong, or not allowed; "
+    "see {section}.username, {section}.password_file and the broker's access list"
 )
 HINTS = {
     133: "another mqtt.base_topic or pack.name may help",  # client identifier not valid
@@ -20,7 +21,7 @@ HINTS = {
     151: "the broker allows no more",  # quota exceeded
     159: "too many connections in a short time",  # connection rate exceeded
 }
-"""Causes and remedies by reason code."""
+"""Causes and remedies by reason code. ``section`` is the settings section of the broker."""
 
 FINAL = {
     135,  # not authorized
@@ -36,7 +37,12 @@ def is_final(reason: ReasonCode) -> bool:
     return reason.value in FINAL
 
 
-def describe_reason(reason: ReasonCode) -> str:
-    """Return a reason code as text: name, number, hint."""
-    hint = HINTS.get(reason.value)
+def describe_reason(reason: ReasonCode, section: str) -> str:
+    """Return a reason code as text: name, number, hint.
+
+    Args:
+        reason: Reason code.
+        section: Settings section of the broker.
+    """
+    hint = HINTS.get(reason.value, "").format(section=section)
     return f"{reason.getName()} ({reason.value})" + (f": {hint}" if hint else "")

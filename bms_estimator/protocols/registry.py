@@ -36,6 +36,11 @@ PROTOCOLS = (BOARD, *DEVICES)
 """Values of ``sensor.protocol``."""
 
 
+def valid_addresses(protocol: str) -> range:
+    """Return the valid values of ``sensor.address``; empty for a protocol without addresses."""
+    return DEVICES[protocol].addresses if protocol in DEVICES else range(0)
+
+
 class Sensor(Protocol):
     """Part of ``[sensor]`` that a protocol depends on."""
 

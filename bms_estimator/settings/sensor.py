@@ -7,7 +7,7 @@ from pydantic import Field, ModelWrapValidatorHandler, model_validator
 from bms_estimator.model.config_file import NotNegative, Positive, Strict
 from bms_estimator.model.one_of import OneOf
 from bms_estimator.protocols.base.sensor_correction import SensorCorrection
-from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS
+from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS, valid_addresses
 from bms_estimator.settings.sampling import BOARD_GAIN_STD
 
 ALLOWED_WITH_SOURCE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
@@ -49,7 +49,7 @@ class SensorSettings(Strict):
     )
     address: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
-        description="address of the BMS on a shared RS485 line; default: the first address that responds",
+        description="address of the BMS on a shared RS485 line, for daly (board number) and jk; default: the first address that responds",
     )
     baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
         default=500_000, description="baud rate of the serial port; default: depends on the protocol"
@@ -116,6 +116,15 @@ class SensorSettings(Strict):
                 f"serial: only a binary board reports its serial number, but sensor.protocol is {self.protocol}; remove serial"
             )
         return self
+
+    @model_validator(mode="after")
+    def _protocol_has_the_address(self) -> Self:
+        addresses = valid_addresses(self.protocol)
+        if self.address is None or self.address in addresses:
+            return self
+        if not addresses:
+            raise ValueError(f"address: the protocol {self.protocol} has no addresses; remove address")
+        raise ValueError(f"address: {self.protocol} has addresses {addresses[0]} to {addresses[-1]}")
 
     @property
     def correction(self) -> SensorCorrection:

@@ -50,7 +50,7 @@ def sample_counters(state: np.void) -> dict[str, int]:
 
 def dropped_text(dropped: Mapping[str, int]) -> str:
     """Return a description of dropped samples: the number of each kind. ``dropped`` has names without ``dropped_``."""
-    words = {"range": "outside the cell's range"}
+    words = {"range": "outside the cell's range", "contradicted": "with a current that the voltage does not follow"}
     return ", ".join(f"{n:,} {words.get(kind, kind).replace('_', ' ')}" for kind, n in dropped.items() if n) or "none"
 
 

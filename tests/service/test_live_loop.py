@@ -134,6 +134,7 @@ async def test_unusable_samples_are_dropped_and_counted() -> None:
         "dropped_range": 2,
         "dropped_repeated": 1,
         "dropped_saturated": 1,
+        "dropped_contradicted": 0,
         "time_steps_back": 0,
         "gaps": 1,
     }
@@ -321,7 +322,7 @@ async def test_current_zero_is_accepted_at_rest() -> None:
     [
         ([], "no usable sample"),
         (AT_REST[:5], "watched for"),
-        ([*AT_REST, (4.5, 3.8)], "current flows: 4.5 A"),
+        ([*AT_REST, (4.5, 3.5)], "current flows: 4.5 A"),
         ([(0.3, 3.8)] * len(AT_REST), "current flows: 0.3 A"),
         ([*AT_REST, (0.03, 3.7), (0.03, 3.7)], "the voltage moved by 0.1 V"),
     ],

@@ -4,6 +4,7 @@ import binascii
 import gzip
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,17 @@ from bms_estimator.model.decimal_text import measured, number
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
+from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.curves import read_curve
-from bms_estimator.sources.captures.raw_capture import MAGIC, CaptureHeader, CaptureWriter, read_capture, read_header
+from bms_estimator.sources.captures.raw_capture import (
+    MAGIC,
+    CaptureHeader,
+    CaptureWriter,
+    make_header,
+    read_capture,
+    read_header,
+    read_sensor_settings,
+)
 from bms_estimator.sources.captures.replay import Replay, load_capture, open_capture
 from tests.protocols.firmware.board_messages import HELLO, NTC_STATUS, encode_hello, encode_sample
 
@@ -142,3 +152,12 @@ def test_implausible_temperature_of_a_board_is_dropped_and_counted() -> None:
     block = decoder.feed(0.0, encode_hello(ntc_beta_k=200) + b"".join(ntc_samples))
     assert np.isnan(block["temperature_c"]).all()
     assert decoder.counters["implausible"] == 3
+
+
+@pytest.mark.parametrize(("protocol", "recorded", "used"), [("jbd", 2, None), ("daly", 2, 2), ("daly", 200, None)])
+def test_a_recorded_address_that_settings_reject_is_ignored(
+    tmp_path: Path, protocol: str, recorded: int, used: int | None
+) -> None:
+    path, sensor = tmp_path / "capture.bms", SensorSettings.model_validate({"protocol": protocol})
+    CaptureWriter(path, replace(make_header(sensor), address=recorded)).close()
+    assert read_sensor_settings(path).address == used

@@ -81,6 +81,7 @@ POSSIBLE = {
         GOOD._replace(voltage_v=40.0, current_a=2000.0, cells_v=(2.5,) * 16),
         {"discharge_over_current"},
     ),
+    "9 C that the voltage does not follow": (GOOD._replace(current_a=900.0), {"discharge_over_current"}),
 }
 """Readings that may be true, and alarms that they raise."""
 

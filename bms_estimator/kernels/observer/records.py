@@ -40,6 +40,9 @@ OBSERVER_SETTINGS = np.dtype(
         ("voltage_min_v", "f8"),  # minimum voltage of an accepted sample [V]
         ("voltage_max_v", "f8"),  # maximum voltage of an accepted sample [V]
         ("current_max_a", "f8"),  # maximum magnitude of the current of an accepted sample [A]
+        ("check_ohm", "f8"),  # series resistance at 50 % SOC by the cell file, for the check of the current [ohm]
+        ("check_slow_ohm", "f8"),  # resistance of the RC pairs at 50 % SOC by the cell file, for this check [ohm]
+        ("check_v", "f8"),  # ohmic drop up to which a change of the current is not checked [V]
         # A longer step is a gap, unless it is at most GAP_RATIO times the previous step [s]
         ("gap_s", "f8"),
         ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
@@ -77,6 +80,7 @@ OBSERVER_STATE = np.dtype(
         ("dropped_range", "i8"),
         ("dropped_repeated", "i8"),  # samples with the time stamp of the previous one
         ("dropped_saturated", "i8"),  # voltage or current at the end of the converter's range
+        ("dropped_contradicted", "i8"),  # samples with a current that the voltage does not follow
         ("time_steps_back", "i8"),  # times that the clock was set back; the sample is accepted, but not the step to it
         ("gaps", "i8"),  # number of gaps (``kernels.step.is_gap``)
         ("lock_losses", "i8"),  # number of times that the lock was lost

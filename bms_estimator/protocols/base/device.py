@@ -44,9 +44,11 @@ class Device:
         sensor_defaults: Defaults of ``[sensor]``.
         has_binary_frames: True if the frames are not lines of text. A device search sends binary queries last, because a device that
             reads lines would interpret them as the beginning of a line.
+        addresses: Valid values of ``sensor.address``; empty: the protocol has no addresses.
     """
 
     name: str
     make: Callable[[CurrentSign, int | None], DeviceProtocol]
     sensor_defaults: SensorDefaults
     has_binary_frames: bool = False
+    addresses: range = range(0)

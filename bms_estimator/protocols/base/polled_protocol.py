@@ -8,7 +8,7 @@ from enum import Enum
 
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
+from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT, ReadingProtocol
 
 POLL_CYCLE_S = 1.0
 """Duration of a poll cycle [s], as in dbus-serialbattery."""
@@ -54,6 +54,8 @@ class PolledProtocol(ReadingProtocol):
         self._unparsed = b""
         self._responses = 0  # number of valid frames
         self._noise_bytes = 0  # since the last valid frame
+        self._last_bytes = b""
+        self._has_echo = False  # True if the present query arrived since the last valid frame
         self._due_queries: list[bytes] = []
         self._query = b""
         self._variant_index = self._unanswered_cycles = 0
@@ -64,6 +66,8 @@ class PolledProtocol(ReadingProtocol):
     def fault(self) -> str | None:
         """First invalid response since the last sample."""
         if self._fault_text is None and self._noise_bytes > MAX_NOISE_BYTES:
+            if self._has_echo:
+                return ECHO_FAULT
             return f"bytes arrive that are no response of a {self._name}: wrong baud rate, or another sensor.protocol?"
         return self._fault_text
 
@@ -113,9 +117,11 @@ class PolledProtocol(ReadingProtocol):
         self._due_queries = list(variants[self._variant_index % len(variants)])
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:
+        self._last_bytes = (self._last_bytes + data)[-MAX_NOISE_BYTES:]
+        self._has_echo |= bool(self._query) and self._query in self._last_bytes
         for frame in self._frames(data):
             self._responses += 1
-            self._noise_bytes = 0
+            self._noise_bytes, self._has_echo = 0, False
             if (reading := self._decode_frame(arrival_s, frame)) is not None:
                 yield reading
 

@@ -19,6 +19,12 @@ from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_bl
 from bms_estimator.protocols.base.probe_check import ProbeCheck
 from bms_estimator.protocols.base.reading import Reading
 
+ECHO_FAULT = (
+    "the own requests come back, and no response arrives: the adapter echoes; "
+    "are the device and its wires connected, and A and B or RX and TX not swapped?"
+)
+"""Fault of a line on which only own requests arrive."""
+
 
 class ReadingProtocol(DeviceProtocol):
     """Protocol that decodes bytes to readings, and readings to samples. It takes no commands.

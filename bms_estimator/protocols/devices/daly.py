@@ -1,7 +1,7 @@
 """Daly Smart BMS, protocol of the ``A5`` frames: UART or RS485 at 9600 baud.
 
-Request: ``A5 host command 08``, eight zeros, checksum; the host is 40 on RS485 and USB, 80 on UART. Response: ``A5 01 command 08``,
-eight bytes, checksum, big-endian; cells and probes are in several frames, each with its number as first byte. The checksum is the sum of all
+Request: ``A5 host command 08``, eight zeros, checksum; the host is 40 on RS485 and USB, 80 on UART. A request to board n of a shared
+line has 3F + n in place of 40, and its response has n in place of 01 (dbus-serialbattery). Response: ``A5 01 command 08``, eight bytes, checksum, big-endian; cells and probes are in several frames, each with its number as first byte. The checksum is the sum of all
 bytes before it, modulo 256. Current: 0.1 A per step, 30000 at zero, positive on discharge as in python-daly-bms, batmon-ha and
 dbus-serialbattery. Some firmwares report the opposite sign (dbus-serialbattery issues 65, 70, 255), which
 ``sensor.current_sign`` corrects.
@@ -27,9 +27,9 @@ START = 0xA5
 DATA_BYTES, FRAME_BYTES = 8, 13
 """Number of data bytes of a frame, and of all its bytes."""
 HOSTS = (0x40, 0x80)
-"""Addresses of the host on RS485 or USB, and on UART."""
+"""Second byte of a request to board 1: on RS485 or USB, and on UART."""
 PACK_ADDRESSES = range(0x01, 0x40)
-"""Addresses of responses."""
+"""Board numbers, the second byte of responses."""
 ZERO_CURRENT = 30000
 """Value at 0 A [0.1 A]."""
 ZERO_C = 40
@@ -46,7 +46,7 @@ def with_checksum(frame: bytes) -> bytes:
 
 
 def request(host: int, command: int) -> bytes:
-    """Build the request for ``command``. The commands used here only read from the BMS."""
+    """Build the request for ``command`` with this second byte. The commands used here only read from the BMS."""
     return with_checksum(bytes((START, host, command, DATA_BYTES)) + bytes(DATA_BYTES))
 
 
@@ -55,11 +55,12 @@ class DalyProtocol(PolledProtocol):
 
     Args:
         current_sign: Direction of positive current. Daly's documentation states discharge.
-        address: Address of the BMS on a shared line; None: the first that responds.
+        address: Board number of the BMS on a shared line; None: board 1, or whichever responds to its requests.
     """
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive", address: int | None = None) -> None:
         super().__init__("Daly BMS", re.compile(b"\xa5"), current_sign, address)
+        self._hosts = HOSTS if address in (None, 1) else (HOSTS[0] - 1 + address,)
         self._cell_count: int | None = None
         self._probe_count: int | None = None
         self._has_sample = False
@@ -83,7 +84,7 @@ class DalyProtocol(PolledProtocol):
         if self.probing:
             return [[request(host, command) for host in HOSTS for command in (STATUS, CELLS, PACK)]]
         commands = (CELLS, PROBES, PACK) if self._has_status else (STATUS, CELLS, PROBES, PACK)
-        return [[request(host, command) for command in commands] for host in HOSTS]
+        return [[request(host, command) for command in commands] for host in self._hosts]
 
     def _frame_length(self, data: bytes, at: int) -> int | ParseResult:
         head = data[at + 1 : at + 4]
@@ -159,6 +160,7 @@ DEVICE = Device(
         current_dead_band_a=2.5,
     ),
     has_binary_frames=True,
+    addresses=PACK_ADDRESSES,
 )
 """Registration of the protocol. Voltage and current have steps of 0.1 V and 0.1 A.
 

@@ -274,6 +274,7 @@ DEVICE = Device(
         current_dead_band_a=0.7,
     ),
     has_binary_frames=True,
+    addresses=range(256),
 )
 """One frame has voltage and current in steps of 10 mV and 10 mA. One board showed nothing below 0.7 A
 (github.com/syssi/esphome-jk-bms, issue 243)."""

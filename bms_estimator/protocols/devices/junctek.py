@@ -13,11 +13,13 @@ from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
+from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT, ReadingProtocol
 
 ADDRESS = 1
 """Factory default address."""
 QUERY = b":R50=%d,2,1,\r\n" % ADDRESS
+MAX_ECHOES = 3
+"""Number of own queries that may arrive without a response before they are reported as a fault."""
 POLL_INTERVAL_S = 1.0
 """Poll interval [s]."""
 MAX_LINE_BYTES = 256
@@ -50,6 +52,12 @@ class JunctekProtocol(ReadingProtocol):
         self._overlong = False
         self._synchronized = False
         self._query_s = -math.inf
+        self._echoes = 0  # number of own queries that arrived since the last response
+
+    @property
+    def fault(self) -> str | None:
+        """First fault since the last reading; None without one."""
+        return super().fault or (ECHO_FAULT if self._echoes > MAX_ECHOES else None)
 
     @property
     def description(self) -> str | None:
@@ -92,6 +100,7 @@ class JunctekProtocol(ReadingProtocol):
             is_complete: False for the first line, which may be partial and is therefore not counted as a fault.
         """
         begin = line.rfind(b":")
+        self._echoes = self._echoes + 1 if line == QUERY.strip() else 0
         if not line or line[begin:].startswith(
             (b":R", b":W", b":w", b":r00=", b":r51=")
         ):  # queries of the display, or other responses

@@ -3,7 +3,9 @@
 The console prints text: ``pwr`` a table of all batteries in parallel, ``bat N`` a table of the cells of battery N. A
 prompt follows each table. Voltages in mV, currents in mA and positive on charge, temperatures in thousandths of a degree
 Celsius.
-There is no checksum: a table is accepted if it ends with the success message and each of its rows can be read.
+There is no checksum, and a reading is a sum over batteries. A table is therefore accepted only if it ends with the success
+message, its rows are numbered without a gap, no row has more columns than the header, and no battery is missing that was
+present before.
 """
 
 import itertools
@@ -11,6 +13,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 
+from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
@@ -24,8 +27,14 @@ MAX_RESPONSE_BYTES = 16384
 """Maximum length of a response [bytes]: 16 rows of less than 200 bytes, with a margin."""
 PROMPT = re.compile(rb"pylon\w*>")
 """Prompt of the console, which follows each response."""
+RS485_FRAME = re.compile(rb"~[0-9A-F]{12,}\r")
+"""Frame of the protocol on the RS-485 port."""
 ECHO = re.compile(r"\bbat\s+([0-9]{1,2})\b")
 """Echo of a query of cells, with the number of the battery."""
+MAX_SHOWN_BYTES = 60
+"""Maximum number of characters of an unexpected text that are shown."""
+STACK, CELLS = "Power", ("Battery", "Bat")
+"""First column of the table of ``pwr``, and of those of ``bat`` by older and newer firmware."""
 SUCCESS = "Command completed"
 """Beginning of the success message."""
 MAX_BATTERIES = 16
@@ -38,6 +47,10 @@ MAX_DIGITS = 9
 """Maximum number of digits of a value."""
 SOC = "Coulomb"
 """Column of the SOC [%]."""
+TIME = "Time"
+"""Column with a date and a time, which count as two."""
+MAX_MISSING_S = 3600.0
+"""Time after which a battery that was present before counts as removed [s]."""
 ABSENT = "-"
 """Value of a battery or cell that is absent."""
 
@@ -56,11 +69,18 @@ class PylontechProtocol(ReadingProtocol):
         self._unparsed = b""
         self._cells = dict[int, RecentCellVoltages]()
         self._batteries: tuple[int, ...] = ()
+        self._table_s = -math.inf  # arrival time of the last complete table
         self._responses = 0
         self._cycle_s = self._query_s = -math.inf
         self._responses_at_query = -1  # number of responses when the last query was sent
         self._query = b""
         self._battery_index = 0  # index of the battery whose cells were queried last
+        self._unprompted: str | None = None  # fault of bytes that arrived instead of a response and its prompt
+
+    @property
+    def fault(self) -> str | None:
+        """First fault since the last reading; None without one."""
+        return super().fault or self._unprompted
 
     @property
     def description(self) -> str | None:
@@ -81,6 +101,8 @@ class PylontechProtocol(ReadingProtocol):
         is_unanswered = self._query and self._responses == self._responses_at_query
         if is_unanswered and now_s - self._query_s < RESPONSE_TIMEOUT_S:
             return b""
+        if is_unanswered and self._unparsed:
+            self._unprompted = _describe_unprompted(self._unparsed)
         if now_s - self._cycle_s >= POLL_CYCLE_S or is_unanswered:
             self._cycle_s = now_s
             return self._send_query(b"pwr\n", now_s)
@@ -94,38 +116,51 @@ class PylontechProtocol(ReadingProtocol):
         return command
 
     def _read(self, arrival_s: float, data: bytes) -> Iterator[Reading]:
-        self._unparsed += data
+        self._unparsed, rs485_frames = RS485_FRAME.subn(b"", self._unparsed + data)
+        if rs485_frames:
+            self._count_fault(
+                "text_errors", "frames of the RS-485 protocol arrive: connect to the console port of the master battery"
+            )
         *answers, self._unparsed = PROMPT.split(self._unparsed)
         for answer in answers:
-            self._responses += 1
+            self._responses, self._unprompted = self._responses + 1, None
             if (
                 len(answer) <= MAX_RESPONSE_BYTES
                 and (reading := self._parse(arrival_s, answer.decode("ascii", "replace"))) is not None
             ):
                 yield reading
         if len(self._unparsed) > MAX_RESPONSE_BYTES:
+            self._count_fault("length_errors", _describe_unprompted(self._unparsed))
             self._unparsed = b""
-            self._count_fault(
-                "length_errors", "bytes arrive, but no prompt of a Pylontech console: its baud rate is 115200"
-            )
 
     def _parse(self, arrival_s: float, answer: str) -> Reading | None:
         """Parse a response: return the reading of ``pwr``; store the cells of ``bat`` and return None."""
         lines = [line.split() for line in re.split(r"[\r\n]+", answer) if line.strip()]
-        # the table of ``pwr`` begins with Power, that of ``bat`` with Battery
-        header = next((n for n, line in enumerate(lines) if line[:2] in (["Power", "Volt"], ["Battery", "Volt"])), None)
+        header = next((n for n, line in enumerate(lines) if line[0] in (STACK, *CELLS) and line[1:2] == ["Volt"]), None)
         if header is None:
             if "Unknown command" in answer or "Invalid" in answer:
                 self._count_fault(
                     "text_errors", "the console rejects the command: is it the console of a Pylontech master?"
+                )
+            elif SUCCESS in answer:
+                shown = next((line for line in lines if "Volt" in line), lines[0])
+                self._count_fault(
+                    "text_errors",
+                    "a table does not begin with the columns Power, Volt of a master's console: "
+                    + " ".join(shown)[:MAX_SHOWN_BYTES],
                 )
             return None
         rows = [line for line in lines[header + 1 :] if line[0].isdigit()]
         if SUCCESS not in answer or not rows:
             self._count_fault("length_errors", "a table is cut off")
             return None
+        # batteries are numbered from 1, cells from 0 or 1
+        first = 0 if lines[header][0] in CELLS and rows[0][0] == "0" else 1
+        if (lost := next((n for n, row in enumerate(rows, first) if row[0] != str(n)), None)) is not None:
+            self._count_fault("length_errors", f"row {lost} of a table is missing")
+            return None
         try:
-            if lines[header][0] == "Battery":
+            if lines[header][0] in CELLS:
                 self._store_cells(arrival_s, answer, rows)
                 return None
             return self._stack_reading(arrival_s, lines[header], rows)
@@ -143,16 +178,25 @@ class PylontechProtocol(ReadingProtocol):
         self._cells.setdefault(battery, RecentCellVoltages(MAX_CELLS_AGE_S)).store(arrival_s, cells_v)
 
     def _stack_reading(self, arrival_s: float, names: Sequence[str], rows: Sequence[Sequence[str]]) -> Reading | None:
-        """Return the reading of all batteries in parallel; None if none is present.
+        """Return the reading of all batteries in parallel; None if none is present, or if one is missing.
 
         Raises:
-            ValueError, LookupError: A row cannot be parsed.
+            ValueError, LookupError: A row cannot be parsed, or has more columns than the header.
         """
         columns = (names.index(name) for name in ("Volt", "Curr", "Tempr", "Tlow", "Thigh"))
         voltage, current, temperature, lowest_temperature, highest_temperature = columns
         present = [row for row in rows if row[voltage] != ABSENT]
         if not present:
             self._count_fault("text_errors", "the console reports no present battery")
+            return None
+        if max(map(len, present)) > len(names) + names.count(TIME):  # a master may leave the SOC of other batteries out
+            raise ValueError(names)
+        batteries = tuple(int(row[0]) for row in present)
+        if (missing := set(self._batteries) - set(batteries)) and arrival_s - self._table_s < MAX_MISSING_S:
+            absent = " and ".join(map(str, sorted(missing)))
+            self._count_fault(
+                "text_errors", f"the table has no values of battery {absent}: the sum would lack a part of the current"
+            )
             return None
         voltages_v = [1e-3 * _parse_integer(row[voltage]) for row in present]
         currents_a = [1e-3 * _parse_integer(row[current]) for row in present]
@@ -162,12 +206,20 @@ class PylontechProtocol(ReadingProtocol):
             for texts, row in zip(cell_temperatures, present, strict=True)
         ]
         temperatures_c = tuple(1e-3 * _parse_integer(text) for texts in temperature_texts for text in texts)
-        self._batteries = tuple(int(row[0]) for row in present)
+        self._batteries, self._table_s = batteries, arrival_s
         battery_cells_v = [
             self._cells[battery].at(arrival_s) if battery in self._cells else () for battery in self._batteries
         ]
         cells_v = tuple(itertools.chain(*battery_cells_v)) if all(battery_cells_v) else ()
         return Reading(_mean(voltages_v), sum(currents_a), temperatures_c, cells_v, soc=_stack_soc(names, present))
+
+
+def _describe_unprompted(data: bytes) -> str:
+    """Return the fault of received bytes without a prompt."""
+    if data.translate(None, PRINTABLE):
+        return "bytes arrive, but no prompt of a Pylontech console: its baud rate is 115200"
+    shown = " ".join(data.decode("ascii").split())[:MAX_SHOWN_BYTES]
+    return f"text without the prompt of a Pylontech console arrives: is it another device or port? It begins: {shown}"
 
 
 def _stack_soc(names: Sequence[str], rows: Sequence[Sequence[str]]) -> float:

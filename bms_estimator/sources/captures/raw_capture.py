@@ -36,6 +36,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.protocols.registry import valid_addresses
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.settings.sources.source import BaseSource
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES, split_records
@@ -104,7 +105,9 @@ def read_sensor_settings(path: Path) -> SensorSettings:
     """
     header = read_header(path)
     try:
-        fields = {"protocol": header.mode, "current_sign": header.current_sign, "address": header.address}
+        # earlier versions accepted an address for each protocol
+        address = header.address if header.address in valid_addresses(header.mode) else None
+        fields = {"protocol": header.mode, "current_sign": header.current_sign, "address": address}
         corrections = {name: getattr(header, name) for name in CORRECTIONS}
         return SensorSettings.model_validate(fields | corrections)
     except ValidationError:

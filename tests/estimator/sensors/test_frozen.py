@@ -43,8 +43,8 @@ def run(estimator: Estimator, samples: SampleBlock) -> tuple[np.ndarray, np.ndar
     """Return SOC, its std and the bits of ``InputFault`` after each sample."""
     results = []
     for n in range(samples.size):
-        trace = estimator.run(samples[n : n + 1])
-        results.append((trace["soc"][0], trace["soc_std"][0], estimator.record[0]["checks"]["suspects"]))
+        estimator.run(samples[n : n + 1])
+        results.append((estimator.soc, estimator.soc_std, estimator.record[0]["checks"]["suspects"]))
     soc, std, suspects = np.array(results).T
     return soc, std, suspects.astype(int)
 

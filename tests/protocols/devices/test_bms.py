@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
 from bms_estimator.protocols.base.polled_protocol import (
@@ -16,6 +17,7 @@ from bms_estimator.protocols.base.polled_protocol import (
     QUERY_INTERVAL_S,
     PolledProtocol,
 )
+from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT
 from bms_estimator.protocols.devices import daly, jbd, jk
 from bms_estimator.protocols.devices.daly import with_checksum
 from bms_estimator.protocols.registry import make_protocol
@@ -407,6 +409,46 @@ def test_next_request_variant_is_tried_after_unanswered_poll_cycles() -> None:
     assert {jk.request(1), jk.request(0)} < set(requests)
     assert set(poll_requests(make_decoder("jk", address=7), 20.0)) == {jk.OLD_REQUEST, jk.request(7)}
     assert {request[1] for request in poll_requests(make_decoder("daly"), 20.0)} == set(daly.HOSTS)
+
+
+@pytest.mark.parametrize(("address", "hosts"), [(None, {0x40, 0x80}), (1, {0x40, 0x80}), (2, {0x41}), (15, {0x4E})])
+def test_board_number_of_a_daly_reaches_the_requests(address: int | None, hosts: set[int]) -> None:
+    requests = poll_requests(make_decoder("daly", address=address), 20.0)
+    assert {request[1] for request in requests} == hosts
+
+
+def test_a_daly_with_another_board_number_is_read() -> None:
+    device = make_decoder("daly", address=2)
+    response = daly.with_checksum(bytes((0xA5, 2)) + frames.DALY_PACK[2:-1])
+    assert decode(device, response)[0]["voltage_v"].tolist() == [53.0]
+    assert decode(device, frames.DALY_PACK)[0].size == 0
+    assert device.fault == "pack 1 responds, but pack 2 is selected: see sensor.address"
+
+
+@pytest.mark.parametrize("protocol", ["binary", "jbd", "junctek", "pylontech", "text", "vedirect"])
+def test_an_address_is_rejected_for_a_protocol_without_addresses(protocol: str) -> None:
+    with pytest.raises(ValidationError, match=f"the protocol {protocol} has no addresses; remove address"):
+        SensorSettings.model_validate({"protocol": protocol, "address": 2})
+
+
+@pytest.mark.parametrize("address", [0, 64])
+def test_a_board_number_beyond_the_protocol_is_rejected(address: int) -> None:
+    with pytest.raises(ValidationError, match="daly has addresses 1 to 63"):
+        SensorSettings.model_validate({"protocol": "daly", "address": address})
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("split", [1, 7, 1000])
+def test_own_requests_that_the_adapter_returns_are_named(protocol: str, split: int) -> None:
+    device = make_decoder(protocol)
+    for tick in range(200):
+        request = device.next_output(tick / 20.0)
+        for at in range(0, len(request), split):
+            device.feed(tick / 20.0, request[at : at + split])
+    assert device.fault == ECHO_FAULT
+    published = {"jbd": frames.JBD, "daly": frames.DALY, "jk": frames.JK_OLD}[protocol]
+    assert decode(device, published.frames)[0].size == 1
+    assert device.fault is None
 
 
 def test_request_variant_that_got_a_response_is_used_from_then_on() -> None:

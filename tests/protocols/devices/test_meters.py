@@ -3,7 +3,7 @@
 import asyncio
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
-from bms_estimator.protocols.base.reading_protocol import ReadingProtocol
+from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT, ReadingProtocol
 from bms_estimator.protocols.devices.junctek import QUERY, JunctekProtocol
 from bms_estimator.protocols.devices.pylontech import PylontechProtocol
 from bms_estimator.protocols.devices.vedirect import VeDirectProtocol
@@ -224,6 +224,135 @@ def test_damaged_frame_is_counted_and_reported_until_a_valid_frame(
     assert decoder.fault is None
 
 
+STACK_CURRENT_A = 80.0
+"""Current of four batteries with 20 A each [A]."""
+
+
+def stack_response(rows: Sequence[str]) -> bytes:
+    """Return the response to command ``pwr`` with these rows, in the format of a US5000."""
+    head = US5000_PWR[: US5000_PWR.index(b"1     49874")]
+    return head + "\r\r\n".join(rows).encode() + US2000_END
+
+
+def battery_row(number: int) -> str:
+    """Return the row of a battery that delivers 20 A."""
+    values = f"{number:<5} 49874  -20000 19100  17000  8        17600  0        3324   2        3325   0        "
+    return (
+        values
+        + "Dischg   Normal   Normal   Normal   81%      2025-03-18 05:58:51  Normal   Normal  18200    Normal   Normal"
+    )
+
+
+def absent_row(number: int) -> str:
+    """Return the row of an absent battery."""
+    return (
+        f"{number:<5} -      -      -      -      -      -      -      Absent   -        -        -        -        -"
+    )
+
+
+STACK = [*map(battery_row, (1, 2, 3, 4)), *map(absent_row, (5, 6, 7, 8))]
+INCOMPLETE = {
+    "first row lost": (STACK[1:], "row 1 of a table is missing"),
+    "middle row lost": ([*STACK[:2], *STACK[3:]], "row 3 of a table is missing"),
+    "last rows lost": (STACK[:3], "no values of battery 4"),
+    "rows merged by an overflow": (
+        [STACK[0], STACK[1][:70] + STACK[2][20:], *STACK[3:]],
+        "row 3 of a table is missing",
+    ),
+    "last rows merged by an overflow": ([*STACK[:2], STACK[2][:70] + STACK[3][20:]], "cannot be parsed"),
+    "battery absent": ([*STACK[:3], absent_row(4), *STACK[4:]], "no values of battery 4"),
+    "batteries absent": ([*STACK[:2], absent_row(3), absent_row(4), *STACK[4:]], "no values of battery 3 and 4"),
+}
+"""Rows of a table that lacks a part of the current, and part of the reported fault."""
+
+
+@pytest.mark.parametrize(("rows", "message"), INCOMPLETE.values(), ids=INCOMPLETE)
+def test_the_currents_of_an_incomplete_stack_are_not_summed(rows: list[str], message: str) -> None:
+    decoder = PylontechProtocol()
+    assert decoder.feed(1.0, stack_response(STACK))["current_a"].tolist() == [STACK_CURRENT_A]
+    for second in range(2, 600, 2):
+        assert decoder.feed(second, stack_response(rows)).size == 0
+    assert message in (decoder.fault or "")
+    assert decoder.counters["text_errors"] + decoder.counters["length_errors"] == 299
+    assert decoder.feed(600.0, stack_response(STACK))["current_a"].tolist() == [STACK_CURRENT_A]
+    assert decoder.fault is None
+
+
+def test_a_battery_that_is_absent_for_an_hour_counts_as_removed_and_a_new_one_counts_at_once() -> None:
+    decoder = PylontechProtocol()
+    three = stack_response([*STACK[:3], absent_row(4), *STACK[4:]])
+    assert decoder.feed(0.0, stack_response(STACK)).size == 1
+    assert decoder.feed(3599.0, three).size == 0
+    assert decoder.feed(3600.0, three)["current_a"].tolist() == [60.0]
+    assert decoder.feed(3602.0, stack_response(STACK))["current_a"].tolist() == [STACK_CURRENT_A]
+
+
+def test_a_stack_whose_master_leaves_out_the_soc_of_the_others_is_read() -> None:
+    decoder = PylontechProtocol()
+    without_soc = [STACK[0], *(row.replace("81%", "   ") for row in STACK[1:])]
+    assert decoder.feed(1.0, stack_response(without_soc))["current_a"].tolist() == [STACK_CURRENT_A]
+    assert decoder.last_reading is not None
+    assert math.isnan(decoder.last_reading.soc)
+
+
+def test_cells_of_newer_firmware_are_read() -> None:
+    head = b"bat 1\n\r@\r\r\nBat  Volt Curr    Tempr   V.State T.State AH(mAH)             Bal\r\r\n"
+    rows = [
+        b"%-4d %d -144    18800   Normal  Normal   68%%      33819 mAH   N" % row for row in enumerate(US2000_CELLS_MV)
+    ]
+    decoder = PylontechProtocol()
+    decoder.feed(1.0, head + b"\r\r\n".join(rows) + US2000_END + US5000_PWR)
+    assert decoder.cells.tolist() == [pytest.approx([mv / 1000 for mv in US2000_CELLS_MV])]
+    assert decoder.fault is None
+
+
+def test_cells_of_a_table_with_a_lost_row_are_not_used() -> None:
+    decoder = PylontechProtocol()
+    complete = bat_response(1, US2000_CELLS_MV)
+    row = b"%-8d %-8d" % (3, US2000_CELLS_MV[3])
+    begin = complete.index(row)
+    end = complete.index(b"%-8d %-8d" % (4, US2000_CELLS_MV[4]))
+    decoder.feed(1.0, complete[:begin] + complete[end:] + US5000_PWR)
+    assert decoder.cells.size == 0
+    assert decoder.counters["length_errors"] == 1
+    decoder.feed(2.0, complete + US5000_PWR)
+    assert decoder.cells.shape == (1, 15)
+
+
+def test_own_requests_that_the_adapter_of_a_junctek_returns_are_named() -> None:
+    decoder = JunctekProtocol()
+    for second in range(6):
+        decoder.feed(second, decoder.next_output(second))
+    assert decoder.fault == ECHO_FAULT
+    assert decoder.feed(6.0, KG_CHARGING).size == 1
+    assert decoder.fault is None
+
+
+RS485_FRAME = b"~20024642E00202FD33\r"
+UNIT_TABLE = b"Unit     Volt     Curr     Tempr\r\n1        49874    -642     19100\r\n"
+UNEXPECTED = {
+    "frames of the RS-485 port": (RS485_FRAME, "connect to the console port"),
+    "table of another command": (
+        b"@\r\n" + UNIT_TABLE + US2000_END,
+        "Power, Volt of a master's console: Unit Volt Curr",
+    ),
+    "table without a prompt": (UNIT_TABLE, "another device or port? It begins: Unit Volt Curr Tempr"),
+    "wrong baud rate": (bytes(range(128, 256)), "baud rate is 115200"),
+}
+"""Bytes that are no response of a Pylontech console, and part of the reported fault."""
+
+
+@pytest.mark.parametrize(("data", "message"), UNEXPECTED.values(), ids=UNEXPECTED)
+def test_other_bytes_than_those_of_a_pylontech_console_are_named(data: bytes, message: str) -> None:
+    decoder = PylontechProtocol()
+    for second in range(12):
+        if decoder.next_output(second):
+            decoder.feed(second, data)
+    assert message in (decoder.fault or "")
+    assert decoder.feed(12.0, b"\n\rpylon>" + US5000_PWR).size == 1
+    assert decoder.fault is None
+
+
 def test_vedirect_charger_is_rejected() -> None:
     body = vedirect_block("\nPID 0xA042\nV 12740\nI 800\nVPV 0\nPPV 0\nCS 0\nERR 0\nLOAD ON\nChecksum ")
     decoder = VeDirectProtocol()
@@ -321,9 +450,10 @@ def test_no_bytes_raise_and_chunk_boundaries_do_not_change_the_values(
     edges = [0, *sorted(min(at, len(damaged)) for at in cuts), len(damaged)]
     blocks, cell_rows = [], 0
     for n, (a, b) in enumerate(itertools.pairwise(edges)):
-        blocks.append(cut_decoder.feed(1.0 + n, bytes(damaged[a:b])))
+        now_s = 1.0 + 0.1 * n  # before the timeout of a response, which is a fault
+        blocks.append(cut_decoder.feed(now_s, bytes(damaged[a:b])))
         cell_rows += cut_decoder.cells.shape[0]
-        cut_decoder.next_output(1.0 + n)
+        cut_decoder.next_output(now_s)
     assert voltages_and_currents(np.concatenate(blocks)) == voltages_and_currents(block)
     # a block with any cell voltages has a row of them for each sample; a block without has no rows
     assert cell_rows <= cells.shape[0]

@@ -8,9 +8,14 @@ from typing import Any
 import pytest
 import structlog
 
+from bms_estimator.mqtt.broker_config import brokers
+from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.queue_sender import WINDOW
+from bms_estimator.settings.broker import BrokerSettings
 from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.sources.mqtt import SourceBroker
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
@@ -57,6 +62,17 @@ async def test_wrong_password_is_reported_and_not_shown(
     health = snapshot(delivery=delivery).health
     assert health.broker_trouble == logs[0]["reason"]
     assert "s3cret" not in f"{logs} {health}"
+
+
+@pytest.mark.parametrize(("settings", "section"), [(MqttSettings, "mqtt"), (SourceBroker, "source")])
+async def test_a_wrong_password_points_to_the_section_of_its_broker(
+    locked_broker: Broker, settings: type[BrokerSettings], section: str
+) -> None:
+    options = ConnectOptions("reader", None, lambda _kind, _topic: None)
+    connection = settings(url=locked_broker.url)
+    with pytest.raises(BrokerConnectionError, match=f"see {section}.username, {section}.password_file"):
+        async with BrokerConnector(connection)(brokers(connection)[0], options):
+            pytest.fail("connected without a password")
 
 
 @pytest.mark.parametrize(

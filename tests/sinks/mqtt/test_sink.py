@@ -126,7 +126,7 @@ async def test_publish_returns_at_once_and_the_sink_closes_without_a_broker(tmp_
 async def test_abandoned_connection_leaves_no_callbacks(broker: Broker) -> None:
     """The connecting thread continues after its task is cancelled, and the event loop may be closing."""
     client = Client(
-        {"hostname": "127.0.0.1", "port": broker.port}, ProtocolVersion.V5, CONNECT_OPTIONS, DEFAULT_TIMEOUTS
+        {"hostname": "127.0.0.1", "port": broker.port}, ProtocolVersion.V5, CONNECT_OPTIONS, DEFAULT_TIMEOUTS, "mqtt"
     )
     tasks_before = asyncio.all_tasks()
     client.abandon()
