@@ -74,6 +74,12 @@ class AlarmHooks:
             if hook.covers(change.alarm.name):
                 hook.on_alarm_change(change.alarm)
 
+    def stop_watching(self) -> None:
+        """Send no more relay level without an alarm, because the alarms are no longer evaluated."""
+        for hook in self._hooks:
+            hook.has_watched = False
+        self.is_watching = lambda: False
+
     @property
     def finished_hashes(self) -> list[str]:
         """Hashes of the hooks without unfinished or failed jobs."""

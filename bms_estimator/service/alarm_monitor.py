@@ -158,14 +158,14 @@ class AlarmMonitor:
         """Acknowledge all alarms, because a person on this machine requested it with a signal."""
         log.info("alarms acknowledged by SIGUSR1", alarms=self.acknowledge(None))
 
-    def restore(self, saved_state: str) -> str:
-        """Restore the ``alarms.saved_state`` of an earlier run.
+    def restore(self, saved_state: str, *, crashed: bool = False) -> str:
+        """Restore the ``alarms.saved_state`` of an earlier run, which may have ``crashed``.
 
         Returns:
             Reason for which raised alarms may be missing; empty if the alarms are complete.
         """
         try:
-            lost_reason = self.alarms.restore(saved_state)
+            lost_reason = self.alarms.restore(saved_state, self._clock.wall() if crashed else None)
         except Exception as error:  # noqa: BLE001 - a damaged state may raise anything, and is reported
             lost_reason = f"the saved state of the alarms is damaged ({error!r})"
         self.report = self.alarms.report()

@@ -105,6 +105,11 @@ class CheckpointWriter:
         tried_s, failed, load_tried_s = -math.inf, False, loop.time()
         # until the final save marks the run as clean, the next start counts it as crashed
         run_failed, run_tried_s = not await self._save_counters(), loop.time()
+        if run_failed:
+            path = self._checkpoint.run_file.path
+            self._publisher.alarm_monitor.raise_state_lost(
+                f"{path.name} cannot be written, so that a restart loses alarms"
+            )
         while True:
             await self._wait_for_alarm(min(CHECK_S, self._interval_s))
             run_delay_s = RETRY_S if run_failed else self._delay_of_counters_s

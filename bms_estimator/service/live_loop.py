@@ -131,7 +131,7 @@ async def run_estimation_loop(
         on_alarm=hooks.on_alarm_change,
         forecaster=forecaster,
     )
-    unrestored = publisher.alarm_monitor.restore(counters.alarms)
+    unrestored = publisher.alarm_monitor.restore(counters.alarms, crashed=saved_run.crashed)
     hooks.is_watching = lambda: publisher.alarm_monitor.alarms.is_watching
     hooks.restore_active(publisher.alarm_monitor.report, counters.hooks, crashed=saved_run.crashed)
     if lost_reason := saved_run.lost_reason or unrestored:
@@ -187,9 +187,9 @@ async def run_estimation_loop(
             clean = True
         finally:  # an exception ends the loop, too
             notifier.stopping(name)
-            if (
-                writer
-            ):  # save before the sinks close, because closing may take seconds, and the service may be killed meanwhile
+            hooks.stop_watching()
+            if writer:
+                # before the sinks close, because closing may take seconds, and the service may be killed meanwhile
                 await writer.save_final(clean=clean)
         publisher.publish_last()
     return estimator

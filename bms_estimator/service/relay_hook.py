@@ -125,7 +125,6 @@ class RelayHook(Hook):
     ) -> None:
         super().__init__(settings)
         self._board, self._clock, self._is_watching = board, clock, is_watching
-        self._has_watched = False
         self._hold = RelayHold(low_is_safe=settings.relay == "low")
 
     @property
@@ -173,8 +172,8 @@ class RelayHook(Hook):
 
     async def _send_level(self) -> str:
         """Send the level that is allowed now. Return why the board does not confirm it; empty if it does."""
-        self._has_watched = self._has_watched or self._is_watching()
-        if not (self._raised or self._has_watched):
+        self.has_watched = self.has_watched or self._is_watching()
+        if not (self._raised or self.has_watched):
             return ""
         level = self._hold.level(high=self._wants_high, now_s=self._clock())
         if level is None:

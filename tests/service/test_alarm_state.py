@@ -477,7 +477,7 @@ async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full
     await asyncio.wait_for(task, LONG_S)
 
 
-async def test_a_kill_within_the_delay_of_an_alarm_does_not_restart_the_delay(tmp_path: Path) -> None:
+async def test_a_kill_within_the_delay_of_an_alarm_raises_it_although_its_cause_is_gone(tmp_path: Path) -> None:
     source, checkpoint = ScriptedSource(), CheckpointFile(tmp_path, SETTINGS, CELL)
     task = asyncio.create_task(
         run_estimation_loop(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=checkpoint)
@@ -489,9 +489,9 @@ async def test_a_kill_within_the_delay_of_an_alarm_does_not_restart_the_delay(tm
     killed = Path(shutil.copytree(tmp_path, tmp_path / "killed"))
     source.finish()
     await asyncio.wait_for(task, LONG_S)
-    restarted = await run(killed, OVER_VOLTAGE[:1])
+    restarted = await run(killed, NORMAL)
     assert restarted.alarms["pack_over_voltage"].active
-    assert not any(restarted.relay[1:])
+    assert not any(restarted.relay)
 
 
 def test_an_alarm_is_saved_in_a_folder_that_cannot_be_written(folder: Path) -> None:
@@ -523,6 +523,14 @@ async def test_a_restart_connects_the_load_only_once_a_due_alarm_would_be_raised
     folder = tmp_path / "second"
     assert all((await run(folder, NORMAL)).relay)
     assert not any((await run(folder, hot, until=lambda a: a["over_temperature"].active)).relay)
+
+
+async def test_a_start_that_cannot_save_alarms_takes_the_safe_side(tmp_path: Path, disk_without_files: Path) -> None:
+    unwritable = await run(disk_without_files / "state", NORMAL)
+    assert "cannot be written" in unwritable.alarms["alarm_state_lost"].text
+    assert not any(unwritable.relay)
+    (tmp_path / "pack.new").touch()
+    assert (await run(tmp_path, NORMAL)).alarms["alarm_state_lost"].active
 
 
 async def test_a_hook_that_is_added_before_a_restart_acts_on_a_raised_alarm(folder: Path) -> None:

@@ -135,3 +135,18 @@ async def test_a_silent_board_is_a_failure_and_gets_the_level_when_it_answers_ag
         board.is_silent = False
         await until(lambda: not board.high)
         await until(lambda: hooks.health and hooks.health.failing == [])
+
+
+async def test_only_the_level_in_alarms_is_sent_while_alarms_are_not_watched() -> None:
+    async with run_hook("low") as (hooks, board):
+        await later_command(board)
+        hooks.stop_watching()
+        polls = list[bool]()
+        hooks.is_watching = lambda: bool(polls.append(False))
+        await until(lambda: polls)
+        commands = board.commands
+        await until(lambda: len(polls) > 5)
+        assert board.commands == commands
+        hooks.on_alarm_change(Change(0.0, ALARM))
+        await later_command(board)
+        assert not board.high

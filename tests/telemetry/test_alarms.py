@@ -616,12 +616,41 @@ async def test_a_pack_stays_hot_while_the_hot_probe_reads_cold_sooner_than_it_ca
     assert any(f"probe {len(others_c) + 1} reads 0 °C" in text for text in texts)
 
 
-def test_an_acknowledged_over_temperature_ends_although_a_probe_is_faulty() -> None:
+@pytest.mark.parametrize("is_faulty", [False, True])
+def test_only_an_acknowledgement_with_a_faulty_probe_ends_over_temperature_with_one(is_faulty: bool) -> None:
     alarms = make_evaluator()
+    faulty = int(SampleStatus.PROBE_FAULT)
     add_samples(alarms, *range(20), temperature_c=70.0)
+    add_samples(alarms, *range(20, 25), temperature_c=70.0, status=faulty if is_faulty else 0)
     alarms.acknowledge("over_temperature")
-    add_samples(alarms, *range(20, 100), temperature_c=25.0, status=int(SampleStatus.PROBE_FAULT))
-    assert "over_temperature" not in alarms.active
+    add_samples(alarms, *range(25, 100), temperature_c=25.0, status=faulty)
+    assert ("over_temperature" in alarms.active) == (not is_faulty)
+
+
+async def test_an_alarm_of_a_cell_does_not_end_when_the_wire_of_the_cell_breaks(tmp_path: Path) -> None:
+    alarms = {"cell_under_voltage": {"clear_delay_s": 2.0}}
+    low, good = (2.5, 3.7), (3.7, 3.7)
+    lines = [Line(10, cells_v=good), Line(10, cells_v=low), Line(8, cells_v=low[1:]), Line(5, cells_v=good)]
+    result = await replayed(record(tmp_path / "capture.bms", lines), settings(alarms))
+    assert result.transitions("cell_under_voltage") == [(15.0, True), (30.0, False)]
+
+
+async def test_a_missing_probe_stays_missing_over_a_restart_until_a_person_acknowledges(tmp_path: Path) -> None:
+    lines = [Line(10, temperatures_c=(25.0, 40.0)), Line(20, temperatures_c=(25.0,))]
+    before = await replayed(record(tmp_path / "one.bms", lines), settings())
+    assert before.transitions("sensor_fault") == [(20.0, True)]
+    alarms = make_evaluator()
+    alarms.restore(before.saved_state)
+    assert "probes" in json.loads(alarms.saved_state)
+    alarms.acknowledge("sensor_fault")
+    assert "probes" not in json.loads(alarms.saved_state)
+
+
+def test_a_crash_within_the_delay_of_a_critical_alarm_raises_it() -> None:
+    before, after = (make_evaluator() for _ in range(2))
+    add_samples(before, 0.0, 1.0, temperature_c=70.0)
+    after.restore(before.saved_state, crashed_s=WALL_S)
+    assert after.active == ("over_temperature",)
 
 
 def test_restarts_within_the_delay_of_a_critical_alarm_do_not_prevent_it() -> None:

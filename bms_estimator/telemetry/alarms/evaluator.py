@@ -47,8 +47,9 @@ SILENCE = "silence"
 PENDING = "pending"
 """Key of the critical alarms whose delay runs, in the saved state."""
 PROBES = "probes"
-"""Key of the number of temperature probes while ``over_temperature`` is raised or pending, in the saved state. All keys but these
-four are names of alarms."""
+"""Key of the number of temperature probes, in the saved state. All keys but these four are names of alarms."""
+MIN_WATCHED_S = 10.0
+"""Minimum duration of the samples after which alarms count as watched [s]. The delays of most critical alarms are not longer."""
 NO_FORECAST = unknown_values()
 """Forecast at all samples of a pack without a forecaster."""
 WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
@@ -100,11 +101,11 @@ class AlarmEvaluator:
 
     @property
     def is_watching(self) -> bool:
-        """True if samples have arrived for ``lost_s`` since the start or a silence, and no delay of a critical alarm runs.
+        """True if enough samples have arrived since the start or a silence, and no delay of a critical alarm runs.
 
         A relay may only then follow the alarms, because before that a due alarm may not be raised yet.
         """
-        return (self._watched_s or 0.0) >= self._inputs.lost_s and not self._alarms.pending
+        return (self._watched_s or 0.0) >= max(self._inputs.lost_s, MIN_WATCHED_S) and not self._alarms.pending
 
     @property
     def rows(self) -> int:
@@ -256,6 +257,8 @@ class AlarmEvaluator:
             name: Name of the alarm; None: all.
         """
         acknowledged = self._alarms.acknowledge(name, self._at_s)
+        if "sensor_fault" in acknowledged:
+            self._probe_faults.expected = 0  # a missing probe was removed
         self._save_state()
         return acknowledged
 
@@ -284,8 +287,13 @@ class AlarmEvaluator:
         """
         return self._alarms.report()
 
-    def restore(self, saved_state: str) -> str:
+    def restore(self, saved_state: str, crashed_s: float | None = None) -> str:
         """Restore the ``saved_state`` of an earlier run.
+
+        Args:
+            saved_state: The saved state.
+            crashed_s: Wall clock [s since 1970] if the earlier run crashed or was killed, perhaps because the cause of an alarm
+                cut its power. Alarms whose delay ran are then raised. None: it ended cleanly, and the delays resume.
 
         Returns:
             Reason for which raised critical alarms are missing; empty if none are.
@@ -302,7 +310,9 @@ class AlarmEvaluator:
         unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, {})
         missing = self._alarms.restore(entries, unwatched)
         for name in pending:
-            if state := self._alarms.states.get(name):
+            if crashed_s is not None:
+                self._alarms.raise_at(name, self._at_s, RaisedAlarm(crashed_s, None))
+            elif state := self._alarms.states.get(name):
                 state.resume_delay()
         self._save_state()
         return f"no longer monitored, but raised before the restart: {', '.join(missing)}" if missing else ""
@@ -334,10 +344,15 @@ class AlarmEvaluator:
         self._watched_s = float(observed_s[1:].sum() if self._watched_s is None else self._watched_s + observed_s.sum())
         samples, cells, unusable = self._without_impossible(samples, cells)
         has_probe_fault = (samples["status"] & SampleStatus.PROBE_FAULT) != 0
+        lacks_cell = (cells[:, 2] > 0) & (cells[:, 2] < self._inputs.cells)
+        # heat destroys probes, and a broken wire hides a cell, so that the missing value may still be beyond the limit
+        uncertain: dict[AlarmName, NDArray[np.bool_]] = {
+            "over_temperature": has_probe_fault,
+            "cell_over_voltage": lacks_cell,
+            "cell_under_voltage": lacks_cell,
+        }
         for name, series in measured_values(samples, cells, self._charging_a).items():
-            # heat destroys probes, so that with a faulty one the pack may still be as hot as before
-            uncertain = has_probe_fault if name == "over_temperature" else None
-            self._alarms.update(name, times_s, observed_s, series, wall_offset_s, uncertain=uncertain)
+            self._alarms.update(name, times_s, observed_s, series, wall_offset_s, uncertain=uncertain.get(name))
         gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # duration of the gap before each sample [s]; 0: no gap
         self._alarms.update("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
         counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
@@ -406,6 +421,6 @@ class AlarmEvaluator:
             saved[SILENCE] = self._silence_reason
         if pending := self._alarms.pending:
             saved[PENDING] = pending
-        if self._probe_faults.expected and "over_temperature" in (*self._alarms.active, *pending):
+        if self._probe_faults.expected > 1:
             saved[PROBES] = self._probe_faults.expected
         self.saved_state = json.dumps(saved) if saved else ""

@@ -91,6 +91,11 @@ class Inputs:
         """State for ``restore`` after a restart."""
         return {name: [each.max_count, each.lost] for name, each in self._inputs.items() if each.max_count or each.lost}
 
+    @property
+    def cells(self) -> int:
+        """Largest number of cell voltages in a sample so far."""
+        return self._inputs["cells"].max_count
+
     def were_measured(self, names: Collection[Quantity]) -> bool:
         """Return True if all these quantities were measured at some time."""
         return all(self._inputs[name].max_count for name in names)

@@ -52,6 +52,10 @@ class AlarmState:
     """Time without values since the last value [s]."""
     _held_s: float | None = None
     """Time for which the condition of the next state has held [s]; None: it does not hold."""
+    _is_uncertain: bool = False
+    """True if the last value was uncertain."""
+    _accepts_uncertain: bool = False
+    """True if the alarm was acknowledged at an uncertain value."""
 
     @property
     def is_pending(self) -> bool:
@@ -74,7 +78,7 @@ class AlarmState:
             values: Values in the unit of the limit, shape (n,). NaN (not measured) neither raises nor ends the alarm.
             wall_offset_s: Wall clock minus the samples' clock [s].
             uncertain: True where the true value may be beyond the limit, shape (n,). Such a value neither ends the alarm nor its
-                delay, unless the alarm is acknowledged. None: nowhere.
+                delay, unless the alarm was acknowledged at such a value. None: nowhere.
 
         Returns:
             Transitions, oldest first.
@@ -89,7 +93,8 @@ class AlarmState:
         are_uncertain = [False] * values.size if uncertain is None else uncertain.tolist()
         rows = zip(times_s.tolist(), steps_s.tolist(), signed.tolist(), are_uncertain, strict=True)
         for at_s, step_s, measured, is_uncertain in rows:
-            keeps_state = is_uncertain and (self.is_pending or (self.raised and not self.acknowledged))
+            self._is_uncertain = is_uncertain
+            keeps_state = is_uncertain and (self.is_pending or (self.raised and not self._accepts_uncertain))
             value = max(sign * self.definition.limit, measured) if keeps_state else measured
             if math.isnan(value):
                 self._missing_s += step_s
@@ -110,6 +115,7 @@ class AlarmState:
     def acknowledge(self) -> bool:
         """Acknowledge the alarm. Return True if that ends it."""
         self.acknowledged = self.raised is not None
+        self._accepts_uncertain = self._is_uncertain
         if not self.cause_cleared:
             return False
         self._end()
@@ -153,3 +159,4 @@ class AlarmState:
 
     def _end(self) -> None:
         self.raised, self.cause_cleared, self.acknowledged, self._held_s = None, False, False, None
+        self._accepts_uncertain = False
