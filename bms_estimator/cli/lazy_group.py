@@ -32,11 +32,12 @@ class LazyGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Import and return the command that is called."""
         name, placeholder, remaining_args = super().resolve_command(ctx, args)
-        command = _import(name, self.entries[name]) if name in self.entries else placeholder
+        command = import_command(name, self.entries[name]) if name in self.entries else placeholder
         return name, command, remaining_args
 
 
-def _import(name: str, entry: LazyCommand) -> Any:
+def import_command(name: str, entry: LazyCommand) -> Any:
+    """Import a command or a group of commands."""
     module, attribute = entry.target.split(":")
     target = getattr(importlib.import_module(module), attribute)
     if not isinstance(target, typer.Typer):

@@ -6,13 +6,10 @@ All modules of ``protocols.devices`` are registered automatically, so that a new
 import importlib
 import pkgutil
 from collections.abc import Mapping
-from typing import Protocol
 
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols import devices
-from bms_estimator.protocols.base.device import Device
+from bms_estimator.protocols.base.device import Device, Sensor
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
-from bms_estimator.protocols.base.sensor_correction import SensorCorrection
 
 BOARD = "binary"
 """Name of the firmware's protocol. It is not a ``Device``, because its decoder imports numba, which other devices do not need."""
@@ -41,28 +38,9 @@ def valid_addresses(protocol: str) -> range:
     return DEVICES[protocol].addresses if protocol in DEVICES else range(0)
 
 
-class Sensor(Protocol):
-    """Part of ``[sensor]`` that a protocol depends on."""
-
-    @property
-    def protocol(self) -> str:
-        """Name of the protocol, one of ``PROTOCOLS``."""
-
-    @property
-    def current_sign(self) -> CurrentSign:
-        """Direction of the current that the device reports as positive."""
-
-    @property
-    def address(self) -> int | None:
-        """Address of the device on its bus; None: the first that responds."""
-
-    @property
-    def sample_rate_hz(self) -> int:
-        """Sample rate that a board of the firmware is set to [Hz]."""
-
-    @property
-    def correction(self) -> SensorCorrection:
-        """Correction of the measured values."""
+def max_batteries(protocol: str) -> int:
+    """Return the maximum number of batteries in parallel whose values a protocol sums; 1: it has one battery."""
+    return DEVICES[protocol].max_batteries if protocol in DEVICES else 1
 
 
 def make_protocol(sensor: Sensor) -> DeviceProtocol:
@@ -77,4 +55,4 @@ def _make_uncorrected(sensor: Sensor) -> DeviceProtocol:
         from bms_estimator.protocols.firmware.protocol import BoardProtocol  # noqa: PLC0415 - it loads numba
 
         return BoardProtocol(current_sign=sensor.current_sign, rate_hz=sensor.sample_rate_hz)
-    return DEVICES[sensor.protocol].make(sensor.current_sign, sensor.address)
+    return DEVICES[sensor.protocol].make(sensor)

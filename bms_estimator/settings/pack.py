@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from bms_estimator.model.config_file import Fraction, Positive, Strict, read_toml
+from bms_estimator.protocols.registry import max_batteries
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.charge_limits import ChargeLimits
 from bms_estimator.settings.edge import EdgeSettings
@@ -206,6 +207,20 @@ class Settings(Strict):
         return tables | {
             "sensor": {"period_s": source.period_s, **source.sensor_defaults, **configured, "protocol": "text"}
         }
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expect_all_batteries(cls, tables: object) -> object:
+        """Set ``sensor.batteries`` to ``pack.parallel``, if the protocol sums the values of as many batteries."""
+        if not isinstance(tables, dict):
+            return tables
+        pack, sensor = tables.get("pack"), tables.get("sensor")
+        if not isinstance(pack, dict) or not isinstance(sensor, dict):
+            return tables
+        parallel, protocol = pack.get("parallel"), sensor.get("protocol")
+        if isinstance(parallel, int) and isinstance(protocol, str) and 1 < parallel <= max_batteries(protocol):
+            return tables | {"sensor": {"batteries": parallel} | sensor}
+        return tables
 
     @property
     def charge_limits(self) -> ChargeLimits:

@@ -7,7 +7,7 @@ from pydantic import Field, ModelWrapValidatorHandler, model_validator
 from bms_estimator.model.config_file import NotNegative, Positive, Strict
 from bms_estimator.model.one_of import OneOf
 from bms_estimator.protocols.base.sensor_correction import SensorCorrection
-from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS, valid_addresses
+from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS, max_batteries, valid_addresses
 from bms_estimator.settings.sampling import BOARD_GAIN_STD
 
 ALLOWED_WITH_SOURCE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
@@ -50,6 +50,10 @@ class SensorSettings(Strict):
     address: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
         description="address of the BMS on a shared RS485 line, for daly (board number) and jk; default: the first address that responds",
+    )
+    batteries: Annotated[int, Field(ge=1)] | None = Field(
+        default=None,
+        description="number of batteries in parallel that the console of a pylontech stack reports; a table with fewer is rejected; default: pack.parallel, if it is 2 or more",
     )
     baud: Annotated[int, Field(ge=1200, le=10_000_000)] = Field(
         default=500_000, description="baud rate of the serial port; default: depends on the protocol"
@@ -125,6 +129,12 @@ class SensorSettings(Strict):
         if not addresses:
             raise ValueError(f"address: the protocol {self.protocol} has no addresses; remove address")
         raise ValueError(f"address: {self.protocol} has addresses {addresses[0]} to {addresses[-1]}")
+
+    @model_validator(mode="after")
+    def _protocol_has_the_batteries(self) -> Self:
+        if self.batteries is not None and self.batteries > (limit := max_batteries(self.protocol)):
+            raise ValueError(f"batteries: the protocol {self.protocol} has at most {limit}")
+        return self
 
     @property
     def correction(self) -> SensorCorrection:

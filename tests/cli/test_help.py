@@ -3,10 +3,14 @@
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
+from rich.text import Text
 
 from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
+from bms_estimator.cli.lazy_group import import_command
 from bms_estimator.cli.main import COMMANDS
 from tests.command_line import PROGRAM, run
 
@@ -14,9 +18,23 @@ SLOW_PACKAGES = {"aiohttp", "aiomqtt", "numba", "numpy", "pydantic", "scipy", "s
 """Packages that the list of commands must not import."""
 
 
+def help_texts(command: Any) -> Iterator[str]:
+    """Yield the help texts of the options and arguments of a command, and of its subcommands."""
+    yield from (text for parameter in command.params if (text := getattr(parameter, "help", None)))
+    for subcommand in getattr(command, "commands", {}).values():
+        yield from help_texts(subcommand)
+
+
 @pytest.mark.parametrize("words", [[], *([name] for name in COMMANDS), *(["fleet", name] for name in FLEET_COMMANDS)])
 def test_h_is_a_short_form_of_help(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
     assert run(capsys, *words, "-h") == run(capsys, *words, "--help")
+
+
+def test_no_bracket_of_a_help_text_is_read_as_markup() -> None:
+    commands = [import_command(name, entry) for name, entry in [*COMMANDS.items(), *FLEET_COMMANDS.items()]]
+    texts = [text for command in commands for text in help_texts(command)]
+    assert len(texts) > 100
+    assert [text for text in texts if Text.from_markup(text).plain != text.replace("\\[", "[")] == []
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,9 @@ from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.devices.text import TextProtocol
 
 DEVICE = Device(
-    "shunt", lambda sign, _: TextProtocol(current_sign=sign), SensorDefaults(2400, "charge_positive", 5.0, 0.05, 0.02, 0.3)
+    "shunt",
+    lambda sensor: TextProtocol(current_sign=sensor.current_sign),
+    SensorDefaults(2400, "charge_positive", 5.0, 0.05, 0.02, 0.3),
 )
 """
 """Module that registers protocol ``shunt``: 2400 baud, a period of 5 s and a current dead band of 0.3 A."""

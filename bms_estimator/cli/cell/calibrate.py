@@ -105,7 +105,7 @@ def calibrate_command(
         int,
         typer.Option(
             parser=whole(1, 3600),
-            help="with --relay: time without a command after which the board itself disconnects the load [s]",
+            help="with --relay: time without a command after which the board itself disconnects the load, in s",
         ),
     ] = 10,
     force: Force = False,

@@ -94,7 +94,7 @@ MappedColumns = Annotated[
         parser=parse_column_map,
         metavar="time=COLUMN,...",
         help="columns of a table for some of time, current, voltage and temperature; a unit may follow a name, as in "
-        "'time=Time [ms]'; sheet=SHEET chooses a sheet of a spreadsheet",
+        "'time=Time \\[ms]'; sheet=SHEET chooses a sheet of a spreadsheet",
         show_default=False,
     ),
 ]

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.protocols.base.sensor_correction import SensorCorrection
 
 BMS_GAIN_STD = 0.005
 """Relative std of the gains of a BMS. Vendors state 0.5 % for the pack voltage, and seldom a smaller error."""
@@ -32,6 +34,34 @@ class SensorDefaults:
     """Relative std of the current sensor's gain."""
 
 
+class Sensor(Protocol):
+    """Part of ``[sensor]`` that a protocol depends on."""
+
+    @property
+    def protocol(self) -> str:
+        """Name of the protocol, one of ``PROTOCOLS``."""
+
+    @property
+    def current_sign(self) -> CurrentSign:
+        """Direction of the current that the device reports as positive."""
+
+    @property
+    def address(self) -> int | None:
+        """Address of the device on its bus; None: the first that responds."""
+
+    @property
+    def batteries(self) -> int | None:
+        """Number of batteries whose values are summed; None: as many as the first reading has."""
+
+    @property
+    def sample_rate_hz(self) -> int:
+        """Sample rate that a board of the firmware is set to [Hz]."""
+
+    @property
+    def correction(self) -> SensorCorrection:
+        """Correction of the measured values."""
+
+
 @dataclass(frozen=True)
 class Device:
     """Kind of device.
@@ -40,15 +70,17 @@ class Device:
 
     Attributes:
         name: Value of ``sensor.protocol``.
-        make: Creates the protocol from the sign of the current and the address (None: the first device that responds).
+        make: Creates the protocol.
         sensor_defaults: Defaults of ``[sensor]``.
         has_binary_frames: True if the frames are not lines of text. A device search sends binary queries last, because a device that
             reads lines would interpret them as the beginning of a line.
         addresses: Valid values of ``sensor.address``; empty: the protocol has no addresses.
+        max_batteries: Maximum number of batteries in parallel whose values are summed; 1: the protocol has one battery.
     """
 
     name: str
-    make: Callable[[CurrentSign, int | None], DeviceProtocol]
+    make: Callable[[Sensor], DeviceProtocol]
     sensor_defaults: SensorDefaults
     has_binary_frames: bool = False
     addresses: range = range(0)
+    max_batteries: int = 1

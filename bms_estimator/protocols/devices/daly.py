@@ -150,7 +150,7 @@ class DalyProtocol(PolledProtocol):
 
 DEVICE = Device(
     "daly",
-    lambda sign, address: DalyProtocol(current_sign=sign, address=address),
+    lambda sensor: DalyProtocol(current_sign=sensor.current_sign, address=sensor.address),
     SensorDefaults(
         baud=9600,
         current_sign=None,

@@ -114,7 +114,7 @@ def _whole_words(data: bytes) -> bytes:
 
 DEVICE = Device(
     "jbd",
-    lambda sign, _: JbdProtocol(current_sign=sign),
+    lambda sensor: JbdProtocol(current_sign=sensor.current_sign),
     SensorDefaults(
         baud=9600,
         current_sign="charge_positive",

@@ -264,7 +264,7 @@ def _number(content: bytes) -> int:
 
 DEVICE = Device(
     "jk",
-    lambda sign, address: JkProtocol(current_sign=sign, address=address),
+    lambda sensor: JkProtocol(current_sign=sensor.current_sign, address=sensor.address),
     SensorDefaults(
         baud=115_200,
         current_sign="charge_positive",

@@ -139,7 +139,7 @@ class JunctekProtocol(ReadingProtocol):
 
 DEVICE = Device(
     "junctek",
-    lambda sign, _: JunctekProtocol(current_sign=sign),
+    lambda sensor: JunctekProtocol(current_sign=sensor.current_sign),
     SensorDefaults(
         baud=115_200,
         current_sign="charge_positive",

@@ -5,7 +5,7 @@ prompt follows each table. Voltages in mV, currents in mA and positive on charge
 Celsius.
 There is no checksum, and a reading is a sum over batteries. A table is therefore accepted only if it ends with the success
 message, its rows are numbered without a gap, no row has more columns than the header, and no battery is missing that was
-present before.
+present before, or that the settings name.
 """
 
 import itertools
@@ -62,13 +62,15 @@ class PylontechProtocol(ReadingProtocol):
 
     Args:
         current_sign: Direction of positive current. The device reports charge as positive.
+        batteries: Number of batteries of the stack; None: as many as the first table has.
     """
 
-    def __init__(self, *, current_sign: CurrentSign = "charge_positive") -> None:
+    def __init__(self, *, current_sign: CurrentSign = "charge_positive", batteries: int | None = None) -> None:
         super().__init__(current_sign, ("text_errors", "length_errors"))
         self._unparsed = b""
         self._cells = dict[int, RecentCellVoltages]()
         self._batteries: tuple[int, ...] = ()
+        self._expected = batteries
         self._table_s = -math.inf  # arrival time of the last complete table
         self._responses = 0
         self._cycle_s = self._query_s = -math.inf
@@ -198,6 +200,14 @@ class PylontechProtocol(ReadingProtocol):
                 "text_errors", f"the table has no values of battery {absent}: the sum would lack a part of the current"
             )
             return None
+        if self._expected is not None and len(batteries) < self._expected:
+            numbers = ", ".join(map(str, batteries))
+            self._count_fault(
+                "text_errors",
+                f"the table has only battery {numbers}, but pack.parallel is {self._expected}: connect the others, or set "
+                "pack.parallel to the number of batteries",
+            )
+            return None
         voltages_v = [1e-3 * _parse_integer(row[voltage]) for row in present]
         currents_a = [1e-3 * _parse_integer(row[current]) for row in present]
         cell_temperatures = [[row[lowest_temperature], row[highest_temperature]] for row in present]
@@ -249,7 +259,7 @@ def _mean(values: Sequence[float]) -> float:
 
 DEVICE = Device(
     "pylontech",
-    lambda sign, _: PylontechProtocol(current_sign=sign),
+    lambda sensor: PylontechProtocol(current_sign=sensor.current_sign, batteries=sensor.batteries),
     SensorDefaults(
         baud=115_200,
         current_sign="charge_positive",
@@ -258,5 +268,6 @@ DEVICE = Device(
         current_resolution_a=0.01,
         current_dead_band_a=0.1,
     ),
+    max_batteries=MAX_BATTERIES,
 )
 """The table has steps of 1 mV and 1 mA. In public captures the smallest nonzero current is 149 mA, next to many zeros."""

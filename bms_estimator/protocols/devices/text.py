@@ -157,7 +157,7 @@ def _status(reading: Reading) -> int:
 
 DEVICE = Device(
     "text",
-    lambda sign, _: TextProtocol(current_sign=sign),
+    lambda sensor: TextProtocol(current_sign=sensor.current_sign),
     SensorDefaults(period_s=1.0),
 )
 """Boards print at their own pace, usually once a second."""

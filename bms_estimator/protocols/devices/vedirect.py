@@ -100,7 +100,7 @@ class VeDirectProtocol(ReadingProtocol):
 
 DEVICE = Device(
     "vedirect",
-    lambda sign, _: VeDirectProtocol(current_sign=sign),
+    lambda sensor: VeDirectProtocol(current_sign=sensor.current_sign),
     SensorDefaults(
         baud=19_200,
         current_sign="charge_positive",

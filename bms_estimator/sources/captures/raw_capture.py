@@ -77,6 +77,8 @@ class CaptureHeader:
     version: int = VERSION
     address: int | None = None
     """Address of the recorded pack, if the line had several."""
+    batteries: int | None = None
+    """Number of batteries in parallel, if the protocol sums their values."""
     voltage_gain: float = 1.0
     current_gain: float = 1.0
     current_zero_a: float = 0.0
@@ -92,7 +94,9 @@ def make_header(sensor: SensorSettings, source: BaseSource | None = None) -> Cap
     if source is not None:
         device = CaptureHeader(sensor.protocol, source.short_description)
     else:
-        device = CaptureHeader(sensor.protocol, sensor.port, sensor.baud, address=sensor.address)
+        device = CaptureHeader(
+            sensor.protocol, sensor.port, sensor.baud, address=sensor.address, batteries=sensor.batteries
+        )
     decoder_settings = {name: getattr(sensor, name) for name in ("current_sign", *CORRECTIONS)}
     return dataclasses.replace(device, **decoder_settings)
 
@@ -107,7 +111,8 @@ def read_sensor_settings(path: Path) -> SensorSettings:
     try:
         # earlier versions accepted an address for each protocol
         address = header.address if header.address in valid_addresses(header.mode) else None
-        fields = {"protocol": header.mode, "current_sign": header.current_sign, "address": address}
+        device = {"protocol": header.mode, "address": address, "batteries": header.batteries}
+        fields = device | {"current_sign": header.current_sign}
         corrections = {name: getattr(header, name) for name in CORRECTIONS}
         return SensorSettings.model_validate(fields | corrections)
     except ValidationError:

@@ -143,7 +143,9 @@ def test_row_of_the_table_gives_the_settings_of_a_pack():
 
 def test_columns_are_the_settings_of_a_pack_file_that_change_an_estimate():
     """A new setting must become a column, unless the edge or the worker handles it."""
-    handled_by_the_edge = {"port", "serial", "address", "baud", "sample_rate_hz", "current_sign"} | set(CORRECTIONS)
+    handled_by_the_edge = {"port", "serial", "address", "batteries", "baud", "sample_rate_hz", "current_sign"} | set(
+        CORRECTIONS
+    )
     fixed_by_the_worker = {"enabled", "pack_model", "cutoff_v"}  # cutoff_v: a worker makes no forecasts
     settings = {name for section in (PackSettings, SensorSettings, IdentifierSettings) for name in section.model_fields}
     assert settings - handled_by_the_edge - fixed_by_the_worker == set(COLUMNS) - {"pack"} | {"name"}

@@ -4,6 +4,7 @@ import asyncio
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +18,12 @@ from bms_estimator.protocols.devices.junctek import QUERY, JunctekProtocol
 from bms_estimator.protocols.devices.pylontech import PylontechProtocol
 from bms_estimator.protocols.devices.vedirect import VeDirectProtocol
 from bms_estimator.protocols.registry import make_protocol
+from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header
+from bms_estimator.sources.captures.replay import RawCapture
 from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.patience import LONG_S
 
@@ -276,6 +280,21 @@ def test_the_currents_of_an_incomplete_stack_are_not_summed(rows: list[str], mes
     assert decoder.counters["text_errors"] + decoder.counters["length_errors"] == 299
     assert decoder.feed(600.0, stack_response(STACK))["current_a"].tolist() == [STACK_CURRENT_A]
     assert decoder.fault is None
+
+
+def test_a_battery_that_is_absent_from_the_first_table_on_is_noticed_by_the_settings(tmp_path: Path) -> None:
+    settings = Settings.model_validate(
+        {"pack": {"cell": "lfp", "capacity_ah": 100, "parallel": 4}, "sensor": {"protocol": "pylontech"}}
+    )
+    three = stack_response([*STACK[:3], absent_row(4), *STACK[4:]])
+    decoder = make_protocol(settings.sensor)
+    assert decoder.feed(0.0, three).size == 0
+    assert "only battery 1, 2, 3, but pack.parallel is 4" in (decoder.fault or "")
+    assert decoder.feed(4000.0, three).size == 0
+    assert decoder.feed(4002.0, stack_response(STACK))["current_a"].tolist() == [STACK_CURRENT_A]
+    with CaptureWriter(tmp_path / "capture.bms", make_header(settings.sensor)) as writer:
+        writer.write(0.0, three)
+    assert not list(RawCapture(tmp_path / "capture.bms"))
 
 
 def test_a_battery_that_is_absent_for_an_hour_counts_as_removed_and_a_new_one_counts_at_once() -> None:
