@@ -150,8 +150,9 @@ class RunFile:
         return sorted(paths, key=lambda path: path.lstat().st_mtime_ns, reverse=True)
 
     def _has_other_files(self) -> bool:
-        """Return True if an earlier run has left a history, a load, a database, or a damaged or unfinished file with counters."""
-        pattern = re.compile(rf"{re.escape(self._name)}(-[0-9a-f]{{8}})?\.(.*\.npz|sqlite.*|refused\.run|new)")
+        """Return True if an earlier run has left any other file."""
+        suffixes = r".*\.npz|changes-\d|sqlite.*|board\.json|refused\.run|new"
+        pattern = re.compile(rf"{re.escape(self._name)}(-[0-9a-f]{{8}})?\.({suffixes})")
         return any(pattern.fullmatch(path.name) for path in self._folder_content())
 
     def _other_pack_with_alarm(self) -> str:

@@ -48,11 +48,10 @@ def _acknowledge_all() -> None:
 def startup_signals() -> Iterator[None]:
     """Exit with code 0 on SIGTERM or SIGHUP until an event loop handles them. There is no state to save yet.
 
-    SIGUSR1 is ignored, because no alarm is known yet. An ignored SIGHUP stays ignored, as under nohup.
+    An ignored SIGHUP stays ignored, as under nohup.
     """
     unignored = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
     previous_handlers = {number: signal.signal(number, _end) for number in unignored}
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
     try:
         yield
     finally:

@@ -106,10 +106,7 @@ class CheckpointWriter:
         # until the final save marks the run as clean, the next start counts it as crashed
         run_failed, run_tried_s = not await self._save_counters(), loop.time()
         if run_failed:
-            path = self._checkpoint.run_file.path
-            self._publisher.alarm_monitor.raise_state_lost(
-                f"{path.name} cannot be written, so that a restart loses alarms"
-            )
+            self._raise_state_lost()
         while True:
             await self._wait_for_alarm(min(CHECK_S, self._interval_s))
             run_delay_s = RETRY_S if run_failed else self._delay_of_counters_s
@@ -117,6 +114,8 @@ class CheckpointWriter:
                 self._saved_counters, run_delay_s = None, 0.0
             if loop.time() >= run_tried_s + run_delay_s:
                 run_failed, run_tried_s = not await self._save_counters(), loop.time()
+                if run_failed and self._lacks_alarm:
+                    self._raise_state_lost()
             if loop.time() >= tried_s + self._interval_s or (self._needs_save and not failed):
                 history_saved = await self._save_history()
                 failed = not (await self._save() and history_saved)
@@ -124,6 +123,10 @@ class CheckpointWriter:
             if loop.time() >= load_tried_s + LOAD_SAVE_S:
                 await self._save_load()
                 load_tried_s = loop.time()
+
+    def _raise_state_lost(self) -> None:
+        name = self._checkpoint.run_file.path.name
+        self._publisher.alarm_monitor.raise_state_lost(f"{name} cannot be written, so that a restart loses alarms")
 
     async def _wait_for_alarm(self, pause_s: float) -> None:
         """Wait for ``pause_s``, or until an alarm changes: its cause may be about to cut the power of this computer."""
@@ -172,10 +175,15 @@ class CheckpointWriter:
         """Minimum interval between two saves of counters and alarms [s]; 0 if the next one is urgent."""
         if self._saved_counters is None:
             return 0.0
-        saved, alarms = self._saved_counters.alarms, self._alarms.saved_state
-        if alarms == saved:
+        if self._alarms.saved_state == self._saved_counters.alarms:
             return self._interval_s
-        return 0.0 if lacks_alarm(saved, alarms) else min(ALARM_SAVE_S, self._interval_s)
+        return 0.0 if self._lacks_alarm else min(ALARM_SAVE_S, self._interval_s)
+
+    @property
+    def _lacks_alarm(self) -> bool:
+        """True if the last save lacks a raised alarm."""
+        saved = self._saved_counters.alarms if self._saved_counters else ""
+        return lacks_alarm(saved, self._alarms.saved_state)
 
     async def _is_run_file_missing(self) -> bool:
         """Return True if the file with counters and alarms was deleted."""

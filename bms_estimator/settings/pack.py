@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from bms_estimator.model.config_file import Fraction, Positive, Strict, read_toml
+from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.registry import max_batteries
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.charge_limits import ChargeLimits
@@ -244,6 +245,9 @@ def load_settings(path: Path) -> Settings:
     """Read a pack's settings.
 
     Raises:
-        UserError: The file cannot be read, or a setting is invalid.
+        UserError: The file cannot be read or is empty, or a setting is invalid.
     """
-    return read_toml(path, Settings)
+    settings = read_toml(path, Settings)
+    if not settings.model_fields_set:
+        raise UserError(f"{path}: has no settings; was it cut off? `bms-estimator new` writes a new file")
+    return settings

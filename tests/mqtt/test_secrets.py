@@ -39,7 +39,7 @@ def test_error_on_a_url_hides_the_password(tmp_path: Path, capsys: pytest.Captur
 
 def test_error_on_a_command_line_url_hides_the_password(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pack = tmp_path / "pack.toml"
-    pack.write_text("")
+    pack.write_text("[pack]\n")
     for url in URLS_WITH_PASSWORD:
         code, out, err = run(capsys, "run", pack, "--mqtt", url)
         assert (code, "--mqtt" in err, SECRET in out + err) == (2, True, False), url

@@ -477,6 +477,30 @@ async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full
     await asyncio.wait_for(task, LONG_S)
 
 
+async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
+    folder = tmp_path / "state"
+    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(folder, SETTINGS, CELL)
+    task = asyncio.create_task(
+        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    async with asyncio.timeout(LONG_S):
+        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+    folder.rename(tmp_path / "former")
+    folder.write_text("a file instead of the folder")
+    source.give(*OVER_VOLTAGE)
+    await sink.until(
+        lambda s: "alarm_state_lost" in (alarms := by_name(s.alarms)) and alarms["alarm_state_lost"].active
+    )
+    assert "cannot be written" in by_name(sink.snapshots[-1].alarms)["alarm_state_lost"].text
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+
+
 async def test_a_kill_within_the_delay_of_an_alarm_raises_it_although_its_cause_is_gone(tmp_path: Path) -> None:
     source, checkpoint = ScriptedSource(), CheckpointFile(tmp_path, SETTINGS, CELL)
     task = asyncio.create_task(
@@ -529,7 +553,11 @@ async def test_a_start_that_cannot_save_alarms_takes_the_safe_side(tmp_path: Pat
     unwritable = await run(disk_without_files / "state", NORMAL)
     assert "cannot be written" in unwritable.alarms["alarm_state_lost"].text
     assert not any(unwritable.relay)
-    (tmp_path / "pack.new").touch()
+
+
+@pytest.mark.parametrize("left", ["pack.new", "pack.board.json", "pack-3105fc89.changes-0"])
+async def test_a_start_beside_any_file_of_an_earlier_run_takes_the_safe_side(tmp_path: Path, left: str) -> None:
+    (tmp_path / left).touch()
     assert (await run(tmp_path, NORMAL)).alarms["alarm_state_lost"].active
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from structlog.testing import capture_logs
@@ -51,6 +52,20 @@ async def test_the_error_names_the_pack_that_cannot_be_served(
         packs.append((Settings.model_validate(tables), cell))
     with pytest.raises(UserError, match=f"^{re.escape(text)}"):
         await asyncio.wait_for(run_pack_services(packs), LONG_S)
+
+
+async def test_contradictory_limits_of_a_pack_are_an_error_before_any_service_starts(state_home: Path) -> None:
+    tables: list[dict[str, Any]] = [{}, {"alarms": {"over_temperature": {"limit_c": 60.0, "clear_c": 61.0}}}]
+    packs = [
+        (
+            Settings.model_validate({"pack": {"name": name}, "sensor": {"port": f"/dev/{name}"}} | table),
+            load_cell("leaf"),
+        )
+        for name, table in zip("ab", tables, strict=True)
+    ]
+    with pytest.raises(UserError, match=r"^b: .*clear_c"), capture_logs() as lines:
+        await asyncio.wait_for(run_pack_services(packs), LONG_S)
+    assert lines == []
 
 
 async def test_packs_without_a_serial_line_may_have_equal_port_settings(state_home: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import socket
+import subprocess
 import sys
 import time
 from asyncio.subprocess import Process
@@ -66,6 +67,19 @@ from bms_estimator.cli.main import main
 main()
 """
 """Program with the default action of SIGHUP. Under nohup it would inherit from the tests that SIGHUP is ignored."""
+
+
+ACKNOWLEDGED_DURING_IMPORT = """
+import os, signal, sys
+from bms_estimator.cli.main import main
+class Acknowledge:
+    def find_spec(self, name, *_):
+        if name == "bms_estimator.cli.live.run":
+            os.kill(os.getpid(), signal.SIGUSR1)
+sys.meta_path.insert(0, Acknowledge())
+main()
+"""
+"""Program that receives SIGUSR1 while it imports the module of ``run``."""
 
 
 SIGNAL_DURING_START = """
@@ -241,6 +255,12 @@ async def test_a_service_that_is_still_starting_ends_cleanly_on_a_signal(
         log = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
         assert await process.wait() == 0
     assert json.loads(log)["event"] == "asked to end before samples were taken"
+
+
+def test_an_acknowledgement_by_signal_does_not_end_a_service_that_is_still_imported(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", ACKNOWLEDGED_DURING_IMPORT, "run", tmp_path / "missing.toml"]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
+    assert (process.returncode, process.stderr.count("missing.toml: cannot be read")) == (2, 1), process.stderr
 
 
 async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_restarts_the_service(

@@ -110,9 +110,13 @@ def test_the_error_on_an_invalid_setting_names_key_value_and_allowed_values(
         load_settings(path)
 
 
-def test_empty_settings_are_the_defaults(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text", ["", "# [pack]\n"])
+def test_a_file_without_settings_is_an_error_because_it_may_be_cut_off(tmp_path: Path, text: str) -> None:
     path = tmp_path / "pack.toml"
-    path.write_text("")
+    path.write_text(text)
+    with pytest.raises(UserError, match="has no settings"):
+        load_settings(path)
+    path.write_text(f"{text}[pack]\n")
     assert load_settings(path) == Settings()
 
 
@@ -127,7 +131,7 @@ def test_the_gain_law_of_the_thesis_is_configurable(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "law"),
     [
-        ("", "improved"),
+        ("[pack]", "improved"),
         ("[identifier]\nenabled = false", "learning"),
         ('[identifier]\nenabled = false\n[observer]\nlaw = "improved"', "improved"),
     ],

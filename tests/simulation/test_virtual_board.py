@@ -30,6 +30,7 @@ from bms_estimator.protocols.firmware.messages import (
     unseal,
     zero_current_command,
 )
+from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading, compute_window
@@ -103,6 +104,24 @@ async def test_frames_contain_the_readings_within_the_resolution_of_the_adc() ->
     assert block["voltage_v"].mean() == pytest.approx(STEADY.voltage_v, abs=0.2 * DIVIDER * step_v)
     assert block["temperature_c"][-1] == pytest.approx(STEADY.temperature_c, abs=0.3)
     assert counters == FrameCounters(bytes_received=counters.bytes_received, frames_received=500)
+
+
+async def test_an_ntc_with_a_loose_contact_reads_its_temperature_or_nothing() -> None:
+    board = VirtualBoard(lambda s: Reading(0.0, 22.2, 80.0 if s % 2.6 < 1.3 else math.nan), speed=math.inf)
+    block, _ = decode(await receive(board, 1500))
+    measured_c = block["temperature_c"][np.isfinite(block["temperature_c"])]
+    assert 0.4 < measured_c.size / block.size < 0.6
+    assert measured_c == pytest.approx(80.0, abs=1.0)
+
+
+async def test_a_hot_ntc_that_fails_to_a_plausible_value_is_not_believed() -> None:
+    board = VirtualBoard(lambda s: Reading(0.0, 22.2, 80.0 if s < 13.0 else -12.0), speed=math.inf)
+    protocol = BoardProtocol()
+    block = protocol.feed(0.0, await receive(board, 1600))
+    assert block["temperature_c"][1200] == pytest.approx(80.0, abs=1.0)
+    assert np.isnan(block["temperature_c"][1400:]).all()
+    assert (block["status"][1400:] == SampleStatus.PROBE_FAULT).all()
+    assert protocol.counters["implausible"] == 1
 
 
 async def test_a_supply_other_than_5_v_does_not_change_the_measured_values() -> None:

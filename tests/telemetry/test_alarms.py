@@ -385,6 +385,27 @@ async def test_a_saturated_current_exceeds_any_limit() -> None:
     assert change.alarm.since == iso_utc(WALL_S)
 
 
+@pytest.mark.parametrize(
+    ("voltage_v", "status"),
+    [(0.05, SampleStatus(0)), (7.6, SampleStatus.VOLTAGE_SATURATED)],
+    ids=["broken wire", "range of the converter that sags with its supply"],
+)
+def test_a_voltage_that_cannot_be_measured_does_not_end_an_over_voltage(voltage_v: float, status: SampleStatus) -> None:
+    alarms = make_evaluator({"pack_over_voltage": {"latch": False}})
+    add_samples(alarms, *range(20), voltage_v=8.6)
+    assert alarms.active == ("pack_over_voltage",)
+    add_samples(alarms, *range(20, 100), voltage_v=voltage_v, status=int(status))
+    assert "pack_over_voltage" in alarms.active
+    add_samples(alarms, *range(100, 200), voltage_v=7.4)
+    assert "pack_over_voltage" not in alarms.active
+
+
+def test_a_saturated_voltage_exceeds_any_limit() -> None:
+    alarms = make_evaluator({"pack_over_voltage": {"limit_v": 9.0, "clear_v": 8.5}})
+    add_samples(alarms, *range(20), voltage_v=8.0, status=int(SampleStatus.VOLTAGE_SATURATED))
+    assert alarms.active == ("pack_over_voltage",)
+
+
 def test_a_latched_link_lost_is_active_again_during_a_second_silence() -> None:
     alarms = make_evaluator({"link_lost": {"latch": True}})
     # gone: the cause of the alarm has ended
@@ -503,10 +524,12 @@ async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None
     assert after.transitions("sensor_fault") == [(10.0, True)]
 
 
-def add_samples(alarms: AlarmEvaluator, *times_s: float, temperature_c: float = NAN, status: int = 0) -> None:
+def add_samples(
+    alarms: AlarmEvaluator, *times_s: float, temperature_c: float = NAN, voltage_v: float = 7.4, status: int = 0
+) -> None:
     """Evaluate samples of a pack at rest."""
     block = np.zeros(len(times_s), dtype=SAMPLE)
-    block["time_s"], block["voltage_v"], block["temperature_c"] = times_s, 7.4, temperature_c
+    block["time_s"], block["voltage_v"], block["temperature_c"] = times_s, voltage_v, temperature_c
     block["temperature_min_c"] = block["temperature_max_c"] = temperature_c
     block["status"] = status
     alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)

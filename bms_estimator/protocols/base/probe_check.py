@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import MAX_C, MIN_C, NO_PROBES, PROBE, ProbeBlock, SampleBlock, SampleStatus
 
 STEP_K = 30.0
@@ -75,6 +76,16 @@ class ProbeCheck:
             [list(zip(row_c, each.faulty, strict=True)) for row_c, each in zip(rows_c, checked, strict=True)]
         )
 
+    def apply_to_single_probe(self, block: SampleBlock) -> None:
+        """Check the only probe of a device, as ``apply`` does. Blocks without a remarkable reading are checked at once.
+
+        Args:
+            block: Samples with the readings of the probe as their temperatures; changed in place.
+        """
+        self._probes = self._probes or [_Probe()]
+        if not self._probes[0].accepts_all(block["time_s"], block["temperature_c"]):
+            self.apply(block, block["temperature_c"][:, None].tolist())
+
     def check(self, time_s: float, readings_c: Sequence[float]) -> CheckedProbes:
         """Check the readings of a sample.
 
@@ -123,6 +134,21 @@ class _Probe:
         self._doubted_c = math.nan  # previous reading if it was not credible
         self._hot_c, self._hot_s = -math.inf, 0.0  # last temperature above ``HOT_C`` that was sustained, and its time
         self._rise_c, self._rise_s = math.inf, 0.0  # lowest of the hotter readings since then, time of the first
+
+    def accepts_all(self, times_s: Floats, readings_c: Floats) -> bool:
+        """Accept readings that are all credible and not hot, or absent; otherwise return False, and change nothing."""
+        rows = np.flatnonzero(~np.isnan(readings_c))
+        if rows.size:
+            present_c = readings_c[rows]
+            range_c = np.append(present_c, self.credible_c) if not math.isnan(self.credible_c) else present_c
+            coldest_c = self._hot_c - COOLING_K_PER_S * (float(times_s[rows[0]]) - self._hot_s) - COOLING_TOLERANCE_K
+            lowest_c = max(coldest_c, max(OPEN_OR_SHORT_C[:2]) + OPEN_OR_SHORT_TOLERANCE_K)
+            if present_c.min() <= lowest_c or present_c.max() > HOT_C or np.ptp(range_c) > STEP_K:
+                return False
+            self.credible_c, self._credible_s = float(present_c[-1]), float(times_s[rows[-1]])
+            self._doubted_c, self._rise_c = math.nan, math.inf
+        self.was_faulty = False
+        return True
 
     def is_credible(self, time_s: float, reading_c: float) -> bool:
         """Return True if a reading is possible. An impossible change needs confirmation by the next reading."""

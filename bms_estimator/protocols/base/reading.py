@@ -97,7 +97,7 @@ def read_line(line: bytes) -> Reading | None:
         if len(columns) not in (2, 3):
             return None
         return Reading(number(columns[0]), number(columns[1]), tuple(measured(column) for column in columns[2:]))
-    except (ValueError, OverflowError, RecursionError):
+    except (ValueError, TypeError, OverflowError, RecursionError):
         return None
 
 

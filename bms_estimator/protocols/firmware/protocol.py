@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign, SampleBlock
 from bms_estimator.protocols.base.device_protocol import Command, DeviceProtocol
+from bms_estimator.protocols.base.probe_check import ProbeCheck
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import (
@@ -63,7 +64,7 @@ class BoardProtocol(DeviceProtocol):
     """
 
     def __init__(self, *, current_sign: CurrentSign = "discharge_positive", rate_hz: int | None = None) -> None:
-        self._decoder = FrameDecoder(current_sign=current_sign)
+        self._decoder, self._probe_check = FrameDecoder(current_sign=current_sign), ProbeCheck()
         self._rate_hz = rate_hz
         self._frame_end_at_opening = 0
         self._last_output, self._output_s = b"", -math.inf
@@ -72,7 +73,8 @@ class BoardProtocol(DeviceProtocol):
     @property
     def counters(self) -> Mapping[str, int]:
         """Counters of the decoder."""
-        return self._decoder.counters.as_dict()
+        counts = self._decoder.counters.as_dict()
+        return counts | {"implausible": counts["implausible"] + self._probe_check.faults}
 
     @property
     def fault(self) -> str | None:
@@ -127,6 +129,7 @@ class BoardProtocol(DeviceProtocol):
     def _decode(self, arrival_s: float, data: bytes) -> SampleBlock:
         """Decode the bytes of one read; for ``time_s`` see ``FrameDecoder.feed``."""
         block = self._decoder.feed(arrival_s, data)
+        self._probe_check.apply_to_single_probe(block)
         if self._command is not None:
             self._update_command(self._command)
         return block
@@ -135,7 +138,9 @@ class BoardProtocol(DeviceProtocol):
         self, arrivals_s: NDArray[np.float64], ends: NDArray[np.int64], data: NDArray[np.uint8]
     ) -> SampleBlock:
         """Decode many reads at once."""
-        return self._decoder.feed_reads(arrivals_s, ends, data)
+        block = self._decoder.feed_reads(arrivals_s, ends, data)
+        self._probe_check.apply_to_single_probe(block)
+        return block
 
     def next_output(self, now_s: float) -> bytes:
         """Return a request for the hello, then the pending command, then the rate command. Each is repeated until answered."""

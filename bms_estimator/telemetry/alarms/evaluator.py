@@ -54,6 +54,8 @@ NO_FORECAST = unknown_values()
 """Forecast at all samples of a pack without a forecaster."""
 WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
 """Text of a wrong clock that is right again at the end of a recorded block."""
+BROKEN_WIRE_V = 0.1
+"""Maximum voltage per cell of a broken wire [V]. No cell is charged so far that its pack then has an over-voltage."""
 _COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
 """Column of SAMPLE by quantity."""
 
@@ -345,8 +347,9 @@ class AlarmEvaluator:
         samples, cells, unusable = self._without_impossible(samples, cells)
         has_probe_fault = (samples["status"] & SampleStatus.PROBE_FAULT) != 0
         lacks_cell = (cells[:, 2] > 0) & (cells[:, 2] < self._inputs.cells)
-        # heat destroys probes, and a broken wire hides a cell, so that the missing value may still be beyond the limit
+        # heat destroys probes, and a broken wire hides a voltage, so that the missing value may still be beyond the limit
         uncertain: dict[AlarmName, NDArray[np.bool_]] = {
+            "pack_over_voltage": samples["voltage_v"] < BROKEN_WIRE_V * self._inputs.series,
             "over_temperature": has_probe_fault,
             "cell_over_voltage": lacks_cell,
             "cell_under_voltage": lacks_cell,

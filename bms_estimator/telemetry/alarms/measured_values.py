@@ -18,13 +18,16 @@ def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> d
     lowest_v, highest_v = cells[:, 0], cells[:, 1]
     voltage_v = samples["voltage_v"]
     coldest_c, hottest_c = _extreme_temperatures(samples)
-    is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
-    current_a = np.where(is_saturated, np.copysign(np.inf, samples["current_a"]), samples["current_a"])
+    # beyond the range of the converter, and therefore beyond every limit
+    voltage_is_saturated, current_is_saturated = (
+        (samples["status"] & bit) != 0 for bit in (SampleStatus.VOLTAGE_SATURATED, SampleStatus.CURRENT_SATURATED)
+    )
+    current_a = np.where(current_is_saturated, np.copysign(np.inf, samples["current_a"]), samples["current_a"])
     # the lowest temperature while charging; infinite while not charging, NaN if a quantity is not measured
     charging_c = np.where(current_a <= -charging_a, coldest_c, np.inf)
     charging_c[np.isnan(current_a) | np.isnan(coldest_c)] = np.nan
     return {
-        "pack_over_voltage": voltage_v,
+        "pack_over_voltage": np.where(voltage_is_saturated, np.inf, voltage_v),
         "pack_under_voltage": voltage_v,
         "cell_over_voltage": highest_v,
         "cell_under_voltage": lowest_v,

@@ -440,7 +440,7 @@ def test_recording_of_another_protocol_is_rejected(tmp_path, capsys):
     capture, pack = tmp_path / "meter.bmsraw", tmp_path / "pack.toml"
     with CaptureWriter(capture, CaptureHeader("junctek", "/dev/ttyUSB0", 115_200, "charge_positive")) as writer:
         writer.write(0.0, b":r50=1,34,5166,1030,109337,11738441,62100651,48663,125,0,99,0,644,9117,\r\n")
-    pack.write_text("")
+    pack.write_text("[pack]\n")
     code, _, err = run(capsys, "replay", capture, "--pack", pack)
     assert code == 2
     assert "recorded with protocol 'junctek', but sensor.protocol is 'binary'" in err

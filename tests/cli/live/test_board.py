@@ -130,7 +130,7 @@ def test_missing_port_is_reported(capsys, tmp_path, monkeypatch):
 
 def test_file_that_is_no_port_is_reported(capsys, tmp_path):
     path = tmp_path / "file"
-    path.write_text("")
+    path.write_text("[pack]\n")
     code, out, err = run_board(capsys, str(path))
     assert (code, out) == (2, "")
     assert err.startswith(f"error: {path}: it is not a serial port")

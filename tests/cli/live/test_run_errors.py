@@ -67,7 +67,7 @@ def test_invalid_broker_url_is_an_error(tmp_path, capsys):
 def test_options_of_one_board_are_rejected_for_several_packs(options, tmp_path, capsys):
     packs = [tmp_path / "one.toml", tmp_path / "two.toml"]
     for pack in packs:
-        pack.write_text("")
+        pack.write_text("[pack]\n")
     assert run(capsys, "run", *packs, *options) == (2, "", "error: --port, --record and --view require a single pack\n")
 
 

@@ -3,10 +3,12 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.protocols.base.probe_check import CheckedProbes, ProbeCheck
 
 NAN = math.nan
@@ -113,6 +115,28 @@ def test_a_probe_that_heats_up_and_cools_is_credible() -> None:
 def test_glitches_of_a_few_samples_do_not_count_as_hot(usual_c: float) -> None:
     results = check_each_second(*[[usual_c]] * 30, *[[usual_c + 29.0]] * 5, *[[usual_c]] * 30)
     assert not any(result.faulty[0] for result in results)
+
+
+@given(
+    st.lists(st.sampled_from([NAN, -50.0, -39.9, -30.0, -25.0, 0.0, 20.0, 44.0, 48.0, 60.0, 90.0]), max_size=120),
+    st.integers(min_value=1, max_value=40),
+)
+def test_blocks_of_a_single_probe_give_the_results_of_single_samples(readings_c: list[float], size: int) -> None:
+    rows = np.zeros(len(readings_c), dtype=SAMPLE)
+    rows["time_s"] = np.arange(rows.size) * 2.0
+    rows["temperature_c"] = rows["temperature_min_c"] = rows["temperature_max_c"] = readings_c
+    blocks, single = ProbeCheck(), ProbeCheck()
+    for begin in range(0, rows.size, size):
+        blocks.apply_to_single_probe(rows[begin : begin + size])
+    expected = [single.check(2.0 * n, [reading_c]) for n, reading_c in enumerate(readings_c)]
+    for name, field in (
+        ("temperature_c", "mean_c"),
+        ("temperature_min_c", "lowest_c"),
+        ("temperature_max_c", "highest_c"),
+    ):
+        np.testing.assert_array_equal(rows[name], [getattr(each, field) for each in expected])
+    assert ((rows["status"] & SampleStatus.PROBE_FAULT) != 0).tolist() == [each.faulty[0] for each in expected]
+    assert blocks.faults == single.faults
 
 
 @given(

@@ -118,6 +118,9 @@ def test_cell_voltages_are_read_from_common_formats(line: bytes) -> None:
         b'{"voltage": NaN, "current": 2}',
         b'{"voltage": 13.3, "current": -Infinity}',
         b'{"voltage": 1e999, "current": 2}',
+        b'{"voltage": 13.3, "current": 2, "voltage_held": null}',
+        b'{"voltage": 13.3, "current": 2, "current_held": [[]]}',
+        b'{"voltage": 13.3, "current": 2, "current_held": {}}',
     ],
 )
 def test_line_without_valid_voltage_and_current_is_rejected(line: bytes) -> None:
@@ -150,6 +153,8 @@ fragments = st.sampled_from(
         b"cells=",
         b"{",
         b'"voltage":',
+        b'{"voltage": 13.3, "current": 2, "voltage_held": ',
+        b"null",
         b"[",
         b"]",
         b"}",
