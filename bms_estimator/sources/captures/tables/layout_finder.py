@@ -64,13 +64,14 @@ class LayoutFinder:
         column_map: Column names and sheet that the user gave. The dialect determines the other columns.
 
     Attributes:
+        given: Column names that the user gave, by quantity.
         sheet: Name of the sheet that the user gave; None: the sheet is recognized.
     """
 
     def __init__(self, path: object, column_map: ColumnMap | None = None) -> None:
         given = column_map or {}
         self._path, self.sheet = path, given.get(SHEET)
-        self._map: dict[Quantity, str] = {quantity: given[quantity] for quantity in QUANTITIES if quantity in given}
+        self.given: dict[Quantity, str] = {quantity: given[quantity] for quantity in QUANTITIES if quantity in given}
         self._closest = _Header((), GENERIC, REQUIRED)
         self._first_numbers: Sequence[str] = ()
 
@@ -82,7 +83,7 @@ class LayoutFinder:
         """
         cells = [cell.strip() for cell in header]
         given = self._given_columns(cells)
-        if len(given) < len(self._map):
+        if len(given) < len(self.given):
             return None
         names = [split_unit(cell) for cell in cells]
         for dialect in DIALECTS:
@@ -99,22 +100,22 @@ class LayoutFinder:
     def no_header(self) -> UserError:
         """Return the error for a table without a header. It names the columns of the line that is most similar to a header."""
         header, dialect, missing = self._closest
-        if self._map and not header:
-            return UserError(f"{self._path}: no line names the columns {', '.join(self._map.values())}")
+        if self.given and not header:
+            return UserError(f"{self._path}: no line names the columns {', '.join(self.given.values())}")
         needed = f"{','.join(OWN.signatures[0])}[,temperature_c], the columns of a program in docs/cell/captures.md, or {MAP_HELP}"
         if (
             len(missing) == len(REQUIRED) or len(header) < len(REQUIRED) - 1
         ):  # a line of text may contain a name by chance
             if self._first_numbers:
                 return UserError(
-                    f"{self._path}: no line names the columns: add one above {_shown(self._first_numbers)}, with a name for each "
+                    f"{self._path}: no line names the columns: add one above {shown(self._first_numbers)}, with a name for each "
                     f"of the {len(self._first_numbers)} columns, such as {','.join(OWN.signatures[0])}; columns that are not "
                     "needed may have any other names"
                 )
             return UserError(f"{self._path}: not a capture: no line names the columns; needed: {needed}")
         program = "" if dialect is GENERIC else f" in this export of {dialect.name}"
         return UserError(
-            f"{self._path}: no column of {' nor '.join(missing)}{program}; found {_shown(header)}; needed: {needed}"
+            f"{self._path}: no column of {' nor '.join(missing)}{program}; found {shown(header)}; needed: {needed}"
         )
 
     def with_units(self, layout: Layout, units_row: Sequence[str]) -> Layout | None:
@@ -143,8 +144,8 @@ class LayoutFinder:
     def _given_columns(self, cells: Sequence[str]) -> dict[Quantity, Column]:
         """Return the columns that the user named and the header has. A name may be followed by a unit in square brackets."""
         columns = dict[Quantity, Column]()
-        for quantity, given in self._map.items():
-            name, unit = (given, None) if given in cells else _split_given_unit(given)
+        for quantity, given in self.given.items():
+            name, unit = (given, None) if given in cells else split_given_unit(given)
             if cells.count(name) > 1:
                 raise UserError(f"{self._path}: {cells.count(name)} columns are named {name}: rename all but one")
             if name not in cells:
@@ -195,7 +196,7 @@ class LayoutFinder:
         if unit_text is None:
             return Column(index, name, SI_UNITS[quantity], assumed=True)
         unit = find_unit(quantity, unit_text)
-        if unit is None and (quantity in REQUIRED or quantity in self._map):
+        if unit is None and (quantity in REQUIRED or quantity in self.given):
             raise UserError(
                 f"{self._path}: column {name}: {unit_text!r} is not a unit of {quantity} that is supported; "
                 f"convert it, or name other columns by {MAP_HELP}"
@@ -212,7 +213,7 @@ def _find_indices(wanted: Sequence[str], names: Sequence[ColumnName]) -> list[in
     return next(filter(None, found), [])
 
 
-def _split_given_unit(given: str) -> tuple[str, str | None]:
+def split_given_unit(given: str) -> tuple[str, str | None]:
     """Return the name and the unit of a column that a user gave as ``name [unit]``."""
     name, bracket, unit = given.rpartition(" [")
     return (name, unit.removesuffix("]")) if bracket else (given, None)
@@ -270,6 +271,6 @@ def _is_number(cell: str) -> bool:
         return False
 
 
-def _shown(cells: Sequence[str]) -> str:
+def shown(cells: Sequence[str]) -> str:
     """Return cells of a line for messages, limited in number and length."""
     return ", ".join(cell[:MAX_SHOWN_CHARACTERS] for cell in cells[:MAX_SHOWN_COLUMNS])

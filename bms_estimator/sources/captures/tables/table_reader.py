@@ -24,6 +24,8 @@ from bms_estimator.sources.captures.tables.cycler_files import (
     read_neware,
 )
 from bms_estimator.sources.captures.tables.dialects import GENERIC, OWN
+from bms_estimator.sources.captures.tables.history_export import HistoryExport
+from bms_estimator.sources.captures.tables.history_records import open_records
 from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layout, RawBlock, Role
 from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
@@ -278,7 +280,7 @@ def _open_reader(path: Path, finder: LayoutFinder) -> TableReader:
         NDA_MAGIC: partial(read_neware, suffix=".nda"),
         MPR_MAGIC: read_biologic,
     }
-    reader = next((reader for magic, reader in readers.items() if head.startswith(magic)), TextTable)
+    reader = next((reader for magic, reader in readers.items() if head.startswith(magic)), _open_text)
     return reader(path, finder)
 
 
@@ -293,7 +295,13 @@ def _open_archive(path: Path, finder: LayoutFinder) -> TableReader:
         return read_neware(path, finder, ".ndax")
     if {EXCEL_MEMBER, OPEN_DOCUMENT_MEMBER} & set(members):
         return Spreadsheet(path, finder)
-    return TextTable(path, finder)
+    return _open_text(path, finder)
+
+
+def _open_text(path: Path, finder: LayoutFinder) -> TableReader:
+    """Open a text: a history of entities or a table with a column of each quantity."""
+    records = open_records(path, finder)
+    return HistoryExport(path, finder, records) if records else TextTable(path, finder)
 
 
 def convert_table(table: ColumnTable, configured: Sign, column_map: ColumnMap | None = None) -> Table:
