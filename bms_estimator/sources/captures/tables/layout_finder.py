@@ -8,11 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from bms_estimator.model.cell_voltage_columns import present_columns
+from bms_estimator.model.decimal_text import number
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.tables.cell_values import CellKind, parse_number
 from bms_estimator.sources.captures.tables.dialects import CLOCKS, DIALECTS, GENERIC, OWN, Dialect
 from bms_estimator.sources.captures.tables.layout import (
+    INSTANCE,
     QUANTITIES,
     REQUIRED,
     SHEET,
@@ -33,7 +35,7 @@ from bms_estimator.sources.captures.tables.units import (
     split_unit,
 )
 
-MAP_SYNTAX = "one or more of time=COLUMN,current=COLUMN,voltage=COLUMN,temperature=COLUMN,sheet=SHEET"
+MAP_SYNTAX = "one or more of time=COLUMN,current=COLUMN,voltage=COLUMN,temperature=COLUMN,sheet=SHEET,instance=NUMBER"
 MAP_HELP = "--map time=COLUMN,current=COLUMN,voltage=COLUMN (in Python: column_map)"
 MAX_SHOWN_COLUMNS = 30
 """Maximum number of column names in a message."""
@@ -66,11 +68,19 @@ class LayoutFinder:
     Attributes:
         given: Column names that the user gave, by quantity.
         sheet: Name of the sheet that the user gave; None: the sheet is recognized.
+        instance: Number of the battery that the user gave; None: the table must have rows of one battery only.
+
+    Raises:
+        UserError: The number of the battery is not a number.
     """
 
     def __init__(self, path: object, column_map: ColumnMap | None = None) -> None:
         given = column_map or {}
         self._path, self.sheet = path, given.get(SHEET)
+        try:
+            self.instance = number(given[INSTANCE]) if INSTANCE in given else None
+        except ValueError:
+            raise UserError(f"{path}: --map instance={given[INSTANCE]}: must be a number") from None
         self.given: dict[Quantity, str] = {quantity: given[quantity] for quantity in QUANTITIES if quantity in given}
         self._closest = _Header((), GENERIC, REQUIRED)
         self._first_numbers: Sequence[str] = ()
@@ -172,13 +182,16 @@ class LayoutFinder:
                     columns[Role(quantity)] = column
         columns |= _own_columns(cells) if dialect is OWN else _clock_column(dialect, cells, names, columns[Role.TIME])
         current_name = names[columns[Role.CURRENT].index].name
-        return Layout(dialect, columns | self._sign_columns(dialect, cells, names, current_name), bool(given))
+        return Layout(dialect, columns | self._optional_columns(dialect, cells, names, current_name), bool(given))
 
-    def _sign_columns(
+    def _optional_columns(
         self, dialect: Dialect, cells: Sequence[str], names: Sequence[ColumnName], current_name: str
     ) -> dict[ColumnRole, Column]:
-        """Return the optional columns that determine the sign of the current."""
+        """Return the optional columns of the battery and those that determine the sign of the current."""
         columns = dict[ColumnRole, Column]()
+        for role, wanted in ((Role.INSTANCE, dialect.instance), (Role.SERIES, dialect.series)):
+            for index in _find_indices(wanted, names)[:1]:
+                columns[role] = Column(index, cells[index], Unit(""), is_lenient=True)
         for state in _find_indices(dialect.state, names)[:1]:
             columns[Role.STATE] = Column(state, cells[state], Unit(""), kind=CellKind.DIRECTION)
         if current_name in DISCHARGE_CURRENTS:
@@ -255,7 +268,7 @@ def parse_column_map(text: str) -> ColumnMap:
     Raises:
         UserError: A quantity is unknown, is given twice, or has no column.
     """
-    keys = (*QUANTITIES, SHEET)
+    keys = (*QUANTITIES, SHEET, INSTANCE)
     parts = re.split(rf",(?=(?:{'|'.join(keys)})=)", text)
     pairs = [tuple(part.partition("=")[::2]) for part in parts]
     names = dict(pairs)
