@@ -71,7 +71,7 @@ def test_log_is_read_without_options(export: Export, tmp_path: Path) -> None:
     np.testing.assert_allclose(capture["voltage_v"], expected.voltage_v, atol=1e-9)
     np.testing.assert_allclose(capture["temperature_c"], temperature_c, atol=1e-9)
     assert capture.note.startswith(f"read as {export.dialect} (")
-    assert ("4 cells in series: give --series 4" in capture.note) == (export.dialect == "PX4")
+    assert ("4 cells in series (calibrate, report: --series 4)" in capture.note) == (export.dialect == "PX4")
     assert capture.warning == ""
 
 

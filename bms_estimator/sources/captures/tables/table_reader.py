@@ -204,9 +204,7 @@ def _cells_in_series(first: RawBlock) -> str:
     counts = first.get(Role.SERIES, np.empty(0))
     count = float(np.median(counts[counts > 0.0])) if (counts > 0.0).any() else 0.0
     is_whole = 0.0 < count == round(count) < np.inf
-    return (
-        f"; {count:.0f} cells in series: give --series {count:.0f}, or a pack file with this number" if is_whole else ""
-    )
+    return f"; {count:.0f} cells in series (calibrate, report: --series {count:.0f})" if is_whole else ""
 
 
 def _without_zero_temperature(layout: Layout, first: RawBlock) -> tuple[Layout, str]:
