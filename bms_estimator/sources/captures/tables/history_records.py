@@ -142,7 +142,7 @@ class JsonRecords:
         try:
             self._value = json.loads(text)
         except (ValueError, RecursionError) as error:
-            raise UserError(f"{path}: JSON damaged or cut short: {error}") from None
+            raise UserError(f"{path}: JSON damaged or cut short: {error}; export it again") from None
         self._times = {form: _time_columns(finder, form) for form in (_HOME_ASSISTANT, _COMPRESSED)}
         self.times = self._times[_HOME_ASSISTANT]
 
