@@ -130,6 +130,13 @@ def test_reader_of_exports_raises_only_user_errors_that_name_the_file(folder: Pa
     load_file(folder / "export.txt", load_capture, data)
 
 
+@edited_seeds(
+    "history", b"unavailable", b"entity_id", b"last_changed", b"_value", b"2026-03-04T04:53:20Z", b"[[{", b"\\ud800"
+)
+def test_reader_of_histories_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
+    load_file(folder / "history.json", load_capture, data)
+
+
 @edited_seeds("zip", b"PK\x03\x04", b"PK\x01\x02")
 def test_reader_of_archives_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
     load_file(folder / "export.zip", load_capture, data)

@@ -27,7 +27,7 @@ from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind, d
 from bms_estimator.sources.captures.tables.column_tables import parse_column
 from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, ColumnRole, Layout, Role, with_column_kinds
 from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
-from bms_estimator.sources.captures.tables.table_reader import (
+from bms_estimator.sources.captures.tables.table_samples import (
     cell_voltages,
     remove_implausible_temperatures,
     to_samples,
@@ -139,7 +139,7 @@ class BatchReader:
         roles: dict[ColumnRole, Column] = {
             role: Column(column.index, header[column.index], column.unit, column.assumed)
             for role, column in layout.columns.items()
-            if role not in (Role.STATE, Role.CLOCK)
+            if role not in (Role.STATE, Role.CLOCK, Role.INSTANCE, Role.SERIES)
         }
         if len(layout.cells) > MAX_CELLS:
             raise UserError(f"{len(layout.cells)} columns of cell voltages: must be at most {MAX_CELLS}")

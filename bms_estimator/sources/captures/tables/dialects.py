@@ -24,6 +24,10 @@ class Dialect:
     """Columns with words for charge and discharge, which give the current its sign."""
     charge_current: tuple[str, ...] = ()
     """Columns of the charge current, if ``current`` contains only the discharge current."""
+    instance: tuple[str, ...] = ()
+    """Columns with the number of the battery, if a table may have rows of several batteries."""
+    series: tuple[str, ...] = ()
+    """Columns with the number of cells in series."""
     signatures: tuple[tuple[str, ...], ...] = ((),)
     """Sets of column names, with or without their units. A table that has all names of a set has this dialect."""
     time_unit: str | None = None
@@ -243,9 +247,40 @@ DIALECTS = (
         current=("current",),
         voltage=("voltage",),
         temperature=("temperature",),
+        instance=("id",),
+        series=("cell_count",),
         signatures=(("timestamp", "voltage_v", "current_a", "cell_count"),),
         time_unit="us",
         current_sign="discharge_positive",
+    ),
+    Dialect(
+        "ArduPilot",
+        time=("timeus",),
+        current=("curr",),
+        voltage=("volt",),
+        temperature=("temp",),
+        instance=("inst", "instance"),
+        signatures=(("timeus", "volt", "curr"),),
+        time_unit="us",
+        current_sign="discharge_positive",
+    ),
+    Dialect(
+        "VESC Tool",
+        time=("ms today",),
+        current=("current in",),
+        voltage=("input voltage",),
+        signatures=(("ms_today", "input_voltage", "current_in"),),
+        time_unit="ms",
+        current_sign="discharge_positive",
+    ),
+    Dialect(
+        "Victron VRM",
+        time=("timestamp",),
+        current=("battery monitor current",),
+        voltage=("battery monitor voltage",),
+        temperature=("battery monitor battery temperature",),
+        signatures=(("timestamp", "battery monitor current", "battery monitor voltage"),),
+        current_sign="charge_positive",
     ),
     GENERIC,
 )

@@ -22,15 +22,17 @@ REQUIRED: tuple[Quantity, ...] = ("time", "current", "voltage")
 """Quantities that a table must have."""
 SHEET: Literal["sheet"] = "sheet"
 """Key of the sheet of a spreadsheet in a ``ColumnMap``."""
+INSTANCE: Literal["instance"] = "instance"
+"""Key of the number of the battery in a ``ColumnMap``."""
 BLOCK_ROWS = 65_536
 """Maximum number of rows of a block."""
 
-ColumnMap = Mapping[Quantity | Literal["sheet"], str]
-"""Column names that the user gave, by quantity, and the name of the sheet."""
+ColumnMap = Mapping[Quantity | Literal["sheet", "instance"], str]
+"""Column names that the user gave, by quantity, the name of the sheet and the number of the battery."""
 
 
 class Role(Enum):
-    """Meaning of a column: a ``Quantity``, the sign of the current (state, charge current), a second time, or the status."""
+    """Meaning of a column: a ``Quantity``, the sign of the current (state, charge current), a second time, status, or battery."""
 
     TIME = "time"
     CURRENT = "current"
@@ -42,6 +44,8 @@ class Role(Enum):
     CLOCK = "second time"
     CHARGE_CURRENT = "charge current"
     STATUS = "status"
+    INSTANCE = "battery"
+    SERIES = "cells in series"
 
 
 class CellVoltage(NamedTuple):

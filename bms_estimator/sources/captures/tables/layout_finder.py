@@ -8,11 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from bms_estimator.model.cell_voltage_columns import present_columns
+from bms_estimator.model.decimal_text import number
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.tables.cell_values import CellKind, parse_number
 from bms_estimator.sources.captures.tables.dialects import CLOCKS, DIALECTS, GENERIC, OWN, Dialect
 from bms_estimator.sources.captures.tables.layout import (
+    INSTANCE,
     QUANTITIES,
     REQUIRED,
     SHEET,
@@ -33,7 +35,7 @@ from bms_estimator.sources.captures.tables.units import (
     split_unit,
 )
 
-MAP_SYNTAX = "one or more of time=COLUMN,current=COLUMN,voltage=COLUMN,temperature=COLUMN,sheet=SHEET"
+MAP_SYNTAX = "one or more of time=COLUMN,current=COLUMN,voltage=COLUMN,temperature=COLUMN,sheet=SHEET,instance=NUMBER"
 MAP_HELP = "--map time=COLUMN,current=COLUMN,voltage=COLUMN (in Python: column_map)"
 MAX_SHOWN_COLUMNS = 30
 """Maximum number of column names in a message."""
@@ -64,13 +66,22 @@ class LayoutFinder:
         column_map: Column names and sheet that the user gave. The dialect determines the other columns.
 
     Attributes:
+        given: Column names that the user gave, by quantity.
         sheet: Name of the sheet that the user gave; None: the sheet is recognized.
+        instance: Number of the battery that the user gave; None: the table must have rows of one battery only.
+
+    Raises:
+        UserError: The number of the battery is not a number.
     """
 
     def __init__(self, path: object, column_map: ColumnMap | None = None) -> None:
         given = column_map or {}
         self._path, self.sheet = path, given.get(SHEET)
-        self._map: dict[Quantity, str] = {quantity: given[quantity] for quantity in QUANTITIES if quantity in given}
+        try:
+            self.instance = number(given[INSTANCE]) if INSTANCE in given else None
+        except ValueError:
+            raise UserError(f"{path}: --map instance={given[INSTANCE]}: must be a number") from None
+        self.given: dict[Quantity, str] = {quantity: given[quantity] for quantity in QUANTITIES if quantity in given}
         self._closest = _Header((), GENERIC, REQUIRED)
         self._first_numbers: Sequence[str] = ()
 
@@ -82,7 +93,7 @@ class LayoutFinder:
         """
         cells = [cell.strip() for cell in header]
         given = self._given_columns(cells)
-        if len(given) < len(self._map):
+        if len(given) < len(self.given):
             return None
         names = [split_unit(cell) for cell in cells]
         for dialect in DIALECTS:
@@ -99,22 +110,22 @@ class LayoutFinder:
     def no_header(self) -> UserError:
         """Return the error for a table without a header. It names the columns of the line that is most similar to a header."""
         header, dialect, missing = self._closest
-        if self._map and not header:
-            return UserError(f"{self._path}: no line names the columns {', '.join(self._map.values())}")
+        if self.given and not header:
+            return UserError(f"{self._path}: no line names the columns {', '.join(self.given.values())}")
         needed = f"{','.join(OWN.signatures[0])}[,temperature_c], the columns of a program in docs/cell/captures.md, or {MAP_HELP}"
         if (
             len(missing) == len(REQUIRED) or len(header) < len(REQUIRED) - 1
         ):  # a line of text may contain a name by chance
             if self._first_numbers:
                 return UserError(
-                    f"{self._path}: no line names the columns: add one above {_shown(self._first_numbers)}, with a name for each "
+                    f"{self._path}: no line names the columns: add one above {shown(self._first_numbers)}, with a name for each "
                     f"of the {len(self._first_numbers)} columns, such as {','.join(OWN.signatures[0])}; columns that are not "
                     "needed may have any other names"
                 )
             return UserError(f"{self._path}: not a capture: no line names the columns; needed: {needed}")
         program = "" if dialect is GENERIC else f" in this export of {dialect.name}"
         return UserError(
-            f"{self._path}: no column of {' nor '.join(missing)}{program}; found {_shown(header)}; needed: {needed}"
+            f"{self._path}: no column of {' nor '.join(missing)}{program}; found {shown(header)}; needed: {needed}"
         )
 
     def with_units(self, layout: Layout, units_row: Sequence[str]) -> Layout | None:
@@ -143,8 +154,8 @@ class LayoutFinder:
     def _given_columns(self, cells: Sequence[str]) -> dict[Quantity, Column]:
         """Return the columns that the user named and the header has. A name may be followed by a unit in square brackets."""
         columns = dict[Quantity, Column]()
-        for quantity, given in self._map.items():
-            name, unit = (given, None) if given in cells else _split_given_unit(given)
+        for quantity, given in self.given.items():
+            name, unit = (given, None) if given in cells else split_given_unit(given)
             if cells.count(name) > 1:
                 raise UserError(f"{self._path}: {cells.count(name)} columns are named {name}: rename all but one")
             if name not in cells:
@@ -171,13 +182,16 @@ class LayoutFinder:
                     columns[Role(quantity)] = column
         columns |= _own_columns(cells) if dialect is OWN else _clock_column(dialect, cells, names, columns[Role.TIME])
         current_name = names[columns[Role.CURRENT].index].name
-        return Layout(dialect, columns | self._sign_columns(dialect, cells, names, current_name), bool(given))
+        return Layout(dialect, columns | self._optional_columns(dialect, cells, names, current_name), bool(given))
 
-    def _sign_columns(
+    def _optional_columns(
         self, dialect: Dialect, cells: Sequence[str], names: Sequence[ColumnName], current_name: str
     ) -> dict[ColumnRole, Column]:
-        """Return the optional columns that determine the sign of the current."""
+        """Return the optional columns of the battery and those that determine the sign of the current."""
         columns = dict[ColumnRole, Column]()
+        for role, wanted in ((Role.INSTANCE, dialect.instance), (Role.SERIES, dialect.series)):
+            for index in _find_indices(wanted, names)[:1]:
+                columns[role] = Column(index, cells[index], Unit(""), is_lenient=True)
         for state in _find_indices(dialect.state, names)[:1]:
             columns[Role.STATE] = Column(state, cells[state], Unit(""), kind=CellKind.DIRECTION)
         if current_name in DISCHARGE_CURRENTS:
@@ -195,7 +209,7 @@ class LayoutFinder:
         if unit_text is None:
             return Column(index, name, SI_UNITS[quantity], assumed=True)
         unit = find_unit(quantity, unit_text)
-        if unit is None and (quantity in REQUIRED or quantity in self._map):
+        if unit is None and (quantity in REQUIRED or quantity in self.given):
             raise UserError(
                 f"{self._path}: column {name}: {unit_text!r} is not a unit of {quantity} that is supported; "
                 f"convert it, or name other columns by {MAP_HELP}"
@@ -212,7 +226,7 @@ def _find_indices(wanted: Sequence[str], names: Sequence[ColumnName]) -> list[in
     return next(filter(None, found), [])
 
 
-def _split_given_unit(given: str) -> tuple[str, str | None]:
+def split_given_unit(given: str) -> tuple[str, str | None]:
     """Return the name and the unit of a column that a user gave as ``name [unit]``."""
     name, bracket, unit = given.rpartition(" [")
     return (name, unit.removesuffix("]")) if bracket else (given, None)
@@ -254,7 +268,7 @@ def parse_column_map(text: str) -> ColumnMap:
     Raises:
         UserError: A quantity is unknown, is given twice, or has no column.
     """
-    keys = (*QUANTITIES, SHEET)
+    keys = (*QUANTITIES, SHEET, INSTANCE)
     parts = re.split(rf",(?=(?:{'|'.join(keys)})=)", text)
     pairs = [tuple(part.partition("=")[::2]) for part in parts]
     names = dict(pairs)
@@ -270,6 +284,6 @@ def _is_number(cell: str) -> bool:
         return False
 
 
-def _shown(cells: Sequence[str]) -> str:
+def shown(cells: Sequence[str]) -> str:
     """Return cells of a line for messages, limited in number and length."""
     return ", ".join(cell[:MAX_SHOWN_CHARACTERS] for cell in cells[:MAX_SHOWN_COLUMNS])

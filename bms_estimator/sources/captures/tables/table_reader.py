@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import MAX_C, MIN_C, NO_CELLS, SAMPLE, CellBlock, SampleBlock, remove_implausible
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
 from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction
@@ -24,9 +24,16 @@ from bms_estimator.sources.captures.tables.cycler_files import (
     read_neware,
 )
 from bms_estimator.sources.captures.tables.dialects import GENERIC, OWN
+from bms_estimator.sources.captures.tables.history_export import HistoryExport
+from bms_estimator.sources.captures.tables.history_records import open_records
 from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layout, RawBlock, Role
 from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
+from bms_estimator.sources.captures.tables.table_samples import (
+    cell_voltages,
+    remove_implausible_temperatures,
+    to_samples,
+)
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
 from bms_estimator.sources.captures.tables.text_table import TextTable
 from bms_estimator.sources.captures.tables.time_base import find_time_base
@@ -34,6 +41,8 @@ from bms_estimator.sources.captures.tables.voltage_response import VoltageRespon
 
 FIRST_ROWS = 262_144
 """Minimum number of rows at the beginning of a table that determine its time base and the sign of the current."""
+MAX_SHOWN_BATTERIES = 8
+"""Maximum number of batteries in a message."""
 STEP_S = 1e-6
 """Time that is inserted between two rows with the same time, between which the current steps [s]."""
 PARQUET_MAGIC, OLE_MAGIC = b"PAR1", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
@@ -71,6 +80,7 @@ class Table:
         name: Name of the table for messages.
         reader: Reader of the columns.
         configured: Direction of positive current that the user configured.
+        instance: Number of the battery whose rows are read; None: the table must have rows of one battery only.
 
     Attributes:
         layout: Columns of the table.
@@ -79,10 +89,10 @@ class Table:
         note: Description of dialect, columns and sign; empty for a table with this project's columns.
     """
 
-    def __init__(self, name: object, reader: TableReader, configured: Sign) -> None:
-        self._reader = reader
+    def __init__(self, name: object, reader: TableReader, configured: Sign, instance: float | None = None) -> None:
+        self._name, self._reader, self._instance = name, reader, instance
         self.implausible, self.cells = 0, NO_CELLS
-        first = _first_rows(reader)
+        first = self._first_rows()
         time_base = find_time_base(reader.layout, first)
         first[Role.TIME] = first[time_base.role]
         layout, ignored = _without_zero_temperature(time_base.layout, first)
@@ -91,7 +101,9 @@ class Table:
         response = VoltageResponse() if configured.option else self._voltage_response(first, has_words=has_words)
         self._direction = find_direction(name, self.layout, configured, response, has_words=has_words)
         is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
-        self.note = "" if is_own else _note(reader, time_base.reason, self._direction.text) + ignored
+        self.note = (
+            "" if is_own else _note(reader, time_base.reason, self._direction.text) + ignored + _cells_in_series(first)
+        )
         self._warnings = (time_base.warning, self._direction.warning)
 
     @property
@@ -113,7 +125,7 @@ class Table:
         self.implausible = 0
         before = np.empty(0, dtype=SAMPLE)
         start_s, rows = None, 0
-        for raw in self._reader.blocks():
+        for raw in _rows_of_battery(self._name, self._reader, self._instance):
             samples = to_samples(raw, self.layout)
             if Role.CLOCK in self.layout.columns or self.layout.columns[Role.TIME].kind in DATES:
                 start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
@@ -138,18 +150,61 @@ class Table:
         response = voltage_response(to_samples(first, self.layout))
         if not response.has_no_sign or has_words or first[Role.TIME].size < FIRST_ROWS:
             return response
-        return voltage_response(to_samples(_first_rows(self._reader, math.inf), self.layout))
+        return voltage_response(to_samples(self._first_rows(math.inf), self.layout))
+
+    def _first_rows(self, min_rows: float = FIRST_ROWS) -> RawBlock:
+        """Return rows at the beginning of the table, at least ``min_rows`` if it has as many."""
+        blocks, rows = list[RawBlock](), 0
+        for raw in _rows_of_battery(self._name, self._reader, self._instance):
+            blocks.append(raw)
+            rows += raw[Role.TIME].size
+            if rows >= min_rows:
+                break
+        columns = self._reader.layout.columns
+        return {role: np.concatenate([np.empty(0), *(raw[role] for raw in blocks)]) for role in columns}
 
 
-def _first_rows(reader: TableReader, min_rows: float = FIRST_ROWS) -> RawBlock:
-    """Return rows at the beginning of a table, at least ``min_rows`` if it has as many."""
-    blocks, rows = list[RawBlock](), 0
+def _rows_of_battery(name: object, reader: TableReader, instance: float | None) -> Iterator[RawBlock]:
+    """Yield blocks with the rows of one battery.
+
+    Raises:
+        UserError: The table has rows of several batteries and none is chosen, or none of the chosen battery.
+    """
+    column = reader.layout.columns.get(Role.INSTANCE)
+    if column is None:
+        if instance is not None:
+            raise UserError(
+                f"{name}: --map instance={instance:g}: the table has no column with the number of the battery"
+            )
+        yield from reader.blocks()
+        return
+    found = set[float]()
     for raw in reader.blocks():
-        blocks.append(raw)
-        rows += raw[Role.TIME].size
-        if rows >= min_rows:
-            break
-    return {role: np.concatenate([np.empty(0), *(raw[role] for raw in blocks)]) for role in reader.layout.columns}
+        numbers = raw[Role.INSTANCE]
+        found |= set(np.unique(numbers[np.isfinite(numbers)]).tolist())
+        if instance is None and len(found) > 1:
+            raise UserError(
+                f"{name}: rows of several batteries, {column.name} = {_shown(found)}: choose one by "
+                f"--map instance={min(found):g} (in Python: column_map)"
+            )
+        chosen = np.ones(numbers.size, dtype=bool) if instance is None else numbers == instance
+        if chosen.any():
+            yield {role: values[chosen] for role, values in raw.items()}
+    if instance is not None and instance not in found:
+        raise UserError(f"{name}: --map instance={instance:g}: no such battery; {column.name} = {_shown(found)}")
+
+
+def _shown(numbers: set[float]) -> str:
+    """Return numbers of batteries for messages, limited in number."""
+    return ", ".join(f"{number:g}" for number in sorted(numbers)[:MAX_SHOWN_BATTERIES]) or "empty"
+
+
+def _cells_in_series(first: RawBlock) -> str:
+    """Return the number of cells in series that the table states, as text for the note; empty if it states none."""
+    counts = first.get(Role.SERIES, np.empty(0))
+    count = float(np.median(counts[counts > 0.0])) if (counts > 0.0).any() else 0.0
+    is_whole = 0.0 < count == round(count) < np.inf
+    return f"; {count:.0f} cells in series (calibrate, report: --series {count:.0f})" if is_whole else ""
 
 
 def _without_zero_temperature(layout: Layout, first: RawBlock) -> tuple[Layout, str]:
@@ -163,37 +218,6 @@ def _without_zero_temperature(layout: Layout, first: RawBlock) -> tuple[Layout, 
     columns = dict(layout.columns)
     temperature = columns.pop(Role.TEMPERATURE)
     return dataclasses.replace(layout, columns=columns), f'; "{temperature.name}" is 0 in each row: no temperature'
-
-
-def to_samples(raw: RawBlock, layout: Layout) -> SampleBlock:
-    """Return samples in SI units. The current has the sign of the table."""
-    with np.errstate(over="ignore"):  # infinite results are dropped like other invalid values
-        values = {role: raw[role] * column.unit.factor + column.unit.offset for role, column in layout.columns.items()}
-    samples = np.zeros(values[Role.TIME].size, dtype=SAMPLE)
-    samples["time_s"], samples["voltage_v"] = values[Role.TIME] + values.get(Role.CLOCK, 0.0), values[Role.VOLTAGE]
-    samples["current_a"] = values[Role.CURRENT]
-    if Role.CHARGE_CURRENT in values:
-        discharge_a, charge_a = np.abs(values[Role.CURRENT]), np.abs(values[Role.CHARGE_CURRENT])
-        samples["current_a"] = np.nan_to_num(discharge_a) - np.nan_to_num(charge_a)
-    samples["temperature_c"] = values.get(Role.TEMPERATURE, np.nan)
-    samples["temperature_min_c"] = values.get(Role.TEMPERATURE_MIN, samples["temperature_c"])
-    samples["temperature_max_c"] = values.get(Role.TEMPERATURE_MAX, samples["temperature_c"])
-    if Role.STATUS in values:
-        samples["status"] = np.nan_to_num(values[Role.STATUS]).clip(0.0, np.iinfo(np.uint32).max)
-    return samples
-
-
-def remove_implausible_temperatures(samples: SampleBlock) -> int:
-    """Replace implausible temperatures with NaN in place; return the number of samples with an implausible ``temperature_c``."""
-    for name in ("temperature_min_c", "temperature_max_c"):
-        remove_implausible(samples[name], MIN_C, MAX_C)
-    return remove_implausible(samples["temperature_c"], MIN_C, MAX_C)
-
-
-def cell_voltages(raw: RawBlock, layout: Layout) -> CellBlock:
-    """Return the cell voltages of a block, shape (n, m) [V]; empty for a table without them."""
-    cells = layout.cells
-    return np.column_stack([raw[cell] for cell in cells]) if cells else NO_CELLS
 
 
 def _separate_steps(before: SampleBlock, samples: SampleBlock) -> SampleBlock:
@@ -261,7 +285,7 @@ def open_table(path: Path, configured: Sign, column_map: ColumnMap | None = None
     reader = _open_reader(path, finder)
     if finder.sheet is not None and not isinstance(reader, Spreadsheet):
         raise UserError(f"{path}: sheet {finder.sheet} is given, but the file is not a spreadsheet")
-    return Table(path, reader, configured)
+    return Table(path, reader, configured, finder.instance)
 
 
 def _open_reader(path: Path, finder: LayoutFinder) -> TableReader:
@@ -278,7 +302,7 @@ def _open_reader(path: Path, finder: LayoutFinder) -> TableReader:
         NDA_MAGIC: partial(read_neware, suffix=".nda"),
         MPR_MAGIC: read_biologic,
     }
-    reader = next((reader for magic, reader in readers.items() if head.startswith(magic)), TextTable)
+    reader = next((reader for magic, reader in readers.items() if head.startswith(magic)), _open_text)
     return reader(path, finder)
 
 
@@ -293,7 +317,13 @@ def _open_archive(path: Path, finder: LayoutFinder) -> TableReader:
         return read_neware(path, finder, ".ndax")
     if {EXCEL_MEMBER, OPEN_DOCUMENT_MEMBER} & set(members):
         return Spreadsheet(path, finder)
-    return TextTable(path, finder)
+    return _open_text(path, finder)
+
+
+def _open_text(path: Path, finder: LayoutFinder) -> TableReader:
+    """Open a text: a history of entities or a table with a column of each quantity."""
+    records = open_records(path, finder)
+    return HistoryExport(path, finder, records) if records else TextTable(path, finder)
 
 
 def convert_table(table: ColumnTable, configured: Sign, column_map: ColumnMap | None = None) -> Table:
@@ -303,4 +333,5 @@ def convert_table(table: ColumnTable, configured: Sign, column_map: ColumnMap | 
         UserError: A column is missing or does not contain numbers.
     """
     name = "the table"
-    return Table(name, ArrayTable(name, table, LayoutFinder(name, column_map)), configured)
+    finder = LayoutFinder(name, column_map)
+    return Table(name, ArrayTable(name, table, finder), configured, finder.instance)

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from io import TextIOWrapper
@@ -17,6 +18,8 @@ MAX_HEADER_CHARACTERS = 1 << 20
 """Maximum length of a line that is searched for the header."""
 PROBED_LINES = 200
 """Number of lines after the header that show units, decimal sign and format of the time."""
+_DEVICE = re.compile(r".+ \[\d+\]")
+"""Name of a device in the line above the column names, by Victron VRM."""
 SEPARATORS = {"\t": "tab", ";": "semicolon", ",": "comma"}
 """Separators of columns, in the order in which they are tried, with their names."""
 
@@ -73,6 +76,7 @@ def find_format(text: TextIOWrapper, finder: LayoutFinder) -> TextFormat:
     Raises:
         UserError: No line is a header.
     """
+    above = ""
     for number in range(1, MAX_HEADER_LINES + 1):
         line = text.readline(MAX_HEADER_CHARACTERS)
         if not line:
@@ -83,12 +87,23 @@ def find_format(text: TextIOWrapper, finder: LayoutFinder) -> TextFormat:
             continue
         names = unquoted(line)
         for separator in SEPARATORS:
-            header = split_cells(names, separator)
+            header = _with_devices(split_cells(above, separator), split_cells(names, separator))
             layout = finder.find(header)
             if layout is not None:
                 text_format = TextFormat(layout, names, len(header), number + 1, separator, is_quoted=names != line)
                 return _probe(text_format, text, finder, header)
+        above = names
     raise finder.no_header()
+
+
+def _with_devices(devices: Sequence[str], header: Sequence[str]) -> Sequence[str]:
+    """Return column names with the names of the devices in the line above, if it has any."""
+    if len(devices) != len(header) or not any(map(_DEVICE.fullmatch, devices)):
+        return header
+    return [
+        f"{device} {name}" if _DEVICE.fullmatch(device) else device or name
+        for device, name in zip(devices, header, strict=True)
+    ]
 
 
 def _probe(text_format: TextFormat, text: TextIOWrapper, finder: LayoutFinder, header: Sequence[str]) -> TextFormat:

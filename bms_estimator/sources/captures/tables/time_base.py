@@ -62,7 +62,7 @@ def find_time_base(layout: Layout, raw: RawBlock) -> TimeBase:
 
 def _by_unix_time(layout: Layout, time: Column, values: Floats) -> TimeBase | None:
     """Return the time base of Unix times in another unit than seconds; None for other times."""
-    unit = _unix_unit(values)
+    unit = unix_unit(values)
     if unit is None or time.kind is not CellKind.NUMBER or unit == time.unit:
         return None
     if time.assumed:
@@ -112,7 +112,7 @@ def _is_time_of_day(clock: Column, raw: RawBlock) -> bool:
     return not later_days.any() or bool((np.diff(time_s)[later_days] < 0.0).any())
 
 
-def _unix_unit(values: Floats) -> Unit | None:
+def unix_unit(values: Floats) -> Unit | None:
     """Return the unit in which large numbers are Unix times; None for smaller numbers."""
     finite = values[np.isfinite(values)]
     middle = float(np.median(finite)) if finite.size else 0.0

@@ -66,7 +66,7 @@ _STAMP = re.compile(r"[:\-].*s|y{2,4}.*m", re.IGNORECASE)
 _BRACKETED = re.compile(r"(?P<name>[^()\[\]]+)[(\[](?P<unit>[^()\[\]]*)[)\]]\s*")
 _SEPARATED = re.compile(r"(?P<name>.+)[/#](?P<unit>[^/#]+)")
 _LAST_WORD = re.compile(r"(?P<name>.+)[_ ](?P<unit>[^_ ]+)")
-_IGNORED = re.compile(r"[\s_.~/\-]+")
+_IGNORED = re.compile(r"[\s_.~/\-]+|\[\d+\](?=.)")
 _NOT_UNITS = frozenset({"time", "date"})
 """Words after a slash that belong to the name, as in ``Date/Time``."""
 
@@ -81,7 +81,10 @@ class ColumnName(NamedTuple):
 
 
 def fold(name: str) -> str:
-    """Return a name in lower case, without spaces and the characters ``_``, ``-``, ``.``, ``/`` and ``~``."""
+    """Return a name in lower case, without spaces, the characters ``_``, ``-``, ``.``, ``/`` and ``~``, and numbers of devices.
+
+    The number of a device is in square brackets between other words, as in ``Battery Monitor [279] Voltage``.
+    """
     return _IGNORED.sub("", name.lower())
 
 

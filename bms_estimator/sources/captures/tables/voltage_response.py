@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import CurrentSign, SampleBlock
+from bms_estimator.model.sample import CurrentSign, SampleBlock, SampleStatus
 
+HELD = int(SampleStatus.VOLTAGE_HELD | SampleStatus.CURRENT_HELD)
+"""Status of samples with values of another time."""
 LOAD_FRACTION = 0.01
 """Minimum current of a load, as a fraction of the largest current."""
 STEP_FRACTION = 0.1
@@ -25,6 +27,8 @@ MIN_CORRELATION = 0.7
 """Minimum correlation of voltage and charge for a decision, if there are too few steps."""
 MIN_TREND_ROWS = 20
 """Minimum number of samples for a decision by a trend of the voltage."""
+NOISE_RATIO = 4.0
+"""Minimum change of the voltage in a trend, in std of its noise. The stretches end at the extremes of the voltage."""
 MIN_OTHER_FRACTION = 0.1
 """Minimum fraction of the charge in the other direction, for which a current of one sign is a current without a sign, and for
 which charge and discharge follow each other without a rest in a load."""
@@ -64,12 +68,14 @@ class _Parts(NamedTuple):
 def voltage_response(samples: SampleBlock) -> VoltageResponse:
     """Return the direction of the current that a battery's voltage shows.
 
-    The voltage falls during a discharge, and in a step of the current to a larger discharge.
+    The voltage falls during a discharge, and in a step of the current to a larger discharge. Held values are not used, because
+    they are of another time.
 
     Args:
         samples: Samples with the current as in the table.
     """
     valid = np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"]) & np.isfinite(samples["time_s"])
+    valid &= (samples["status"] & HELD) == 0
     rows = samples[valid]
     if rows.size < MIN_STEPS + 1 or not rows["current_a"].any():
         return VoltageResponse()
@@ -79,9 +85,8 @@ def voltage_response(samples: SampleBlock) -> VoltageResponse:
         if has_one_sign and (unsigned := _without_sign(rows, stretches)):
             if unsigned.row_factors is None:
                 return unsigned
-            factors = np.ones(samples.size)
-            factors[valid] = unsigned.row_factors
-            return unsigned._replace(row_factors=factors)
+            used = np.maximum(np.cumsum(valid) - 1, 0)  # a sample that is not used belongs to the load before it
+            return unsigned._replace(row_factors=unsigned.row_factors[used])
         response = (
             _trend_response(rows, stretches)
             or _step_response(rows["current_a"], rows["voltage_v"])
@@ -179,13 +184,19 @@ def _direction_by_ends(rows: SampleBlock, loads: _Parts, stretches: _Parts) -> t
 
 def _trend_response(rows: SampleBlock, stretches: _Parts) -> int:
     """Return 1 if the voltage rises while a positive current flows, -1 if it falls, weighted by charge; 0 if it is not clear."""
-    charge = np.where(stretches.change_v != 0.0, stretches.charge, 0.0)
+    charge = np.where(np.abs(stretches.change_v) > NOISE_RATIO * _noise(rows["voltage_v"]), stretches.charge, 0.0)
     samples = int((stretches.last - stretches.first + 1).sum())
     if samples < MIN_TREND_ROWS or charge.sum() < MIN_STRETCH_FRACTION * np.abs(_charge_steps(rows)).sum():
         return 0
     rising = float(np.sum(charge * (np.sign(rows["current_a"][stretches.first]) == np.sign(stretches.change_v))))
     fraction = rising / float(charge.sum()) if charge.any() else 0.5
     return 1 if fraction >= AGREEING_FRACTION else -1 if fraction <= 1.0 - AGREEING_FRACTION else 0
+
+
+def _noise(voltage_v: Floats) -> float:
+    """Return the std of white noise in the voltage, by the products of successive changes; 0 if most have the same direction."""
+    changes_v = np.diff(voltage_v)
+    return float(np.sqrt(max(-np.mean(changes_v[1:] * changes_v[:-1]), 0.0)))
 
 
 def _steps(current_a: Floats, voltage_v: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:

@@ -1,0 +1,237 @@
+"""Reader of histories in long form, such as the history of Home Assistant: choice of the entities of a battery."""
+
+import re
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.decimal_text import measured
+from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind, parse_date_time
+from bms_estimator.sources.captures.tables.dialects import Dialect
+from bms_estimator.sources.captures.tables.held_values import TimedValues, assemble
+from bms_estimator.sources.captures.tables.history_records import CsvRecords, JsonRecords, Labels, Record
+from bms_estimator.sources.captures.tables.layout import Column, ColumnRole, Layout, RawBlock, Role
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder, shown, split_given_unit
+from bms_estimator.sources.captures.tables.time_base import unix_unit
+from bms_estimator.sources.captures.tables.units import SI_UNITS, Quantity, Unit, find_unit
+
+DIALECT = Dialect("history of entities", time=(), current=(), voltage=())
+NAME_COLUMNS = ("entity_id", "_field")
+"""Columns whose cells are preferred as names, if they differ in all entities."""
+UNAVAILABLE = frozenset({"", "unavailable", "unknown", "none", "null"})
+"""States that end the last value."""
+WORDS: dict[Quantity, frozenset[str]] = {
+    "voltage": frozenset({"voltage", "volt", "volts", "spannung"}),
+    "current": frozenset({"current", "amps", "ampere", "amperes", "strom"}),
+}
+"""Words in names of entities without a unit."""
+_WORD = re.compile(r"[^\W\d_]+")
+
+
+class _Entity:
+    """Values of one entity.
+
+    Args:
+        labels: Names and cells of the columns that name it.
+
+    Attributes:
+        labels: Names and cells of the columns that name it.
+        unit: Unit as text; empty if the file states none.
+        name: Name for messages.
+        invalid: Place and text of the first value that is not a number; empty without one.
+    """
+
+    def __init__(self, labels: Labels) -> None:
+        self.labels, self.unit, self.name, self.invalid = labels, "", "", ""
+        self._times, self._values = array("d"), array("d")
+
+    def add(self, record: Record, time: float) -> None:
+        """Add a value."""
+        self.unit = self.unit or record.unit
+        value, text = np.nan, record.value.strip()
+        if text.lower() not in UNAVAILABLE:
+            try:
+                value = measured(text)
+            except ValueError:
+                self.invalid = self.invalid or f"{record.place}: {text[:MAX_TEXT_CHARACTERS]!r}"
+        self._times.append(time)
+        self._values.append(value)
+
+    @property
+    def times(self) -> Floats:
+        """Times in the order of the file."""
+        return np.array(self._times)
+
+    @property
+    def has_numbers(self) -> bool:
+        """True if a value is a number."""
+        return bool(np.isfinite(np.array(self._values)).any())
+
+    def timed_values(self, time_unit: Unit) -> TimedValues:
+        """Return the values in the order of time. Of several values at one time the last one in the file counts."""
+        times_s = self.times * time_unit.factor
+        order = np.argsort(times_s, kind="stable")
+        is_last = np.append(np.diff(times_s[order]) > 0.0, True)
+        return TimedValues(times_s[order][is_last], np.array(self._values)[order][is_last])
+
+    def looks_like(self, quantity: Quantity) -> bool:
+        """Return True if its unit is one of the quantity, or if it has no unit but a name of the quantity."""
+        if self.unit:
+            return find_unit(quantity, self.unit) is not None
+        words = {word.lower() for _, cell in self.labels for word in _WORD.findall(cell)}
+        return not words.isdisjoint(WORDS[quantity])
+
+
+class HistoryExport:
+    """Reader of a history, as one block.
+
+    Args:
+        path: The file.
+        finder: Names of entities that the user gave by quantity, and of the column with the time.
+        records: Records of the file.
+
+    Attributes:
+        description: Kind of the file for messages.
+        layout: The entities as columns.
+        warning: Fault of the file; empty without one.
+
+    Raises:
+        UserError: A record is not valid, or it is not clear which entities are voltage and current.
+    """
+
+    fraction = 1.0
+
+    def __init__(self, path: Path, finder: LayoutFinder, records: CsvRecords | JsonRecords) -> None:
+        self._path, self._given, self.description = path, finder.given, records.description
+        self._entities = self._read(records)
+        self.warning = records.warning
+        pooled = np.concatenate([np.empty(0), *(entity.times for entity in self._entities)])
+        time_unit = unix_unit(pooled) or SI_UNITS["time"]
+        voltage, current = self._choose("voltage"), self._choose("current")
+        temperature = self._choose("temperature") if "temperature" in self._given else None
+        columns: dict[ColumnRole, Column] = {
+            Role.TIME: Column(0, records.times[-1], SI_UNITS["time"], kind=CellKind.DATE_TIME),
+            Role.VOLTAGE: self._column("voltage", voltage),
+            Role.CURRENT: self._column("current", current),
+            Role.STATUS: Column(0, "status", Unit("")),
+        }
+        if temperature:
+            columns[Role.TEMPERATURE] = self._column("temperature", temperature)
+        self.layout = Layout(DIALECT, columns, bool(self._given))
+        self._block = assemble(
+            voltage.timed_values(time_unit),
+            current.timed_values(time_unit),
+            temperature.timed_values(time_unit) if temperature else None,
+        )
+        if not self._block[Role.TIME].size:
+            raise UserError(
+                f"{path}: {voltage.name} and {current.name} have no values at the same time: export both for the same days"
+            )
+
+    def blocks(self) -> Iterator[RawBlock]:
+        """Yield all samples."""
+        yield self._block
+
+    def _read(self, records: CsvRecords | JsonRecords) -> Sequence[_Entity]:
+        """Return the entities with numbers, with their names."""
+        entities = dict[Labels, _Entity]()
+        for record in records:
+            try:
+                time = _parse_time(record.time)
+            except (ValueError, OverflowError):
+                cell = record.time[:MAX_TEXT_CHARACTERS]
+                raise UserError(
+                    f"{self._path}: {record.place}: time = {cell!r}: must be a date and time, year first, or Unix time"
+                ) from None
+            entity = entities.get(record.labels)
+            if entity is None:
+                entity = entities[record.labels] = _Entity(record.labels)
+            entity.add(record, time)
+        numeric = [entity for entity in entities.values() if entity.has_numbers]
+        for entity, name in zip(numeric, _names([dict(entity.labels) for entity in numeric]), strict=True):
+            entity.name = name
+        return numeric
+
+    def _choose(self, quantity: Quantity) -> _Entity:
+        """Return the entity of a quantity: the one that the user named, or the only one that looks like it."""
+        given = self._given.get(quantity)
+        if given is None:
+            found, reason = self._similar(quantity), f"look like a {quantity}"
+        else:
+            found, reason = self._named(given) or self._named(split_given_unit(given)[0]), f"have the name {given}"
+        if len(found) != 1:
+            raise self._unclear(f"{len(found) or 'no'} entities {reason}")
+        entity = found[0]
+        if entity.invalid:
+            raise UserError(
+                f"{self._path}: {entity.invalid} of {entity.name}: must be a number, unavailable or unknown; "
+                "choose other entities by --map"
+            )
+        return entity
+
+    def _named(self, name: str) -> Sequence[_Entity]:
+        """Return the entities with a name, or with the name in one of their columns."""
+        found = [entity for entity in self._entities if entity.name == name]
+        return found or [entity for entity in self._entities if name in dict(entity.labels).values()]
+
+    def _unclear(self, reason: str) -> UserError:
+        """Return the error for entities that are not clear. It lists the entities and shows the option to give."""
+        names = [entity.name for entity in self._entities]
+        examples = {"voltage": self._similar("voltage"), "current": self._similar("current")}
+        example = ",".join(
+            f"{quantity}={similar[0].name if similar else f'NAME_OF_{quantity.upper()}'}"
+            for quantity, similar in examples.items()
+        )
+        return UserError(
+            f"{self._path}: {reason}; entities with numbers: {shown(names) or 'none'}; name voltage and current as in "
+            f'--map "{example}" (in Python: column_map)'
+        )
+
+    def _similar(self, quantity: Quantity) -> Sequence[_Entity]:
+        """Return the entities that look like a quantity."""
+        return [entity for entity in self._entities if entity.looks_like(quantity)]
+
+    def _column(self, quantity: Quantity, entity: _Entity) -> Column:
+        """Return the column of an entity with its unit.
+
+        Raises:
+            UserError: The unit is not one of the quantity.
+        """
+        given = self._given.get(quantity, entity.name)
+        text = (None if self._named(given) else split_given_unit(given)[1]) or entity.unit
+        unit = find_unit(quantity, text) if text else SI_UNITS[quantity]
+        if unit is None:
+            raise UserError(
+                f"{self._path}: {entity.name}: {text!r} is not a unit of {quantity}; choose another entity by --map, or "
+                f'give its unit, as in --map "{quantity}={entity.name} [{SI_UNITS[quantity].symbol}]"'
+            )
+        return Column(0, entity.name, unit, assumed=not text)
+
+
+def _parse_time(cell: str) -> float:
+    """Return a number or the Unix time of a date with the year first.
+
+    Raises:
+        ValueError: The text is neither.
+    """
+    if cell[:4].isdecimal() and cell[4:5] in ("-", "/"):
+        return parse_date_time(cell)
+    time = measured(cell)
+    if not np.isfinite(time):
+        raise ValueError
+    return time
+
+
+def _names(labels: Sequence[Mapping[str, str]]) -> Sequence[str]:
+    """Return a name of each entity: its cell in a column that differs in all of them, otherwise all cells that differ."""
+    columns = list(dict.fromkeys(column for each in labels for column in each))
+    for column in sorted(columns, key=lambda column: column not in NAME_COLUMNS):
+        names = [each.get(column, "") for each in labels]
+        if all(names) and len(set(names)) == len(names):
+            return names
+    differing = [column for column in columns if len({each.get(column) for each in labels}) > 1]
+    return [" ".join(each[column] for column in differing if column in each) for each in labels]
