@@ -28,6 +28,8 @@ GOOD_SOC = 0.02
 """Maximum RMS error of a good SOC estimate. Coulomb counting itself is uncertain by 1 to 2 %, because of the capacity."""
 FAIR_SOC = 0.05
 """Maximum RMS error of a fair SOC estimate. Devices commonly keep a reserve of 5 %."""
+UNGRADED = "No grade, because the coulomb counting that the model is compared with is not reliable."
+"""Sentence of a verdict without a grade."""
 MIN_WITHIN_BAND = 0.9
 """Minimum fraction of samples whose SOC lies within ±2 std. The fraction is 95 % for a normal distribution."""
 USUAL_MIN_C, USUAL_MAX_C = 0.0, 45.0
@@ -167,7 +169,7 @@ def judge(runs: Sequence[Run], cell: CellModel, covered: Coverage | None = None)
     if not sound and grade is not Grade.GOOD:
         grade = None
     earlier = None if unfitted or cell.fit is None else cell.fit.grade
-    sentences = _voltage_sentences(None if earlier else grade, errors, is_explained=grade is None)
+    sentences = _voltage_sentences(None if earlier else grade, errors, is_explained=grade is None and earlier is None)
     if unfitted and len(unfitted) < len(runs):
         fitted = ", ".join(run.name for run in runs if run.is_fitted)
         sentences.append(f"Not part of the grade, because the cell file was fitted to them: {fitted}.")
@@ -226,7 +228,7 @@ def _voltage_sentences(grade: Grade | None, errors: VoltageErrors, *, is_explain
         "The measured voltage differs from the model by" if is_explained else "The model predicts the voltage within"
     )
     low, high = max(errors.soc[0], LOW_SOC), errors.soc[1]
-    sentences = []
+    sentences = [UNGRADED] if is_explained else []
     if math.isfinite(errors.rms_v):
         sentences.append(
             f"{subject} {_millivolts(errors.rms_v)} (RMS per cell, on average "

@@ -239,7 +239,8 @@ class CellModel(Strict):
     ocv: Annotated[ChenMoraOcv | TableOcv, Field(discriminator="form")]
     ladder: Ladder | None = Field(default=None, description="RC ladder; default: computed from the elements")
     adaptation: dict[str, Bounds] = Field(default_factory=dict, description="bounds by parameter, keys a1 to a15")
-    fit: Fit | None = Field(default=None, description="captures that the values were fitted to")
+    # repr=False: identities of checkpoints are hashes of the repr, and do not depend on the origin of the values
+    fit: Fit | None = Field(default=None, repr=False, description="captures that the values were fitted to")
 
     @model_validator(mode="after")
     def _known_parameters(self) -> Self:

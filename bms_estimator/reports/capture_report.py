@@ -189,7 +189,7 @@ def _ocv(cell: CellModel, validation: Validation, salt: str) -> Group:
     return Group(
         "Open-circuit voltage",
         (curve, Plot("Residuals of the OCV", residuals)),
-        remark=f"Points are the ends of {ends.size} rests; the relaxation that the model still expects there is subtracted. "
+        remark=f"Points are the ends of {ends.size} rests, at their SOC by coulomb counting; the relaxation that the model still expects there is subtracted. "
         f"They deviate by {rms_mv:.1f} mV RMS.",
     )
 
