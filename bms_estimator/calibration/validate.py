@@ -20,6 +20,8 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 
+GIVEN, FIRST_REST, UNDER_LOAD = "given", "first rest", "first sample under load"
+"""Origins of the SOC at the first sample."""
 LOW_SOC = 0.1
 """SOC below which (2.5)-(2.9) do not fit any measured cell. Errors are reported with and without that range."""
 
@@ -134,12 +136,12 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     resting = np.abs(load.current_a) < REST_C_RATE * cell.cell.capacity_ah
     current_a = load.current_a[above]
     extra_ohm = -float(error_v[above] @ current_a) / max(float(current_a @ current_a), 1e-12)
-    measured_from = "first rest" if load.resting_samples else "first sample under load"
+    measured_from = FIRST_REST if load.resting_samples else UNDER_LOAD
     return Validation(
         samples=load.samples,
         glitches=load.glitches,
         initial_soc=start,
-        initial_soc_from=measured_from if initial_soc is None else "given",
+        initial_soc_from=measured_from if initial_soc is None else GIVEN,
         final_soc=float(soc[-1]),
         all=_errors(error_v, load.voltage_v),
         above=_errors(error_v[above], load.voltage_v[above]),

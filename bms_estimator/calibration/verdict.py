@@ -3,14 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import LONG_REST_S, ends_of_long_rests
+from bms_estimator.calibration.reference import ReferenceFault, reference_faults
+from bms_estimator.calibration.soc_errors import SocErrors
 from bms_estimator.calibration.validate import LOW_SOC, Validation
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell import CellModel, Grade
+from bms_estimator.model.sample import SampleBlock, capture_digest
 
 GOOD_RMS_V = 0.010
 """Maximum RMS error of a good model, per cell [V]. Cell files that were fitted to captures of their own cell have 5 to
@@ -26,6 +28,8 @@ GOOD_SOC = 0.02
 """Maximum RMS error of a good SOC estimate. Coulomb counting itself is uncertain by 1 to 2 %, because of the capacity."""
 FAIR_SOC = 0.05
 """Maximum RMS error of a fair SOC estimate. Devices commonly keep a reserve of 5 %."""
+UNGRADED = "No grade, because the coulomb counting that the model is compared with is not reliable."
+"""Sentence of a verdict without a grade."""
 MIN_WITHIN_BAND = 0.9
 """Minimum fraction of samples whose SOC lies within ±2 std. The fraction is 95 % for a normal distribution."""
 USUAL_MIN_C, USUAL_MAX_C = 0.0, 45.0
@@ -34,14 +38,6 @@ FULL_SOC = 0.95
 """SOC that counts as full, because a charge with a voltage limit ends below 1."""
 MIN_LOAD_C_RATE = 0.05
 """Minimum C-rate of a load that shows resistances [1/h]. At C/20 the overpotential is a few millivolts."""
-
-
-class Grade(StrEnum):
-    """Quality of a model."""
-
-    GOOD = "good"
-    FAIR = "fair"
-    POOR = "poor"
 
 
 @dataclass(frozen=True)
@@ -62,16 +58,20 @@ class VoltageErrors:
 
 
 @dataclass(frozen=True)
-class SocErrors:
-    """Errors of the estimated SOC against coulomb counting.
+class Run:
+    """Comparison of a model with one capture.
 
     Attributes:
-        rms: RMS error, 0..1.
-        within_band: Fraction of the samples whose error is at most 2 std.
+        name: Name of the capture.
+        validation: Validation of the model on the capture.
+        soc_errors: Errors of the estimated SOC.
+        is_fitted: True if the model was fitted to the capture.
     """
 
-    rms: float
-    within_band: float
+    name: str
+    validation: Validation
+    soc_errors: SocErrors
+    is_fitted: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,19 +98,26 @@ class Verdict:
     """Verdict on a model.
 
     Attributes:
-        grade: Grade of the voltage errors.
+        grade: Grade of the model by its voltage errors; None if an error of the reference prevents it.
         sentences: Sentences on the errors.
         unknown: Conditions that the captures do not cover, such as ``below 10 °C``.
     """
 
-    grade: Grade
+    grade: Grade | None
     sentences: tuple[str, ...]
     unknown: tuple[str, ...]
 
     @property
-    def text(self) -> str:
+    def all_sentences(self) -> tuple[str, ...]:
         """All sentences, with the unknown conditions at the end."""
-        return " ".join([*self.sentences, *([f"Not known: {'; '.join(self.unknown)}."] if self.unknown else [])])
+        if not self.unknown:
+            return self.sentences
+        return (*self.sentences, f"Not known, because the captures do not show it: {'; '.join(self.unknown)}.")
+
+    @property
+    def text(self) -> str:
+        """All sentences in one paragraph."""
+        return " ".join(self.all_sentences)
 
 
 def voltage_errors(validations: Sequence[Validation], cell: CellModel) -> VoltageErrors:
@@ -141,16 +148,48 @@ def coverage(validations: Sequence[Validation], cell: CellModel) -> Coverage:
     )
 
 
-def judge(errors: VoltageErrors, covered: Coverage, soc_errors: SocErrors | None = None) -> Verdict:
+def judge(runs: Sequence[Run], cell: CellModel, covered: Coverage | None = None) -> Verdict:
     """Return the verdict on a model.
 
+    The grade comes from the captures to which the model was not fitted and whose reference has no error. An error of the
+    reference can only increase the voltage errors, so that a good model keeps its grade.
+
     Args:
-        errors: Errors of the modeled voltage, preferably on captures that were not used in the fit.
-        covered: Operating ranges of all captures.
-        soc_errors: Errors of the estimated SOC; None if no estimator was run.
+        runs: Comparisons of ``cell`` with captures, at least one.
+        cell: The model.
+        covered: Operating ranges of all captures; None: those of ``runs``.
     """
-    grade = grade_voltage(errors)
-    return Verdict(grade, tuple(_sentences(grade, errors, soc_errors)), tuple(_unknown_conditions(covered)))
+    covered = covered or coverage([run.validation for run in runs], cell)
+    unfitted = [run for run in runs if not run.is_fitted]
+    judged = unfitted or list(runs)
+    faults = [_faults_of(run, cell) for run in judged]
+    sound = [run for run, found in zip(judged, faults, strict=True) if not any(f.affects_voltage for f in found)]
+    errors = voltage_errors([run.validation for run in sound or judged], cell)
+    grade: Grade | None = grade_voltage(errors)
+    if not sound and grade is not Grade.GOOD:
+        grade = None
+    earlier = None if unfitted or cell.fit is None else cell.fit.grade
+    sentences = _voltage_sentences(None if earlier else grade, errors, is_explained=grade is None and earlier is None)
+    if unfitted and len(unfitted) < len(runs):
+        fitted = ", ".join(run.name for run in runs if run.is_fitted)
+        sentences.append(f"Not part of the grade, because the cell file was fitted to them: {fitted}.")
+    elif not unfitted:
+        sentences.append(_fitted_sentence(len(runs), earlier))
+    for run, found in zip(judged, faults, strict=True):
+        sentences += [fault.text if len(runs) == 1 else f"{run.name}: {fault.text}" for fault in found]
+    comparable = [run.soc_errors for run, found in zip(judged, faults, strict=True) if not found]
+    sentences += _soc_sentences(comparable, with_grade=earlier is None)
+    return Verdict(earlier or grade, tuple(sentences), tuple(_unknown_conditions(covered)))
+
+
+def is_fitted_to(cell: CellModel, samples: SampleBlock) -> bool:
+    """Return True if the cell file was fitted to a capture, of which ``samples`` are all as they were read."""
+    return cell.fit is not None and capture_digest(samples) in cell.fit.captures
+
+
+def _faults_of(run: Run, cell: CellModel) -> list[ReferenceFault]:
+    """Return the errors of the reference of a comparison."""
+    return reference_faults(run.validation, cell, GOOD_RMS_V, run.soc_errors.faults)
 
 
 def grade_voltage(errors: VoltageErrors) -> Grade:
@@ -160,11 +199,11 @@ def grade_voltage(errors: VoltageErrors) -> Grade:
     return Grade.FAIR if errors.rms_v <= FAIR_RMS_V and errors.mean_percent <= FAIR_PERCENT else Grade.POOR
 
 
-def grade_soc(errors: SocErrors) -> Grade:
-    """Return the grade of the SOC errors."""
-    if errors.rms <= GOOD_SOC:
+def grade_soc(rms: float) -> Grade:
+    """Return the grade of an RMS error of the SOC, 0..1."""
+    if rms <= GOOD_SOC:
         return Grade.GOOD
-    return Grade.FAIR if errors.rms <= FAIR_SOC else Grade.POOR
+    return Grade.FAIR if rms <= FAIR_SOC else Grade.POOR
 
 
 def _soc_range(validations: Sequence[Validation]) -> tuple[float, float]:
@@ -177,27 +216,50 @@ def _range(values: Floats) -> tuple[float, float]:
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
-def _sentences(grade: Grade, errors: VoltageErrors, soc_errors: SocErrors | None) -> list[str]:
-    """Return the sentences on the errors."""
+def _voltage_sentences(grade: Grade | None, errors: VoltageErrors, *, is_explained: bool) -> list[str]:
+    """Return the sentences on the voltage errors.
+
+    Args:
+        grade: Grade of the errors; None: not stated.
+        errors: The errors.
+        is_explained: True if the errors are those of the reference, and not of the model.
+    """
+    subject = (
+        "The measured voltage differs from the model by" if is_explained else "The model predicts the voltage within"
+    )
     low, high = max(errors.soc[0], LOW_SOC), errors.soc[1]
-    sentences = []
+    sentences = [UNGRADED] if is_explained else []
     if math.isfinite(errors.rms_v):
         sentences.append(
-            f"The model predicts the voltage within {_millivolts(errors.rms_v)} (RMS per cell, on average "
-            f"{errors.mean_percent:.2g} % of the voltage) between SOC {100 * low:.0f} % and {100 * high:.0f} %: {grade}."
+            f"{subject} {_millivolts(errors.rms_v)} (RMS per cell, on average "
+            f"{errors.mean_percent:.2g} % of the voltage) between SOC {100 * low:.0f} % and {100 * high:.0f} %"
+            f"{f': {grade}' if grade else ''}."
         )
     if math.isfinite(errors.low_soc_rms_v):
         sentences.append(f"Below SOC {100 * LOW_SOC:.0f} % the error is {_millivolts(errors.low_soc_rms_v)}.")
-    if soc_errors is not None:
-        sentences.append(_soc_sentence(soc_errors))
     return sentences
 
 
-def _soc_sentence(errors: SocErrors) -> str:
-    sentence = f"The estimated SOC differs from coulomb counting by {100 * errors.rms:.1f} % (RMS): {grade_soc(errors)}"
-    if errors.within_band >= MIN_WITHIN_BAND:
-        return f"{sentence}."
-    return f"{sentence}, but its ±2 std band is too narrow: only {100 * errors.within_band:.0f} % of the samples are inside."
+def _fitted_sentence(captures: int, grade: Grade | None) -> str:
+    """Return the sentence on captures to which the cell file was fitted, with its grade on data that were held back."""
+    these = "this capture" if captures == 1 else "these captures"
+    sentence = f"The cell file was fitted to {these}, so that its errors on other captures may be larger"
+    return f"{sentence}; on data that were held back from the fit it was {grade}." if grade else f"{sentence}."
+
+
+def _soc_sentences(errors: Sequence[SocErrors], *, with_grade: bool) -> list[str]:
+    """Return the sentence on the SOC errors of captures, or nothing without scored samples."""
+    scored = [each for each in errors if each.samples]
+    samples = sum(each.samples for each in scored)
+    if not samples:
+        return []
+    rms = math.sqrt(sum(each.samples * each.rms**2 for each in scored) / samples)
+    within_band = sum(each.samples * each.within_band for each in scored) / samples
+    grade = f": {grade_soc(rms)}" if with_grade else ""
+    sentence = f"The estimated SOC differs from coulomb counting by {100 * rms:.1f} % (RMS){grade}"
+    if within_band >= MIN_WITHIN_BAND:
+        return [f"{sentence}."]
+    return [f"{sentence}, but its ±2 std band is too narrow: only {100 * within_band:.0f} % of the samples are inside."]
 
 
 def _unknown_conditions(covered: Coverage) -> list[str]:

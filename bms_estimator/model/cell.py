@@ -10,6 +10,8 @@ of such objects in series and parallel.
 import itertools
 import math
 import tomllib
+from collections.abc import Sequence
+from enum import StrEnum
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -208,8 +210,25 @@ class Cell(Rated):
     )
 
 
+class Grade(StrEnum):
+    """Quality of a cell model."""
+
+    GOOD = "good"
+    FAIR = "fair"
+    POOR = "poor"
+
+
+class Fit(Strict):
+    """Captures to which a cell file was fitted, and the result of its validation."""
+
+    captures: tuple[str, ...] = Field(default=(), description="digests of the captures' samples")
+    grade: Grade | None = Field(
+        default=None, description="grade on data that were held back from the fit; default: not validated"
+    )
+
+
 class CellModel(Strict):
-    """Contents of a cell file: ratings, elements (2.5)-(2.9), OCV, RC ladder, and bounds of the adaptive law."""
+    """Contents of a cell file: ratings, elements (2.5)-(2.9), OCV, RC ladder, bounds of the adaptive law, and the fit."""
 
     cell: Cell
     r_ts: Resistance
@@ -220,6 +239,8 @@ class CellModel(Strict):
     ocv: Annotated[ChenMoraOcv | TableOcv, Field(discriminator="form")]
     ladder: Ladder | None = Field(default=None, description="RC ladder; default: computed from the elements")
     adaptation: dict[str, Bounds] = Field(default_factory=dict, description="bounds by parameter, keys a1 to a15")
+    # repr=False: identities of checkpoints are hashes of the repr, and do not depend on the origin of the values
+    fit: Fit | None = Field(default=None, repr=False, description="captures that the values were fitted to")
 
     @model_validator(mode="after")
     def _known_parameters(self) -> Self:
@@ -283,7 +304,14 @@ def _scaled(model: CellModel, series: int, parallel: float) -> CellModel:
     cell = scaled_by_unit(model.cell, factor) | {"series_count": model.cell.series_count * series}
     ladder = None if model.ladder is None else scaled_by_unit(model.ladder, factor)
     return CellModel.model_validate(
-        {"cell": cell, "ocv": scaled_by_unit(model.ocv, factor), "ladder": ladder, "adaptation": adaptation, **elements}
+        {
+            "cell": cell,
+            "ocv": scaled_by_unit(model.ocv, factor),
+            "ladder": ladder,
+            "adaptation": adaptation,
+            "fit": model.fit,
+        }
+        | elements
     )
 
 
@@ -362,10 +390,28 @@ def load_cell(name_or_path: str | Path, capacity_ah: float | None = None) -> Cel
 
 
 def with_capacity(cell: CellModel, capacity_ah: float, relative_std: float | None = None) -> CellModel:
-    """Return the cell with another capacity [Ah], its relative std (None: unknown), and unchanged resistances."""
-    return cell.model_copy(
-        update={"cell": cell.cell.model_copy(update={"capacity_ah": capacity_ah, "capacity_std": relative_std})}
-    )
+    """Return the cell with another capacity [Ah], its relative std (None: unknown), and unchanged resistances.
+
+    The grade of the cell's validation does not apply to another capacity.
+    """
+    ratings = cell.cell.model_copy(update={"capacity_ah": capacity_ah, "capacity_std": relative_std})
+    if cell.fit is None or capacity_ah == cell.cell.capacity_ah:
+        return cell.model_copy(update={"cell": ratings})
+    return cell.model_copy(update={"cell": ratings, "fit": cell.fit.model_copy(update={"grade": None})})
+
+
+def fitted_to(cell: CellModel, captures: Sequence[str], grade: Grade | None = None) -> CellModel:
+    """Return the cell with the digests of the captures that it was fitted to, beside those of the cell it began with.
+
+    Args:
+        cell: The cell.
+        captures: Digests by ``capture_digest``.
+        grade: Grade on data that were held back from the fit; None: not validated.
+    """
+    if cell.fit is None and not captures:
+        return cell
+    earlier = cell.fit.captures if cell.fit else ()
+    return cell.model_copy(update={"fit": Fit(captures=tuple(dict.fromkeys([*earlier, *captures])), grade=grade)})
 
 
 def with_name(cell: CellModel, name: str) -> CellModel:

@@ -4,6 +4,7 @@ Sources yield samples in blocks, numpy structured arrays of dtype ``SAMPLE``. A 
 from a serial line, or some thousand rows of a file.
 """
 
+import hashlib
 from enum import IntFlag
 from typing import Literal
 
@@ -79,6 +80,14 @@ def fill_temperature(samples: SampleBlock, temperature_c: float | None) -> None:
     if temperature_c is not None and not any(np.isfinite(samples[name]).any() for name in names):
         for name in names:
             samples[name] = temperature_c
+
+
+def capture_digest(samples: SampleBlock) -> str:
+    """Return a digest of times, currents and voltages, by which a capture is recognized in any file format."""
+    digest = hashlib.sha256()
+    for name in ("time_s", "current_a", "voltage_v"):
+        digest.update(np.ascontiguousarray(samples[name]).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def remove_implausible(values: NDArray[np.float64], low: float, high: float) -> int:

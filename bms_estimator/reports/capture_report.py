@@ -10,9 +10,10 @@ import numpy as np
 from bms_estimator import plot
 from bms_estimator.calibration.cleaning.capture_checks import ends_of_long_rests
 from bms_estimator.calibration.cleaning.data_quality import DataQuality
+from bms_estimator.calibration.soc_errors import SocErrors
 from bms_estimator.calibration.thesis.prediction import open_circuit
 from bms_estimator.calibration.validate import Validation
-from bms_estimator.calibration.verdict import SocErrors, coverage, judge, voltage_errors
+from bms_estimator.calibration.verdict import Run, Verdict, judge
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.plot.cell_curves import ELEMENTS, PAIRS
@@ -30,7 +31,7 @@ class Estimates:
     Attributes:
         columns: Columns of the trace by name, thinned so that the extremes remain; ``time_s`` from 0 at the first sample.
         counted: SOC by coulomb counting at the same samples.
-        soc_errors: Errors of the SOC over all samples.
+        soc_errors: Errors of the SOC.
         capacity_ah: Learned capacity [Ah].
         capacity_std_ah: Standard deviation of the learned capacity [Ah].
         suspicions: Suspicions of the input at the end, one sentence each.
@@ -53,6 +54,7 @@ class CaptureResult:
         validation: Comparison of the cell's model with the capture.
         estimates: Estimates over the capture.
         quality: Quality of the data.
+        is_fitted: True if the model was fitted to the capture.
         decoder_counters: Counters of the decoder of a raw capture, such as CRC errors; empty for a table.
         clock_ppm: Rate error of the device's clock [1e-6]; None if unknown.
     """
@@ -61,41 +63,41 @@ class CaptureResult:
     validation: Validation
     estimates: Estimates
     quality: DataQuality
+    is_fitted: bool
     decoder_counters: Mapping[str, int]
     clock_ppm: float | None
 
+    @property
+    def run(self) -> Run:
+        """Comparison of the model with the capture, for the verdict."""
+        return Run(self.name, self.validation, self.estimates.soc_errors, self.is_fitted)
 
-def capture_report(cell: CellModel, results: Sequence[CaptureResult], written: str) -> ReportPage:
+
+def capture_report(
+    cell: CellModel, results: Sequence[CaptureResult], written: str, verdict: Verdict | None = None
+) -> ReportPage:
     """Return the report on captures.
 
     Args:
         cell: Model of a cell or of a whole pack that the captures were compared with.
         results: Results of each capture.
         written: Time at which the report is written.
+        verdict: Verdict of the calibration that made the model; None: by ``results``.
     """
-    validations = [result.validation for result in results]
-    verdict = judge(voltage_errors(validations, cell), coverage(validations, cell), _soc_errors(results))
-    unknown = f"Not known, because the captures do not show it: {'; '.join(verdict.unknown)}."
+    has_verdicts = len(results) > 1 or verdict is not None
+    verdict = verdict or judge([result.run for result in results], cell)
     names = ", ".join(result.name for result in results)
     ratings = cell.cell
     return ReportPage(
         title=f"{ratings.name}: report on {names if len(results) == 1 else f'{len(results)} captures'}",
         subtitle=f"Cell model {ratings.name}, {ratings.capacity_ah:g} Ah, {ratings.nominal_voltage_v:g} V. Captures: {names}.",
-        grade=verdict.grade.value,
-        sentences=(*verdict.sentences, unknown),
+        grade=verdict.grade.value if verdict.grade else "",
+        sentences=verdict.all_sentences,
         sections=tuple(
-            _section(cell, result, position, has_verdict=len(results) > 1) for position, result in enumerate(results, 1)
+            _section(cell, result, position, has_verdict=has_verdicts) for position, result in enumerate(results, 1)
         ),
         written=written,
     )
-
-
-def _soc_errors(results: Sequence[CaptureResult]) -> SocErrors:
-    """Return the SOC errors over all captures, weighted by their numbers of samples."""
-    samples = np.array([result.quality.samples for result in results], dtype=float)
-    squares = [result.estimates.soc_errors.rms**2 for result in results]
-    within = [result.estimates.soc_errors.within_band for result in results]
-    return SocErrors(float(np.sqrt(np.average(squares, weights=samples))), float(np.average(within, weights=samples)))
 
 
 def _section(cell: CellModel, result: CaptureResult, position: int, *, has_verdict: bool) -> Section:
@@ -105,17 +107,16 @@ def _section(cell: CellModel, result: CaptureResult, position: int, *, has_verdi
         cell: Cell that the capture was compared with.
         result: Results of the capture.
         position: Number of the section, which makes ids unique.
-        has_verdict: True if the section has a verdict of its own, because the page is on several captures.
+        has_verdict: True if the section has a verdict of its own, because the page's verdict is on other data.
     """
     validation = result.validation
     extent = (
         f"{result.quality.duration_s / 3600.0:.2f} h, {validation.samples:,} samples, SOC {100 * validation.initial_soc:.1f} % "
         f"({validation.initial_soc_from}) to {100 * validation.final_soc:.1f} % by coulomb counting."
     )
-    verdict = judge(voltage_errors([validation], cell), coverage([validation], cell), result.estimates.soc_errors)
     return Section(
         title=result.name,
-        sentences=(extent, *(verdict.sentences if has_verdict else ())),
+        sentences=(extent, *(judge([result.run], cell).sentences if has_verdict else ())),
         warnings=(*validation.warnings, *result.estimates.suspicions),
         groups=(
             _over_time(result, f"capture-{position}"),
@@ -188,7 +189,7 @@ def _ocv(cell: CellModel, validation: Validation, salt: str) -> Group:
     return Group(
         "Open-circuit voltage",
         (curve, Plot("Residuals of the OCV", residuals)),
-        remark=f"Points are the ends of {ends.size} rests; the relaxation that the model still expects there is subtracted. "
+        remark=f"Points are the ends of {ends.size} rests, at their SOC by coulomb counting; the relaxation that the model still expects there is subtracted. "
         f"They deviate by {rms_mv:.1f} mV RMS.",
     )
 

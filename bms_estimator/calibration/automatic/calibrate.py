@@ -14,15 +14,14 @@ from bms_estimator.calibration.automatic.given_values import capacity_warnings, 
 from bms_estimator.calibration.automatic.hold_back import Split, hold_back, use_all
 from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFitter
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture, recognize
-from bms_estimator.calibration.elements.replay_score import MIN_SOC, SETTLING_S
 from bms_estimator.calibration.ocv.source import ExternalCurve
+from bms_estimator.calibration.soc_errors import soc_errors
 from bms_estimator.calibration.validate import Validation, validate
-from bms_estimator.calibration.verdict import SocErrors, Verdict, coverage, judge, voltage_errors
+from bms_estimator.calibration.verdict import Run, Verdict, coverage, judge, voltage_errors
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE
 
 MAX_FULL_DEVIATION_V = 0.45
 """Maximum difference between the highest voltages of captures of one cell [V]. It allows the 0.31 V between a full LFP cell at rest
@@ -96,17 +95,20 @@ def calibrate(
     validated_model, model, notes = _fit_both(fitter, split, use_all(recognized), report)
     report(1.0, "validation")
     validations, failures = _validate_all(recognized, model)
-    covered = coverage(validations, model.cell) if validations else None  # by all captures, not only the data held back
-    soc_errors = None
+    covered = coverage([v for _, v in validations], model.cell) if validations else None  # by all captures
     if split.held_back is not None:
         initial_soc = model.initial_soc(split.held_back)
         validation = validate(
             split.held_back.capture, validated_model.cell, initial_soc=initial_soc, from_s=split.held_back_from_s
         )
-        validations, soc_errors = [validation], _soc_errors(validation, validated_model.cell)
+        validations = [(split.held_back.capture, validation)]
     if not validations:
         raise UserError("\n".join(failures))
-    errors = voltage_errors(validations, validated_model.cell)
+    runs = [
+        Run(capture.name, validation, soc_errors(Estimator(validated_model.cell), capture.rows, validation))
+        for capture, validation in validations
+    ]
+    errors = voltage_errors([run.validation for run in runs], validated_model.cell)
     contradictions = [
         *chemistry_warnings(given, capacity, model.ocv),
         *capacity_warnings(given, capacity, recognized, errors.low_soc_rms_v),
@@ -117,8 +119,8 @@ def calibrate(
         captures=recognized,
         has_held_back_data=split.held_back is not None,
         validation_data=split.sentence,
-        validations=tuple(validations),
-        verdict=judge(errors, covered or coverage(validations, model.cell), soc_errors),
+        validations=tuple(run.validation for run in runs),
+        verdict=judge(runs, validated_model.cell, covered),
         warnings=(*contradictions, *notes, *failures),
     )
 
@@ -171,27 +173,15 @@ def _fit_both(
     return validated_model, model, []
 
 
-def _validate_all(captures: Sequence[RecognizedCapture], model: FittedModel) -> tuple[list[Validation], list[str]]:
-    """Validate the model on all captures; return also the reasons why some cannot be validated."""
+def _validate_all(
+    captures: Sequence[RecognizedCapture], model: FittedModel
+) -> tuple[list[tuple[Columns, Validation]], list[str]]:
+    """Validate the model on all captures; return each with its validation, and the reasons why some cannot be validated."""
     validations, warnings = [], []
     for each in captures:
         try:
-            validations.append(validate(each.capture, model.cell, initial_soc=model.initial_soc(each)))
+            validation = validate(each.capture, model.cell, initial_soc=model.initial_soc(each))
+            validations.append((each.capture, validation))
         except UserError as error:
             warnings.append(str(error))
     return validations, warnings
-
-
-def _soc_errors(validation: Validation, cell: CellModel) -> SocErrors | None:
-    """Return the errors of an estimator that initializes its SOC from the voltage; None if the capture is too short."""
-    samples = np.zeros(validation.time_s.size, dtype=SAMPLE)
-    for name in ("time_s", "current_a", "voltage_v", "temperature_c"):
-        samples[name] = getattr(validation, name)
-    trace = Estimator(cell).run(samples)
-    true_soc = np.interp(trace["time_s"], validation.time_s, validation.soc)
-    scored = (trace["time_s"] >= SETTLING_S) & (true_soc >= MIN_SOC)
-    if not scored.any():
-        return None
-    error = (trace["soc"] - true_soc)[scored]
-    within = np.abs(error) <= 2.0 * trace["soc_std"][scored]
-    return SocErrors(rms=float(np.sqrt(np.mean(error**2))), within_band=float(within.mean()))

@@ -82,7 +82,7 @@ def soc_outside(load: CleanCapture, capacity_ah: float, initial_soc: float) -> s
     return (
         f"SOC runs from {soc.min():.3f} to {soc.max():.3f}, outside 0..1: from {initial_soc:.3f} at the start "
         f"({load.start_v:.3f} V), {np.ptp(load.discharged_ah):.3f} Ah were moved with a capacity of "
-        f"{capacity_ah:g} Ah; give the right capacity, or the OCV of this cell"
+        f"{capacity_ah:g} Ah; give the right capacity (--capacity-ah) or SOC at the start (--soc), or the OCV of this cell"
     )
 
 

@@ -104,7 +104,7 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
             f"{name}: {good.size} of {samples.size} samples lie within the cell's limits ({limits.voltage_min_v:g} to "
             f"{limits.voltage_max_v:g} V, {limits.current_max_a:g} A); the capture runs from {voltage_v.min():.3f} to "
             f"{voltage_v.max():.3f} V and {current_a.min():.3f} to {current_a.max():.3f} A: check the cell file and its "
-            "number of cells in series (calibrate, report: --series)"
+            "number of cells in series (calibrate, report, validate: --series)"
         )
     if good.size < MIN_SAMPLES:
         raise UserError(f"{name}: {good.size} good samples are too few, at least {MIN_SAMPLES} are needed")

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.data_quality import data_quality
+from bms_estimator.calibration.soc_errors import BLOCK_SAMPLES, first_time_s, soc_errors
 from bms_estimator.calibration.validate import Validation, validate
-from bms_estimator.calibration.verdict import SocErrors
+from bms_estimator.calibration.verdict import is_fitted_to
 from bms_estimator.cli.options.capture_input import read_with_bar
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.progress_bar import progress_bar
@@ -26,8 +27,6 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Capture, RawCapture
 from bms_estimator.telemetry.health import suspicions
 
-BLOCK_SAMPLES = 1 << 16
-"""Number of samples in a block. The trace of one block at a time is in memory."""
 ESTIMATE_POINTS = 6000
 """Maximum number of rows of the trace that remain after thinning."""
 KEPT_EXTREMES = ("soc", "soc_std", "r_s_ohm", "r_ts_ohm", "r_tl_ohm", "tau_ts_s", "tau_tl_s")
@@ -61,6 +60,7 @@ def capture_result(
     with show_compile_progress():
         rows = read_with_bar(file, opened)
         quality = data_quality(rows)  # first, because it needs memory for copies of columns
+        is_fitted = is_fitted_to(model, rows)
         fill_temperature(rows, temperature_c)
         validation = validate(Columns(rows, name), model, initial_soc=initial_soc)
         estimator = new_estimator(settings, model)
@@ -72,32 +72,10 @@ def capture_result(
         validation,
         estimates,
         quality,
+        is_fitted=is_fitted,
         decoder_counters=dict(raw.decoder.counters) if raw else {},
         clock_ppm=raw.decoder.clock_ppm if raw else None,
     )
-
-
-class _SocErrorSums:
-    """Running sums over the blocks of a trace for the errors of its SOC.
-
-    Attributes:
-        samples: Number of samples so far.
-    """
-
-    def __init__(self) -> None:
-        self.samples = 0
-        self._squares, self._within_band = 0.0, 0
-
-    def add(self, trace: SampleBlock, counted: Floats) -> None:
-        """Add a block of the trace, with the SOC by coulomb counting at its samples."""
-        error = trace["soc"] - counted
-        self.samples += trace.size
-        self._squares += float(error @ error)
-        self._within_band += int(np.count_nonzero(np.abs(error) <= 2.0 * trace["soc_std"]))
-
-    def errors(self) -> SocErrors:
-        """Return the errors of the samples so far, at least one."""
-        return SocErrors(float(np.sqrt(self._squares / self.samples)), self._within_band / self.samples)
 
 
 def _estimate(estimator: Estimator, rows: SampleBlock, validation: Validation, progress: Progress) -> Estimates:
@@ -106,27 +84,25 @@ def _estimate(estimator: Estimator, rows: SampleBlock, validation: Validation, p
     Raises:
         UserError: The estimator accepted no sample.
     """
-    first_s = float(rows["time_s"][np.isfinite(rows["time_s"])][0])
     max_rows = max(ESTIMATE_POINTS * BLOCK_SAMPLES // rows.size, 1)
-    sums, traces, counted = _SocErrorSums(), [], []
-    for begin in range(0, rows.size, BLOCK_SAMPLES):
-        block = rows[begin : begin + BLOCK_SAMPLES]
-        block_trace = estimator.run(block)
-        progress((begin + block.size) / rows.size)
-        block_counted = np.interp(block_trace["time_s"] - first_s, validation.time_s, validation.soc)
-        sums.add(block_trace, block_counted)
-        kept = _thinned_indices(block_trace, max_rows)
-        traces.append(block_trace[kept])
+    traces, counted = [], []
+
+    def keep(trace: SampleBlock, block_counted: Floats, fraction: float) -> None:
+        kept = _thinned_indices(trace, max_rows)
+        traces.append(trace[kept])
         counted.append(block_counted[kept])
-    if sums.samples == 0:
+        progress(fraction)
+
+    errors = soc_errors(estimator, rows, validation, keep)
+    if not any(trace.size for trace in traces):
         raise UserError("the estimator accepted no sample of the capture")
     trace = np.concatenate(traces)
     capacity = relative_capacity(estimator.record[0])
     rated_ah = float(estimator.settings["capacity_as"][0]) / 3600.0
     return Estimates(
-        {name: trace[name] for name in trace.dtype.names or ()} | {"time_s": trace["time_s"] - first_s},
+        {name: trace[name] for name in trace.dtype.names or ()} | {"time_s": trace["time_s"] - first_time_s(rows)},
         np.concatenate(counted),
-        sums.errors(),
+        errors,
         capacity_ah=capacity.value * rated_ah,
         capacity_std_ah=capacity.std * rated_ah,
         suspicions=tuple(suspicions(estimator.record[0], estimator.settings_record[0])),

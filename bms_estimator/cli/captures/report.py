@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from bms_estimator.calibration.verdict import Verdict
 from bms_estimator.cli.captures.capture_results import capture_result
 from bms_estimator.cli.captures.history_results import pack_history
 from bms_estimator.cli.options.capture_input import capture_files, print_guesses
@@ -115,6 +116,7 @@ def report_on_captures(
     *,
     series: int | None,
     temperature_c: float | None,
+    verdict: Verdict | None = None,
 ) -> ReportPage:
     """Return the page on captures and their cell's model.
 
@@ -127,6 +129,7 @@ def report_on_captures(
         soc: SOC at the first sample of each capture, 0..1; None: from the voltage.
         series: Number of cells in series; None: the number in the settings.
         temperature_c: Temperature of captures without a sensor [°C]; None: the default of the model.
+        verdict: Verdict of the calibration that made the cell file; None: by the captures.
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah, series)
     if not isinstance(model, CellModel):
@@ -138,7 +141,7 @@ def report_on_captures(
         capture_result(file, name, capture, settings, model, initial_soc=soc, temperature_c=temperature_c)
         for file, name, capture in zip(files, names, opened, strict=True)
     ]
-    return capture_report(model, results, _now())
+    return capture_report(model, results, _now(), verdict)
 
 
 def _report_on_history(pack: Path | None, folder: Path | None, days: float | None) -> ReportPage:

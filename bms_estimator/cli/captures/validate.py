@@ -10,8 +10,11 @@ import typer
 from rich import box
 from rich.console import Console, Group
 from rich.table import Table
+from rich.text import Text
 
+from bms_estimator.calibration.soc_errors import soc_errors
 from bms_estimator.calibration.validate import Errors, Validation, validate
+from bms_estimator.calibration.verdict import Run, Verdict, is_fitted_to, judge
 from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
@@ -20,13 +23,19 @@ from bms_estimator.cli.options.capture_options import (
     CellName,
     Force,
     MappedColumns,
+    Series,
     SignOfCurrent,
     TemperatureWithoutSensor,
     check_output_file,
 )
+from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.cli.options.pack_options import pack_or_cell, with_pack
+from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.arrays import Records, structured_array
-from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import fill_temperature
 from bms_estimator.sinks.trace_file import table_sink
 
@@ -41,6 +50,7 @@ def validate_command(
             parser=decimal(0.0, 1.0), help="SOC at the first sample; default: from the voltage of the first rest"
         ),
     ] = None,
+    series: Series = None,
     temperature_c: TemperatureWithoutSensor = None,
     current_sign: SignOfCurrent = None,
     column_map: MappedColumns = None,
@@ -57,22 +67,32 @@ def validate_command(
 
     The parameters are constant. The measured voltage is used only for the SOC of the first rest.
     """
-    model = load_cell(cell, capacity_ah)
+    settings, model = pack_or_cell(None, cell, capacity_ah, series)
+    if not isinstance(model, CellModel):
+        raise UserError(f"{model.cell.name} is a fuel cell: validate needs a battery cell")
+    if soc is not None:
+        settings = with_pack(settings, initial_soc=soc)
     (loaded,) = load_captures([capture], current_sign=current_sign, column_map=column_map)
+    is_fitted = is_fitted_to(model, loaded.rows)
     fill_temperature(loaded.rows, temperature_c)
     if out is not None:
         check_output_file(out, [capture], force=force)
     residual_sink = table_sink(out) if out else None
     validation = validate(loaded, model, initial_soc=soc)
+    with show_compile_progress():
+        estimator = new_estimator(settings, model)
+    with progress_bar("estimating") as bar:
+        errors = soc_errors(estimator, loaded.rows, validation, lambda _trace, _counted, fraction: bar.update(fraction))
+    verdict = judge([Run(loaded.name, validation, errors, is_fitted)], model)
     for line in validation.warnings:
         typer.echo(f"warning: {line}", err=True)
     if residual_sink:
         with residual_sink:
             residual_sink.write(_residuals(validation))
     if as_json:
-        sys.stdout.write(json.dumps(_json_result(validation)) + "\n")
+        sys.stdout.write(json.dumps(_json_result(validation, verdict)) + "\n")
     else:
-        Console().print(_tables(capture, validation))
+        Console().print(_tables(capture, validation, verdict))
 
 
 def _residuals(validation: Validation) -> Records:
@@ -88,7 +108,7 @@ def _residuals(validation: Validation) -> Records:
     return structured_array(columns)
 
 
-def _json_result(validation: Validation) -> dict[str, Any]:
+def _json_result(validation: Validation, verdict: Verdict) -> dict[str, Any]:
     above = {f"{key}_soc_above_0_1": value for key, value in _errors(validation.above).items()}
     return (
         _errors(validation.all)
@@ -102,6 +122,8 @@ def _json_result(validation: Validation) -> dict[str, Any]:
             "loaded": _errors(validation.loaded),
             "extra_series_resistance_ohm": _finite_or_none(validation.extra_ohm),
             "with_extra_series_resistance": _errors(validation.with_extra_ohm),
+            "grade": verdict.grade,
+            "verdict": verdict.text,
             "warnings": list(validation.warnings),
         }
     )
@@ -120,8 +142,8 @@ def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _tables(capture: Path, validation: Validation) -> Group:
-    """Return a table of the errors over several sets of samples, with the SOC below it."""
+def _tables(capture: Path, validation: Validation, verdict: Verdict) -> Group:
+    """Return a table of the errors over several sets of samples, with the SOC and the verdict below it."""
     table = Table(title=capture.name, title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("", "samples", "RMS", "mean", "max"):
         table.add_column(column, justify="left" if not column else "right")
@@ -130,4 +152,4 @@ def _tables(capture: Path, validation: Validation) -> Group:
         indented = f"  {name}" if row > 1 else name
         table.add_row(indented, f"{errors.samples:,}", f"{1e3 * errors.voltage_rms_v:.2f} mV", *percents)
     soc = f"SOC {validation.initial_soc:.4f} ({validation.initial_soc_from}) to {validation.final_soc:.4f}"
-    return Group(table, f"{soc}; {validation.glitches} glitches skipped")
+    return Group(table, f"{soc}; {validation.glitches} glitches skipped", "", Text(verdict.text))

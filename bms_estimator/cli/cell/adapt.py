@@ -54,8 +54,9 @@ def adapt_command(
     check_output_file(out, captures, force=force)
     reject_duplicates(captures)
     model = load_cell(cell, capacity_ah)
-    adaptation = adapt(load_captures(captures, current_sign=current_sign, column_map=column_map), model, soc=soc)
-    write_cell_named_as_file(out, adaptation.cell, _remarks(cell, adaptation))
+    loaded = load_captures(captures, current_sign=current_sign, column_map=column_map)
+    adaptation = adapt(loaded, model, soc=soc)
+    write_cell_named_as_file(out, adaptation.cell, _remarks(cell, adaptation), loaded)
     if as_json:
         sys.stdout.write(json.dumps(_json_result(out, adaptation)) + "\n")
         return

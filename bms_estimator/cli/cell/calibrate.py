@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -32,11 +33,13 @@ from bms_estimator.cli.options.capture_options import (
 )
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.model.cell import fitted_to
 from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.config_file import write_text
-from bms_estimator.model.sample import fill_temperature
+from bms_estimator.model.sample import capture_digest, fill_temperature
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.sources.captures.curves import read_curve
+from bms_estimator.sources.captures.replay import load_capture
 
 
 class PlanName(StrEnum):
@@ -142,6 +145,9 @@ def calibrate_command(
                 typer.echo("interrupted; the same command continues the test", err=True)
                 raise typer.Exit(130)
             captures, recorded = [capture], [session.write_capture(capture)]
+        digests = [capture_digest(load_capture(file).rows) for file in recorded] or [
+            capture_digest(each.rows) for each in captures
+        ]
         for each in captures:
             fill_temperature(each.rows, temperature_c)
         with progress_bar("calibrating") as bar:
@@ -152,7 +158,9 @@ def calibrate_command(
                 curves=curves,
                 report=bar.update,
             )
-        write_cell(out, calibration.model.cell, remarks(calibration))
+        verdict = calibration.verdict
+        grade = verdict.grade if calibration.has_held_back_data else None
+        write_cell(out, fitted_to(calibration.model.cell, digests, grade), remarks(calibration))
         if session is not None:
             session.end()
         _print_result(out, calibration, as_json=as_json)
@@ -163,7 +171,15 @@ def calibrate_command(
             opened = open_captures(measured, pack, current_sign, column_map)
             capacity_ah = calibration.model.cell.cell.capacity_ah
             page = report_on_captures(
-                measured, opened, pack, str(out), capacity_ah, None, series=given.series, temperature_c=temperature_c
+                measured,
+                opened,
+                pack,
+                str(out),
+                capacity_ah,
+                None,
+                series=given.series,
+                temperature_c=temperature_c,
+                verdict=replace(verdict, sentences=(*verdict.sentences, calibration.validation_data)),
             )
             write_text(report, page.html())
             typer.echo(f"{report}: written", err=True)

@@ -61,7 +61,7 @@ def json_result(out: Path, calibration: Calibration) -> dict[str, Any]:
         "resistances_identified": identification is not None,
         "held_back": calibration.has_held_back_data,
         "validation": calibration.validation_data,
-        "grade": verdict.grade.value,
+        "grade": verdict.grade,
         "verdict": verdict.text,
         "warnings": list(calibration.warnings),
     }

@@ -99,7 +99,7 @@ def identify_command(
         )
     duration_s = time.perf_counter() - started_s
     initial_cell = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
-    write_cell_named_as_file(out, identification.cell, _remarks(initial_cell, identification))
+    write_cell_named_as_file(out, identification.cell, _remarks(initial_cell, identification), loaded)
     if as_json:
         sys.stdout.write(json.dumps(_json_result(out, identification, duration_s)) + "\n")
     else:

@@ -28,9 +28,9 @@ from bms_estimator.cli.options.capture_options import (
     check_output_file,
     name_of,
     reject_duplicates,
+    write_cell_named_as_file,
 )
 from bms_estimator.cli.options.number_options import decimal, whole
-from bms_estimator.model.cell_file import write_cell
 
 STEEP_SOC = 0.05
 """Width of the ranges at both ends of the SOC in which OCV curves are steep."""
@@ -150,7 +150,7 @@ def ocv(
         recordings, curves, form=form, capacity_ah=capacity_ah, initial_soc=soc, series_count=series, name=name_of(out)
     )
     result = _result(form, determined)
-    write_cell(out, determined.cell, _remarks(result))
+    write_cell_named_as_file(out, determined.cell, _remarks(result), loaded)
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:

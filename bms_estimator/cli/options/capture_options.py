@@ -8,10 +8,11 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.number_options import decimal, whole
-from bms_estimator.model.cell import CellModel, battery_names, cell_names, with_name
+from bms_estimator.model.cell import CellModel, battery_names, cell_names, fitted_to, with_name
 from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import CurrentSign
+from bms_estimator.model.sample import CurrentSign, capture_digest
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 
@@ -144,6 +145,10 @@ def name_of(path: Path) -> str:
     return path.name.split(".")[0]
 
 
-def write_cell_named_as_file(out: Path, cell: CellModel, remarks: list[str]) -> None:
-    """Write a cell file. Its cell is named after the file, and ``remarks`` become comments at its beginning."""
-    write_cell(out, with_name(cell, name_of(out)), remarks)
+def write_cell_named_as_file(out: Path, cell: CellModel, remarks: list[str], captures: Sequence[Columns] = ()) -> None:
+    """Write a cell file that was fitted to captures.
+
+    Its cell is named after the file, and ``remarks`` become comments at its beginning.
+    """
+    fitted = fitted_to(cell, [capture_digest(capture.rows) for capture in captures])
+    write_cell(out, with_name(fitted, name_of(out)), remarks)

@@ -101,7 +101,7 @@ def test_one_relaxation_test_gives_a_model_with_errors_of_millivolts(captures) -
     middle = slice(difference_v.size // 5, -difference_v.size // 20)
     assert np.abs(difference_v[middle]).max() < 0.01
     assert calibration.validations[0].above.voltage_rms_v < 0.02
-    assert "Not known: the effect of temperature" in calibration.verdict.text
+    assert "Not known, because the captures do not show it: the effect of temperature" in calibration.verdict.text
 
 
 def test_captures_that_determine_nothing_are_listed_with_their_kind() -> None:

@@ -365,7 +365,7 @@ def convert_time_to_hours(samples):
         (
             capture(steps()),
             load_cell("thunder_power_6s"),
-            ["lie within the cell's limits", "calibrate, report: --series"],
+            ["lie within the cell's limits", "calibrate, report, validate: --series"],
         ),
     ],
     ids=[

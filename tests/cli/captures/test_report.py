@@ -273,7 +273,10 @@ def test_cells_in_series_reach_the_report(tmp_path, capsys):
     rows["voltage_v"] *= 2.0
     path, page = write_table(tmp_path / "two.csv", rows), tmp_path / "page.html"
     code, _, err = run(capsys, "report", path, "--cell", "ncr18650", "--out", page)
-    assert (code, "check the cell file and its number of cells in series (calibrate, report: --series)" in err) == (
+    assert (
+        code,
+        "check the cell file and its number of cells in series (calibrate, report, validate: --series)" in err,
+    ) == (
         2,
         True,
     )

@@ -16,9 +16,11 @@ import pytest
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.sample import capture_digest
 from bms_estimator.simulation.simulated_pack import PackWithRelay
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, read_capture, read_header
+from bms_estimator.sources.captures.replay import load_capture
 from tests.command_line import PROGRAM, run, running_program
 from tests.patience import LONG_S, end
 
@@ -158,6 +160,9 @@ async def test_after_a_kill_the_test_continues_unless_charge_may_be_missing(
     assert {path.name for path in tmp_path.glob("cell-*")} == {"cell-1.bms", "cell-2.bms", "cell-test.csv.gz"}
     assert not (tmp_path / "cell.calibration.json").exists()
     assert not pack.board.relay_high
+    fit = load_cell(tmp_path / "cell.toml").fit
+    assert fit is not None
+    assert fit.captures == (capture_digest(load_capture(tmp_path / "cell-test.csv.gz").rows),)
     capture_begin_s = float(_text_of(tmp_path / "cell-test.csv.gz").splitlines()[1].partition(",")[0])
     assert (capture_begin_s > 3600.0) == begins_again
     drawn_ah = np.linspace(0.0, 2.6, 100)
