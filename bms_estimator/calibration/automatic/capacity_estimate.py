@@ -9,6 +9,7 @@ from bms_estimator.calibration.capacity import measure_capacity
 from bms_estimator.calibration.cleaning.rests import remove_glitches
 from bms_estimator.calibration.ocv.slow_curve import measured_capacity_ah, slow_branches
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
@@ -85,5 +86,4 @@ def _rated_or_rests(captures: Sequence[Columns], rated: CellModel) -> CapacityEs
 
 def largest_swing_ah(good: SampleBlock) -> float:
     """Return the largest difference of the counted charge within a capture [Ah]."""
-    counted_ah = np.cumsum(good["current_a"][:-1] * np.diff(good["time_s"])) / 3600.0
-    return float(np.ptp(np.r_[0.0, counted_ah]))
+    return float(np.ptp(charge_ah(good["time_s"], good["current_a"])))

@@ -8,6 +8,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.charge_count import smaller_current_a
 from bms_estimator.model.time_faults import MIN_GAP_PERIODS
 
 MIN_PEAK_C_RATE = 0.1
@@ -28,7 +29,7 @@ MAX_SOC_DEVIATION = 0.1
 MAX_VOLTAGE_DEVIATION_V = 0.1
 """Maximum deviation of a rested voltage from the OCV at the counted SOC, per cell [V]."""
 MIN_GAP_CHARGE = 0.01
-"""Minimum charge that the current before a gap would draw over it, as a fraction of the capacity."""
+"""Minimum charge that the smaller of the currents before and after a gap would draw over it, as a fraction of the capacity."""
 MIN_DURATION_S = 30.0
 """Minimum duration of a capture [s]."""
 MIN_RESPONSE_V = 1e-3
@@ -134,9 +135,13 @@ def _unresponsive_voltage(load: CleanCapture, cell: CellModel) -> str | None:
 
 
 def _gap_with_charge(load: CleanCapture, cell: CellModel) -> str | None:
-    """Return a message on the first gap over which an unknown charge flowed."""
+    """Return a message on the first gap over which an unknown charge flowed.
+
+    A current that ended or changed its sign in the gap counts as no charge. If charge flowed nevertheless, the voltages of
+    later rests contradict the counted SOC.
+    """
     step_s = np.diff(load.time_s)
-    charge_ah = np.abs(load.current_a[:-1]) * step_s / 3600.0
+    charge_ah = np.abs(smaller_current_a(load.current_a)) * step_s / 3600.0
     gaps = (step_s > MIN_GAP_PERIODS * np.median(step_s)) & (charge_ah > MIN_GAP_CHARGE * cell.cell.capacity_ah)
     if not gaps.any():
         return None

@@ -7,6 +7,7 @@ import numpy as np
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches, selected
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
@@ -78,7 +79,7 @@ def clean_capture(name: str, samples: SampleBlock, cell: CellModel) -> CleanCapt
         current_a=current_a,
         voltage_v=np.ascontiguousarray(good["voltage_v"]),
         temperature_c=np.ascontiguousarray(good["temperature_c"]),
-        discharged_ah=np.r_[0.0, np.cumsum(current_a[:-1] * np.diff(time_s))] / 3600.0,
+        discharged_ah=charge_ah(time_s, current_a),
         resting_samples=int(np.argmin(resting)) if not resting.all() else resting.size,
         samples=samples.size,
         glitches=samples.size - good.size,

@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter1d, median_filter
 from bms_estimator.calibration.cleaning.rests import SOC_SLACK, mean_temperature_c, resting_samples, true_runs
 from bms_estimator.calibration.ocv.points import COLD_V, Points, coldness
 from bms_estimator.model.arrays import Floats
+from bms_estimator.model.charge_count import are_long_gaps, charge_ah
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
@@ -132,20 +133,20 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
     Raises:
         UserError: The voltage changes in the wrong direction for the current.
     """
-    moved_ah = np.r_[0.0, np.cumsum(good["current_a"][:-1] * np.diff(good["time_s"]))] / 3600.0
+    moved_ah = charge_ah(good["time_s"], good["current_a"])
     if good.size < 2 or np.ptp(moved_ah) == 0.0:
         return []
     smooth = good.copy()
     smooth["current_a"] = median_filter(good["current_a"], SMOOTH_SAMPLES, mode="nearest")
     noise_a = STD_PER_MEDIAN_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))
     resting = resting_samples(smooth, capacity_ah=float(np.ptp(moved_ah)))  # the capacity itself is unknown here
+    is_after_gap = np.r_[False, are_long_gaps(good["time_s"])]  # the charge of a curve with such a gap is unknown
     branches = []
     for first, last in true_runs(~resting):
         current_a = smooth["current_a"][first:last]
         middle_a = float(np.median(current_a))
-        for first_steady, end_steady in true_runs(
-            np.abs(current_a - middle_a) <= MAX_CURRENT_DEVIATION * abs(middle_a) + noise_a
-        ):
+        is_steady = np.abs(current_a - middle_a) <= MAX_CURRENT_DEVIATION * abs(middle_a) + noise_a
+        for first_steady, end_steady in true_runs(is_steady & ~is_after_gap[first:last]):
             if good["time_s"][first + end_steady - 1] - good["time_s"][first + first_steady] >= MIN_DURATION_S:
                 branches.append(_branch(good, moved_ah, resting, first + first_steady, first + end_steady, name))
     return branches

@@ -134,3 +134,15 @@ def test_a_rated_capacity_that_a_whole_discharge_contradicts_is_warned_about(dat
     warnings = calibrate([leaf], load_cell("lmo", rated_ah), name="mine").warnings
     expected = f"{leaf.name} draws 30.47 Ah from full; if it ended when the cell was empty, give --capacity 30.47"
     assert warnings == ((expected,) if is_warned else ())
+
+
+def test_a_gap_of_hours_after_a_sample_of_a_charge_carries_no_charge(captures) -> None:
+    rows = captures["relaxation"].rows.copy()
+    last = int(np.flatnonzero(np.diff(rows["current_a"]) > 0.0)[9])  # of a rest
+    rows["current_a"][last] = -0.7
+    rows["time_s"][last + 1 :] += 16_000.0
+    calibration = calibrate([Columns(rows, "interrupted")], GIVEN, name="mine")
+    assert calibration.model.identification is not None
+    difference_v = ocv_grid(calibration.model.cell)[0] - ocv_grid(TRUTH)[0]
+    assert np.abs(difference_v[difference_v.size // 5 : -difference_v.size // 20]).max() < 0.01
+    assert calibration.validations[0].above.voltage_rms_v < 0.02

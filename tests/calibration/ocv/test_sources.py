@@ -241,3 +241,11 @@ def test_the_hysteresis_of_a_cold_pair_is_converted_to_25_c(shared_data):
         assert result.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v / temperature_factor)
         mean_v[at] = result.hysteresis_v[INSIDE].mean()
     assert 0.7 < mean_v["n15"] / mean_v["p25"] < 1.8
+
+
+def test_a_slow_discharge_with_a_gap_of_hours_measures_no_capacity() -> None:
+    samples = slow((1.0,))
+    middle = samples.size // 2
+    with_gap = np.delete(samples, np.s_[middle : middle + 480])  # 4 h
+    with pytest.raises(UserError, match="--capacity-ah: not given"):
+        sources_of(with_gap)
