@@ -5,13 +5,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.time_faults import gap_s
+from bms_estimator.model.unmeasured_time import MAX_FLOW_S, UNMEASURED_S
 
-UNMEASURED_S = 60.0
-"""Maximum step over which the current counts as measured [s]. For a slow source the maximum is some of its periods, if these
-are longer."""
-MAX_FLOW_S = 3600.0
-"""Maximum time over which a current is integrated without a sample [s], so that one wrong time stamp cannot empty a
-cell."""
 MIN_END_FRACTION = 0.01
 """Minimum current at an end of a gap that counts as a load, as a fraction of the largest current."""
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from bms_estimator.model.charge_count import MAX_FLOW_S, charge_ah, gap_warnings, step_charges_as
+from bms_estimator.model.charge_count import charge_ah, gap_warnings, step_charges_as
+from bms_estimator.model.unmeasured_time import MAX_FLOW_S
 
 
 def samples(gap_s, before_a=2.0, after_a=2.0):

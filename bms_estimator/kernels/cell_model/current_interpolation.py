@@ -1,6 +1,6 @@
 """Current between two samples."""
 
-from bms_estimator.model.charge_count import UNMEASURED_S
+from bms_estimator.model.unmeasured_time import UNMEASURED_S
 from bms_estimator.numba_cache import njit
 
 SLOW_S = 2.0

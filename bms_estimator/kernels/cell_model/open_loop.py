@@ -18,7 +18,7 @@ from bms_estimator.kernels.cell_model.current_interpolation import (
 )
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS, TREND
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.charge_count import UNMEASURED_S
+from bms_estimator.model.unmeasured_time import UNMEASURED_S
 from bms_estimator.numba_cache import njit
 
 MIN_CAPACITANCE = 1e-3

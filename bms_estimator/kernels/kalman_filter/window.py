@@ -31,7 +31,7 @@ from bms_estimator.kernels.kalman_filter.temperature import (
     propagate_self_heating,
 )
 from bms_estimator.model.arrays import Record
-from bms_estimator.model.charge_count import MAX_FLOW_S
+from bms_estimator.model.unmeasured_time import MAX_FLOW_S
 from bms_estimator.numba_cache import njit
 
 WINDOW_S = 0.99

@@ -15,7 +15,7 @@ from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, c_tl, c_ts, d
 from bms_estimator.kernels.cell_model.current_interpolation import interpolated_current
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.arrays import Record
-from bms_estimator.model.charge_count import MAX_FLOW_S
+from bms_estimator.model.unmeasured_time import MAX_FLOW_S
 from bms_estimator.numba_cache import njit
 
 MIN_LOOP_GAIN = 0.1
