@@ -69,6 +69,7 @@ def step_resistance(load: CleanCapture) -> float | None:
     change_a = np.diff(load.current_a)
     largest_a = float(np.abs(load.current_a).max(initial=0.0))
     steps = (np.abs(change_a) > STEP_FRACTION * largest_a) & (np.diff(load.time_s) <= MAX_STEP_S)
+    steps &= ~(load.mismatched[:-1] | load.mismatched[1:])
     if steps.sum() < MIN_STEPS:
         return None
     return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))

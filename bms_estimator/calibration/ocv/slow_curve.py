@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, median_filter
 
+from bms_estimator.calibration.cleaning.mismatched_steps import with_matched_voltages
 from bms_estimator.calibration.cleaning.rests import SOC_SLACK, mean_temperature_c, resting_samples, true_runs
 from bms_estimator.calibration.ocv.points import COLD_V, Points, coldness
 from bms_estimator.model.arrays import Floats
@@ -136,6 +137,7 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
     moved_ah = charge_ah(good["time_s"], good["current_a"])
     if good.size < 2 or np.ptp(moved_ah) == 0.0:
         return []
+    good = with_matched_voltages(good)
     smooth = good.copy()
     smooth["current_a"] = median_filter(good["current_a"], SMOOTH_SAMPLES, mode="nearest")
     noise_a = STD_PER_MEDIAN_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))

@@ -9,7 +9,7 @@ from bms_estimator.calibration.ocv.hysteresis import (
     TYPICAL_HYSTERESIS_STD,
     center_on_typical_hysteresis,
 )
-from bms_estimator.calibration.ocv.slow_curve import GRID
+from bms_estimator.calibration.ocv.slow_curve import GRID, slow_branches
 from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
 from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
@@ -19,7 +19,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture
 from tests.calibration.simulated_relaxation import relaxation, schedule
-from tests.calibration.simulated_slow import CAPACITY_AH, CURRENT_A, hysteresis_v, slow, true_v
+from tests.calibration.simulated_slow import CAPACITY_AH, CURRENT_A, OHM, hysteresis_v, slow, true_v
 
 INSIDE = (NODES > 0.1) & (NODES < 0.95)
 
@@ -249,3 +249,14 @@ def test_a_slow_discharge_with_a_gap_of_hours_measures_no_capacity() -> None:
     with_gap = np.delete(samples, np.s_[middle : middle + 480])  # 4 h
     with pytest.raises(UserError, match="--capacity-ah: not given"):
         sources_of(with_gap)
+
+
+def test_the_first_record_of_a_slow_discharge_with_the_old_voltage_does_not_hide_the_ohmic_step() -> None:
+    samples = slow((1.0,))
+    first = int(np.argmax(samples["current_a"] > 0.0))
+    record = samples[first : first + 1].copy()
+    record["time_s"] -= 0.01
+    record["voltage_v"] = samples["voltage_v"][first - 1]
+    (expected,), (found,) = (slow_branches(rows, "c20") for rows in (samples, np.insert(samples, first, record)))
+    assert found.step_v == pytest.approx(expected.step_v, abs=1e-9)
+    assert found.step_v == pytest.approx(OHM * CURRENT_A, abs=2e-3)
