@@ -11,7 +11,7 @@ import numpy as np
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, soc_outside
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE
-from bms_estimator.calibration.elements.capture_run import initial_soc as soc_of_first_rest
+from bms_estimator.calibration.cleaning.start_soc import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.ocv.overpotential import overpotential
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
@@ -123,7 +123,7 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     load = clean_capture(capture.name, capture.rows, cell)
     start = soc_of_first_rest(load, cell) if initial_soc is None else initial_soc
     warnings = capture_contradictions(load, cell, start)
-    outside = soc_outside(load, cell.cell.capacity_ah, start)
+    outside = soc_outside(load, cell, start)
     if outside:
         raise UserError("\n".join(dict.fromkeys([*warnings, f"{capture.name}: {outside}"])))
     soc = start - load.discharged_ah / cell.cell.capacity_ah

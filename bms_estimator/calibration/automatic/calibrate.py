@@ -5,12 +5,12 @@ held back, on which it is then validated. The second fit uses all captures, and 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bms_estimator.calibration.automatic.capacity_estimate import CapacityEstimate, estimate_capacity
-from bms_estimator.calibration.automatic.given_values import capacity_warnings, chemistry_warnings
+from bms_estimator.calibration.automatic.given_values import capacity_warnings, chemistry_warnings, unproven_starts
 from bms_estimator.calibration.automatic.hold_back import Split, hold_back, use_all
 from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFitter
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture, recognize
@@ -69,28 +69,33 @@ def calibrate(
     *,
     name: str,
     curves: Sequence[ExternalCurve] = (),
+    initial_soc: float | None = None,
     report: Report = ignore_report,
 ) -> Calibration:
     """Calibrate a cell by captures of any kind.
 
     Args:
-        captures: Captures of one cell, or of a pack scaled to one cell. A capture that determines the open-circuit voltage
-            starts with a full cell.
+        captures: Captures of one cell, or of a pack scaled to one cell.
         given: Cell with the rated capacity, such as a generic cell. It supplies the values that the captures do not determine.
         name: Name of the new cell.
         curves: Open-circuit voltages over SOC that were measured otherwise.
+        initial_soc: SOC 0..1 at the first sample of the captures that start at the highest voltage; None: 1 if their first rest
+            has the voltage of a full cell, otherwise by that voltage.
         report: Receives the finished fraction of the work and the name of the step.
 
     Raises:
         UserError: A capture cannot be used, or no capture determines the open-circuit voltage or resistances.
     """
     report(0.0, "capacity")
-    capacity = estimate_capacity(captures, given)
+    capacity = estimate_capacity(captures, given, initial_soc)
     initial_cell = with_capacity(given, capacity.capacity_ah, capacity.relative_std)
-    recognized = tuple(recognize(capture, initial_cell) for capture in captures)
+    recognized = recognize(captures, initial_cell, initial_soc)
+    start_notes = [] if curves else unproven_starts(recognized, given)
     _require_equal_full_voltages(recognized)
+    if not curves and not any(each.gives_ocv and each.reaches_full for each in recognized):
+        recognized = [replace(each, gives_ocv=False) for each in recognized]
     if not curves:
-        _require_usable_capture(recognized)
+        _require_usable_capture(recognized, start_notes)
     split = hold_back(recognized)
     fitter = ModelFitter(initial_cell, capacity, curves, name)
     validated_model, model, notes = _fit_both(fitter, split, use_all(recognized), report)
@@ -114,22 +119,25 @@ def calibrate(
     return Calibration(
         model=model,
         capacity=capacity,
-        captures=recognized,
+        captures=tuple(recognized),
         has_held_back_data=split.held_back is not None,
         validation_data=split.sentence,
         validations=tuple(validations),
         verdict=judge(errors, covered or coverage(validations, model.cell), soc_errors),
-        warnings=(*contradictions, *notes, *failures),
+        warnings=(*start_notes, *contradictions, *notes, *failures),
     )
 
 
 def _require_equal_full_voltages(captures: Sequence[RecognizedCapture]) -> None:
     """Raise UserError if the highest voltages of captures show that the cells have different chemistries.
 
-    Captures that determine the OCV contain the full cell. The other ones need not, but do not exceed its voltage either.
+    Captures that determine the OCV from full contain the full cell. Tests that draw more than their first voltage allows may do
+    so, too, if they are of another chemistry. The other captures do not exceed the voltage of the full cell.
     """
     ranges_v = {each.capture.name: np.percentile(each.good["voltage_v"], [1.0, 99.0]) for each in captures}
-    from_full = [each.capture.name for each in captures if each.gives_ocv]
+    from_full = [
+        each.capture.name for each in captures if (each.gives_ocv and each.reaches_full) or each.contradicts_start
+    ]
     if not from_full:
         return
     low, high = min(from_full, key=lambda name: ranges_v[name][1]), max(ranges_v, key=lambda name: ranges_v[name][1])
@@ -141,10 +149,12 @@ def _require_equal_full_voltages(captures: Sequence[RecognizedCapture]) -> None:
         )
 
 
-def _require_usable_capture(captures: Sequence[RecognizedCapture]) -> None:
+def _require_usable_capture(captures: Sequence[RecognizedCapture], start_notes: Sequence[str]) -> None:
     """Raise UserError if no capture determines anything."""
     if not any(each.gives_ocv or each.gives_resistances for each in captures):
-        kinds = "".join(f"\n{each.capture.name}: {each.kind}" for each in captures)
+        kinds = "".join(
+            f"\n{line}" for line in (*(f"{each.capture.name}: {each.kind}" for each in captures), *start_notes)
+        )
         raise UserError(
             "no capture determines the OCV or resistances: give a slow discharge from full to empty, or a load with at "
             f"least six rests of some minutes{kinds}"

@@ -56,7 +56,9 @@ def with_matched_voltages(samples: SampleBlock) -> SampleBlock:
 
 def _early_voltages(samples: SampleBlock) -> NDArray[np.bool_]:
     """Return which samples have the current before a step and the voltage after it."""
-    return _old_voltages(samples[::-1])[::-1]  # backward in time, an early voltage is an old one
+    return np.asarray(
+        _old_voltages(samples[::-1])[::-1], dtype=np.bool_
+    )  # backward in time, an early voltage is an old one
 
 
 def _old_voltages(samples: SampleBlock) -> NDArray[np.bool_]:
@@ -74,4 +76,4 @@ def _old_voltages(samples: SampleBlock) -> NDArray[np.bool_]:
         & (response_v > MIN_RESPONSE * np.median(np.abs(change_v)))
         & (response_v * step_s[2:] > MIN_RATE_RATIO * np.abs(change_v[2:]) * step_s[1:-1])
     )
-    return np.r_[False, is_old, False, False]
+    return np.concatenate([[False], is_old, [False, False]])

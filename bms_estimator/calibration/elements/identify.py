@@ -5,7 +5,8 @@ given and with the identified cell. If other captures at about the temperature o
 that capture use a fit without it (hold-out).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -36,6 +37,7 @@ def identify(
     *,
     refine_ocv: bool = True,
     initial_soc: float | None = None,
+    initial_socs: Mapping[str, float] = MappingProxyType({}),
     temperature_c: float | None = None,
     progress: Progress = no_progress,
 ) -> Identification:
@@ -47,6 +49,7 @@ def identify(
             temperature.
         refine_ocv: Correct the open-circuit voltage as well if the correction improves the replays.
         initial_soc: SOC 0..1 at the first sample of each capture; None: from the voltage of its first rest.
+        initial_socs: SOC 0..1 at the first sample of some captures by name, which precedes ``initial_soc``.
         temperature_c: Temperature of captures without a sensor [C]; None: 25 C.
         progress: Receives the finished fraction of the work.
 
@@ -57,7 +60,7 @@ def identify(
     cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
     loads = [load for load in cleaned if not without_excitation(load, cell)]
     # without any load, the checks below report the missing excitation
-    runs = [make_run(load, cell, initial_soc, temperature_c) for load in loads or cleaned]
+    runs = [make_run(load, cell, initial_socs.get(load.name, initial_soc), temperature_c) for load in loads or cleaned]
     contradictions = [line for run in runs for line in capture_contradictions(run.load, cell, float(run.soc[0]))]
     contradictions += [line for load in loads for line in wrong_temperature(load, temperature_c)]
     if contradictions:

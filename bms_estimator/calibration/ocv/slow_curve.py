@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter1d, median_filter
 
 from bms_estimator.calibration.cleaning.mismatched_steps import with_matched_voltages
 from bms_estimator.calibration.cleaning.rests import SOC_SLACK, mean_temperature_c, resting_samples, true_runs
+from bms_estimator.calibration.cleaning.start_soc import StartOrigin, StartSoc
 from bms_estimator.calibration.ocv.points import COLD_V, Points, coldness
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.charge_count import are_long_gaps, charge_ah
@@ -93,6 +94,7 @@ class SlowBranch:
         step_v: Jump of the voltage when the current starts or stops at the end of the curve at which the cell is full [V]; NaN
             without a rest there.
         to_empty: True for a discharge down to empty.
+        start: SOC at the first sample of the capture; full if the curve itself is a discharge that starts with a full cell.
     """
 
     name: str
@@ -105,6 +107,7 @@ class SlowBranch:
     start_v: float
     step_v: float
     to_empty: bool
+    start: StartSoc
 
     def label(self, capacity_ah: float) -> str:
         """Return a description such as "C/20 discharge"."""
@@ -128,8 +131,13 @@ class SlowCurve:
     notes: tuple[str, ...]
 
 
-def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
+def slow_branches(good: SampleBlock, name: str, start: StartSoc) -> list[SlowBranch]:
     """Return the low-rate discharges and charges of a capture without glitches.
+
+    Args:
+        good: Samples without glitches, dtype ``SAMPLE``.
+        name: Name for messages.
+        start: SOC at the first sample.
 
     Raises:
         UserError: The voltage changes in the wrong direction for the current.
@@ -150,12 +158,12 @@ def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
         is_steady = np.abs(current_a - middle_a) <= MAX_CURRENT_DEVIATION * abs(middle_a) + noise_a
         for first_steady, end_steady in true_runs(is_steady & ~is_after_gap[first:last]):
             if good["time_s"][first + end_steady - 1] - good["time_s"][first + first_steady] >= MIN_DURATION_S:
-                branches.append(_branch(good, moved_ah, resting, first + first_steady, first + end_steady, name))
+                branches.append(_branch(good, moved_ah, resting, first + first_steady, first + end_steady, name, start))
     return branches
 
 
 def _branch(
-    good: SampleBlock, moved_ah: Floats, resting: NDArray[np.bool_], first: int, last: int, name: str
+    good: SampleBlock, moved_ah: Floats, resting: NDArray[np.bool_], first: int, last: int, name: str, start: StartSoc
 ) -> SlowBranch:
     """Return the low-rate discharge or charge in the samples ``first`` to ``last`` - 1.
 
@@ -177,6 +185,9 @@ def _branch(
         jump_v = voltage_v[-1] - float(good["voltage_v"][last])
     elif not charge and first > 0 and resting[first - 1]:
         jump_v = float(good["voltage_v"][first - 1]) - voltage_v[0]
+    start_v = float(good["voltage_v"][first - 1]) if first > 0 and resting[first - 1] else float("nan")
+    if not charge and np.fmax(start_v, voltage_v[0]) >= start.full_v and moved_ah[first] <= 0.0:
+        start = replace(start, soc=1.0, origin=StartOrigin.FULL)
     # over the last hundredth of the charge, see EMPTY_FALL
     last_fall_v = float(np.interp(0.99 * ah[-1], ah, voltage_v)) - voltage_v[-1]
     return SlowBranch(
@@ -187,29 +198,38 @@ def _branch(
         current_a=float(np.abs(part["current_a"]).mean()),
         temperature_c=mean_temperature_c(part),
         before_ah=float(moved_ah[first]),
-        start_v=float(good["voltage_v"][first - 1]) if first > 0 and resting[first - 1] else float("nan"),
+        start_v=start_v,
         step_v=float(np.maximum(jump_v, 0.0)),  # NaN stays NaN
         to_empty=not charge and last_fall_v > EMPTY_FALL * float(np.median(voltage_v)),
+        start=start,
     )
 
 
 def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
-    """Return the charge of the full low-rate discharge nearest to 25 C [Ah]; NaN without one."""
-    full = [branch for branch in branches if branch.to_empty and branch.before_ah < MAX_BEFORE_FRACTION * branch.ah[-1]]
-    if not full:
+    """Return the capacity by the low-rate discharge down to empty nearest to 25 C [Ah]; NaN without one.
+
+    Only discharges count that start at a given SOC or with a full cell, because others give a lower bound at most.
+    """
+    known = [
+        branch
+        for branch in branches
+        if branch.to_empty
+        and branch.start.is_exact
+        and branch.start.soc > 0.0
+        and branch.before_ah < MAX_BEFORE_FRACTION * branch.ah[-1]
+    ]
+    if not known:
         return float("nan")
-    return float(min(full, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0)).ah[-1])
+    nearest = min(known, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0))
+    return float(nearest.ah[-1]) / nearest.start.soc
 
 
-def slow_curves(
-    branches: Sequence[SlowBranch], capacity_ah: float, *, initial_soc: float = 1.0, series_count: int = 1
-) -> list[SlowCurve]:
+def slow_curves(branches: Sequence[SlowBranch], capacity_ah: float, *, series_count: int = 1) -> list[SlowCurve]:
     """Return the curves of pairs of a discharge and a charge, and of the remaining unpaired branches.
 
     Args:
         branches: Branches of all captures.
         capacity_ah: Capacity that SOC is counted against [Ah].
-        initial_soc: SOC at the first sample of each capture, 0..1.
         series_count: Cells in series, for values per cell.
 
     Raises:
@@ -219,7 +239,7 @@ def slow_curves(
     curves = []
     for discharge in (branch for branch in branches if not branch.charge):
         # a charge before the discharge may have filled the cell
-        start_soc = min(initial_soc - discharge.before_ah / capacity_ah, 1.0)
+        start_soc = min(discharge.start.soc - discharge.before_ah / capacity_ah, 1.0)
         soc = start_soc - discharge.ah / capacity_ah
         if soc[-1] < -SOC_SLACK:
             raise UserError(

@@ -76,6 +76,15 @@ def calibrate_command(
             show_default=False,
         ),
     ] = None,
+    soc: Annotated[
+        float | None,
+        typer.Option(
+            parser=decimal(0.0, 1.0),
+            help="SOC at the first sample of the captures that start at the highest voltage; default: 1 if their first rest "
+            "has the voltage of a full cell, otherwise by that voltage",
+            show_default=False,
+        ),
+    ] = None,
     series: Series = None,
     report: Annotated[
         Path | None,
@@ -114,7 +123,7 @@ def calibrate_command(
     """Calibrate a cell: measure its capacity, OCV, hysteresis and resistances, and write a cell file.
 
     The command recognizes slow discharges and charges, relaxation tests, HPPC and drive cycles.
-    One capture is enough. A capture for the OCV must begin with a full cell.
+    One capture is enough. A capture for the OCV must begin with a full cell, or at the SOC given by --soc.
 
     With PACK.toml alone, the command reads the pack's device and gives instructions: charge, discharge, rest.
     It recognizes the end of each step by voltage and current, and records all samples.
@@ -141,6 +150,7 @@ def calibrate_command(
             if capture is None:
                 typer.echo("interrupted; the same command continues the test", err=True)
                 raise typer.Exit(130)
+            soc = 1.0  # the capture begins with the rest of the full pack
             captures, recorded = [capture], [session.write_capture(capture)]
         for each in captures:
             fill_temperature(each.rows, temperature_c)
@@ -150,6 +160,7 @@ def calibrate_command(
                 given.cell,
                 name=name_of(out),
                 curves=curves,
+                initial_soc=soc,
                 report=bar.update,
             )
         write_cell(out, calibration.model.cell, remarks(calibration))

@@ -6,9 +6,9 @@ from scipy.stats import gmean
 
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
+from bms_estimator.calibration.cleaning.start_soc import initial_soc
 from bms_estimator.calibration.elements import identify as module
 from bms_estimator.calibration.elements import two_branch_fit
-from bms_estimator.calibration.elements.capture_run import initial_soc
 from bms_estimator.calibration.elements.cell_from_fit import LADDER_STD
 from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.calibration.elements.replay_score import interval_score

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bms_estimator.calibration.cleaning.start_soc import StartSoc
 from bms_estimator.calibration.ocv.hysteresis import (
     PLATEAU_SHARE,
     REST_SHARE_STD,
@@ -257,6 +258,8 @@ def test_the_first_record_of_a_slow_discharge_with_the_old_voltage_does_not_hide
     record = samples[first : first + 1].copy()
     record["time_s"] -= 0.01
     record["voltage_v"] = samples["voltage_v"][first - 1]
-    (expected,), (found,) = (slow_branches(rows, "c20") for rows in (samples, np.insert(samples, first, record)))
+    (expected,), (found,) = (
+        slow_branches(rows, "c20", StartSoc()) for rows in (samples, np.insert(samples, first, record))
+    )
     assert found.step_v == pytest.approx(expected.step_v, abs=1e-9)
     assert found.step_v == pytest.approx(OHM * CURRENT_A, abs=2e-3)
