@@ -45,6 +45,8 @@ class Calibration:
         model: Model fitted to all captures; if that fit finds no resistances, the model without the data held back.
         capacity: Capacity that SOC was counted against.
         captures: The captures, and what each determines.
+        is_ocv_measured: True if low-rate curves, rests of some minutes, or given curves determine the OCV; False if it is that of the
+            given cell, or an estimate from short rests.
         has_held_back_data: True if the data of the validation were held back from the fit.
         validation_data: Sentence that names the data of the validation.
         validations: Validation on the data that were held back; without such data, validations on all captures.
@@ -56,6 +58,7 @@ class Calibration:
     model: FittedModel
     capacity: CapacityEstimate
     captures: tuple[RecognizedCapture, ...]
+    is_ocv_measured: bool
     has_held_back_data: bool
     validation_data: str
     validations: tuple[Validation, ...]
@@ -120,6 +123,7 @@ def calibrate(
         model=model,
         capacity=capacity,
         captures=tuple(recognized),
+        is_ocv_measured=bool(curves) or any(each.gives_ocv and each.measures_ocv for each in recognized),
         has_held_back_data=split.held_back is not None,
         validation_data=split.sentence,
         validations=tuple(validations),

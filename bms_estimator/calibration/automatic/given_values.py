@@ -32,7 +32,8 @@ def unproven_starts(captures: Sequence[RecognizedCapture], given: CellModel) -> 
     lines = []
     has_other_curve = any(each.gives_ocv and each.start.is_exact for each in captures)
     for each in captures:
-        if each.start.is_exact or not each.is_ocv_test or (has_other_curve and each.gives_ocv):
+        ends_full = each.gives_ocv and all(branch.charge for branch in each.slow_branches) and each.slow_branches
+        if each.start.is_exact or not each.is_ocv_test or ends_full or (has_other_curve and each.gives_ocv):
             continue
         remedy = (
             "the SOC is counted from there"

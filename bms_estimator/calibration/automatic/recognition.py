@@ -30,7 +30,8 @@ CONSTANT_FRACTION = 0.9
 """Minimum fraction of a load's samples at the median current for a constant current."""
 
 MIN_OCV_REST_S = 120.0
-"""Minimum duration of the rests that determine an open-circuit voltage [s]. In a rest of a minute, a cell relaxes by about half."""
+"""Minimum duration of the rests that measure an open-circuit voltage [s]. In a rest of a minute, a cell relaxes by about half, so
+that the curve is an estimate."""
 MIN_HIGHEST_SOC = 0.9
 """Minimum highest SOC of captures that determine the open-circuit voltage, because the curve above it is extrapolated."""
 
@@ -49,6 +50,7 @@ class RecognizedCapture:
             voltage without others.
         is_ocv_test: True if the capture has low-rate curves or enough rests for an open-circuit voltage.
         gives_ocv: True if the capture determines the open-circuit voltage.
+        measures_ocv: True if it does so by low-rate curves, or by enough rests of some minutes.
         gives_resistances: True if its current is large enough for resistances.
         temperature_c: Mean temperature [°C]; NaN without a sensor.
     """
@@ -61,6 +63,7 @@ class RecognizedCapture:
     reaches_full: bool
     is_ocv_test: bool
     gives_ocv: bool
+    measures_ocv: bool
     gives_resistances: bool
     temperature_c: float
 
@@ -73,7 +76,8 @@ class RecognizedCapture:
     @property
     def determined(self) -> str:
         """Values that the capture determines, for a table."""
-        values = ["OCV"] * self.gives_ocv + ["resistances"] * self.gives_resistances
+        ocv = "OCV" if self.measures_ocv else "OCV (short rests)"
+        values = [ocv] * self.gives_ocv + ["resistances"] * self.gives_resistances
         return ", ".join(values) or "none"
 
     def with_capture(self, part: Columns) -> "RecognizedCapture":
@@ -121,6 +125,7 @@ def _recognize(capture: Columns, cleaned: CleanCapture, start: StartSoc, cell: C
         reaches_full=start.origin is StartOrigin.GIVEN or _highest_soc(slow, test, cell) >= MIN_HIGHEST_SOC,
         is_ocv_test=bool(slow) or test is not None or unplaced_test is not None,
         gives_ocv=_is_placed(slow, cell) or test is not None,
+        measures_ocv=bool(slow) or (test is not None and _has_long_rests(test)),
         gives_resistances=not without_excitation(cleaned, cell),
         temperature_c=mean_temperature_c(good),
     )
@@ -137,8 +142,12 @@ def _relaxation_test(capture: Columns, initial_soc: float, cell: CellModel) -> R
         test = relaxation_test(capture.rows, cell.cell.capacity_ah, initial_soc=initial_soc, name=capture.name)
     except UserError:  # too few rests, a charge, or a charge that contradicts the SOC
         return None
-    has_rests = sum(rest.duration_s >= MIN_OCV_REST_S for rest in test.rests) >= MIN_POINTS
-    return test if has_rests and np.ptp(test.soc) >= MIN_SPAN else None
+    return test if np.ptp(test.soc) >= MIN_SPAN else None
+
+
+def _has_long_rests(test: RelaxationTest) -> bool:
+    """Return True if enough rests are long enough for the open-circuit voltage."""
+    return sum(rest.duration_s >= MIN_OCV_REST_S for rest in test.rests) >= MIN_POINTS
 
 
 def _is_placed(slow: Sequence[SlowBranch], cell: CellModel) -> bool:

@@ -8,6 +8,7 @@ from bms_estimator.calibration.automatic.capacity_estimate import estimate_capac
 from bms_estimator.calibration.automatic.hold_back import hold_back
 from bms_estimator.calibration.automatic.recognition import recognize
 from bms_estimator.calibration.elements.identify import identify
+from bms_estimator.cli.cell.calibration_output import remarks
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
 from bms_estimator.model.cell import load_cell, with_capacity
@@ -217,10 +218,16 @@ def test_the_given_soc_is_that_of_the_captures_at_the_highest_first_voltage(capt
     assert second.start.soc < 0.97
 
 
-def test_pulses_with_rests_of_less_than_a_minute_give_no_ocv() -> None:
-    pulses_a = np.r_[np.zeros(60), np.tile(np.r_[np.full(60, 3.0), np.zeros(50)], 160)]
-    (recognized,) = recognize([Columns(capture(pulses_a, soc=1.0), "pulses")], TRUTH)
-    assert (recognized.gives_ocv, recognized.gives_resistances) == (False, True)
+def test_pulses_with_rests_of_less_than_a_minute_measure_no_ocv() -> None:
+    pulses_a = np.r_[np.zeros(60), np.tile(np.r_[np.full(90, 0.5), np.zeros(50)], 220)]
+    pulses = Columns(capture(pulses_a, soc=1.0), "pulses")
+    (recognized,) = recognize([pulses], TRUTH)
+    assert (recognized.measures_ocv, recognized.gives_resistances) == (False, True)
+    calibration = calibrate([pulses], TRUTH, name="mine")
+    assert not calibration.is_ocv_measured
+    text = "\n".join(remarks(calibration))
+    assert "OCV: estimated from rests of less than 2 minutes" in text
+    assert "OCV: measured" not in text
 
 
 def test_a_first_rest_on_a_plateau_is_named_with_the_socs_that_it_allows() -> None:
