@@ -115,6 +115,12 @@ def calibrate(
     if not validations:
         raise UserError("\n".join(failures))
     errors = voltage_errors(validations, validated_model.cell)
+    named = [each.capture.name for each in recognized if each.is_ocv_test]  # ``start_notes`` name them already
+    undetermined = [
+        line
+        for line in (model.identification.undetermined_starts if model.identification else ())
+        if line.partition(":")[0] not in named
+    ]
     contradictions = [
         *chemistry_warnings(given, capacity, model.ocv),
         *capacity_warnings(given, capacity, recognized, errors.low_soc_rms_v),
@@ -128,7 +134,7 @@ def calibrate(
         validation_data=split.sentence,
         validations=tuple(validations),
         verdict=judge(errors, covered or coverage(validations, model.cell), soc_errors),
-        warnings=(*start_notes, *contradictions, *notes, *failures),
+        warnings=tuple(dict.fromkeys([*start_notes, *undetermined, *contradictions, *notes, *failures])),
     )
 
 

@@ -9,7 +9,7 @@ from bms_estimator.calibration.capacity import measure_capacity
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
 from bms_estimator.calibration.cleaning.rests import remove_glitches
 from bms_estimator.calibration.cleaning.start_soc import FULL_SOC, StartOrigin, starts_of
-from bms_estimator.calibration.ocv.slow_curve import measured_capacity_ah, slow_branches
+from bms_estimator.calibration.ocv.slow_branch import measured_capacity_ah, slow_branches
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.model.cell import CellModel

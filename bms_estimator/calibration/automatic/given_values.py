@@ -65,7 +65,10 @@ def chemistry_warnings(given: CellModel, capacity: CapacityEstimate, ocv: OcvCel
 def capacity_warnings(
     given: CellModel, capacity: CapacityEstimate, captures: Sequence[RecognizedCapture], low_soc_rms_v: float
 ) -> list[str]:
-    """Return a warning if the rated capacity is used, and the charge drawn from full may be the capacity instead.
+    """Return a warning on a rated capacity that a capture contradicts.
+
+    Either a slow discharge measures much less, or the rated capacity is used, and the charge drawn from full may be the capacity
+    instead.
 
     Args:
         given: Cell with the rated capacity.
@@ -74,6 +77,10 @@ def capacity_warnings(
         low_soc_rms_v: RMS error of the model at low SOC, per cell [V]; NaN without samples.
     """
     rated_ah = given.cell.capacity_ah
+    if capacity.from_slow_discharge and capacity.capacity_ah < MIN_DRAWN_FRACTION * rated_ah:
+        percent = 100.0 * capacity.capacity_ah / rated_ah
+        text = f"the slow discharge measures {percent:.0f} % of the rated {rated_ah:.4g} Ah"
+        return [f"{text}; if it began below full, give the SOC at its start (--soc)"]
     drawn = [
         (largest_swing_ah(each.good), each.capture.name)
         for each in captures

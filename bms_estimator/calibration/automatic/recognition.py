@@ -16,7 +16,7 @@ from bms_estimator.calibration.cleaning.rests import (
 from bms_estimator.calibration.cleaning.start_soc import StartOrigin, StartSoc, starts_of
 from bms_estimator.calibration.ocv.points import MIN_SPAN
 from bms_estimator.calibration.ocv.relaxation_test import MIN_POINTS, RelaxationTest, relaxation_test
-from bms_estimator.calibration.ocv.slow_curve import SlowBranch, slow_branches
+from bms_estimator.calibration.ocv.slow_branch import SlowBranch, slow_branches
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError

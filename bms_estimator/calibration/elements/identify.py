@@ -6,12 +6,14 @@ that capture use a fit without it (hold-out).
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, without_excitation
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
+from bms_estimator.calibration.cleaning.start_soc import undetermined_start
 from bms_estimator.calibration.elements.candidate import Candidate, equations_of, geometric_mean
 from bms_estimator.calibration.elements.capture_run import Run, make_run, wrong_temperature
 from bms_estimator.calibration.elements.identification import Identification
@@ -83,9 +85,15 @@ def identify(
         )
         best = int((EQUAL_SCORE_RATIO if held_back else 1.0) * refined < given)  # index in ``candidates``
     outcome = candidates[best].outcome(before, after[best], left_out)
+    unknown = [load for load in loads if initial_soc is None and load.name not in initial_socs]
+    undetermined = tuple(
+        f"{load.name}: give the SOC at the start (--soc), because {text}"
+        for load in unknown
+        if (text := undetermined_start(load, cell))
+    )
     if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before:
-        raise UserError(_worse_replays(outcome))
-    return outcome
+        raise UserError("\n".join([_worse_replays(outcome), *undetermined]))
+    return replace(outcome, undetermined_starts=undetermined)
 
 
 def _scores(candidate: Candidate, runs: list[Run], work: WorkCounter) -> Floats:

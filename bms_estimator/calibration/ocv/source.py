@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from bms_estimator.calibration.cleaning.start_soc import StartSoc
 from bms_estimator.calibration.ocv.points import Points, joined
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
-from bms_estimator.calibration.ocv.slow_curve import SlowBranch
+from bms_estimator.calibration.ocv.slow_branch import SlowBranch
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 

@@ -18,14 +18,8 @@ from bms_estimator.calibration.ocv.hysteresis import (
 from bms_estimator.calibration.ocv.overpotential import steady_drop
 from bms_estimator.calibration.ocv.points import Points, joined, points_of
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v, relaxation_test
-from bms_estimator.calibration.ocv.slow_curve import (
-    GRID,
-    SlowBranch,
-    SlowCurve,
-    measured_capacity_ah,
-    slow_branches,
-    slow_curves,
-)
+from bms_estimator.calibration.ocv.slow_branch import SlowBranch, measured_capacity_ah, slow_branches
+from bms_estimator.calibration.ocv.slow_curve import GRID, SlowCurve, slow_curves
 from bms_estimator.calibration.ocv.source import ExternalCurve, OcvSources, Recording, Source
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C

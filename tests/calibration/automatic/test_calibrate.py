@@ -238,3 +238,23 @@ def test_a_first_rest_on_a_plateau_is_named_with_the_socs_that_it_allows() -> No
     with pytest.raises(UserError, match=message):
         identify([Columns(rows, "plateau")], cell)
     assert identify([Columns(rows, "plateau")], cell, initial_soc=0.85).captures[0].initial_soc == 0.85
+
+
+def test_a_start_on_a_plateau_without_a_contradiction_is_named_beside_the_result() -> None:
+    cell = load_cell("lfp", 3.0)
+    rows = Columns(
+        capture(np.r_[np.zeros(600), np.tile(np.r_[np.full(600, 1.5), np.zeros(900)], 5)], cell=cell, soc=0.7), "load"
+    )
+    (line,) = identify([rows], cell).undetermined_starts
+    assert line.startswith("load: give the SOC at the start (--soc), because its first rest at 3.3")
+    assert identify([rows], cell, initial_soc=0.7).undetermined_starts == ()
+    assert identify([rows], cell, initial_socs={"load": 0.7}).undetermined_starts == ()
+
+
+def test_a_slow_discharge_far_below_the_rated_capacity_is_warned_about() -> None:
+    half = slow_discharge(load_cell("nca", 3.0), 1.0)
+    warnings = calibrate([half], load_cell("nca", 5.0), name="mine").warnings
+    assert (
+        "the slow discharge measures 60 % of the rated 5 Ah; if it began below full, give the SOC at its start (--soc)"
+        in warnings
+    )

@@ -10,10 +10,12 @@ from bms_estimator.calibration.ocv.hysteresis import (
     TYPICAL_HYSTERESIS_STD,
     center_on_typical_hysteresis,
 )
-from bms_estimator.calibration.ocv.slow_curve import GRID, slow_branches
+from bms_estimator.calibration.ocv.slow_branch import slow_branches
+from bms_estimator.calibration.ocv.slow_curve import GRID
 from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
 from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
+from bms_estimator.calibration.ocv_cell import determine_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
@@ -263,3 +265,21 @@ def test_the_first_record_of_a_slow_discharge_with_the_old_voltage_does_not_hide
     )
     assert found.step_v == pytest.approx(expected.step_v, abs=1e-9)
     assert found.step_v == pytest.approx(OHM * CURRENT_A, abs=2e-3)
+
+
+@pytest.mark.parametrize("initial_soc", [0.45, 0.6, 0.9])
+def test_a_curve_that_does_not_begin_full_needs_the_soc_at_its_start(initial_soc) -> None:
+    whole = slow((1.0,))
+    soc = 1.0 - np.r_[0.0, np.cumsum(whole["current_a"][:-1])] * 30.0 / 3600.0 / CAPACITY_AH
+    begin = int(np.argmax(soc <= initial_soc))
+    rest = whole[:60].copy()
+    rest["voltage_v"] += true_v(initial_soc) - true_v(1.0)
+    rest["time_s"] += whole["time_s"][begin] - 30.0 * 60
+    partial = np.concatenate([rest, whole[begin:]])
+    recording = Recording("half", partial)
+    with pytest.raises(
+        UserError, match=r"--soc: not given, and nothing proves that the cell is full at the start of half"
+    ):
+        determine_ocv([recording], [], name="mine", series_count=1)
+    given = determine_ocv([recording], [], name="mine", series_count=1, initial_soc=initial_soc)
+    assert given.sources.capacity_ah == pytest.approx(CAPACITY_AH, rel=0.01)
