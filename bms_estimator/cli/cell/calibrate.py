@@ -174,7 +174,14 @@ def calibrate_command(
             opened = open_captures(measured, pack, current_sign, column_map)
             capacity_ah = calibration.model.cell.cell.capacity_ah
             page = report_on_captures(
-                measured, opened, pack, str(out), capacity_ah, None, series=given.series, temperature_c=temperature_c
+                measured,
+                opened,
+                pack,
+                str(out),
+                capacity_ah,
+                soc if len(measured) == 1 else None,  # with several captures, it is not the SOC of each
+                series=given.series,
+                temperature_c=temperature_c,
             )
             write_text(report, page.html())
             typer.echo(f"{report}: written", err=True)
