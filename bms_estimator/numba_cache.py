@@ -62,6 +62,7 @@ COMPILED_IN = (
             "model/arrays.py",
             "model/sample.py",
             "model/input_faults.py",
+            "model/unmeasured_time.py",
             "protocols/base/relay.py",
             "protocols/firmware/clock_drift.py",
             "protocols/firmware/framing.py",

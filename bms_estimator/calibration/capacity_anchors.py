@@ -16,6 +16,7 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.kernels.cell_model.open_loop import hysteresis
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, arrhenius, on_grid
 from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
+from bms_estimator.model.charge_count import step_charges_as
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.model.time_faults import MIN_GAP_PERIODS
@@ -105,7 +106,7 @@ class AnchorSearch:
     def _add_part(self, name: str, good: SampleBlock) -> None:
         """Add the rests of a continuous part."""
         capacity_ah = self.settings["capacity_as"] / 3600.0
-        step_ah = good["current_a"][:-1] * np.diff(good["time_s"]) / 3600.0
+        step_ah = step_charges_as(good["time_s"], good["current_a"]) / 3600.0
         counted_ah, throughput_ah = np.r_[0.0, np.cumsum(step_ah)], np.r_[0.0, np.cumsum(np.abs(step_ah))]
         soc = -counted_ah / capacity_ah
         resting = resting_samples(good, capacity_ah)

@@ -8,18 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.rests import remove_glitches
+from bms_estimator.calibration.cleaning.start_soc import FULL_SOC
 from bms_estimator.calibration.elements.generic_prior import curve as generic_curve
 from bms_estimator.calibration.elements.generic_prior import nearest_generic_cell, scaled_generic_ladder
 from bms_estimator.calibration.elements.initial_elements import initial_elements
 from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
 from bms_estimator.calibration.ocv.hysteresis import center_on_typical_hysteresis, has_plateau
 from bms_estimator.calibration.ocv.points import Points
-from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
+from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v
 from bms_estimator.calibration.ocv.source import ExternalCurve, OcvSources, Recording
 from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each, soc_from_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
-from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder, generic_cells, load_cell
+from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.errors import UserError
 
 TYPICAL_CELL_V = 3.7
@@ -43,6 +48,12 @@ MIN_CURRENT_LIMIT_C = 5.0
 """Minimum C-rate of ``current_max_a`` in the written cell file, the limit above which a sample is not valid [1/h]."""
 PEAK_CURRENT_MARGIN = 1.5
 """Minimum ratio of ``current_max_a`` in the written cell file to the largest current in the captures."""
+
+MIN_DISCHARGED_SOC = 0.05
+"""Minimum SOC that a capture draws if the SOC at its start matters. A charge is counted from its end."""
+AMBIGUOUS_SOC = (0.05, 0.9)
+"""SOC range of a voltage that is half full in another chemistry: 3.5 V is a full LFP cell or a nearly empty NMC cell. The plateau of
+the curve distinguishes them."""
 
 
 class OcvForm(StrEnum):
@@ -78,7 +89,7 @@ def determine_ocv(
     name: str,
     form: OcvForm = OcvForm.TABLE,
     capacity_ah: float | None = None,
-    initial_soc: float = 1.0,
+    initial_soc: float | None = None,
     series_count: int | None = None,
 ) -> OcvCell:
     """Determine the open-circuit voltage and initial values of the resistances.
@@ -89,20 +100,23 @@ def determine_ocv(
         name: Name of the cell.
         form: Form of the open-circuit voltage.
         capacity_ah: Capacity with which the SOC is counted [Ah]; None: capacity by a full slow discharge.
-        initial_soc: SOC 0..1 at the first sample of the captures that start at the highest voltage.
+        initial_soc: SOC 0..1 at the first sample of the captures without a ``start`` that start at the highest voltage; None: 1,
+            if this is the voltage of a full cell.
         series_count: Cells in series; None: estimated from the median voltage.
 
     Raises:
-        UserError: A capture cannot be used, or the captures do not determine the curve.
+        UserError: A capture cannot be used, the captures do not determine the curve, or nothing proves that they start with a
+            full cell.
     """
     voltages_v = [_checked_voltage(recording) for recording in recordings]
     series_count = _cells_in_series(np.concatenate([*voltages_v, *(each.ocv_v for each in curves)]), series_count)
-    sources = find_sources(
-        recordings, curves, capacity_ah=capacity_ah, initial_soc=initial_soc, series_count=series_count
-    )
+    soc = 1.0 if initial_soc is None else initial_soc
+    sources = find_sources(recordings, curves, capacity_ah=capacity_ah, initial_soc=soc, series_count=series_count)
     # unpaired curves still contain the overpotential of RC pairs, which are known only with the generic cell
     preliminary_v = _fit_curve(form, sources.points)(NODES)
     generic = nearest_generic_cell(NODES, preliminary_v, sources.capacity_ah, series_count)
+    if initial_soc is None:
+        _require_full_start(recordings, sources.capacity_ah, generic, preliminary_v)
     ladder, elements = _elements(generic, sources, recordings)
     sources = subtract_rc_overpotential(sources, ladder)
     # the two phases of a plateau cause hysteresis, which the form chen-mora does not have
@@ -113,6 +127,45 @@ def determine_ocv(
     sections = _cell_and_ocv_sections(name, series_count, fit, sources, recordings)
     cell = CellModel.model_validate({**sections, "ladder": ladder, **elements})
     return OcvCell(cell, fit, sources, generic)
+
+
+def _require_full_start(
+    recordings: Sequence[Recording], capacity_ah: float, generic: CellModel, preliminary_v: Floats
+) -> None:
+    """Check that the captures without a known SOC start with a full cell, by the highest voltage of a first rest.
+
+    Args:
+        recordings: Captures.
+        capacity_ah: Capacity of the cell [Ah].
+        generic: Generic cell of the most similar chemistry.
+        preliminary_v: OCV at ``NODES``, if the captures start with a full cell [V].
+
+    Raises:
+        UserError: They start with a lower voltage, or with that of a full cell whose OCV curve has another shape.
+    """
+    starts = [
+        (initial_rest_v(each.samples, each.name, capacity_ah), each.name)
+        for each in recordings
+        if each.start is None and _discharged_ah(each) > MIN_DISCHARGED_SOC * capacity_ah
+    ]
+    finite = [(start_v, name) for start_v, name in starts if np.isfinite(start_v)]
+    if not finite:
+        return
+    start_v, name = max(finite)
+    series, grid = generic.cell.series_count, ocv_grid(generic)
+    others = [ocv_grid(load_cell(each, capacity_ah).pack(series, 1)) for each in generic_cells()]
+    is_ambiguous = any(AMBIGUOUS_SOC[0] < soc_from_ocv(start_v, *each) < AMBIGUOUS_SOC[1] for each in others)
+    has_shape = has_plateau(NODES, preliminary_v, series) == has_plateau(NODES, ocv_of_each(NODES, *grid), series)
+    if soc_from_ocv(start_v, *grid) < FULL_SOC or (is_ambiguous and not has_shape):
+        raise UserError(
+            f"--soc: not given, and nothing proves that the cell is full at the start of {name}: the first rest has "
+            f"{start_v / series:.3f} V per cell; give the SOC at the start, which is 1 for a full cell"
+        )
+
+
+def _discharged_ah(recording: Recording) -> float:
+    good = remove_glitches(recording.samples, recording.name)
+    return float(charge_ah(good["time_s"], good["current_a"]).max())
 
 
 def _fit_curve(form: OcvForm, points: Points) -> ChenMoraFit | TableFit:

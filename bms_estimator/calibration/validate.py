@@ -11,7 +11,7 @@ import numpy as np
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, soc_outside
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE
-from bms_estimator.calibration.elements.capture_run import initial_soc as soc_of_first_rest
+from bms_estimator.calibration.cleaning.start_soc import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.ocv.overpotential import overpotential
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
@@ -125,13 +125,13 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     load = clean_capture(capture.name, capture.rows, cell)
     start = soc_of_first_rest(load, cell) if initial_soc is None else initial_soc
     warnings = capture_contradictions(load, cell, start)
-    outside = soc_outside(load, cell.cell.capacity_ah, start)
+    outside = soc_outside(load, cell, start)
     if outside:
         raise UserError("\n".join(dict.fromkeys([*warnings, f"{capture.name}: {outside}"])))
     soc = start - load.discharged_ah / cell.cell.capacity_ah
     grid = ocv_grid(cell)
     error_v = load.voltage_v - ocv_of_each(soc, *grid) + overpotential(cell, load, soc)
-    load, soc, error_v = _later(load, soc, error_v, from_s)
+    load, soc, error_v = _evaluated(load, soc, error_v, from_s)
     above = soc > LOW_SOC
     resting = np.abs(load.current_a) < REST_C_RATE * cell.cell.capacity_ah
     current_a = load.current_a[above]
@@ -159,12 +159,13 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
     )
 
 
-def _later(load: CleanCapture, soc: Floats, error_v: Floats, from_s: float) -> tuple[CleanCapture, Floats, Floats]:
-    """Return the samples from the time ``from_s`` on."""
-    first = int(np.searchsorted(load.time_s, from_s))
-    names = ("time_s", "current_a", "voltage_v", "temperature_c", "discharged_ah")
-    later = replace(load, **{name: getattr(load, name)[first:] for name in names})
-    return later, soc[first:], error_v[first:]
+def _evaluated(load: CleanCapture, soc: Floats, error_v: Floats, from_s: float) -> tuple[CleanCapture, Floats, Floats]:
+    """Return the samples from the time ``from_s`` on whose voltage belongs to their current."""
+    chosen = (load.time_s >= from_s) & ~load.mismatched
+    if chosen.all():  # no copy, because a long capture is large
+        return load, soc, error_v
+    names = ("time_s", "current_a", "voltage_v", "temperature_c", "discharged_ah", "mismatched")
+    return replace(load, **{name: getattr(load, name)[chosen] for name in names}), soc[chosen], error_v[chosen]
 
 
 def _errors(error_v: Floats, voltage_v: Floats) -> Errors:

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model import chen_mora
-from bms_estimator.kernels.cell_model.current_interpolation import PERIODS, UNMEASURED_S
+from bms_estimator.kernels.cell_model.current_interpolation import PERIODS
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, RESISTANCES, TAU_S, weak_share
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, Noise
 from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.unmeasured_time import UNMEASURED_S
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.sampling import EXACT, Sampling
 

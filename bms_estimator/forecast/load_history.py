@@ -3,11 +3,11 @@
 import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.kernels.cell_model.current_interpolation import UNMEASURED_S
 from bms_estimator.kernels.forecast.load_seconds import LOAD, add_rows, copy_seconds
 from bms_estimator.kernels.kalman_filter.current_offset import REST_C
 from bms_estimator.kernels.kalman_filter.ekf import CHARGE_C
 from bms_estimator.model.arrays import Floats, Records
+from bms_estimator.model.unmeasured_time import UNMEASURED_S
 
 
 class LoadHistory:

@@ -5,12 +5,12 @@ held back, on which it is then validated. The second fit uses all captures, and 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bms_estimator.calibration.automatic.capacity_estimate import CapacityEstimate, estimate_capacity
-from bms_estimator.calibration.automatic.given_values import capacity_warnings, chemistry_warnings
+from bms_estimator.calibration.automatic.given_values import capacity_warnings, chemistry_warnings, unproven_starts
 from bms_estimator.calibration.automatic.hold_back import Split, hold_back, use_all
 from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFitter
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture, recognize
@@ -44,6 +44,8 @@ class Calibration:
         model: Model fitted to all captures; if that fit finds no resistances, the model without the data held back.
         capacity: Capacity that SOC was counted against.
         captures: The captures, and what each determines.
+        is_ocv_measured: True if low-rate curves, rests of some minutes, or given curves determine the OCV; False if it is that of the
+            given cell, or an estimate from short rests.
         has_held_back_data: True if the data of the validation were held back from the fit.
         validation_data: Sentence that names the data of the validation.
         validations: Validation on the data that were held back; without such data, validations on all captures.
@@ -55,6 +57,7 @@ class Calibration:
     model: FittedModel
     capacity: CapacityEstimate
     captures: tuple[RecognizedCapture, ...]
+    is_ocv_measured: bool
     has_held_back_data: bool
     validation_data: str
     validations: tuple[Validation, ...]
@@ -68,28 +71,33 @@ def calibrate(
     *,
     name: str,
     curves: Sequence[ExternalCurve] = (),
+    initial_soc: float | None = None,
     report: Report = ignore_report,
 ) -> Calibration:
     """Calibrate a cell by captures of any kind.
 
     Args:
-        captures: Captures of one cell, or of a pack scaled to one cell. A capture that determines the open-circuit voltage
-            starts with a full cell.
+        captures: Captures of one cell, or of a pack scaled to one cell.
         given: Cell with the rated capacity, such as a generic cell. It supplies the values that the captures do not determine.
         name: Name of the new cell.
         curves: Open-circuit voltages over SOC that were measured otherwise.
+        initial_soc: SOC 0..1 at the first sample of the captures that start at the highest voltage; None: 1 if their first rest
+            has the voltage of a full cell, otherwise by that voltage.
         report: Receives the finished fraction of the work and the name of the step.
 
     Raises:
         UserError: A capture cannot be used, or no capture determines the open-circuit voltage or resistances.
     """
     report(0.0, "capacity")
-    capacity = estimate_capacity(captures, given)
+    capacity = estimate_capacity(captures, given, initial_soc)
     initial_cell = with_capacity(given, capacity.capacity_ah, capacity.relative_std)
-    recognized = tuple(recognize(capture, initial_cell) for capture in captures)
+    recognized = recognize(captures, initial_cell, initial_soc)
+    start_notes = [] if curves else unproven_starts(recognized, given)
     _require_equal_full_voltages(recognized)
+    if not curves and not any(each.gives_ocv and each.reaches_full for each in recognized):
+        recognized = [replace(each, gives_ocv=False) for each in recognized]
     if not curves:
-        _require_usable_capture(recognized)
+        _require_usable_capture(recognized, start_notes)
     split = hold_back(recognized)
     fitter = ModelFitter(initial_cell, capacity, curves, name)
     validated_model, model, notes = _fit_both(fitter, split, use_all(recognized), report)
@@ -109,6 +117,12 @@ def calibrate(
         for capture, validation in validations
     ]
     errors = voltage_errors([run.validation for run in runs], validated_model.cell)
+    named = [each.capture.name for each in recognized if each.is_ocv_test]  # ``start_notes`` name them already
+    undetermined = [
+        line
+        for line in (model.identification.undetermined_starts if model.identification else ())
+        if line.partition(":")[0] not in named
+    ]
     contradictions = [
         *chemistry_warnings(given, capacity, model.ocv),
         *capacity_warnings(given, capacity, recognized, errors.low_soc_rms_v),
@@ -116,22 +130,26 @@ def calibrate(
     return Calibration(
         model=model,
         capacity=capacity,
-        captures=recognized,
+        captures=tuple(recognized),
+        is_ocv_measured=bool(curves) or any(each.gives_ocv and each.measures_ocv for each in recognized),
         has_held_back_data=split.held_back is not None,
         validation_data=split.sentence,
         validations=tuple(run.validation for run in runs),
         verdict=judge(runs, validated_model.cell, covered),
-        warnings=(*contradictions, *notes, *failures),
+        warnings=tuple(dict.fromkeys([*start_notes, *undetermined, *contradictions, *notes, *failures])),
     )
 
 
 def _require_equal_full_voltages(captures: Sequence[RecognizedCapture]) -> None:
     """Raise UserError if the highest voltages of captures show that the cells have different chemistries.
 
-    Captures that determine the OCV contain the full cell. The other ones need not, but do not exceed its voltage either.
+    Captures that determine the OCV from full contain the full cell. Tests that draw more than their first voltage allows may do
+    so, too, if they are of another chemistry. The other captures do not exceed the voltage of the full cell.
     """
     ranges_v = {each.capture.name: np.percentile(each.good["voltage_v"], [1.0, 99.0]) for each in captures}
-    from_full = [each.capture.name for each in captures if each.gives_ocv]
+    from_full = [
+        each.capture.name for each in captures if (each.gives_ocv and each.reaches_full) or each.contradicts_start
+    ]
     if not from_full:
         return
     low, high = min(from_full, key=lambda name: ranges_v[name][1]), max(ranges_v, key=lambda name: ranges_v[name][1])
@@ -143,10 +161,12 @@ def _require_equal_full_voltages(captures: Sequence[RecognizedCapture]) -> None:
         )
 
 
-def _require_usable_capture(captures: Sequence[RecognizedCapture]) -> None:
+def _require_usable_capture(captures: Sequence[RecognizedCapture], start_notes: Sequence[str]) -> None:
     """Raise UserError if no capture determines anything."""
     if not any(each.gives_ocv or each.gives_resistances for each in captures):
-        kinds = "".join(f"\n{each.capture.name}: {each.kind}" for each in captures)
+        kinds = "".join(
+            f"\n{line}" for line in (*(f"{each.capture.name}: {each.kind}" for each in captures), *start_notes)
+        )
         raise UserError(
             "no capture determines the OCV or resistances: give a slow discharge from full to empty, or a load with at "
             f"least six rests of some minutes{kinds}"

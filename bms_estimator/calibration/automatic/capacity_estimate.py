@@ -6,9 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.calibration.capacity import measure_capacity
+from bms_estimator.calibration.cleaning.clean_capture import clean_capture
 from bms_estimator.calibration.cleaning.rests import remove_glitches
-from bms_estimator.calibration.ocv.slow_curve import measured_capacity_ah, slow_branches
+from bms_estimator.calibration.cleaning.start_soc import FULL_SOC, StartOrigin, starts_of
+from bms_estimator.calibration.ocv.slow_branch import measured_capacity_ah, slow_branches
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
@@ -17,6 +22,9 @@ MAX_RESTS_STD = 0.06
 """Maximum relative standard deviation of a capacity from rests. With the OCV of a generic cell, the std is 2 to 6 % if the rests
 include one when full and one when empty, and otherwise above 7 %. A rated capacity is exact to some percent for a new cell, and
 10 to 20 % too large for an aged one."""
+
+EMPTY_SOC = 0.05
+"""SOC whose OCV a capture must reach if its end proves an empty cell. Below, the OCV is steep."""
 
 
 @dataclass(frozen=True)
@@ -41,31 +49,48 @@ class CapacityEstimate:
         return self.from_slow_discharge or self.relative_std is not None
 
 
-def estimate_capacity(captures: Sequence[Columns], rated: CellModel) -> CapacityEstimate:
+def estimate_capacity(
+    captures: Sequence[Columns], rated: CellModel, initial_soc: float | None = None
+) -> CapacityEstimate:
     """Return the capacity of a cell.
 
-    The first choice is the charge of a slow discharge from full to empty. The second is the capacity by the SOC differences
-    between rests, if its std is small. The third is the rated capacity. If a capture draws more charge than the second or
-    third choice, this charge is the capacity.
+    The first choice is the charge of a slow discharge from full, or from a given SOC, to empty. The second is the capacity by
+    the SOC differences between rests, if its std is small. The third is the rated capacity. If a capture draws more charge
+    than the second or third choice, this charge is the capacity: a lower bound, if the cell was not full or not empty.
 
     Args:
         captures: Captures of one cell.
         rated: Cell with the rated capacity, and an OCV that gives the SOC of rests.
+        initial_soc: SOC 0..1 of the captures that start at the highest voltage; None: by their voltages.
 
     Raises:
         UserError: A capture has too few good samples, or the wrong sign of the current.
     """
     good = {capture.name: remove_glitches(capture.rows, capture.name) for capture in captures}
-    branches = [branch for name, samples in good.items() for branch in slow_branches(samples, name)]
+    loads = [clean_capture(capture.name, capture.rows, rated) for capture in captures]
+    starts = starts_of(loads, rated, initial_soc)
+    branches = [
+        branch
+        for (name, samples), start in zip(good.items(), starts, strict=True)
+        for branch in slow_branches(samples, name, start)
+    ]
     slow_ah = measured_capacity_ah(branches)
     if np.isfinite(slow_ah):
-        return CapacityEstimate(slow_ah, "measured by a slow discharge from full to empty", from_slow_discharge=True)
+        begin = "full" if initial_soc is None or initial_soc >= FULL_SOC else f"the given SOC of {initial_soc:g}"
+        return CapacityEstimate(
+            slow_ah, f"measured by a slow discharge from {begin} to empty", from_slow_discharge=True
+        )
     estimate = _rated_or_rests(captures, rated)
     name, drawn_ah = max(
         ((name, largest_swing_ah(samples)) for name, samples in good.items()), key=lambda swing: swing[1]
     )
     if drawn_ah > estimate.capacity_ah:
-        return CapacityEstimate(drawn_ah, f"drawn in {name}, more than the expected {estimate.capacity_ah:.4g} Ah")
+        start = starts[list(good).index(name)]
+        is_whole = start.origin is StartOrigin.FULL and good[name]["voltage_v"].min() < ocv(EMPTY_SOC, *ocv_grid(rated))
+        bound = "" if is_whole else "; a lower bound, because the capture does not run from full to empty"
+        return CapacityEstimate(
+            drawn_ah, f"drawn in {name}, more than the expected {estimate.capacity_ah:.4g} Ah{bound}"
+        )
     return estimate
 
 
@@ -85,5 +110,4 @@ def _rated_or_rests(captures: Sequence[Columns], rated: CellModel) -> CapacityEs
 
 def largest_swing_ah(good: SampleBlock) -> float:
     """Return the largest difference of the counted charge within a capture [Ah]."""
-    counted_ah = np.cumsum(good["current_a"][:-1] * np.diff(good["time_s"])) / 3600.0
-    return float(np.ptp(np.r_[0.0, counted_ah]))
+    return float(np.ptp(charge_ah(good["time_s"], good["current_a"])))

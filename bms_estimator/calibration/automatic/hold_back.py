@@ -8,6 +8,7 @@ import numpy as np
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture
 from bms_estimator.calibration.elements.capture_run import MIN_SPAN_K
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.model.charge_count import step_charges_as
 from bms_estimator.model.columns import Columns
 
 FIT_FRACTION = 0.7
@@ -86,7 +87,7 @@ def _hold_back_last_part(all_data: Split) -> Split:
     """Return the split that holds back the last part of the first capture with resistances."""
     chosen, *others = all_data.resistances
     samples = chosen.good
-    throughput_as = np.cumsum(np.abs(samples["current_a"]) * np.diff(samples["time_s"], append=samples["time_s"][-1]))
+    throughput_as = np.cumsum(np.append(np.abs(step_charges_as(samples["time_s"], samples["current_a"])), 0.0))
     end = int(np.argmax(throughput_as >= FIT_FRACTION * throughput_as[-1]))
     first_part = chosen.with_capture(Columns(samples[:end], f"first part of {chosen.capture.name}"))
     return replace(

@@ -7,7 +7,8 @@ from bms_estimator.calibration.automatic.capacity_estimate import CapacityEstima
 from bms_estimator.calibration.automatic.hold_back import Split
 from bms_estimator.calibration.automatic.recognition import RecognizedCapture
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
-from bms_estimator.calibration.elements.capture_run import initial_soc as soc_of_first_rest
+from bms_estimator.calibration.cleaning.start_soc import StartOrigin
+from bms_estimator.calibration.cleaning.start_soc import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.elements.identification import Identification
 from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
@@ -35,6 +36,8 @@ class FittedModel:
 
     def initial_soc(self, recognized: RecognizedCapture) -> float:
         """Return the SOC at the first sample of a capture, from the identification or else from the capture's first rest."""
+        if recognized.start.origin is StartOrigin.GIVEN:
+            return recognized.start.soc
         if self.identification is not None:
             for fit in self.identification.captures:
                 if fit.name == recognized.capture.name:
@@ -75,8 +78,11 @@ class ModelFitter:
         if not data.resistances:
             return FittedModel(cell, ocv, None, "no capture has a current above 0.1 C")
         captures = [each.capture for each in data.resistances]
+        given_socs = {
+            each.capture.name: each.start.soc for each in data.resistances if each.start.origin is StartOrigin.GIVEN
+        }
         try:
-            identification = identify(captures, cell, progress=progress)
+            identification = identify(captures, cell, initial_socs=given_socs, progress=progress)
         except UserError as error:
             if ocv is None:
                 raise
@@ -89,7 +95,7 @@ class ModelFitter:
         if not captures and not self.curves:
             return None
         return determine_ocv(
-            [Recording(each.capture.name, each.capture.rows) for each in captures],
+            [Recording(each.capture.name, each.capture.rows, each.start) for each in captures],
             self.curves,
             name=self.name,
             capacity_ah=None if self.capacity.from_slow_discharge else self.capacity.capacity_ah,

@@ -1,20 +1,22 @@
 """Recognition of what a capture determines: the open-circuit voltage, the resistances, or both."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import without_excitation
-from bms_estimator.calibration.cleaning.clean_capture import clean_capture
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
 from bms_estimator.calibration.cleaning.rests import (
     mean_temperature_c,
     remove_glitches,
     resting_samples,
     true_runs,
 )
+from bms_estimator.calibration.cleaning.start_soc import StartOrigin, StartSoc, starts_of
 from bms_estimator.calibration.ocv.points import MIN_SPAN
-from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, relaxation_test
-from bms_estimator.calibration.ocv.slow_curve import SlowBranch, slow_branches
+from bms_estimator.calibration.ocv.relaxation_test import MIN_POINTS, RelaxationTest, relaxation_test
+from bms_estimator.calibration.ocv.slow_branch import SlowBranch, slow_branches
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
@@ -27,6 +29,12 @@ MAX_CURRENT_DEVIATION = 0.05
 CONSTANT_FRACTION = 0.9
 """Minimum fraction of a load's samples at the median current for a constant current."""
 
+MIN_OCV_REST_S = 120.0
+"""Minimum duration of the rests that measure an open-circuit voltage [s]. In a rest of a minute, a cell relaxes by about half, so
+that the curve is an estimate."""
+MIN_HIGHEST_SOC = 0.9
+"""Minimum highest SOC of captures that determine the open-circuit voltage, because the curve above it is extrapolated."""
+
 
 @dataclass(frozen=True)
 class RecognizedCapture:
@@ -37,7 +45,12 @@ class RecognizedCapture:
         good: Its samples without glitches, dtype ``SAMPLE``.
         kind: Kind of the test, such as "relaxation test, 19 rests".
         slow_branches: Low-rate discharges and charges; empty without any.
+        start: SOC at the first sample.
+        reaches_full: True if the SOC is known and comes near 1, or was given, so that the capture determines the open-circuit
+            voltage without others.
+        is_ocv_test: True if the capture has low-rate curves or enough rests for an open-circuit voltage.
         gives_ocv: True if the capture determines the open-circuit voltage.
+        measures_ocv: True if it does so by low-rate curves, or by enough rests of some minutes.
         gives_resistances: True if its current is large enough for resistances.
         temperature_c: Mean temperature [°C]; NaN without a sensor.
     """
@@ -46,14 +59,25 @@ class RecognizedCapture:
     good: SampleBlock
     kind: str
     slow_branches: tuple[SlowBranch, ...]
+    start: StartSoc
+    reaches_full: bool
+    is_ocv_test: bool
     gives_ocv: bool
+    measures_ocv: bool
     gives_resistances: bool
     temperature_c: float
 
     @property
+    def contradicts_start(self) -> bool:
+        """True if the rests would determine an open-circuit voltage, but their charge contradicts the SOC by the first voltage."""
+        is_by_voltage = self.start.origin is StartOrigin.VOLTAGE
+        return is_by_voltage and self.is_ocv_test and not self.slow_branches and not self.gives_ocv
+
+    @property
     def determined(self) -> str:
         """Values that the capture determines, for a table."""
-        values = ["OCV"] * self.gives_ocv + ["resistances"] * self.gives_resistances
+        ocv = "OCV" if self.measures_ocv else "OCV (short rests)"
+        values = [ocv] * self.gives_ocv + ["resistances"] * self.gives_resistances
         return ", ".join(values) or "none"
 
     def with_capture(self, part: Columns) -> "RecognizedCapture":
@@ -61,24 +85,35 @@ class RecognizedCapture:
         return replace(self, capture=part, good=part.rows)
 
 
-def recognize(capture: Columns, cell: CellModel) -> RecognizedCapture:
-    """Recognize the kind of a capture.
+def recognize(
+    captures: Sequence[Columns], cell: CellModel, initial_soc: float | None = None
+) -> list[RecognizedCapture]:
+    """Recognize the kinds of captures.
 
     Args:
-        capture: Samples of one cell.
+        captures: Captures of one cell.
         cell: Cell with the capacity that SOC is counted against, and with the limits of valid samples.
+        initial_soc: SOC 0..1 of the captures that start at the highest voltage; None: by their voltages.
 
     Raises:
-        UserError: The capture has too few good samples, or the wrong sign of the current.
+        UserError: A capture has too few good samples, or the wrong sign of the current.
     """
+    loads = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
+    starts = starts_of(loads, cell, initial_soc)
+    return [
+        _recognize(capture, load, start, cell) for capture, load, start in zip(captures, loads, starts, strict=True)
+    ]
+
+
+def _recognize(capture: Columns, cleaned: CleanCapture, start: StartSoc, cell: CellModel) -> RecognizedCapture:
     good = remove_glitches(capture.rows, capture.name)
-    cleaned = clean_capture(capture.name, capture.rows, cell)
-    slow = tuple(slow_branches(good, capture.name))
-    test = None if slow else _relaxation_test(capture, cell)
+    slow = tuple(slow_branches(good, capture.name, start))
+    test = None if slow else _relaxation_test(capture, start.soc, cell)
+    unplaced_test = None if slow or test is not None else _relaxation_test(capture, 1.0, cell)
     if slow:
         kind = " and ".join(branch.label(cell.cell.capacity_ah) for branch in slow)
-    elif test is not None:
-        kind = f"{_kind_of_test(good, cell)}, {len(test.rests)} rests"
+    elif (any_test := test or unplaced_test) is not None:
+        kind = f"{_kind_of_test(good, cell)}, {len(any_test.rests)} rests"
     else:
         kind = _kind_of_load(good, cell)
     return RecognizedCapture(
@@ -86,19 +121,54 @@ def recognize(capture: Columns, cell: CellModel) -> RecognizedCapture:
         good=good,
         kind=kind,
         slow_branches=slow,
-        gives_ocv=bool(slow) or test is not None,
+        start=start,
+        reaches_full=start.origin is StartOrigin.GIVEN or _highest_soc(slow, test, cell) >= MIN_HIGHEST_SOC,
+        is_ocv_test=bool(slow) or test is not None or unplaced_test is not None,
+        gives_ocv=_is_placed(slow, cell) or test is not None,
+        measures_ocv=bool(slow) or (test is not None and _has_long_rests(test)),
         gives_resistances=not without_excitation(cleaned, cell),
         temperature_c=mean_temperature_c(good),
     )
 
 
-def _relaxation_test(capture: Columns, cell: CellModel) -> RelaxationTest | None:
-    """Return the relaxation test of a capture; None if its rests do not determine an open-circuit voltage."""
+def _relaxation_test(capture: Columns, initial_soc: float, cell: CellModel) -> RelaxationTest | None:
+    """Return the relaxation test of a capture; None if its rests do not determine an open-circuit voltage.
+
+    ``initial_soc`` is the SOC at the first sample; NaN if it is unknown, so that the rests determine nothing.
+    """
+    if np.isnan(initial_soc):
+        return None
     try:
-        test = relaxation_test(capture.rows, cell.cell.capacity_ah, name=capture.name)
-    except UserError:  # too few rests, or a charge
+        test = relaxation_test(capture.rows, cell.cell.capacity_ah, initial_soc=initial_soc, name=capture.name)
+    except UserError:  # too few rests, a charge, or a charge that contradicts the SOC
         return None
     return test if np.ptp(test.soc) >= MIN_SPAN else None
+
+
+def _has_long_rests(test: RelaxationTest) -> bool:
+    """Return True if enough rests are long enough for the open-circuit voltage."""
+    return sum(rest.duration_s >= MIN_OCV_REST_S for rest in test.rests) >= MIN_POINTS
+
+
+def _is_placed(slow: Sequence[SlowBranch], cell: CellModel) -> bool:
+    """Return True if low-rate curves are long enough, and their SOC is known.
+
+    It is known by the start of discharges; without a discharge, by the end of charges with a full cell.
+    """
+    if max((branch.ah[-1] for branch in slow), default=0.0) < MIN_SPAN * cell.cell.capacity_ah:
+        return False
+    discharges = [branch for branch in slow if not branch.charge]
+    if discharges:
+        return all(np.isfinite(branch.start.soc) for branch in discharges)
+    return all(branch.voltage_v[-1] >= branch.start.full_v for branch in slow)
+
+
+def _highest_soc(slow: Sequence[SlowBranch], test: RelaxationTest | None, cell: CellModel) -> float:
+    """Return the highest SOC at which the capture determines the open-circuit voltage; NaN if the SOC is unknown."""
+    if test is not None:
+        return max(test.start_soc, float(test.soc.max()))
+    before = [branch.start.soc - branch.before_ah / cell.cell.capacity_ah for branch in slow if not branch.charge]
+    return max(before, default=1.0)
 
 
 def _kind_of_test(good: SampleBlock, cell: CellModel) -> str:

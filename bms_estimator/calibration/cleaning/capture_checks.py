@@ -4,10 +4,12 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE, SOC_SLACK, true_runs
+from bms_estimator.calibration.cleaning.start_soc import undetermined_start
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.charge_count import smaller_current_a
 from bms_estimator.model.time_faults import MIN_GAP_PERIODS
 
 MIN_PEAK_C_RATE = 0.1
@@ -28,7 +30,7 @@ MAX_SOC_DEVIATION = 0.1
 MAX_VOLTAGE_DEVIATION_V = 0.1
 """Maximum deviation of a rested voltage from the OCV at the counted SOC, per cell [V]."""
 MIN_GAP_CHARGE = 0.01
-"""Minimum charge that the current before a gap would draw over it, as a fraction of the capacity."""
+"""Minimum charge that the smaller of the currents before and after a gap would draw over it, as a fraction of the capacity."""
 MIN_DURATION_S = 30.0
 """Minimum duration of a capture [s]."""
 MIN_RESPONSE_V = 1e-3
@@ -68,13 +70,15 @@ def step_resistance(load: CleanCapture) -> float | None:
     change_a = np.diff(load.current_a)
     largest_a = float(np.abs(load.current_a).max(initial=0.0))
     steps = (np.abs(change_a) > STEP_FRACTION * largest_a) & (np.diff(load.time_s) <= MAX_STEP_S)
+    steps &= ~(load.mismatched[:-1] | load.mismatched[1:])
     if steps.sum() < MIN_STEPS:
         return None
     return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))
 
 
-def soc_outside(load: CleanCapture, capacity_ah: float, initial_soc: float) -> str | None:
+def soc_outside(load: CleanCapture, cell: CellModel, initial_soc: float) -> str | None:
     """Return a message if SOC, counted from ``initial_soc``, leaves 0..1; None if it stays within."""
+    capacity_ah = cell.cell.capacity_ah
     soc = initial_soc - load.discharged_ah / capacity_ah
     slack = 2.0 * SOC_SLACK
     if soc.min() >= -slack and soc.max() <= 1.0 + slack:
@@ -82,8 +86,14 @@ def soc_outside(load: CleanCapture, capacity_ah: float, initial_soc: float) -> s
     return (
         f"SOC runs from {soc.min():.3f} to {soc.max():.3f}, outside 0..1: from {initial_soc:.3f} at the start "
         f"({load.start_v:.3f} V), {np.ptp(load.discharged_ah):.3f} Ah were moved with a capacity of "
-        f"{capacity_ah:g} Ah; give the right capacity (--capacity-ah) or SOC at the start (--soc), or the OCV of this cell"
+        f"{capacity_ah:g} Ah; give {_start_remedy(load, cell)}the right capacity (--capacity-ah), or the OCV of this cell"
     )
+
+
+def _start_remedy(load: CleanCapture, cell: CellModel) -> str:
+    """Return the remedy for a first rest on a plateau of the OCV, which does not determine the SOC; otherwise an empty text."""
+    undetermined = undetermined_start(load, cell)
+    return f"the SOC at the start (--soc), because {undetermined}; or " if undetermined else ""
 
 
 def _too_short(load: CleanCapture) -> str | None:
@@ -134,9 +144,13 @@ def _unresponsive_voltage(load: CleanCapture, cell: CellModel) -> str | None:
 
 
 def _gap_with_charge(load: CleanCapture, cell: CellModel) -> str | None:
-    """Return a message on the first gap over which an unknown charge flowed."""
+    """Return a message on the first gap over which an unknown charge flowed.
+
+    A current that ended or changed its sign in the gap counts as no charge. If charge flowed nevertheless, the voltages of
+    later rests contradict the counted SOC.
+    """
     step_s = np.diff(load.time_s)
-    charge_ah = np.abs(load.current_a[:-1]) * step_s / 3600.0
+    charge_ah = np.abs(smaller_current_a(load.current_a)) * step_s / 3600.0
     gaps = (step_s > MIN_GAP_PERIODS * np.median(step_s)) & (charge_ah > MIN_GAP_CHARGE * cell.cell.capacity_ah)
     if not gaps.any():
         return None
@@ -150,7 +164,7 @@ def _gap_with_charge(load: CleanCapture, cell: CellModel) -> str | None:
 def _wrong_capacity(load: CleanCapture, cell: CellModel, initial_soc: float) -> str | None:
     """Return a message if the counted SOC leaves 0..1 or contradicts the voltage of a long rest."""
     capacity_ah, grid = cell.cell.capacity_ah, ocv_grid(cell)
-    outside = soc_outside(load, capacity_ah, initial_soc)
+    outside = soc_outside(load, cell, initial_soc)
     if outside:
         return outside
     soc = initial_soc - load.discharged_ah / capacity_ah
@@ -164,7 +178,7 @@ def _wrong_capacity(load: CleanCapture, cell: CellModel, initial_soc: float) -> 
             return (
                 f"charge and voltage disagree: after {load.discharged_ah[j]:.3f} Ah, at rest at {load.time_s[j]:.0f} s, "
                 f"SOC is {soc[j]:.3f} by the charge and a capacity of {capacity_ah:g} Ah, but {rested_soc:.3f} by "
-                f"{rested_v:.3f} V; give the right capacity, or find this cell's OCV with `ocv`"
+                f"{rested_v:.3f} V; give {_start_remedy(load, cell)}the right capacity, or find this cell's OCV with `ocv`"
             )
     return None
 

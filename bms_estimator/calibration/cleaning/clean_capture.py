@@ -3,10 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bms_estimator.calibration.cleaning.mismatched_steps import are_mismatched, with_matched_voltages
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches, selected
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
@@ -41,6 +44,8 @@ class CleanCapture:
         voltage_v: Shape (n,), measured [V].
         temperature_c: Shape (n,), temperature of the cell [C]; NaN where it was not measured.
         discharged_ah: Shape (n,), charge drawn since the first sample [Ah].
+        mismatched: Shape (n,), True where voltage and current were of different sides of a step (``are_mismatched``). The current
+            of such a sample counts. Its voltage is that of a neighbor with the same current, and determines no resistance.
         resting_samples: Number of samples at rest before the first load; 0 if the capture starts under load.
         samples: Number of samples in the capture.
         glitches: Number of dropped glitches.
@@ -52,6 +57,7 @@ class CleanCapture:
     voltage_v: Floats
     temperature_c: Floats
     discharged_ah: Floats
+    mismatched: NDArray[np.bool_]
     resting_samples: int
     samples: int
     glitches: int
@@ -76,9 +82,10 @@ def clean_capture(name: str, samples: SampleBlock, cell: CellModel) -> CleanCapt
         name=name,
         time_s=time_s,
         current_a=current_a,
-        voltage_v=np.ascontiguousarray(good["voltage_v"]),
+        voltage_v=np.ascontiguousarray(with_matched_voltages(good)["voltage_v"]),
         temperature_c=np.ascontiguousarray(good["temperature_c"]),
-        discharged_ah=np.r_[0.0, np.cumsum(current_a[:-1] * np.diff(time_s))] / 3600.0,
+        discharged_ah=charge_ah(time_s, current_a),
+        mismatched=are_mismatched(good),
         resting_samples=int(np.argmin(resting)) if not resting.all() else resting.size,
         samples=samples.size,
         glitches=samples.size - good.size,

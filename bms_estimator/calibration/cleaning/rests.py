@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.arrays import Floats
+from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
@@ -75,11 +76,9 @@ def selected(samples: SampleBlock, mask: NDArray[np.bool_]) -> SampleBlock:
 def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float = 1.0) -> Floats:
     """Return SOC at every sample by coulomb counting, (2.1). Shape (n,), not limited to 0..1.
 
-    A current counts as constant until the next sample.
+    The charge is that of ``charge_count``.
     """
-    step_s = np.diff(samples["time_s"])
-    charge_ah = np.r_[0.0, np.cumsum(samples["current_a"][:-1] * step_s)] / 3600.0
-    return np.asarray(initial_soc - charge_ah / capacity_ah, dtype=np.float64)
+    return initial_soc - charge_ah(samples["time_s"], samples["current_a"]) / capacity_ah
 
 
 def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
+from bms_estimator.calibration.cleaning.start_soc import initial_soc
 from bms_estimator.calibration.ocv.overpotential import temperature_of
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.chen_mora import r_s, soc_from_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
@@ -66,12 +66,6 @@ def make_run(load: CleanCapture, cell: CellModel, soc: float | None, temperature
     if soc is None and is_cold and abs(full_v - load.start_v) < FULL_TOLERANCE_V * cell.cell.series_count:
         first_soc = 1.0
     return Run(load, first_soc - load.discharged_ah / cell.cell.capacity_ah, temperature)
-
-
-def initial_soc(load: CleanCapture, cell: CellModel) -> float:
-    """Return SOC at the first sample by the voltage of the first rest; without a rest, by the voltage plus i R_s."""
-    current_a = 0.0 if load.resting_samples else float(load.current_a[0])
-    return soc_from_ocv(load.start_v + current_a * r_s(0.5, cell.a), *ocv_grid(cell))
 
 
 def wrong_temperature(load: CleanCapture, temperature_c: float | None) -> list[str]:

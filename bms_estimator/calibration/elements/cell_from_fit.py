@@ -66,7 +66,7 @@ def voltage_rms_v(cell: CellModel, run: Run) -> float:
     e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
     error_v = run.load.voltage_v - e_o + overpotential(cell, run.load_with_temperature, run.soc)
     weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, MAX_STEP_S)
-    weight *= (run.soc > MIN_RMS_SOC) / arrhenius(0.5 * STRONG_J, run.temperature_c) ** 2
+    weight *= ((run.soc > MIN_RMS_SOC) & ~run.load.mismatched) / arrhenius(0.5 * STRONG_J, run.temperature_c) ** 2
     return float(np.sqrt((weight * error_v**2).sum() / max(weight.sum(), 1e-12)))
 
 

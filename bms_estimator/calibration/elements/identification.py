@@ -47,6 +47,8 @@ class Identification:
         score_before: Geometric mean of the captures' interval scores with the given cell [%]; NaN when none has a
             score.
         score_after: Geometric mean of the interval scores with the identified cell [%].
+        undetermined_starts: Lines on captures whose SOC at the first sample was not given, and whose first voltage allows a wide
+            range of SOC.
     """
 
     cell: CellModel
@@ -56,3 +58,4 @@ class Identification:
     ocv_correction_v: float
     score_before: float
     score_after: float
+    undetermined_starts: tuple[str, ...] = ()

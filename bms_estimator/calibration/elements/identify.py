@@ -5,12 +5,15 @@ given and with the identified cell. If other captures at about the temperature o
 that capture use a fit without it (hold-out).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, without_excitation
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
+from bms_estimator.calibration.cleaning.start_soc import undetermined_start
 from bms_estimator.calibration.elements.candidate import Candidate, equations_of, geometric_mean
 from bms_estimator.calibration.elements.capture_run import Run, make_run, wrong_temperature
 from bms_estimator.calibration.elements.identification import Identification
@@ -36,6 +39,7 @@ def identify(
     *,
     refine_ocv: bool = True,
     initial_soc: float | None = None,
+    initial_socs: Mapping[str, float] = MappingProxyType({}),
     temperature_c: float | None = None,
     progress: Progress = no_progress,
 ) -> Identification:
@@ -47,6 +51,7 @@ def identify(
             temperature.
         refine_ocv: Correct the open-circuit voltage as well if the correction improves the replays.
         initial_soc: SOC 0..1 at the first sample of each capture; None: from the voltage of its first rest.
+        initial_socs: SOC 0..1 at the first sample of some captures by name, which precedes ``initial_soc``.
         temperature_c: Temperature of captures without a sensor [C]; None: 25 C.
         progress: Receives the finished fraction of the work.
 
@@ -57,7 +62,7 @@ def identify(
     cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
     loads = [load for load in cleaned if not without_excitation(load, cell)]
     # without any load, the checks below report the missing excitation
-    runs = [make_run(load, cell, initial_soc, temperature_c) for load in loads or cleaned]
+    runs = [make_run(load, cell, initial_socs.get(load.name, initial_soc), temperature_c) for load in loads or cleaned]
     contradictions = [line for run in runs for line in capture_contradictions(run.load, cell, float(run.soc[0]))]
     contradictions += [line for load in loads for line in wrong_temperature(load, temperature_c)]
     if contradictions:
@@ -80,9 +85,15 @@ def identify(
         )
         best = int((EQUAL_SCORE_RATIO if held_back else 1.0) * refined < given)  # index in ``candidates``
     outcome = candidates[best].outcome(before, after[best], left_out)
+    unknown = [load for load in loads if initial_soc is None and load.name not in initial_socs]
+    undetermined = tuple(
+        f"{load.name}: give the SOC at the start (--soc), because {text}"
+        for load in unknown
+        if (text := undetermined_start(load, cell))
+    )
     if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before:
-        raise UserError(_worse_replays(outcome))
-    return outcome
+        raise UserError("\n".join([_worse_replays(outcome), *undetermined]))
+    return replace(outcome, undetermined_starts=undetermined)
 
 
 def _scores(candidate: Candidate, runs: list[Run], work: WorkCounter) -> Floats:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
+from bms_estimator.calibration.cleaning.mismatched_steps import are_mismatched
 from bms_estimator.calibration.cleaning.rests import remove_glitches
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
 from bms_estimator.model.cell import Capacitance, Resistance
@@ -73,6 +74,7 @@ def initial_elements(samples: SampleBlock, test: RelaxationTest, capacity_ah: fl
         UserError: No rest follows a load.
     """
     good = remove_glitches(samples, test.name)
+    good = good[~are_mismatched(good)]  # the first sample of a rest would show a resistance of 0
     elements_of_rests = []
     soc = test.start_soc
     for rest in test.rests:

@@ -116,7 +116,7 @@ def normal_equations(
     currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])  # x_0, x_1, ...
     weight, is_rest_end = _weights(load)
     inside = (soc > MIN_SOC) & (soc < MAX_SOC)
-    selected = (_first_of_each_slot(load.time_s) | is_rest_end) & inside
+    selected = (_first_of_each_slot(load.time_s) | is_rest_end) & inside & ~load.mismatched
     if not selected.any():
         raise UserError(
             f"{load.name}: no sample between SOC {MIN_SOC:g} and {MAX_SOC:g} [--soc], so that resistances are undetermined"
@@ -187,4 +187,5 @@ def _clean_steps(load: CleanCapture) -> NDArray[np.bool_]:
     steady = (bounds_s[1:-1] - bounds_s[:-2] >= STEADY_S) & (bounds_s[2:] - bounds_s[1:-1] >= STEADY_S)
     clean = np.zeros(change_a.size, dtype=np.bool_)
     clean[changes[steady]] = True
+    clean &= ~(load.mismatched | np.roll(load.mismatched, 1))
     return np.asarray(clean & (change_a > STEP_FRACTION * largest_a) & (step_s <= MAX_STEP_S))

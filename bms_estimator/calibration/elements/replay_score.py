@@ -11,6 +11,7 @@ from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.charge_count import step_charges_as
 from bms_estimator.model.progress import Progress, no_progress
 from bms_estimator.model.sample import SAMPLE
 
@@ -39,7 +40,7 @@ def interval_score(cell: CellModel, load: CleanCapture, soc: Floats, progress: P
         soc: Shape (n,), true SOC.
         progress: Receives the finished fraction after each replay.
     """
-    throughput_as = np.cumsum(np.abs(load.current_a) * np.diff(load.time_s, append=load.time_s[-1]))
+    throughput_as = np.cumsum(np.append(np.abs(step_charges_as(load.time_s, load.current_a)), 0.0))
     start_indices = [int(np.argmax(throughput_as >= fraction * throughput_as[-1])) for fraction in START_FRACTIONS]
     starts = [(start, error) for start in start_indices for error in WRONG_SOC]
     scores = []

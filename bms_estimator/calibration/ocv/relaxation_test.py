@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.calibration.cleaning.mismatched_steps import with_matched_voltages
 from bms_estimator.calibration.cleaning.rests import (
     SOC_SLACK,
     mean_temperature_c,
@@ -187,6 +188,7 @@ def find_rests(
         resting: True for each sample at rest.
         series_count: Cells in series, for limits that are given per cell.
     """
+    good = with_matched_voltages(good)
     rests: list[Rest] = []
     rejected: list[str] = []
     for first, last in true_runs(resting):

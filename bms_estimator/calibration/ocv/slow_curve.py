@@ -9,29 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, median_filter
+from scipy.ndimage import gaussian_filter1d
 
-from bms_estimator.calibration.cleaning.rests import SOC_SLACK, mean_temperature_c, resting_samples, true_runs
+from bms_estimator.calibration.cleaning.rests import SOC_SLACK
 from bms_estimator.calibration.ocv.points import COLD_V, Points, coldness
+from bms_estimator.calibration.ocv.slow_branch import SlowBranch
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
-MIN_DURATION_S = 7.0 * 3600.0
-"""Minimum duration of a low-rate curve [s]. A full curve at C/7 takes this long. Faster curves deviate too much from the OCV:
-half of the difference between discharge and charge is already some 20 mV at C/10."""
-MAX_CURRENT_DEVIATION = 0.05
-"""Maximum relative deviation of a constant current from its median, in addition to a standard deviation of its
-noise."""
-SMOOTH_SAMPLES = 31
-"""Length of the median filter [samples]. It removes faults and divides the noise by about five."""
-STD_PER_MEDIAN_STEP = 1.05
-"""Standard deviation of white noise over the median absolute difference between its samples."""
-EMPTY_FALL = 0.01
-"""Minimum relative fall of the voltage over the last hundredth of the charge for a discharge that ends empty."""
-MAX_BEFORE_FRACTION = 0.01
-"""Maximum charge drawn before a full discharge, as a fraction of the discharge's charge."""
 PAIR_K = 5.0
 """Maximum temperature difference between discharge and charge of a pair [K]."""
 PAIR_CURRENT = 0.3
@@ -76,40 +61,6 @@ An unpaired curve has all of this error."""
 
 
 @dataclass(frozen=True)
-class SlowBranch:
-    """One low-rate discharge or charge.
-
-    Attributes:
-        name: Name of the capture.
-        charge: True for a charge, False for a discharge.
-        ah: Shape (n,), charge moved since the start of the curve, increasing [Ah].
-        voltage_v: Shape (n,), terminal voltage [V].
-        current_a: Mean magnitude of the current [A].
-        temperature_c: Mean temperature [C]; NaN without a sensor.
-        before_ah: Net charge drawn between the start of the capture and the start of the curve [Ah].
-        start_v: Voltage of the rest before the curve [V]; NaN without a rest.
-        step_v: Jump of the voltage when the current starts or stops at the end of the curve at which the cell is full [V]; NaN
-            without a rest there.
-        to_empty: True for a discharge down to empty.
-    """
-
-    name: str
-    charge: bool
-    ah: Floats
-    voltage_v: Floats
-    current_a: float
-    temperature_c: float
-    before_ah: float
-    start_v: float
-    step_v: float
-    to_empty: bool
-
-    def label(self, capacity_ah: float) -> str:
-        """Return a description such as "C/20 discharge"."""
-        return f"C/{capacity_ah / self.current_a:.0f} {'charge' if self.charge else 'discharge'}"
-
-
-@dataclass(frozen=True)
 class SlowCurve:
     """Open-circuit voltage from a paired or unpaired low-rate curve.
 
@@ -126,87 +77,12 @@ class SlowCurve:
     notes: tuple[str, ...]
 
 
-def slow_branches(good: SampleBlock, name: str) -> list[SlowBranch]:
-    """Return the low-rate discharges and charges of a capture without glitches.
-
-    Raises:
-        UserError: The voltage changes in the wrong direction for the current.
-    """
-    moved_ah = np.r_[0.0, np.cumsum(good["current_a"][:-1] * np.diff(good["time_s"]))] / 3600.0
-    if good.size < 2 or np.ptp(moved_ah) == 0.0:
-        return []
-    smooth = good.copy()
-    smooth["current_a"] = median_filter(good["current_a"], SMOOTH_SAMPLES, mode="nearest")
-    noise_a = STD_PER_MEDIAN_STEP * float(np.median(np.abs(np.diff(good["current_a"]))))
-    resting = resting_samples(smooth, capacity_ah=float(np.ptp(moved_ah)))  # the capacity itself is unknown here
-    branches = []
-    for first, last in true_runs(~resting):
-        current_a = smooth["current_a"][first:last]
-        middle_a = float(np.median(current_a))
-        for first_steady, end_steady in true_runs(
-            np.abs(current_a - middle_a) <= MAX_CURRENT_DEVIATION * abs(middle_a) + noise_a
-        ):
-            if good["time_s"][first + end_steady - 1] - good["time_s"][first + first_steady] >= MIN_DURATION_S:
-                branches.append(_branch(good, moved_ah, resting, first + first_steady, first + end_steady, name))
-    return branches
-
-
-def _branch(
-    good: SampleBlock, moved_ah: Floats, resting: NDArray[np.bool_], first: int, last: int, name: str
-) -> SlowBranch:
-    """Return the low-rate discharge or charge in the samples ``first`` to ``last`` - 1.
-
-    Raises:
-        UserError: The voltage changes in the wrong direction for the current.
-    """
-    part = good[first:last]
-    charge = bool(np.median(part["current_a"]) < 0.0)
-    ah = np.abs(moved_ah[first:last] - moved_ah[first])
-    voltage_v = part["voltage_v"].astype(np.float64)
-    if charge != (voltage_v[-1] > voltage_v[0]):
-        raise UserError(
-            f"{name}: current has the wrong sign: {'charge' if charge else 'discharge'} from {part['time_s'][0]:.0f} s on "
-            f"while the voltage went from {voltage_v[0]:.3f} to {voltage_v[-1]:.3f} V; discharge must be positive "
-            "(--current-sign)"
-        )
-    jump_v = float("nan")  # at the full end: the end of a charge, the start of a discharge
-    if charge and last < good.size and resting[last]:
-        jump_v = voltage_v[-1] - float(good["voltage_v"][last])
-    elif not charge and first > 0 and resting[first - 1]:
-        jump_v = float(good["voltage_v"][first - 1]) - voltage_v[0]
-    # over the last hundredth of the charge, see EMPTY_FALL
-    last_fall_v = float(np.interp(0.99 * ah[-1], ah, voltage_v)) - voltage_v[-1]
-    return SlowBranch(
-        name=name,
-        charge=charge,
-        ah=ah,
-        voltage_v=voltage_v,
-        current_a=float(np.abs(part["current_a"]).mean()),
-        temperature_c=mean_temperature_c(part),
-        before_ah=float(moved_ah[first]),
-        start_v=float(good["voltage_v"][first - 1]) if first > 0 and resting[first - 1] else float("nan"),
-        step_v=float(np.maximum(jump_v, 0.0)),  # NaN stays NaN
-        to_empty=not charge and last_fall_v > EMPTY_FALL * float(np.median(voltage_v)),
-    )
-
-
-def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
-    """Return the charge of the full low-rate discharge nearest to 25 C [Ah]; NaN without one."""
-    full = [branch for branch in branches if branch.to_empty and branch.before_ah < MAX_BEFORE_FRACTION * branch.ah[-1]]
-    if not full:
-        return float("nan")
-    return float(min(full, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0)).ah[-1])
-
-
-def slow_curves(
-    branches: Sequence[SlowBranch], capacity_ah: float, *, initial_soc: float = 1.0, series_count: int = 1
-) -> list[SlowCurve]:
+def slow_curves(branches: Sequence[SlowBranch], capacity_ah: float, *, series_count: int = 1) -> list[SlowCurve]:
     """Return the curves of pairs of a discharge and a charge, and of the remaining unpaired branches.
 
     Args:
         branches: Branches of all captures.
         capacity_ah: Capacity that SOC is counted against [Ah].
-        initial_soc: SOC at the first sample of each capture, 0..1.
         series_count: Cells in series, for values per cell.
 
     Raises:
@@ -216,7 +92,7 @@ def slow_curves(
     curves = []
     for discharge in (branch for branch in branches if not branch.charge):
         # a charge before the discharge may have filled the cell
-        start_soc = min(initial_soc - discharge.before_ah / capacity_ah, 1.0)
+        start_soc = min(discharge.start.soc - discharge.before_ah / capacity_ah, 1.0)
         soc = start_soc - discharge.ah / capacity_ah
         if soc[-1] < -SOC_SLACK:
             raise UserError(

@@ -2,19 +2,28 @@
 
 from dataclasses import dataclass
 
+from bms_estimator.calibration.cleaning.start_soc import StartSoc
 from bms_estimator.calibration.ocv.points import Points, joined
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
-from bms_estimator.calibration.ocv.slow_curve import SlowBranch
+from bms_estimator.calibration.ocv.slow_branch import SlowBranch
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Name and raw samples of a capture, dtype ``SAMPLE``."""
+    """Capture.
+
+    Attributes:
+        name: Name for messages.
+        samples: Raw samples, dtype ``SAMPLE``.
+        start: SOC at the first sample; None: full for the captures that start at the highest voltage, otherwise by the OCV curve
+            of the other sources.
+    """
 
     name: str
     samples: SampleBlock
+    start: StartSoc | None = None
 
 
 @dataclass(frozen=True)

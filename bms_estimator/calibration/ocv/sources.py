@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from bms_estimator.calibration.cleaning.rests import remove_glitches
+from bms_estimator.calibration.cleaning.start_soc import SAME_START_V, StartSoc
 from bms_estimator.calibration.ocv.hysteresis import (
     REST_SHARE_STD,
     centered,
@@ -17,23 +18,14 @@ from bms_estimator.calibration.ocv.hysteresis import (
 from bms_estimator.calibration.ocv.overpotential import steady_drop
 from bms_estimator.calibration.ocv.points import Points, joined, points_of
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v, relaxation_test
-from bms_estimator.calibration.ocv.slow_curve import (
-    GRID,
-    SlowBranch,
-    SlowCurve,
-    measured_capacity_ah,
-    slow_branches,
-    slow_curves,
-)
+from bms_estimator.calibration.ocv.slow_branch import SlowBranch, measured_capacity_ah, slow_branches
+from bms_estimator.calibration.ocv.slow_curve import GRID, SlowCurve, slow_curves
 from bms_estimator.calibration.ocv.source import ExternalCurve, OcvSources, Recording, Source
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import Ladder
 from bms_estimator.model.errors import UserError
 
-SAME_START_V = 0.02
-"""Maximum difference of the first rests of captures that start at the same SOC, per cell [V]. Full charges vary by as
-much."""
 GIVEN_V = 1e-3
 """Std of each point of a given curve, per cell [V]."""
 GIVEN_SYSTEMATIC_V = 2e-3
@@ -57,23 +49,27 @@ def find_sources(
         curves: Given curves.
         capacity_ah: Capacity that the SOC of rests is counted against [Ah]; None: the capacity by a full low-rate
             discharge. The SOC of low-rate curves is counted against the measured capacity if there is one.
-        initial_soc: SOC at the first sample, 0..1, of the captures that start at the highest voltage.
+        initial_soc: SOC at the first sample, 0..1, of the captures without a ``start`` that start at the highest voltage.
         series_count: Cells in series.
 
     Raises:
         UserError: A capture is neither a relaxation test nor a low-rate curve, or no capacity is given or measured.
     """
-    good = [Recording(recording.name, remove_glitches(recording.samples, recording.name)) for recording in recordings]
-    branches = {recording.name: slow_branches(recording.samples, recording.name) for recording in good}
+    branches = {
+        each.name: slow_branches(
+            remove_glitches(each.samples, each.name), each.name, each.start or StartSoc(initial_soc)
+        )
+        for each in recordings
+    }
     all_branches = [branch for branches_of_capture in branches.values() for branch in branches_of_capture]
-    measured_ah = measured_capacity_ah(all_branches) / initial_soc if initial_soc > 0.0 else float("nan")
+    measured_ah = measured_capacity_ah(all_branches)
     used_ah = measured_ah if capacity_ah is None else capacity_ah
     if not np.isfinite(used_ah):
         raise UserError(
             "--capacity-ah: not given, and no capture is a slow discharge from full to empty that measures it"
         )
     slow_ah = measured_ah if np.isfinite(measured_ah) else used_ah
-    slow = slow_curves(all_branches, slow_ah, initial_soc=initial_soc, series_count=series_count)
+    slow = slow_curves(all_branches, slow_ah, series_count=series_count)
     sources = [_slow_curve_source(curve, slow_ah, used_ah) for curve in slow] + [
         _given_curve_source(curve, series_count) for curve in curves
     ]
@@ -150,11 +146,19 @@ def _rests(
 ) -> list[tuple[RelaxationTest, Points]]:
     """Return the relaxation tests and their points.
 
-    A capture that starts at a lower voltage than the others gets its initial SOC from the curve of the others.
+    A capture whose initial SOC is not known gets it from the curve of the others: a capture that starts at a lower voltage, or
+    whose SOC was read from another cell's curve.
     """
     start_volts = [initial_rest_v(recording.samples, recording.name, capacity_ah) for recording in recordings]
     highest_v = np.nanmax([*start_volts, *(branch.start_v for branch in branches if not branch.charge), -np.inf])
-    starts_lower = [start < highest_v - SAME_START_V * series_count for start in start_volts]
+    starts = [
+        _known_soc(recording, None if start_v < highest_v - SAME_START_V * series_count else initial_soc)
+        for recording, start_v in zip(recordings, start_volts, strict=True)
+    ]
+    if not sources and all(
+        start is None for start in starts
+    ):  # without a curve, the SOCs by the other cell's curve remain
+        starts = [recording.start.soc if recording.start else initial_soc for recording in recordings]
 
     def evaluate(recording: Recording, soc: float) -> tuple[RelaxationTest, Points]:
         test = relaxation_test(
@@ -163,18 +167,25 @@ def _rests(
         return test, points_of(test, series_count)
 
     tests_with_points = {
-        recording.name: evaluate(recording, initial_soc)
-        for recording, lower in zip(recordings, starts_lower, strict=True)
-        if not lower
+        recording.name: evaluate(recording, soc)
+        for recording, soc in zip(recordings, starts, strict=True)
+        if soc is not None
     }
-    if any(starts_lower):
+    if None in starts:
         curve = fit_table(
             joined([*(source.points for source in sources), *(points for _, points in tests_with_points.values())])
         )
-        for recording, start_v, lower in zip(recordings, start_volts, starts_lower, strict=True):
-            if lower:
+        for recording, start_v, soc in zip(recordings, start_volts, starts, strict=True):
+            if soc is None:
                 tests_with_points[recording.name] = evaluate(recording, _soc_at(curve, start_v))
     return [tests_with_points[recording.name] for recording in recordings]
+
+
+def _known_soc(recording: Recording, otherwise: float | None) -> float | None:
+    """Return the SOC at the first sample if it is exact; for a recording without a start, ``otherwise``."""
+    if recording.start is None:
+        return otherwise
+    return recording.start.soc if recording.start.is_exact else None
 
 
 def _soc_at(curve: TableFit, voltage_v: float) -> float:

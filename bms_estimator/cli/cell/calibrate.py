@@ -79,6 +79,15 @@ def calibrate_command(
             show_default=False,
         ),
     ] = None,
+    soc: Annotated[
+        float | None,
+        typer.Option(
+            parser=decimal(0.0, 1.0),
+            help="SOC at the first sample of the captures that start at the highest voltage; default: 1 if their first rest "
+            "has the voltage of a full cell, otherwise by that voltage",
+            show_default=False,
+        ),
+    ] = None,
     series: Series = None,
     report: Annotated[
         Path | None,
@@ -117,7 +126,7 @@ def calibrate_command(
     """Calibrate a cell: measure its capacity, OCV, hysteresis and resistances, and write a cell file.
 
     The command recognizes slow discharges and charges, relaxation tests, HPPC and drive cycles.
-    One capture is enough. A capture for the OCV must begin with a full cell.
+    One capture is enough. A capture for the OCV must begin with a full cell, or at the SOC given by --soc.
 
     With PACK.toml alone, the command reads the pack's device and gives instructions: charge, discharge, rest.
     It recognizes the end of each step by voltage and current, and records all samples.
@@ -144,6 +153,7 @@ def calibrate_command(
             if capture is None:
                 typer.echo("interrupted; the same command continues the test", err=True)
                 raise typer.Exit(130)
+            soc = 1.0  # the capture begins with the rest of the full pack
             captures, recorded = [capture], [session.write_capture(capture)]
         digests = [capture_digest(load_capture(file).rows) for file in recorded] or [
             capture_digest(each.rows) for each in captures
@@ -156,6 +166,7 @@ def calibrate_command(
                 given.cell,
                 name=name_of(out),
                 curves=curves,
+                initial_soc=soc,
                 report=bar.update,
             )
         verdict = calibration.verdict
@@ -176,7 +187,7 @@ def calibrate_command(
                 pack,
                 str(out),
                 capacity_ah,
-                None,
+                soc if len(measured) == 1 else None,  # with several captures, it is not the SOC of each
                 series=given.series,
                 temperature_c=temperature_c,
                 verdict=replace(verdict, sentences=(*verdict.sentences, calibration.validation_data)),

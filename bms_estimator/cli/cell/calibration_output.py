@@ -57,7 +57,7 @@ def json_result(out: Path, calibration: Calibration) -> dict[str, Any]:
             }
             for each in calibration.captures
         ],
-        "ocv_measured": calibration.model.ocv is not None,
+        "ocv_measured": calibration.is_ocv_measured,
         "resistances_identified": identification is not None,
         "held_back": calibration.has_held_back_data,
         "validation": calibration.validation_data,
@@ -70,7 +70,10 @@ def json_result(out: Path, calibration: Calibration) -> dict[str, Any]:
 def _origin_lines(calibration: Calibration) -> list[str]:
     """Return sentences on the origin of the OCV curve and of the resistances."""
     model = calibration.model
-    ocv = "from the given cell, corrected by the fit" if model.ocv is None else "measured"
+    if model.ocv is None:
+        ocv = "from the given cell, corrected by the fit"
+    else:
+        ocv = "measured" if calibration.is_ocv_measured else "estimated from rests of less than 2 minutes"
     if model.ocv is not None and model.ocv.sources.usual_hysteresis:
         ocv += f", with the hysteresis of the generic {model.ocv.generic.cell.name}"
     if model.identification is not None:

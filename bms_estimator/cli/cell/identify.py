@@ -98,6 +98,8 @@ def identify_command(
             progress=bar.update,
         )
     duration_s = time.perf_counter() - started_s
+    for line in identification.undetermined_starts:
+        typer.echo(f"warning: {line}", err=True)
     initial_cell = cell if capacity_ah is None else f"{cell} of {capacity_ah:g} Ah"
     write_cell_named_as_file(out, identification.cell, _remarks(initial_cell, identification), loaded)
     if as_json:
@@ -133,6 +135,7 @@ def _json_result(out: Path, identification: Identification, duration_s: float) -
             for c in identification.captures
         ],
         "left_out": list(identification.left_out),
+        "undetermined_starts": list(identification.undetermined_starts),
         "ocv_correction_rms_mv": 1e3 * identification.ocv_correction_v,
         "score_before_percent": _finite_or_none(identification.score_before),
         "score_after_percent": _finite_or_none(identification.score_after),

@@ -112,12 +112,14 @@ def ocv(
         ),
     ] = OcvForm.TABLE,
     soc: Annotated[
-        float,
+        float | None,
         typer.Option(
             parser=decimal(0.0, 1.0),
-            help="initial SOC of the captures that start at the highest voltage; other captures start at an SOC that is read from the OCV curve",
+            help="SOC at the first sample of the captures that start at the highest voltage; other captures start at an SOC that is read "
+            "from the OCV curve; default: 1, if that is the voltage of a full cell",
+            show_default=False,
         ),
-    ] = 1.0,
+    ] = None,
     series: Annotated[
         int | None,
         typer.Option(

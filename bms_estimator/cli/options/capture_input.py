@@ -7,6 +7,7 @@ from pathlib import Path
 import typer
 
 from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.model.charge_count import gap_warnings
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.progress import Progress, no_progress
 from bms_estimator.model.sample import CurrentSign, SampleBlock
@@ -52,7 +53,7 @@ def load_captures(
             rows = read_with_bar(file, capture)
             faults = TimeFaults()
             faults.add(rows["time_s"])
-            print_warnings(file.name, faults.warnings)
+            print_warnings(file.name, [*faults.warnings, *gap_warnings(rows["time_s"], rows["current_a"])])
             loaded.append(Columns(rows, file.name, capture.note, capture.warning))
     return loaded
 

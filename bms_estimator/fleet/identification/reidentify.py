@@ -24,6 +24,7 @@ from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, with_name
 from bms_estimator.model.cell_file import cell_text
+from bms_estimator.model.charge_count import charge_ah, step_charges_as
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
@@ -206,7 +207,7 @@ class _Pack:
             raise _UnsuitableError(
                 f"its SOC is known to {100.0 * std[start_sample]:.0f} % at best: rests, or a charge to the top, are missing"
             )
-        drawn_ah = _drawn_ah(piece)[start_sample - first]
+        drawn_ah = charge_ah(piece["time_s"], piece["current_a"])[start_sample - first]
         # SOC at the beginning of the piece, by counting back
         start = float(np.clip(soc[start_sample] + drawn_ah / cell.cell.capacity_ah, 0.0, 1.0))
         return identify([Columns(piece, self._outcome.pack)], cell, initial_soc=start).cell
@@ -311,15 +312,9 @@ def _estimate(estimator: Estimator, samples: SampleBlock) -> tuple[Floats, Float
     return soc, std
 
 
-def _drawn_ah(piece: SampleBlock) -> Floats:
-    """Return the charge drawn since the first sample [Ah]."""
-    drawn_as: Floats = np.r_[0.0, np.cumsum(piece["current_a"][:-1] * np.diff(piece["time_s"]))]
-    return drawn_as / 3600.0
-
-
 def _throughput_ah(piece: SampleBlock) -> float:
     """Return the charge throughput, out and in together [Ah]."""
-    return float(np.abs(np.diff(_drawn_ah(piece))).sum())
+    return float(np.abs(step_charges_as(piece["time_s"], piece["current_a"])).sum()) / 3600.0
 
 
 def _on_one_line(error: Exception) -> str:

@@ -1,5 +1,6 @@
 """Current between two samples."""
 
+from bms_estimator.model.unmeasured_time import UNMEASURED_S
 from bms_estimator.numba_cache import njit
 
 SLOW_S = 2.0
@@ -7,14 +8,8 @@ SLOW_S = 2.0
 deviate from a straight line between the samples."""
 GAP_RATIO = 3.0
 """Minimum ratio of a gap to the previous step, so that slow sampling does not count as gaps."""
-UNMEASURED_S = 60.0
-"""Maximum step over which the current counts as measured [s]. For a slow source the maximum is ``PERIODS`` of its periods,
-if these are longer."""
 PERIODS = 2.5
 """Maximum regular step in multiples of the sample period, because a regular source may be late or lose a sample."""
-MAX_FLOW_S = 3600.0
-"""Maximum time over which a current is integrated without a sample [s], so that one wrong time stamp cannot empty a
-cell."""
 
 
 @njit(cache=True)

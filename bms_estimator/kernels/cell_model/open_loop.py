@@ -13,12 +13,12 @@ import numpy as np
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts, rc_step
 from bms_estimator.kernels.cell_model.current_interpolation import (
     SLOW_S,
-    UNMEASURED_S,
     interpolated_current,
     ramp_correction,
 )
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS, TREND
 from bms_estimator.model.arrays import Floats
+from bms_estimator.model.unmeasured_time import UNMEASURED_S
 from bms_estimator.numba_cache import njit
 
 MIN_CAPACITANCE = 1e-3

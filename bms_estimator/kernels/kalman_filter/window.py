@@ -6,7 +6,6 @@
 import math
 
 from bms_estimator.kernels.cell_model.current_interpolation import (
-    MAX_FLOW_S,
     SLOW_S,
     interpolated_current,
     ramp_correction,
@@ -32,6 +31,7 @@ from bms_estimator.kernels.kalman_filter.temperature import (
     propagate_self_heating,
 )
 from bms_estimator.model.arrays import Record
+from bms_estimator.model.unmeasured_time import MAX_FLOW_S
 from bms_estimator.numba_cache import njit
 
 WINDOW_S = 0.99

@@ -12,9 +12,10 @@ every N >= 0 and every period. ``s`` is a record of OBSERVER_STATE, ``p`` of OBS
 import math
 
 from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, c_tl, c_ts, delta, ocv, r_s, r_tl, r_ts, soc_from_ocv
-from bms_estimator.kernels.cell_model.current_interpolation import MAX_FLOW_S, interpolated_current
+from bms_estimator.kernels.cell_model.current_interpolation import interpolated_current
 from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.arrays import Record
+from bms_estimator.model.unmeasured_time import MAX_FLOW_S
 from bms_estimator.numba_cache import njit
 
 MIN_LOOP_GAIN = 0.1

@@ -7,13 +7,17 @@ from bms_estimator.calibration.automatic.calibrate import calibrate
 from bms_estimator.calibration.automatic.capacity_estimate import estimate_capacity
 from bms_estimator.calibration.automatic.hold_back import hold_back
 from bms_estimator.calibration.automatic.recognition import recognize
+from bms_estimator.calibration.elements.identify import identify
+from bms_estimator.cli.cell.calibration_output import remarks
 from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
 from bms_estimator.model.cell import load_cell, with_capacity
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps
-from tests.calibration.simulated_relaxation import relaxation
+from tests.calibration.simulated_relaxation import relaxation, schedule
 
 GIVEN = load_cell("nca", 3.0)
 
@@ -39,7 +43,7 @@ def captures() -> dict[str, Columns]:
     ],
 )
 def test_a_capture_is_recognized_by_its_content(captures, name, kind, gives_ocv) -> None:
-    recognized = recognize(captures[name], TRUTH)
+    (recognized,) = recognize([captures[name]], TRUTH)
     assert (recognized.kind, recognized.gives_ocv, recognized.gives_resistances) == (kind, gives_ocv, True)
 
 
@@ -76,14 +80,14 @@ def test_rests_from_full_to_empty_measure_the_capacity_of_an_aged_pack(chemistry
 
 
 def test_a_capture_without_ocv_is_held_back_first(captures) -> None:
-    recognized = [recognize(captures[name], TRUTH) for name in ("relaxation", "constant", "pulses")]
+    recognized = recognize([captures[name] for name in ("relaxation", "constant", "pulses")], TRUTH)
     split = hold_back(recognized)
     assert split.held_back is recognized[1]
     assert [each.capture.name for each in split.resistances] == ["relaxation", "pulses"]
 
 
 def test_the_end_of_a_single_capture_is_held_back_from_the_resistances(captures) -> None:
-    recognized = recognize(captures["relaxation"], TRUTH)
+    (recognized,) = recognize([captures["relaxation"]], TRUTH)
     split = hold_back([recognized])
     first_part = split.resistances[0].capture.rows
     assert split.held_back is recognized
@@ -134,3 +138,123 @@ def test_a_rated_capacity_that_a_whole_discharge_contradicts_is_warned_about(dat
     warnings = calibrate([leaf], load_cell("lmo", rated_ah), name="mine").warnings
     expected = f"{leaf.name} draws 30.47 Ah from full; if it ended when the cell was empty, give --capacity 30.47"
     assert warnings == ((expected,) if is_warned else ())
+
+
+def test_a_gap_of_hours_after_a_sample_of_a_charge_carries_no_charge(captures) -> None:
+    rows = captures["relaxation"].rows.copy()
+    last = int(np.flatnonzero(np.diff(rows["current_a"]) > 0.0)[9])  # of a rest
+    rows["current_a"][last] = -0.7
+    rows["time_s"][last + 1 :] += 16_000.0
+    calibration = calibrate([Columns(rows, "interrupted")], GIVEN, name="mine")
+    assert calibration.model.identification is not None
+    difference_v = ocv_grid(calibration.model.cell)[0] - ocv_grid(TRUTH)[0]
+    assert np.abs(difference_v[difference_v.size // 5 : -difference_v.size // 20]).max() < 0.01
+    assert calibration.validations[0].above.voltage_rms_v < 0.02
+
+
+def slow_discharge(cell, initial_soc, *, final_soc=0.0, noise_v=2e-4):
+    """Return a capture at C/20 from rest at ``initial_soc`` to rest at ``final_soc``, one sample a minute."""
+    capacity_ah = cell.cell.capacity_ah
+    minutes = round((initial_soc - final_soc) * 20.0 * 60.0)
+    current_a = np.r_[np.zeros(30), np.full(minutes, capacity_ah / 20.0), np.zeros(30)]
+    samples = np.zeros(current_a.size, dtype=SAMPLE)
+    samples["time_s"], samples["current_a"], samples["temperature_c"] = (
+        60.0 * np.arange(current_a.size),
+        current_a,
+        np.nan,
+    )
+    soc = initial_soc - np.r_[0.0, np.cumsum(current_a[:-1])] / 60.0 / capacity_ah
+    samples["voltage_v"] = ocv_of_each(np.clip(soc, 0.0, 1.0), *ocv_grid(cell)) - 0.03 / capacity_ah * current_a
+    samples["voltage_v"] += noise_v * np.random.default_rng(5).standard_normal(soc.size)
+    return Columns(samples, "slow")
+
+
+@pytest.mark.parametrize(("chemistry", "initial_soc"), [("nmc", 0.5), ("nca", 0.7), ("lfp", 0.6), ("lmo", 0.4)])
+def test_a_slow_discharge_that_begins_half_full_measures_no_capacity_and_no_ocv(chemistry, initial_soc) -> None:
+    cell = load_cell(chemistry, 43.0)
+    half = slow_discharge(cell, initial_soc)
+    estimate = estimate_capacity([half], cell)
+    assert not estimate.from_slow_discharge
+    assert estimate.capacity_ah == 43.0
+    with pytest.raises(
+        UserError, match=r"(?s)no capture determines.*nothing proves that it starts with a full.*give --soc"
+    ):
+        calibrate([half], cell, name="mine")
+
+
+@pytest.mark.parametrize("chemistry", ["nmc", "lfp"])
+def test_with_the_soc_at_its_start_a_partial_discharge_measures_the_capacity(chemistry) -> None:
+    estimate = estimate_capacity([slow_discharge(load_cell(chemistry, 40.0), 0.5)], load_cell(chemistry, 43.0), 0.5)
+    assert estimate.from_slow_discharge
+    assert estimate.capacity_ah == pytest.approx(40.0, rel=0.01)
+    assert estimate.origin == "measured by a slow discharge from the given SOC of 0.5 to empty"
+
+
+def test_a_discharge_from_full_that_ends_half_full_measures_no_capacity() -> None:
+    cell = load_cell("nmc", 43.0)
+    assert not estimate_capacity([slow_discharge(cell, 1.0, final_soc=0.4)], cell).from_slow_discharge
+
+
+def test_a_larger_charge_than_the_rated_capacity_is_a_lower_bound_unless_the_cell_is_full_and_then_empty() -> None:
+    cell = load_cell("nmc", 43.0)
+    estimate = estimate_capacity([slow_discharge(cell, 1.0, final_soc=0.4)], with_capacity(cell, 20.0))
+    assert estimate.capacity_ah == pytest.approx(0.6 * 43.0, rel=0.01)
+    assert "a lower bound, because the capture does not run from full to empty" in estimate.origin
+
+
+def test_the_soc_of_a_start_below_full_is_counted_from_its_voltage() -> None:
+    rows = capture(schedule(rounds=30), soc=0.93)
+    calibration = calibrate([Columns(rows, "later")], with_capacity(TRUTH, 3.0), name="mine")
+    assert calibration.model.ocv.sources.tests[0].start_soc == pytest.approx(0.93, abs=0.01)
+    (line,) = calibration.warnings
+    assert "nothing proves that it starts with a full cell: its first rest at 4.0" in line
+    assert "the SOC is counted from there" in line
+
+
+def test_the_given_soc_is_that_of_the_captures_at_the_highest_first_voltage(captures) -> None:
+    later = Columns(captures["relaxation"].rows[3000:], "later")
+    first, second = recognize([captures["relaxation"], later], TRUTH, 0.99)
+    assert (first.start.soc, first.start.is_exact) == (0.99, True)
+    assert second.start.soc < 0.97
+
+
+def test_pulses_with_rests_of_less_than_a_minute_measure_no_ocv() -> None:
+    pulses_a = np.r_[np.zeros(60), np.tile(np.r_[np.full(90, 0.5), np.zeros(50)], 220)]
+    pulses = Columns(capture(pulses_a, soc=1.0), "pulses")
+    (recognized,) = recognize([pulses], TRUTH)
+    assert (recognized.measures_ocv, recognized.gives_resistances) == (False, True)
+    calibration = calibrate([pulses], TRUTH, name="mine")
+    assert not calibration.is_ocv_measured
+    text = "\n".join(remarks(calibration))
+    assert "OCV: estimated from rests of less than 2 minutes" in text
+    assert "OCV: measured" not in text
+
+
+def test_a_first_rest_on_a_plateau_is_named_with_the_socs_that_it_allows() -> None:
+    cell = load_cell("lfp", 3.0)
+    rows = capture(np.r_[np.zeros(600), np.tile(np.r_[np.full(600, 1.5), np.zeros(900)], 11)], cell=cell, soc=0.85)
+    rows["voltage_v"] -= 0.012  # the curve of another make, whose SOC is 0.5 at this voltage
+    message = r"give the SOC at the start \(--soc\), because its first rest at 3\.3\d\d V fits SOC 0\.\d\d to 0\.\d\d; or the right"
+    with pytest.raises(UserError, match=message):
+        identify([Columns(rows, "plateau")], cell)
+    assert identify([Columns(rows, "plateau")], cell, initial_soc=0.85).captures[0].initial_soc == 0.85
+
+
+def test_a_start_on_a_plateau_without_a_contradiction_is_named_beside_the_result() -> None:
+    cell = load_cell("lfp", 3.0)
+    rows = Columns(
+        capture(np.r_[np.zeros(600), np.tile(np.r_[np.full(600, 1.5), np.zeros(900)], 5)], cell=cell, soc=0.7), "load"
+    )
+    (line,) = identify([rows], cell).undetermined_starts
+    assert line.startswith("load: give the SOC at the start (--soc), because its first rest at 3.3")
+    assert identify([rows], cell, initial_soc=0.7).undetermined_starts == ()
+    assert identify([rows], cell, initial_socs={"load": 0.7}).undetermined_starts == ()
+
+
+def test_a_slow_discharge_far_below_the_rated_capacity_is_warned_about() -> None:
+    half = slow_discharge(load_cell("nca", 3.0), 1.0)
+    warnings = calibrate([half], load_cell("nca", 5.0), name="mine").warnings
+    assert (
+        "the slow discharge measures 60 % of the rated 5 Ah; if it began below full, give the SOC at its start (--soc)"
+        in warnings
+    )

@@ -6,9 +6,9 @@ from scipy.stats import gmean
 
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
+from bms_estimator.calibration.cleaning.start_soc import initial_soc
 from bms_estimator.calibration.elements import identify as module
 from bms_estimator.calibration.elements import two_branch_fit
-from bms_estimator.calibration.elements.capture_run import initial_soc
 from bms_estimator.calibration.elements.cell_from_fit import LADDER_STD
 from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.calibration.elements.replay_score import interval_score
@@ -277,6 +277,41 @@ def test_glitches_do_not_change_the_result(warm, from_warm):
     assert result.captures[0].glitches >= 45
     for name in OHM:
         assert result.elements[0.5][name][0] == pytest.approx(from_warm.elements[0.5][name][0], rel=0.05)
+
+
+def with_mismatched_records(samples, rows, voltage_from):
+    """Insert a record 10 ms before each of ``rows``, which begin steps of the current.
+
+    The record has the voltage of the row before and the current of the row (``voltage_from`` "before"), as cyclers write the
+    first record of a step, or the voltage of the row and the current before it ("after").
+    """
+    records = samples[rows].copy()
+    records["time_s"] -= 0.01
+    records["voltage_v" if voltage_from == "before" else "current_a"] = samples[
+        "voltage_v" if voltage_from == "before" else "current_a"
+    ][rows - 1]
+    return np.insert(samples, rows, records)
+
+
+@pytest.mark.parametrize("voltage_from", ["before", "after"])
+def test_records_whose_voltage_is_of_the_other_side_of_a_step_are_not_used(from_warm, warm, voltage_from):
+    changes = np.flatnonzero(np.diff(warm.rows["current_a"])) + 1
+    result = identify([Columns(with_mismatched_records(warm.rows, changes, voltage_from), "cycler")], wrong_start())
+    for name in OHM:
+        assert result.elements[0.5][name][0] == pytest.approx(from_warm.elements[0.5][name][0], rel=0.1)
+    assert result.captures[0].voltage_rms_v < 1.1 * from_warm.captures[0].voltage_rms_v
+
+
+def test_one_mismatched_record_at_the_only_step_does_not_make_the_resistance_zero():
+    """A constant load has few steps, so that the jump of the voltage at one of them weighs much."""
+    current_a = np.r_[np.zeros(600), np.full(9000, 1.0), np.zeros(1200)]
+    samples = ladder_capture(current_a, WARM_C)
+    with_record = with_mismatched_records(samples, np.array([600, 9600]), "before")
+    ohm, expected_ohm = (
+        identify([Columns(rows, "constant")], wrong_start()).elements[0.5]["r_s"][0] for rows in (with_record, samples)
+    )
+    assert ohm == pytest.approx(expected_ohm, rel=0.25)
+    assert ohm == pytest.approx(OHM["r_s"], rel=0.4)
 
 
 def test_a_gap_at_rest_is_accepted():

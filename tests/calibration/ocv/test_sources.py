@@ -3,23 +3,26 @@
 import numpy as np
 import pytest
 
+from bms_estimator.calibration.cleaning.start_soc import StartSoc
 from bms_estimator.calibration.ocv.hysteresis import (
     PLATEAU_SHARE,
     REST_SHARE_STD,
     TYPICAL_HYSTERESIS_STD,
     center_on_typical_hysteresis,
 )
+from bms_estimator.calibration.ocv.slow_branch import slow_branches
 from bms_estimator.calibration.ocv.slow_curve import GRID
 from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
 from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
+from bms_estimator.calibration.ocv_cell import determine_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture
 from tests.calibration.simulated_relaxation import relaxation, schedule
-from tests.calibration.simulated_slow import CAPACITY_AH, CURRENT_A, hysteresis_v, slow, true_v
+from tests.calibration.simulated_slow import CAPACITY_AH, CURRENT_A, OHM, hysteresis_v, slow, true_v
 
 INSIDE = (NODES > 0.1) & (NODES < 0.95)
 
@@ -241,3 +244,42 @@ def test_the_hysteresis_of_a_cold_pair_is_converted_to_25_c(shared_data):
         assert result.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v / temperature_factor)
         mean_v[at] = result.hysteresis_v[INSIDE].mean()
     assert 0.7 < mean_v["n15"] / mean_v["p25"] < 1.8
+
+
+def test_a_slow_discharge_with_a_gap_of_hours_measures_no_capacity() -> None:
+    samples = slow((1.0,))
+    middle = samples.size // 2
+    with_gap = np.delete(samples, np.s_[middle : middle + 480])  # 4 h
+    with pytest.raises(UserError, match="--capacity-ah: not given"):
+        sources_of(with_gap)
+
+
+def test_the_first_record_of_a_slow_discharge_with_the_old_voltage_does_not_hide_the_ohmic_step() -> None:
+    samples = slow((1.0,))
+    first = int(np.argmax(samples["current_a"] > 0.0))
+    record = samples[first : first + 1].copy()
+    record["time_s"] -= 0.01
+    record["voltage_v"] = samples["voltage_v"][first - 1]
+    (expected,), (found,) = (
+        slow_branches(rows, "c20", StartSoc()) for rows in (samples, np.insert(samples, first, record))
+    )
+    assert found.step_v == pytest.approx(expected.step_v, abs=1e-9)
+    assert found.step_v == pytest.approx(OHM * CURRENT_A, abs=2e-3)
+
+
+@pytest.mark.parametrize("initial_soc", [0.45, 0.6, 0.9])
+def test_a_curve_that_does_not_begin_full_needs_the_soc_at_its_start(initial_soc) -> None:
+    whole = slow((1.0,))
+    soc = 1.0 - np.r_[0.0, np.cumsum(whole["current_a"][:-1])] * 30.0 / 3600.0 / CAPACITY_AH
+    begin = int(np.argmax(soc <= initial_soc))
+    rest = whole[:60].copy()
+    rest["voltage_v"] += true_v(initial_soc) - true_v(1.0)
+    rest["time_s"] += whole["time_s"][begin] - 30.0 * 60
+    partial = np.concatenate([rest, whole[begin:]])
+    recording = Recording("half", partial)
+    with pytest.raises(
+        UserError, match=r"--soc: not given, and nothing proves that the cell is full at the start of half"
+    ):
+        determine_ocv([recording], [], name="mine", series_count=1)
+    given = determine_ocv([recording], [], name="mine", series_count=1, initial_soc=initial_soc)
+    assert given.sources.capacity_ah == pytest.approx(CAPACITY_AH, rel=0.01)

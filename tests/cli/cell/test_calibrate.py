@@ -282,3 +282,28 @@ def test_series_and_temperature_reach_fit_validation_and_report(capsys, data, tm
     assert result["captures"][0]["temperature_c"] == 10.0
     assert "temperatures other than 10 °C" in result["verdict"]
     assert "temperatures other than 10 °C" in report.read_text(encoding="utf-8")
+
+
+def test_the_soc_at_the_start_of_a_partial_discharge_is_asked_for_and_reaches_fit_and_report(capsys, tmp_path) -> None:
+    cell, begin_soc = load_cell("nmc", 40.0), 0.8
+    current_a = np.r_[np.zeros(30), np.full(round(begin_soc * 9.0 * 60.0), 40.0 / 9.0), np.zeros(30)]
+    soc = begin_soc - np.r_[0.0, np.cumsum(current_a[:-1])] / 60.0 / 40.0
+    voltage_v = ocv_of_each(np.clip(soc, 0.0, 1.0), *ocv_grid(cell)) - 1e-3 * current_a
+    path, out, report = tmp_path / "partial.csv", tmp_path / "cell.toml", tmp_path / "page.html"
+    rows = [f"{60 * i},{a:.4f},{v:.4f}\n" for i, (a, v) in enumerate(zip(current_a, voltage_v, strict=True))]
+    path.write_text("time_s,current_a,voltage_v\n" + "".join(rows))
+    options = "--cell", "nmc", "--capacity", 43, "--out", out, "--json"
+    _, printed, err = run(capsys, "calibrate", path, *options)
+    assert "nothing proves that it starts with a full cell" in err
+    assert "give --soc" in err
+    result = json.loads(printed)
+    assert not result["ocv_measured"]
+    assert result["capacity_origin"].startswith("rated")
+    options = *options, "--force", "--soc", begin_soc, "--report", report
+    code, printed, err = run(capsys, "calibrate", path, *options)
+    assert code == 0, err
+    result = json.loads(printed)
+    assert result["capacity_ah"] == pytest.approx(40.0, rel=0.01)
+    assert result["capacity_origin"] == "measured by a slow discharge from the given SOC of 0.8 to empty"
+    assert "nothing proves" not in err
+    assert report.exists()

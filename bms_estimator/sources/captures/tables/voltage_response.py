@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.arrays import Floats
+from bms_estimator.model.charge_count import step_charges_as
 from bms_estimator.model.sample import CurrentSign, SampleBlock, SampleStatus
 
 HELD = int(SampleStatus.VOLTAGE_HELD | SampleStatus.CURRENT_HELD)
@@ -97,7 +98,7 @@ def voltage_response(samples: SampleBlock) -> VoltageResponse:
 
 def _charge_steps(rows: SampleBlock) -> Floats:
     """Return the charge from each sample to the next one; the last one has none."""
-    return np.asarray(rows["current_a"] * np.diff(rows["time_s"], append=rows["time_s"][-1:]).clip(min=0.0))
+    return np.append(step_charges_as(rows["time_s"], rows["current_a"]), 0.0)
 
 
 def _parts(rows: SampleBlock, begins: NDArray[np.bool_], kept: NDArray[np.bool_]) -> _Parts:
@@ -218,8 +219,7 @@ def _step_response(current_a: Floats, voltage_v: Floats) -> int:
 
 def _charge_response(rows: SampleBlock) -> int:
     """Return 1 if the voltage rises with the integral of the current, -1 if it falls, 0 if neither is clear."""
-    steps_s = np.diff(rows["time_s"]).clip(min=0.0)
-    charge_as = np.cumsum(rows["current_a"][1:] * steps_s)
+    charge_as = np.cumsum(_charge_steps(rows)[:-1])
     voltage_v = rows["voltage_v"][1:]
     if rows.size < MIN_TREND_ROWS or not np.ptp(charge_as) > 0.0 or not np.ptp(voltage_v) > 0.0:
         return 0
