@@ -117,12 +117,6 @@ def calibrate(
         for capture, validation in validations
     ]
     errors = voltage_errors([run.validation for run in runs], validated_model.cell)
-    named = [each.capture.name for each in recognized if each.is_ocv_test]  # ``start_notes`` name them already
-    undetermined = [
-        line
-        for line in (model.identification.undetermined_starts if model.identification else ())
-        if line.partition(":")[0] not in named
-    ]
     contradictions = [
         *chemistry_warnings(given, capacity, model.ocv),
         *capacity_warnings(given, capacity, recognized, errors.low_soc_rms_v),
@@ -136,8 +130,18 @@ def calibrate(
         validation_data=split.sentence,
         validations=tuple(run.validation for run in runs),
         verdict=judge(runs, validated_model.cell, covered),
-        warnings=tuple(dict.fromkeys([*start_notes, *undetermined, *contradictions, *notes, *failures])),
+        warnings=tuple(
+            dict.fromkeys([*start_notes, *_undetermined_starts(model, recognized), *contradictions, *notes, *failures])
+        ),
     )
+
+
+def _undetermined_starts(model: FittedModel, captures: Sequence[RecognizedCapture]) -> list[str]:
+    """Return the lines on captures whose voltage does not determine their SOC at the start, except those of OCV tests."""
+    if model.identification is None:
+        return []
+    named = [each.capture.name for each in captures if each.is_ocv_test]  # ``unproven_starts`` names them
+    return [line for line in model.identification.undetermined_starts if line.partition(":")[0] not in named]
 
 
 def _require_equal_full_voltages(captures: Sequence[RecognizedCapture]) -> None:
