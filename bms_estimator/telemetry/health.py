@@ -33,6 +33,8 @@ _SAMPLE_COUNTERS = [
     if name.startswith("dropped_") or name in ("samples", "gaps", "time_steps_back")
 ]
 """Fields of OBSERVER_STATE that count samples."""
+MAX_SERIES_FACTOR = 200
+"""Maximum number of cells in series that is suggested, relative to the configured one. It is that of a vehicle of 800 V."""
 
 
 def resident_mib() -> float | None:
@@ -203,4 +205,7 @@ def out_of_range_reason(block: SampleBlock, settings: np.void) -> str | None:
     ):
         if low_v <= corrected_v <= high_v and abs(corrected_a) <= max_a:
             return f"{text}: {question}"
+    fewest, most = math.ceil(volt / high_v), math.floor(volt / low_v)
+    if 1 < fewest <= min(most, MAX_SERIES_FACTOR) and abs(ampere) <= max_a:
+        return f"{text}: are there {fewest} to {most} times as many cells in series (pack.series)?"
     return text

@@ -282,6 +282,7 @@ def test_a_capture_without_a_usable_sample_is_an_error(tmp_path, capsys):
     code, out, err = run(capsys, "replay", empty, "--cell", "ncr18650", "--json")
     assert (code, out) == (2, "")
     assert "nan.csv: no usable sample; dropped: 1 not finite, 1 outside the cell's range" in err
+    assert err.endswith("are there 3 to 4 times as many cells in series (pack.series)?\n")
 
 
 def test_error_suggests_the_unit_of_the_columns(capture, tmp_path, capsys):
