@@ -20,6 +20,7 @@ from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.protocols.base.device_clock import MAX_LEAD_S
+from bms_estimator.protocols.base.probe_check import probe_block
 from bms_estimator.settings.alarm_limits import AlarmDefinition, implausible_limits, monitored_alarms
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
@@ -387,8 +388,8 @@ async def test_a_saturated_current_exceeds_any_limit() -> None:
 
 @pytest.mark.parametrize(
     ("voltage_v", "status"),
-    [(0.05, SampleStatus(0)), (7.6, SampleStatus.VOLTAGE_SATURATED)],
-    ids=["broken wire", "range of the converter that sags with its supply"],
+    [(0.05, SampleStatus(0)), (5.0, SampleStatus(0)), (7.6, SampleStatus.VOLTAGE_SATURATED)],
+    ids=["broken wire", "floating wire", "range of the converter that sags with its supply"],
 )
 def test_a_voltage_that_cannot_be_measured_does_not_end_an_over_voltage(voltage_v: float, status: SampleStatus) -> None:
     alarms = make_evaluator({"pack_over_voltage": {"latch": False}})
@@ -398,6 +399,58 @@ def test_a_voltage_that_cannot_be_measured_does_not_end_an_over_voltage(voltage_
     assert "pack_over_voltage" in alarms.active
     add_samples(alarms, *range(100, 200), voltage_v=7.4)
     assert "pack_over_voltage" not in alarms.active
+
+
+def test_a_current_sensor_that_dies_does_not_end_an_over_current_and_is_lost() -> None:
+    alarms = make_evaluator({"discharge_over_current": {"limit_a": 20.0, "latch": False}})
+    add_samples(alarms, *range(20), current_a=22.0)
+    assert alarms.active == ("discharge_over_current",)
+    add_samples(alarms, *range(20, 100), current_a=-25.0, status=int(SampleStatus.CURRENT_SATURATED))
+    assert "discharge_over_current" in alarms.active
+    assert "discharge_over_current" in alarms.unwatched_critical
+
+
+def test_a_cell_whose_wire_reads_0_v_does_not_end_a_cell_over_voltage() -> None:
+    alarms = make_evaluator({"cell_over_voltage": {"latch": False}})
+    add_samples(alarms, *range(20), cells_v=(3.7, 4.3))
+    add_samples(alarms, *range(20, 100), cells_v=(3.7, 0.0))
+    assert "cell_over_voltage" in alarms.active
+    add_samples(alarms, *range(100, 200), cells_v=(3.7, 3.7))
+    assert "cell_over_voltage" not in alarms.active
+
+
+def test_charging_below_freezing_does_not_end_when_the_cold_probe_fails_but_when_the_charge_ends() -> None:
+    alarms = make_evaluator({"charging_below_freezing": {"latch": False}})
+    add_samples(alarms, *range(20), current_a=-2.0, temperature_c=-5.0)
+    faulty = int(SampleStatus.PROBE_FAULT)
+    add_samples(alarms, *range(20, 100), current_a=-2.0, temperature_c=20.0, status=faulty)
+    assert "charging_below_freezing" in alarms.active
+    add_samples(alarms, *range(100, 200), temperature_c=20.0, status=faulty)
+    assert "charging_below_freezing" not in alarms.active
+
+
+def test_an_alarm_whose_cause_has_returned_is_not_ended_by_its_acknowledgement() -> None:
+    """The delay of ``over_temperature`` is 10 s."""
+    alarms = make_evaluator({"over_temperature": {"latch": True}})
+    add_samples(alarms, *range(20), temperature_c=70.0)
+    add_samples(alarms, *range(20, 100), temperature_c=25.0)
+    add_samples(alarms, *range(100, 105), temperature_c=70.0)
+    alarms.acknowledge("over_temperature")
+    assert "over_temperature" in alarms.active
+    add_samples(alarms, *range(105, 200), temperature_c=25.0)
+    assert "over_temperature" not in alarms.active
+
+
+def test_only_its_own_acknowledgement_ends_over_temperature_while_the_hot_probe_is_missing() -> None:
+    alarms = make_evaluator()
+    add_samples(alarms, *range(20), temperature_c=70.0, probes_c=(25.0, 70.0))
+    add_samples(alarms, *range(20, 60), temperature_c=25.0, probes_c=(25.0,))
+    alarms.acknowledge("sensor_fault")
+    add_samples(alarms, *range(60, 200), temperature_c=25.0, probes_c=(25.0,))
+    assert "over_temperature" in alarms.active
+    alarms.acknowledge("over_temperature")
+    add_samples(alarms, *range(200, 300), temperature_c=25.0, probes_c=(25.0,))
+    assert "over_temperature" not in alarms.active
 
 
 def test_a_saturated_voltage_exceeds_any_limit() -> None:
@@ -525,14 +578,23 @@ async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None
 
 
 def add_samples(
-    alarms: AlarmEvaluator, *times_s: float, temperature_c: float = NAN, voltage_v: float = 7.4, status: int = 0
+    alarms: AlarmEvaluator,
+    *times_s: float,
+    temperature_c: float = NAN,
+    voltage_v: float = 7.4,
+    current_a: float = 0.0,
+    cells_v: tuple[float, ...] = (),
+    probes_c: tuple[float, ...] = (),
+    status: int = 0,
 ) -> None:
-    """Evaluate samples of a pack at rest."""
+    """Evaluate samples of a pack."""
     block = np.zeros(len(times_s), dtype=SAMPLE)
     block["time_s"], block["voltage_v"], block["temperature_c"] = times_s, voltage_v, temperature_c
     block["temperature_min_c"] = block["temperature_max_c"] = temperature_c
-    block["status"] = status
-    alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
+    block["current_a"], block["status"] = current_a, status
+    cells = np.tile(cells_v, (len(times_s), 1)) if cells_v else NO_CELLS
+    probes = probe_block([[(reading_c, False) for reading_c in probes_c]] * len(times_s))
+    alarms.add(block, np.zeros(0, dtype=TRACE), cells, probes=probes)
     alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
 
 

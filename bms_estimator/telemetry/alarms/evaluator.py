@@ -26,7 +26,7 @@ from bms_estimator.telemetry.alarms.cell_alarms import CellAlarms
 from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, EstimateAlarms
 from bms_estimator.telemetry.alarms.faulty_fraction import FaultyFraction, SampleCounts
 from bms_estimator.telemetry.alarms.inputs import MAX_SPACING_FRACTION, Inputs, count_values
-from bms_estimator.telemetry.alarms.measured_values import measured_values
+from bms_estimator.telemetry.alarms.measured_values import has_bit, measured_values, uncertain_values
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.sample_buffer import UNUSABLE, SampleBuffer
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
@@ -55,7 +55,7 @@ NO_FORECAST = unknown_values()
 WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
 """Text of a wrong clock that is right again at the end of a recorded block."""
 BROKEN_WIRE_V = 0.1
-"""Maximum voltage per cell of a broken wire [V]. No cell is charged so far that its pack then has an over-voltage."""
+"""Maximum voltage per cell of a broken wire without a limit of under-voltage [V]."""
 _COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
 """Column of SAMPLE by quantity."""
 
@@ -259,7 +259,7 @@ class AlarmEvaluator:
             name: Name of the alarm; None: all.
         """
         acknowledged = self._alarms.acknowledge(name, self._at_s)
-        if "sensor_fault" in acknowledged:
+        if "sensor_fault" in acknowledged and "over_temperature" not in self.active:
             self._probe_faults.expected = 0  # a missing probe was removed
         self._save_state()
         return acknowledged
@@ -345,15 +345,11 @@ class AlarmEvaluator:
         # the interval before the first sample is a part of the silence
         self._watched_s = float(observed_s[1:].sum() if self._watched_s is None else self._watched_s + observed_s.sum())
         samples, cells, unusable = self._without_impossible(samples, cells)
-        has_probe_fault = (samples["status"] & SampleStatus.PROBE_FAULT) != 0
-        lacks_cell = (cells[:, 2] > 0) & (cells[:, 2] < self._inputs.cells)
-        # heat destroys probes, and a broken wire hides a voltage, so that the missing value may still be beyond the limit
-        uncertain: dict[AlarmName, NDArray[np.bool_]] = {
-            "pack_over_voltage": samples["voltage_v"] < BROKEN_WIRE_V * self._inputs.series,
-            "over_temperature": has_probe_fault,
-            "cell_over_voltage": lacks_cell,
-            "cell_under_voltage": lacks_cell,
-        }
+        low_v, low_cell_v = (
+            self._limit_v("pack_under_voltage", self._inputs.series),
+            self._limit_v("cell_under_voltage", 1),
+        )
+        uncertain = uncertain_values(samples, cells, self._inputs.cells, low_v, low_cell_v)
         for name, series in measured_values(samples, cells, self._charging_a).items():
             self._alarms.update(name, times_s, observed_s, series, wall_offset_s, uncertain=uncertain.get(name))
         gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # duration of the gap before each sample [s]; 0: no gap
@@ -361,13 +357,19 @@ class AlarmEvaluator:
         counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
         counts["cells"] = cells[:, 2].astype(np.int64)
         # with only faulty probes the temperature counts as missing also if it was never measured
-        unusable["temperature"] = has_probe_fault & np.isnan(samples["temperature_c"])
+        unusable["temperature"] = has_bit(samples, SampleStatus.PROBE_FAULT) & np.isnan(samples["temperature_c"])
+        unusable["current"] = has_bit(samples, SampleStatus.CURRENT_SATURATED) | unusable.get("current", False)
         for quantity, rows in unusable.items():
             counts[quantity][rows] = UNUSABLE
         for at_s in self._inputs.update(times_s, observed_s, counts):
             self._update_unwatched(at_s)
             if self._is_blinded():  # without the delay of the alarm, because a quantity has been missing for ``lost_s``
                 self._alarms.raise_at("sensor_fault", at_s, RaisedAlarm(at_s + wall_offset_s, None))
+
+    def _limit_v(self, name: AlarmName, series: int) -> float:
+        """Return the limit of an alarm [V]; if it is switched off, the voltage of a broken wire at cells in series."""
+        state = self._alarms.states.get(name)
+        return state.definition.limit if state else BROKEN_WIRE_V * series
 
     def _without_impossible(
         self, samples: SampleBlock, cells: Floats

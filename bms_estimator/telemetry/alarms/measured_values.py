@@ -1,6 +1,7 @@
 """Values of the alarms on measured quantities."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock, SampleStatus
@@ -19,10 +20,12 @@ def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> d
     voltage_v = samples["voltage_v"]
     coldest_c, hottest_c = _extreme_temperatures(samples)
     # beyond the range of the converter, and therefore beyond every limit
-    voltage_is_saturated, current_is_saturated = (
-        (samples["status"] & bit) != 0 for bit in (SampleStatus.VOLTAGE_SATURATED, SampleStatus.CURRENT_SATURATED)
+    voltage_is_saturated = has_bit(samples, SampleStatus.VOLTAGE_SATURATED)
+    current_a = np.where(
+        has_bit(samples, SampleStatus.CURRENT_SATURATED),
+        np.copysign(np.inf, samples["current_a"]),
+        samples["current_a"],
     )
-    current_a = np.where(current_is_saturated, np.copysign(np.inf, samples["current_a"]), samples["current_a"])
     # the lowest temperature while charging; infinite while not charging, NaN if a quantity is not measured
     charging_c = np.where(current_a <= -charging_a, coldest_c, np.inf)
     charging_c[np.isnan(current_a) | np.isnan(coldest_c)] = np.nan
@@ -38,6 +41,41 @@ def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> d
         "under_temperature": coldest_c,
         "charging_below_freezing": charging_c,
     }
+
+
+def uncertain_values(
+    samples: SampleBlock, cells: Floats, expected_cells: int, low_v: float, low_cell_v: float
+) -> dict[AlarmName, NDArray[np.bool_]]:
+    """Return where the true value of an alarm may be beyond its limit although the measured one is not, each of shape (n,).
+
+    Heat destroys probes, a broken wire hides a voltage or lets it float, and a dead current sensor reads an end of its range.
+
+    Args:
+        samples: Shape (n,), dtype SAMPLE.
+        cells: As for ``measured_values``, with the number of cell voltages in the third column.
+        expected_cells: Largest number of cell voltages so far.
+        low_v: Voltage of the pack below which it has no over-voltage, so that a wire is broken [V].
+        low_cell_v: The same for a cell [V].
+    """
+    has_probe_fault, is_saturated = (
+        has_bit(samples, bit) for bit in (SampleStatus.PROBE_FAULT, SampleStatus.CURRENT_SATURATED)
+    )
+    lacks_cell = (cells[:, 2] > 0) & (cells[:, 2] < expected_cells)
+    return {
+        "pack_over_voltage": samples["voltage_v"] < low_v,
+        "cell_over_voltage": lacks_cell | (cells[:, 0] < low_cell_v),
+        "cell_under_voltage": lacks_cell,
+        "discharge_over_current": is_saturated,
+        "charge_over_current": is_saturated,
+        "over_temperature": has_probe_fault,
+        "under_temperature": has_probe_fault,
+        "charging_below_freezing": has_probe_fault & (samples["current_a"] < 0.0),
+    }
+
+
+def has_bit(samples: SampleBlock, bit: SampleStatus) -> NDArray[np.bool_]:
+    """Return where a bit of the status is set, shape (n,)."""
+    return np.asarray((samples["status"] & bit) != 0)
 
 
 def _extreme_temperatures(samples: SampleBlock) -> tuple[Floats, Floats]:

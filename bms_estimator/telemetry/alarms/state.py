@@ -116,6 +116,8 @@ class AlarmState:
         """Acknowledge the alarm. Return True if that ends it."""
         self.acknowledged = self.raised is not None
         self._accepts_uncertain = self._is_uncertain
+        if self.cause_cleared and self._held_s is not None:  # the cause has returned, and the delay runs
+            self.cause_cleared, self._held_s = False, None
         if not self.cause_cleared:
             return False
         self._end()
