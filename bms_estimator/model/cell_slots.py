@@ -18,7 +18,7 @@ class CellSlots:
     """Cell slots of one device.
 
     Many devices report more slots than their pack has cells. The live slots are the cells if there are as many of them as
-    cells in series. These slots remain the cells when a cell fails. Until then the first slots are the cells. The division of
+    cells in series. These slots remain the cells when a cell fails. Until then the live slots and the first of the others are the cells. The division of
     the samples into blocks does not change the selection.
 
     Args:
@@ -29,7 +29,7 @@ class CellSlots:
     """
 
     def __init__(self, series: int) -> None:
-        self._series, self._slots = series, np.arange(series)
+        self._series, self._slots, self._is_known = series, np.arange(series), False
         self.fault = self._excess_text = ""
         self._excess_samples = 0  # number of successive samples with too many live slots
         # number of samples with live slots and their largest number of these, as long as they are too few
@@ -91,8 +91,12 @@ class CellSlots:
             return np.full((len(slots_v), self._series), np.nan)
         self._excess_samples = 0
         if count == self._series:
-            self._slots = np.flatnonzero(live)
-        return slots_v[:, self._slots]
+            self._slots, self._is_known = np.flatnonzero(live), True
+        if self._is_known:
+            return slots_v[:, self._slots]
+        # the live slots, and the first of the others: one of them is a cell with a broken wire
+        order = np.argsort(~live, kind="stable")[: self._series]
+        return slots_v[:, np.sort(order)]
 
 
 def is_live(slots_v: Floats) -> NDArray[np.bool_]:

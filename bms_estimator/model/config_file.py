@@ -93,7 +93,7 @@ def read_toml(path: Path, model: type[T]) -> T:
         UserError: The file cannot be read, is not TOML, or contains invalid keys or values, with one line for each.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows write a byte order mark
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

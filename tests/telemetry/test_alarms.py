@@ -410,6 +410,14 @@ def test_a_current_sensor_that_dies_does_not_end_an_over_current_and_is_lost() -
     assert "discharge_over_current" in alarms.unwatched_critical
 
 
+def test_a_voltage_at_the_end_of_the_range_does_not_end_an_under_voltage() -> None:
+    alarms = make_evaluator({"pack_under_voltage": {"latch": False}})
+    add_samples(alarms, *range(20), voltage_v=5.3)
+    assert "pack_under_voltage" in alarms.active
+    add_samples(alarms, *range(20, 100), voltage_v=30.0, status=int(SampleStatus.VOLTAGE_SATURATED))
+    assert "pack_under_voltage" in alarms.active
+
+
 def test_a_cell_whose_wire_reads_0_v_does_not_end_a_cell_over_voltage() -> None:
     alarms = make_evaluator({"cell_over_voltage": {"latch": False}})
     add_samples(alarms, *range(20), cells_v=(3.7, 4.3))
@@ -653,7 +661,7 @@ def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_samples_arr
 @pytest.mark.parametrize("jitter_s", [0.5, 3.0])
 async def test_times_with_jitter_neither_shorten_delays_nor_count_charge_twice(tmp_path: Path, jitter_s: float) -> None:
     hot_s = 70
-    lines = [Line(hot_s, temperature_c=61.0, current_a=10.0), Line(100, temperature_c=54.0, current_a=10.0)]
+    lines = [Line(hot_s, temperature_c=60.1, current_a=10.0), Line(100, temperature_c=54.9, current_a=10.0)]
     capture = record(tmp_path / "capture.bms", lines, period_s=0.1, jitter_s=jitter_s)
     result = await replayed(capture, settings(**WITHOUT_IDENTIFIER))
     (raised_s, _), (ended_s, _) = result.transitions("over_temperature")

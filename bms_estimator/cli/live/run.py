@@ -56,11 +56,15 @@ def run(
     loaded = [(apply_options(settings), model) for settings, model in map(load_pack, paths)]
     with startup_signals():
         if len(loaded) == 1:
-            _run_one(*loaded[0], record, view=sys.stdout.isatty() if view is None else view)
+            _run_one(*loaded[0], record, view=_stdout_is_terminal() if view is None else view)
         else:
             if port or record or view:
                 raise UserError("--port, --record and --view require a single pack")
             _run_several(loaded)
+
+
+def _stdout_is_terminal() -> bool:
+    return sys.stdout is not None and sys.stdout.isatty()  # None if the process was started without a stdout
 
 
 def _with_options(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
@@ -79,7 +83,7 @@ def _run_several(packs: Sequence[tuple[Settings, PackModel]]) -> None:
 
 def _run_one(settings: Settings, model: PackModel, record: Path | None, *, view: bool) -> None:
     log: deque[str] = deque(maxlen=LOG_LINES)
-    configure_logs(log if view and sys.stdout.isatty() else None)
+    configure_logs(log if view and _stdout_is_terminal() else None)
     recorder = (
         CaptureRecorder(record, make_header(settings.sensor, settings.source)) if record else contextlib.nullcontext()
     )

@@ -1,6 +1,7 @@
 """Check of temperature probes: which of them are faulty, and the temperatures of a sample. It does no I/O."""
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from statistics import median
 from typing import NamedTuple
@@ -133,7 +134,9 @@ class _Probe:
         self._credible_s = 0.0
         self._doubted_c = math.nan  # previous reading if it was not credible
         self._hot_c, self._hot_s = -math.inf, 0.0  # last temperature above ``HOT_C`` that was sustained, and its time
-        self._rise_c, self._rise_s = math.inf, 0.0  # lowest of the hotter readings since then, time of the first
+        self._begin_s = math.inf  # time of the first credible reading after a gap
+        # times and rising readings: the first one is the lowest of the last ``SUSTAINED_S``
+        self._lowest = deque[tuple[float, float]]()
 
     def accepts_all(self, times_s: Floats, readings_c: Floats) -> bool:
         """Accept readings that are all credible and not hot, or absent; otherwise return False, and change nothing."""
@@ -146,7 +149,8 @@ class _Probe:
             if present_c.min() <= lowest_c or present_c.max() > HOT_C or np.ptp(range_c) > STEP_K:
                 return False
             self.credible_c, self._credible_s = float(present_c[-1]), float(times_s[rows[-1]])
-            self._doubted_c, self._rise_c = math.nan, math.inf
+            self._doubted_c, self._begin_s = math.nan, self._credible_s
+            self._lowest = deque([(self._credible_s, self.credible_c)])
         self.was_faulty = False
         return True
 
@@ -155,22 +159,25 @@ class _Probe:
         cooled_c = self._hot_c - COOLING_K_PER_S * (time_s - self._hot_s)
         possible = self._is_possible(time_s, reading_c) and reading_c >= cooled_c - COOLING_TOLERANCE_K
         if possible:
-            self.credible_c, self._credible_s, self._doubted_c = reading_c, time_s, math.nan
             self._follow_heat(time_s, reading_c, cooled_c)
+            self.credible_c, self._credible_s, self._doubted_c = reading_c, time_s, math.nan
         elif not math.isnan(reading_c):
             self._doubted_c = reading_c
         return possible
 
     def _follow_heat(self, time_s: float, reading_c: float, cooled_c: float) -> None:
         """Update the sustained temperature. ``cooled_c`` is the lowest one to which the probe can have cooled since then [C]."""
-        if reading_c <= max(HOT_C, cooled_c):
-            self._rise_c = math.inf
-            return
-        if math.isinf(self._rise_c):
-            self._rise_s = time_s
-        self._rise_c = min(self._rise_c, reading_c)
-        if time_s - self._rise_s >= SUSTAINED_S:
-            self._hot_c, self._hot_s, self._rise_c = self._rise_c, time_s, math.inf
+        if math.isinf(self._begin_s) or time_s - self._credible_s > SUSTAINED_S:
+            self._begin_s = time_s
+            self._lowest.clear()
+        while self._lowest and self._lowest[-1][1] >= reading_c:
+            self._lowest.pop()
+        self._lowest.append((time_s, reading_c))
+        while self._lowest[0][0] < time_s - SUSTAINED_S:
+            self._lowest.popleft()
+        lowest_c = self._lowest[0][1]
+        if time_s - self._begin_s >= SUSTAINED_S and lowest_c > max(HOT_C, cooled_c):
+            self._hot_c, self._hot_s = lowest_c, time_s
 
     def _is_possible(self, time_s: float, reading_c: float) -> bool:
         change_k = reading_c - self.credible_c

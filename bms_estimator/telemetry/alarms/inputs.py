@@ -17,6 +17,10 @@ MAX_SPACING_FRACTION = 0.5
 """Maximum interval between two values that ends a loss although samples between them lack the quantity, as a fraction of
 ``lost_s``. Below 1, so that a sensor that is almost lost again stays lost."""
 
+MIN_RESTORED_S = 10.0
+"""Minimum time of samples with values that ends a loss [s], also if ``lost_s`` is shorter: a loose wire must not make a relay
+chatter."""
+
 
 @dataclass
 class _Input:
@@ -63,7 +67,7 @@ class _Input:
             self._restored_s = (
                 self._restored_s + self._value_age_s if continues and self._restored_s is not None else 0.0
             )
-            self._value_age_s, self.lost = 0.0, self._restored_s < lost_s
+            self._value_age_s, self.lost = 0.0, self._restored_s < max(lost_s, MIN_RESTORED_S)
         return self.lost != was_lost
 
 
@@ -73,7 +77,7 @@ class Inputs:
 
     Args:
         lost_s: Time of samples without a value after which a quantity is lost, and time of samples with values after which
-            it is measured again [s].
+            it is measured again, at least ``MIN_RESTORED_S`` [s].
         series: Number of cells in series, the maximum number of cell voltages.
     """
 

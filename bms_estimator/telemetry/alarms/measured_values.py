@@ -48,7 +48,8 @@ def uncertain_values(
 ) -> dict[AlarmName, NDArray[np.bool_]]:
     """Return where the true value of an alarm may be beyond its limit although the measured one is not, each of shape (n,).
 
-    Heat destroys probes, a broken wire hides a voltage or lets it float, and a dead current sensor reads an end of its range.
+    Heat destroys probes, a broken wire hides a voltage or lets it float to an end of the range, and a dead current sensor reads
+    an end of its range.
 
     Args:
         samples: Shape (n,), dtype SAMPLE.
@@ -63,6 +64,7 @@ def uncertain_values(
     lacks_cell = (cells[:, 2] > 0) & (cells[:, 2] < expected_cells)
     return {
         "pack_over_voltage": samples["voltage_v"] < low_v,
+        "pack_under_voltage": has_bit(samples, SampleStatus.VOLTAGE_SATURATED),
         "cell_over_voltage": lacks_cell | (cells[:, 0] < low_cell_v),
         "cell_under_voltage": lacks_cell,
         "discharge_over_current": is_saturated,

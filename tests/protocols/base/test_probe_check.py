@@ -111,6 +111,12 @@ def test_a_probe_that_heats_up_and_cools_is_credible() -> None:
     assert not any(result.faulty[0] for result in results)
 
 
+def test_a_probe_that_dies_right_after_a_thermal_runaway_is_faulty() -> None:
+    rise = [[40.0 + 5.0 * second] for second in range(20)]
+    results = check_each_second(*rise, *[[41.0]] * 60)
+    assert all(result.faulty[0] for result in results[20:])
+
+
 @pytest.mark.parametrize("usual_c", [25.0, 46.0, 60.0])
 def test_glitches_of_a_few_samples_do_not_count_as_hot(usual_c: float) -> None:
     results = check_each_second(*[[usual_c]] * 30, *[[usual_c + 29.0]] * 5, *[[usual_c]] * 30)
