@@ -18,9 +18,33 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _GROUPED_DIGITS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
 _WORD = re.compile(r"[^\W\d_]+")
 _DISCHARGE = frozenset(
-    {"d", "dchg", "dch", "dis", "disc", "dischg", "discharge", "discharging", "entladen", "entladung"}
+    [
+        "d",
+        "dchg",
+        "dch",
+        "dchrg",
+        "dis",
+        "disc",
+        "disch",
+        "dischg",
+        "dischrg",
+        "discharge",
+        "discharging",
+        "dsc",
+        "dsch",
+        "dsg",
+        "entladen",
+        "entladung",
+        "décharge",
+        "decharge",
+        "descarga",
+        "scarica",
+        "放电",
+    ]
 )
-_CHARGE = frozenset({"c", "chg", "cha", "charge", "charging", "laden", "ladung"})
+_CHARGE = frozenset(["c", "chg", "chrg", "cha", "charge", "charging", "laden", "ladung", "carga", "carica", "充电"])
+_CHINESE_DIRECTION = re.compile("[放充]电")
+"""Words for charge and discharge in Chinese, which is written without spaces."""
 
 MAX_TEXT_CHARACTERS = 40
 """Maximum length of a time stamp or state, and of an invalid cell in a message. Longer texts are cut off."""
@@ -105,7 +129,7 @@ def _unix_s(moment: datetime) -> float:
 
 def parse_direction(cell: str) -> float:
     """Return 1 for a text with a word for discharge, -1 with a word for charge, and 0 for other texts, such as rest or pause."""
-    words = {word.lower() for word in _WORD.findall(cell)}
+    words = {word.lower() for word in _WORD.findall(cell)} | {*_CHINESE_DIRECTION.findall(cell)}
     return 1.0 if words & _DISCHARGE else -1.0 if words & _CHARGE else 0.0
 
 

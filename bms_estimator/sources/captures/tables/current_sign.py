@@ -1,18 +1,49 @@
 """Sign of the current in a table: from an option, a state column, the dialect, the settings or the voltage's response."""
 
-from typing import NamedTuple
+from enum import Enum
+from typing import NamedTuple, Self
+
+import numpy as np
 
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.captures.tables.dialects import OWN
 from bms_estimator.sources.captures.tables.layout import Layout, Role
-from bms_estimator.sources.captures.tables.voltage_response import VoltageResponse
+from bms_estimator.sources.captures.tables.voltage_response import LOAD_FRACTION, VoltageResponse
 
 SIGN_TEXTS: dict[CurrentSign, str] = {
     "discharge_positive": "positive on discharge",
     "charge_positive": "positive on charge",
 }
+
+
+MAX_LOADS_WITHOUT_WORD = 0.05
+"""Maximum fraction of the rows with a load whose state has no word, for a direction by the states alone. Rows at the change of a
+step may have the state of the step before."""
+
+
+class StateWords(Enum):
+    """Words for charge and discharge in a state column."""
+
+    NONE = "none"
+    SOME_LOADS = "some loads"
+    ALL_LOADS = "all loads"
+
+    @classmethod
+    def find(cls, state: Floats, current: Floats) -> Self:
+        """Return the words in the rows of a table.
+
+        Args:
+            state: 1 with a word for discharge, -1 with a word for charge, otherwise another number; shape (n,).
+            current: Current in any unit and with any sign, shape (n,).
+        """
+        has_word = np.abs(state) == 1.0
+        if not has_word.any():
+            return cls.NONE
+        is_load = np.abs(current) > LOAD_FRACTION * np.nanmax(np.abs(current), initial=0.0)
+        without_word = np.count_nonzero(is_load & ~has_word)
+        return cls.ALL_LOADS if without_word <= MAX_LOADS_WITHOUT_WORD * np.count_nonzero(is_load) else cls.SOME_LOADS
 
 
 class Sign(NamedTuple):
@@ -30,7 +61,7 @@ class CurrentDirection(NamedTuple):
     sign: CurrentSign
     reason: str
     by_state: bool = False
-    """True if words in a state column give the direction of each row."""
+    """True if words in a state column give the direction of the rows that have one."""
     row_factors: Floats | None = None
     """Factors of the rows, 1 on discharge and -1 on charge, of a current without a sign; None for a current with a sign."""
     warning: str = ""
@@ -49,7 +80,7 @@ class CurrentDirection(NamedTuple):
 
 
 def find_direction(
-    name: object, layout: Layout, configured: Sign, response: VoltageResponse, *, has_words: bool
+    name: object, layout: Layout, configured: Sign, response: VoltageResponse, words: StateWords
 ) -> CurrentDirection:
     """Return the direction of positive current in a table.
 
@@ -58,7 +89,7 @@ def find_direction(
         layout: Columns of the table.
         configured: Direction that the user configured.
         response: Direction that the voltage shows.
-        has_words: True if the state column has words for charge or discharge.
+        words: Words for charge and discharge in the state column.
 
     Raises:
         UserError: The current has no sign, and the voltage does not show the direction of each load.
@@ -72,10 +103,11 @@ def find_direction(
         direction = CurrentDirection(response.sign, "response of the voltage")
     if direction is None:
         direction = CurrentDirection("discharge_positive", "assumed: the file does not show it; --current-sign sets it")
-    if has_words:
+    if words is StateWords.ALL_LOADS or (words is StateWords.SOME_LOADS and not response.has_no_sign):
         return CurrentDirection(direction.sign, f"column {layout.columns[Role.STATE].name}", by_state=True)
     if response.has_no_sign:
-        return _direct_by_voltage(name, layout, direction, response)
+        by_voltage = _direct_by_voltage(name, layout, direction, response)
+        return by_voltage._replace(by_state=words is StateWords.SOME_LOADS)
     if response.sign is None or response.sign == direction.sign:
         return direction
     warning = (

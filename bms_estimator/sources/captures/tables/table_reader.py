@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
-from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction
+from bms_estimator.sources.captures.tables.current_sign import Sign, StateWords, find_direction
 from bms_estimator.sources.captures.tables.cycler_files import (
     MPR_MAGIC,
     NDA_MAGIC,
@@ -97,9 +97,9 @@ class Table:
         first[Role.TIME] = first[time_base.role]
         layout, ignored = _without_zero_temperature(time_base.layout, first)
         self.layout = reader.layout = layout
-        has_words = Role.STATE in first and bool((np.abs(first[Role.STATE]) == 1.0).any())
-        response = VoltageResponse() if configured.option else self._voltage_response(first, has_words=has_words)
-        self._direction = find_direction(name, self.layout, configured, response, has_words=has_words)
+        words = StateWords.find(first[Role.STATE], first[Role.CURRENT]) if Role.STATE in first else StateWords.NONE
+        response = VoltageResponse() if configured.option else self._voltage_response(first, words)
+        self._direction = find_direction(name, self.layout, configured, response, words)
         is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
         self.note = (
             "" if is_own else _note(reader, time_base.reason, self._direction.text) + ignored + _cells_in_series(first)
@@ -145,10 +145,10 @@ class Table:
             self.cells = cell_voltages(raw, self.layout)
             yield samples
 
-    def _voltage_response(self, first: RawBlock, *, has_words: bool) -> VoltageResponse:
+    def _voltage_response(self, first: RawBlock, words: StateWords) -> VoltageResponse:
         """Return the response of the voltage in the first rows; of all rows if the current has no sign."""
         response = voltage_response(to_samples(first, self.layout))
-        if not response.has_no_sign or has_words or first[Role.TIME].size < FIRST_ROWS:
+        if not response.has_no_sign or words is StateWords.ALL_LOADS or first[Role.TIME].size < FIRST_ROWS:
             return response
         return voltage_response(to_samples(self._first_rows(math.inf), self.layout))
 
