@@ -36,7 +36,7 @@ from bms_estimator.sources.captures.tables.table_samples import (
 )
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
 from bms_estimator.sources.captures.tables.text_table import TextTable
-from bms_estimator.sources.captures.tables.time_base import find_time_base
+from bms_estimator.sources.captures.tables.time_base import ClockTurns, find_time_base, is_descending
 from bms_estimator.sources.captures.tables.voltage_response import VoltageResponse, voltage_response
 
 FIRST_ROWS = 262_144
@@ -92,7 +92,11 @@ class Table:
     def __init__(self, name: object, reader: TableReader, configured: Sign, instance: float | None = None) -> None:
         self._name, self._reader, self._instance = name, reader, instance
         self.implausible, self.cells = 0, NO_CELLS
+        self._newest_first = False
         first = self._first_rows()
+        if is_descending(first[Role.TIME]):
+            self._newest_first = True
+            first = self._first_rows()
         time_base = find_time_base(reader.layout, first)
         first[Role.TIME] = first[time_base.role]
         layout, ignored = _without_zero_temperature(time_base.layout, first)
@@ -102,7 +106,12 @@ class Table:
         self._direction = find_direction(name, self.layout, configured, response, words)
         is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
         self.note = (
-            "" if is_own else _note(reader, time_base.reason, self._direction.text) + ignored + _cells_in_series(first)
+            ""
+            if is_own
+            else _note(reader, time_base.reason, self._direction.text)
+            + ignored
+            + _cells_in_series(first)
+            + self._newest_first * "; the newest row is the first: read in reverse order"
         )
         self._warnings = (time_base.warning, self._direction.warning)
 
@@ -125,8 +134,10 @@ class Table:
         self.implausible = 0
         before = np.empty(0, dtype=SAMPLE)
         start_s, rows = None, 0
-        for raw in _rows_of_battery(self._name, self._reader, self._instance):
+        turns = self._turns()
+        for raw in self._rows():
             samples = to_samples(raw, self.layout)
+            samples["time_s"] = turns.apply(samples["time_s"])
             if Role.CLOCK in self.layout.columns or self.layout.columns[Role.TIME].kind in DATES:
                 start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
                 samples["time_s"] -= start_s
@@ -147,15 +158,33 @@ class Table:
 
     def _voltage_response(self, first: RawBlock, words: StateWords) -> VoltageResponse:
         """Return the response of the voltage in the first rows; of all rows if the current has no sign."""
-        response = voltage_response(to_samples(first, self.layout))
+        response = self._response(first)
         if not response.has_no_sign or words is StateWords.ALL_LOADS or first[Role.TIME].size < FIRST_ROWS:
             return response
-        return voltage_response(to_samples(self._first_rows(math.inf), self.layout))
+        return self._response(self._first_rows(math.inf))
+
+    def _response(self, rows: RawBlock) -> VoltageResponse:
+        samples = to_samples(rows, self.layout)
+        samples["time_s"] = self._turns().apply(samples["time_s"])
+        return voltage_response(samples)
+
+    def _turns(self) -> ClockTurns:
+        """Return the turns of the clock. Times of the day have none if another column has the dates."""
+        return ClockTurns(self.layout.columns[Role.CLOCK if Role.CLOCK in self.layout.columns else Role.TIME])
+
+    def _rows(self) -> Iterator[RawBlock]:
+        """Yield blocks with the rows of the battery, the oldest first."""
+        blocks = _rows_of_battery(self._name, self._reader, self._instance)
+        if not self._newest_first:
+            yield from blocks
+            return
+        for raw in reversed(list(blocks)):
+            yield {role: values[::-1] for role, values in raw.items()}
 
     def _first_rows(self, min_rows: float = FIRST_ROWS) -> RawBlock:
         """Return rows at the beginning of the table, at least ``min_rows`` if it has as many."""
         blocks, rows = list[RawBlock](), 0
-        for raw in _rows_of_battery(self._name, self._reader, self._instance):
+        for raw in self._rows():
             blocks.append(raw)
             rows += raw[Role.TIME].size
             if rows >= min_rows:
