@@ -94,7 +94,7 @@ class Table:
         self.implausible, self.cells = 0, NO_CELLS
         self._newest_first = False
         first = self._first_rows()
-        if is_descending(first[Role.TIME]):
+        if reader.layout.dialect is not OWN and is_descending(first[Role.TIME]):
             self._newest_first = True
             first = self._first_rows()
         time_base = find_time_base(reader.layout, first)
