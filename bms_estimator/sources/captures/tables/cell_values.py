@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import zlib
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from enum import Enum
@@ -58,6 +59,7 @@ class CellKind(Enum):
     DATE_TIME = "date and time"
     DAY_FIRST = "date and time, day first"
     DIRECTION = "direction"
+    LABEL = "number or name"
 
 
 DATES = frozenset({CellKind.DATE_TIME, CellKind.DAY_FIRST})
@@ -133,6 +135,15 @@ def parse_direction(cell: str) -> float:
     return 1.0 if words & _DISCHARGE else -1.0 if words & _CHARGE else 0.0
 
 
+def parse_label(cell: str) -> float:
+    """Return the number of a device, or a negative number that stands for its name."""
+    text = cell.strip()[:MAX_TEXT_CHARACTERS]
+    try:
+        return parse_number(text, decimal_comma=False)
+    except ValueError:
+        return -1.0 - zlib.crc32(text.encode(errors="replace"))
+
+
 def uses_decimal_comma(cells: list[str]) -> bool:
     """Return True if cells have a comma where a decimal point would be, and none has a point."""
     return any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in cells) and not any("." in cell for cell in cells)
@@ -184,5 +195,6 @@ def parser(kind: CellKind, *, decimal_comma: bool) -> Callable[[str], float]:
         CellKind.DATE_TIME: parse_date_time,
         CellKind.DAY_FIRST: partial(parse_date_time, day_first=True),
         CellKind.DIRECTION: parse_direction,
+        CellKind.LABEL: parse_label,
     }
     return parsers[kind]

@@ -25,7 +25,7 @@ class Dialect:
     charge_current: tuple[str, ...] = ()
     """Columns of the charge current, if ``current`` contains only the discharge current."""
     instance: tuple[str, ...] = ()
-    """Columns with the number of the battery, if a table may have rows of several batteries."""
+    """Columns with the number or name of the battery, if a table may have rows of several batteries."""
     series: tuple[str, ...] = ()
     """Columns with the number of cells in series."""
     signatures: tuple[tuple[str, ...], ...] = ((),)
@@ -114,6 +114,22 @@ GENERIC = Dialect(
     temperature=("temperature", "cell temperature", "temp", "t cell", "temperatur"),
     state=("state", "status", "mode", "step type", "zustand"),
     charge_current=("charge current", "ladestrom"),
+    instance=(
+        "device",
+        "device id",
+        "device name",
+        "bms",
+        "bms id",
+        "battery id",
+        "battery name",
+        "battery no",
+        "pack id",
+        "pack name",
+        "pack no",
+        "serial number",
+        "mac",
+        "host",
+    ),
 )
 """Common names. This dialect is tried last."""
 

@@ -191,7 +191,8 @@ class LayoutFinder:
         columns = dict[ColumnRole, Column]()
         for role, wanted in ((Role.INSTANCE, dialect.instance), (Role.SERIES, dialect.series)):
             for index in _find_indices(wanted, names)[:1]:
-                columns[role] = Column(index, cells[index], Unit(""), is_lenient=True)
+                kind = CellKind.LABEL if role is Role.INSTANCE else CellKind.NUMBER
+                columns[role] = Column(index, cells[index], Unit(""), kind=kind, is_lenient=True)
         for state in _find_indices(dialect.state, names)[:1]:
             columns[Role.STATE] = Column(state, cells[state], Unit(""), kind=CellKind.DIRECTION)
         if current_name in DISCHARGE_CURRENTS:

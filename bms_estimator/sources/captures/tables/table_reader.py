@@ -211,6 +211,10 @@ def _rows_of_battery(name: object, reader: TableReader, instance: float | None) 
     for raw in reader.blocks():
         numbers = raw[Role.INSTANCE]
         found |= set(np.unique(numbers[np.isfinite(numbers)]).tolist())
+        if instance is None and len(found) > 1 and min(found) < 0.0:
+            raise UserError(
+                f"{name}: rows of several batteries, with different names in {column.name}: keep the rows of one"
+            )
         if instance is None and len(found) > 1:
             raise UserError(
                 f"{name}: rows of several batteries, {column.name} = {_shown(found)}: choose one by "

@@ -119,7 +119,7 @@ def _convert(column: Column, cells: NDArray[np.float64] | NDArray[np.str_]) -> N
     if column.kind is CellKind.NUMBER:
         return cells.astype(np.float64)
     parse = column.parser(decimal_comma=False)
-    if column.kind is CellKind.DIRECTION:  # few different words
+    if column.kind in (CellKind.DIRECTION, CellKind.LABEL):  # few different words
         words, index = np.unique(cells, return_inverse=True)
         return np.array([parse(str(word)) for word in words])[index]
     return np.array([parse(cell) for cell in cells.tolist()])
