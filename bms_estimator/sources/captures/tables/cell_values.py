@@ -15,6 +15,9 @@ _DATE_TIME = re.compile(
     r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?:[T ]+(\d{1,2}):(\d{1,2})(?::(\d{1,2})([.,:]\d+)?)?\s*([AP]M)?)?",
     re.IGNORECASE,
 )
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_MONTH_NAME = re.compile(rf"(\d{{1,2}})[- ]({'|'.join(_MONTHS)})[a-z]*[- ](\d{{2,4}})\b", re.IGNORECASE)
+"""Day, name of the month and year at the beginning of a date."""
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _GROUPED_DIGITS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
 _WORD = re.compile(r"[^\W\d_]+")
@@ -47,6 +50,8 @@ _CHARGE = frozenset(["c", "chg", "chrg", "cha", "charge", "charging", "laden", "
 _CHINESE_DIRECTION = re.compile("[放充]电")
 """Words for charge and discharge in Chinese, which is written without spaces."""
 
+NO_NUMBER = frozenset({"", "-", "--", "---", "n/a", "#n/a", "na", "null", "none", "unavailable", "unknown"})
+"""Cells without a value, in addition to the words of ``measured``."""
 MAX_TEXT_CHARACTERS = 40
 """Maximum length of a time stamp or state, and of an invalid cell in a message. Longer texts are cut off."""
 
@@ -67,7 +72,7 @@ DATES = frozenset({CellKind.DATE_TIME, CellKind.DAY_FIRST})
 
 
 def parse_number(cell: str, *, decimal_comma: bool) -> float:
-    """Parse a number; an empty cell, or a word such as nan, is NaN.
+    """Parse a number; an empty cell, a dash, or a word such as nan, is NaN.
 
     Args:
         cell: The text. Commas between groups of three digits are ignored, unless ``decimal_comma`` is set.
@@ -77,7 +82,7 @@ def parse_number(cell: str, *, decimal_comma: bool) -> float:
         ValueError: The text is not a number.
     """
     cell = cell.strip()
-    if not cell:
+    if cell.lower() in NO_NUMBER:
         return float("nan")
     if decimal_comma:
         cell = cell.replace(",", ".")
@@ -102,12 +107,14 @@ def parse_duration(cell: str) -> float:
 def parse_date_time(cell: str, *, day_first: bool = False) -> float:
     """Return the Unix time of a date and time [s]; UTC if the text has no time zone, midnight if it has no time.
 
-    Formats are ISO 8601, year first, day first with periods, and with slashes or hyphens as ``day_first`` says.
+    Formats are ISO 8601, year first, day first with periods or with the English name of the month, and with slashes or hyphens as ``day_first`` says.
 
     Raises:
         ValueError: The text is not a date with time.
     """
     cell = cell.strip()
+    if named := _MONTH_NAME.match(cell):
+        cell = f"{named[1]}.{_MONTHS.index(named[2].lower()) + 1}.{named[3]}{cell[named.end() :]}"
     match = _DATE_TIME.fullmatch(cell)
     if not match:
         return _unix_s(datetime.fromisoformat(cell))

@@ -84,6 +84,7 @@ class LayoutFinder:
         self.given: dict[Quantity, str] = {quantity: given[quantity] for quantity in QUANTITIES if quantity in given}
         self._closest = _Header((), GENERIC, REQUIRED)
         self._first_numbers: Sequence[str] = ()
+        self._names: Sequence[str] = ()  # cells of the last line above the first numbers
 
     def find(self, header: Sequence[str]) -> Layout | None:
         """Return the layout of a table with this header; None if it is not a header.
@@ -103,7 +104,10 @@ class LayoutFinder:
             if not missing:
                 return self._apply_dialect(dialect, cells, names, given)
             self._closest = max(self._closest, _Header(cells, dialect, missing), key=_Header.rank)
-        if not self._first_numbers and sum(map(_is_number, cells)) >= max(len(REQUIRED), 0.5 * len(cells)):
+        numbers = sum(map(_is_number, cells))
+        if not self._first_numbers and not numbers and len(cells) >= len(REQUIRED):
+            self._names = cells
+        if not self._first_numbers and numbers >= max(len(REQUIRED), 0.5 * len(cells)):
             self._first_numbers = cells
         return None
 
@@ -116,6 +120,10 @@ class LayoutFinder:
         if (
             len(missing) == len(REQUIRED) or len(header) < len(REQUIRED) - 1
         ):  # a line of text may contain a name by chance
+            if self._first_numbers and len(self._names) == len(self._first_numbers):
+                return UserError(
+                    f"{self._path}: the columns {shown(self._names)} have none of the known names: name them by {MAP_HELP}"
+                )
             if self._first_numbers:
                 return UserError(
                     f"{self._path}: no line names the columns: add one above {shown(self._first_numbers)}, with a name for each "

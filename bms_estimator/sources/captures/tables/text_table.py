@@ -1,6 +1,7 @@
 """Reader of delimited text with any preamble, separator and decimal sign. It reads blocks, to limit the memory."""
 
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from bms_estimator.sources.captures.tables.text_format import (
     unquoted,
 )
 
+_WITH_UNIT = re.compile(r"[-+\d.,]+\s*[^\W\d]{1,3}")
 TEXT_DTYPE = f"U{MAX_TEXT_CHARACTERS}"
 
 
@@ -190,5 +192,9 @@ class _RowParser:
             return self._parsers[role](cell)
         except (ValueError, OverflowError):
             kind = "number" if column.kind is CellKind.NUMBER else column.kind.value
+            if _WITH_UNIT.fullmatch(cell.strip()):
+                kind = (
+                    f"number without its unit, which belongs to the header, as in {column.name} [{column.unit.symbol}]"
+                )
             shown = cell[:MAX_TEXT_CHARACTERS]
             raise UserError(f"{self._path}: line {line}: {column.name} = {shown!r}: must be a {kind}") from None
