@@ -89,7 +89,7 @@ def test_the_order_follows_from_dates_after_many_rows(tmp_path: Path) -> None:
     np.testing.assert_allclose(load_capture(path)["time_s"], elapsed_s)
 
 
-@pytest.mark.parametrize(("step", "remedy"), [(1e5, "[ms]"), (1 / 3600, "[h]")])
+@pytest.mark.parametrize(("step", "remedy"), [(1e5, "[ms]"), (500, "[ms]"), (1 / 3600, "[h]")])
 def test_an_implausible_sample_period_is_a_warning_with_a_remedy(step: float, remedy: str, tmp_path: Path) -> None:
     capture = load(tmp_path / "log.csv", {"Time": step * SECONDS})
     assert f'state the unit, as in --map "time=Time {remedy}"' in capture.warning

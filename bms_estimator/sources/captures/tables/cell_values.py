@@ -20,6 +20,9 @@ _MONTH_NAME = re.compile(rf"(\d{{1,2}})[- ]({'|'.join(_MONTHS)})[a-z]*[- ](\d{{2
 """Day, name of the month and year at the beginning of a date."""
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _GROUPED_DIGITS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
+_GROUPED_BY_POINTS = re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+")
+_GROUPING_SPACE = re.compile(r"(?<=\d)[ '\u2019\u00a0\u202f](?=\d{3}(?!\d))")
+"""Space or apostrophe between groups of three digits."""
 _WORD = re.compile(r"[^\W\d_]+")
 _DISCHARGE = frozenset(
     [
@@ -75,7 +78,8 @@ def parse_number(cell: str, *, decimal_comma: bool) -> float:
     """Parse a number; an empty cell, a dash, or a word such as nan, is NaN.
 
     Args:
-        cell: The text. Commas between groups of three digits are ignored, unless ``decimal_comma`` is set.
+        cell: The text. Spaces and apostrophes between groups of three digits are ignored, and commas, or points if
+            ``decimal_comma`` is set.
         decimal_comma: The decimal separator is a comma.
 
     Raises:
@@ -84,8 +88,9 @@ def parse_number(cell: str, *, decimal_comma: bool) -> float:
     cell = cell.strip()
     if cell.lower() in NO_NUMBER:
         return float("nan")
+    cell = _GROUPING_SPACE.sub("", cell)
     if decimal_comma:
-        cell = cell.replace(",", ".")
+        cell = (cell.replace(".", "") if _GROUPED_BY_POINTS.fullmatch(cell) else cell).replace(",", ".")
     elif _GROUPED_DIGITS.fullmatch(cell):
         cell = cell.replace(",", "")
     return measured(cell)
@@ -152,8 +157,12 @@ def parse_label(cell: str) -> float:
 
 
 def uses_decimal_comma(cells: list[str]) -> bool:
-    """Return True if cells have a comma where a decimal point would be, and none has a point."""
-    return any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in cells) and not any("." in cell for cell in cells)
+    """Return True if cells have a comma where a decimal point would be, and none has a point except between groups of digits."""
+    numbers = [_GROUPING_SPACE.sub("", cell.strip()) for cell in cells]
+    is_grouped = [_GROUPED_BY_POINTS.fullmatch(number) is not None for number in numbers]
+    return any(is_grouped) or (
+        any(map(_DECIMAL_COMMA.fullmatch, numbers)) and not any("." in number for number in numbers)
+    )
 
 
 def time_kind(cells: Iterable[str]) -> CellKind:

@@ -44,6 +44,9 @@ class Dialect:
         )
 
 
+DISCHARGE_CURRENTS = ("discharge current", "discharging current", "battery discharge current", "entladestrom")
+"""Names of a column that contains only the discharge current. The charge current has another column."""
+
 CLOCKS = (
     "absolute time",
     "date time",
@@ -96,9 +99,9 @@ GENERIC = Dialect(
         "系统时间",
     ),
     current=(
-        "current",
-        "pack current",
         "battery current",
+        "pack current",
+        "current",
         "i",
         "<i>",
         "cur",
@@ -110,14 +113,13 @@ GENERIC = Dialect(
         "corrente",
         "电流",
         "im",
-        "discharge current",
-        "entladestrom",
+        *DISCHARGE_CURRENTS,
     ),
     voltage=(
+        "battery voltage",
+        "pack voltage",
         "voltage",
         "terminal voltage",
-        "pack voltage",
-        "battery voltage",
         "u",
         "v",
         "e",
@@ -145,7 +147,7 @@ GENERIC = Dialect(
         "温度",
     ),
     state=("state", "status", "mode", "step type", "zustand", "schrittart", "工步类型", "状态"),
-    charge_current=("charge current", "ladestrom"),
+    charge_current=("charge current", "charging current", "battery charge current", "ladestrom"),
     instance=(
         "device",
         "device id",

@@ -12,7 +12,7 @@ from bms_estimator.model.decimal_text import number
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.tables.cell_values import CellKind, parse_number
-from bms_estimator.sources.captures.tables.dialects import CLOCKS, DIALECTS, GENERIC, OWN, Dialect
+from bms_estimator.sources.captures.tables.dialects import CLOCKS, DIALECTS, DISCHARGE_CURRENTS, GENERIC, OWN, Dialect
 from bms_estimator.sources.captures.tables.layout import (
     INSTANCE,
     QUANTITIES,
@@ -41,9 +41,6 @@ MAX_SHOWN_COLUMNS = 30
 """Maximum number of column names in a message."""
 MAX_SHOWN_CHARACTERS = 40
 """Maximum length of a column name in a message."""
-
-DISCHARGE_CURRENTS = frozenset(fold(name) for name in ("discharge current", "entladestrom"))
-"""Names of a column that contains only the discharge current. The charge current has another column."""
 
 
 class _Header(NamedTuple):
@@ -203,7 +200,7 @@ class LayoutFinder:
                 columns[role] = Column(index, cells[index], Unit(""), kind=kind, is_lenient=True)
         for state in _find_indices(dialect.state, names)[:1]:
             columns[Role.STATE] = Column(state, cells[state], Unit(""), kind=CellKind.DIRECTION)
-        if current_name in DISCHARGE_CURRENTS:
+        if current_name in map(fold, DISCHARGE_CURRENTS):
             for charge in _find_indices(dialect.charge_current, names)[:1]:
                 if column := self._column("current", charge, cells[charge], names[charge].unit):
                     columns[Role.CHARGE_CURRENT] = column

@@ -192,7 +192,9 @@ class _RowParser:
             return self._parsers[role](cell)
         except (ValueError, OverflowError):
             kind = "number" if column.kind is CellKind.NUMBER else column.kind.value
-            if _WITH_UNIT.fullmatch(cell.strip()):
+            if role is Role.TIME and column.kind is CellKind.NUMBER:
+                kind = "number, a duration h:m:s, or a date and time"
+            elif _WITH_UNIT.fullmatch(cell.strip()):
                 kind = (
                     f"number without its unit, which belongs to the header, as in {column.name} [{column.unit.symbol}]"
                 )

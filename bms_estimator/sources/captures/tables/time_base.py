@@ -25,7 +25,9 @@ MIN_DESCENDING_FRACTION = 0.9
 """Minimum fraction of steps back in time, for a table whose newest row is the first one."""
 FIRST_EXCEL_DAY, LAST_EXCEL_DAY = 36_526.0, 73_051.0
 """Days in the years 2000 to 2099 as spreadsheets count them."""
-MIN_PERIOD_S, MAX_PERIOD_S = 0.005, 600.0
+MAX_EXCEL_PERIOD_S = 3600.0
+"""Maximum sample period of dates as numbers of days [s]."""
+MIN_PERIOD_S, MAX_PERIOD_S = 0.005, 90.0
 """Range of the sample period [s]. With a period beyond it, the assumed unit is probably wrong."""
 
 Floats = NDArray[np.float64]
@@ -123,7 +125,7 @@ def _by_excel_days(layout: Layout, time: Column, values: Floats) -> TimeBase | N
     steps = np.abs(np.diff(finite))
     if not finite.size or not FIRST_EXCEL_DAY <= finite.min() <= finite.max() < LAST_EXCEL_DAY:
         return None
-    if not 0.0 < (float(np.median(steps[steps > 0.0])) if steps.any() else 0.0) <= MAX_PERIOD_S / DAY_S:
+    if not 0.0 < (float(np.median(steps[steps > 0.0])) if steps.any() else 0.0) <= MAX_EXCEL_PERIOD_S / DAY_S:
         return None
     day = find_unit("time", "d")
     return TimeBase(_with_unit(layout, time, day), reason="days of a spreadsheet") if day else None
