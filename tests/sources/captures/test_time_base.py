@@ -1,5 +1,6 @@
 """Time base of a table: Unix times, units that a second time column shows, the better of two columns, order of the date."""
 
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -167,3 +168,19 @@ def test_numbers_of_days_are_dates_of_a_spreadsheet(tmp_path: Path) -> None:
     capture = load(tmp_path / "log.csv", {"Date": [f"{45_356.999 + s / 86_400:.9f}" for s in SECONDS]})
     np.testing.assert_allclose(np.diff(capture["time_s"]), 1.0, atol=1e-3)
     assert 'time "Date" in d (days of a spreadsheet)' in capture.note
+
+
+@pytest.mark.parametrize("begin", [0, 1])
+@pytest.mark.parametrize("as_text", [str, lambda second: f"0:00:{second:02d}"])
+def test_a_time_that_starts_again_with_each_step_is_joined(
+    begin: int, as_text: Callable[[int], str], tmp_path: Path
+) -> None:
+    capture = load(tmp_path / "log.csv", {"Time": [as_text(int(second) % 10 + begin) for second in SECONDS]})
+    assert (np.diff(capture["time_s"]) > 0.0).all()
+    assert capture["time_s"][-1] - capture["time_s"][0] == pytest.approx(59.0 if begin else 54.0, abs=1e-4)
+    assert "starts again with each step: the steps are joined" in capture.note
+
+
+def test_a_time_that_starts_again_within_steps_is_not_joined(tmp_path: Path) -> None:
+    capture = load(tmp_path / "log.csv", {"Time": (SECONDS + 5) % 20})
+    assert (np.diff(capture["time_s"]) < 0.0).sum() == 3

@@ -98,7 +98,7 @@ class Table:
             self._newest_first = True
             first = self._first_rows()
         time_base = find_time_base(reader.layout, first)
-        first[Role.TIME] = first[time_base.role]
+        first[Role.TIME], self._is_step_time = first[time_base.role], time_base.is_step_time
         layout, ignored = _without_zero_temperature(time_base.layout, first)
         self.layout = reader.layout = layout
         words = StateWords.find(first[Role.STATE], first[Role.CURRENT]) if Role.STATE in first else StateWords.NONE
@@ -170,7 +170,8 @@ class Table:
 
     def _turns(self) -> ClockTurns:
         """Return the turns of the clock. Times of the day have none if another column has the dates."""
-        return ClockTurns(self.layout.columns[Role.CLOCK if Role.CLOCK in self.layout.columns else Role.TIME])
+        time = self.layout.columns[Role.CLOCK if Role.CLOCK in self.layout.columns else Role.TIME]
+        return ClockTurns(time, is_step_time=self._is_step_time)
 
     def _rows(self) -> Iterator[RawBlock]:
         """Yield blocks with the rows of the battery, the oldest first."""
