@@ -57,6 +57,7 @@ def test_usual_names_of_other_programs_are_read(header: str, tmp_path: Path) -> 
     [
         ("Zeitstempel;Spannung [V];Strom [A]", "%d.%m.%Y %H:%M:%S"),
         ("Temps;Tension (V);Courant (A)", "%H:%M:%S"),
+        ("Datum/Zeit;U [V];I [A]", "%d.%m.%y %H:%M:%S"),
         ("Tiempo;Voltaje (V);Corriente (A)", "%d-%b-%Y %H:%M:%S.000"),
         ("测试时间;电压/V;电流/A", "%H:%M:%S"),
         ("Device Time;Battery V;Current", "%d %B %Y %H:%M:%S"),

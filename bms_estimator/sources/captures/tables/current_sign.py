@@ -1,7 +1,6 @@
 """Sign of the current in a table: from an option, a state column, the dialect, the settings or the voltage's response."""
 
-from enum import Enum
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,27 +22,45 @@ MAX_LOADS_WITHOUT_WORD = 0.05
 step may have the state of the step before."""
 
 
-class StateWords(Enum):
+MIN_OPPOSITE_ROWS, MIN_OPPOSITE_FRACTION = 3, 0.02
+"""Minimum number and fraction of the rows of a word whose current has the opposite sign, for a current that has a sign of its
+own, as in a drive cycle with regenerative braking."""
+
+
+class StateWords(NamedTuple):
     """Words for charge and discharge in a state column."""
 
-    NONE = "none"
-    SOME_LOADS = "some loads"
-    ALL_LOADS = "all loads"
+    has_words: bool = False
+    in_all_loads: bool = False
+    """True if almost all rows with a load have a word."""
+    sign: CurrentSign | None = None
+    """Direction of positive current, if rows with the same word have currents of both signs; otherwise None."""
 
-    @classmethod
-    def find(cls, state: Floats, current: Floats) -> Self:
-        """Return the words in the rows of a table.
 
-        Args:
-            state: 1 with a word for discharge, -1 with a word for charge, otherwise another number; shape (n,).
-            current: Current in any unit and with any sign, shape (n,).
-        """
-        has_word = np.abs(state) == 1.0
-        if not has_word.any():
-            return cls.NONE
-        is_load = np.abs(current) > LOAD_FRACTION * np.nanmax(np.abs(current), initial=0.0)
-        without_word = np.count_nonzero(is_load & ~has_word)
-        return cls.ALL_LOADS if without_word <= MAX_LOADS_WITHOUT_WORD * np.count_nonzero(is_load) else cls.SOME_LOADS
+def find_words(state: Floats, current: Floats) -> StateWords:
+    """Return the words in the rows of a table.
+
+    Args:
+        state: 1 with a word for discharge, -1 with a word for charge, otherwise another number; shape (n,).
+        current: Current in any unit and with any sign, shape (n,).
+    """
+    has_word = np.abs(state) == 1.0
+    if not has_word.any():
+        return StateWords()
+    is_load = np.abs(current) > LOAD_FRACTION * np.nanmax(np.abs(current), initial=0.0)
+    without_word = np.count_nonzero(is_load & ~has_word)
+    in_all_loads = bool(without_word <= MAX_LOADS_WITHOUT_WORD * np.count_nonzero(is_load))
+    is_signed = any(_has_both_signs(current[is_load & (state == word)]) for word in (-1.0, 1.0))
+    if not is_signed:
+        return StateWords(has_words=True, in_all_loads=in_all_loads)
+    is_positive = np.sum((state * current)[is_load & has_word]) > 0.0
+    sign: CurrentSign = "discharge_positive" if is_positive else "charge_positive"
+    return StateWords(has_words=True, in_all_loads=in_all_loads, sign=sign)
+
+
+def _has_both_signs(current: Floats) -> bool:
+    opposite = min(np.count_nonzero(current > 0.0), np.count_nonzero(current < 0.0))
+    return bool(opposite >= max(MIN_OPPOSITE_ROWS, MIN_OPPOSITE_FRACTION * current.size))
 
 
 class Sign(NamedTuple):
@@ -96,18 +113,18 @@ def find_direction(
     """
     if configured.option:
         return CurrentDirection(configured.option, "--current-sign")
-    if Role.CHARGE_CURRENT in layout.columns:
-        return CurrentDirection("discharge_positive", "separate columns of charge and discharge")
+    if direction := _column_direction(layout, words):
+        return direction
     direction = _defined_direction(layout, configured)
     if direction is None and response.sign is not None:
         direction = CurrentDirection(response.sign, "response of the voltage")
     if direction is None:
         direction = CurrentDirection("discharge_positive", "assumed: the file does not show it; --current-sign sets it")
-    if words is StateWords.ALL_LOADS or (words is StateWords.SOME_LOADS and not response.has_no_sign):
+    if words.in_all_loads or (words.has_words and not response.has_no_sign):
         return CurrentDirection(direction.sign, f"column {layout.columns[Role.STATE].name}", by_state=True)
     if response.has_no_sign:
         by_voltage = _direct_by_voltage(name, layout, direction, response)
-        return by_voltage._replace(by_state=words is StateWords.SOME_LOADS)
+        return by_voltage._replace(by_state=words.has_words)
     if response.sign is None or response.sign == direction.sign:
         return direction
     warning = (
@@ -115,6 +132,15 @@ def find_direction(
         f"{SIGN_TEXTS[response.sign]}: if so, use --current-sign {response.sign}"
     )
     return direction._replace(warning=warning)
+
+
+def _column_direction(layout: Layout, words: StateWords) -> CurrentDirection | None:
+    """Return the direction that separate columns or the states of a signed current show; None without them."""
+    if Role.CHARGE_CURRENT in layout.columns:
+        return CurrentDirection("discharge_positive", "separate columns of charge and discharge")
+    if words.sign is not None:
+        return CurrentDirection(words.sign, f"column {layout.columns[Role.STATE].name}")
+    return None
 
 
 def _direct_by_voltage(

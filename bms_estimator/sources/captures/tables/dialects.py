@@ -95,6 +95,8 @@ GENERIC = Dialect(
         "absolute time",
         "date and time",
         "date",
+        "datum zeit",
+        "datum",
         "绝对时间",
         "系统时间",
     ),

@@ -181,7 +181,8 @@ class JsonRecords:
                     return _record(cells, form, times, place)
         raise UserError(
             f"{self._path}: {place}: has no entity_id, state or last_changed, as Home Assistant's /api/history/period "
-            "returns them"
+            "returns them; "
+            "convert other JSON to a table with the columns time, current and voltage"
         )
 
 

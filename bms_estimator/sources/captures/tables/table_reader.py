@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
-from bms_estimator.sources.captures.tables.current_sign import Sign, StateWords, find_direction
+from bms_estimator.sources.captures.tables.current_sign import Sign, StateWords, find_direction, find_words
 from bms_estimator.sources.captures.tables.cycler_files import (
     MPR_MAGIC,
     NDA_MAGIC,
@@ -101,7 +101,7 @@ class Table:
         first[Role.TIME], self._is_step_time = first[time_base.role], time_base.is_step_time
         layout, ignored = _without_zero_temperature(time_base.layout, first)
         self.layout = reader.layout = layout
-        words = StateWords.find(first[Role.STATE], first[Role.CURRENT]) if Role.STATE in first else StateWords.NONE
+        words = find_words(first[Role.STATE], first[Role.CURRENT]) if Role.STATE in first else StateWords()
         response = VoltageResponse() if configured.option else self._voltage_response(first, words)
         self._direction = find_direction(name, self.layout, configured, response, words)
         is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
@@ -159,7 +159,7 @@ class Table:
     def _voltage_response(self, first: RawBlock, words: StateWords) -> VoltageResponse:
         """Return the response of the voltage in the first rows; of all rows if the current has no sign."""
         response = self._response(first)
-        if not response.has_no_sign or words is StateWords.ALL_LOADS or first[Role.TIME].size < FIRST_ROWS:
+        if not response.has_no_sign or words.in_all_loads or first[Role.TIME].size < FIRST_ROWS:
             return response
         return self._response(self._first_rows(math.inf))
 

@@ -69,7 +69,7 @@ _BRACKETED = re.compile(r"(?P<name>[^()\[\]]+)[(\[](?P<unit>[^()\[\]]*)[)\]]\s*"
 _SEPARATED = re.compile(r"(?P<name>.+)[/#](?P<unit>[^/#]+)")
 _LAST_WORD = re.compile(r"(?P<name>.+)[_ ](?P<unit>[^_ ]+)")
 _IGNORED = re.compile(r"[\s_.~/\-]+|\[\d+\](?=.)")
-_NOT_UNITS = frozenset({"time", "date"})
+_NOT_UNITS = frozenset({"time", "date", "zeit"})
 """Words after a slash that belong to the name, as in ``Date/Time``."""
 
 
