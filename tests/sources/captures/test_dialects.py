@@ -93,6 +93,15 @@ def test_columns_may_be_separated_by_spaces(tmp_path: Path) -> None:
         "~a text: words\n~Time[s]  U[V] I[A]\n" + "".join(f" {t:8.1f}  {v:.4f} {i:7.3f}\n" for t, v, i in rows)
     )
     np.testing.assert_array_equal(load_capture(path)["voltage_v"], m.voltage_v)
+    path.write_text(path.read_text().replace(".", ","))
+    np.testing.assert_array_equal(load_capture(path)["voltage_v"], m.voltage_v)
+
+
+def test_columns_may_be_separated_by_bars(tmp_path: Path) -> None:
+    m = measure()
+    path = tmp_path / "log.txt"
+    path.write_text("time | voltage | current\n" + text(zip(m.time_s, m.voltage_v, m.current_a, strict=True), " | "))
+    np.testing.assert_array_equal(load_capture(path)["voltage_v"], m.voltage_v)
 
 
 def test_a_potentiostat_names_the_reference_in_the_unit(tmp_path: Path) -> None:
