@@ -53,7 +53,7 @@ _CHARGE = frozenset(["c", "chg", "chrg", "cha", "charge", "charging", "laden", "
 _CHINESE_DIRECTION = re.compile("[放充]电")
 """Words for charge and discharge in Chinese, which is written without spaces."""
 
-NO_NUMBER = frozenset({"", "-", "--", "---", "n/a", "#n/a", "na", "null", "none", "unavailable", "unknown"})
+NO_NUMBER = frozenset({"", "-", "--", "---", "n/a", "#n/a", "na", "null", "unavailable", "unknown"})
 """Cells without a value, in addition to the words of ``measured``."""
 MAX_TEXT_CHARACTERS = 40
 """Maximum length of a time stamp or state, and of an invalid cell in a message. Longer texts are cut off."""
