@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bms_estimator.calibration.cleaning.mismatched_steps import are_mismatched
 from bms_estimator.calibration.elements.replay_score import MIN_SOC, SETTLING_S
 from bms_estimator.calibration.validate import Validation
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import SampleBlock, SampleStatus
 
 BLOCK_SAMPLES = 1 << 16
 """Number of samples in a block. The trace of one block at a time is in memory."""
@@ -53,7 +54,8 @@ def soc_errors(
     """Run an estimator over the samples of a validation, and compare its SOC with coulomb counting.
 
     The first ``SETTLING_S`` are not scored, because the estimator searches its initial SOC. SOCs below ``MIN_SOC`` are not
-    scored either.
+    scored either. A voltage of the other side of a step of the current counts as held, because the steps would seem to have no
+    resistance, or the wrong sign.
 
     Args:
         estimator: Estimator without samples.
@@ -67,7 +69,7 @@ def soc_errors(
     squares, within, samples = 0.0, 0, 0
     for begin in range(0, rows.size, BLOCK_SAMPLES):
         block = rows[begin : begin + BLOCK_SAMPLES]
-        trace = estimator.run(block)
+        trace = estimator.run(_with_held_voltages(block))
         time_s = trace["time_s"] - first_s
         counted = np.interp(time_s, validation.time_s, validation.soc)
         scored = (time_s - start_s >= SETTLING_S) & (counted >= MIN_SOC)
@@ -80,3 +82,16 @@ def soc_errors(
     if samples == 0:
         return SocErrors(math.nan, math.nan, 0, faults)
     return SocErrors(math.sqrt(squares / samples), within / samples, samples, faults)
+
+
+def _with_held_voltages(rows: SampleBlock) -> SampleBlock:
+    """Return the samples with ``VOLTAGE_HELD`` where voltage and current are of different sides of a step."""
+    finite = np.flatnonzero(
+        np.isfinite(rows["time_s"]) & np.isfinite(rows["current_a"]) & np.isfinite(rows["voltage_v"])
+    )
+    mismatched = finite[are_mismatched(rows[finite])]
+    if not mismatched.size:
+        return rows
+    marked = rows.copy()
+    marked["status"][mismatched] |= np.uint32(SampleStatus.VOLTAGE_HELD)
+    return marked

@@ -28,6 +28,8 @@ MAX_SPREAD_V = 1.0
 """Maximum difference between cells that confirm each other [V]."""
 FACTORS = 10, 100, 1000
 """Usual factors between the scales or units of two devices."""
+MILLI = 1000.0
+"""Factor of a voltage in mV that is read as V."""
 FACTOR_TOLERANCE = 0.1
 """Tolerance of a ratio that shows one of the factors."""
 MIN_SWAPPED = 1e7
@@ -103,15 +105,21 @@ class PackBounds(NamedTuple):
             found["cells"] = ImpossibleValue(
                 rows, *_describe_cells(self.series * float(mean_v[last]), float(voltage_v[last]))
             )
-        rows = (np.abs(current_a) > self.max_a) & ~is_saturated
+        low_v, high_v = self.range_v
+        is_milli = (voltage_v >= MILLI * low_v) & (voltage_v <= MILLI * high_v)  # then the current is, too
+        rows = (np.abs(current_a) > np.where(is_milli, self.range_a, self.max_a)) & ~is_saturated
         if rows.any():
             found["current"] = ImpossibleValue(rows, *self._describe_current(float(current_a[rows][-1])))
         return found
 
     def _describe_current(self, ampere: float) -> tuple[str, str]:
         """Return the likely cause of an impossible current [A], and a sentence with it."""
+        text = f"the current cannot be true: {ampere:.6g} A"
+        if abs(ampere) <= self.max_a:  # possible, but not beside a voltage in mV
+            kind = _factor_question(MILLI)
+            return kind, f"{text} with this voltage ({kind})"
         kind = _current_cause(ampere, self.range_a)
-        text = f"the current cannot be true: {ampere:.6g} A, and at most {self.max_a:.6g} A are possible"
+        text += f", and at most {self.max_a:.6g} A are possible"
         return kind, f"{text} ({kind})"
 
     def _describe_voltage(self, volt: float, sum_v: float) -> tuple[str, str]:

@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 
+from bms_estimator.calibration.soc_errors import soc_errors
 from bms_estimator.calibration.validate import validate
+from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps
 
@@ -143,3 +146,14 @@ def test_errors_of_the_leaf_cell_on_its_own_pulses(data):
     )
     assert above_soc_0_1 == pytest.approx((6.45, 0.0999, 0.915), rel=0.005)
     assert all_samples == pytest.approx((16.14, 0.1996, 4.644), rel=0.005)
+
+
+def test_voltages_of_the_other_side_of_a_step_are_no_wrong_sign():
+    """Some cyclers write the first record of a step with the voltage before it."""
+    load = np.concatenate([np.zeros(1800), *(np.r_[np.full(720, 1.5), np.zeros(1800)] for _ in range(8))])
+    samples = capture(load)[::10].copy()
+    first = np.flatnonzero(np.diff(samples["current_a"])) + 1
+    samples["voltage_v"][first] = samples["voltage_v"][first - 1]
+    errors = soc_errors(Estimator(TRUTH), samples, validate(Columns(samples, "cycler"), TRUTH))
+    assert errors.faults == InputFault(0)
+    assert errors.rms < 0.01

@@ -73,6 +73,15 @@ async def test_an_intermittent_impossible_value_raises_sensor_fault_and_a_single
     assert [is_raised for _, is_raised in transitions] == [True] * raises
 
 
+async def test_milliamperes_beside_millivolts_raise_only_sensor_fault(tmp_path: Path) -> None:
+    """As amperes, such a current would be possible."""
+    line = GOOD._replace(voltage_v=53_500.0, current_a=9_000.0)
+    result = await replayed(record(tmp_path / "capture.bms", [GOOD, line]), settings(), LFP)
+    assert {c.alarm.name for c in result.changes if c.alarm.active and c.field == "active"} == {"sensor_fault"}
+    (text,) = {a.text for a in result.snapshots[-1].alarms if a.name == "sensor_fault"}
+    assert "9000 A with this voltage (is the unit or scale wrong by a factor of 1000?)" in text
+
+
 POSSIBLE = {
     "blown fuse": (Line(30, voltage_v=0.0, cells_v=()), {"pack_under_voltage", "sensor_fault"}),
     "dead pack": (Line(30, voltage_v=0.1, cells_v=(0.0,) * 16), {"pack_under_voltage", "cell_under_voltage"}),

@@ -32,13 +32,12 @@ from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.fit_thread import new_slow_fit
 from bms_estimator.service.pack_forecaster import load_forecast_kernels, new_forecaster
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.captures.replay import Replay, open_capture
+from bms_estimator.sources.captures.replay import Replay, no_samples_error, open_capture
 from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
@@ -107,7 +106,7 @@ def alarms(
         source = Replay(opened, max_block_s=MAX_BLOCK_S)
         result = asyncio.run(_evaluate(settings, model, source))
         if source.samples == 0:
-            raise UserError(f"{path}: contains no sample")
+            raise no_samples_error(path, opened)
     if as_json:
         sys.stdout.write(json.dumps(asdict(result)) + "\n")
     else:

@@ -23,7 +23,7 @@ from bms_estimator.model.progress import Progress
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.model.time_faults import TimeFaults
 from bms_estimator.sinks.trace_file import SINKS, CsvSink, TableSink, join_columns, table_sink
-from bms_estimator.sources.captures.replay import Capture, open_capture
+from bms_estimator.sources.captures.replay import Capture, no_samples_error, open_capture
 
 SUFFIXES_HELP = ".csv, .csv.gz or .parquet; Battery Data Format: .bdf, .bdf.gz, .bdf.csv, .bdf.csv.gz or .bdf.parquet"
 """Formats by file name suffix."""
@@ -58,8 +58,8 @@ def convert(
             sink.write(block)
             rows += block.size
         print_warnings(path.name, faults.warnings)
-    if rows == 0:
-        raise UserError(f"{capture}: no samples")
+        if rows == 0:
+            raise no_samples_error(path, reopen())
     typer.echo(f"{out}: {rows:,} samples")
 
 

@@ -52,7 +52,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.sinks.trace_file import TableSink, join_columns, table_sink
-from bms_estimator.sources.captures.replay import RawCapture, Replay, open_capture
+from bms_estimator.sources.captures.replay import RawCapture, Replay, no_samples_error, open_capture
 from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.cell_columns import CellColumns
 from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
@@ -132,6 +132,8 @@ def replay(
         if isinstance(source, RawCapture):
             for warning in _unread_warnings(source, result.duration_s or 0.0):
                 typer.echo(f"warning: {capture}: {warning}", err=True)
+        if replay_source.samples == 0:
+            raise no_samples_error(path, source)
         if result.samples == 0:
             raise UserError(f"{path}: no usable sample; dropped: {_dropped_text(result)}")
     if as_json:

@@ -128,6 +128,14 @@ class RawCapture:
                 yield block
 
 
+def no_samples_error(path: object, capture: Capture) -> UserError:
+    """Return the error for a capture without a sample. It names the fault of the bytes, which are read again."""
+    for _ in capture:
+        pass
+    fault = capture.decoder.fault if isinstance(capture, RawCapture) else None
+    return UserError(f"{path}: contains no sample" + (f": {fault}" if fault else ""))
+
+
 class Replay:
     """Source of the samples of a capture; it ends after the last one.
 

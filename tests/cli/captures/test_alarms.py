@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 from tests.command_line import run
 from tests.telemetry.alarm_captures import Line, record
 
@@ -107,3 +108,19 @@ def test_show_prints_the_limits_in_effect(pack: Path, capsys: pytest.CaptureFixt
     assert code == 0
     assert "# alarms.soc_low.clear = 0.25\n" in out
     assert "# alarms.pack_over_voltage.limit = 8.5\n" in out
+
+
+@pytest.mark.parametrize(
+    "command", [["alarms", "--cell", "nmc", "--capacity-ah", "10"], ["convert", "--out", "out.csv"]]
+)
+def test_a_capture_without_samples_is_an_error_that_names_the_fault_of_its_bytes(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with CaptureWriter(tmp_path / "capture.bms", CaptureHeader(mode="text")) as writer:
+        for second in range(5):
+            writer.write(float(second), b'{"voltage": 7.4}\n')
+    name, *options = command
+    code, _, err = run(capsys, name, tmp_path / "capture.bms", *options)
+    assert code == 2
+    assert "contains no sample: lines without voltage and current arrive; the first: '{" in " ".join(err.split())

@@ -171,6 +171,14 @@ def influx_1(rows: Iterable[Change]) -> str:
     return text
 
 
+def grafana(rows: Iterable[Change]) -> str:
+    """Return CSV of Grafana with the series as rows."""
+    lines = [
+        f'"{entity[7:]}";"{iso(row.time_s)}";{row.state}' for entity, each in numbers(rows).items() for row in each
+    ]
+    return "\n".join(['"Series";"Time";"Value"', *lines]) + "\n"
+
+
 EXPORTS = (
     home_assistant_csv,
     quoted_csv,
@@ -182,4 +190,5 @@ EXPORTS = (
     influx_2_of_home_assistant,
     influx_2_fields,
     influx_1,
+    grafana,
 )

@@ -141,3 +141,42 @@ def test_option_overrides_a_column_of_states(tmp_path: Path) -> None:
     assert "signed (column Md)" in load_capture(path).note
     capture = load_capture(path, current_sign="charge_positive")
     np.testing.assert_allclose(capture["current_a"], -np.abs(M.current_a))
+
+
+@pytest.mark.parametrize(
+    ("discharge", "charge"),
+    [("DISC", "CHRG"), ("Discharge", "Regen"), ("Step 2", "C-CV"), ("Décharge", "Charge"), ("恒流放电", "恒流充电")],
+)
+def test_loads_whose_state_has_no_word_have_the_direction_that_the_voltage_shows(
+    discharge: str, charge: str, tmp_path: Path
+) -> None:
+    current_a, voltage_v = cycle(60)
+    states = np.select([current_a > 0.0, current_a < 0.0], [discharge, charge], "Rest")
+    path = tmp_path / "cell.csv"
+    rows = zip(range(current_a.size), np.abs(current_a), voltage_v, states, strict=True)
+    path.write_text("Time (s),Current (A),Voltage (V),Mode\n" + text(rows))
+    np.testing.assert_array_equal(load_capture(path)["current_a"], current_a)
+
+
+def test_words_for_one_direction_are_not_enough_if_the_voltage_shows_no_direction(tmp_path: Path) -> None:
+    current_a, voltage_v = cycle(0)
+    states = np.where(current_a > 0.0, "Discharge", "Regen")
+    path = tmp_path / "cell.csv"
+    rows = zip(range(current_a.size), np.abs(current_a), voltage_v, states, strict=True)
+    path.write_text("Time (s),Current (A),Voltage (V),Mode\n" + text(rows))
+    with pytest.raises(UserError, match="the current has no sign"):
+        load_capture(path)
+
+
+@pytest.mark.parametrize("factor", [1.0, -1.0])
+def test_a_signed_current_keeps_its_sign_within_a_state(factor: float, tmp_path: Path) -> None:
+    """A drive cycle with regenerative braking is one step for a cycler."""
+    current_a, voltage_v = cycle(60)
+    states = np.select([current_a > 0.0, current_a < 0.0], ["CC DChg", "CC Chg"], "Rest")
+    braking = np.flatnonzero(current_a > 0.0)[::7]
+    current_a[braking] = -0.5
+    voltage_v[braking] += 0.075
+    path = tmp_path / "cell.csv"
+    rows = zip(range(current_a.size), factor * current_a, voltage_v, states, strict=True)
+    path.write_text("Time (s),Current (A),Voltage (V),State\n" + text(rows))
+    np.testing.assert_array_equal(load_capture(path)["current_a"], current_a)

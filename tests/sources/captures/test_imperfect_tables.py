@@ -93,3 +93,26 @@ def test_a_column_without_name_that_numbers_the_rows_is_ignored(tmp_path: Path) 
     rows = text(zip(range(M.step.size), durations(M), M.charge_a, M.voltage_v, strict=True))
     capture = load(tmp_path / "cell.csv", ",Time,Current,Voltage\n" + rows)
     assert_is_the_measurement(capture, has_temperature=False)
+
+
+@pytest.mark.parametrize("missing", ["-", "--", "N/A", "null", "unavailable"])
+def test_marks_of_a_missing_value_are_no_error(missing: str, tmp_path: Path) -> None:
+    capture = load(tmp_path / "cell.csv", f"time_s,current_a,voltage_v\n0,1,3.7\n1,{missing},3.6\n2,1,{missing}\n")
+    assert np.isnan(capture["current_a"]).tolist() == [False, True, False]
+    assert np.isnan(capture["voltage_v"]).tolist() == [False, False, True]
+
+
+def test_unknown_names_above_the_numbers_are_shown(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"the columns a, b, c have none of the known names: name them by --map"):
+        load(tmp_path / "cell.csv", "a,b,c\n0,1,3.7\n1,1,3.6\n")
+
+
+def test_a_number_with_its_unit_is_an_error_that_says_where_the_unit_belongs(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"line 2: Current = '2\.5 A': must be a number without its unit, .* \[A\]"):
+        load(tmp_path / "cell.csv", "Time,Current,Voltage\n0,2.5 A,3.7 V\n1,850 mA,3.7 V\n")
+
+
+def test_json_with_one_object_in_each_line_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
+    line = '{"time": 1700000000, "voltage": 13.1, "current": 2}\n'
+    with pytest.raises(UserError, match="JSON with one object in each line: convert it to a table"):
+        load(tmp_path / "log.jsonl", 2 * line)

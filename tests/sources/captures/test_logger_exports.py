@@ -92,6 +92,20 @@ def test_batteries_in_one_table_are_not_mixed(tmp_path: Path) -> None:
         load_capture(path, column_map={"instance": "2"})
 
 
+@pytest.mark.parametrize("header", ["device", "Serial Number", "battery_id"])
+def test_devices_with_names_in_one_table_are_not_mixed(header: str, tmp_path: Path) -> None:
+    m = measure()
+    rows = zip(m.time_s, m.charge_a, m.voltage_v, strict=True)
+    both = "".join(f"{t:g},{name},{i},{v}\n" for t, i, v in rows for name in ("left", "right"))
+    columns = f"time,{header},current,voltage\n"
+    with pytest.raises(UserError, match=f"rows of several batteries, with different names in {header}: keep the rows"):
+        load_capture(save(tmp_path, columns + both))
+    one = "".join(line for line in both.splitlines(keepends=True) if "left" in line)
+    np.testing.assert_array_equal(load_capture(save(tmp_path, columns + one))["voltage_v"], m.voltage_v)
+    table = {"time": m.time_s, header: ["left"] * m.time_s.size, "current": m.charge_a, "voltage": m.voltage_v}
+    np.testing.assert_array_equal(load_capture(table)["voltage_v"], m.voltage_v)
+
+
 def test_instance_that_cannot_be_chosen_is_an_error(tmp_path: Path) -> None:
     path = save(tmp_path, vesc(measure()))
     with pytest.raises(

@@ -169,3 +169,34 @@ def test_pipe_is_rejected_with_a_remedy(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UserError, match="is a pipe or a device; give - and redirect it to standard input"):
         open_capture(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize(("group", "comma"), [(".", ","), ("\u202f", ","), ("'", "."), (" ", ",")])
+def test_groups_of_digits_are_read(group: str, comma: str, tmp_path: Path) -> None:
+    marks = str.maketrans(",.", group + comma)
+    rows = [
+        [f"{value:,.1f}".translate(marks) for value in (1_000.0 + second, 3_650.5, 12_000.0)] for second in range(9)
+    ]
+    path = tmp_path / "log.csv"
+    path.write_text("Time (s);Voltage (mV);Current (mA)\n" + "".join(";".join(row) + "\n" for row in rows), "utf-8")
+    capture = load_capture(path, current_sign="discharge_positive")
+    assert capture["time_s"].tolist() == [1_000.0 + second for second in range(9)]
+    np.testing.assert_allclose(capture["voltage_v"], 3.6505)
+    np.testing.assert_allclose(capture["current_a"], 12.0)
+
+
+def test_columns_of_the_battery_precede_those_of_the_grid(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "time,voltage,current,battery voltage,battery_discharge_current,battery_charge_current\n0,230,1,52,4,0\n1,230,1,52,0,3\n"
+    )
+    capture = load_capture(path, column_map={"current": "battery_discharge_current"})
+    assert capture["voltage_v"].tolist() == [52.0, 52.0]
+    assert capture["current_a"].tolist() == [4.0, -3.0]
+
+
+def test_a_time_that_cannot_be_read_is_an_error_that_names_the_formats(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("Time,Current,Voltage\n0:30.5,1,3.7\n0:31.5,1,3.7\n")
+    with pytest.raises(UserError, match=r"Time = '0:30\.5': must be a number, a duration h:m:s, or a date and time"):
+        load_capture(path)

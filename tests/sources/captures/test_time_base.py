@@ -1,5 +1,6 @@
 """Time base of a table: Unix times, units that a second time column shows, the better of two columns, order of the date."""
 
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -89,7 +90,7 @@ def test_the_order_follows_from_dates_after_many_rows(tmp_path: Path) -> None:
     np.testing.assert_allclose(load_capture(path)["time_s"], elapsed_s)
 
 
-@pytest.mark.parametrize(("step", "remedy"), [(1e5, "[ms]"), (1 / 3600, "[h]")])
+@pytest.mark.parametrize(("step", "remedy"), [(1e5, "[ms]"), (500, "[ms]"), (1 / 3600, "[h]")])
 def test_an_implausible_sample_period_is_a_warning_with_a_remedy(step: float, remedy: str, tmp_path: Path) -> None:
     capture = load(tmp_path / "log.csv", {"Time": step * SECONDS})
     assert f'state the unit, as in --map "time=Time {remedy}"' in capture.warning
@@ -129,3 +130,57 @@ def test_seconds_beyond_the_year_2096_are_a_warning_with_a_remedy(tmp_path: Path
     assert 'if it is Unix time, use --map "time=time_s [ms]"' in load_capture(path).warning
     mapped = load_capture(path, column_map={"time": "time_s [ms]"})
     np.testing.assert_array_equal(mapped["time_s"], 1.7e9 + SECONDS)
+
+
+@pytest.mark.parametrize("time_format", ["%H:%M:%S", "%d.%m.%Y %H:%M:%S"])
+def test_a_clock_goes_on_across_midnight_and_the_end_of_summer_time(time_format: str, tmp_path: Path) -> None:
+    half = SECONDS >= 30
+    shift_s = np.where(half, -3600.0, 0.0) if "Y" in time_format else np.full(60, 15 * 3600.0 - 30.0)
+    capture = load(tmp_path / "log.csv", {"Time": stamps(SECONDS + shift_s, time_format)})
+    np.testing.assert_allclose(capture["time_s"] - capture["time_s"][0], SECONDS)
+
+
+@pytest.mark.parametrize("back_s", [1200.0, 4000.0, 7200.0])
+def test_a_clock_that_was_set_back_otherwise_is_not_changed(back_s: float, tmp_path: Path) -> None:
+    times = stamps(SECONDS - back_s * (SECONDS >= 30), "%d.%m.%Y %H:%M:%S")
+    capture = load(tmp_path / "log.csv", {"Time": times})
+    assert (np.diff(capture["time_s"]) < 0.0).sum() == 1
+
+
+def test_a_duration_that_restarts_is_not_midnight(tmp_path: Path) -> None:
+    times = [f"{hour}:00:{second:02d}" for hour in (26, 2) for second in range(30)]
+    capture = load(tmp_path / "log.csv", {"Time": times})
+    assert (np.diff(capture["time_s"]) < 0.0).sum() == 1
+
+
+@pytest.mark.parametrize("times", [stamps(SECONDS), [f"0:00:{second:02d}" for second in SECONDS], SECONDS.tolist()])
+def test_rows_with_the_newest_first_are_reversed(times: list[object], tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = list(zip(times, CURRENT_A, VOLTAGE_V, strict=True))
+    path.write_text("Time,Current (A),Voltage (V)\n" + text(rows[::-1]))
+    capture = load_capture(path)
+    np.testing.assert_allclose(capture["time_s"], SECONDS)
+    np.testing.assert_array_equal(capture["current_a"], CURRENT_A)
+    assert "the newest row is the first" in capture.note
+
+
+def test_numbers_of_days_are_dates_of_a_spreadsheet(tmp_path: Path) -> None:
+    capture = load(tmp_path / "log.csv", {"Date": [f"{45_356.999 + s / 86_400:.9f}" for s in SECONDS]})
+    np.testing.assert_allclose(np.diff(capture["time_s"]), 1.0, atol=1e-3)
+    assert 'time "Date" in d (days of a spreadsheet)' in capture.note
+
+
+@pytest.mark.parametrize("begin", [0, 1])
+@pytest.mark.parametrize("as_text", [str, lambda second: f"0:00:{second:02d}"])
+def test_a_time_that_starts_again_with_each_step_is_joined(
+    begin: int, as_text: Callable[[int], str], tmp_path: Path
+) -> None:
+    capture = load(tmp_path / "log.csv", {"Time": [as_text(int(second) % 10 + begin) for second in SECONDS]})
+    assert (np.diff(capture["time_s"]) > 0.0).all()
+    assert capture["time_s"][-1] - capture["time_s"][0] == pytest.approx(59.0 if begin else 54.0, abs=1e-4)
+    assert "starts again with each step: the steps are joined" in capture.note
+
+
+def test_a_time_that_starts_again_within_steps_is_not_joined(tmp_path: Path) -> None:
+    capture = load(tmp_path / "log.csv", {"Time": (SECONDS + 5) % 20})
+    assert (np.diff(capture["time_s"]) < 0.0).sum() == 3

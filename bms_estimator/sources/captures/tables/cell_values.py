@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import zlib
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from enum import Enum
@@ -14,14 +15,46 @@ _DATE_TIME = re.compile(
     r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?:[T ]+(\d{1,2}):(\d{1,2})(?::(\d{1,2})([.,:]\d+)?)?\s*([AP]M)?)?",
     re.IGNORECASE,
 )
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_MONTH_NAME = re.compile(rf"(\d{{1,2}})[- ]({'|'.join(_MONTHS)})[a-z]*[- ](\d{{2,4}})\b", re.IGNORECASE)
+"""Day, name of the month and year at the beginning of a date."""
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _GROUPED_DIGITS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?")
+_GROUPED_BY_POINTS = re.compile(r"[-+]?\d{1,3}(?:\.\d{3})+,\d+")
+_GROUPING_SPACE = re.compile(r"(?<=\d)[ '\u2019\u00a0\u202f](?=\d{3}(?!\d))")
+"""Space or apostrophe between groups of three digits."""
 _WORD = re.compile(r"[^\W\d_]+")
 _DISCHARGE = frozenset(
-    {"d", "dchg", "dch", "dis", "disc", "dischg", "discharge", "discharging", "entladen", "entladung"}
+    [
+        "d",
+        "dchg",
+        "dch",
+        "dchrg",
+        "dis",
+        "disc",
+        "disch",
+        "dischg",
+        "dischrg",
+        "discharge",
+        "discharging",
+        "dsc",
+        "dsch",
+        "dsg",
+        "entladen",
+        "entladung",
+        "décharge",
+        "decharge",
+        "descarga",
+        "scarica",
+        "放电",
+    ]
 )
-_CHARGE = frozenset({"c", "chg", "cha", "charge", "charging", "laden", "ladung"})
+_CHARGE = frozenset(["c", "chg", "chrg", "cha", "charge", "charging", "laden", "ladung", "carga", "carica", "充电"])
+_CHINESE_DIRECTION = re.compile("[放充]电")
+"""Words for charge and discharge in Chinese, which is written without spaces."""
 
+NO_NUMBER = frozenset({"", "-", "--", "---", "n/a", "#n/a", "na", "null", "unavailable", "unknown"})
+"""Cells without a value, in addition to the words of ``measured``."""
 MAX_TEXT_CHARACTERS = 40
 """Maximum length of a time stamp or state, and of an invalid cell in a message. Longer texts are cut off."""
 
@@ -34,6 +67,7 @@ class CellKind(Enum):
     DATE_TIME = "date and time"
     DAY_FIRST = "date and time, day first"
     DIRECTION = "direction"
+    LABEL = "number or name"
 
 
 DATES = frozenset({CellKind.DATE_TIME, CellKind.DAY_FIRST})
@@ -41,20 +75,22 @@ DATES = frozenset({CellKind.DATE_TIME, CellKind.DAY_FIRST})
 
 
 def parse_number(cell: str, *, decimal_comma: bool) -> float:
-    """Parse a number; an empty cell, or a word such as nan, is NaN.
+    """Parse a number; an empty cell, a dash, or a word such as nan, is NaN.
 
     Args:
-        cell: The text. Commas between groups of three digits are ignored, unless ``decimal_comma`` is set.
+        cell: The text. Spaces and apostrophes between groups of three digits are ignored, and commas, or points if
+            ``decimal_comma`` is set.
         decimal_comma: The decimal separator is a comma.
 
     Raises:
         ValueError: The text is not a number.
     """
     cell = cell.strip()
-    if not cell:
+    if cell.lower() in NO_NUMBER:
         return float("nan")
+    cell = _GROUPING_SPACE.sub("", cell)
     if decimal_comma:
-        cell = cell.replace(",", ".")
+        cell = (cell.replace(".", "") if _GROUPED_BY_POINTS.fullmatch(cell) else cell).replace(",", ".")
     elif _GROUPED_DIGITS.fullmatch(cell):
         cell = cell.replace(",", "")
     return measured(cell)
@@ -76,12 +112,14 @@ def parse_duration(cell: str) -> float:
 def parse_date_time(cell: str, *, day_first: bool = False) -> float:
     """Return the Unix time of a date and time [s]; UTC if the text has no time zone, midnight if it has no time.
 
-    Formats are ISO 8601, year first, day first with periods, and with slashes or hyphens as ``day_first`` says.
+    Formats are ISO 8601, year first, day first with periods or with the English name of the month, and with slashes or hyphens as ``day_first`` says.
 
     Raises:
         ValueError: The text is not a date with time.
     """
     cell = cell.strip()
+    if named := _MONTH_NAME.match(cell):
+        cell = f"{named[1]}.{_MONTHS.index(named[2].lower()) + 1}.{named[3]}{cell[named.end() :]}"
     match = _DATE_TIME.fullmatch(cell)
     if not match:
         return _unix_s(datetime.fromisoformat(cell))
@@ -105,13 +143,26 @@ def _unix_s(moment: datetime) -> float:
 
 def parse_direction(cell: str) -> float:
     """Return 1 for a text with a word for discharge, -1 with a word for charge, and 0 for other texts, such as rest or pause."""
-    words = {word.lower() for word in _WORD.findall(cell)}
+    words = {word.lower() for word in _WORD.findall(cell)} | {*_CHINESE_DIRECTION.findall(cell)}
     return 1.0 if words & _DISCHARGE else -1.0 if words & _CHARGE else 0.0
 
 
+def parse_label(cell: str) -> float:
+    """Return the number of a device, or a negative number that stands for its name."""
+    text = cell.strip()[:MAX_TEXT_CHARACTERS]
+    try:
+        return parse_number(text, decimal_comma=False)
+    except ValueError:
+        return -1.0 - zlib.crc32(text.encode(errors="replace"))
+
+
 def uses_decimal_comma(cells: list[str]) -> bool:
-    """Return True if cells have a comma where a decimal point would be, and none has a point."""
-    return any(_DECIMAL_COMMA.fullmatch(cell.strip()) for cell in cells) and not any("." in cell for cell in cells)
+    """Return True if cells have a comma where a decimal point would be, and none has a point except between groups of digits."""
+    numbers = [_GROUPING_SPACE.sub("", cell.strip()) for cell in cells]
+    is_grouped = [_GROUPED_BY_POINTS.fullmatch(number) is not None for number in numbers]
+    return any(is_grouped) or (
+        any(map(_DECIMAL_COMMA.fullmatch, numbers)) and not any("." in number for number in numbers)
+    )
 
 
 def time_kind(cells: Iterable[str]) -> CellKind:
@@ -160,5 +211,6 @@ def parser(kind: CellKind, *, decimal_comma: bool) -> Callable[[str], float]:
         CellKind.DATE_TIME: parse_date_time,
         CellKind.DAY_FIRST: partial(parse_date_time, day_first=True),
         CellKind.DIRECTION: parse_direction,
+        CellKind.LABEL: parse_label,
     }
     return parsers[kind]

@@ -201,7 +201,7 @@ def to_floats(name: object, column: Column, values: ArrayLike) -> NDArray[np.flo
         UserError: A value is not a number.
     """
     array = np.asarray(values)
-    if column.kind is CellKind.DIRECTION:
+    if column.kind in (CellKind.DIRECTION, CellKind.LABEL):
         return parse_column(name, column, [str(value) for value in array.ravel().tolist()])
     if array.dtype.kind == "O" and all(value is None or isinstance(value, int | float) for value in array.flat):
         array = array.astype(np.float64)

@@ -2,17 +2,65 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.captures.tables.dialects import OWN
 from bms_estimator.sources.captures.tables.layout import Layout, Role
-from bms_estimator.sources.captures.tables.voltage_response import VoltageResponse
+from bms_estimator.sources.captures.tables.voltage_response import LOAD_FRACTION, VoltageResponse
 
 SIGN_TEXTS: dict[CurrentSign, str] = {
     "discharge_positive": "positive on discharge",
     "charge_positive": "positive on charge",
 }
+
+
+MAX_LOADS_WITHOUT_WORD = 0.05
+"""Maximum fraction of the rows with a load whose state has no word, for a direction by the states alone. Rows at the change of a
+step may have the state of the step before."""
+
+
+MIN_OPPOSITE_ROWS, MIN_OPPOSITE_FRACTION = 3, 0.02
+"""Minimum number and fraction of the rows of a word whose current has the opposite sign, for a current that has a sign of its
+own, as in a drive cycle with regenerative braking."""
+
+
+class StateWords(NamedTuple):
+    """Words for charge and discharge in a state column."""
+
+    has_words: bool = False
+    in_all_loads: bool = False
+    """True if almost all rows with a load have a word."""
+    sign: CurrentSign | None = None
+    """Direction of positive current, if rows with the same word have currents of both signs; otherwise None."""
+
+
+def find_words(state: Floats, current: Floats) -> StateWords:
+    """Return the words in the rows of a table.
+
+    Args:
+        state: 1 with a word for discharge, -1 with a word for charge, otherwise another number; shape (n,).
+        current: Current in any unit and with any sign, shape (n,).
+    """
+    has_word = np.abs(state) == 1.0
+    if not has_word.any():
+        return StateWords()
+    is_load = np.abs(current) > LOAD_FRACTION * np.nanmax(np.abs(current), initial=0.0)
+    without_word = np.count_nonzero(is_load & ~has_word)
+    in_all_loads = bool(without_word <= MAX_LOADS_WITHOUT_WORD * np.count_nonzero(is_load))
+    is_signed = any(_has_both_signs(current[is_load & (state == word)]) for word in (-1.0, 1.0))
+    if not is_signed:
+        return StateWords(has_words=True, in_all_loads=in_all_loads)
+    is_positive = np.sum((state * current)[is_load & has_word]) > 0.0
+    sign: CurrentSign = "discharge_positive" if is_positive else "charge_positive"
+    return StateWords(has_words=True, in_all_loads=in_all_loads, sign=sign)
+
+
+def _has_both_signs(current: Floats) -> bool:
+    opposite = min(np.count_nonzero(current > 0.0), np.count_nonzero(current < 0.0))
+    return bool(opposite >= max(MIN_OPPOSITE_ROWS, MIN_OPPOSITE_FRACTION * current.size))
 
 
 class Sign(NamedTuple):
@@ -30,7 +78,7 @@ class CurrentDirection(NamedTuple):
     sign: CurrentSign
     reason: str
     by_state: bool = False
-    """True if words in a state column give the direction of each row."""
+    """True if words in a state column give the direction of the rows that have one."""
     row_factors: Floats | None = None
     """Factors of the rows, 1 on discharge and -1 on charge, of a current without a sign; None for a current with a sign."""
     warning: str = ""
@@ -49,7 +97,7 @@ class CurrentDirection(NamedTuple):
 
 
 def find_direction(
-    name: object, layout: Layout, configured: Sign, response: VoltageResponse, *, has_words: bool
+    name: object, layout: Layout, configured: Sign, response: VoltageResponse, words: StateWords
 ) -> CurrentDirection:
     """Return the direction of positive current in a table.
 
@@ -58,24 +106,25 @@ def find_direction(
         layout: Columns of the table.
         configured: Direction that the user configured.
         response: Direction that the voltage shows.
-        has_words: True if the state column has words for charge or discharge.
+        words: Words for charge and discharge in the state column.
 
     Raises:
         UserError: The current has no sign, and the voltage does not show the direction of each load.
     """
     if configured.option:
         return CurrentDirection(configured.option, "--current-sign")
-    if Role.CHARGE_CURRENT in layout.columns:
-        return CurrentDirection("discharge_positive", "separate columns of charge and discharge")
+    if direction := _column_direction(layout, words):
+        return direction
     direction = _defined_direction(layout, configured)
     if direction is None and response.sign is not None:
         direction = CurrentDirection(response.sign, "response of the voltage")
     if direction is None:
         direction = CurrentDirection("discharge_positive", "assumed: the file does not show it; --current-sign sets it")
-    if has_words:
+    if words.in_all_loads or (words.has_words and not response.has_no_sign):
         return CurrentDirection(direction.sign, f"column {layout.columns[Role.STATE].name}", by_state=True)
     if response.has_no_sign:
-        return _direct_by_voltage(name, layout, direction, response)
+        by_voltage = _direct_by_voltage(name, layout, direction, response)
+        return by_voltage._replace(by_state=words.has_words)
     if response.sign is None or response.sign == direction.sign:
         return direction
     warning = (
@@ -83,6 +132,15 @@ def find_direction(
         f"{SIGN_TEXTS[response.sign]}: if so, use --current-sign {response.sign}"
     )
     return direction._replace(warning=warning)
+
+
+def _column_direction(layout: Layout, words: StateWords) -> CurrentDirection | None:
+    """Return the direction that separate columns or the states of a signed current show; None without them."""
+    if Role.CHARGE_CURRENT in layout.columns:
+        return CurrentDirection("discharge_positive", "separate columns of charge and discharge")
+    if words.sign is not None:
+        return CurrentDirection(words.sign, f"column {layout.columns[Role.STATE].name}")
+    return None
 
 
 def _direct_by_voltage(

@@ -25,7 +25,7 @@ class Dialect:
     charge_current: tuple[str, ...] = ()
     """Columns of the charge current, if ``current`` contains only the discharge current."""
     instance: tuple[str, ...] = ()
-    """Columns with the number of the battery, if a table may have rows of several batteries."""
+    """Columns with the number or name of the battery, if a table may have rows of several batteries."""
     series: tuple[str, ...] = ()
     """Columns with the number of cells in series."""
     signatures: tuple[tuple[str, ...], ...] = ((),)
@@ -43,6 +43,9 @@ class Dialect:
             for signature in self.signatures
         )
 
+
+DISCHARGE_CURRENTS = ("discharge current", "discharging current", "battery discharge current", "entladestrom")
+"""Names of a column that contains only the discharge current. The charge current has another column."""
 
 CLOCKS = (
     "absolute time",
@@ -74,33 +77,51 @@ GENERIC = Dialect(
         "total time",
         "elapsed time",
         "run time",
+        "gesamtzeit",
+        "testzeit",
+        "总时间",
+        "测试时间",
         "time",
         "t",
         "zeit",
+        "temps",
+        "tiempo",
+        "tempo",
+        "时间",
         "timestamp",
+        "unix timestamp",
+        "zeitstempel",
         "date time",
         "absolute time",
         "date and time",
         "date",
+        "datum zeit",
+        "datum",
+        "绝对时间",
+        "系统时间",
     ),
     current=(
-        "current",
-        "pack current",
         "battery current",
+        "pack current",
+        "current",
         "i",
         "<i>",
         "cur",
         "amps",
         "pack amps",
         "strom",
-        "discharge current",
-        "entladestrom",
+        "courant",
+        "corriente",
+        "corrente",
+        "电流",
+        "im",
+        *DISCHARGE_CURRENTS,
     ),
     voltage=(
+        "battery voltage",
+        "pack voltage",
         "voltage",
         "terminal voltage",
-        "pack voltage",
-        "battery voltage",
         "u",
         "v",
         "e",
@@ -110,10 +131,41 @@ GENERIC = Dialect(
         "pack volts",
         "potential",
         "spannung",
+        "tension",
+        "tensión",
+        "voltaje",
+        "tensione",
+        "电压",
+        "vf",
     ),
-    temperature=("temperature", "cell temperature", "temp", "t cell", "temperatur"),
-    state=("state", "status", "mode", "step type", "zustand"),
-    charge_current=("charge current", "ladestrom"),
+    temperature=(
+        "temperature",
+        "cell temperature",
+        "temp",
+        "t cell",
+        "temperatur",
+        "température",
+        "temperatura",
+        "温度",
+    ),
+    state=("state", "status", "mode", "step type", "zustand", "schrittart", "工步类型", "状态"),
+    charge_current=("charge current", "charging current", "battery charge current", "ladestrom"),
+    instance=(
+        "device",
+        "device id",
+        "device name",
+        "bms",
+        "bms id",
+        "battery id",
+        "battery name",
+        "battery no",
+        "pack id",
+        "pack name",
+        "pack no",
+        "serial number",
+        "mac",
+        "host",
+    ),
 )
 """Common names. This dialect is tried last."""
 

@@ -33,8 +33,13 @@ class _Form(NamedTuple):
 
 _HOME_ASSISTANT = _Form("state", ("last_updated", "last_changed"), "entity_id")
 _COMPRESSED = _Form("s", ("lu", "lc"), "entity_id")
-_FORMS = (_HOME_ASSISTANT, _Form("_value", ("_time",)), _Form("value", ("time",)))
-"""Columns of Home Assistant, InfluxDB 2 and InfluxDB 1."""
+_FORMS = (
+    _HOME_ASSISTANT,
+    _Form("_value", ("_time",)),
+    _Form("value", ("time",)),
+    _Form("Value", ("Time",), "Series"),
+)
+"""Columns of Home Assistant, InfluxDB 2, InfluxDB 1 and Grafana."""
 _UNIT = "unit_of_measurement"
 _MEASUREMENTS = ("_measurement", "name")
 """Columns with the measurement in InfluxDB, which is the unit if Home Assistant wrote it."""
@@ -142,6 +147,11 @@ class JsonRecords:
         try:
             self._value = json.loads(text)
         except (ValueError, RecursionError) as error:
+            if str(error).startswith("Extra data: line 2"):
+                raise UserError(
+                    f"{path}: JSON with one object in each line: convert it to a table, for example with jq -r "
+                    "'[.time, .current, .voltage] | @csv', and add a line time,current,voltage above"
+                ) from None
             raise UserError(f"{path}: JSON damaged or cut short: {error}; export it again") from None
         self._times = {form: _time_columns(finder, form) for form in (_HOME_ASSISTANT, _COMPRESSED)}
         self.times = self._times[_HOME_ASSISTANT]
@@ -171,7 +181,8 @@ class JsonRecords:
                     return _record(cells, form, times, place)
         raise UserError(
             f"{self._path}: {place}: has no entity_id, state or last_changed, as Home Assistant's /api/history/period "
-            "returns them"
+            "returns them; "
+            "convert other JSON to a table with the columns time, current and voltage"
         )
 
 

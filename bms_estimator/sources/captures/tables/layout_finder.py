@@ -12,7 +12,7 @@ from bms_estimator.model.decimal_text import number
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.tables.cell_values import CellKind, parse_number
-from bms_estimator.sources.captures.tables.dialects import CLOCKS, DIALECTS, GENERIC, OWN, Dialect
+from bms_estimator.sources.captures.tables.dialects import CLOCKS, DIALECTS, DISCHARGE_CURRENTS, GENERIC, OWN, Dialect
 from bms_estimator.sources.captures.tables.layout import (
     INSTANCE,
     QUANTITIES,
@@ -41,9 +41,6 @@ MAX_SHOWN_COLUMNS = 30
 """Maximum number of column names in a message."""
 MAX_SHOWN_CHARACTERS = 40
 """Maximum length of a column name in a message."""
-
-DISCHARGE_CURRENTS = frozenset(fold(name) for name in ("discharge current", "entladestrom"))
-"""Names of a column that contains only the discharge current. The charge current has another column."""
 
 
 class _Header(NamedTuple):
@@ -84,6 +81,7 @@ class LayoutFinder:
         self.given: dict[Quantity, str] = {quantity: given[quantity] for quantity in QUANTITIES if quantity in given}
         self._closest = _Header((), GENERIC, REQUIRED)
         self._first_numbers: Sequence[str] = ()
+        self._names: Sequence[str] = ()  # cells of the last line above the first numbers
 
     def find(self, header: Sequence[str]) -> Layout | None:
         """Return the layout of a table with this header; None if it is not a header.
@@ -103,7 +101,10 @@ class LayoutFinder:
             if not missing:
                 return self._apply_dialect(dialect, cells, names, given)
             self._closest = max(self._closest, _Header(cells, dialect, missing), key=_Header.rank)
-        if not self._first_numbers and sum(map(_is_number, cells)) >= max(len(REQUIRED), 0.5 * len(cells)):
+        numbers = sum(map(_is_number, cells))
+        if not self._first_numbers and not numbers and len(cells) >= len(REQUIRED):
+            self._names = cells
+        if not self._first_numbers and numbers >= max(len(REQUIRED), 0.5 * len(cells)):
             self._first_numbers = cells
         return None
 
@@ -116,6 +117,10 @@ class LayoutFinder:
         if (
             len(missing) == len(REQUIRED) or len(header) < len(REQUIRED) - 1
         ):  # a line of text may contain a name by chance
+            if self._first_numbers and len(self._names) == len(self._first_numbers):
+                return UserError(
+                    f"{self._path}: the columns {shown(self._names)} have none of the known names: name them by {MAP_HELP}"
+                )
             if self._first_numbers:
                 return UserError(
                     f"{self._path}: no line names the columns: add one above {shown(self._first_numbers)}, with a name for each "
@@ -191,10 +196,11 @@ class LayoutFinder:
         columns = dict[ColumnRole, Column]()
         for role, wanted in ((Role.INSTANCE, dialect.instance), (Role.SERIES, dialect.series)):
             for index in _find_indices(wanted, names)[:1]:
-                columns[role] = Column(index, cells[index], Unit(""), is_lenient=True)
+                kind = CellKind.LABEL if role is Role.INSTANCE else CellKind.NUMBER
+                columns[role] = Column(index, cells[index], Unit(""), kind=kind, is_lenient=True)
         for state in _find_indices(dialect.state, names)[:1]:
             columns[Role.STATE] = Column(state, cells[state], Unit(""), kind=CellKind.DIRECTION)
-        if current_name in DISCHARGE_CURRENTS:
+        if current_name in map(fold, DISCHARGE_CURRENTS):
             for charge in _find_indices(dialect.charge_current, names)[:1]:
                 if column := self._column("current", charge, cells[charge], names[charge].unit):
                     columns[Role.CHARGE_CURRENT] = column

@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
-from bms_estimator.sources.captures.tables.current_sign import Sign, find_direction
+from bms_estimator.sources.captures.tables.current_sign import Sign, StateWords, find_direction, find_words
 from bms_estimator.sources.captures.tables.cycler_files import (
     MPR_MAGIC,
     NDA_MAGIC,
@@ -36,7 +36,7 @@ from bms_estimator.sources.captures.tables.table_samples import (
 )
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
 from bms_estimator.sources.captures.tables.text_table import TextTable
-from bms_estimator.sources.captures.tables.time_base import find_time_base
+from bms_estimator.sources.captures.tables.time_base import ClockTurns, find_time_base, is_descending
 from bms_estimator.sources.captures.tables.voltage_response import VoltageResponse, voltage_response
 
 FIRST_ROWS = 262_144
@@ -92,17 +92,26 @@ class Table:
     def __init__(self, name: object, reader: TableReader, configured: Sign, instance: float | None = None) -> None:
         self._name, self._reader, self._instance = name, reader, instance
         self.implausible, self.cells = 0, NO_CELLS
+        self._newest_first = False
         first = self._first_rows()
+        if reader.layout.dialect is not OWN and is_descending(first[Role.TIME]):
+            self._newest_first = True
+            first = self._first_rows()
         time_base = find_time_base(reader.layout, first)
-        first[Role.TIME] = first[time_base.role]
+        first[Role.TIME], self._is_step_time = first[time_base.role], time_base.is_step_time
         layout, ignored = _without_zero_temperature(time_base.layout, first)
         self.layout = reader.layout = layout
-        has_words = Role.STATE in first and bool((np.abs(first[Role.STATE]) == 1.0).any())
-        response = VoltageResponse() if configured.option else self._voltage_response(first, has_words=has_words)
-        self._direction = find_direction(name, self.layout, configured, response, has_words=has_words)
+        words = find_words(first[Role.STATE], first[Role.CURRENT]) if Role.STATE in first else StateWords()
+        response = VoltageResponse() if configured.option else self._voltage_response(first, words)
+        self._direction = find_direction(name, self.layout, configured, response, words)
         is_own = self.layout.dialect is OWN and not self.layout.has_given_columns
         self.note = (
-            "" if is_own else _note(reader, time_base.reason, self._direction.text) + ignored + _cells_in_series(first)
+            ""
+            if is_own
+            else _note(reader, time_base.reason, self._direction.text)
+            + ignored
+            + _cells_in_series(first)
+            + self._newest_first * "; the newest row is the first: read in reverse order"
         )
         self._warnings = (time_base.warning, self._direction.warning)
 
@@ -125,8 +134,10 @@ class Table:
         self.implausible = 0
         before = np.empty(0, dtype=SAMPLE)
         start_s, rows = None, 0
-        for raw in _rows_of_battery(self._name, self._reader, self._instance):
+        turns = self._turns()
+        for raw in self._rows():
             samples = to_samples(raw, self.layout)
+            samples["time_s"] = turns.apply(samples["time_s"])
             if Role.CLOCK in self.layout.columns or self.layout.columns[Role.TIME].kind in DATES:
                 start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
                 samples["time_s"] -= start_s
@@ -145,17 +156,36 @@ class Table:
             self.cells = cell_voltages(raw, self.layout)
             yield samples
 
-    def _voltage_response(self, first: RawBlock, *, has_words: bool) -> VoltageResponse:
+    def _voltage_response(self, first: RawBlock, words: StateWords) -> VoltageResponse:
         """Return the response of the voltage in the first rows; of all rows if the current has no sign."""
-        response = voltage_response(to_samples(first, self.layout))
-        if not response.has_no_sign or has_words or first[Role.TIME].size < FIRST_ROWS:
+        response = self._response(first)
+        if not response.has_no_sign or words.in_all_loads or first[Role.TIME].size < FIRST_ROWS:
             return response
-        return voltage_response(to_samples(self._first_rows(math.inf), self.layout))
+        return self._response(self._first_rows(math.inf))
+
+    def _response(self, rows: RawBlock) -> VoltageResponse:
+        samples = to_samples(rows, self.layout)
+        samples["time_s"] = self._turns().apply(samples["time_s"])
+        return voltage_response(samples)
+
+    def _turns(self) -> ClockTurns:
+        """Return the turns of the clock. Times of the day have none if another column has the dates."""
+        time = self.layout.columns[Role.CLOCK if Role.CLOCK in self.layout.columns else Role.TIME]
+        return ClockTurns(time, is_step_time=self._is_step_time)
+
+    def _rows(self) -> Iterator[RawBlock]:
+        """Yield blocks with the rows of the battery, the oldest first."""
+        blocks = _rows_of_battery(self._name, self._reader, self._instance)
+        if not self._newest_first:
+            yield from blocks
+            return
+        for raw in reversed(list(blocks)):
+            yield {role: values[::-1] for role, values in raw.items()}
 
     def _first_rows(self, min_rows: float = FIRST_ROWS) -> RawBlock:
         """Return rows at the beginning of the table, at least ``min_rows`` if it has as many."""
         blocks, rows = list[RawBlock](), 0
-        for raw in _rows_of_battery(self._name, self._reader, self._instance):
+        for raw in self._rows():
             blocks.append(raw)
             rows += raw[Role.TIME].size
             if rows >= min_rows:
@@ -182,6 +212,10 @@ def _rows_of_battery(name: object, reader: TableReader, instance: float | None) 
     for raw in reader.blocks():
         numbers = raw[Role.INSTANCE]
         found |= set(np.unique(numbers[np.isfinite(numbers)]).tolist())
+        if instance is None and len(found) > 1 and min(found) < 0.0:
+            raise UserError(
+                f"{name}: rows of several batteries, with different names in {column.name}: keep the rows of one"
+            )
         if instance is None and len(found) > 1:
             raise UserError(
                 f"{name}: rows of several batteries, {column.name} = {_shown(found)}: choose one by "

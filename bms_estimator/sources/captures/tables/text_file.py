@@ -1,7 +1,8 @@
-"""Text of a file: plain, gzipped or the only member of a zip archive, in UTF-8, UTF-16 or latin-1."""
+"""Text of a file: plain, gzipped or the only member of a zip archive, in UTF-8, UTF-16, GB 18030 or latin-1."""
 
 import codecs
 import gzip
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -14,6 +15,12 @@ from bms_estimator.model.errors import UserError
 
 GZIP_MAGIC, ZIP_MAGIC = b"\x1f\x8b", b"PK\x03\x04"
 """First bytes of gzip files and of zip archives."""
+SAMPLE_BYTES = 65_536
+"""Number of bytes that show the encoding."""
+MAX_UTF_8_BYTES = 4
+"""Maximum length of a character in UTF-8, which the end of the sample may divide."""
+_HIGH_BYTES, _GB_2312 = re.compile(rb"[\x80-\xff]+"), re.compile(rb"(?:[\xa1-\xf7][\xa1-\xfe])+")
+_HANZI = re.compile(rb"(?:..)*?[\xb0-\xf7][\xa1-\xfe]", re.DOTALL)
 _LATIN_1_BYTES = "latin-1-bytes"
 """Error handler of the UTF-8 decoder that reads invalid bytes as latin-1."""
 
@@ -94,10 +101,26 @@ class TextFile:
 
 def _decoded(plain: IO[bytes]) -> TextIOWrapper:
     """Return the text of a byte stream, by its byte order mark or by the zero bytes of UTF-16."""
-    head = plain.read(2)
+    sample = plain.read(SAMPLE_BYTES)
     plain.seek(0)
+    head = sample[:2]
     if head in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return TextIOWrapper(plain, encoding="utf-16")
     if len(head) == 2 and 0 in head:
         return TextIOWrapper(plain, encoding="utf-16-le" if head[1] == 0 else "utf-16-be")
+    if _is_chinese(sample):
+        return TextIOWrapper(plain, encoding="gb18030", errors="replace")
     return TextIOWrapper(plain, encoding="utf-8-sig", errors=_LATIN_1_BYTES)
+
+
+def _is_chinese(sample: bytes) -> bool:
+    """Return True if all bytes beyond ASCII are pairs of the Chinese encoding GB 2312, and they are not UTF-8.
+
+    In latin-1 a letter or sign beyond ASCII rarely follows another one.
+    """
+    try:
+        sample[:-MAX_UTF_8_BYTES].decode()
+    except UnicodeDecodeError:
+        runs = _HIGH_BYTES.findall(sample[: sample.rfind(b"\n") + 1])
+        return any(map(_HANZI.match, runs)) and all(map(_GB_2312.fullmatch, runs))
+    return False

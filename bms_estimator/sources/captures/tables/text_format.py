@@ -20,8 +20,10 @@ PROBED_LINES = 200
 """Number of lines after the header that show units, decimal sign and format of the time."""
 _DEVICE = re.compile(r".+ \[\d+\]")
 """Name of a device in the line above the column names, by Victron VRM."""
-SEPARATORS = {"\t": "tab", ";": "semicolon", ",": "comma"}
-"""Separators of columns, in the order in which they are tried, with their names."""
+_NOT_SPACED = re.compile(r"[\t;|]|,(?!\d)|[:'](?:\s|$)")
+"""Other separators than spaces, and marks at the end of a word of a text. A comma before a digit is a decimal comma."""
+SEPARATORS = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "vertical bar", " ": "space"}
+"""Separators of columns, in the order in which they are tried, with their names. Any number of spaces is one separator."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,9 @@ def unquoted(line: str) -> str:
 
 
 def split_cells(line: str, separator: str) -> list[str]:
-    """Return the cells of a line; an empty list if it is not valid CSV."""
+    """Return the cells of a line; an empty list if it is not valid CSV, or if spaces separate words of a text."""
+    if separator == " ":
+        return [] if _NOT_SPACED.search(line) else line.split()
     try:
         return next(csv.reader([line], delimiter=separator))
     except (csv.Error, StopIteration):

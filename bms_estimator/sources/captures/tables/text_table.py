@@ -1,6 +1,7 @@
 """Reader of delimited text with any preamble, separator and decimal sign. It reads blocks, to limit the memory."""
 
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from bms_estimator.sources.captures.tables.text_format import (
     unquoted,
 )
 
+_WITH_UNIT = re.compile(r"[-+\d.,]+\s*[^\W\d]{1,3}")
 TEXT_DTYPE = f"U{MAX_TEXT_CHARACTERS}"
 
 
@@ -119,7 +121,7 @@ def _convert(column: Column, cells: NDArray[np.float64] | NDArray[np.str_]) -> N
     if column.kind is CellKind.NUMBER:
         return cells.astype(np.float64)
     parse = column.parser(decimal_comma=False)
-    if column.kind is CellKind.DIRECTION:  # few different words
+    if column.kind in (CellKind.DIRECTION, CellKind.LABEL):  # few different words
         words, index = np.unique(cells, return_inverse=True)
         return np.array([parse(str(word)) for word in words])[index]
     return np.array([parse(cell) for cell in cells.tolist()])
@@ -190,5 +192,11 @@ class _RowParser:
             return self._parsers[role](cell)
         except (ValueError, OverflowError):
             kind = "number" if column.kind is CellKind.NUMBER else column.kind.value
+            if role is Role.TIME and column.kind is CellKind.NUMBER:
+                kind = "number, a duration h:m:s, or a date and time"
+            elif _WITH_UNIT.fullmatch(cell.strip()):
+                kind = (
+                    f"number without its unit, which belongs to the header, as in {column.name} [{column.unit.symbol}]"
+                )
             shown = cell[:MAX_TEXT_CHARACTERS]
             raise UserError(f"{self._path}: line {line}: {column.name} = {shown!r}: must be a {kind}") from None

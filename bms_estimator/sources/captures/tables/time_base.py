@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
+from bms_estimator.sources.captures.tables.dialects import OWN
 from bms_estimator.sources.captures.tables.layout import Column, Layout, RawBlock, Role, without_clock
-from bms_estimator.sources.captures.tables.units import TIME_UNITS, Unit
+from bms_estimator.sources.captures.tables.units import TIME_UNITS, Unit, find_unit
 
 FIRST_UNIX_S, LAST_UNIX_S = 9e8, 4e9
 """Range of Unix times in a capture: 1998 to 2096 [s]."""
@@ -18,7 +19,19 @@ MAX_RATE_ERROR = 0.2
 DAY_S = 86_400.0
 CHUNKS = 8
 """Number of parts of a table in which two time columns are compared. Their median excludes pauses of one of them."""
-MIN_PERIOD_S, MAX_PERIOD_S = 0.005, 600.0
+TURNS_S = {CellKind.DURATION: (DAY_S, 1800.0)} | dict.fromkeys(DATES, (3600.0, 600.0))
+"""Step back of a clock at midnight and at the end of summer time, by the kind of its cells, and the maximum step of the time
+across it [s]. With a longer one, the clock was set or the test was restarted."""
+MIN_STEP_RESTARTS, MIN_STEP_FRACTION, MIN_STEP_CHANGE = 2, 0.8, 0.05
+"""For a time that starts again with each step: minimum number of its restarts, minimum fraction of them at which the current
+changes, and minimum change relative to the range of the current."""
+MIN_DESCENDING_FRACTION = 0.9
+"""Minimum fraction of steps back in time, for a table whose newest row is the first one."""
+FIRST_EXCEL_DAY, LAST_EXCEL_DAY = 36_526.0, 73_051.0
+"""Days in the years 2000 to 2099 as spreadsheets count them."""
+MAX_EXCEL_PERIOD_S = 3600.0
+"""Maximum sample period of dates as numbers of days [s]."""
+MIN_PERIOD_S, MAX_PERIOD_S = 0.005, 90.0
 """Range of the sample period [s]. With a period beyond it, the assumed unit is probably wrong."""
 
 Floats = NDArray[np.float64]
@@ -33,12 +46,14 @@ class TimeBase:
         role: Role of the column that is the time.
         reason: Reason for the column or for its unit, for messages; empty if the table states both.
         warning: Contradiction, with its remedy; empty without one.
+        is_step_time: True if the time starts again with each step of a test.
     """
 
     layout: Layout
     role: Role = Role.TIME
     reason: str = ""
     warning: str = ""
+    is_step_time: bool = False
 
 
 def find_time_base(layout: Layout, raw: RawBlock) -> TimeBase:
@@ -51,13 +66,68 @@ def find_time_base(layout: Layout, raw: RawBlock) -> TimeBase:
     time, clock = layout.columns[Role.TIME], layout.columns.get(Role.CLOCK)
     if clock is not None and time.kind is CellKind.DURATION and _is_time_of_day(clock, raw):
         return TimeBase(layout, reason=f'after "{clock.name}"')
-    time_base = _by_unix_time(layout, time, raw[Role.TIME])
+    time_base = _by_unix_time(layout, time, raw[Role.TIME]) or _by_excel_days(layout, time, raw[Role.TIME])
     if time_base is None and clock is not None and not clock.assumed:
         time_base = _by_clock(layout, time, clock, raw)
     if time_base is not None:
         return time_base
     warning = _implausible_period(time, raw[Role.TIME]) if time.assumed else ""
-    return TimeBase(without_clock(layout), warning=warning)
+    is_step_time = layout.dialect is not OWN and _is_step_time(raw[Role.TIME], raw[Role.CURRENT])
+    reason = "starts again with each step: the steps are joined" if is_step_time else ""
+    return TimeBase(without_clock(layout), reason=reason, warning=warning, is_step_time=is_step_time)
+
+
+def _is_step_time(values: Floats, current: Floats) -> bool:
+    """Return True if a time starts again, near 0, where the current changes. After a restart of the tester, it does not change."""
+    valid = np.isfinite(values) & np.isfinite(current)
+    times, steps, changes = values[valid], np.diff(values[valid]), np.abs(np.diff(current[valid]))
+    is_restart = steps < 0.0
+    if np.count_nonzero(is_restart) < MIN_STEP_RESTARTS or not (steps > 0.0).any():
+        return False
+    is_change = changes[is_restart] > MIN_STEP_CHANGE * np.ptp(current[valid])
+    near_0 = np.abs(times[1:][is_restart]) <= 2.0 * np.max(steps[steps > 0.0])
+    return bool(near_0.all() and np.mean(is_change) >= MIN_STEP_FRACTION)
+
+
+class ClockTurns:
+    """Continuation of times of the day across midnight, of dates across the end of summer time, and of the times of steps.
+
+    Args:
+        time: Column of the time. Other times as numbers are not changed.
+        is_step_time: True if the time starts again with each step of a test.
+    """
+
+    def __init__(self, time: Column, *, is_step_time: bool) -> None:
+        self._turn_s, self._max_step_s = TURNS_S.get(time.kind, (0.0, 0.0))
+        self._is_step_time = is_step_time
+        self._last_s, self._added_s = np.nan, 0.0
+
+    def apply(self, time_s: Floats) -> Floats:
+        """Return the times of the next rows [s], each without the turns of the clock before it."""
+        finite = np.flatnonzero(np.isfinite(time_s))
+        if not (self._turn_s or self._is_step_time) or not finite.size:
+            return time_s
+        values_s = time_s[finite]
+        steps_s = np.diff(values_s, prepend=self._last_s)
+        before_s = values_s - steps_s
+        if self._is_step_time:
+            turns_s = np.where(steps_s < 0.0, before_s, 0.0)
+        else:
+            before_day_end = (before_s < DAY_S) | (self._turn_s < DAY_S)
+            is_turn = (-self._turn_s < steps_s) & (steps_s <= self._max_step_s - self._turn_s) & before_day_end
+            turns_s = self._turn_s * is_turn
+        self._last_s = float(values_s[-1])
+        added_s = self._added_s + np.zeros(time_s.size)
+        added_s[finite] += np.cumsum(turns_s)
+        self._added_s = float(added_s[finite[-1]])
+        return time_s + added_s
+
+
+def is_descending(values: Floats) -> bool:
+    """Return True if the newest row is the first one."""
+    steps = np.diff(values[np.isfinite(values)])
+    steps = steps[steps != 0.0]
+    return bool(steps.size > 1 and np.mean(steps < 0.0) >= MIN_DESCENDING_FRACTION)
 
 
 def _by_unix_time(layout: Layout, time: Column, values: Floats) -> TimeBase | None:
@@ -72,6 +142,20 @@ def _by_unix_time(layout: Layout, time: Column, values: Floats) -> TimeBase | No
         f'--map "time={time.name} [{unit.symbol}]"'
     )
     return TimeBase(without_clock(layout), warning=warning)
+
+
+def _by_excel_days(layout: Layout, time: Column, values: Floats) -> TimeBase | None:
+    """Return the time base of dates that a spreadsheet has written as numbers of days; None for other times."""
+    if time.kind is not CellKind.NUMBER or not time.assumed:
+        return None
+    finite = values[np.isfinite(values)]
+    steps = np.abs(np.diff(finite))
+    if not finite.size or not FIRST_EXCEL_DAY <= finite.min() <= finite.max() < LAST_EXCEL_DAY:
+        return None
+    if not 0.0 < (float(np.median(steps[steps > 0.0])) if steps.any() else 0.0) <= MAX_EXCEL_PERIOD_S / DAY_S:
+        return None
+    day = find_unit("time", "d")
+    return TimeBase(_with_unit(layout, time, day), reason="days of a spreadsheet") if day else None
 
 
 def _by_clock(layout: Layout, time: Column, clock: Column, raw: RawBlock) -> TimeBase | None:

@@ -63,11 +63,13 @@ _GBK_CELSIUS = "¡æ"
 """Character ℃ in the Chinese encoding GBK, read as latin-1."""
 _STAMP = re.compile(r"[:\-].*s|y{2,4}.*m", re.IGNORECASE)
 """Pattern of a format of time stamps, such as ``h:min:s.ms`` or ``yyyy-mm-dd``."""
+_REFERENCE = re.compile(r"\s+vs\b.*", re.IGNORECASE)
+"""Reference electrode after a unit, as in ``V vs. Ref.``."""
 _BRACKETED = re.compile(r"(?P<name>[^()\[\]]+)[(\[](?P<unit>[^()\[\]]*)[)\]]\s*")
 _SEPARATED = re.compile(r"(?P<name>.+)[/#](?P<unit>[^/#]+)")
 _LAST_WORD = re.compile(r"(?P<name>.+)[_ ](?P<unit>[^_ ]+)")
 _IGNORED = re.compile(r"[\s_.~/\-]+|\[\d+\](?=.)")
-_NOT_UNITS = frozenset({"time", "date"})
+_NOT_UNITS = frozenset({"time", "date", "zeit"})
 """Words after a slash that belong to the name, as in ``Date/Time``."""
 
 
@@ -107,4 +109,6 @@ def find_unit(quantity: Quantity, text: str) -> Unit | None:
         return SI_UNITS["time"]
     if quantity == "temperature" and text == _GBK_CELSIUS:
         return SI_UNITS["temperature"]
+    if quantity == "voltage":
+        text = _REFERENCE.sub("", text)
     return _UNITS[quantity].get(text.translate(_CHARACTERS).lower())
