@@ -5,7 +5,9 @@ thesis.
 """
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +45,13 @@ VALID_CAPACITY_STD = 0.02
 """Maximum std of a valid capacity, relative to the capacity of the cell file."""
 VALID_OFFSET_FRACTION = 0.5
 """Maximum std of a valid current offset, as a fraction of its std at the start."""
+_AMPLITUDE_UNITS = {1: "ohm", 4: "ohm", 7: "F", 10: "F", 13: "ohm"}
+"""Unit of amplitude a_i and offset a_(i+2) of an element, (2.5)-(2.9), by i."""
+UNITS: Mapping[str, str] = MappingProxyType(
+    {f"a{i + j}": "1" if j == 1 else unit for i, unit in _AMPLITUDE_UNITS.items() for j in range(3)}
+    | {"a16": "V", "a17": "1", "a18": "V", "a19": "V", "a20": "V", "a21": "V"}
+)
+"""Unit of a1..a21; the exponents are per unit of SOC, a16..a21 are those of (2.10)."""
 _ELEMENT_FUNCTIONS = {
     "r_s_ohm": chen_mora.r_s,  # (2.9)
     "r_ts_ohm": chen_mora.r_ts,  # (2.5)
@@ -69,7 +78,7 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
         return ParameterReport(
             publish_time=iso_utc(now_s),
             soc=None,
-            a=_cell_file_parameters(estimator.cell, a),
+            a=_with_units(_cell_file_parameters(estimator.cell, a)),
             ocv=None,
             elements={},
             state_of_health={},
@@ -96,7 +105,7 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
     return ParameterReport(
         publish_time=iso_utc(now_s),
         soc=finite(state["soc"]),
-        a=parameters,
+        a=_with_units(parameters),
         ocv=_ocv(estimator) if estimator.identifying else None,
         elements=elements,
         state_of_health=health,
@@ -119,6 +128,10 @@ def _cell_file_parameters(cell: CellModel, a: np.ndarray) -> dict[str, Parameter
     for i, (value, std) in enumerate(zip(fit.a, fit.std, strict=True), start=16):
         parameters[f"a{i}"] = Parameter(value=value, std=finite(std), valid=False, source="configured", reason=reason)
     return parameters
+
+
+def _with_units(parameters: dict[str, Parameter]) -> dict[str, Parameter]:
+    return {name: parameter.model_copy(update={"unit": UNITS[name]}) for name, parameter in parameters.items()}
 
 
 def _ocv(estimator: Estimator) -> OcvCurve:
