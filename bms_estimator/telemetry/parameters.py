@@ -41,6 +41,8 @@ LEARNED_REASON = "learned by the adaptive law, which gives no std"
 """Reason why a value of the learning law is not valid."""
 VALID_FIT_STD = 0.5
 """Maximum relative std of a valid a1..a15. Amplitudes and exponents can be separated only after a sweep of the SOC."""
+CAPACITANCE_PARAMETERS = range(7, 13)
+"""a7..a12, the parameters of C_ts and C_tl, (2.7) and (2.8)."""
 VALID_CAPACITY_STD = 0.02
 """Maximum std of a valid capacity, relative to the capacity of the cell file."""
 VALID_OFFSET_FRACTION = 0.5
@@ -92,6 +94,8 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
         observer_value = parameters[f"a{i}"] = _mark_source(parameters[f"a{i}"], from_data[i], learning)
         if estimator.identifying and not learning:
             parameters[f"a{i}"] = _with_fit_std(observer_value, fitted_parameter(record, i), now_s)
+            if i in CAPACITANCE_PARAMETERS:
+                parameters[f"a{i}"] = _with_tau_validity(parameters[f"a{i}"], estimator)
     for e, name in enumerate(ELEMENT_NAMES):  # each element has three parameters, from a1 on
         elements[name] = _mark_source(elements[name], from_data[3 * e + 1 : 3 * e + 4].any(), learning)
     if estimator.identifying:
@@ -218,8 +222,23 @@ def _with_fit_std(observer_value: Parameter, fit: IdentifiedValue | None, now_s:
     """Return the observer's value of a parameter with the std of the fit."""
     if fit is None or observer_value.source == "configured":
         return observer_value
-    fitted = _identified(fit, observer_value, VALID_FIT_STD, now_s)
-    return fitted.model_copy(update={"value": observer_value.value}) if fitted.valid else fitted
+    value = observer_value.value
+    if value is not None:  # the observer's value differs from the fit if a bound limits the fit
+        fit = fit._replace(value=value, std=math.hypot(fit.std, fit.value - value))
+    return _identified(fit, observer_value, VALID_FIT_STD, now_s)
+
+
+def _with_tau_validity(parameter: Parameter, estimator: Estimator) -> Parameter:
+    """Return a parameter of a capacitance, not valid unless data have determined the time constants.
+
+    A capacitance is a time constant divided by a resistance. The filter learns the resistances; the time constants of both RC
+    pairs follow from the ratios of the RC ladder, which only a fit to data determines.
+    """
+    r_std = float(estimator.settings_record[0]["filter"]["r_std"])
+    if not parameter.valid or r_std < VALID_STD:
+        return parameter
+    reason = f"the resistances of the RC ladder, which give the time constants, have a std of {r_std:.0%}; valid below {VALID_STD:.0%}"
+    return parameter.model_copy(update={"valid": False, "reason": reason})
 
 
 def _identified(learned: IdentifiedValue, observer_value: Parameter, limit: float, now_s: float) -> Parameter:
