@@ -12,7 +12,7 @@ class Parameter(Payload):
 
     value: float | None = Field(description="value in the unit of its name, or in ``unit``")
     std: float | None = Field(description="standard deviation in the same unit; null if unknown")
-    valid: bool = Field(description="true: the value is supported by data or configured")
+    valid: bool = Field(description="true: data support the value; a configured value is never valid")
     source: Literal["configured", "identified"]
     updated: str | None = Field(default=None, description="time of the last informative data, ISO 8601, UTC")
     reason: str | None = Field(default=None, description="reason why the value is not valid, with numbers")
