@@ -2,8 +2,8 @@
 
 from typing import TypeVar
 
+from bms_estimator.estimator.observer_conditions import observer_warnings
 from bms_estimator.estimator.settings_plausibility import implausible_settings
-from bms_estimator.estimator.stability_conditions import Condition, failed_conditions
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.mqtt.broker_config import check as check_brokers
@@ -40,7 +40,7 @@ def check_settings(settings: Settings, cell: PackModel) -> list[str]:
         *implausible_settings(settings, cell),
         *implausible_limits(settings, cell),
         *hook_warnings(settings),
-        *_failed_conditions(cell),
+        *observer_warnings(settings.observer, cell),
     ]
     if settings.mqtt is not None:
         mqtt, unchecked = _without_credentials("mqtt", settings.mqtt)
@@ -93,20 +93,3 @@ def _unreadable(
     files = {key: getattr(settings, key) for key in keys}
     unreadable = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
     return set(unreadable), [f"{section}.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unreadable.items()]
-
-
-def _failed_conditions(cell: PackModel) -> list[str]:
-    """Return a warning for each condition of Lemma 4.1.1 of the thesis that the cell's bounds fail.
-
-    A fuel cell has no such bounds, and gives no warning.
-    """
-    if not isinstance(cell, CellModel):
-        return []
-    return [f"{cell.cell.name}: {_violation(condition)}" for condition in failed_conditions(cell)]
-
-
-def _violation(condition: Condition) -> str:
-    return (
-        f"condition {condition.name} of Lemma 4.1.1 fails: {condition.left:g} is not below {condition.right:g}; "
-        "a capacitance of the observer may become negative although the SOC is above its limit"
-    )

@@ -13,6 +13,7 @@ from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.observer_conditions import observer_warnings
 from bms_estimator.estimator.settings_plausibility import implausible_settings
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads.health import RecordingHealth
@@ -79,6 +80,8 @@ async def run_pack_service(
     set_level(settings.pack.name, settings.log.level)
     for line in [*implausible_settings(settings, cell), *implausible_limits(settings, cell)]:
         log.warning("implausible setting", pack=settings.pack.name, reason=line)
+    for line in observer_warnings(settings.observer, cell):
+        log.warning("condition of the observer fails", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
     delivery = DeliveryStats(store_trouble=lambda: database.reason) if database else DeliveryStats()
     all_sinks = [*sinks, *export_sinks(settings)]

@@ -5,7 +5,9 @@ thesis.
 """
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,10 +41,19 @@ LEARNED_REASON = "learned by the adaptive law, which gives no std"
 """Reason why a value of the learning law is not valid."""
 VALID_FIT_STD = 0.5
 """Maximum relative std of a valid a1..a15. Amplitudes and exponents can be separated only after a sweep of the SOC."""
+CAPACITANCE_PARAMETERS = range(7, 13)
+"""a7..a12, the parameters of C_ts and C_tl, (2.7) and (2.8)."""
 VALID_CAPACITY_STD = 0.02
 """Maximum std of a valid capacity, relative to the capacity of the cell file."""
 VALID_OFFSET_FRACTION = 0.5
 """Maximum std of a valid current offset, as a fraction of its std at the start."""
+_AMPLITUDE_UNITS = {1: "ohm", 4: "ohm", 7: "F", 10: "F", 13: "ohm"}
+"""Unit of amplitude a_i and offset a_(i+2) of an element, (2.5)-(2.9), by i."""
+UNITS: Mapping[str, str] = MappingProxyType(
+    {f"a{i + j}": "1" if j == 1 else unit for i, unit in _AMPLITUDE_UNITS.items() for j in range(3)}
+    | {"a16": "V", "a17": "1", "a18": "V", "a19": "V", "a20": "V", "a21": "V"}
+)
+"""Unit of a1..a21; the exponents are per unit of SOC, a16..a21 are those of (2.10)."""
 _ELEMENT_FUNCTIONS = {
     "r_s_ohm": chen_mora.r_s,  # (2.9)
     "r_ts_ohm": chen_mora.r_ts,  # (2.5)
@@ -69,7 +80,7 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
         return ParameterReport(
             publish_time=iso_utc(now_s),
             soc=None,
-            a=_cell_file_parameters(estimator.cell, a),
+            a=_with_units(_cell_file_parameters(estimator.cell, a)),
             ocv=None,
             elements={},
             state_of_health={},
@@ -83,6 +94,8 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
         observer_value = parameters[f"a{i}"] = _mark_source(parameters[f"a{i}"], from_data[i], learning)
         if estimator.identifying and not learning:
             parameters[f"a{i}"] = _with_fit_std(observer_value, fitted_parameter(record, i), now_s)
+            if i in CAPACITANCE_PARAMETERS:
+                parameters[f"a{i}"] = _with_tau_validity(parameters[f"a{i}"], estimator)
     for e, name in enumerate(ELEMENT_NAMES):  # each element has three parameters, from a1 on
         elements[name] = _mark_source(elements[name], from_data[3 * e + 1 : 3 * e + 4].any(), learning)
     if estimator.identifying:
@@ -96,7 +109,7 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
     return ParameterReport(
         publish_time=iso_utc(now_s),
         soc=finite(state["soc"]),
-        a=parameters,
+        a=_with_units(parameters),
         ocv=_ocv(estimator) if estimator.identifying else None,
         elements=elements,
         state_of_health=health,
@@ -119,6 +132,10 @@ def _cell_file_parameters(cell: CellModel, a: np.ndarray) -> dict[str, Parameter
     for i, (value, std) in enumerate(zip(fit.a, fit.std, strict=True), start=16):
         parameters[f"a{i}"] = Parameter(value=value, std=finite(std), valid=False, source="configured", reason=reason)
     return parameters
+
+
+def _with_units(parameters: dict[str, Parameter]) -> dict[str, Parameter]:
+    return {name: parameter.model_copy(update={"unit": UNITS[name]}) for name, parameter in parameters.items()}
 
 
 def _ocv(estimator: Estimator) -> OcvCurve:
@@ -205,8 +222,23 @@ def _with_fit_std(observer_value: Parameter, fit: IdentifiedValue | None, now_s:
     """Return the observer's value of a parameter with the std of the fit."""
     if fit is None or observer_value.source == "configured":
         return observer_value
-    fitted = _identified(fit, observer_value, VALID_FIT_STD, now_s)
-    return fitted.model_copy(update={"value": observer_value.value}) if fitted.valid else fitted
+    value = observer_value.value
+    if value is not None:  # the observer's value differs from the fit if a bound limits the fit
+        fit = fit._replace(value=value, std=math.hypot(fit.std, fit.value - value))
+    return _identified(fit, observer_value, VALID_FIT_STD, now_s)
+
+
+def _with_tau_validity(parameter: Parameter, estimator: Estimator) -> Parameter:
+    """Return a parameter of a capacitance, not valid unless data have determined the time constants.
+
+    A capacitance is a time constant divided by a resistance. The filter learns the resistances; the time constants of both RC
+    pairs follow from the ratios of the RC ladder, which only a fit to data determines.
+    """
+    r_std = float(estimator.settings_record[0]["filter"]["r_std"])
+    if not parameter.valid or r_std < VALID_STD:
+        return parameter
+    reason = f"the resistances of the RC ladder, which give the time constants, have a std of {r_std:.0%}; valid below {VALID_STD:.0%}"
+    return parameter.model_copy(update={"valid": False, "reason": reason})
 
 
 def _identified(learned: IdentifiedValue, observer_value: Parameter, limit: float, now_s: float) -> Parameter:

@@ -65,11 +65,12 @@ def test_bash_completes_options(bash_home: dict[str, str]) -> None:
 
 def test_bash_completes_cells_of_a_battery(bash_home: dict[str, str]) -> None:
     assert complete(bash_home, "simulate", "--cell", "l") == ["lco", "lfp", "lmo", "lto", "leaf"]
-    assert complete(bash_home, "simulate", "--cell", "pem") == []
+    assert complete(bash_home, "adapt", "run.csv", "--cell", "pem") == []
 
 
 def test_bash_completes_fuel_cells_where_they_are_allowed(bash_home: dict[str, str]) -> None:
     assert complete(bash_home, "replay", "run.csv", "--cell", "pem") == ["pem_30w"]
+    assert complete(bash_home, "simulate", "--cell", "pem") == ["pem_30w"]
 
 
 def test_bash_completes_protocols(bash_home: dict[str, str]) -> None:

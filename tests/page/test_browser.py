@@ -77,7 +77,7 @@ SHOWN_TEXTS = {  # by quantity (attribute ``data-q``)
     "time_left_label": "To full",
     "energy_out_kwh": "12.35 kWh",
     "energy_in_kwh": "123.5 kWh",
-    "stop": "7.9",
+    "invalid_below": "7.9",
     "deltas": "δ₁ 3.1 %, δ₂ 7.9 %",
     "weakest_cell_soc": "38.7",
     "weakest_cell_soc_std": "3.7",  # two std in percent
@@ -246,6 +246,22 @@ async def test_unknown_values_are_hidden(browser: Browser, programs: RunningProg
         await page_tab.until_text("voltage_v", "")
         body = await page_tab.page.inner_text("body")
         assert not re.search("NaN|undefined|null|Infinity", body)
+        assert page_tab.errors == []
+
+
+async def test_the_limit_of_the_model_is_marked_only_above_0_and_is_no_instruction(
+    browser: Browser, programs: RunningPrograms
+) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        page = page_tab.page
+        for delta_2 in (0.0789, -0.0205, 0.0789, None):
+            is_shown = delta_2 is not None and delta_2 > 0.0
+            await publish_state(programs.live, **STATE_VALUES | {"delta_1": -0.0205, "delta_2": delta_2})
+            await page.locator("#invalidmark").wait_for(state="visible" if is_shown else "hidden")
+            assert await page.get_by_text("model not valid below").is_visible() is is_shown
+            meter_text = await page.get_by_role("meter", name="State of charge").get_attribute("aria-valuetext")
+            assert ("model not valid below 8 %" in (meter_text or "")) is is_shown
+            assert "stop discharging" not in await page.inner_text(".hero")
         assert page_tab.errors == []
 
 

@@ -30,6 +30,18 @@ async def test_implausible_settings_are_logged():
     assert "the board's range ends at 25.0 V" in reasons[1]
 
 
+@pytest.mark.parametrize(("law", "count"), [("improved", 1), ("scheme-1", 0), ("learning", 0)])
+async def test_failing_conditions_of_lemma_4_1_1_are_logged_for_a_law_with_bounds(law: str, count: int) -> None:
+    settings = Settings.model_validate({"observer": {"law": law}, "sensor": {"port": "/dev/none"}})
+    stop = asyncio.Event()
+    stop.set()  # the service ends at once
+    with capture_logs() as lines:
+        await run_pack_service(settings, load_cell("chen_mora"), stop=stop)
+    reasons = [line["reason"] for line in lines if line["event"] == "condition of the observer fails"]
+    assert len(reasons) == count
+    assert all("1: P9.l9 < P7.l7 of Lemma 4.1.1 fails" in reason for reason in reasons)
+
+
 @pytest.mark.parametrize(
     ("names", "ports", "mqtt", "text"),
     [

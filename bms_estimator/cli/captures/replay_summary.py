@@ -11,12 +11,14 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.telemetry.cell_columns import CELL_COLUMNS
 from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
-from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.health import sample_counters, suspicions
+from bms_estimator.telemetry.parameters import make_parameters_payload
+from bms_estimator.telemetry.stability_margin import applicable_margin
 from bms_estimator.telemetry.state import finite
 
 
@@ -66,7 +68,13 @@ class ReplayResult:
     time_steps_back: int
     """Number of samples with a timestamp before the previous sample's."""
     parameters: dict[str, LearnedParameter]
-    """Parameters of a fuel cell by the keys of its file; empty for a battery, whose parameters depend on SOC."""
+    """Parameters of a fuel cell by the keys of its file; a1..a21 of the observer for a battery."""
+    delta_1: float | None
+    """SOC below which C_ts is negative, (2.11); None for a fuel cell."""
+    delta_2: float | None
+    """SOC below which C_tl is negative, (2.12)."""
+    stability_margin: float | None
+    """SOC at the end minus the larger of both; None where it does not apply (``applicable_margin``)."""
     capacity_ah: float | None
     """Learned capacity at the end [Ah]; None without the identifier."""
     capacity_std_ah: float | None
@@ -104,6 +112,7 @@ class Summary:
         self._first: np.void | None = None
         self._last: np.void | None = None
         self._duration_s = 0.0
+        self._soc_known = False  # True if the SOC was known at the last row
         # sums of squares
         self._innovation_sum = self._error_sum = self._soc_difference_sum = 0.0
 
@@ -117,6 +126,7 @@ class Summary:
         # a step back of the clock counts as 0 s
         self._duration_s += float(np.diff(trace["time_s"], prepend=previous_s).clip(min=0.0).sum())
         self._last = trace[-1].copy()
+        self._soc_known = bool(known_rows(trace, self._soc_known)[-1])
         self._row_count += trace.size
         error_v = trace["voltage_v"] - trace["voltage_estimate_v"]
         soc_difference = trace["soc"] - trace["soc_coulomb"]
@@ -174,6 +184,9 @@ class Summary:
             gaps=counters["gaps"],
             time_steps_back=counters["time_steps_back"],
             parameters=_learned_parameters(estimator),
+            delta_1=_finite_field(self._last, "delta_1"),
+            delta_2=_finite_field(self._last, "delta_2"),
+            stability_margin=None if self._last is None else finite(applicable_margin(self._last, self._soc_known)),
             capacity_ah=capacity.value * declared_ah if capacity else None,
             capacity_std_ah=capacity.std * declared_ah if capacity else None,
             fits=pack_model.fits if pack_model else 0,
@@ -189,10 +202,11 @@ class Summary:
 
 
 def _learned_parameters(estimator: Estimator) -> dict[str, LearnedParameter]:
-    """Return the parameters of a fuel cell; empty for a battery, and before the first sample."""
-    if not isinstance(estimator.cell, FuelCellModel) or not estimator.state[0]["started"]:
+    """Return the parameters of a fuel cell, or a1..a21 of a battery; empty before the first sample."""
+    if not estimator.state[0]["started"]:
         return {}
-    parameters = fuel_cell_parameters(estimator, now_s=0.0)  # the time is not part of the result
+    report = make_parameters_payload(estimator, now_s=0.0)  # the time is not part of the result
+    parameters = report.elements if isinstance(estimator.cell, FuelCellModel) else report.a
     return {name: LearnedParameter(p.value, p.std, p.valid) for name, p in parameters.items()}
 
 

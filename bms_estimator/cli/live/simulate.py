@@ -6,11 +6,12 @@ from typing import Annotated, Literal
 
 import typer
 
-from bms_estimator.cli.options.capture_options import CELL_HELP, CapacityAh, complete_battery
+from bms_estimator.cli.options.capture_options import CELL_OR_FUEL_CELL_HELP, CapacityAh, complete_cell
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.pack_options import with_broker
-from bms_estimator.model.cell import Cell, load_cell
+from bms_estimator.model.cell import Cell, is_fuel_cell, load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.suggestion import suggestion
 from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.process.signals import stop_on_signal
@@ -22,12 +23,15 @@ from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
 from bms_estimator.simulation.simulated_pack import LOADS, LoadName, PackWithRelay, SimulatedPack
+from bms_estimator.simulation.simulated_stack import SimulatedStack
 from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 
 DEVICE_PROTOCOLS = (*METERS, *BMS_ANSWERS)
 """Protocols of the simulated devices that are not boards: battery monitors and BMS."""
 DEFAULT_LOAD_C = 3.0
 """Default load current of a board as a multiple of the capacity [1/h], at which the SOC changes visibly."""
+DEFAULT_LOAD_FRACTION = 0.5
+"""Default load current of a fuel cell as a fraction of its limiting current."""
 DEVICE_LOAD_C = 1.0
 """Default load current of a battery monitor or BMS as a multiple of the capacity [1/h]. Their packs are large."""
 
@@ -40,7 +44,8 @@ def simulate(
     cell: Annotated[
         str,
         typer.Option(
-            help=f"{CELL_HELP}; chen_mora: 275 mAh Li-ion cell of Chen and Rincón-Mora", autocompletion=complete_battery
+            help=f"{CELL_OR_FUEL_CELL_HELP}; chen_mora: 275 mAh Li-ion cell of Chen and Rincón-Mora",
+            autocompletion=complete_cell,
         ),
     ] = "chen_mora",
     capacity_ah: CapacityAh = None,
@@ -52,7 +57,7 @@ def simulate(
         float | None,
         typer.Option(
             parser=decimal(),
-            help="current of the load [A], positive on discharge; default: 3C for a board, 1C for other devices",
+            help="current of the load [A], positive on discharge; default: 3C for a board, 1C for other devices, half of the limiting current of a fuel cell",
             show_default=False,
         ),
     ] = None,
@@ -101,6 +106,20 @@ def simulate(
     --protocol simulates a BMS or battery monitor instead.
     --mqtt simulates an ESPHome node with a JK-BMS instead, for the setting `source.profile = "esphome-jk"`.
     """
+    if is_fuel_cell(cell):
+        if capacity_ah is not None or protocol is not None or mqtt is not None or load is LoadName.RELAY:
+            raise UserError(
+                f"--cell {cell}: a fuel cell is simulated on a board without relay; omit --capacity-ah, --protocol, --mqtt and "
+                "--load relay"
+            )
+        stack = load_fuel_cell(cell).pack(series, parallel=1)
+        stack_a = DEFAULT_LOAD_FRACTION * stack.fuel_cell.limiting_current_a if current_a is None else current_a
+        signal = SimulatedStack(stack, LOADS[load](stack_a, seed))
+        mode: Literal["binary", "text"] = "text" if text else "binary"
+        _run(
+            VirtualBoard(signal, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed), None, seconds
+        )
+        return
     model = load_cell(cell, capacity_ah).pack(series, parallel=1)
     load_c = DEFAULT_LOAD_C if protocol is None and mqtt is None else DEVICE_LOAD_C
     load_a = load_c * model.cell.capacity_ah if current_a is None else current_a
@@ -123,7 +142,7 @@ def simulate(
         cells = model.cell.series_count
         device = SimulatedNode(pack, cells=cells, mqtt=broker, prefix=prefix, speed=speed, seed=seed)
     elif protocol is None:
-        mode: Literal["binary", "text"] = "text" if text else "binary"
+        mode = "text" if text else "binary"
         device = VirtualBoard(pack, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed)
     elif protocol in METERS:
         device = METERS[protocol](pack, speed)
@@ -156,9 +175,11 @@ def _simulated_bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float,
         raise UserError(f"--series: {error}") from None
 
 
-def _run(device: VirtualBoard | SimulatedMeter | SimulatedNode, pack: SimulatedPack, seconds: float) -> None:
+def _run(device: VirtualBoard | SimulatedMeter | SimulatedNode, pack: SimulatedPack | None, seconds: float) -> None:
+    """Run the device, and print the SOC at the end. ``pack`` is None for a fuel cell."""
     asyncio.run(_serve(device, seconds))
-    typer.echo(f"{device.samples:,} samples in {device.time_s:.1f} s, SOC {pack.soc:.2%}", err=True)
+    soc = "" if pack is None else f", SOC {pack.soc:.2%}"
+    typer.echo(f"{device.samples:,} samples in {device.time_s:.1f} s{soc}", err=True)
 
 
 async def _serve(device: VirtualBoard | SimulatedMeter | SimulatedNode, seconds: float) -> None:

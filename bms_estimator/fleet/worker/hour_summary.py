@@ -121,7 +121,7 @@ def _measurements(h: np.void) -> dict[str, object]:
             values[f"{quantity}_{unit}"] = float(h[f"sum_{unit}"]) / count
             values[f"{quantity}_min_{unit}"] = float(h[f"min_{unit}"])
             values[f"{quantity}_max_{unit}"] = float(h[f"max_{unit}"])
-    if h["samples"]:
+    if h["samples"] and math.isfinite(h["min_margin"]):
         values["stability_margin_min"] = float(h["min_margin"])
     if h["innovations"]:
         values["innovation_rms_v"] = math.sqrt(h["sum_innovation_v2"] / h["innovations"])

@@ -117,7 +117,7 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
     exponent = _best_exponent(prior[base + 1], sign, x, y, w)
     amplitude, offset, _ = _linear_part(exponent, sign, x, y, w)
     fit.a[base], fit.a[base + 1], fit.a[base + 2] = amplitude, exponent, offset
-    _standard_errors(fit, base, sign, x, w)
+    _standard_errors(fit, base, sign, x, w, _common_variance(m, e))
 
 
 @njit(cache=True)
@@ -252,8 +252,26 @@ def _linear_part(exponent: float, sign: float, x: Floats, y: Floats, w: Floats) 
 
 
 @njit(cache=True)
-def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats) -> None:
-    """Write the standard errors, roots of the diagonal of (J' W J)^-1, by elimination; NaN if the matrix is singular."""
+def _common_variance(m: Record, e: int) -> float:
+    """Return the relative variance of the factor that the errors of all bins have in common.
+
+    The filter has one scale for a resistance at all SOCs, and the time constants of the RC pairs are constant. Therefore the
+    errors of the bins are nearly equal, and more bins do not reduce them. The mean over the visited time estimates them.
+    """
+    dwell_s = weight = 0.0
+    for b in range(BINS):
+        dwell_s += m.dwell_s[e, b]
+        weight += m.weight[e, b]
+    return dwell_s / weight
+
+
+@njit(cache=True)
+def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats, common: float) -> None:
+    """Write the standard errors; NaN if the matrix J' W J is singular.
+
+    The variances are the diagonal of (J' W J)^-1, computed by elimination, for independent errors of the bins. Amplitude and
+    offset are proportional to the common factor of the bins, so that its relative variance ``common`` is added to theirs.
+    """
     amplitude, exponent, offset = fit.a[base], fit.a[base + 1], fit.a[base + 2]
     # a weak prior keeps the matrix regular: each parameter has a std of 3 times its value
     h00, h11, h22 = (3.0 * amplitude) ** -2, (3.0 * exponent) ** -2, (3.0 * offset) ** -2
@@ -279,6 +297,7 @@ def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats) 
     d2 = h22 - l20 * h02 - l21 * l21 * d1
     if not d2 > 0.0:
         return
-    fit.std[base] = math.sqrt(1.0 / h00 + l10 * l10 / d1 + (l10 * l21 - l20) ** 2 / d2)
+    amplitude_variance = 1.0 / h00 + l10 * l10 / d1 + (l10 * l21 - l20) ** 2 / d2
+    fit.std[base] = math.sqrt(amplitude_variance + common * amplitude * amplitude)
     fit.std[base + 1] = math.sqrt(1.0 / d1 + l21 * l21 / d2)
-    fit.std[base + 2] = math.sqrt(1.0 / d2)
+    fit.std[base + 2] = math.sqrt(1.0 / d2 + common * offset * offset)

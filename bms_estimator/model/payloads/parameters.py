@@ -10,12 +10,15 @@ from bms_estimator.model.payloads.payload import Payload
 class Parameter(Payload):
     """One parameter with its error and validity."""
 
-    value: float | None = Field(description="value in the unit of its name; a1..a21 in SI units as in the thesis")
+    value: float | None = Field(description="value in the unit of its name, or in ``unit``")
     std: float | None = Field(description="standard deviation in the same unit; null if unknown")
-    valid: bool = Field(description="true: the value is supported by data or configured")
+    valid: bool = Field(description="true: data support the value; a configured value is never valid")
     source: Literal["configured", "identified"]
     updated: str | None = Field(default=None, description="time of the last informative data, ISO 8601, UTC")
     reason: str | None = Field(default=None, description="reason why the value is not valid, with numbers")
+    unit: str | None = Field(
+        default=None, description="unit of a1..a21; null: the name ends with the unit, or is a ratio"
+    )
 
 
 class OcvCurve(Payload):

@@ -40,7 +40,7 @@ export function drawState(state) {
 }
 
 function drawScale(s) {
-	const known = [s.delta_1, s.delta_2].filter(f.isNumber), stop = Math.max(0, ...known), band = 2 * (s.soc_std ?? 0);
+	const known = [s.delta_1, s.delta_2].filter(f.isNumber), invalid = Math.max(0, ...known), band = 2 * (s.soc_std ?? 0);
 	const place = (id, name, x) => {
 		const value = `${(100 * clip(x)).toFixed(2)}%`, element = $(id);
 		if (element[name] !== value) element.style[name] = element[name] = value;
@@ -49,12 +49,12 @@ function drawScale(s) {
 	place("band", "left", s.soc - band);
 	place("band", "width", clip(s.soc + band) - clip(s.soc - band));
 	place("at", "left", s.soc);
-	hide($("stopmark"), !known.length);
-	for (const [id, x] of [["stop", stop], ["stopmark", stop], ["d1", s.delta_1], ["d2", s.delta_2]]) place(id, id === "stop" ? "width" : "left", x ?? 0);
-	attribute($("stopmark"), "class", stop > 0.5 ? "left" : "");
-	put("stop", f.percent(stop));
+	for (const id of ["invalidmark", "d1", "d2"]) hide($(id), invalid <= 0);
+	for (const [id, x] of [["invalid", invalid], ["invalidmark", invalid], ["d1", s.delta_1], ["d2", s.delta_2]]) place(id, id === "invalid" ? "width" : "left", x ?? 0);
+	attribute($("invalidmark"), "class", invalid > 0.5 ? "left" : "");
+	put("invalid_below", f.percent(invalid));
 	put("deltas", [s.delta_1, s.delta_2].map((d, i) => f.isNumber(d) && `δ${"₁₂"[i]} ${f.percent(d)} %`).filter(Boolean).join(", "));
-	attribute($("fill"), "class", s.soc <= Math.max(stop, 0.1) ? "bad" : s.soc < 0.2 ? "low" : "");
+	attribute($("fill"), "class", s.soc <= 0.1 ? "bad" : s.soc < 0.2 ? "low" : "");
 	attribute($("scale"), "aria-valuenow", String(Math.round(100 * s.soc)));
-	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %; stop discharging at ${f.percent(stop, 0)} %`);
+	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %${invalid > 0 ? `; model not valid below ${f.percent(invalid, 0)} %` : ""}`);
 }

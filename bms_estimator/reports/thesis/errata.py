@@ -1,4 +1,4 @@
-"""Errata E1 to E36 of the thesis, numbered as in docs/theory/thesis.md.
+"""Errata E1 to E37 of the thesis, numbered as in docs/theory/thesis.md.
 
 Corrected numbers are computed. Printed numbers come from ``printed_values``.
 """
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from bms_estimator.estimator.stability_conditions import Condition, lemma_conditions
 from bms_estimator.kernels.cell_model.chen_mora import delta, emf
-from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell import CellModel, generic_cells, load_cell
 from bms_estimator.reports.formats import number
 from bms_estimator.reports.thesis import printed_pack, printed_values
 from bms_estimator.reports.thesis.quasi_steady import quasi_steady
@@ -44,7 +44,7 @@ class Erratum:
 
 
 def errata(s: Simulation) -> list[Erratum]:
-    """Return E1 to E36 in order."""
+    """Return E1 to E37 in order."""
     return [*_first(s), *_theory(s), *_experiments(s), *_second_audit(s), *_later_chapters()]
 
 
@@ -300,7 +300,7 @@ def _second_audit(s: Simulation) -> list[Erratum]:
 
 
 def _later_chapters() -> list[Erratum]:
-    """Return E34 to E36."""
+    """Return E34 to E37."""
     return [
         Erratum(
             "Theorem 4.1.2, proof",
@@ -318,7 +318,23 @@ def _later_chapters() -> list[Erratum]:
             "data from step 3; Continue after Return",
             "step 1; Continue cannot be reached: the loop must run until t_max and return once",
         ),
+        Erratum(
+            "2.1.2",
+            "the battery must be switched off at delta2",
+            "delta1 and delta2 say where (2.7), (2.8) with the fitted a7 to a12 are not valid, not where a battery is empty: for the "
+            f"generic cells of this project they are at most {_highest_generic_delta():.4f}, so that they would allow a discharge beyond "
+            "SOC 0. The cut-off voltage ends a discharge",
+        ),
     ]
+
+
+def _highest_generic_delta() -> float:
+    """Return the largest delta1 or delta2 of the generic cells, with the limits of a7..a12 by Lemma 4.1.3."""
+    deltas = []
+    for name in generic_cells():
+        cell = load_cell(name, capacity_ah=1.0)
+        deltas += [delta(*(cell.bounds(i).limit for i in indices)) for indices in ((8, 9, 7), (11, 12, 10))]
+    return max(deltas)
 
 
 def _starts(s: Simulation) -> str:

@@ -1,6 +1,6 @@
 """Figures 26 to 38 and 40 to 42 of the thesis: results of the procedure of chapter 5.
 
-Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+Numbers in parentheses are equations of the thesis, and E1 to E37 are its errata (``errata``).
 """
 
 import math

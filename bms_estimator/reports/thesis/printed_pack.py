@@ -1,6 +1,6 @@
 """Pack with the parameters of Tables 8 to 10 of the thesis: Figures 28 to 30, and a check of the printed currents.
 
-Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+Numbers in parentheses are equations of the thesis, and E1 to E37 are its errata (``errata``).
 """
 
 from collections.abc import Callable

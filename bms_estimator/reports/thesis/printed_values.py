@@ -1,6 +1,6 @@
 """Numbers as printed in the thesis, including misprints.
 
-Numbers in parentheses are sections and equations of the thesis, and E1 to E36 are its errata (``errata``).
+Numbers in parentheses are sections and equations of the thesis, and E1 to E37 are its errata (``errata``).
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Experimental procedure of chapter 5 of the thesis on captures: steps 1 to 3, validation, SOC by interpolation.
 
-Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+Numbers in parentheses are equations of the thesis, and E1 to E37 are its errata (``errata``).
 
 Step 1 fits the open-circuit voltage (2.10) to the relaxation tests. Step 2 estimates a1..a12, the coefficients of R_ts,
 R_tl, C_ts and C_tl, by the adaptive observer. It uses the constant load of the smallest current, with bounds that do

@@ -1,6 +1,6 @@
 """Simulations of the thesis with the cell of Chen and Mora.
 
-Numbers in parentheses are equations and sections of the thesis, and E1 to E36 are its errata (``errata``).
+Numbers in parentheses are equations and sections of the thesis, and E1 to E37 are its errata (``errata``).
 
 The thesis simulates schemes 1 to 3 (3.2.5) and the improved method (4.1.1). They differ in the law that adapts the
 coefficients a1..a15 of the elements: (3.16) in scheme 1, (3.17) in scheme 2, and (3.18) in scheme 3 and in the improved

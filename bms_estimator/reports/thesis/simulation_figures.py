@@ -1,6 +1,6 @@
 """Figures 3 to 10, 13 to 17, 19 to 23 and 39 of the thesis, recomputed.
 
-Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+Numbers in parentheses are equations of the thesis, and E1 to E37 are its errata (``errata``).
 """
 
 from collections.abc import Callable

@@ -17,6 +17,7 @@ from pyarrow.csv import read_csv
 
 from bms_estimator import estimate, load_capture, load_cell
 from bms_estimator.forecast.forecast import FORECAST
+from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 from tests.command_line import run
 
@@ -116,6 +117,26 @@ def test_estimates_sample_by_sample_agree_with_the_summary(name, capture, tmp_pa
     assert columns["soc_std"][-1] == result["soc_std_final"]
     assert columns["k"][-1] == result["k_final"]
     assert math.sqrt(np.mean(columns["innovation_v"] ** 2)) == pytest.approx(result["innovation_rms_v"])
+
+
+@pytest.mark.parametrize("law", ["improved", "learning"])
+def test_json_has_the_parameters_of_the_thesis_and_the_margin_of_the_last_row(law, capture, tmp_path, capsys):
+    pack, out = tmp_path / "pack.toml", tmp_path / "out.csv"
+    pack.write_text(
+        f'[pack]\ncell = "chen_mora"\ncapacity_ah = 3\n[observer]\nlaw = "{law}"\n[identifier]\nsoc_std = 0.05\n'
+    )
+    code, text, _ = run(capsys, "replay", capture, "--pack", pack, "--out", out, "--json")
+    assert code == 0
+    columns, result = columns_of_csv(out), json.loads(text)
+    assert list(result["parameters"]) == [f"a{i}" for i in range(1, 22)]
+    a = {name: parameter["value"] for name, parameter in result["parameters"].items()}
+    for name, values in (("delta_1", [a["a8"], a["a9"], a["a7"]]), ("delta_2", [a["a11"], a["a12"], a["a10"]])):
+        assert result[name] == columns[name][-1]
+        assert result[name] == pytest.approx(delta(*values), rel=1e-3)
+    assert result["stability_margin"] == columns["stability_margin"][-1]
+    assert result["stability_margin"] == pytest.approx(
+        result["soc_final"] - max(result["delta_1"], result["delta_2"]), abs=1e-12
+    )
 
 
 @pytest.fixture

@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.cli.main import main
+from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
+from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import set_rate_command, set_relay_command
@@ -85,6 +88,30 @@ def test_frames_of_the_configured_pack_are_sent_until_ctrl_c():
         out, err = process.communicate(timeout=LONG_S)
     assert (process.returncode, out) == (0, "")
     assert re.fullmatch(r"[\d,]+ samples in \d+\.\d s, SOC \d+\.\d\d%\n", err)
+
+
+def test_a_board_measures_a_fuel_cell_under_a_constant_load():
+    stack, current_a = load_fuel_cell("pem_30w"), 3.0
+    expected_v = polarisation(stack.a, np.zeros(LEARNABLE), np.full(1, current_a), np.full(1, np.nan))[0][0]
+    arguments = ("--cell", "pem_30w", "--load", "constant", "--current-a", str(current_a))
+    with simulate(*arguments) as (process, path):
+        with open_line(path) as line:
+            samples = decode(read(line, lambda data: decode(data)[0].size >= RATE_HZ))[0]
+        process.send_signal(signal.SIGINT)
+        err = process.communicate(timeout=LONG_S)[1]
+    assert samples["current_a"].mean() == pytest.approx(current_a, abs=0.05)
+    assert samples["voltage_v"].mean() == pytest.approx(expected_v, abs=0.1)
+    assert re.fullmatch(r"[\d,]+ samples in \d+\.\d s\n", err)
+
+
+@pytest.mark.parametrize("option", [("--capacity-ah", "3"), ("--protocol", "jk"), ("--load", "relay")])
+def test_options_of_batteries_are_rejected_for_a_fuel_cell(option, capsys):
+    with pytest.raises(SystemExit, match=r"^2$"):
+        main(["simulate", "--cell", "pem_30w", *option])
+    assert (
+        "--cell pem_30w: a fuel cell is simulated on a board without relay; omit --capacity-ah"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_relay_of_the_board_connects_the_load():

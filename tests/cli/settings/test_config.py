@@ -303,3 +303,33 @@ def test_a_rejected_url_is_shown_without_its_password(pack, capsys, section, url
     assert (code, out) == (2, "")
     assert f"{section}.url = " in err
     assert "secret" not in err
+
+
+@pytest.mark.parametrize(
+    ("law", "is_checked"), [("improved", True), ("scheme-3", True), ("scheme-1", False), ("learning", False)]
+)
+def test_check_names_failing_conditions_of_lemma_4_1_1_only_for_a_law_with_bounds(law, is_checked, pack, capsys):
+    """The bounds of chen_mora, those of Table 5 of the thesis, violate a condition (erratum 6)."""
+    pack.write_text(f'[pack]\ncell = "chen_mora"\n[observer]\nlaw = "{law}"\n')
+    code, _, err = run(capsys, "config", "check", pack)
+    assert code == 0
+    assert ("of Lemma 4.1.1 fails" in err) == is_checked
+
+
+@pytest.mark.parametrize(
+    ("nussbaum", "k0", "law", "is_zero"),
+    [
+        ("mittag-leffler", 0.0, "improved", False),
+        ("k2-cos", 0.0, "improved", True),
+        ("k2-cos", 0.5, "improved", False),
+        ("k-cos-sqrt", 0.0, "scheme-1", True),
+        ("ln-cos-sqrt-ln", 1.0, "improved", True),
+        ("ln-cos-sqrt-ln", 1.5, "improved", False),
+        ("k2-cos", 0.0, "learning", False),
+    ],
+)
+def test_check_warns_of_an_initial_gain_for_which_the_nussbaum_function_is_0(nussbaum, k0, law, is_zero, pack, capsys):
+    pack.write_text(f'[pack]\ncell = "leaf"\n[observer]\nlaw = "{law}"\nnussbaum = "{nussbaum}"\nk0 = {k0}\n')
+    code, _, err = run(capsys, "config", "check", pack)
+    assert code == 0
+    assert (f"warning: {pack}: observer.k0 = {k0:g}: N(k) of '{nussbaum}' is 0" in err) == is_zero

@@ -79,6 +79,17 @@ def test_row_has_the_estimates_at_the_end_of_the_hour(hour):
     assert abs(summary.soc_offset_correlation) <= 1.0
 
 
+@pytest.mark.parametrize(("name", "applies"), [("lfp", False), ("chen_mora", True)])
+def test_a_cell_whose_model_is_stable_at_each_soc_has_no_margin(name: str, applies: bool) -> None:
+    cell = load_cell(name, 3.0)
+    samples, _ = pulses(soc=0.8, hours=0.1)
+    samples["voltage_v"] = cell.cell.nominal_voltage_v
+    sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(cell, identifier=None)
+    add_blocks(sums, estimator, samples)
+    assert (max(estimator.state["delta_1"][0], estimator.state["delta_2"][0]) > 0.0) == applies
+    assert (row(PACK, STORE_HOUR, sums, estimator).stability_margin_min is not None) == applies
+
+
 def test_row_is_restored_from_json(hour):
     text = row(PACK, STORE_HOUR, hour[0], hour[1]).model_dump_json()
     assert Hour.model_validate_json(text).model_dump_json() == text

@@ -299,6 +299,11 @@ def corrections(simulation):
     return {f"E{n}": erratum.corrected for n, erratum in enumerate(errata(simulation), 1)}
 
 
-def test_there_are_36_errata(corrections):
-    assert len(corrections) == 36
+def test_there_are_37_errata(corrections):
+    assert len(corrections) == 37
+
+
+def test_delta1_and_delta2_of_generic_cells_are_negative(corrections):
+    """Erratum 37: a limit of the model is not a limit of the discharge."""
+    assert "they are at most -0.0205" in corrections["E37"]
     assert all(corrections.values())

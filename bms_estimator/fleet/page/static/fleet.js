@@ -174,7 +174,7 @@ const KINDS = [
 	["unknown", "Unknown", (v) => `its blocks are held${v ? `: ${v}` : ""}`],
 ];
 const NOTES = {
-	all: "The worst packs of each kind.", margin: "Live packs, smallest margin first; counted below 5 %. The model is about to become invalid: stop discharging.",
+	all: "The worst packs of each kind.", margin: "Live packs, smallest margin first; counted below 5 %. Below 0 the thesis's model is not valid.",
 	suspects: "Input faults that the identifier suspected in the last hour.", uncertain: "Live packs, widest band first; counted above ± 10 %.",
 	soc: "Live packs, lowest SOC first; counted below 10 %.", silent: "No message for three minutes or more.", clock: "The clock of the pack's edge is wrong: its hourly summaries are quarantined.",
 	dead: "Packs with blocks that no worker could process; fleet dead-letters lists these blocks.", unknown: "Packs that send blocks but are not in the table.",
