@@ -28,6 +28,12 @@ def test_a_failed_cell_keeps_its_slot() -> None:
     assert not slots.select(NO_CELLS).size
 
 
+def test_after_a_restart_with_a_broken_wire_no_live_cell_is_left_out() -> None:
+    """Slot 3 of 8 is empty, and the wire of the cell in slot 1 is broken."""
+    slots = np.array([[0.0, 3.3, 0.0, 3.31, 3.32, 3.33, 4.5, 0.0]])
+    assert CellSlots(6).select(slots).tolist() == [[0.0, 3.3, 3.31, 3.32, 3.33, 4.5]]
+
+
 def test_more_cells_than_in_series_are_a_fault_and_no_cell_voltages() -> None:
     slots = CellSlots(3)
     assert np.isnan(slots.select(np.array([LIVE]))).all()
