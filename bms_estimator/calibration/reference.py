@@ -13,17 +13,17 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.input_faults import InputFault
 
 MAX_OUTSIDE = 0.02
-"""Maximum distance of the counted SOC outside 0..1. Coulomb counting is uncertain by as much."""
+"""Maximum distance of the counted SOC outside 0..1, the usual error of coulomb counting."""
 MAX_UNEXPLAINED = 1.0 / 3.0
-"""Fraction of the voltage error that may remain if a correction of the reference explains the error. Corrections of the
-reference of a wrong model, such as the generic cell of another chemistry, leave at least 40 % of the error."""
+"""Maximum fraction of the voltage error that remains after a correction of the reference, if the reference is wrong. With a
+wrong model, such as the generic cell of another chemistry, every correction leaves at least 40 % of the error."""
 SIMILAR_ERROR = 1.5
-"""Maximum error of a correction that is named beside the best one, relative to the error of the best one. During a
-discharge alone, a wrong capacity and an offset of the current have similar effects."""
+"""Maximum remaining error of a correction that is reported together with the best one, relative to that of the best one.
+During a discharge alone, a wrong capacity and an offset of the current have similar effects."""
 START_SHIFT = 0.05
-"""Error of the initial SOC that a capture must show."""
+"""Error of the initial SOC that must be visible in the voltage of a capture."""
 START_SHIFT_V = 0.010
-"""Minimum change of the voltage by which a shift of the SOC is visible, per cell [V]. Models of a cell have such errors."""
+"""Minimum change of the voltage by which a shift of the SOC is visible, per cell [V]. Good models have errors of this size."""
 START_SHIFTS = np.linspace(-0.5, 0.5, 201)
 """Errors of the initial SOC that are tried."""
 CAPACITY_RATIOS = np.linspace(0.6, 1.5, 181)
@@ -31,15 +31,15 @@ CAPACITY_RATIOS = np.linspace(0.6, 1.5, 181)
 OFFSET_C_RATES = np.linspace(-0.05, 0.05, 201)
 """Offsets of the current that are tried, as a C-rate [1/h]."""
 FLOOR_QUANTILE = 0.02
-"""Fraction of the samples whose currents are below the smallest current that occurs regularly."""
+"""Quantile of the absolute current that estimates the current between the loads. It ignores a few smaller values."""
 FLOOR_TOLERANCE = 0.2
-"""Maximum deviation from the smallest current, relative to it."""
+"""Maximum deviation of a sample from the current between the loads, relative to this current."""
 MIN_LOAD_FACTOR = 5.0
-"""Minimum ratio of the largest current to the smallest. A constant load has no current between loads."""
+"""Minimum ratio of the largest current to the current between the loads. With a constant load, both are the same."""
 MIN_FLOORS = 3
-"""Minimum number of periods with the smallest current."""
+"""Minimum number of periods between loads."""
 MIN_FLOOR_FRACTION = 0.1
-"""Minimum fraction of the samples with the smallest current."""
+"""Minimum fraction of the samples between loads."""
 MAX_POINTS = 4000
 """Approximate number of samples for which corrections are tried."""
 FAULTS = InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.CAPACITY | InputFault.VOLTAGE | InputFault.CURRENT
@@ -48,7 +48,7 @@ FAULTS = InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.CAPACITY | 
 
 @dataclass(frozen=True)
 class ReferenceFault:
-    """Error of the reference.
+    """Error of the coulomb counting that a model is compared with.
 
     Attributes:
         text: Sentence on the error and its remedy.
@@ -61,7 +61,7 @@ class ReferenceFault:
 
 @dataclass(frozen=True)
 class _Correction:
-    """Correction of the reference.
+    """Correction of the capacity, the initial SOC or the current.
 
     Attributes:
         text: Description, such as ``a capacity of about 3 Ah``.
@@ -80,7 +80,7 @@ def reference_faults(
     Args:
         validation: Validation of ``cell`` on a capture.
         cell: Cell of the validation.
-        good_rms_v: RMS error of the voltage up to which nothing must be explained, per cell [V].
+        good_rms_v: RMS error of the voltage up to which no explanation is searched, per cell [V].
         faults: Faults of the input that the estimator suspected.
     """
     curve = _Curve(validation, cell)
@@ -121,7 +121,7 @@ class _Curve:
         return ocv_of_each(soc, *self._grid)
 
     def rms_v(self, soc: Floats) -> float:
-        """Return the RMS error of the voltage with another SOC of the samples, per cell [V]; 0 without samples."""
+        """Return the RMS error of the voltage if the samples had the SOCs ``soc``, per cell [V]; 0 without samples."""
         if soc.size == 0:
             return 0.0
         error_v = self._error_v + self._ocv_v - self._at(soc)
@@ -210,7 +210,7 @@ def _start(curve: _Curve, validation: Validation) -> _Correction | None:
 
 
 def _constant_floor(validation: Validation, cell: CellModel) -> str | None:
-    """Return a sentence if the current between loads is constant, but not 0, and its charge matters."""
+    """Return a sentence if the current between the loads is constant, but not 0, and its charge exceeds ``MAX_OUTSIDE``."""
     current_a = validation.current_a
     floor_a = float(np.quantile(np.abs(current_a), FLOOR_QUANTILE)) * float(np.sign(np.median(current_a)) or 1.0)
     is_floor = np.abs(current_a - floor_a) <= FLOOR_TOLERANCE * abs(floor_a)

@@ -54,11 +54,11 @@ def soc_errors(
     """Run an estimator over the samples of a validation, and compare its SOC with coulomb counting.
 
     The first ``SETTLING_S`` are not scored, because the estimator searches its initial SOC. SOCs below ``MIN_SOC`` are not
-    scored either. A voltage of the other side of a step of the current counts as held, because the steps would seem to have no
-    resistance, or the wrong sign.
+    scored either. If voltage and current of a sample are of different sides of a step, the voltage is marked as held.
+    Otherwise the resistance would seem to be 0 or negative.
 
     Args:
-        estimator: Estimator without samples.
+        estimator: New estimator that has processed no samples.
         rows: All samples of the capture, dtype ``SAMPLE``.
         validation: Validation of the capture. If it begins later than the capture, the estimator begins there as well.
         on_block: Receives each block of the trace.

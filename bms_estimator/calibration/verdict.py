@@ -183,7 +183,7 @@ def judge(runs: Sequence[Run], cell: CellModel, covered: Coverage | None = None)
 
 
 def is_fitted_to(cell: CellModel, samples: SampleBlock) -> bool:
-    """Return True if the cell file was fitted to a capture, of which ``samples`` are all as they were read."""
+    """Return True if the cell file was fitted to the capture with these samples. They must be complete and unchanged."""
     return cell.fit is not None and capture_digest(samples) in cell.fit.captures
 
 
@@ -220,9 +220,9 @@ def _voltage_sentences(grade: Grade | None, errors: VoltageErrors, *, is_explain
     """Return the sentences on the voltage errors.
 
     Args:
-        grade: Grade of the errors; None: not stated.
+        grade: Grade of the errors; None: the sentences state no grade.
         errors: The errors.
-        is_explained: True if the errors are those of the reference, and not of the model.
+        is_explained: True if an error of the reference explains the errors, so that the model gets no grade.
     """
     subject = (
         "The measured voltage differs from the model by" if is_explained else "The model predicts the voltage within"
@@ -282,7 +282,7 @@ def _unknown_conditions(covered: Coverage) -> list[str]:
 
 
 def _unknown_temperatures(low_c: float, high_c: float) -> list[str]:
-    """Return the usual temperatures that the captures, between two temperatures [°C], do not cover."""
+    """Return the usual temperatures that captures between ``low_c`` and ``high_c`` [°C] do not cover."""
     below, above = low_c > USUAL_MIN_C, high_c < USUAL_MAX_C
     if below and above and round(low_c) == round(high_c):
         return [f"temperatures other than {low_c:.0f} °C"]
@@ -290,7 +290,7 @@ def _unknown_temperatures(low_c: float, high_c: float) -> list[str]:
 
 
 def _unknown_currents(direction: str, c_rate: float) -> str:
-    """Return the currents of a direction that captures with at most ``c_rate`` do not cover."""
+    """Return the currents of a direction that captures with currents up to ``c_rate`` do not cover."""
     return direction if c_rate < MIN_LOAD_C_RATE else f"{direction} above {c_rate:.2g} C"
 
 

@@ -1,4 +1,4 @@
-"""Warnings about settings of the observer for which the thesis's law does not work as described.
+"""Warnings about settings of the observer that violate conditions of the thesis.
 
 Numbers in parentheses are equations of the thesis.
 """
@@ -11,7 +11,7 @@ from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.settings.observer import ObserverSettings
 
 LAWS_WITH_BOUNDS = ("improved", "scheme-3")
-"""Laws that adapt the parameters by (3.18). Lemma 4.1.1 is on the bounds of (3.18) only."""
+"""Laws that adapt the parameters by (3.18). Lemma 4.1.1 applies to the bounds of (3.18) only."""
 MAX_K_WITHOUT_GAIN = {"k2-cos": 0.0, "k-cos-sqrt": 0.0, "ln-cos-sqrt-ln": 1.0}
 """Adaptive gain k up to which a Nussbaum function N(k) is 0 [V^2 s]."""
 
@@ -19,7 +19,7 @@ MAX_K_WITHOUT_GAIN = {"k2-cos": 0.0, "k-cos-sqrt": 0.0, "ln-cos-sqrt-ln": 1.0}
 def observer_warnings(observer: ObserverSettings, cell: PackModel) -> Iterator[str]:
     """Yield a warning for each condition of Lemma 4.1.1 that fails with (3.18), and one if N(k0) is 0.
 
-    A fuel cell, and the law ``learning``, use neither (3.18) nor N(k), and give no warning.
+    A fuel cell and the law ``learning`` use neither (3.18) nor N(k), so that they give no warning.
     """
     if not isinstance(cell, CellModel) or observer.law == "learning":
         return

@@ -10,16 +10,16 @@ MIN_CELL_V, MAX_CELL_V = 0.1, 6.0
 """Range of the absolute voltage of a live cell [V]. Empty slots read 0 V, a few millivolts of noise, or the largest number of
 their format. No single cell exceeds 5 V."""
 MIN_SAMPLES = 10
-"""Minimum number of samples with a wrong number of cells before ``CellSlots`` gives a reason. A device may report its cells in
-several responses, so that the first samples have a part of them."""
+"""Minimum number of samples with a wrong number of cells before ``CellSlots`` gives a reason. If a device reports its cells in
+several responses, the first samples lack some of them."""
 
 
 class CellSlots:
     """Cell slots of one device.
 
-    Many devices report more slots than their pack has cells. The live slots are the cells if there are as many of them as
-    cells in series. These slots remain the cells when a cell fails. Until then the live slots and the first of the others are the cells. The division of
-    the samples into blocks does not change the selection.
+    Many devices report more slots than their pack has cells. Once a sample has as many live slots as cells in series, these
+    slots are the cells, even if a cell fails later. Before that, the live slots and the first of the others are the cells.
+    The division of the samples into blocks does not change the selection.
 
     Args:
         series: Number of cells in series.
@@ -32,12 +32,12 @@ class CellSlots:
         self._series, self._slots, self._is_known = series, np.arange(series), False
         self.fault = self._excess_text = ""
         self._excess_samples = 0  # number of successive samples with too many live slots
-        # number of samples with live slots and their largest number of these, as long as they are too few
+        # until enough cells are live: number of samples with live slots, and the largest number of live slots
         self._samples = self._max_cells = 0
 
     @property
     def reason(self) -> str:
-        """Reason why single cells have no estimates, as a sentence; empty if they have, and in the first samples."""
+        """Reason why single cells have no estimates, as a sentence; empty if they have estimates, and in the first samples."""
         if self._excess_samples >= MIN_SAMPLES:
             return self._excess_text
         if self._samples < MIN_SAMPLES or self._has_enough:

@@ -8,15 +8,15 @@ from bms_estimator.model.time_faults import gap_s
 from bms_estimator.model.unmeasured_time import MAX_FLOW_S, UNMEASURED_S
 
 MIN_END_FRACTION = 0.01
-"""Minimum current at an end of a gap that counts as a load, as a fraction of the largest current."""
+"""Minimum current before or after a gap that counts as a load, as a fraction of the largest current."""
 
 
 def step_charges_as(time_s: Floats, current_a: Floats) -> Floats:
     """Return the charge from each sample to the next one [As].
 
-    The current is constant until the next sample. Over a gap it is the smaller of both ends, or 0 if their signs differ, as in
-    the estimator. A gap longer than ``MAX_FLOW_S`` carries no charge, because a recording that was interrupted for hours does
-    not show which current flowed.
+    The current is constant until the next sample. Over a gap it is the smaller of the currents before and after it, or 0 if
+    their signs differ, as in the estimator. A gap longer than ``MAX_FLOW_S`` carries no charge, because a recording that was
+    interrupted for hours does not show which current flowed.
 
     Args:
         time_s: Shape (n,) [s]. A step back carries no charge.

@@ -16,11 +16,11 @@ MAX_CURRENT_CHANGE = 0.1
 """Maximum change of the current between the mismatched sample and its neighbor with the same current, as a fraction of the
 step."""
 MAX_VOLTAGE_CHANGE = 0.05
-"""Maximum change of the voltage at the step of the current, as a fraction of the voltage's response one sample earlier or
-later. The ohmic drop of a cell is a larger part of its response within the usual sample periods."""
+"""Maximum change of the voltage at the step of the current, as a fraction of the response one sample earlier or later. A larger
+change is the ohmic drop, so that voltage and current belong together."""
 MIN_RATE_RATIO = 3.0
-"""Minimum ratio of the rate of the response to the rate of the voltage before an early or after a late response. A slow
-response, such as the fall of the voltage near empty, is not a delayed one."""
+"""Minimum ratio of the response's rate of change to that of the voltage in the interval beyond it: after a late response, or
+before an early one. A steady fall of the voltage, as near empty, is not a delayed response."""
 MIN_RESPONSE = 5.0
 """Minimum response of the voltage, in multiples of its median change between two samples, so that noise is not a response."""
 
@@ -41,7 +41,7 @@ def with_matched_voltages(samples: SampleBlock) -> SampleBlock:
     """Return the samples with the voltage of each mismatched one replaced by that of its neighbor with the same current.
 
     Args:
-        samples: As in ``are_mismatched``; returned itself if no sample is mismatched, because a long capture is large.
+        samples: Samples as for ``are_mismatched``. They are returned without a copy if none is mismatched.
     """
     old, early = np.flatnonzero(_old_voltages(samples)), np.flatnonzero(_early_voltages(samples))
     if not old.size and not early.size:
@@ -56,9 +56,8 @@ def with_matched_voltages(samples: SampleBlock) -> SampleBlock:
 
 def _early_voltages(samples: SampleBlock) -> NDArray[np.bool_]:
     """Return which samples have the current before a step and the voltage after it."""
-    return np.asarray(
-        _old_voltages(samples[::-1])[::-1], dtype=np.bool_
-    )  # backward in time, an early voltage is an old one
+    # backward in time, an early voltage is an old one
+    return np.asarray(_old_voltages(samples[::-1])[::-1], dtype=np.bool_)
 
 
 def _old_voltages(samples: SampleBlock) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""SOC at the first sample of a capture, and the proof that the cell is full there."""
+"""SOC at the first sample of a capture, and whether the cell is full there."""
 
 import math
 from collections.abc import Sequence
@@ -13,18 +13,19 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, r_s, soc_from_ocv
 from bms_estimator.model.cell import CellModel, TableOcv, generic_cells, load_cell
 
 FULL_SOC = 0.97
-"""Minimum SOC by the voltage of a first rest that proves a full cell. Rested full cells of one type differ by some 30 mV, and
-cells rest 20 to 50 mV below the voltage at the end of their charge."""
+"""Minimum SOC by the voltage of the first rest at which the cell counts as full. Rested full cells of one type differ by some
+30 mV, and cells rest 20 to 50 mV below the voltage at the end of their charge."""
 MAX_RANGE = 0.3
-"""Maximum range of the SOCs that a voltage allows if it determines the SOC. The OCV of a generic cell allows about 0.2 without
-a plateau, and 0.6 on the plateau of LFP."""
+"""Maximum width of the range of SOCs that fit a voltage, if the voltage determines the SOC. With generic cells the width is
+about 0.2 without a plateau, and 0.6 on the plateau of LFP."""
 CURVE_STD_V = 0.005
 """Standard deviation of an OCV curve without an error column, per cell [V]."""
 SAME_START_V = 0.02
 """Maximum difference of the first rests of captures that start at the same SOC, per cell [V]. Full charges vary by as
 much."""
 MAX_EXCESS = 0.1
-"""Maximum SOC that a capture draws beyond its SOC by voltage. More shows that the OCV curve is of another chemistry."""
+"""Maximum discharged charge above the initial charge by the voltage, as a fraction of the capacity. A larger excess shows that
+the OCV curve is of another chemistry."""
 MAX_MEDIAN_DIFFERENCE_V = 0.15
 """Maximum difference between the median voltage of a capture and the OCV at SOC 0.5 of a cell of its chemistry [V]."""
 
@@ -66,14 +67,14 @@ def starts_of(loads: Sequence[CleanCapture], cell: CellModel, initial_soc: float
     Args:
         loads: Captures of one cell.
         cell: Cell whose OCV gives the SOC of a rest.
-        initial_soc: SOC 0..1 of the captures that start at the highest voltage; None: by their voltages.
+        initial_soc: SOC 0..1 of the captures that start at the highest voltage; None: their voltages determine it.
     """
     highest_v = max(load.start_v for load in loads) - SAME_START_V * cell.cell.series_count
     return [_start_of(load, cell, initial_soc if load.start_v >= highest_v else None) for load in loads]
 
 
 def initial_soc(load: CleanCapture, cell: CellModel) -> float:
-    """Return SOC at the first sample by the voltage of the first rest; without a rest, by the voltage plus i R_s."""
+    """Return the SOC whose OCV is the voltage of the first rest or, without a rest, the first voltage plus i R_s."""
     return soc_from_ocv(_open_circuit_v(load, cell), *ocv_grid(cell))
 
 
@@ -97,7 +98,7 @@ def _start_of(load: CleanCapture, cell: CellModel, given: float | None) -> Start
 
 
 def _is_full_of_another_chemistry(load: CleanCapture, cell: CellModel, soc: float) -> bool:
-    """Return True if the capture draws more than ``soc`` allows, and starts like a full generic cell of another chemistry."""
+    """Return True if the capture draws more charge than ``soc`` allows, and its voltages fit a full generic cell."""
     capacity_ah, series = cell.cell.capacity_ah, cell.cell.series_count
     if load.discharged_ah.max() < (soc + MAX_EXCESS) * capacity_ah:
         return False
@@ -116,7 +117,7 @@ def _open_circuit_v(load: CleanCapture, cell: CellModel) -> float:
 
 
 def _soc_range(load: CleanCapture, cell: CellModel) -> tuple[float, float]:
-    """Return the lowest and the highest SOC whose OCV agrees with the first voltage, with error and hysteresis."""
+    """Return the lowest and the highest SOC whose OCV agrees with the first voltage within the OCV's error and hysteresis."""
     grid_v = ocv_grid(cell)[0]
     soc = np.linspace(0.0, 1.0, grid_v.size)
     tolerance_v = np.full(soc.size, CURVE_STD_V * cell.cell.series_count)

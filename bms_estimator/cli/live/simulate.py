@@ -176,7 +176,7 @@ def _simulated_bms(protocol: str, pack: SimulatedPack, cell: Cell, speed: float,
 
 
 def _run(device: VirtualBoard | SimulatedMeter | SimulatedNode, pack: SimulatedPack | None, seconds: float) -> None:
-    """Run the device, and print the SOC at the end. ``pack`` is None for a fuel cell."""
+    """Run the device, and print the SOC at the end. A fuel cell has no ``pack``."""
     asyncio.run(_serve(device, seconds))
     soc = "" if pack is None else f", SOC {pack.soc:.2%}"
     typer.echo(f"{device.samples:,} samples in {device.time_s:.1f} s{soc}", err=True)

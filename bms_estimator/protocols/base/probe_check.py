@@ -14,18 +14,18 @@ from bms_estimator.model.sample import MAX_C, MIN_C, NO_PROBES, PROBE, ProbeBloc
 STEP_K = 30.0
 """Change of a probe that is accepted at once [K]. The delays of the alarms suppress single glitches of this size."""
 NEAR_K = 10.0
-"""Maximum change to a reading of ``OPEN_OR_SHORT_C`` that is accepted [K]."""
+"""Maximum accepted change from the last credible reading to one of ``OPEN_OR_SHORT_C`` [K]."""
 RATE_K_PER_S = 20.0
 """Maximum rate of a probe [K/s]. In thermal runaway a probe on a cell rises by several K/s."""
 HOT_C = 45.0
 """Temperature above which a fall is checked [C]. It is the usual limit of charging; cells are seldom hotter."""
 SUSTAINED_S = 10.0
-"""Time for which a probe must have been hot [s], the default delay of ``over_temperature``. Glitches are shorter."""
+"""Time above ``HOT_C`` after which a fall is checked [s], the default delay of ``over_temperature``. Glitches are shorter."""
 COOLING_K_PER_S = 0.5
 """Maximum rate at which a hot probe cools [K/s]. A cell of 70 J/K loses 5 W to forced air, and cools by less than 0.1 K/s. The
 margin is for probes on busbars and transistors."""
 COOLING_TOLERANCE_K = 5.0
-"""Maximum reading below that cooling [K], for noise and resolution."""
+"""Maximum fall beyond ``COOLING_K_PER_S`` [K], for noise and resolution."""
 MAX_DEVIATION_K = 30.0
 """Maximum difference of a sound probe from the median of all probes [K]. The project's choice, twice the usual difference
 between the cells of a pack."""
@@ -34,7 +34,7 @@ _FIELDS = ("temperature_c", "temperature_min_c", "temperature_max_c")
 OPEN_OR_SHORT_C = (-40.0, -30.0, 127.0)
 """Plausible readings that devices report for an open or shorted probe [C]; 255, -273 and 3276.7 are implausible anyway."""
 OPEN_OR_SHORT_TOLERANCE_K = 0.2
-"""Maximum deviation from such a reading [K], caused by conversion from kelvin."""
+"""Maximum deviation from a reading of ``OPEN_OR_SHORT_C`` [K], caused by conversion from kelvin."""
 
 
 class CheckedProbes(NamedTuple):
@@ -78,7 +78,7 @@ class ProbeCheck:
         )
 
     def apply_to_single_probe(self, block: SampleBlock) -> None:
-        """Check the only probe of a device, as ``apply`` does. Blocks without a remarkable reading are checked at once.
+        """Check the only probe of a device, as ``apply`` does. A block of ordinary readings is checked without a loop.
 
         Args:
             block: Samples with the readings of the probe as their temperatures; changed in place.
@@ -135,11 +135,11 @@ class _Probe:
         self._doubted_c = math.nan  # previous reading if it was not credible
         self._hot_c, self._hot_s = -math.inf, 0.0  # last temperature above ``HOT_C`` that was sustained, and its time
         self._begin_s = math.inf  # time of the first credible reading after a gap
-        # times and rising readings: the first one is the lowest of the last ``SUSTAINED_S``
+        # (time, reading) in the last ``SUSTAINED_S``, each lower than all later ones, so that the first is the minimum
         self._lowest = deque[tuple[float, float]]()
 
     def accepts_all(self, times_s: Floats, readings_c: Floats) -> bool:
-        """Accept readings that are all credible and not hot, or absent; otherwise return False, and change nothing."""
+        """Accept readings if each is credible and not hot, or absent; otherwise return False and change nothing."""
         rows = np.flatnonzero(~np.isnan(readings_c))
         if rows.size:
             present_c = readings_c[rows]
@@ -166,7 +166,7 @@ class _Probe:
         return possible
 
     def _follow_heat(self, time_s: float, reading_c: float, cooled_c: float) -> None:
-        """Update the sustained temperature. ``cooled_c`` is the lowest one to which the probe can have cooled since then [C]."""
+        """Update the last sustained temperature, from which the probe can have cooled to ``cooled_c`` [C]."""
         if math.isinf(self._begin_s) or time_s - self._credible_s > SUSTAINED_S:
             self._begin_s = time_s
             self._lowest.clear()
@@ -187,7 +187,7 @@ class _Probe:
             return abs(change_k) <= NEAR_K
         if math.isnan(change_k) or abs(change_k) <= STEP_K:
             return True
-        if not math.isnan(self._doubted_c):  # only as far as the previous reading confirms the change
+        if not math.isnan(self._doubted_c):  # count only the part of the change that the previous reading confirms
             confirmed_k = math.copysign(1.0, change_k) * (self._doubted_c - self.credible_c)
             if confirmed_k < 0.0:
                 return False
@@ -196,7 +196,7 @@ class _Probe:
 
 
 def _find_outliers(readings_c: dict[int, float]) -> tuple[set[int], set[int]]:
-    """Return the numbers of the outliers, and of all suspected probes.
+    """Return the indices of the outliers, and of all suspected probes.
 
     If the majority does not show which probe is wrong, there is no outlier, and the lowest and the highest are suspected.
     """

@@ -1,4 +1,4 @@
-"""Values of the alarms on measured quantities."""
+"""Values that alarms on measured quantities compare with their limits."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from bms_estimator.settings.alarms import AlarmName
 
 
 def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> dict[AlarmName, Floats]:
-    """Return the values of the alarms on measured quantities, each of shape (n,).
+    """Return the values that the alarms compare with their limits, each of shape (n,).
 
     Args:
         samples: Shape (n,), dtype SAMPLE.
@@ -55,8 +55,8 @@ def uncertain_values(
         samples: Shape (n,), dtype SAMPLE.
         cells: As for ``measured_values``, with the number of cell voltages in the third column.
         expected_cells: Largest number of cell voltages so far.
-        low_v: Voltage of the pack below which it has no over-voltage, so that a wire is broken [V].
-        low_cell_v: The same for a cell [V].
+        low_v: Voltage of the pack below which its wire may be broken [V].
+        low_cell_v: Voltage of a cell below which its wire may be broken [V].
     """
     has_probe_fault, is_saturated = (
         has_bit(samples, bit) for bit in (SampleStatus.PROBE_FAULT, SampleStatus.CURRENT_SATURATED)
@@ -83,7 +83,7 @@ def has_bit(samples: SampleBlock, bit: SampleStatus) -> NDArray[np.bool_]:
 def _extreme_temperatures(samples: SampleBlock) -> tuple[Floats, Floats]:
     """Return the temperatures of the coldest and of the hottest probe [C], each of shape (n,).
 
-    Samples of other programs may have only a mean temperature, and extremes that do not enclose it. The mean is then used.
+    Samples of other programs may have only a mean temperature, or extremes that do not enclose it. The mean is then used.
     """
     mean_c, lowest_c, highest_c = (samples[f"temperature_{name}c"] for name in ("", "min_", "max_"))
     has_extremes = (lowest_c <= mean_c) & (mean_c <= highest_c)

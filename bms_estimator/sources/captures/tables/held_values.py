@@ -9,21 +9,21 @@ from bms_estimator.model.sample import SampleStatus
 from bms_estimator.sources.captures.tables.layout import RawBlock, Role
 
 SETTLE_S = 0.5
-"""Maximum time between a voltage and a current of one sample [s], as the default of an MQTT source."""
+"""Maximum time between the voltage and the current of one sample [s], the default of an MQTT source."""
 MAX_SILENT_S = 3600.0
-"""Time without a change after which values no longer hold, because the recording probably stopped [s]."""
+"""Maximum pause of both values in which they are repeated [s]. In a longer pause the recording probably stopped."""
 MAX_HELD_S = 86_400.0
 """Maximum time for which a value holds while the other one changes [s]."""
 REPEAT_PERIODS = 1.5
 """Time without a change after which the values are repeated, in periods of the recording."""
 MIN_REPEAT_S = 5.0
-"""Minimum interval of repeated values [s]. The estimator tolerates longer steps in a slow recording only."""
+"""Minimum interval of repeated values [s], to limit their number. Longer intervals would be gaps in a fast recording."""
 PERIOD_QUANTILE = 0.1
 """Quantile of the times between two changes that estimates the period. A value often stays the same for several periods."""
 MIN_STEPS = 20
 """Minimum number of steps of the current that determine its period. With fewer, the steps of the voltage count too."""
 MIN_PERIOD_S, MAX_PERIOD_S = 0.1, 60.0
-"""Range of the period [s]. The steps of a value that rarely changes are longer."""
+"""Range of the period [s]. Longer steps are those of a value that rarely changes."""
 
 
 class TimedValues(NamedTuple):
@@ -51,9 +51,9 @@ def assemble(voltage: TimedValues, current: TimedValues, temperature: TimedValue
 
     A voltage and a current within ``SETTLE_S`` of each other belong to one sample. A sample with only a new current is marked as
     having a held voltage. A sample with only a new voltage has the last current. It is marked as having a held current if the
-    current changes within a period, because the change may have been earlier than its record. A current that holds is repeated,
-    with a held voltage, so that its charge counts up to the period before its next change. There are no samples while voltage
-    or current is unavailable, and no repeated ones in a pause longer than ``MAX_SILENT_S``.
+    current changes within a period, because the change may have been earlier than its record. An unchanged current is
+    repeated, with a held voltage, until one period before its next change, so that its charge counts. There are no samples
+    while voltage or current is unavailable, and no repeated ones in a pause longer than ``MAX_SILENT_S``.
     """
     period_s = _period(voltage, current)
     changes_s = _sample_times(voltage, current)

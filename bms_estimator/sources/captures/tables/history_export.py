@@ -1,4 +1,4 @@
-"""Reader of histories in long form, such as the history of Home Assistant: choice of the entities of a battery."""
+"""Reader of histories in long form, such as that of Home Assistant. It chooses the entities of a battery."""
 
 import re
 from array import array
@@ -21,14 +21,14 @@ from bms_estimator.sources.captures.tables.units import SI_UNITS, Quantity, Unit
 
 DIALECT = Dialect("history of entities", time=(), current=(), voltage=())
 NAME_COLUMNS = ("entity_id", "_field")
-"""Columns whose cells are preferred as names, if they differ in all entities."""
+"""Preferred columns for the names of entities, if each entity has a cell of its own there."""
 UNAVAILABLE = frozenset({"", "unavailable", "unknown", "none", "null"})
-"""States that end the last value."""
+"""States without a value. The value before them ends there."""
 WORDS: dict[Quantity, frozenset[str]] = {
     "voltage": frozenset({"voltage", "volt", "volts", "spannung"}),
     "current": frozenset({"current", "amps", "ampere", "amperes", "strom"}),
 }
-"""Words in names of entities without a unit."""
+"""Words by which entities without a unit are recognized."""
 _WORD = re.compile(r"[^\W\d_]+")
 
 
@@ -36,10 +36,10 @@ class _Entity:
     """Values of one entity.
 
     Args:
-        labels: Names and cells of the columns that name it.
+        labels: Names and cells of the columns that identify it.
 
     Attributes:
-        labels: Names and cells of the columns that name it.
+        labels: Names and cells of the columns that identify it.
         unit: Unit as text; empty if the file states none.
         name: Name for messages.
         invalid: Place and text of the first value that is not a number; empty without one.
@@ -72,14 +72,14 @@ class _Entity:
         return bool(np.isfinite(np.array(self._values)).any())
 
     def timed_values(self, time_unit: Unit) -> TimedValues:
-        """Return the values in the order of time. Of several values at one time the last one in the file counts."""
+        """Return the values in the order of time; of several values at one time, the last one in the file."""
         times_s = self.times * time_unit.factor
         order = np.argsort(times_s, kind="stable")
         is_last = np.append(np.diff(times_s[order]) > 0.0, True)
         return TimedValues(times_s[order][is_last], np.array(self._values)[order][is_last])
 
     def looks_like(self, quantity: Quantity) -> bool:
-        """Return True if its unit is one of the quantity, or if it has no unit but a name of the quantity."""
+        """Return True if the unit is one of the quantity. Without a unit, a word for the quantity must be in the labels."""
         if self.unit:
             return find_unit(quantity, self.unit) is not None
         words = {word.lower() for _, cell in self.labels for word in _WORD.findall(cell)}
@@ -91,7 +91,7 @@ class HistoryExport:
 
     Args:
         path: The file.
-        finder: Names of entities that the user gave by quantity, and of the column with the time.
+        finder: Names given by the user: the entity of each quantity, and the column with the time.
         records: Records of the file.
 
     Attributes:
@@ -137,7 +137,7 @@ class HistoryExport:
         yield self._block
 
     def _read(self, records: CsvRecords | JsonRecords) -> Sequence[_Entity]:
-        """Return the entities with numbers, with their names."""
+        """Return the entities that have numbers, and set their names."""
         entities = dict[Labels, _Entity]()
         for record in records:
             try:
@@ -179,7 +179,7 @@ class HistoryExport:
         return found or [entity for entity in self._entities if name in dict(entity.labels).values()]
 
     def _unclear(self, reason: str) -> UserError:
-        """Return the error for entities that are not clear. It lists the entities and shows the option to give."""
+        """Return the error of an ambiguous or missing entity. It lists the entities and shows the option that chooses one."""
         names = [entity.name for entity in self._entities]
         examples = {"voltage": self._similar("voltage"), "current": self._similar("current")}
         example = ",".join(
@@ -227,7 +227,7 @@ def _parse_time(cell: str) -> float:
 
 
 def _names(labels: Sequence[Mapping[str, str]]) -> Sequence[str]:
-    """Return a name of each entity: its cell in a column that differs in all of them, otherwise all cells that differ."""
+    """Return the name of each entity: its cell in a column without repetitions, otherwise its cells in all differing columns."""
     columns = list(dict.fromkeys(column for each in labels for column in each))
     for column in sorted(columns, key=lambda column: column not in NAME_COLUMNS):
         names = [each.get(column, "") for each in labels]

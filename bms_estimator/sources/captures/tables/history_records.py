@@ -33,6 +33,7 @@ class _Form(NamedTuple):
 
 _HOME_ASSISTANT = _Form("state", ("last_updated", "last_changed"), "entity_id")
 _COMPRESSED = _Form("s", ("lu", "lc"), "entity_id")
+"""Short keys of Home Assistant's WebSocket."""
 _FORMS = (
     _HOME_ASSISTANT,
     _Form("_value", ("_time",)),
@@ -42,7 +43,7 @@ _FORMS = (
 """Columns of Home Assistant, InfluxDB 2, InfluxDB 1 and Grafana."""
 _UNIT = "unit_of_measurement"
 _MEASUREMENTS = ("_measurement", "name")
-"""Columns with the measurement in InfluxDB, which is the unit if Home Assistant wrote it."""
+"""Columns of InfluxDB with the name of the measurement. Home Assistant writes the unit as this name."""
 _MEASURED: tuple[Quantity, ...] = ("voltage", "current", "temperature")
 _NO_LABELS = frozenset({"", "result", "table", "_start", "_stop", _UNIT})
 """Columns that do not name an entity."""
@@ -72,7 +73,7 @@ class CsvRecords:
 
     Args:
         path: The file.
-        finder: Column of the time that the user gave.
+        finder: Gives the column of the time, if the user named one.
         form: Names of the columns.
         header: Cells of the header.
         first_line: Number of the line after the header, counted from 1.
@@ -81,7 +82,7 @@ class CsvRecords:
     Attributes:
         description: Kind of the file for messages.
         times: Columns of the time.
-        warning: Description of a last row that is cut off; empty without one.
+        warning: Description of an incomplete last row; empty without one.
 
     Raises:
         UserError: The table has no column of the time.
@@ -128,7 +129,7 @@ class JsonRecords:
 
     Args:
         path: The file.
-        finder: Key of the time that the user gave.
+        finder: Gives the key of the time, if the user named one.
         text: Content of the file.
 
     Attributes:
@@ -169,7 +170,7 @@ class JsonRecords:
                 yield self._read(item, labels, f"history {_text(key)}, record {number}")
 
     def _read(self, item: object, labels: dict[str, str], place: str) -> Record:
-        """Return the record of an item; its name and unit replace those of the records before in ``labels``."""
+        """Return the record of an item. Its name and unit, if any, replace those of earlier records in ``labels``."""
         if isinstance(item, dict):
             attributes = item.get("attributes") or item.get("a")
             unit = attributes.get(_UNIT) if isinstance(attributes, dict) else None
@@ -189,9 +190,11 @@ class JsonRecords:
 def open_records(path: Path, finder: LayoutFinder) -> CsvRecords | JsonRecords | None:
     """Return the records of a history; None if the file is neither JSON nor a table in long form.
 
+    A table in which ``finder`` finds a column of each quantity is not in long form.
+
     Args:
         path: The file.
-        finder: Finder of the columns of a table that is not in long form, with the column of the time that the user gave.
+        finder: Finder of the columns of a table, with the names given by the user.
 
     Raises:
         UserError: The file cannot be read.
@@ -231,7 +234,7 @@ def _find_form(header: Sequence[str]) -> _Form | None:
 
 
 def _time_columns(finder: LayoutFinder, form: _Form) -> tuple[str, ...]:
-    """Return the columns of the time, or the one that the user named."""
+    """Return the column of the time that the user named, otherwise those of the form."""
     return (finder.given["time"],) if "time" in finder.given else form.times
 
 

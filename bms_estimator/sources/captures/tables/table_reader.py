@@ -1,4 +1,4 @@
-"""Captures as tables: the reader of a file by its first bytes, and the samples with the sign of their current."""
+"""Captures as tables: choice of the reader by the first bytes of a file, and samples with the sign of their current."""
 
 import dataclasses
 import math
@@ -44,7 +44,7 @@ FIRST_ROWS = 262_144
 MAX_SHOWN_BATTERIES = 8
 """Maximum number of batteries in a message."""
 STEP_S = 1e-6
-"""Time that is inserted between two rows with the same time, between which the current steps [s]."""
+"""Time that is inserted between two rows with the same time and different currents [s]."""
 PARQUET_MAGIC, OLE_MAGIC = b"PAR1", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 """First bytes of Parquet files and of .xls files."""
 EXCEL_MEMBER, OPEN_DOCUMENT_MEMBER = "[Content_Types].xml", "mimetype"
@@ -169,7 +169,7 @@ class Table:
         return voltage_response(samples)
 
     def _turns(self) -> ClockTurns:
-        """Return the turns of the clock. Times of the day have none if another column has the dates."""
+        """Return a new correction of times that roll over or restart. Times of the day need none if a column has the dates."""
         time = self.layout.columns[Role.CLOCK if Role.CLOCK in self.layout.columns else Role.TIME]
         return ClockTurns(time, is_step_time=self._is_step_time)
 
@@ -212,7 +212,7 @@ def _rows_of_battery(name: object, reader: TableReader, instance: float | None) 
     for raw in reader.blocks():
         numbers = raw[Role.INSTANCE]
         found |= set(np.unique(numbers[np.isfinite(numbers)]).tolist())
-        if instance is None and len(found) > 1 and min(found) < 0.0:
+        if instance is None and len(found) > 1 and min(found) < 0.0:  # names are read as negative numbers
             raise UserError(
                 f"{name}: rows of several batteries, with different names in {column.name}: keep the rows of one"
             )
