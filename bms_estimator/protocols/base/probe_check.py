@@ -134,8 +134,8 @@ class _Probe:
         self._credible_s = 0.0
         self._doubted_c = math.nan  # previous reading if it was not credible
         self._hot_c, self._hot_s = -math.inf, 0.0  # last temperature above ``HOT_C`` that was sustained, and its time
-        self._begin_s = math.inf  # time of the first credible reading after a gap
-        # (time, reading) in the last ``SUSTAINED_S``, each lower than all later ones, so that the first is the minimum
+        self._begin_s = 0.0  # time of the first credible reading
+        # (end, reading) of readings that ended in the last ``SUSTAINED_S``, each lower than all later ones
         self._lowest = deque[tuple[float, float]]()
 
     def accepts_all(self, times_s: Floats, readings_c: Floats) -> bool:
@@ -148,9 +148,11 @@ class _Probe:
             lowest_c = max(coldest_c, max(OPEN_OR_SHORT_C[:2]) + OPEN_OR_SHORT_TOLERANCE_K)
             if present_c.min() <= lowest_c or present_c.max() > HOT_C or np.ptp(range_c) > STEP_K:
                 return False
+            if math.isnan(self.credible_c):
+                self._begin_s = float(times_s[rows[0]])
             self.credible_c, self._credible_s = float(present_c[-1]), float(times_s[rows[-1]])
-            self._doubted_c, self._begin_s = math.nan, self._credible_s
-            self._lowest = deque([(self._credible_s, self.credible_c)])
+            self._doubted_c = math.nan
+            self._lowest.clear()
         self.was_faulty = False
         return True
 
@@ -166,16 +168,19 @@ class _Probe:
         return possible
 
     def _follow_heat(self, time_s: float, reading_c: float, cooled_c: float) -> None:
-        """Update the last sustained temperature, from which the probe can have cooled to ``cooled_c`` [C]."""
-        if math.isinf(self._begin_s) or time_s - self._credible_s > SUSTAINED_S:
+        """Update the sustained temperature. ``cooled_c`` is the lowest one to which the probe can have cooled since then [C].
+
+        A reading holds until the next one, so that slow sources are followed, too.
+        """
+        if math.isnan(self.credible_c):
             self._begin_s = time_s
-            self._lowest.clear()
-        while self._lowest and self._lowest[-1][1] >= reading_c:
-            self._lowest.pop()
-        self._lowest.append((time_s, reading_c))
-        while self._lowest[0][0] < time_s - SUSTAINED_S:
+        else:
+            while self._lowest and self._lowest[-1][1] >= self.credible_c:
+                self._lowest.pop()
+            self._lowest.append((time_s, self.credible_c))
+        while self._lowest and self._lowest[0][0] < time_s - SUSTAINED_S:
             self._lowest.popleft()
-        lowest_c = self._lowest[0][1]
+        lowest_c = min(reading_c, self._lowest[0][1] if self._lowest else reading_c)
         if time_s - self._begin_s >= SUSTAINED_S and lowest_c > max(HOT_C, cooled_c):
             self._hot_c, self._hot_s = lowest_c, time_s
 

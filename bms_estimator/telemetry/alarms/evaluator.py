@@ -26,7 +26,12 @@ from bms_estimator.telemetry.alarms.cell_alarms import CellAlarms
 from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, EstimateAlarms
 from bms_estimator.telemetry.alarms.faulty_fraction import FaultyFraction, SampleCounts
 from bms_estimator.telemetry.alarms.inputs import MAX_SPACING_FRACTION, Inputs, count_values
-from bms_estimator.telemetry.alarms.measured_values import has_bit, measured_values, uncertain_values
+from bms_estimator.telemetry.alarms.measured_values import (
+    WireLimits,
+    has_bit,
+    measured_values,
+    uncertain_values,
+)
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.sample_buffer import UNUSABLE, SampleBuffer
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
@@ -55,7 +60,11 @@ NO_FORECAST = unknown_values()
 WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
 """Text of a wrong clock that is right again at the end of a recorded block."""
 BROKEN_WIRE_V = 0.1
-"""Maximum voltage per cell of a broken wire without a limit of under-voltage [V]."""
+"""Voltage per cell below which a wire is broken [V]."""
+TEMPERATURE_ALARMS: frozenset[AlarmName] = frozenset(
+    {"over_temperature", "under_temperature", "charging_below_freezing"}
+)
+"""Alarms that a missing probe may hold."""
 _COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
 """Column of SAMPLE by quantity."""
 
@@ -259,7 +268,7 @@ class AlarmEvaluator:
             name: Name of the alarm; None: all.
         """
         acknowledged = self._alarms.acknowledge(name, self._at_s)
-        if "sensor_fault" in acknowledged and "over_temperature" not in self.active:
+        if "sensor_fault" in acknowledged and TEMPERATURE_ALARMS.isdisjoint((*self.active, *self._alarms.pending)):
             self._probe_faults.expected = 0  # a missing probe was removed
         self._save_state()
         return acknowledged
@@ -345,11 +354,7 @@ class AlarmEvaluator:
         # the interval before the first sample is a part of the silence
         self._watched_s = float(observed_s[1:].sum() if self._watched_s is None else self._watched_s + observed_s.sum())
         samples, cells, unusable = self._without_impossible(samples, cells)
-        low_v, low_cell_v = (
-            self._limit_v("pack_under_voltage", self._inputs.series),
-            self._limit_v("cell_under_voltage", 1),
-        )
-        uncertain = uncertain_values(samples, cells, self._inputs.cells, low_v, low_cell_v)
+        uncertain = uncertain_values(samples, cells, self._inputs.cells, self._wire_limits())
         for name, series in measured_values(samples, cells, self._charging_a).items():
             self._alarms.update(name, times_s, observed_s, series, wall_offset_s, uncertain=uncertain.get(name))
         gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # duration of the gap before each sample [s]; 0: no gap
@@ -359,6 +364,9 @@ class AlarmEvaluator:
         # with only faulty probes the temperature counts as missing also if it was never measured
         unusable["temperature"] = has_bit(samples, SampleStatus.PROBE_FAULT) & np.isnan(samples["temperature_c"])
         unusable["current"] = has_bit(samples, SampleStatus.CURRENT_SATURATED) | unusable.get("current", False)
+        is_wire_broken = samples["voltage_v"] < BROKEN_WIRE_V * self._inputs.series
+        is_saturated = has_bit(samples, SampleStatus.VOLTAGE_SATURATED)
+        unusable["voltage"] = is_wire_broken | is_saturated | unusable.get("voltage", False)
         for quantity, rows in unusable.items():
             counts[quantity][rows] = UNUSABLE
         for at_s in self._inputs.update(times_s, observed_s, counts):
@@ -366,10 +374,15 @@ class AlarmEvaluator:
             if self._is_blinded():  # without the delay of the alarm, because a quantity has been missing for ``lost_s``
                 self._alarms.raise_at("sensor_fault", at_s, RaisedAlarm(at_s + wall_offset_s, None))
 
-    def _limit_v(self, name: AlarmName, series: int) -> float:
-        """Return the limit of an alarm [V]; if it is switched off, the voltage of a broken wire at cells in series."""
-        state = self._alarms.states.get(name)
-        return state.definition.limit if state else BROKEN_WIRE_V * series
+    def _wire_limits(self) -> WireLimits:
+        """Return the voltages that show a broken wire beside an alarm of the opposite side."""
+        limits_v = {name: state.definition.limit for name, state in self._alarms.states.items()}
+        broken_v = BROKEN_WIRE_V * self._inputs.series
+        return WireLimits(
+            limits_v.get("pack_under_voltage", broken_v),
+            limits_v.get("cell_under_voltage", BROKEN_WIRE_V),
+            limits_v.get("cell_over_voltage", math.inf),
+        )
 
     def _without_impossible(
         self, samples: SampleBlock, cells: Floats

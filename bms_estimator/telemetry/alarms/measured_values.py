@@ -1,5 +1,7 @@
 """Values that alarms on measured quantities compare with their limits."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,8 +45,19 @@ def measured_values(samples: SampleBlock, cells: Floats, charging_a: float) -> d
     }
 
 
+class WireLimits(NamedTuple):
+    """Voltages that show a broken wire beside an alarm of the opposite side [V]."""
+
+    low_v: float
+    """Voltage of a pack with an over-voltage is not below this one."""
+    low_cell_v: float
+    """Voltage of the lowest cell beside one with an over-voltage is not below this one."""
+    high_cell_v: float
+    """Voltage of the highest cell beside one with an under-voltage is not above this one."""
+
+
 def uncertain_values(
-    samples: SampleBlock, cells: Floats, expected_cells: int, low_v: float, low_cell_v: float
+    samples: SampleBlock, cells: Floats, expected_cells: int, limits: WireLimits
 ) -> dict[AlarmName, NDArray[np.bool_]]:
     """Return where the true value of an alarm may be beyond its limit although the measured one is not, each of shape (n,).
 
@@ -55,18 +68,17 @@ def uncertain_values(
         samples: Shape (n,), dtype SAMPLE.
         cells: As for ``measured_values``, with the number of cell voltages in the third column.
         expected_cells: Largest number of cell voltages so far.
-        low_v: Voltage of the pack below which its wire may be broken [V].
-        low_cell_v: Voltage of a cell below which its wire may be broken [V].
+        limits: Voltages that show a broken wire.
     """
     has_probe_fault, is_saturated = (
         has_bit(samples, bit) for bit in (SampleStatus.PROBE_FAULT, SampleStatus.CURRENT_SATURATED)
     )
     lacks_cell = (cells[:, 2] > 0) & (cells[:, 2] < expected_cells)
     return {
-        "pack_over_voltage": samples["voltage_v"] < low_v,
+        "pack_over_voltage": samples["voltage_v"] < limits.low_v,
         "pack_under_voltage": has_bit(samples, SampleStatus.VOLTAGE_SATURATED),
-        "cell_over_voltage": lacks_cell | (cells[:, 0] < low_cell_v),
-        "cell_under_voltage": lacks_cell,
+        "cell_over_voltage": lacks_cell | (cells[:, 0] < limits.low_cell_v),
+        "cell_under_voltage": lacks_cell | (cells[:, 1] > limits.high_cell_v),
         "discharge_over_current": is_saturated,
         "charge_over_current": is_saturated,
         "over_temperature": has_probe_fault,

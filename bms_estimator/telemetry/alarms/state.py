@@ -100,6 +100,8 @@ class AlarmState:
                 self._missing_s += step_s
                 continue
             self.has_value = True
+            if not is_uncertain and value >= sign * self.definition.limit:
+                self._accepts_uncertain = False  # the acknowledgement was of an earlier cause
             missing_s, self._missing_s = self._missing_s, 0.0
             if self._is_due(value, step_s + (missing_s if missing_s < self.lost_s else 0.0), sign):
                 transitions += self._next_state(at_s, sign * value, wall_offset_s)

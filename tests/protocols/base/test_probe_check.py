@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.model.sample import SAMPLE, SampleStatus
-from bms_estimator.protocols.base.probe_check import CheckedProbes, ProbeCheck
+from bms_estimator.protocols.base.probe_check import COOLING_K_PER_S, CheckedProbes, ProbeCheck
 
 NAN = math.nan
 
@@ -115,6 +115,14 @@ def test_a_probe_that_dies_right_after_a_thermal_runaway_is_faulty() -> None:
     rise = [[40.0 + 5.0 * second] for second in range(20)]
     results = check_each_second(*rise, *[[41.0]] * 60)
     assert all(result.faulty[0] for result in results[20:])
+
+
+@pytest.mark.parametrize("period_s", [11.0, 60.0])
+def test_the_heat_of_a_slow_source_is_followed(period_s: float) -> None:
+    probes = ProbeCheck()
+    readings_c = [25.0, 50.0, *[75.0] * 10, 20.0]
+    results = [probes.check(period_s * n, [reading_c]) for n, reading_c in enumerate(readings_c)]
+    assert [result.faulty[0] for result in results] == [False] * 12 + [period_s * COOLING_K_PER_S < 50.0]
 
 
 @pytest.mark.parametrize("usual_c", [25.0, 46.0, 60.0])
