@@ -122,4 +122,4 @@ def _ln_values(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:
     select[2 * n :, u.ln_r] = group_ohm / group_ohm.sum()
     ln_ah = x[u.ln_q] + np.log(cell.capacity_as / HOUR_S)
     mean = np.concatenate([ln_ah, common + np.log(group_ohm[0]), common + np.log(group_ohm.sum())])
-    return mean, select @ minimum.covariance @ select.T
+    return mean, minimum.covariance_of(select)
