@@ -13,7 +13,7 @@ from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosit
 from bms_estimator.pack_model.equations import Equations
 from bms_estimator.pack_model.exchange import is_exchanged
 from bms_estimator.pack_model.prediction import Reference
-from bms_estimator.pack_model.solve import Minimum, minimize
+from bms_estimator.pack_model.solve import Minimum, minimize, single_threaded
 from bms_estimator.pack_model.unknowns import CURVE_NODES, SCALES, SHAPE_NODES
 
 STARTS = ((0.0, 0.0), (0.08, 0.0), (-0.08, 0.0), (0.16, 0.0), (-0.16, 0.0), (0.0, 0.08), (0.0, -0.08))
@@ -73,6 +73,7 @@ class FitError(ValueError):
     """Error of a history without a finite fit, for example because a row is not finite."""
 
 
+@single_threaded()
 def fit(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None = None) -> PackFit:
     """Fit the pack's model. If the last gap hides an exchange of the pack, fit only the rows after it.
 

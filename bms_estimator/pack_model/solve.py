@@ -1,9 +1,12 @@
 """Damped Gauss-Newton (Levenberg-Marquardt) minimization of the slow fit's cost."""
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from bms_estimator.kernels.least_squares import backward_substitution, forward_substitution
 from bms_estimator.model.arrays import Floats
@@ -22,6 +25,20 @@ FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
 """Relative damping of the diagonal at the start, and its limits."""
 LESS_DAMPING, MORE_DAMPING = 0.2, 8.0
 """Factors on the damping after a step that lowers the cost, and after a step that does not."""
+
+_ONE_FIT = threading.Lock()
+"""Lock of the number of BLAS threads, which belongs to the process. With two fits at once, the first to end would restore it."""
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Limit BLAS to one thread, and the process to one fit at a time.
+
+    The matrices are small: more threads need 2 to 18 times the processor time, and a fit on another number of cores could differ
+    in the last bit.
+    """
+    with _ONE_FIT, threadpool_limits(1, user_api="blas"):
+        yield
 
 
 @dataclass(frozen=True)
