@@ -187,8 +187,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments is None:  # the process is the command's own
         # SIGUSR1 acknowledges alarms, and may come while the modules of ``run`` are imported
         signal.signal(signal.SIGUSR1, signal.SIG_IGN)
-    # The slow fit's matrices are small: with more threads OpenBLAS needs twice the time, and a replay on another number of
-    # cores could differ in the last bit. numpy, which reads this once, is not imported yet.
+    # The matrices are small: with more threads OpenBLAS needs twice the time, and a result on another number of cores could
+    # differ in the last bit. numpy, which reads this once, is not imported yet.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         _run(arguments)

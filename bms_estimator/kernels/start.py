@@ -7,7 +7,7 @@ import math
 
 from bms_estimator.kernels.accumulators.history import begin_segment
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
-from bms_estimator.kernels.kalman_filter.anchors import interrupt_anchors
+from bms_estimator.kernels.kalman_filter.anchors import continue_over_gap
 from bms_estimator.kernels.kalman_filter.ekf import predict
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     write_equivalent_circuit,
@@ -65,7 +65,7 @@ def restart_filter(s: Record, p: Record, gap_s: float, current_a: float, voltage
         propagate_over_gap(f, p.filter, gap_s, rested)
         spawn_after_gap(f, p.filter, gap_s, rested)
     reset_window(f)
-    interrupt_anchors(s.anchors)
+    continue_over_gap(s.anchors, p.anchors, f, p.filter, gap_s, current_a, voltage_v)
     s.checks.slow_v = 0.0  # no slow means yet
     s.checks.gated_in_row, s.checks.gated_s = 0, 0.0
     if not s.checks.suspects & UNUSABLE:

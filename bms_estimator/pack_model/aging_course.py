@@ -20,7 +20,7 @@ from bms_estimator.pack_model.fit import (
     starts_near,
 )
 from bms_estimator.pack_model.intervals import HOUR_S
-from bms_estimator.pack_model.solve import Minimum
+from bms_estimator.pack_model.solve import Minimum, single_threaded
 from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS, SHAPE_NODES
 
 RESISTANCE_SOC = np.array([0.5])
@@ -73,6 +73,7 @@ class AgingCourse:
     total: Course
 
 
+@single_threaded()
 def aging_course(cell: CellCurves, rows: NDArray[np.void], previous: PackFit) -> AgingCourse:
     """Fit the pack's model from the minima of the last fit, and return capacity and resistances in each interval.
 
@@ -122,4 +123,4 @@ def _ln_values(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:
     select[2 * n :, u.ln_r] = group_ohm / group_ohm.sum()
     ln_ah = x[u.ln_q] + np.log(cell.capacity_as / HOUR_S)
     mean = np.concatenate([ln_ah, common + np.log(group_ohm[0]), common + np.log(group_ohm.sum())])
-    return mean, select @ minimum.covariance @ select.T
+    return mean, minimum.covariance_of(select)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.kalman_filter.anchors import EMPTY, FULL
+from bms_estimator.kernels.least_squares import add_residuals
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.intervals import Intervals, Links
@@ -63,6 +64,7 @@ class NormalEquations:
     """Normal equations A x = b of a Gauss-Newton step x."""
 
     a: Floats
+    """A. Only its lower triangle is valid."""
     b: Floats
 
 
@@ -116,9 +118,7 @@ class Equations:
         precision = self.prior.precision
         a, b = precision.copy(), -precision @ (r.x - self.prior.mean)
         for block in (self._voltage_block(r, use_file_slope=use_file_slope), r.links, *self._soc_blocks(r)):
-            if block.error.size:
-                a += gram_matrix(block.columns, block.values, self.u.size)
-                b += np.bincount(block.columns.ravel(), (block.values * block.error[:, None]).ravel(), self.u.size)
+            add_residuals(a, b, block.columns, block.values, block.error)
         return NormalEquations(a, b)
 
     def _voltage_block(self, r: Residuals, *, use_file_slope: bool) -> Block:
@@ -157,14 +157,6 @@ class Equations:
         columns = np.column_stack([u.soc.start + later, u.soc.start + k, u.ln_q.start + k, u.offset.start + k])
         values = np.column_stack([np.ones(k.size), -np.ones(k.size), -drawn, -links.hours * inverse_q])
         return float(cost), Block(weight * error, columns, (weight / links.std)[:, None] * values)
-
-
-def gram_matrix(columns: NDArray[np.intp], values: Floats, size: int) -> Floats:
-    """Return J^T J, shape (size, size), of the Jacobian J with the given columns and values in each row."""
-    gram = np.zeros(size * size)
-    for column, value in zip(columns.T, values.T, strict=True):  # all pairs at once would need 100 MB
-        gram += np.bincount((column[:, None] * size + columns).ravel(), (value[:, None] * values).ravel(), size * size)
-    return gram.reshape(size, size)
 
 
 def huber_cost(residual: Floats) -> float:

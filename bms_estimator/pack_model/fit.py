@@ -13,7 +13,7 @@ from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosit
 from bms_estimator.pack_model.equations import Equations
 from bms_estimator.pack_model.exchange import is_exchanged
 from bms_estimator.pack_model.prediction import Reference
-from bms_estimator.pack_model.solve import Minimum, minimize
+from bms_estimator.pack_model.solve import Minimum, minimize, single_threaded
 from bms_estimator.pack_model.unknowns import CURVE_NODES, SCALES, SHAPE_NODES
 
 STARTS = ((0.0, 0.0), (0.08, 0.0), (-0.08, 0.0), (0.16, 0.0), (-0.16, 0.0), (0.0, 0.08), (0.0, -0.08))
@@ -22,9 +22,6 @@ several minima over the SOC."""
 LIKELIHOOD_EXPONENT = 0.5
 """Exponent of the likelihood in the weights of minima. It is below 1, because errors of different passes are not quite
 independent."""
-SAME_COST, SAME_SOC = 0.3, 0.01
-"""Differences of cost and SOC below which two minima count as one. They exceed the differences that an unfinished minimization
-leaves (``solve.CONVERGED``)."""
 NODE_SOC = np.linspace(0.0, 1.0, NODES)
 """SOCs of the filter's OCV nodes."""
 SOC, LN_Q, OFFSET, LN_R, CURVE = 0, 1, 2, slice(3, 6), slice(6, 6 + NODES)
@@ -76,6 +73,7 @@ class FitError(ValueError):
     """Error of a history without a finite fit, for example because a row is not finite."""
 
 
+@single_threaded()
 def fit(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None = None) -> PackFit:
     """Fit the pack's model. If the last gap hides an exchange of the pack, fit only the rows after it.
 
@@ -143,8 +141,8 @@ def distinct_minima(equations: Equations, from_starts: list[Floats]) -> list[Min
     """Return the different minima that are reached from the starts, the best first."""
     minima: list[Minimum] = []
     for start in from_starts:
-        minimum = minimize(equations, start)
-        if not any(_is_same(equations, minimum, other) for other in minima):
+        minimum = minimize(equations, start, minima)
+        if minimum is not None:
             minima.append(minimum)
     return sorted(minima, key=lambda minimum: minimum.cost)
 
@@ -203,11 +201,6 @@ def start_soc_near(equations: Equations, previous: PackFit) -> Floats:
     for k in np.flatnonzero(start_s > previous.elapsed_s).tolist():
         soc[k] = after_gap[k] if intervals.is_new_segment[k] else soc[k - 1] - drawn_soc[k]
     return soc
-
-
-def _is_same(equations: Equations, a: Minimum, b: Minimum) -> bool:
-    difference = np.abs(a.x[equations.u.soc] - b.x[equations.u.soc]).max()
-    return abs(a.cost - b.cost) < SAME_COST and bool(difference < SAME_SOC)
 
 
 def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
@@ -275,4 +268,4 @@ def _results(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:
         select[nodes, u.curve.start + at] = weight
     mean = select @ x
     mean[SOC] = model.soc(x)[-1]
-    return mean, select @ minimum.covariance @ select.T
+    return mean, minimum.covariance_of(select)

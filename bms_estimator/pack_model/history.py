@@ -16,8 +16,10 @@ KEPT_FRACTION = 0.8
 """Maximum number of rows after merging, as a fraction of ``MAX_ROWS``. Without this reserve each new row would begin another
 merge."""
 MAX_SEGMENTS = 100
-"""Maximum number of segments; older ones are dropped. Each adds about five unknowns to the fit, whose time grows with
-the cube of their number: with 100 segments a fit of 30 days takes four times as long as with one."""
+"""Maximum number of segments. Each adds about five unknowns to the fit, whose time grows with the cube of their number: with 100
+segments a fit of 30 days takes four times as long as with one."""
+RECENT_SEGMENTS = MAX_SEGMENTS // 2
+"""Number of segments that are kept before older ones with a known SOC."""
 DAY_S = 86400.0
 """Length of a day [s]."""
 MEAN_FIELDS = ("elapsed_s", "voltage_v", "current_a", "between_a2", "skew_a2", "x_a", "settled_s", "temperature_c", "charge_as",
@@ -69,15 +71,52 @@ class History:
 
     def append(self, rows: NDArray[np.void], capacity_as: float) -> None:
         """Append rows. If there are too many, merge old rows, and drop the oldest if there are still too many."""
-        self.rows = newest_segments(np.concatenate([self.rows, rows]))
+        first_new = float(rows["segment"][0]) if rows.size else np.inf
+        self.rows = bounded_segments(np.concatenate([self.rows, rows]), first_new, capacity_as)
         if self.rows.size > MAX_ROWS:
             self.rows = thin_old_rows(self.rows, capacity_as)[-int(KEPT_FRACTION * MAX_ROWS) :]
 
 
-def newest_segments(rows: NDArray[np.void]) -> NDArray[np.void]:
-    """Return the rows of the last ``MAX_SEGMENTS`` segments."""
+def bounded_segments(rows: NDArray[np.void], first_new: float, capacity_as: float) -> NDArray[np.void]:
+    """Return the rows of the ``MAX_SEGMENTS`` segments with the most information.
+
+    Segments that neither change nor determine the SOC are dropped first. Then older ones without a known SOC are dropped, because
+    known SOCs determine capacity and offset over a long time. In each group the oldest is the first. The charge of a dropped
+    segment is added to the gap before the next one.
+
+    Args:
+        rows: Shape (n,), dtype HISTORY_ROW, in order of time.
+        first_new: Number of the first segment that is never dropped.
+        capacity_as: Declared capacity [A s].
+    """
     starts = np.flatnonzero(np.diff(rows["segment"], prepend=-np.inf))
-    return rows[starts[-MAX_SEGMENTS] :] if starts.size > MAX_SEGMENTS else rows
+    excess = starts.size - MAX_SEGMENTS
+    if excess <= 0:
+        return rows
+    charge_as = rows["charge_as"]
+    moved_as = np.maximum.reduceat(charge_as, starts) - np.minimum.reduceat(charge_as, starts)
+    is_known = np.logical_or.reduceat(np.isfinite(rows["reference_soc"]), starts)
+    is_recent = np.arange(starts.size) >= starts.size - RECENT_SEGMENTS
+    value = np.where(is_known | is_recent, 2, 1)
+    value[~is_known & (moved_as < ROW_SOC * capacity_as)] = 0
+    value[rows["segment"][starts] >= first_new] = 3
+    is_dropped = np.zeros(starts.size, bool)
+    is_dropped[np.argsort(value, kind="stable")[:excess]] = True
+    return _without_segments(rows, np.append(starts, rows.size), is_dropped)
+
+
+def _without_segments(
+    rows: NDArray[np.void], bounds: NDArray[np.intp], is_dropped: NDArray[np.bool_]
+) -> NDArray[np.void]:
+    """Return the rows without some segments, of which segment k has the rows from ``bounds[k]`` to ``bounds[k + 1]``."""
+    rows, sizes = rows.copy(), np.diff(bounds)
+    for k in np.flatnonzero(is_dropped[:-1]).tolist():
+        first, last, after = rows[bounds[k]], rows[bounds[k + 1] - 1], rows[bounds[k + 1] : bounds[k + 2]]
+        after["charge_as"] += last["charge_as"]
+        after["charge_variance_as2"] += last["charge_variance_as2"]
+        after["gap_s"] += last["gap_s"] + last["elapsed_s"] - first["elapsed_s"]
+    kept: NDArray[np.void] = rows[~np.repeat(is_dropped, sizes)]
+    return kept
 
 
 def thin_old_rows(rows: NDArray[np.void], capacity_as: float) -> NDArray[np.void]:

@@ -294,20 +294,17 @@ class SlowFit:
         self.revision += 1
 
     def _is_adoptable(self, fitted: PackFit) -> bool:
-        """Return True if one normal distribution represents the SOC: its std is small, or the history is long."""
-        is_certain = fitted.covariance[FIT_SOC, FIT_SOC] <= MAX_SINGLE_STD**2
-        return bool(is_certain) or self._throughput() >= MIN_THROUGHPUT_SOC
+        """Return True if one normal distribution represents the SOC: its std is small, or the history is long.
 
-    def _throughput(self) -> float:
-        """Return the throughput of the history [SOC].
-
-        It is infinite if the history has a known SOC or a second segment. Then the fit knows more than the filter, which learns
-        neither capacity nor OCV from an end of charge, and stops learning at a gap.
+        In a short history with a known SOC or a gap the fit may know more than the filter, which learns neither capacity nor OCV
+        from an end of charge, and stops learning at a gap. It is then adopted unless it enlarges the std of the SOC.
         """
-        rows = self.history.rows
-        if np.isfinite(rows["reference_soc"]).any() or rows["segment"][0] != rows["segment"][-1]:
-            return math.inf
-        return float(rows["throughput_soc"][-1])
+        rows, std = self.history.rows, math.sqrt(fitted.covariance[FIT_SOC, FIT_SOC])
+        if std <= MAX_SINGLE_STD or throughput(rows) >= MIN_THROUGHPUT_SOC:
+            return True
+        is_known = bool(np.isfinite(rows["reference_soc"]).any())
+        has_gap = bool(rows["segment"][0] != rows["segment"][-1])
+        return (is_known or has_gap) and std <= float(self.estimator.record[0]["filter"]["soc_std"])
 
     def _adopt_curves(self, fitted: PackFit | None) -> None:
         """Write the curves of a fit, or of the cell file, to the filter's settings."""
@@ -330,3 +327,13 @@ def unknown_current(rows: NDArray[np.void]) -> float:
     """
     square_a2s = float(rows["duration_s"] @ rows["current_a"] ** 2)
     return float(rows["duration_s"] @ rows["skew_a2"]) / square_a2s if square_a2s > 0.0 else 0.0
+
+
+def throughput(rows: NDArray[np.void]) -> float:
+    """Return the charge throughput of all segments of a history [SOC].
+
+    Args:
+        rows: Shape (n,), dtype HISTORY_ROW, in order of time.
+    """
+    is_last = np.append(rows["segment"][1:] != rows["segment"][:-1], True)
+    return float(rows["throughput_soc"][is_last].sum())

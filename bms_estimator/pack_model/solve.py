@@ -1,11 +1,16 @@
 """Damped Gauss-Newton (Levenberg-Marquardt) minimization of the slow fit's cost."""
 
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
+from bms_estimator.kernels.least_squares import backward_substitution, forward_substitution
 from bms_estimator.model.arrays import Floats
-from bms_estimator.pack_model.equations import Equations, NormalEquations
+from bms_estimator.pack_model.equations import Equations, NormalEquations, Residuals
 
 MAX_ITERATIONS = 30
 """Maximum number of steps from one start."""
@@ -13,23 +18,46 @@ MAX_STEP_SOC = 0.15
 """Maximum change of an SOC in one step, because the curves are not linear over a longer one."""
 CONVERGED = 0.02
 """Decrease of the cost at which the minimization ends."""
+SAME_COST, SAME_SOC = 0.3, 0.01
+"""Differences of cost and SOC below which two minima count as one. They exceed the differences that an unfinished minimization
+leaves (``CONVERGED``)."""
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
 """Relative damping of the diagonal at the start, and its limits."""
 LESS_DAMPING, MORE_DAMPING = 0.2, 8.0
 """Factors on the damping after a step that lowers the cost, and after a step that does not."""
 
+_ONE_FIT = threading.Lock()
+"""Lock of the number of BLAS threads, which belongs to the process. With two fits at once, the first to end would restore it."""
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Limit BLAS to one thread, and the process to one fit at a time.
+
+    The matrices are small: more threads need 2 to 18 times the processor time, and a fit on another number of cores could differ
+    in the last bit.
+    """
+    with _ONE_FIT, threadpool_limits(1, user_api="blas"):
+        yield
+
 
 @dataclass(frozen=True)
 class Minimum:
-    """Local minimum of the cost, with the covariance of the unknowns (Laplace approximation)."""
+    """Local minimum of the cost."""
 
     x: Floats
     cost: float
-    covariance: Floats
+    factor: Floats
+    """Lower Cholesky factor of the inverse of the unknowns' covariance (Laplace approximation)."""
+
+    def covariance_of(self, select: Floats) -> Floats:
+        """Return the covariance of ``select`` @ x."""
+        half = forward_substitution(self.factor, select.T.copy())
+        return np.asarray(half.T @ half)
 
 
-def minimize(equations: Equations, start: Floats) -> Minimum:
-    """Return the local minimum that is reached from ``start``."""
+def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ()) -> Minimum | None:
+    """Return the local minimum that is reached from ``start``; None if it is one of the known ones."""
     now, damping = equations.residuals(start), FIRST_DAMPING
     normal = equations.normal_equations(now)
     for _ in range(MAX_ITERATIONS):
@@ -44,23 +72,30 @@ def minimize(equations: Equations, start: Floats) -> Minimum:
             damping *= MORE_DAMPING
             if damping > MAX_DAMPING:
                 break
+    if any(is_same(equations, now, other) for other in known):
+        return None
     precision = equations.normal_equations(now, use_file_slope=True).a
-    return Minimum(now.x, now.cost, solve(precision, np.eye(now.x.size)))
+    return Minimum(now.x, now.cost, cholesky(precision))
+
+
+def is_same(equations: Equations, now: Residuals, other: Minimum) -> bool:
+    """Return True if cost and SOCs equal those of another minimum."""
+    difference = np.abs(now.x[equations.u.soc] - other.x[equations.u.soc]).max()
+    return abs(now.cost - other.cost) < SAME_COST and bool(difference < SAME_SOC)
 
 
 def step(normal: NormalEquations, damping: float, soc: slice) -> Floats:
     """Return the damped step, shortened so that no SOC changes by more than ``MAX_STEP_SOC``."""
-    damped = normal.a + damping * np.diag(np.diag(normal.a))
-    full = solve(damped, normal.b)
+    lower = cholesky(normal.a + damping * np.diag(np.diag(normal.a)))
+    full = backward_substitution(lower, forward_substitution(lower, normal.b[:, None]))[:, 0]
     largest = float(np.abs(full[soc]).max())
     return full * min(1.0, MAX_STEP_SOC / largest) if largest > 0.0 else full
 
 
-def solve(a: Floats, b: Floats) -> Floats:
-    """Return the solution of a x = b for a positive definite a.
+def cholesky(a: Floats) -> Floats:
+    """Return the lower Cholesky factor of a matrix whose lower triangle is valid.
 
     Raises:
-        numpy.linalg.LinAlgError: a is not positive definite, or not finite.
+        numpy.linalg.LinAlgError: The matrix is not positive definite, or not finite.
     """
-    np.linalg.cholesky(a)  # raises the error
-    return np.asarray(np.linalg.solve(a, b))
+    return np.linalg.cholesky(a).astype(np.float64, copy=False)

@@ -7,6 +7,7 @@ import numpy as np
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows
+from bms_estimator.kernels.least_squares import add_residuals, backward_substitution, forward_substitution
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack_model.curve_change import return_to_cell_file
@@ -55,7 +56,15 @@ def _call_kernels() -> None:
     estimator.resume(0.0)
     make_parameters_payload(estimator, 0.0)
     SlowFit(estimator).adopt(neutral_fit())
+    _load_fit_kernels()
     return_to_cell_file(estimator)
     remaining_capacity_ah(estimator)
     load_forecast_kernels()
     _ = FrameDecoder().clock_ppm
+
+
+def _load_fit_kernels() -> None:
+    """Call the kernels of the slow fit once."""
+    one = np.ones((1, 1))
+    add_residuals(one, one[0], np.zeros((1, 1), np.intp), one, one[0])
+    backward_substitution(one, forward_substitution(one, one))

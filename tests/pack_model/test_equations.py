@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.kernels.accumulators.history import ROW_SOC
+from bms_estimator.kernels.least_squares import backward_substitution, forward_substitution
 from bms_estimator.pack_model.equations import BEYOND_SOC, Equations
 from bms_estimator.pack_model.solve import minimize
 from tests.pack_model.histories import (
@@ -103,7 +104,7 @@ def test_cost_of_a_soc_beyond_its_range_decreases_along_the_step(equations: Equa
     x = unknowns_of(equations, Truth(soc=1.0 + BEYOND_SOC + 0.07))
     r = equations.residuals(x)
     normal = equations.normal_equations(r)
-    step = np.linalg.solve(normal.a, normal.b)
+    step = np.linalg.solve(np.tril(normal.a) + np.tril(normal.a, -1).T, normal.b)
     assert equations.residuals(x + 0.1 * step).cost < r.cost
 
 
@@ -112,9 +113,45 @@ def test_minimum_is_below_its_start_and_its_neighbors(equations: Equations, shif
     start = unknowns_of(equations, Truth(ln_r=(0.3, 0.3, 0.3)))
     start[equations.u.soc] += shift
     minimum = minimize(equations, start)
+    assert minimum is not None
     assert minimum.cost < equations.residuals(start).cost
-    variances, vectors = np.linalg.eigh(minimum.covariance)
+    variances, vectors = np.linalg.eigh(minimum.covariance_of(np.eye(start.size)))
     for variance, vector in zip(variances[-20:], vectors.T[-20:], strict=True):
         for sign in (-1.0, 1.0):
             neighbor = minimum.x + sign * np.sqrt(variance) * vector
             assert equations.residuals(neighbor).cost > minimum.cost
+
+
+def test_a_known_minimum_is_not_found_again(equations: Equations) -> None:
+    start = unknowns_of(equations, Truth(ln_r=(0.3, 0.3, 0.3)))
+    minimum = minimize(equations, start)
+    assert minimum is not None
+    assert minimize(equations, start, [minimum]) is None
+
+
+def test_normal_equations_sum_the_products_of_all_derivatives(equations: Equations) -> None:
+    """The sum has the prior, the voltages and the known SOC. No SOC is beyond its range."""
+    r = equations.residuals(unknowns_of(equations, Truth()))
+    x, p, u = r.x, r.prediction, equations.u
+    columns, values = equations.model.derivatives(x, p, use_file_slope=False)
+    known, soc_values = equations.known, equations.model.soc_derivatives(x)[1]
+    parts = [(columns, equations.weight[:, None] * values), (r.links.columns, r.links.values)]
+    at = np.column_stack([equations.model.soc_derivatives(x)[0][known], np.full(known.size, u.full.start)])
+    parts.append((at, np.column_stack([soc_values[known], equations.is_full]) / equations.known_std[:, None]))
+    expected = equations.prior.precision.copy()
+    for at, derivatives in parts:
+        jacobian = np.zeros((at.shape[0], u.size))
+        np.add.at(jacobian, (np.arange(at.shape[0])[:, None], at), derivatives)
+        expected += jacobian.T @ jacobian
+    a = np.tril(equations.normal_equations(r).a)
+    np.testing.assert_allclose(a, np.tril(expected), rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("columns", [1, 27])
+def test_triangular_solutions(columns: int) -> None:
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(40, 60))
+    a, b = root @ root.T, rng.normal(size=(40, columns))
+    lower = np.linalg.cholesky(a)
+    x = backward_substitution(lower, forward_substitution(lower, b))
+    np.testing.assert_allclose(a @ x, b, rtol=1e-9, atol=1e-9)

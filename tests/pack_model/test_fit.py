@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from threadpoolctl import threadpool_info, threadpool_limits
 
+from bms_estimator.estimator import Estimator
+from bms_estimator.model.cell import load_cell
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import LN_Q, LN_R, OFFSET, SOC, FitError, PackFit, fit
 from tests.pack_model.histories import (
+    CAPACITY_AH,
     Truth,
     cell_curves,
     equations_of,
@@ -106,6 +110,31 @@ def test_fits_are_bit_identical() -> None:
     assert one.mean.tobytes() == two.mean.tobytes()
     assert one.covariance.tobytes() == two.covariance.tobytes()
     assert one.curve_v.tobytes() == two.curve_v.tobytes()
+
+
+class ThreadCounter(CellCurves):
+    """Curves that record the number of BLAS threads at each use of the OCV."""
+
+    threads: set[int]
+
+    def ocv(self, soc: np.ndarray) -> np.ndarray:
+        self.threads = {*getattr(self, "threads", ()), blas_threads()}
+        return super().ocv(soc)
+
+
+def blas_threads() -> int:
+    return max(int(each["num_threads"]) for each in threadpool_info() if each["user_api"] == "blas")
+
+
+def test_a_fit_uses_one_thread_and_restores_their_number() -> None:
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell, days=1), Truth())[:20]
+    counter = ThreadCounter(Estimator(load_cell("nmc", CAPACITY_AH)).settings_record[0]["filter"])
+    counter.threads = set()
+    with threadpool_limits(2, user_api="blas"):
+        fit(counter, rows)
+        assert counter.threads == {1}
+        assert blas_threads() == 2
 
 
 def test_next_fit_starts_at_the_previous_one() -> None:

@@ -93,6 +93,67 @@ def test_number_of_segments_is_bounded(rows: np.ndarray) -> None:
     assert history.rows.size == 2 * MAX_SEGMENTS
 
 
+def interrupted(rows: np.ndarray, size: int, gap_s: float = 60.0) -> list[np.ndarray]:
+    """Return parts of ``size`` rows as segments of their own, with gaps at rest in which no charge flows."""
+    parts = [rows[start : start + size].copy() for start in range(0, rows.size, size)]
+    drawn_as = 0.0
+    for number, part in enumerate(parts):
+        part["segment"], part["gap_s"] = number, gap_s
+        part["elapsed_s"] += number * gap_s
+        end_as = part["charge_as"][-1]
+        part["charge_as"] -= drawn_as
+        drawn_as = end_as
+    return parts
+
+
+def test_segments_with_a_known_soc_outlast_interruptions(rows: np.ndarray) -> None:
+    """A log that is interrupted every few rows would otherwise lose the ends of charge of more than a few days."""
+    cell, history = cell_curves(), History()
+    parts = interrupted(rows[: 8 * 2 * MAX_SEGMENTS], 8)
+    known = [*range(3, len(parts) // 2, 10)]
+    for number, part in enumerate(parts):
+        end = reference_row(part, 0.9, 0.01) if number in known else part[:0]
+        history.append(np.concatenate([part, end]), cell.capacity_as)
+    segments = np.unique(history.rows["segment"])
+    assert segments.size == MAX_SEGMENTS
+    assert set(known) <= set(segments.tolist())
+    assert segments[-1] == len(parts) - 1
+
+
+def test_charge_and_duration_of_dropped_segments_are_counted_in_the_next_gap(rows: np.ndarray) -> None:
+    cell, history = cell_curves(), History()
+    parts = interrupted(rows[: 8 * 2 * MAX_SEGMENTS], 8)
+    for part in parts:
+        history.append(part, cell.capacity_as)
+    kept, whole = history.rows, np.concatenate(parts)
+    first_as, starts = kept["charge_as"][0], np.flatnonzero(np.diff(kept["segment"])) + 1
+    # each counter begins at the last row of the segment before
+    to_start_as = np.repeat(
+        np.cumsum(kept["charge_as"][np.append(starts, kept.size) - 1]), np.diff(np.r_[0, starts, kept.size])
+    )
+    ends_as = kept["charge_as"][np.append(starts, kept.size) - 1]
+    total_as = kept["charge_as"] + to_start_as - np.repeat(ends_as, np.diff(np.r_[0, starts, kept.size]))
+    at = np.searchsorted(whole["elapsed_s"], kept["elapsed_s"])
+    np.testing.assert_allclose(total_as - first_as, rows["charge_as"][at] - rows["charge_as"][at[0]], atol=1e-6)
+    is_after_dropped = np.diff(kept["segment"])[starts - 1] > 1.0
+    assert is_after_dropped.any()
+    assert np.all(kept["gap_s"][starts][is_after_dropped] > 60.0)
+
+
+def test_segments_at_rest_are_dropped_first(rows: np.ndarray) -> None:
+    cell, history = cell_curves(), History()
+    moving, resting = interrupted(rows[: 40 * (MAX_SEGMENTS - 10)], 40), rows[:2].copy()
+    resting["charge_as"] = 0.0
+    number = 0
+    for part in moving:
+        for each in (part, resting.copy()):
+            each["segment"], each["elapsed_s"] = number, each["elapsed_s"] - each["elapsed_s"][0] + 1e5 * number
+            history.append(each, cell.capacity_as)
+            number += 1
+    sizes = np.unique(history.rows["segment"], return_counts=True)[1]
+    assert (sizes > 2).sum() == len(moving)
+
+
 def test_fit_of_the_thinned_history_differs_by_less_than_its_std(rows: np.ndarray) -> None:
     cell = cell_curves()
     known = reference_row(rows, float(rows["soc"][-1]), 0.01)

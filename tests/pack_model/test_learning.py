@@ -171,6 +171,36 @@ def test_a_fit_of_less_than_a_cycle_is_adopted_only_if_its_std_is_small(
     assert slow_fit.fits == 1
 
 
+@pytest.mark.parametrize(("ratio", "is_adopted"), [(2.0, False), (0.9, True)])
+def test_a_fit_after_few_rows_and_restarts_does_not_enlarge_the_std(
+    samples: SampleBlock, monkeypatch: pytest.MonkeyPatch, ratio: float, is_adopted: bool
+) -> None:
+    """Six starts in half an hour leave a few rows in several segments, which do not determine the SOC."""
+
+    def fit_with_std(*args: object) -> PackFit:
+        fitted = quick_fit(*args)  # type: ignore[arg-type]
+        fitted.covariance[fit_module.SOC, fit_module.SOC] = (ratio * filter_std()) ** 2
+        return fitted
+
+    def filter_std() -> float:
+        return float(slow_fit.estimator.record[0]["filter"]["soc_std"])
+
+    monkeypatch.setattr(learning, "fit", fit_with_std)
+    slow_fit = new_slow_fit()
+    for start in range(6):
+        part = samples[300 * start : 300 * (start + 1)]
+        slow_fit.run(part)
+        slow_fit.estimator.resume(600.0)
+        slow_fit.resume(600.0, restored=True)
+    assert np.unique(slow_fit.history.rows["segment"]).size > 3
+    while slow_fit.estimator.record[0]["history"]["elapsed_s"] < 2.0 * INTERVAL_S:
+        part = part.copy()
+        part["time_s"] += 300.0
+        slow_fit.run(part)
+    assert (slow_fit.fits > 0) == is_adopted
+    assert slow_fit.saved_fit is not None
+
+
 def test_a_short_history_is_fitted_more_often(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "fit", quick_fit)
     times_s: list[float] = []

@@ -37,8 +37,11 @@ def minimum(cell: CellCurves, rows: np.ndarray) -> tuple[float, float]:
     """Return SOC and std at the start of the last interval, at the minimum next to the true values."""
     equations = equations_of(cell, rows)
     found = minimize(equations, unknowns_of(equations, TRUTH))
+    assert found is not None
     last = equations.u.soc.stop - 1
-    return float(found.x[last]), float(np.sqrt(found.covariance[last, last]))
+    select = np.zeros((1, found.x.size))
+    select[0, last] = 1.0
+    return float(found.x[last]), float(np.sqrt(found.covariance_of(select)[0, 0]))
 
 
 def test_an_uncertain_voltage_gain_hardly_widens_the_soc_of_a_flat_curve() -> None:

@@ -56,6 +56,8 @@ FLOAT_S = 3600.0
 off."""
 MAX_COUNTED_S = 0.5 * AT_FULL_S
 """Maximum time that one window counts [s], so that at least two windows show the full voltage."""
+MAX_CHARGE_GAP_S = 1800.0
+"""Maximum gap in the constant-voltage phase of a charge [s]. Assumed."""
 REARM_SOC = 0.02
 """Minimum charge between two anchors of one kind [SOC]. A charger that trickles for days must not cause an anchor again and
 again."""
@@ -107,10 +109,20 @@ ANCHORS = np.dtype(
 
 
 @njit(cache=True)
-def interrupt_anchors(a: Record) -> None:
-    """Discard the present charge or discharge at a gap, in which the current is unknown."""
+def continue_over_gap(
+    a: Record, p: Record, f: Record, ekf: Record, gap_s: float, current_a: float, voltage_v: float
+) -> None:
+    """Count a charge at the full voltage with a small current at the first sample after a gap, and discard everything else.
+
+    A sparse log has samples some minutes apart in the constant-voltage phase. A pack in this phase before and after the gap was in
+    it all the time.
+    """
+    at_full_s = a.at_full_s if gap_s <= MAX_CHARGE_GAP_S else 0.0
     a.at_full_s = a.idle_s = 0.0
     a.below_cutoff = 0
+    if is_charging_at_full(p, f, current_a, voltage_v):
+        a.at_full_s = min(at_full_s + MAX_COUNTED_S, MAX_AT_FULL_S)
+        a.full_std = full_std(f, ekf, current_a, max(p.charger_v - voltage_v, 0.0))
 
 
 @njit(cache=True)
@@ -127,7 +139,7 @@ def detect_anchor(a: Record, p: Record, f: Record, ekf: Record, dt_s: float, cur
         voltage_v: Mean voltage of the window's samples [V].
     """
     if dt_s > ekf.unmeasured_s:
-        interrupt_anchors(a)
+        continue_over_gap(a, p, f, ekf, dt_s, current_a, voltage_v)
         return NO_ANCHOR
     drawn_soc = current_a * dt_s / ekf.capacity_as
     if a.full_wait_soc > 0.0:
@@ -154,9 +166,7 @@ def charge_ends_full(
     The counted time decreases while voltage or current is outside its limits, so that noise does not restart it.
     """
     was_at_full_s = a.at_full_s
-    is_small = -p.small_a <= current_a <= -p.trickle_a
-    is_charge = f.x_a[CHARGE] <= -p.trickle_a  # averaged over 500 s, which is longer than regeneration
-    if voltage_v >= p.full_v and is_small and is_charge:
+    if is_charging_at_full(p, f, current_a, voltage_v):
         a.at_full_s = min(was_at_full_s + min(dt_s, MAX_COUNTED_S), FLOAT_S)
         a.full_std = full_std(f, ekf, current_a, max(p.charger_v - voltage_v, 0.0))
     else:
@@ -164,6 +174,14 @@ def charge_ends_full(
     if was_at_full_s >= AT_FULL_S and current_a > -p.trickle_a:
         return True
     return a.at_full_s >= FLOAT_S and current_a > -p.tail_a
+
+
+@njit(cache=True)
+def is_charging_at_full(p: Record, f: Record, current_a: float, voltage_v: float) -> bool:
+    """Return True during a charge at the full voltage with a small current."""
+    is_small = -p.small_a <= current_a <= -p.trickle_a
+    is_charge = f.x_a[CHARGE] <= -p.trickle_a  # averaged over 500 s, which is longer than regeneration
+    return voltage_v >= p.full_v and is_small and is_charge
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.settings.charge_limits import ChargeLimits
 from bms_estimator.sources.captures.replay import load_capture
@@ -60,6 +60,19 @@ def test_the_ends_of_charge_keep_the_soc_of_a_generic_cell_right() -> None:
     error = trace["soc"][after_first_day] - soc[after_first_day]
     assert np.sqrt(np.mean(error**2)) < 0.015
     assert np.mean(np.abs(error) < 2.0 * trace["soc_std"][after_first_day]) > 0.95
+
+
+@pytest.mark.parametrize("status", [0, SampleStatus.GAP])
+def test_sparse_samples_in_the_constant_voltage_phase_have_an_anchor(status: int) -> None:
+    """A cycler that writes a row at each change of the voltage writes one in some minutes, and one at the end of the charge."""
+    samples, _ = days_with_a_charge()
+    is_charge = (samples["current_a"] < -0.02 * CAPACITY_AH) & (samples["voltage_v"] > FULL_V - 0.004)
+    is_last = is_charge & (np.append(samples["current_a"][1:], 0.0) > -0.02 * CAPACITY_AH)
+    sparse = samples[~is_charge | is_last | (np.arange(samples.size) % 200 == 0)]
+    sparse["status"][1:][np.diff(sparse["time_s"]) > 60.0] |= np.uint32(status)
+    estimator = Estimator(load_cell("nmc", CAPACITY_AH), limits=ChargeLimits(full_voltage_v=FULL_V))
+    estimator.run(sparse)
+    assert identifier_counters(estimator.record[0])["full_anchors"] == DAYS
 
 
 def test_live_samples_and_blocks_have_equal_anchors() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.rc_ladder import TAUS
-from bms_estimator.kernels.kalman_filter.anchors import EMPTY, FULL, apply_anchor, detect_anchor, interrupt_anchors
+from bms_estimator.kernels.kalman_filter.anchors import EMPTY, FULL, apply_anchor, detect_anchor
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, LN_Q, NODE, NODES, OFFSET, SOC
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
@@ -92,8 +92,27 @@ def test_a_charge_has_one_anchor_and_the_next_charge_another() -> None:
 def test_a_gap_in_the_samples_discards_the_present_charge() -> None:
     detector = Detector()
     assert detector.kinds([CHARGE, TAIL]) == []
-    interrupt_anchors(detector.estimator.record[0]["anchors"])
+    assert detector.kinds([(600, 0.0, 4.17)], window_s=600) == []
     assert detector.kinds([REST]) == []
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "current_c", "voltage_v", "kinds"),
+    [
+        pytest.param(200, -0.08, 4.2, [FULL], id="at the full voltage"),
+        pytest.param(7200, -0.08, 4.2, [], id="hours apart"),
+        pytest.param(200, -0.08, 4.1, [], id="below the full voltage"),
+        pytest.param(200, -0.5, 4.2, [], id="with a large current"),
+        pytest.param(200, 0.08, 4.2, [], id="of a discharge"),
+    ],
+)
+def test_samples_some_minutes_apart_at_the_full_voltage_belong_to_one_charge(
+    gap_s: int, current_c: float, voltage_v: float, kinds: list[int]
+) -> None:
+    detector = Detector()
+    assert detector.kinds([CHARGE]) == []
+    assert detector.kinds([(4 * gap_s, current_c, voltage_v)], window_s=gap_s) == []
+    assert detector.kinds([REST]) == kinds
 
 
 def test_a_configured_tail_current_limits_the_current_at_the_end() -> None:

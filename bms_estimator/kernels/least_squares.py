@@ -1,0 +1,55 @@
+"""Sparse sums and triangular solutions of a least-squares problem. They call no BLAS, whose threads would slow them down."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.model.arrays import Floats
+from bms_estimator.numba_cache import njit
+
+
+@njit(cache=True)
+def add_residuals(a: Floats, b: Floats, columns: NDArray[np.intp], values: Floats, error: Floats) -> None:
+    """Add residuals to normal equations A x = b: J^T J to the lower triangle of A, and J^T e to b.
+
+    Args:
+        a: A, shape (unknowns, unknowns); written.
+        b: Shape (unknowns,); written.
+        columns: Indices of the non-zero derivatives of each residual, different within a row, shape (n, k).
+        values: These derivatives, shape (n, k).
+        error: Residuals e, shape (n,).
+    """
+    for i in range(error.size):
+        for j in range(columns.shape[1]):
+            c, v = columns[i, j], values[i, j]
+            b[c] += v * error[i]
+            for k in range(j + 1):
+                d = columns[i, k]
+                a[max(c, d), min(c, d)] += v * values[i, k]
+
+
+@njit(cache=True)
+def forward_substitution(lower: Floats, b: Floats) -> Floats:
+    """Return the solution y of L y = b, shape of ``b``: (n, m)."""
+    y = b.copy()
+    for i in range(y.shape[0]):
+        for j in range(i):
+            factor = lower[i, j]
+            for k in range(y.shape[1]):
+                y[i, k] -= factor * y[j, k]
+        for k in range(y.shape[1]):
+            y[i, k] /= lower[i, i]
+    return y
+
+
+@njit(cache=True)
+def backward_substitution(lower: Floats, y: Floats) -> Floats:
+    """Return the solution x of L^T x = y, shape of ``y``: (n, m)."""
+    x = y.copy()
+    for i in range(x.shape[0] - 1, -1, -1):
+        for k in range(x.shape[1]):
+            x[i, k] /= lower[i, i]
+        for j in range(i):
+            factor = lower[i, j]
+            for k in range(x.shape[1]):
+                x[j, k] -= factor * x[i, k]
+    return x
