@@ -31,8 +31,8 @@ def test_raised_alarms_are_listed_with_their_times(
         Line(seconds=30),
         Line(seconds=10, voltage_v=8.6),
         Line(seconds=30),
-        Line(seconds=20, temperature_c=61.0),
-        Line(seconds=80, temperature_c=54.0),
+        Line(seconds=20, temperature_c=60.0),
+        Line(seconds=80, temperature_c=54.9),
     ]
     capture = record(tmp_path / "capture.bms", lines)
     with pack.open("a") as file:

@@ -222,7 +222,7 @@ def test_help_names_a_fuel_cell_only_for_commands_that_support_fuel_cells(capsys
         for c in ("capacity", "identify", "replay", "simulate", "thesis", "validate")
         if help_mentions_fuel_cell(capsys, c)
     }
-    assert commands == {"identify", "replay"}
+    assert commands == {"identify", "replay", "simulate"}
 
 
 def help_mentions_fuel_cell(capsys, command: str) -> bool:
@@ -238,7 +238,6 @@ def help_mentions_fuel_cell(capsys, command: str) -> bool:
         ("capacity", "{steps}", "--cell", "pem_30w"),
         ("validate", "{steps}", "--cell", "pem_30w"),
         ("cell", "export", "{pack}", "--out", "{out}"),
-        ("simulate", "--cell", "pem_30w"),
         ("thesis", "{steps}", "--cell", "pem_30w"),
         ("replay", "{steps}", "--cell", "pem_30w", "--soc", "0.5"),
         ("replay", "{steps}", "--cell", "pem_30w", "--capacity-ah", "3"),
