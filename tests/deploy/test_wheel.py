@@ -43,6 +43,7 @@ CORE_PACKAGES = {
     "rich",
     "shellingham",
     "structlog",
+    "threadpoolctl",
     "tomlkit",
     "typer",
     "typing-extensions",
