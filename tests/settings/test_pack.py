@@ -120,6 +120,12 @@ def test_a_file_without_settings_is_an_error_because_it_may_be_cut_off(tmp_path:
     assert load_settings(path) == Settings()
 
 
+def test_a_byte_order_mark_before_the_settings_is_skipped(tmp_path: Path) -> None:
+    path = tmp_path / "pack.toml"
+    path.write_text('[pack]\nname = "house"\n', encoding="utf-8-sig")
+    assert load_settings(path).pack.name == "house"
+
+
 def test_the_gain_law_of_the_thesis_is_configurable(tmp_path: Path) -> None:
     path = tmp_path / "pack.toml"
     path.write_text('[observer]\nrearm_gain = "never"\ndead_zone_v = 0.0\nlambda = 2.0\n')

@@ -480,6 +480,13 @@ def test_only_its_own_acknowledgement_ends_over_temperature_while_the_hot_probe_
     assert "over_temperature" not in alarms.active
 
 
+def test_a_loss_ends_after_ten_seconds_of_values_also_if_it_begins_sooner() -> None:
+    inputs, present = Inputs(lost_s=1.0, series=1), np.array([1] * 3 + [0] * 3 + [1] * 20)
+    counts = {"temperature": present, **{name: np.zeros_like(present) for name in ("voltage", "current", "cells")}}
+    changed_s = inputs.update(np.arange(26.0), np.ones(26), counts)
+    assert changed_s == [4.0, 16.0]  # the first missing value is at 3 s, the first one after the loss at 6 s
+
+
 def test_a_saturated_voltage_exceeds_any_limit() -> None:
     alarms = make_evaluator({"pack_over_voltage": {"limit_v": 9.0, "clear_v": 8.5}})
     add_samples(alarms, *range(20), voltage_v=8.0, status=int(SampleStatus.VOLTAGE_SATURATED))
