@@ -5,7 +5,6 @@ BIN     := $(VENV)/bin
 PYTHON  ?= python3
 READY   := $(VENV)/.ready
 CORE    := $(VENV)/.core
-COMPARE := .venv-compare
 BLE     := .venv-ble
 AUDIT   := .venv-audit
 NODE    := .node
@@ -24,7 +23,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb docs test test-all prepared collected demo demo-fleet fleet fleet-kills fleet-sessions fleet-page benchmark compare home-assistant real-home-assistant anywhere month bank cells observability power collapse resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast fuelcell load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
+.PHONY: help venv apt audit check deb docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month bank cells observability power resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -74,9 +73,6 @@ fleet-kills: venv ## workers and server nodes killed 100 times, with one node an
 	for nodes in $(NODES); do KILLS=$(KILLS) NODES=$$nodes $(BIN)/python -m pytest -s --timeout=7200 \
 		tests/fleet/worker/test_worker.py -k kills $(ARGS) || exit 1; done
 
-fleet-sessions: venv ## cost of 10,000 MQTT sessions with TLS, and their return after a killed server, e.g. make fleet-sessions ARGS="--sessions 1000": four minutes
-	@$(BIN)/python -m tests.benchmarks.fleet.mqtt_sessions $(ARGS)
-
 nats: venv ## a node of a NATS cluster killed while messages arrive, in each of its roles: a minute
 	CLUSTER=1 $(BIN)/python -m pytest tests/mqtt/test_nats_server.py $(ARGS)
 
@@ -98,12 +94,6 @@ ble: ## a BMS over Bluetooth with a simulated BlueZ; the extra needs Python 3.12
 benchmark: venv ## the table of measured times, rates and memory
 	@$(BIN)/python -m tests.benchmarks.speed $(ARGS)
 
-compare: ## comparison of methods, including PyBOP, on all real captures, e.g. make compare ARGS="NCR Leaf": minutes
-	@[ -x $(COMPARE)/bin/python ] || $(PYTHON) -m venv $(COMPARE)
-	@$(COMPARE)/bin/pip install --quiet --disable-pip-version-check -e . pybop==26.3
-	@$(COMPARE)/bin/python -m tests.benchmarks.side_by_side $(ARGS)
-	@[ -n "$(findstring --json,$(ARGS))" ] || $(COMPARE)/bin/python -m tests.benchmarks.anywhere $(ARGS)
-
 anywhere: venv ## SOC error from any starting point of real captures, e.g. make anywhere ARGS=PF: minutes
 	@$(BIN)/python -m tests.benchmarks.anywhere $(ARGS)
 
@@ -113,16 +103,13 @@ month: venv ## SOC error over simulated weeks of use, day by day, e.g. make mont
 bank: venv ## the weakest cell of simulated banks: false alarms, detection and error of its SOC: up to 10 minutes
 	@$(BIN)/python -m tests.benchmarks.bank $(ARGS)
 
-collapse: venv ## the alarm before the cut-off: false alarms and warnings by signal, e.g. make collapse ARGS="--plot collapse.png": half an hour
-	@$(BIN)/python -m tests.benchmarks.collapse $(ARGS)
-
 cells: venv ## single cells of simulated packs: shorts and false alarms, beside three other detectors: minutes
 	@$(BIN)/python -m tests.benchmarks.cells $(ARGS)
 
 observability: venv ## the lower bound of the std of the SOC by cell and SOC window, e.g. make observability ARGS="lfp --window 0.5 0.95"
 	@$(BIN)/python -m tests.benchmarks.observability $(ARGS)
 
-forecast: venv ## forecasts of the time to cut-off on real captures, beside other methods, e.g. make forecast ARGS="n10_us06 leaf": half an hour
+forecast: venv ## forecasts of the time to cut-off on real captures, e.g. make forecast ARGS="n10_us06 leaf": half an hour
 	@$(BIN)/python -m tests.benchmarks.forecast $(ARGS)
 
 power: venv ## available power, usable capacity and time to full against real captures: two minutes
@@ -143,9 +130,6 @@ ablation: venv ## ablation of the filter on real captures, e.g. make ablation AR
 ablation-weeks: venv ## ablation of the slow fit over simulated weeks, e.g. make ablation-weeks ARGS="solar --parts slow Huber": hours
 	@$(BIN)/python -m tests.benchmarks.weeks $(ARGS)
 
-fuelcell: venv ## figures of the fuel cell, docs/theory/fuel-cell.md: half a minute
-	@$(BIN)/python -m tests.benchmarks.thesis.fuel_cell
-
 learning: venv ## ablation of the learning law, simulated
 	@$(BIN)/python -m tests.benchmarks.thesis.learning_law
 
@@ -162,9 +146,6 @@ audit: ## known vulnerabilities of requirements.lock; exit code of .ci/audit.py 
 
 page: apt venv ## cost of the live page in a real Chromium at 10 Hz, e.g. make page ARGS=60: minutes
 	@$(BIN)/python -m tests.benchmarks.speed.page $(ARGS)
-
-fleet-page: venv ## cost of the page of a fleet of 100,000 packs, e.g. make fleet-page ARGS="--packs 10000": four minutes
-	@$(BIN)/python -m tests.benchmarks.fleet.page $(ARGS)
 
 screenshots: apt venv ## the pictures of the live page, of the page of a fleet and of reports in docs
 	@$(BIN)/python -m tests.page.screenshots

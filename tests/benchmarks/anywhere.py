@@ -35,9 +35,9 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings
+from tests.benchmarks.ekf import FIVE_TAU_S, five_branches, fixed_ekf, ladder_ekf
+from tests.benchmarks.pulses import pulse_table
 from tests.benchmarks.recipes import GROUPS, Group, charge_ah, chosen, runs
-from tests.benchmarks.side_by_side.baselines import FIVE_TAU_S, five_branches, fixed_ekf, ladder_ekf
-from tests.benchmarks.side_by_side.pulses import pulse_table
 from tests.estimator.anywhere import cycles
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import Score, score

@@ -10,12 +10,13 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.capability import cell_power_limits, projected_pack, write_capability
 from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.forecast.load_history import LoadHistory
+from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.forecast.draws import DRAW
 from bms_estimator.kernels.forecast.mean_discharge import discharge_to_cutoff
+from bms_estimator.kernels.forecast.projected_pack import FAST_RESISTANCES, growth_factor
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.capability.captures import Capture
-from tests.benchmarks.forecast.ablation import GRADIENT, GROWTH, Part, disable
 from tests.benchmarks.recipes import LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_25, PF_CYCLE, PF_US06, Recipe, charge_ah
 
 LG = Recipe(5.0, ("lgm50/rate_0p1c_25c",))
@@ -40,8 +41,8 @@ CAPTURES = (
     Capture("generic nca: PF 25 C, US06", Recipe(2.9, generic="nca"), PF + "25_us06"),
     Capture("generic nca: PF -10 C, US06", Recipe(2.9, generic="nca"), PF + "n10_us06"),
 )
-PARTS, NO_PEAKS = (GROWTH, GRADIENT), "peaks of the load"
-"""Parts of the model whose effect on the usable capacity is measured, and name of another one."""
+PARTS = ("growth of R towards empty", "SOC gradient in the particles", "peaks of the load")
+"""Parts of the model whose effect on the usable capacity is measured."""
 CUTOFF_V, LFP_CUTOFF_V, MAX_LFP_V = 2.6, 2.2, 3.4
 """Cut-off voltage of oxide and of LFP cells, and maximum median voltage of a capture of an LFP cell [V]."""
 LOWEST_QUANTILE, MARGIN_V = 1e-4, 0.01
@@ -70,7 +71,7 @@ def discharge_table(folder: Path) -> Table:
         table.add_row(capture.name, f"{cutoff_v:.2f} V", f"{rows[-1, 3]:.2f}", *cells)
         charge_errors = 100.0 * (rows[:, [1, *range(6, rows.shape[1])]] - rows[:, :1]) / capture.capacity_ah
         without_parts.append(np.median(np.abs(charge_errors), axis=0))
-    means = zip(("nothing", *(part.name for part in PARTS), NO_PEAKS), np.mean(without_parts, axis=0), strict=True)
+    means = zip(("nothing", *PARTS), np.mean(without_parts, axis=0), strict=True)
     table.caption = "mean of the errors of usable_capacity_ah without " + ", ".join(f"{n}: {e:.2f}" for n, e in means)
     return table
 
@@ -115,9 +116,13 @@ def moments(capture: Capture, samples: SampleBlock, cutoff_v: float, folder: Pat
 
 
 def usable_without_parts(estimator: Estimator, cutoff_v: float, largest_a: float) -> Iterator[float]:
-    """Yield the usable capacity without each of ``PARTS``, and without the peaks of the load [Ah]."""
+    """Yield the usable capacity without each of ``PARTS`` [Ah]."""
     state, settings, draw = estimator.record[0]["filter"], estimator.settings_record[0]["filter"], np.zeros(1, DRAW)
-    for part, peak_a in (*((part, largest_a) for part in PARTS), (Part(NO_PEAKS), 0.0)):
+    for part, peak_a in zip(PARTS, (largest_a, largest_a, 0.0), strict=True):
         pack = projected_pack(estimator, cutoff_v, peak_a)
-        disable(part, pack, estimator)
+        if part == PARTS[0]:
+            growth = [growth_factor(state, pack["soc"][0], soc) for soc in np.linspace(0.0, 1.0, GRID)]
+            pack["ohm"][0, :FAST_RESISTANCES] /= growth
+        elif part == PARTS[1]:
+            pack["surface_soc"] = 0.0
         yield discharge_to_cutoff(pack[0], state, settings, peak_a, draw[0])[0] / 3600.0

@@ -1,8 +1,7 @@
-"""Forecasts of the time to the cut-off on real captures, beside other methods.
+"""Forecasts of the time to the cut-off on real captures.
 
 Each discharge is replayed through the estimator and the forecaster. Every minute before the cut-off the forecast is compared
-with the true time to the cut-off T, in the last two hours also with other methods. docs/theory/forecast-figures.md defines the
-figures.
+with the true time to the cut-off T. docs/theory/forecast-figures.md defines the figures.
 """
 
 import argparse
@@ -16,13 +15,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tests.benchmarks.forecast.ablation import PARTS, outcomes_without_parts
-from tests.benchmarks.forecast.captures import OWN, Case, cases, other_cases
+from tests.benchmarks.forecast.captures import Case, cases, other_cases
 from tests.benchmarks.forecast.measure import outcomes_of_discharge
-from tests.benchmarks.forecast.moments import INTERVAL_S
-from tests.benchmarks.forecast.scores import Outcome
+from tests.benchmarks.forecast.scores import INTERVAL_S, Outcome
 from tests.benchmarks.forecast.simulations import SIMULATIONS, Simulation, simulate_discharge
-from tests.benchmarks.forecast.tables import ablation_tables, tables
+from tests.benchmarks.forecast.tables import tables
 from tests.benchmarks.forecast.truth import read_discharge
 from tests.benchmarks.recipes import Recipe, cell_file
 
@@ -37,7 +34,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stdout.write(json.dumps([asdict(outcome) for outcome in found]) + "\n")
         return
     console = Console(width=None if sys.stdout.isatty() else 200)
-    for table in ablation_tables(found, [part.name for part in PARTS]) if options.ablation else tables(found):
+    for table in tables(found):
         if table.row_count:
             console.print(table)
 
@@ -52,11 +49,7 @@ def run(case: Case | Simulation, folder: Path, options: argparse.Namespace) -> I
         if found is None:
             return
         discharge, cell = found, cell_file(case.recipe, folder)
-    if options.ablation:
-        yield from outcomes_without_parts(case, discharge, cell, options.interval)
-    else:
-        has_baselines = not options.no_baselines and case.file == OWN
-        yield from outcomes_of_discharge(case, discharge, cell, options.interval, has_baselines=has_baselines)
+    yield from outcomes_of_discharge(case, discharge, cell, options.interval)
 
 
 def chosen(options: argparse.Namespace) -> Iterator[Case | Simulation]:
@@ -82,8 +75,6 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--interval", type=float, default=INTERVAL_S, help="time between two forecasts [s]; default: %(default)g"
     )
-    made.add_argument("--no-baselines", action="store_true", help="run only the forecast")
-    made.add_argument("--ablation", action="store_true", help="run the forecast without one of its parts at a time")
     made.add_argument("--json", action="store_true", help="print each outcome instead of tables")
     return made
 

@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from bms_estimator.model.arrays import Floats
-from tests.benchmarks.forecast.baselines import Quantiles
-from tests.benchmarks.forecast.moments import INTERVAL_S
 
 OUTSIDE = 2.0 / 0.1
 """Weight of the distance outside a 90 % interval in its interval score."""
@@ -16,13 +15,22 @@ LEVELS = np.array([0.05, 0.5, 0.95])
 MIN_QUANTILE_S = 1.0
 """Minimum of a quantile of which the logarithm is taken [s]."""
 MINUTE_S = 60.0
+INTERVAL_S = 60.0
+"""Interval between two forecasts, by default [s]."""
+
+
+class Quantiles(NamedTuple):
+    """Quantiles of the time to the cut-off [s]; NaN if unknown."""
+
+    p05_s: float
+    p50_s: float
+    p95_s: float
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Forecast by one method, and what came true."""
+    """Forecast, and what came true."""
 
-    method: str
     capture: str
     file: str
     """Kind of the cell file."""
@@ -35,10 +43,8 @@ class Outcome:
     """True if the cell file was measured at this temperature, too."""
     rate_c: float
     """Mean current before the cut-off, as a C-rate."""
-    lead_s: float
-    """True time to the cut-off in the capture [s]."""
     truth_s: float
-    """Time to the cut-off by which the forecast is judged [s]. It differs from ``lead_s`` only if the truth is simulated."""
+    """True time to the cut-off [s]."""
     said: Quantiles
     """Forecast."""
 
@@ -98,4 +104,4 @@ def said_between(low_min: float, high_min: float) -> Condition:
 
 def lead(*seconds: float) -> Condition:
     """Return the condition that the cut-off comes in one of these times [s], as closely as the moments lie."""
-    return lambda o: any(abs(o.lead_s - s) < 0.5 * INTERVAL_S for s in seconds)
+    return lambda o: any(abs(o.truth_s - s) < 0.5 * INTERVAL_S for s in seconds)

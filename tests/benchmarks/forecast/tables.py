@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import product
 
 from rich import box
 from rich.table import Table
@@ -17,10 +16,10 @@ from tests.benchmarks.forecast.captures import (
     PULSES,
     SIMULATED,
 )
-from tests.benchmarks.forecast.measure import COUNT, FORECAST, GIVEN, HALF_HOUR, LEADS_S, PERFECT, POWER
 from tests.benchmarks.forecast.scores import Condition, Outcome, Score, lead, said_between, score
 
-METHODS = (FORECAST, COUNT, HALF_HOUR, POWER, PERFECT)
+LEADS_S = (3600.0, 1800.0, 1200.0, 600.0, 300.0, 120.0)
+"""Times before the cut-off at which the forecasts are judged [s]."""
 BY_FORECAST_MIN = (10.0, 80.0)
 """Range of the median of the forecasts that are judged by what they say [min]."""
 HORIZONS_MIN = ((40.0, 80.0, "20 %"), (20.0, 40.0, "35 %"), (10.0, 20.0, "45 %"), (5.0, 10.0, ""), (0.0, 5.0, ""))
@@ -55,35 +54,19 @@ class Group:
 
 def tables(outcomes: list[Outcome]) -> Iterator[Table]:
     """Yield all tables that have a row."""
-    by_forecast = said_between(*BY_FORECAST_MIN)
-    of_forecast = [o for o in outcomes if o.method == FORECAST]
-    own = [o for o in of_forecast if o.file == OWN]
-    judged = [o for o in of_forecast if by_forecast(o)]
+    own = [o for o in outcomes if o.file == OWN]
+    judged = [o for o in outcomes if said_between(*BY_FORECAST_MIN)(o)]
     judged_own = [o for o in judged if o.file == OWN]
-    yield table("by forecast (median 10 to 80 min)", (o for o in outcomes if by_forecast(o)), method_groups())
-    yield table("by load", judged_own, [Group(load, _load(load)) for load in (DRIVE, PULSES, CONSTANT)])
-    yield table(
-        "by horizon",
-        own,
-        [Group(f"{a:.0f} to {b:.0f} min", said_between(a, b), target) for a, b, target in HORIZONS_MIN],
-    )
-    yield table("by temperature", judged, list(temperature_groups()))
-    for name in METHODS:
-        drives = [o for o in outcomes if o.method == name and o.file == OWN and o.load == DRIVE]
-        yield table(f"by time before the cut-off, drives: {name}", drives, list(lead_groups(name)))
-    given = [o for o in outcomes if o.method == GIVEN and 300.0 - 1.0 <= o.lead_s <= 4800.0]
-    yield table(f"{GIVEN} (cut-off in 5 to 80 min)", given, list(temperature_groups("5 %")))
+    drives = [o for o in own if o.load == DRIVE]
     constant = [o for o in own if o.load == CONSTANT and o.rate_c >= HALF_C]
+    by_horizon = [Group(f"{a:.0f} to {b:.0f} min", said_between(a, b), target) for a, b, target in HORIZONS_MIN]
+    yield table("by cell file (median 10 to 80 min)", judged, [Group(kind, _file(kind)) for kind in FILES])
+    yield table("by load", judged_own, [Group(load, _load(load)) for load in (DRIVE, PULSES, CONSTANT)])
+    yield table("by horizon", own, by_horizon)
+    yield table("by temperature", judged, list(temperature_groups()))
+    yield table("by time before the cut-off, drives", drives, list(lead_groups()))
     yield table("constant load from C/2, by time before the cut-off", constant, list(constant_groups()))
     yield table("by capture", judged, list(capture_groups(judged)))
-
-
-def ablation_tables(outcomes: list[Outcome], parts: list[str]) -> Iterator[Table]:
-    """Yield a table for each kind of load and cell file, with a row for the forecast without each part."""
-    judged = [o for o in outcomes if said_between(*BY_FORECAST_MIN)(o)]
-    for load, kind in product((DRIVE, PULSES, CONSTANT), FILES):
-        of_kind = (o for o in judged if o.load == load and o.file == kind)
-        yield table(f"{load}, {kind}: without", of_kind, [Group(part, _method(part, kind)) for part in parts])
 
 
 def table(title: str, outcomes: Iterable[Outcome], groups: list[Group]) -> Table:
@@ -111,36 +94,27 @@ def cells(scores: Score, captures: int) -> Iterator[str]:
     yield f"{scores.pinball:.3f}"
 
 
-def method_groups() -> list[Group]:
-    """Return a group for each method with a cell's own file, and one for the forecast with each other kind of file."""
-    return [
-        Group(FORECAST, _method(FORECAST, OWN), "85-95 % in band, 6 % before"),
-        *(Group(name, _method(name, OWN)) for name in METHODS[1:]),
-        *(Group(f"{FORECAST}, {kind}", _method(FORECAST, kind)) for kind in (OTHER_TEMPERATURE, GENERIC, SIMULATED)),
-    ]
-
-
-def temperature_groups(target: str = "") -> Iterator[Group]:
+def temperature_groups() -> Iterator[Group]:
     """Yield a group for each temperature, chemistry and kind of cell file."""
     for temperature_c in TEMPERATURES_C:
-        target_at = target or ("20 %" if temperature_c == REFERENCE_C else "45 %" if temperature_c == -20.0 else "35 %")
+        target_at = "20 %" if temperature_c == REFERENCE_C else "45 %" if temperature_c == -20.0 else "35 %"
         for kind in FILES:
             name = f"{temperature_c:g} C, {kind}"
-            for knows, note, error in ((True, "", target_at), (False, ", not of this temperature", target or "60 %")):
+            for knows, note, error in ((True, "", target_at), (False, ", not of this temperature", "60 %")):
                 yield Group(name + note, _oxide(temperature_c, kind, knows=knows), error)
     for kind in FILES:
-        yield Group(f"LFP, {kind}", _phosphate(kind), target or "35 %")
+        yield Group(f"LFP, {kind}", _phosphate(kind), "35 %")
 
 
-def lead_groups(method: str) -> Iterator[Group]:
+def lead_groups() -> Iterator[Group]:
     """Yield a group for each time before the cut-off."""
     for lead_s in LEADS_S:
-        yield Group(f"{lead_s:.0f} s", lead(lead_s), DRIVE_TARGETS.get(lead_s, "") if method == FORECAST else "")
+        yield Group(f"{lead_s:.0f} s", lead(lead_s), DRIVE_TARGETS.get(lead_s, ""))
 
 
 def constant_groups() -> Iterator[Group]:
     """Yield the groups of constant loads."""
-    yield Group("1200 s and more", lambda o: o.lead_s >= LEADS_S[2] - 1.0, "5 %")
+    yield Group("1200 s and more", lambda o: o.truth_s >= LEADS_S[2] - 1.0, "5 %")
     yield Group("600 s", lead(600.0), "10 %")
     yield Group("300 s", lead(300.0))
 
@@ -151,8 +125,8 @@ def capture_groups(outcomes: list[Outcome]) -> Iterator[Group]:
         yield Group(f"{capture}, {kind}", _capture(capture, kind))
 
 
-def _method(method: str, kind: str) -> Condition:
-    return lambda o: o.method == method and o.file == kind
+def _file(kind: str) -> Condition:
+    return lambda o: o.file == kind
 
 
 def _load(load: str) -> Condition:

@@ -10,17 +10,11 @@ import pytest
 
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.benchmarks.forecast.__main__ import main
-from tests.benchmarks.forecast.ablation import PARTS
-from tests.benchmarks.forecast.baselines import Quantiles, load_by_second
-from tests.benchmarks.forecast.measure import COUNT, FORECAST, GIVEN, HALF_HOUR, PERFECT, POWER
-from tests.benchmarks.forecast.moments import INTERVAL_S, voltage_slope
-from tests.benchmarks.forecast.scores import Outcome, lead, said_between, score
+from tests.benchmarks.forecast.scores import INTERVAL_S, Outcome, Quantiles, lead, said_between, score
 from tests.benchmarks.forecast.truth import discharge_of
 
 DATA = Path(__file__).parents[2] / "data"
-OUTCOME = Outcome(
-    FORECAST, "capture", "file", "drive", False, 25.0, True, 0.5, 1000.0, 1000.0, Quantiles(800.0, 1100.0, 1300.0)
-)
+OUTCOME = Outcome("capture", "file", "drive", False, 25.0, True, 0.5, 1000.0, Quantiles(800.0, 1100.0, 1300.0))
 
 
 def samples(time_s: list[float], current_a: list[float], voltage_v: list[float]) -> SampleBlock:
@@ -92,41 +86,17 @@ def test_charge_is_no_discharge():
     assert discharge_of(samples([0.0, 5000.0], [-1.0, -1.0], [2.5, 4.0]), 2.6, 1.0) is None
 
 
-def test_load_of_each_second_keeps_the_charge():
-    load = load_by_second(samples([0.0, 0.5, 1.0, 3.0], [2.0, 4.0, 6.0, 0.0], [4.0] * 4), 0.0, 3.0)
-    assert load is not None
-    assert load.current_a == pytest.approx([3.0, 6.0, 6.0])
-
-
-def test_slope_of_a_steady_fall_is_its_rate():
-    time_s = np.arange(300.0)
-    assert voltage_slope(samples(time_s.tolist(), [1.0] * 300, (4.0 - 1e-3 * time_s).tolist())) == pytest.approx(-1e-3)
-
-
 OPTIONS = ["leaf/cc_1c", "--data", str(DATA), "--cell", "leaf", "--capacity-ah", "30.5"]
 """Options for a capture that is part of this repository."""
 
 
 def test_tool_judges_a_real_capture_minute_by_minute(capsys):
-    main([*OPTIONS, "--no-baselines", "--json"])
+    main([*OPTIONS, "--json"])
     forecasts = json.loads(capsys.readouterr().out)
-    assert {o["method"] for o in forecasts} == {FORECAST}
-    assert [o["lead_s"] for o in forecasts[-10:]] == pytest.approx(
+    assert [o["truth_s"] for o in forecasts[-10:]] == pytest.approx(
         [60.0 * n for n in range(10, 0, -1)], abs=0.5 * INTERVAL_S
     )
     assert all(o["said"][0] <= o["said"][1] <= o["said"][2] for o in forecasts)
-
-
-def test_tool_runs_the_other_methods(capsys):
-    main([*OPTIONS, "--interval", "900", "--json"])
-    methods = {o["method"] for o in json.loads(capsys.readouterr().out)}
-    assert methods == {FORECAST, COUNT, POWER, HALF_HOUR, GIVEN, PERFECT}
-
-
-def test_tool_prints_the_forecast_without_each_part(capsys):
-    main([*OPTIONS, "--interval", "600", "--ablation"])
-    printed = capsys.readouterr().out
-    assert all(f"| {part.name} " in printed for part in PARTS)
 
 
 def test_capture_of_an_unknown_cell_asks_for_a_cell_file(tmp_path):

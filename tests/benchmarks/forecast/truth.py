@@ -23,8 +23,6 @@ class Discharge:
 
     samples: SampleBlock
     """Samples until the cut-off, which the last sample reaches."""
-    load: SampleBlock
-    """Samples until the lowest voltage. The load after the cut-off is known until then."""
     cutoff_v: float
     """Cut-off voltage [V]."""
     temperature_c: float
@@ -60,5 +58,4 @@ def discharge_of(rows: SampleBlock, nominal_cutoff_v: float, capacity_ah: float)
     if drawn_ah[-1] - drawn_ah.min() < MIN_DISCHARGE * capacity_ah:
         return None
     begin = int(np.argmax(until_end["current_a"] > BEGIN_C * capacity_ah))
-    lowest = int(np.argmin(np.where(discharging, rows["voltage_v"], np.inf)))
-    return Discharge(until_end, rows[: lowest + 1], cutoff_v, float(until_end["temperature_c"][begin]))
+    return Discharge(until_end, cutoff_v, float(until_end["temperature_c"][begin]))

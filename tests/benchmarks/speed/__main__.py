@@ -3,7 +3,7 @@
 import sys
 from itertools import chain
 
-from tests.benchmarks.fleet import checkpoints, faults, partition
+from tests.benchmarks.fleet import partition
 from tests.benchmarks.speed import capture, cells, forecast, forecast_request, kernel, live, packs
 from tests.benchmarks.table import show
 
@@ -16,8 +16,6 @@ GROUPS = {  # each function yields the rows of the table
     "live": live.rows,
     "packs": packs.rows,
     "partition": partition.rows,
-    "checkpoints": checkpoints.rows,
-    "faults": faults.rows,
 }
 
 

@@ -1,9 +1,8 @@
-"""Common estimators for comparison: EKFs with fixed parameters, a joint EKF, and RLS on the ARX form."""
+"""Two common estimators for comparison: EKFs with fixed parameters and two or five RC pairs."""
 
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
@@ -11,19 +10,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 EKF_VOLTAGE_SIGMA_V = 0.005
-"""Standard deviation of the measurement noise of the textbook filter, and minimum in the joint filter [V]."""
-ELEMENT_STD = 0.7
-"""Joint filter: initial standard deviation of ln of each element; 0.7 is a factor of two."""
-ELEMENT_WALK = 1e-6
-"""Joint filter: variance of the random walk of ln of each element [1/s].
-
-Of 1e-8, 1e-7 and 1e-6 this value has the smallest voltage error on the identification captures (docs/theory/comparison.md).
-"""
-NOISE_WINDOW_S = 60.0
-"""Joint filter: time constant of the adaptation of the measurement noise to the innovations [s]."""
-LN_SPAN = math.log(4.0)
-"""Joint filter: bound of the change of ln of each element. Elements stay between a quarter and four times their start, as
-in the observer."""
+"""Standard deviation of the measurement noise of the textbook filter [V]."""
 FIVE_SIGMA_V = 0.1
 """Filter with five time constants: measurement noise of the voltage averaged over a second [V].
 
@@ -37,8 +24,6 @@ WALK = np.array([1e-10, 1e-9, 1e-9])
 """Process noise of every filter: variance per second of the SOC, and of two RC voltages [V^2/s]."""
 SOC_STEP = 1e-4
 """Half of the SOC interval over which the slope of the OCV is computed."""
-MAX_RLS_TRACE = 1e6
-"""Recursive least squares: maximum trace of the covariance."""
 COLD_C = 0.0
 """Temperature at which a resistance with one activation energy equals the sum of the weakly and the strongly temperature
 dependent resistance of the cell file [C]."""
@@ -87,68 +72,6 @@ def fixed_ekf(
         p = p - np.outer(ph, ph) / s
         soc[k], std[k] = x[0], math.sqrt(p[0, 0])
     return soc, std
-
-
-@njit()
-def joint_ekf(
-    time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats
-) -> tuple[Floats, Floats]:
-    """Run a joint extended Kalman filter over (soc, v1, v2, ln R_s, ln R_1, ln tau_1, ln R_2, ln tau_2).
-
-    The measurement noise is adapted to the innovations of the last minute, as in an adaptive EKF.
-
-    Args:
-        time_s: Shape (n,) [s].
-        current_a: Shape (n,), positive on discharge [A].
-        voltage_v: Shape (n,) [V].
-        soc0: SOC at the first sample, 0..1.
-        cell: Initial values: capacity [A s], R_s, R_1 [ohm], tau_1 [s], R_2 [ohm], tau_2 [s].
-        grid: Shape (2, m): OCV and its slope over SOC 0..1 [V].
-
-    Returns:
-        SOC at each sample, shape (n,), and R_s, R_1, tau_1, R_2, tau_2, shape (n, 5).
-    """
-    x = np.zeros(8)
-    x[0], x[3:] = soc0, np.log(cell[1:])
-    p = np.diag(np.concatenate((INITIAL_VARIANCE, np.full(5, ELEMENT_STD**2))))
-    q = np.concatenate((WALK, np.full(5, ELEMENT_WALK)))
-    soc, elements = np.empty(len(time_s)), np.empty((len(time_s), 5))
-    noise_v2, h = EKF_VOLTAGE_SIGMA_V**2, np.zeros(8)
-    h[1], h[2] = -1.0, -1.0
-    for k in range(len(time_s)):
-        dt = 0.0
-        if k > 0:
-            dt = max(time_s[k] - time_s[k - 1], 0.0)
-            f, i = np.eye(8), current_a[k - 1]
-            x[0] -= dt / cell[0] * i
-            for branch in range(2):
-                r, tau = math.exp(x[4 + 2 * branch]), math.exp(x[5 + 2 * branch])
-                decay = math.exp(-dt / tau)
-                v = x[1 + branch]
-                f[1 + branch, 1 + branch] = decay
-                f[1 + branch, 4 + 2 * branch] = r * (1.0 - decay) * i  # by ln R
-                f[1 + branch, 5 + 2 * branch] = (v - r * i) * decay * dt / tau  # by ln tau
-                x[1 + branch] = decay * v + r * (1.0 - decay) * i
-            p = f @ p @ f.T + np.diag(q * dt)
-        ohmic_v = current_a[k] * math.exp(x[3])
-        h[0] = _ocv_slope(x[0], grid)
-        h[3] = -ohmic_v
-        innovation = voltage_v[k] - (ocv(x[0], grid[0], grid[1]) - x[1] - x[2] - ohmic_v)
-        ph = p @ h
-        model_v2 = h @ ph
-        # The expected square of the innovation is the variance of the model plus the variance of the noise.
-        noise_v2 += min(dt / NOISE_WINDOW_S, 1.0) * (innovation**2 - model_v2 - noise_v2)
-        noise_v2 = max(noise_v2, EKF_VOLTAGE_SIGMA_V**2)
-        s = model_v2 + noise_v2
-        x = x + ph / s * innovation
-        x[0] = min(max(x[0], 0.0), 1.0)
-        for j in range(5):  # every method of the comparison has these bounds
-            start = math.log(cell[1 + j])
-            x[3 + j] = min(max(x[3 + j], start - LN_SPAN), start + LN_SPAN)
-        p = p - np.outer(ph, ph) / s
-        p = 0.5 * (p + p.T)
-        soc[k], elements[k] = x[0], np.exp(x[3:])
-    return soc, elements
 
 
 def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]:
@@ -242,43 +165,3 @@ def ladder_ekf(
         p = p - np.outer(ph, ph) / s
         soc[k], std[k] = x[0], math.sqrt(max(p[0, 0], 0.0))
     return soc, std
-
-
-@njit()
-def rls_arx(current_a: Floats, overpotential_v: Floats, forgetting: float) -> Floats:
-    """Run recursive least squares with forgetting on the ARX form of a model with two RC pairs.
-
-    v[k] = c1 v[k-1] + c2 v[k-2] + c3 i[k] + c4 i[k-1] + c5 i[k-2] with the overpotential v = E_o - y.
-
-    Args:
-        current_a: Shape (n,), evenly sampled, positive on discharge [A].
-        overpotential_v: Shape (n,) [V].
-        forgetting: Factor per sample, below 1.
-
-    Returns:
-        Coefficients after each sample, shape (n, 5).
-    """
-    theta = np.zeros(5)
-    p = np.eye(5) * 1e3
-    history = np.zeros((len(current_a), 5))
-    for k in range(2, len(current_a)):
-        phi = np.array(
-            [overpotential_v[k - 1], overpotential_v[k - 2], current_a[k], current_a[k - 1], current_a[k - 2]]
-        )
-        pp = p @ phi
-        gain = pp / (forgetting + phi @ pp)
-        theta = theta + gain * (overpotential_v[k] - phi @ theta)
-        p = (p - np.outer(gain, pp)) / forgetting
-        trace = np.trace(p)
-        if trace > MAX_RLS_TRACE:  # without excitation, forgetting would let the covariance grow without limit
-            p *= MAX_RLS_TRACE / trace
-        history[k] = theta
-    return history
-
-
-def simulate_arx(coefficients: NDArray[np.float64], current_a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the overpotential of the ARX model under ``current_a`` [A], from rest. Shape (n,) [V]."""
-    from scipy.signal import lfilter  # noqa: PLC0415 - scipy.signal is slow to import and used here only
-
-    c1, c2, c3, c4, c5 = coefficients
-    return np.asarray(lfilter([c3, c4, c5], [1.0, -c1, -c2], current_a))
