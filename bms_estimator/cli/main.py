@@ -25,9 +25,6 @@ COMMANDS = {
         "bms_estimator.cli.live.run:run",
         "Run the live service: estimate from a BMS, monitor or sensor board, and publish.",
     ),
-    "top": LazyCommand(
-        "bms_estimator.cli.live.top:top", "Show all packs that publish to an MQTT broker, as a table in the terminal."
-    ),
     "edge": LazyCommand("bms_estimator.cli.live.edge:edge", "Send a pack's raw samples to a fleet server."),
     "replay": LazyCommand(
         "bms_estimator.cli.captures.replay:replay",

@@ -46,8 +46,8 @@ def test_published_messages_are_shown_as_printable_text_only(data: bytes) -> Non
         line = text_line(message) if message else None
         assert line is None or line.isprintable()
     if data:
-        view = ViewState(0.0, [PackView("pack", cache.devices["pack"].topics, 0.0)])
-        text = "".join(segment.text for segment in CONSOLE.render(build_screen(view, *CONSOLE.size)))
+        view = ViewState(0.0, PackView("pack", cache.devices["pack"].topics))
+        text = "".join(segment.text for segment in CONSOLE.render(build_screen(view, CONSOLE.width)))
         assert text.replace("\n", "").isprintable()
 
 

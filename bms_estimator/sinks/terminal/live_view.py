@@ -16,7 +16,7 @@ from rich.live import Live
 from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics
 from bms_estimator.sinks.terminal.screen import build_screen
 from bms_estimator.sinks.terminal.text_line import text_line
-from bms_estimator.sinks.terminal.view_state import BrokerOutage, PackView, ViewState
+from bms_estimator.sinks.terminal.view_state import PackView, ViewState
 
 REDRAW_S = 0.25
 """Minimum interval between two screens, at any publish rate [s]."""
@@ -30,14 +30,13 @@ T = TypeVar("T")
 
 
 class LiveView:
-    """View of the packs' publications on standard output. No method waits for a blocked standard output.
+    """View of the pack's publications on standard output. No method waits for a blocked standard output.
 
     Args:
-        devices: Last publications of each pack.
+        devices: Last publications of the pack, by its name.
         log: Log lines. The last of them are shown, because the screen hides log output.
         hint: Last line of the screen.
         true_soc: Returns the pack's true SOC 0..1 at the last sample, in a simulation.
-        outage: Returns the present outage of the broker; None without one.
         wall: Wall clock, seconds since 1970.
     """
 
@@ -48,13 +47,12 @@ class LiveView:
         log: Iterable[str] = (),
         hint: str = "",
         true_soc: Callable[[], float | None] = lambda: None,
-        outage: Callable[[], BrokerOutage | None] = lambda: None,
         wall: Callable[[], float] = time.time,
     ) -> None:
         self._console = Console(file=cast("IO[str]", _UnbufferedStdout()))
         self._terminal = self._console.is_terminal
         self._devices, self._log, self._hint, self._wall = devices, log, hint, wall
-        self._true_soc, self._outage = true_soc, outage
+        self._true_soc = true_soc
         self._states: deque[ViewState] = deque(maxlen=1)  # a newer state replaces one that was not drawn
         self._lines: deque[str] = deque(maxlen=MAX_WAITING_LINES)
         self._draw_event, self._closing = threading.Event(), threading.Event()
@@ -93,8 +91,8 @@ class LiveView:
 
     def _present_state(self) -> ViewState:
         """Return a copy, because the drawing thread must not see changes."""
-        packs = [PackView(name, dict(device.topics), device.last_s) for name, device in self._devices.items()]
-        return ViewState(self._wall(), packs, self._outage(), tuple(self._log), self._hint, self._true_soc())
+        packs = (PackView(name, dict(device.topics)) for name, device in self._devices.items())
+        return ViewState(self._wall(), next(packs, None), tuple(self._log), self._hint, self._true_soc())
 
     def _run_thread(self) -> None:
         try:
@@ -113,7 +111,7 @@ class LiveView:
             console=self._console, auto_refresh=False, screen=True, redirect_stdout=False, redirect_stderr=False
         ) as live:
             for state in self._until_closed(self._states):
-                screen = build_screen(state, *self._console.size)
+                screen = build_screen(state, self._console.width)
                 live.update(screen, refresh=True)
                 self._closing.wait(REDRAW_S)
         if screen is not None:

@@ -1,6 +1,4 @@
-"""Screen of the terminal view: a table of packs, alarms and faults, the last log lines and a hint. No I/O."""
-
-from collections.abc import Sequence
+"""Screen of the terminal view: the pack's values, alarms and faults, the last log lines and a hint. No I/O."""
 
 from rich import box
 from rich.console import Group, RenderableType
@@ -14,8 +12,6 @@ MIN_TABLE_CELLS = 80
 """Minimum width of the table [cells]. A narrower terminal crops the right columns."""
 MIN_WIDE_TABLE_CELLS = 96
 """Minimum width of the table with the remaining charge [cells]."""
-OTHER_LINES = 9
-"""Lines of the screen without packs and messages: headings, broker outage, numbers of omitted lines, log and hint."""
 LOG_LINES = 2
 """Number of log lines on the screen."""
 MAX_MESSAGES = 5
@@ -24,20 +20,12 @@ URGENT_STYLE = "bold red"
 """Style of critical alarms and of faults, which are listed first."""
 
 
-def build_screen(view: ViewState, width: int, height: int) -> RenderableType:
-    """Return the screen for a terminal of ``width`` cells and ``height`` lines. Packs with alarms come first."""
-    packs = sorted(view.packs, key=lambda pack: not pack.alarms())
-    messages = [message for pack in packs for message in _messages(pack, view)]
+def build_screen(view: ViewState, width: int) -> RenderableType:
+    """Return the screen for a terminal of ``width`` cells."""
+    messages = [] if view.pack is None else _messages(view.pack)
     messages.sort(key=lambda message: message.style != URGENT_STYLE)
-    max_packs = max(height - OTHER_LINES - min(len(messages), MAX_MESSAGES), 1)
-    lines: list[RenderableType] = []
-    if view.outage is not None:
-        reason = f": {view.outage.reason}" if view.outage.reason else ""
-        lines.append(Text(f"no broker since {clock_text(view.outage.since_s)}{reason}", style=URGENT_STYLE))
-    lines.append(_pack_table(view, packs[:max_packs], width) if packs else "no pack has published anything yet")
-    if len(packs) > max_packs:
-        lines.append(f"packs not shown: {len(packs) - max_packs}")
-    lines += messages[:MAX_MESSAGES]
+    table = "nothing has been published yet" if view.pack is None else _pack_table(view, view.pack, width)
+    lines: list[RenderableType] = [table, *messages[:MAX_MESSAGES]]
     if len(messages) > MAX_MESSAGES:
         lines.append(Text(f"alarms and faults not shown: {len(messages) - MAX_MESSAGES}", style=URGENT_STYLE))
     for entry in view.log[-LOG_LINES:]:
@@ -47,7 +35,7 @@ def build_screen(view: ViewState, width: int, height: int) -> RenderableType:
     return Group(*lines, Text(view.hint, style="cyan"))
 
 
-def _pack_table(view: ViewState, packs: Sequence[PackView], width: int) -> Table:
+def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0)
     table.width = MIN_TABLE_CELLS if width < MIN_TABLE_CELLS else None
     table.add_column("Pack", overflow="fold")
@@ -59,38 +47,35 @@ def _pack_table(view: ViewState, packs: Sequence[PackView], width: int) -> Table
     remaining = ("Remaining\nAh",) if is_wide else ()
     for heading in ("Voltage\nV", "Current\nA", "Power\nW", *remaining, "To cut-off\nh, 90 %", "Stability\nmargin"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for pack in packs:
-        state, status = pack.fields("state"), "no broker" if view.outage else pack.status(view.now_s)[0]
-        table.add_row(
-            Text(pack.device),
-            soc_text(state),
-            *([] if view.true_soc is None else [f"{100.0 * view.true_soc:.2f}"]),
-            Text(status, style="bold green" if status == "live" else URGENT_STYLE),
-            state.number_text("voltage_v", ".3f"),
-            state.number_text("current_a", "+.3f"),
-            state.number_text("power_w", "+.2f"),
-            *([state.number_text("remaining_capacity_ah", ".3f")] if is_wide else []),
-            cutoff_band_text(state),
-            "NO LOCK" if state and not state.flag("lock") else state.number_text("stability_margin", ".4f"),
-            style="" if status == "live" else "dim",
-        )
+    state, is_stale = pack.fields("state"), pack.stale_since() is not None
+    table.add_row(
+        Text(pack.device),
+        soc_text(state),
+        *([] if view.true_soc is None else [f"{100.0 * view.true_soc:.2f}"]),
+        Text("stale" if is_stale else "live", style=URGENT_STYLE if is_stale else "bold green"),
+        state.number_text("voltage_v", ".3f"),
+        state.number_text("current_a", "+.3f"),
+        state.number_text("power_w", "+.2f"),
+        *([state.number_text("remaining_capacity_ah", ".3f")] if is_wide else []),
+        cutoff_band_text(state),
+        "NO LOCK" if state and not state.flag("lock") else state.number_text("stability_margin", ".4f"),
+        style="dim" if is_stale else "",
+    )
     return table
 
 
-def _messages(pack: PackView, view: ViewState) -> list[Text]:
-    """Return a line for each alarm of a pack, the reason why its values are stale, and each input diagnostic."""
-    health, (status, since) = pack.fields("health"), pack.status(view.now_s)
+def _messages(pack: PackView) -> list[Text]:
+    """Return a line for each alarm, the reason why the values are stale, and each input diagnostic."""
+    health, since = pack.fields("health"), pack.stale_since()
     messages = [
-        Text(
-            f"{pack.device}: {_alarm_text(alarm)}",
-            style=URGENT_STYLE if alarm.text("severity") == "critical" else "yellow",
-        )
+        Text(_alarm_text(alarm), style=URGENT_STYLE if alarm.text("severity") == "critical" else "yellow")
         for alarm in pack.alarms()
     ]
     reason = health.text("sensor_message")
-    if reason or (status != "live" and view.outage is None):
-        messages.append(Text(f"{pack.device}: {status}{since}{reason and ': '}{reason}", style=URGENT_STYLE))
-    return messages + [Text(f"{pack.device}: suspected: {each}", style="yellow") for each in health.texts("suspects")]
+    if reason or since is not None:
+        status = "live" if since is None else f"stale since {since}" if since else "stale"
+        messages.append(Text(f"{status}{reason and ': '}{reason}", style=URGENT_STYLE))
+    return messages + [Text(f"suspected: {each}", style="yellow") for each in health.texts("suspects")]
 
 
 def _alarm_text(alarm: JsonFields) -> str:

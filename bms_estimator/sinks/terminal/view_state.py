@@ -1,15 +1,13 @@
-"""State of the terminal view: last publications of all packs, the broker's outage, and the log. No I/O."""
+"""State of the terminal view: last publications of the pack, and the log. No I/O."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
+from bms_estimator.sinks.mqtt.messages import SENSOR_AVAILABILITY
 from bms_estimator.sinks.terminal.json_fields import JsonFields
 from bms_estimator.telemetry.cutoff_text import clock_duration
 
-MAX_SILENT_S = 10.0
-"""Maximum time between two messages of a running service [s]. A service that is silent for longer counts as gone."""
 ALARM_PREFIX = "alarm/"
 """Prefix of alarm topics."""
 NOT_KNOWN = "not known"
@@ -18,23 +16,13 @@ BAND_STDS = 2.0
 """Half width of the SOC's confidence band [standard deviations]. The band contains the true SOC in 95 % of the cases."""
 
 
-class BrokerOutage(NamedTuple):
-    """Outage of the broker."""
-
-    since_s: float
-    """Start of the outage, seconds since 1970."""
-    reason: str | None
-
-
 class PackView(NamedTuple):
-    """Last publications of one pack."""
+    """Last publications of the pack."""
 
     device: str
     """Name of the device."""
     topics: Mapping[str, Any]
     """Payloads by topic, relative to the device's topic."""
-    received_s: float
-    """Time of the last message, seconds since 1970."""
 
     def fields(self, topic: str) -> JsonFields:
         """Return the fields of a topic's last payload."""
@@ -46,15 +34,12 @@ class PackView(NamedTuple):
         alarms = [self.fields(topic) for topic in self.topics if topic.startswith(ALARM_PREFIX)]
         return [alarm for alarm in alarms if alarm.flag("active") or (online and alarm.text("unwatched_reason"))]
 
-    def status(self, now_s: float) -> tuple[str, str]:
-        """Return ``live``, ``stale``, ``silent`` or ``offline`` and, unless live, `` since 12:00:00Z``."""
-        if self.topics.get(AVAILABILITY) == "offline":
-            return "offline", _since(self.fields("health").text("publish_time"))
-        if now_s - self.received_s > MAX_SILENT_S:
-            return "silent", _since(iso_utc(self.received_s))
-        if self.topics.get(SENSOR_AVAILABILITY) == "offline":
-            return "stale", _since(self.fields("state").text("time"))
-        return "live", ""
+    def stale_since(self) -> str | None:
+        """Return the time of day of the last state, ``12:00:00Z`` or empty, while its values are stale; otherwise None."""
+        if self.topics.get(SENSOR_AVAILABILITY) != "offline":
+            return None
+        time = self.fields("state").text("time")
+        return f"{time[11:19]}Z" if time else ""
 
 
 class ViewState(NamedTuple):
@@ -62,9 +47,8 @@ class ViewState(NamedTuple):
 
     now_s: float
     """Present time, seconds since 1970."""
-    packs: Sequence[PackView] = ()
-    outage: BrokerOutage | None = None
-    """None while the broker is connected, or if none is needed."""
+    pack: PackView | None = None
+    """None before the first publication."""
     log: Sequence[str] = ()
     """Log lines, oldest first; ANSI colours are allowed."""
     hint: str = ""
@@ -90,7 +74,3 @@ def cutoff_band_text(state: JsonFields) -> str:
 def clock_text(epoch_s: float) -> str:
     """Return the time of day in UTC, ``12:00:00Z``."""
     return f"{iso_utc(epoch_s)[11:19]}Z"
-
-
-def _since(iso: str) -> str:
-    return f" since {iso[11:19]}Z" if iso else ""

@@ -12,7 +12,7 @@ from bms_estimator.mqtt.topic_cache import DeviceMessage, TopicCache
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.terminal.screen import MAX_MESSAGES, build_screen
 from bms_estimator.sinks.terminal.text_line import text_line
-from bms_estimator.sinks.terminal.view_state import BrokerOutage, PackView, ViewState
+from bms_estimator.sinks.terminal.view_state import PackView, ViewState
 from tests.sinks.snapshots import CELL_SNAPSHOT, NOW, SNAPSHOT_WITHOUT_SAMPLES, STACK_SNAPSHOT
 
 LOG = [f"12:00:0{n}Z [warning] faults on the line frames_lost={n} crc_errors={n} overruns={n}" for n in range(5)]
@@ -20,18 +20,16 @@ HINT = "live page: http://127.0.0.1:8765/; in a second terminal: mosquitto_sub -
 ESTIMATE = {"soc_percent": 50.0, "soc_std": 0.02, "voltage_v": 24.123, "current_a": 12.5, "power_w": 301.54}
 
 
-def pack_view(
-    topics: dict[str, Any] | None = None, device: str = "pack", snapshot: Snapshot = CELL_SNAPSHOT
-) -> PackView:
+def pack_view(topics: dict[str, Any] | None = None, snapshot: Snapshot = CELL_SNAPSHOT) -> PackView:
     """Return a pack as a subscriber sees it, with some payloads changed. ``topics`` has the changes by topic."""
-    published, messages = TopicCache("bms"), MessageBuilder("bms", device)
+    published, messages = TopicCache("bms"), MessageBuilder("bms", "pack")
     for message in (
         *messages.birth_messages(),
         *messages.guaranteed_messages(None, snapshot),
         *messages.live_messages(PublishedState(), snapshot, NOW)[0],
     ):
         published.take(message.topic, message.payload, NOW)
-    return PackView(device, published.devices[device].topics | {"sensor/availability": "online"} | (topics or {}), NOW)
+    return PackView("pack", published.devices["pack"].topics | {"sensor/availability": "online"} | (topics or {}))
 
 
 def alarm(name: str, severity: str, *, active: bool = True) -> dict[str, Any]:
@@ -44,18 +42,18 @@ def lines_of(view: ViewState, columns: int = 100, rows: int = 40) -> list[str]:
     """Return the lines as the terminal shows them, cropped to its size."""
     console = Console(width=columns, height=rows, force_terminal=True, color_system=None)
     with console.capture() as capture:
-        console.print(Screen(build_screen(view, columns, rows)), end="")
+        console.print(Screen(build_screen(view, columns)), end="")
     return capture.get().splitlines()
 
 
-def text_of(*packs: PackView, now_s: float = NOW, outage: BrokerOutage | None = None) -> str:
+def text_of(pack: PackView) -> str:
     """Return the text of the screen, with one space between words."""
-    return " ".join(" ".join(lines_of(ViewState(now_s, packs, outage))).split())
+    return " ".join(" ".join(lines_of(ViewState(NOW, pack))).split())
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(32, 8), (60, 20), (80, 12), (80, 24), (200, 60)])
 def test_a_screen_of_any_size_shows_the_soc_and_no_line_is_too_long(columns: int, rows: int) -> None:
-    lines = lines_of(ViewState(NOW, [pack_view({"state": ESTIMATE})], None, LOG, HINT, true_soc=0.5), columns, rows)
+    lines = lines_of(ViewState(NOW, pack_view({"state": ESTIMATE}), LOG, HINT, true_soc=0.5), columns, rows)
     assert len(lines) == rows
     assert max(map(cell_len, lines)) <= columns
     assert "pack 50.00 ± 4.00" in " ".join(" ".join(lines).split())
@@ -73,20 +71,18 @@ def test_an_soc_that_is_not_known_is_not_shown_as_a_number() -> None:
 def test_80_by_24_cells_show_a_pack_with_three_alarms_and_the_log_and_the_hint() -> None:
     alarms = alarm("soc_low", "warning") | alarm("cell_over_voltage", "critical") | alarm("cell_imbalance", "warning")
     topics = alarms | alarm("link_lost", "critical", active=False) | {"state": ESTIMATE}
-    view = ViewState(NOW, [pack_view(topics)], None, LOG, HINT, true_soc=0.497)
+    view = ViewState(NOW, pack_view(topics), LOG, HINT, true_soc=0.497)
     text = " ".join(" ".join(lines_of(view, 80, 24)).split())
     assert "pack 50.00 ± 4.00 49.70 live 24.123 +12.500 +301.54 - NO LOCK" in text
     assert LOG[-1][:50] in text
     assert HINT in text
-    critical_at = text.index(
-        "pack: critical since 2024-05-01T12:00:00.000Z: cell_over_voltage: 12.3 % is below the limit"
-    )
-    assert critical_at < text.index("pack: warning since 2024-05-01T12:00:00.000Z: soc_low:") < text.index("imbalance:")
+    critical_at = text.index("critical since 2024-05-01T12:00:00.000Z: cell_over_voltage: 12.3 % is below the limit")
+    assert critical_at < text.index("warning since 2024-05-01T12:00:00.000Z: soc_low:") < text.index("imbalance:")
     assert "link_lost" not in text
 
 
 def test_the_band_of_the_time_to_the_cut_off_is_shown_on_a_narrow_screen_in_place_of_the_remaining_charge() -> None:
-    narrow, wide = ("\n".join(lines_of(ViewState(NOW, [pack_view()]), columns)) for columns in (80, 100))
+    narrow, wide = ("\n".join(lines_of(ViewState(NOW, pack_view()), columns)) for columns in (80, 100))
     assert "1:23-2:45" in narrow
     assert "Remaining" not in narrow
     assert "1:23-2:45" in wide
@@ -108,22 +104,15 @@ def test_stale_values_have_a_reason_and_a_time() -> None:
     health = {"sensor_message": "bytes come, but no valid frame", "suspects": ["reversed sign"]}
     topics = {"state": {"time": "2024-05-01T12:00:00.000Z"}, "health": health, "sensor/availability": "offline"}
     stale = text_of(pack_view(topics))
-    assert "pack: stale since 12:00:00Z: bytes come, but no valid frame pack: suspected: reversed sign" in stale
-    assert "pack: offline since 22:13:20Z" in text_of(pack_view({"availability": "offline"}))
-    assert "pack: silent since 22:13:20Z" in text_of(pack_view(), now_s=NOW + 11.0)
-    no_broker = text_of(pack_view(), outage=BrokerOutage(NOW - 60.0, "the connection broke"))
-    assert "no broker since 22:12:20Z: the connection broke" in no_broker
-    assert "live" not in stale + no_broker
+    assert "stale since 12:00:00Z: bytes come, but no valid frame suspected: reversed sign" in stale
+    assert "live" not in stale
 
 
-def test_packs_with_alarms_are_shown_first_and_hidden_packs_are_counted() -> None:
+def test_alarms_beyond_the_screen_are_counted() -> None:
     alarms = alarm("soc_low", "warning") | {f"alarm/{n}": {"active": True, "severity": "critical"} for n in range(5)}
-    packs = [*(pack_view(device=f"p{n}") for n in range(29)), pack_view(alarms, "last")]
-    lines = [line.rstrip() for line in lines_of(ViewState(NOW, packs, hint=HINT), 100, 24)]
-    names = [line.split()[0] for line in lines if " live " in line]
-    assert names == ["last", *(f"p{n}" for n in range(len(names) - 1))]
-    assert [line.split(":")[0] for line in lines].count("last") == MAX_MESSAGES
-    assert {f"packs not shown: {30 - len(names)}", "alarms and faults not shown: 1", HINT} <= set(lines)
+    lines = [line.rstrip() for line in lines_of(ViewState(NOW, pack_view(alarms), hint=HINT), 100, 24)]
+    assert [line.split()[0] for line in lines if line].count("critical") == MAX_MESSAGES
+    assert {"alarms and faults not shown: 1", HINT} <= set(lines)
 
 
 @pytest.mark.parametrize(
@@ -139,8 +128,8 @@ def test_no_payload_breaks_the_screen_or_controls_the_terminal(garbage: Any) -> 
         "sensor_message": "\x1b]0;x",
     }
     for payload in (garbage, control_characters, {"suspects": [garbage, "\x1b[2J"]}, {"voltage_v": 10**400}):
-        pack = PackView("pack", dict.fromkeys(topics, payload), NOW)
-        assert "".join(lines_of(ViewState(NOW, [pack, PackView("other", {}, NOW)]))).isprintable()
+        for pack in (PackView("pack", dict.fromkeys(topics, payload)), PackView("pack", {})):
+            assert "".join(lines_of(ViewState(NOW, pack))).isprintable()
         for topic in topics:
             line = text_line(DeviceMessage("pack", topic, payload))
             assert line is None or line.isprintable()
@@ -148,5 +137,5 @@ def test_no_payload_breaks_the_screen_or_controls_the_terminal(garbage: Any) -> 
 
 def test_screen_without_a_pack_shows_the_hint() -> None:
     text = " ".join(lines_of(ViewState(NOW, hint=HINT)))
-    assert "no pack has published anything yet" in text
+    assert "nothing has been published yet" in text
     assert HINT in text
