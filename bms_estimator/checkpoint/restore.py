@@ -12,17 +12,14 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import OBSERVER_COUNTERS
 from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, HISTORY_ROW
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENTS
-from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS, store_last_good_state
+from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
 from bms_estimator.kernels.kalman_filter.mixture import decorrelate_state
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
-from bms_estimator.kernels.kalman_filter.ocv_correction import reset_ocv_correction
-from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET, STATES
+from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET
 from bms_estimator.pack_model.saved import MAX_SEGMENT, checked_rows
 
 _PARTS_WITHOUT_FILTER = ("observer.", "learning.", "series_resistance.")
 """Prefixes of the fields that are also estimated while the filter is off."""
-EXTENDABLE_FIELDS = {"filter.mean": 1, "filter.covariance": 2}
-"""Number of trailing axes along the filter's states, by field. Later versions append states at the end of these axes."""
 MAX_COUNT = 1e15
 """Maximum plausible absolute value of a counter: the number of samples of 30,000 years at 1,000 a second."""
 MAX_SUM = 1e24
@@ -35,8 +32,8 @@ off for some time, so that its state is outdated."""
 def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
     """Restore a new estimator from a checkpoint's state, with counters that start from zero.
 
-    Fields that the checkpoint lacks, or has in another shape, and additional filter states get their values from a
-    first sample. Additional fields of the checkpoint are ignored.
+    Fields that the checkpoint lacks, or has in another shape, get their values from a first sample. Additional fields of the
+    checkpoint are ignored.
 
     Args:
         estimator: New estimator; unchanged if the state is invalid.
@@ -71,10 +68,6 @@ def _restore(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: 
     soc_difference = abs(f["soc"][0] - estimator.state["soc"][0])
     if estimator.identifying and (not filter_was_on or soc_difference > MAX_SOC_DIFFERENCE):
         unseen_s = math.inf  # the filter's state is outdated: resume as after a gap of unknown length
-    if "filter.mean_a" not in saved:  # saved by a version without load statistics
-        f["mean_a"] = f["current_a"]
-    if filter_was_on and saved.get("filter.mean", np.zeros(0)).shape[-1] < STATES:
-        _reset_ocv_states(estimator)
     _reset_switched_states(estimator)
     estimator.resume(unseen_s)
     for name in OBSERVER_COUNTERS:
@@ -87,29 +80,11 @@ def _restore(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: 
 
 
 def copy_known_fields(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]]) -> None:
-    """Copy saved fields to the fields of ``record`` with equal names and shapes, or with additional filter states."""
+    """Copy saved fields to the fields of ``record`` with equal names and shapes."""
     for name, field in fields(record):
         value = saved.get(name)
-        if value is None or value.ndim != field.ndim or not np.can_cast(value.dtype, field.dtype, "same_kind"):
-            continue
-        if value.shape == field.shape:
+        if value is not None and value.shape == field.shape and np.can_cast(value.dtype, field.dtype, "same_kind"):
             field[...] = value
-        elif name in EXTENDABLE_FIELDS and _is_shorter(value.shape, field.shape, EXTENDABLE_FIELDS[name]):
-            field[tuple(map(slice, value.shape))] = value
-
-
-def _is_shorter(saved: tuple[int, ...], field: tuple[int, ...], axes: int) -> bool:
-    """Return True if the shapes differ only in the last ``axes``, along which the saved array is shorter."""
-    return saved[:-axes] == field[:-axes] and max(saved[-axes:]) <= field[-1]
-
-
-def _reset_ocv_states(estimator: Estimator) -> None:
-    """Initialize the OCV correction, which an earlier version did not have as states."""
-    f, c = estimator.record[0]["filter"], estimator.record[0]["checks"]
-    count = int(f["count"])
-    for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):
-        reset_ocv_correction(mean, covariance)
-    store_last_good_state(c, f)
 
 
 def _reset_switched_states(estimator: Estimator) -> None:

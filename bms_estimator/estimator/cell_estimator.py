@@ -20,8 +20,6 @@ from bms_estimator.settings.alarm_limits import MIN_CELLS, balancing_voltage_v
 
 LEAK_STDS = 2.5
 """Minimum difference between the self-discharges of a cell and of the median cell that counts as a short [std]."""
-NEW_FIELDS = {"response", "score", "information", "near_full_soc"}
-"""Fields of CELL and BANK that older checkpoints do not have. They begin at zero, so that the hypotheses start again."""
 CONSTANT_FRACTION = 0.5
 """Fraction of ``BIAS_V`` that is constant, such as the offset of a converter."""
 MAX_MEAN = np.array([1.0, 10.0, 10.0, 10.0, 1.0])
@@ -209,22 +207,14 @@ class CellEstimator:
         if not saved or not self._enabled:
             return ""
         cells, bank = saved.get("cells"), saved.get("bank")
-        if (
-            cells is None
-            or bank is None
-            or not _has_state(cells, CELL)
-            or not _has_state(bank, BANK)
-            or bank.shape != (1,)
-        ):
+        if cells is None or bank is None or cells.dtype != CELL or bank.dtype != BANK or bank.shape != (1,):
             return "it was saved by another version"
         if cells.shape != (self._series,):
             return f"it has {cells.size} cells, and the pack has {self._series} in series"
         if reason := _invalid_reason(cells, bank):
             return reason
         self._start(self._series)
-        for records, saved_records in ((self.cells, cells), (self.bank, bank)):
-            for name in set(records.dtype.names or ()) & set(saved_records.dtype.names or ()):
-                records[name] = saved_records[name]
+        self.cells[...], self.bank[...] = cells, bank
         self.resume(unseen_s)
         return ""
 
@@ -234,13 +224,6 @@ class CellEstimator:
         self.bank["unseen_s"] = unseen_s if math.isfinite(unseen_s) else 0.0
 
 
-def _has_state(saved: Records, dtype: np.dtype[Any]) -> bool:
-    """Return True if the fields of ``saved`` are those of ``dtype``, possibly without ``NEW_FIELDS``."""
-    expected, stored = dict(dtype.fields or {}), dict(saved.dtype.fields or {})
-    common = expected.keys() & stored.keys()
-    return expected.keys() - NEW_FIELDS <= common and all(stored[name][0] == expected[name][0] for name in common)
-
-
 def _invalid_reason(cells: Records, bank: Records) -> str:
     """Return the reason for which a saved state is invalid; empty if it is valid."""
     variance = np.diagonal(cells["covariance"], axis1=1, axis2=2)
@@ -248,7 +231,7 @@ def _invalid_reason(cells: Records, bank: Records) -> str:
         cells["mean"],
         cells["covariance"],
         cells["sums"],
-        *(bank[name] for name in bank.dtype.names or () if name in (BANK.names or ()) and name != "time_s"),
+        *(bank[name] for name in bank.dtype.names or () if name != "time_s"),
     )
     if not all(np.isfinite(values).all() for values in numbers if values.dtype.kind == "f"):
         return "a value is not finite"

@@ -34,8 +34,6 @@ def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]
 def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Restore a load.
 
-    An earlier version saved a maximum current below the mean for seconds in which the current fell. The mean replaces it.
-
     Args:
         load: Empty load to fill; unchanged if the arrays are invalid.
         past: Empty minutes to fill; unchanged if the arrays are invalid.

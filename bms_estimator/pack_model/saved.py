@@ -94,10 +94,6 @@ _FIT_RANGES = {
 """Range of each saved field of a fit."""
 _CURVE_UNKNOWNS = CURVE_NODES + DIRECTIONS * DIRECTION_NODES
 """Number of unknowns of the OCV's error and of the error by direction."""
-_DEFAULTS: Mapping[str, NDArray[Any]] = {"first_segment": np.zeros(())}
-"""Fields that an earlier version did not save, with their values: its fits used all segments."""
-_NEW_ROW_FIELDS = {"between_a2", "skew_a2"}
-"""Fields of a row that an earlier version did not save. They are variances, which it assumed to be 0."""
 BANK = "bank_"
 """Prefix of the arrays of the first discharges of a bank and of the fit after them."""
 
@@ -118,9 +114,8 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
     if not arrays:
         return None
     values: dict[str, Any] = {}
-    saved = {**_DEFAULTS, **arrays}
     for name, shape in _SHAPES.items():
-        value = _fit_field(saved, name)
+        value = _fit_field(arrays, name)
         if value.shape != shape:
             raise ValueError(f"{name} of the fit is damaged")
         values[name] = value if shape else float(value)
@@ -150,19 +145,6 @@ def _is_within(values: NDArray[Any], limits: tuple[float, float]) -> bool:
     return bool(((values >= limits[0]) & (values <= limits[1])).all())
 
 
-def _with_present_fields(rows: NDArray[Any] | None) -> NDArray[Any] | None:
-    """Return rows with the fields that an earlier version did not save; other rows are returned unchanged."""
-    kept = [name for name in HISTORY_ROW.names or () if name not in _NEW_ROW_FIELDS]
-    if rows is None or [*(rows.dtype.names or ())] != kept:
-        return rows
-    if any(rows.dtype[name] != HISTORY_ROW[name] for name in kept):
-        return rows
-    result = np.zeros(rows.shape, HISTORY_ROW)
-    for name in kept:
-        result[name] = rows[name]
-    return result
-
-
 def neutral_fit() -> PackFit:
     """Return a fit that corrects nothing. The service adopts it before the first sample to compile the code."""
     values: dict[str, Any] = {name: np.zeros(shape) if shape else 0.0 for name, shape in _SHAPES.items()}
@@ -185,9 +167,9 @@ def history_arrays(history: History, fit: PackFit | None) -> dict[str, NDArray[A
 
 
 def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
-    """Return the times of weak cells. An earlier version did not save them."""
-    saved = arrays.get("weak_cell_times", np.zeros((0, len(WeakCellTime._fields))))
-    if saved.dtype != float or saved.ndim != 2 or saved.shape[1] != len(WeakCellTime._fields):
+    """Return the times of weak cells."""
+    saved = arrays.get("weak_cell_times")
+    if saved is None or saved.dtype != float or saved.ndim != 2 or saved.shape[1] != len(WeakCellTime._fields):
         raise ValueError("the times of weak cells are damaged")
     start_s, end_s, soc = saved.T
     if not (_is_within(start_s, _TIME) and (end_s >= start_s).all() and _is_within(soc, _FITTED_SOC)):
@@ -201,13 +183,12 @@ def _first_discharges(arrays: Arrays) -> ReferenceDischarges | None:
     return None if fit is None else ReferenceDischarges(checked_rows(arrays.get("bank_rows")), fit)
 
 
-def checked_rows(saved: NDArray[Any] | None) -> NDArray[np.void]:
+def checked_rows(rows: NDArray[Any] | None) -> NDArray[np.void]:
     """Return saved rows.
 
     Raises:
         ValueError: They have another layout, an implausible value, or are not in the order of time.
     """
-    rows = _with_present_fields(saved)
     if rows is None or rows.dtype != HISTORY_ROW or rows.ndim != 1 or rows.size > MAX_ROWS:
         raise ValueError("its rows have another layout")
     for name, limits in _ROW_RANGES.items():

@@ -16,14 +16,6 @@ CellCount = Annotated[int, Field(ge=0, le=255)]
 TenantName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
 
 
-def _reject_raw_limits(table: object) -> object:
-    """Reject the former limits of the stream of blocks."""
-    former = {"raw_gb", "raw_days"}.intersection(table if isinstance(table, dict) else ())
-    if former:
-        raise ValueError(f"{min(former)}: replaced by packs and outage_days, from which the size is computed")
-    return table
-
-
 def _validate_listen(text: str) -> str:
     parse_listen(text)
     return text
@@ -72,8 +64,6 @@ class ServerSettings(Strict):
         description="interval between fsyncs; a power failure loses messages since the last fsync, unless another node has them; 0: fsync after each message",
     )
 
-    _raw_limits = model_validator(mode="before")(_reject_raw_limits)
-
     @model_validator(mode="after")
     def _check_that_monitor_is_local(self) -> Self:
         if not parse_listen(self.monitor).loopback:
@@ -113,8 +103,6 @@ class TenantSettings(Strict):
         default={},
         description="revocation times by pack; tokens of a pack that were issued before its time are rejected, for example after a theft",
     )
-
-    _raw_limits = model_validator(mode="before")(_reject_raw_limits)
 
 
 class FleetSettings(Strict):

@@ -11,8 +11,6 @@ SCHEME_2_LAMBDA = 100.0
 """Rate lambda_i in (3.17), as in the simulations of the thesis [1/s]."""
 SCHEME_2_EPSILON = 0.35
 """Largest parameter that (3.17) returns to its initial value."""
-FORMER_SETTINGS = {"scheme_2_lambda", "scheme_2_epsilon"}
-"""Settings of former versions."""
 
 
 class ObserverSettings(Strict):
@@ -65,20 +63,6 @@ class ObserverSettings(Strict):
         yield from super().__repr_args__()
         yield "scheme_2_lambda", SCHEME_2_LAMBDA
         yield "scheme_2_epsilon", SCHEME_2_EPSILON
-
-    @model_validator(mode="before")
-    @classmethod
-    def _reject_former_settings(cls, table: object) -> object:
-        """Reject settings of (3.17) that are constants now.
-
-        Raises:
-            ValueError: A former setting is present.
-        """
-        if isinstance(table, dict) and (former := sorted(FORMER_SETTINGS & table.keys())):
-            raise ValueError(
-                f"{', '.join(former)}: not a setting; (3.17) uses {SCHEME_2_LAMBDA:g} and {SCHEME_2_EPSILON:g}"
-            )
-        return table
 
     @model_validator(mode="before")
     @classmethod

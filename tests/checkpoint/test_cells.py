@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import structlog
-from numpy.lib import recfunctions as rfn
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import NEW_FIELDS, CellEstimator
+from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.service.restored_pack import restore_pack
 from bms_estimator.settings.pack import Settings
 from tests.simulated_pack import SimulatedPack
@@ -48,21 +47,6 @@ def test_an_invalid_state_of_the_cells_is_dropped_with_a_reason_and_the_pack_is_
     assert cells.deviations is None
     assert [line["reason"] for line in lines if "single cells" in line["event"]] == ["a value is not finite"]
     assert any(line.get("outcome", "").startswith("restored") for line in lines)
-
-
-def test_a_state_without_hypotheses_of_a_former_version_is_restored(tmp_path: Path) -> None:
-    pack = SimulatedPack()
-    pack.run(1)
-    saved = dict(pack.cells.saved_state)
-    for key, records in saved.items():
-        former = [name for name in records.dtype.names or () if name not in NEW_FIELDS]
-        saved[key] = rfn.repack_fields(records[former])
-    file = CheckpointFile(tmp_path, Settings(), pack.model)
-    file.save(pack.estimator.record, cells=saved)
-    cells = restarted(CheckpointFile(tmp_path, Settings(), pack.model), pack)
-    assert cells.deviations
-    assert pack.cells.deviations
-    assert np.array_equal(cells.deviations.soc_deviation, pack.cells.deviations.soc_deviation)
 
 
 def test_a_checkpoint_without_cell_voltages_starts_the_cells_anew(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.kernels.kalman_filter.anchors import FULL
-from bms_estimator.kernels.kalman_filter.records import NODE, OFFSET
+from bms_estimator.kernels.kalman_filter.records import OFFSET
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.service import checkpoint_writer, live_loop
@@ -214,30 +214,6 @@ def test_a_checkpoint_without_anchors_is_restored_and_one_with_anchors_keeps_the
         restored = estimator.record[0]["anchors"]
         names = "last", "full_anchors", "full_wait_soc", "soc_before"
         assert tuple(restored[name] for name in names) == expected
-
-
-def test_filter_states_of_a_version_without_ocv_states_are_restored() -> None:
-    """The OCV states start with their prior. All other states have the restored mean and covariance."""
-    learned = learned_estimator()
-    # Field, and the number of its trailing axes that run over the states of the filter.
-    truncated_axes = {"filter.mean": 1, "filter.covariance": 2, "checks.good_mean": 1, "checks.good_covariance": 2}
-    saved = dict(fields(learned.record.copy()))
-    for name, axes in truncated_axes.items():
-        # [..., :NODE] or [..., :NODE, :NODE]: without the OCV states, which begin at index NODE
-        saved[name] = saved[name][(..., *axes * (slice(NODE),))]
-    estimator = new_estimator(SETTINGS, CELL)
-    assert restore_state(estimator, saved, 1.0) == ""
-    learned.resume(1.0)
-    restored, expected = estimator.record[0]["filter"], learned.record[0]["filter"]
-    assert np.array_equal(restored["covariance"][:, :NODE, :NODE], expected["covariance"][:, :NODE, :NODE])
-    assert np.array_equal(restored["mean"][:, :NODE], expected["mean"][:, :NODE])
-    for q in range(restored["count"]):
-        assert (restored["mean"][q, NODE:] == 0.0).all()
-        assert (np.diag(restored["covariance"][q])[NODE:] == 1.0).all()
-    assert np.linalg.eigvalsh(restored["covariance"][0]).min() > -1e-12
-    good_mean = estimator.record[0]["checks"]["good_mean"]
-    assert np.array_equal(good_mean[:NODE], saved["filter.mean"][0, restored["best"]])
-    assert (good_mean[NODE:] == 0.0).all()
 
 
 def save_as(version: int, file: CheckpointFile, estimator: Estimator, monkeypatch: pytest.MonkeyPatch) -> None:

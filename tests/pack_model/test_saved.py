@@ -65,26 +65,6 @@ def test_a_missing_field_of_the_curves_is_rejected() -> None:
         fit_of_curves(arrays)
 
 
-def test_rows_of_a_version_without_the_variances_of_slow_samples_are_read() -> None:
-    rows = some_rows()
-    names = [name for name in HISTORY_ROW.names or () if name not in ("between_a2", "skew_a2")]
-    earlier = np.empty(rows.shape, [(name, HISTORY_ROW[name]) for name in names])
-    for name in names:
-        earlier[name] = rows[name]
-    read = history_of(history_arrays(History(rows), None) | {"rows": earlier})[0].rows
-    assert (read["between_a2"] == 0.0).all()
-    assert (read["skew_a2"] == 0.0).all()
-    assert all(np.array_equal(read[name], rows[name], equal_nan=rows[name].dtype.kind == "f") for name in names)
-
-
-def test_fit_of_a_version_without_exchanges_used_all_rows() -> None:
-    arrays = curve_arrays(quick_fit(None, some_rows()))  # type: ignore[arg-type]
-    del arrays["first_segment"]
-    restored = fit_of_curves(arrays)
-    assert restored is not None
-    assert restored.first_segment == 0.0
-
-
 def fitted_estimator(cell: CellModel = CELL) -> Estimator:
     """Return an estimator at rest with the curves of a fit."""
     estimator = new_estimator(Settings(), cell.pack(SERIES, 1))

@@ -53,15 +53,12 @@ def serve(
             f"default port: {CLUSTER_PORT}"
         ),
     ] = None,
-    former_cluster: Annotated[str | None, typer.Option("--of", hidden=True)] = None,
 ) -> None:
     """Run a node of the fleet server, which stores samples and results in streams, until SIGINT or SIGTERM.
 
     The first start writes the keys of each tenant to --folder.
     In a cluster, copy keys/claims.json from the folder of node 1 to the folder of each other node.
     """
-    if former_cluster is not None:
-        raise UserError(f"--of: renamed; write --cluster {former_cluster}")
     settings = _settings(settings_file, listen=listen, mqtt=mqtt, metrics=metrics)
     location = NodeLocation(_folder(settings, folder), node, _nodes(settings, node, cluster))
 

@@ -22,8 +22,6 @@ COMMANDS = get_args(Command)
 """Names of all commands."""
 READS = ("forecast",)
 """Names of the requests that change nothing, and therefore need no permission."""
-FORMER_READS = ("state", "parameters", "health")
-"""Former requests, whose payloads are now published on topics of these names."""
 MAX_PAYLOAD_BYTES = 4096
 """Maximum size of a request's payload [bytes]."""
 MAX_READ_BYTES = 1 << 17
@@ -60,7 +58,7 @@ class RequestDispatcher:
     ) -> None:
         self._counts, self._allowed, self._monotonic = delivery.requests, commands, monotonic
         self._handlers: dict[str, Handler] = {}
-        rates = ((COMMANDS, REQUESTS_PER_MIN), (READS, READS_PER_MIN), (FORMER_READS, REQUESTS_PER_MIN))
+        rates = ((COMMANDS, REQUESTS_PER_MIN), (READS, READS_PER_MIN))
         self._limiters: dict[str, RateLimiter] = {}
         for names, per_minute in rates:
             self._limiters |= dict.fromkeys(names, RateLimiter(per_minute, monotonic))  # shared by all names of a kind
@@ -75,13 +73,12 @@ class RequestDispatcher:
         """Allowed commands, in the order of ``COMMANDS``."""
         return tuple(command for command in COMMANDS if command in self._allowed)
 
-    async def handle(self, name: str, payload: bytes, prefix: str = "") -> bytes | None:
+    async def handle(self, name: str, payload: bytes) -> bytes | None:
         """Respond to one request: JSON of status, data, error, transaction.
 
         Args:
             name: Name of the request.
             payload: JSON object, or empty.
-            prefix: Prefix of the pack's topics, for the error of a former request.
 
         Returns:
             The response; None for an unknown name and beyond the rate limit.
@@ -96,7 +93,7 @@ class RequestDispatcher:
         try:
             arguments = _arguments(payload, MAX_READ_BYTES if name in READS else MAX_PAYLOAD_BYTES)
             transaction = _transaction(arguments)
-            response = _response("ok", await self._handler(name, prefix)(arguments), None, transaction)
+            response = _response("ok", await self._handler(name)(arguments), None, transaction)
         except UserError as error:
             self.count_refusal("refused", name, reason=str(error))
             return _response("error", None, str(error), transaction)
@@ -120,14 +117,12 @@ class RequestDispatcher:
             self._logged_s[counter] = now_s
             log.warning("request not granted", kind=counter, request=name, so_far=self._counts[counter], **log_fields)
 
-    def _handler(self, name: str, prefix: str) -> Handler:
+    def _handler(self, name: str) -> Handler:
         """Return the handler of a request.
 
         Raises:
-            UserError: The request is a former one, is not allowed, or has no handler.
+            UserError: The request is not allowed, or has no handler.
         """
-        if name in FORMER_READS:
-            raise UserError(f"no such request: subscribe to {prefix}{name}")
         if name not in READS and name not in self._allowed:
             raise UserError(f"{name}: not allowed; mqtt.commands in the pack file lists the allowed commands")
         if name not in self._handlers:

@@ -212,7 +212,7 @@ class MqttSink:
         if message.retain:  # a retained request would be executed again with each connection
             self._requests.count_refusal("retained", name[:MAX_SHOWN])
             return
-        response = await self._requests.handle(name, message.payload, self._topic(""))
+        response = await self._requests.handle(name, message.payload)
         if response is not None:  # the name is a known request
             # not at QoS 1: in a flood the broker acknowledges late, and waiting for that would stop reading
             await connection.publish(Message(self._topic(f"response/{name}"), response, 0, retain=False))

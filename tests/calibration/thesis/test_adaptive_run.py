@@ -6,7 +6,6 @@ is the adaptive gain, and e is the error of the voltage that drives both.
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
 from bms_estimator.estimator import Estimator
@@ -72,11 +71,6 @@ def test_scheme_2_returns_the_parameters_up_to_its_epsilon():
     estimator = Estimator(CELL, make_settings("scheme-2"), initial_soc=1.0, identifier=None)
     assert (estimator.settings["rate"][0, SMALL] == SCHEME_2_LAMBDA).all()
     assert (estimator.settings["rate"][0, LARGE] == 0.0).all()
-
-
-def test_former_settings_of_scheme_2_are_rejected_with_the_constants():
-    with pytest.raises(ValidationError, match=r"scheme_2_epsilon: not a setting; \(3\.17\) uses 100 and 0\.35"):
-        make_settings("scheme-2", scheme_2_epsilon=7.0)
 
 
 @pytest.mark.parametrize(("law", "last"), [("scheme-3", 15), ("improved", 12)])

@@ -284,7 +284,6 @@ async def test_three_nodes_form_a_cluster_whose_streams_have_three_replicas(
             "is open to other machines: add [tls] and [tenants.NAME], or listen on 127.0.0.1",
         ),
         (["--mqtt", "here"], "--mqtt here: must be host:port"),
-        (["--of", "a,b,c"], "--of: renamed; write --cluster a,b,c"),
         (["--node", "2"], "--node 2: requires --cluster"),
         (["--cluster", "a,b"], "must name 3 or 5 distinct nodes"),
         (["--cluster", "a,b,c"], "--cluster a,b,c is open to other machines"),
@@ -327,7 +326,6 @@ def test_missing_certificate_or_another_key_is_rejected(
         ("packs = 10_000_000\noutage_days = 365", 75, "streams: the streams need 4540680.0 GB, but may use only "),
         ("packs = 10_000_000\ndisk_gb = 1e6", 75, "streams: the streams need 94320.0 GB, but may use only "),
         ("packs = 10_000\ndisk_gb = 90", 2, "server.disk_gb = 90: the streams need 94.3 GB: increase disk_gb"),
-        ("raw_gb = 8", 2, "server: raw_gb: replaced by packs and outage_days"),
     ],
 )
 def test_server_refuses_to_start_if_the_streams_do_not_fit(

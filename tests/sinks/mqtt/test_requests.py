@@ -13,7 +13,6 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.sinks.mqtt.requests import (
     COMMANDS,
-    FORMER_READS,
     LOG_S,
     MAX_PAYLOAD_BYTES,
     MAX_READ_BYTES,
@@ -141,19 +140,16 @@ async def test_command_is_granted_only_if_the_settings_allow_it() -> None:
         assert dispatcher.granted == [name]
 
 
-async def test_rate_of_commands_is_limited_and_former_requests_do_not_count() -> None:
+async def test_rate_of_commands_is_limited() -> None:
     dispatcher = RecordingDispatcher("set_soc")
     for _ in range(1000):
         await dispatcher("set_soc")
-        await dispatcher("state")
     assert dispatcher.granted.count("set_soc") == REQUESTS_PER_MIN
-    assert dispatcher.delivery.requests["refused"] == REQUESTS_PER_MIN
     dispatcher.now_s = 30.0
     for _ in range(1000):
         await dispatcher("set_soc")
     assert dispatcher.granted.count("set_soc") == 1.5 * REQUESTS_PER_MIN  # after half a minute
-    # of 3000 requests in all, "state" has used a budget of its own
-    assert dispatcher.delivery.requests["too_many"] == 3000 - len(dispatcher.granted) - REQUESTS_PER_MIN
+    assert dispatcher.delivery.requests["too_many"] == 2000 - len(dispatcher.granted)
 
 
 async def test_each_burst_is_logged_once() -> None:
@@ -168,7 +164,7 @@ async def test_each_burst_is_logged_once() -> None:
     assert logs[-1]["so_far"] == 10_001  # all unknown requests
 
 
-@given(name=st.sampled_from(COMMANDS + FORMER_READS) | st.text(), payload=st.binary() | st.text().map(str.encode))
+@given(name=st.sampled_from(COMMANDS) | st.text(), payload=st.binary() | st.text().map(str.encode))
 async def test_no_request_raises(name: str, payload: bytes) -> None:
     dispatcher = RecordingDispatcher("set_soc", "current_zero")
     await dispatcher(name, payload)

@@ -230,14 +230,6 @@ async def test_request_gets_a_response(broker: Broker, url: str) -> None:
     assert response == {"status": "ok", "data": {"name": "publish_rate"}, "error": None, "transaction": 7}
 
 
-async def test_former_request_gets_an_error_that_names_the_topic_to_subscribe_to(broker: Broker, url: str) -> None:
-    async with Listener(broker) as live, Sink(url):
-        await live.wait("bms/pack/availability")
-        await live.publish("bms/pack/request/state", qos=1)
-        response = await live.wait_json("bms/pack/response/state")
-    assert response["error"] == "no such request: subscribe to bms/pack/state"
-
-
 async def test_retained_request_is_not_granted_on_connection(broker: Broker, url: str) -> None:
     async with Listener(broker) as live:
         await live.publish("bms/pack/request/set_soc", b"{}", qos=1, retain=True)
