@@ -11,6 +11,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.pack.pack import Pack
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sampling import BOARD
@@ -44,17 +45,16 @@ class SimulatedPack:
         self.model = cell.pack(self.bank.cells.soc.size, 1)
         self.estimator = Estimator(self.model, voltage_resolution_v=0.01, sampling=BOARD)
         self.cells = CellEstimator(self.estimator)
+        self.pack = Pack(self.estimator, cells=self.cells)
         self.offset_v = 0.001 * self.rng.standard_normal(self.bank.cells.soc.size)
         self.changes = list[Change]()
         self._now_s, self._sink = 0.0, Collector()
         self._publisher = Publisher(
             Settings.model_validate({"publish": {"rate_hz": 0.1}}),
-            self.model,
-            self.estimator,
+            self.pack,
             source=ScriptedSource(),
             sinks=[self._sink],
             clock=Clock(wall=lambda: self._now_s, monotonic=lambda: self._now_s),
-            cells=self.cells,
             on_alarm=self.changes.append,
         )
         self._direction = 1.0
@@ -78,9 +78,7 @@ class SimulatedPack:
         for begin in range(0, samples.size, BLOCK):
             received = ReceivedSamples(samples[begin : begin + BLOCK], np.round(cells_v[begin : begin + BLOCK], 3))
             self._now_s = float(received.samples["time_s"][-1])
-            trace = self.estimator.run(received.samples)
-            self.cells.run(received.samples, received.cells_v, trace)
-            self._publisher.add(received, trace)
+            self._publisher.add(received, self.pack.run(received.samples, received.cells_v))
 
     @property
     def published(self) -> Snapshot:

@@ -49,7 +49,11 @@ def first_time_s(rows: SampleBlock) -> float:
 
 
 def soc_errors(
-    estimator: Estimator, rows: SampleBlock, validation: Validation, on_block: OnBlock = ignore_block
+    estimator: Estimator,
+    rows: SampleBlock,
+    validation: Validation,
+    on_block: OnBlock = ignore_block,
+    run: Callable[[SampleBlock], TraceBlock] | None = None,
 ) -> SocErrors:
     """Run an estimator over the samples of a validation, and compare its SOC with coulomb counting.
 
@@ -62,6 +66,7 @@ def soc_errors(
         rows: All samples of the capture, dtype ``SAMPLE``.
         validation: Validation of the capture. If it begins later than the capture, the estimator begins there as well.
         on_block: Receives each block of the trace.
+        run: Runs the estimator and further stages of its pack; None: the estimator alone.
     """
     first_s, start_s = first_time_s(rows), float(validation.time_s[0])
     if start_s > 0.0:
@@ -69,7 +74,7 @@ def soc_errors(
     squares, within, samples = 0.0, 0, 0
     for begin in range(0, rows.size, BLOCK_SAMPLES):
         block = rows[begin : begin + BLOCK_SAMPLES]
-        trace = estimator.run(_with_held_voltages(block))
+        trace = (run or estimator.run)(_with_held_voltages(block))
         time_s = trace["time_s"] - first_s
         counted = np.interp(time_s, validation.time_s, validation.soc)
         scored = (time_s - start_s >= SETTLING_S) & (counted >= MIN_SOC)

@@ -72,3 +72,7 @@ class Forecast:
 def unknown_values() -> ForecastRows:
     """Return values that are all unknown, shape (1,), dtype ``FORECAST``."""
     return np.array([(np.nan,) * len(FORECAST.names or ())], FORECAST)
+
+
+NO_FORECAST = unknown_values()
+"""Forecast at all samples of a pack without forecasts."""

@@ -1,7 +1,8 @@
-"""Estimator that also makes forecasts, at intervals on the clock of the samples."""
+"""Forecasts of a pack, at intervals on the clock of the samples."""
 
 import math
-from typing import Protocol
+from copy import copy
+from typing import Self
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.capability import PowerLimits, cell_power_limits, projected_pack, write_capability
-from bms_estimator.forecast.forecast import FORECAST, Forecast, ForecastCurve, ForecastRows, unknown_values
+from bms_estimator.forecast.forecast import Forecast, ForecastCurve, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import LoadHistory
 from bms_estimator.forecast.load_spread import load_spread
@@ -22,10 +23,8 @@ from bms_estimator.forecast.projection import (
     project_trip,
     time_quantiles,
 )
-from bms_estimator.kernels.trace import TRACE
-from bms_estimator.model.arrays import Records
+from bms_estimator.model.arrays import Floats, Records
 from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 
 MIN_INTERVAL_S = 10.0
 """Minimum interval between two forecasts, on the clock of the samples [s]. It limits the CPU time near the cut-off."""
@@ -44,51 +43,29 @@ _HASH_FACTOR = 0x9E3779B97F4A7C15
 _SEED_COUNT = 2**64
 
 
-class Runner(Protocol):
-    """The estimator, or the slow fit that runs it."""
-
-    def run(self, block: SampleBlock) -> TraceBlock:
-        """Process a block of samples. Return one row for each accepted sample."""
-
-
-class CellRunner(Protocol):
-    """Estimators of the single cells."""
-
-    @property
-    def deviations(self) -> CellDeviations | None:
-        """Deviations of the cells at the end of the last window; None before the first window with cell voltages."""
-
-    def run(self, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
-        """Process a block of samples and their cell voltages."""
-
-
 class Forecaster:
-    """Runs the estimator on blocks of samples, and makes a forecast at intervals.
+    """Makes forecasts from the state of an estimator and the load that it observed.
 
-    The times of the forecasts and their random numbers depend on the samples alone, so that any division of the samples into
-    blocks gives the same forecasts to the last bit.
+    The times of the forecasts and their random numbers depend on the samples alone.
 
     Args:
-        estimator: Estimator of the pack.
-        runner: The estimator, or the slow fit that runs it.
+        estimator: Estimator of the pack; read only.
         cutoff_v: Terminal voltage at which the load is switched off [V].
         limits: Limits of the available power; None: the limits of the cell file.
-        cells: Estimators of the single cells, which ``run`` also runs; None: no cell voltages.
 
     Attributes:
         load: Load observed since the last long charge.
         past: Load of this and earlier discharges, minute by minute.
         latest: The last forecast.
+        deviations: Deviations of the single cells; None without cell voltages.
     """
 
     def __init__(
         self,
         estimator: Estimator,
-        runner: Runner,
         *,
         cutoff_v: float,
         limits: PowerLimits | None = None,
-        cells: CellRunner | None = None,
     ) -> None:
         self.estimator, self.cutoff_v = estimator, cutoff_v
         self._limits = limits or cell_power_limits(estimator.cell)
@@ -96,63 +73,47 @@ class Forecaster:
         self.load = LoadHistory(float(filter_settings["capacity_as"]), float(filter_settings["unmeasured_s"]))
         self.past = PastMinutes()
         self.latest = Forecast(math.nan, unknown_values(), "no sample has been processed yet", None)
-        self._runner, self._cells, self._due_s = runner, cells, -math.inf
-        self._has_cell_voltages, self._deviations = False, cells.deviations if cells else None
-        self._rows: list[tuple[ForecastRows, int]] = []
+        self.deviations: CellDeviations | None = None
+        self._due_s = -math.inf
 
-    def run(self, block: SampleBlock, cells_v: CellBlock = NO_CELLS) -> TraceBlock:
-        """Process a block of samples.
+    def first_due(self, time_s: Floats) -> int | None:
+        """Return the index of the first sample at which a forecast is due; None without such a sample.
+
+        A sample more than ``MAX_INTERVAL_S`` before the due time shows that the clock was set back, and is due at once.
 
         Args:
-            block: Samples, shape (n,).
-            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
-
-        Returns:
-            One row of dtype ``TRACE`` for each accepted sample. The array is valid until the next call.
+            time_s: Times of the samples, rejected ones included, shape (n,) [s].
         """
-        self._rows, traces, start = [], [], 0
-        while start < block.size:
-            due = self._first_due(block["time_s"][start:])
-            end = block.size if due is None else start + due + 1
-            trace = self._runner.run(block[start:end])
-            self._run_cells(block[start:end], cells_v[start:end], trace)
-            self.load.add(trace)
-            if start > 0 or end < block.size:
-                trace = trace.copy()  # the next call of the runner overwrites the array
-            traces.append(trace)
-            before = trace.size if due is None else max(trace.size - 1, 0)  # rows before the new forecast
-            self._rows.append((self.latest.values, before))
-            if due is not None:
-                self.past.add(self.load)
-                self.latest = self.forecast()
-                self._due_s = float(block["time_s"][end - 1]) + _interval_s(self.latest)
-                self._rows.append((self.latest.values, trace.size - before))
-            start = end
-        if len(traces) == 1:
-            return traces[0]
-        return np.concatenate(traces) if traces else np.zeros(0, TRACE)
+        earliest_s = self._due_s - MAX_INTERVAL_S
+        due = np.isfinite(time_s) & ((time_s >= self._due_s) | (time_s < earliest_s))
+        first = int(due.argmax()) if due.size else 0
+        return first if due.size and due[first] else None
 
-    def run_without_forecast(self, block: SampleBlock, cells_v: CellBlock = NO_CELLS) -> TraceBlock:
-        """Process a block of samples and store their load, without the forecasts that ``run`` makes."""
-        trace = self._runner.run(block)
-        self._run_cells(block, cells_v, trace)
+    def add(self, trace: TraceBlock, deviations: CellDeviations | None) -> None:
+        """Add estimates, from which the load is observed, and set the deviations of the single cells."""
         self.load.add(trace)
+        self.deviations = deviations
+
+    def update(self, time_s: float) -> None:
+        """Make the forecast that is due at a sample, as ``latest``.
+
+        Args:
+            time_s: Time of the sample [s].
+        """
         self.past.add(self.load)
-        return trace
+        self.latest = self.forecast()
+        self._due_s = time_s + _interval_s(self.latest)
 
-    def _run_cells(self, block: SampleBlock, cells_v: CellBlock, trace: TraceBlock) -> None:
-        if self._cells is None:
-            return
-        self._has_cell_voltages |= cells_v.size > 0
-        if self._has_cell_voltages:  # otherwise the call would take a tenth of the time of a block of one sample
-            self._cells.run(block, cells_v, trace)
-            self._deviations = self._cells.deviations
-
-    @property
-    def rows(self) -> ForecastRows:
-        """Values of the latest forecast at each row of the trace that ``run`` returned last, dtype ``FORECAST``."""
-        parts = [np.repeat(values, count) for values, count in self._rows]
-        return np.concatenate(parts) if parts else np.zeros(0, FORECAST)
+    def copy(self) -> Self:
+        """Return a copy in the present state, from which another thread can forecast while samples still arrive."""
+        estimator = self.estimator.bound_to_record(self.estimator.record.copy())
+        estimator.settings_record = estimator.settings_record.copy()  # the slow fit changes its curves
+        estimator.settings = estimator.settings_record["observer"]
+        other = copy(self)
+        other.estimator, other.load = estimator, copy(self.load)
+        other.past = copy(self.past)  # its arrays are never changed in place
+        other.load.record = self.load.record.copy()
+        return other
 
     def forecast(self, load: GivenLoad | None = None) -> Forecast:
         """Return a forecast from the present state.
@@ -161,7 +122,7 @@ class Forecaster:
             load: Expected load; None: a load like the observed one.
         """
         values, time_s = unknown_values(), float(self.estimator.state["time_s"][0])
-        write_capability(values, self.estimator, self.cutoff_v, self._limits, self._largest_a, self._deviations)
+        write_capability(values, self.estimator, self.cutoff_v, self._limits, self._largest_a, self.deviations)
         reason = self._missing_state()
         if reason is None and load is None:
             reason = self._missing_load()
@@ -195,16 +156,6 @@ class Forecaster:
         state = self.estimator.state
         time_bits = int(state["time_s"].view(np.uint64)[0])
         return (time_bits * _HASH_FACTOR + int(state["samples"][0])) % _SEED_COUNT
-
-    def _first_due(self, time_s: np.ndarray) -> int | None:
-        """Return the index of the first sample at which a forecast is due; None without such a sample.
-
-        A sample more than ``MAX_INTERVAL_S`` before the due time shows that the clock was set back, and is due at once.
-        """
-        earliest_s = self._due_s - MAX_INTERVAL_S
-        due = np.isfinite(time_s) & ((time_s >= self._due_s) | (time_s < earliest_s))
-        first = int(due.argmax()) if due.size else 0
-        return first if due.size and due[first] else None
 
     def _missing_state(self) -> str | None:
         """Return the reason why the pack cannot be projected; None if it can."""

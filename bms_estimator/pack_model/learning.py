@@ -1,4 +1,4 @@
-"""Estimator that records a history, fits the pack's model to it at intervals, and hands each fit to the filter."""
+"""Slow fit: records the history of an estimator, fits the pack's model to it at intervals, and hands each fit to the filter."""
 
 import math
 from collections.abc import Callable
@@ -13,8 +13,6 @@ from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD
 from bms_estimator.kernels.kalman_filter.input_checks import store_last_good_state
-from bms_estimator.kernels.trace import TRACE
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack_model.bank_monitor import BankMonitor
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.curve_change import keep_series_resistance, present_ohm, return_to_cell_file
@@ -76,7 +74,7 @@ def run_now(call: Callable[[], PackFit]) -> "Future[PackFit]":
 
 
 class SlowFit:
-    """Estimator whose cell model is fitted to the pack's history.
+    """Fit of an estimator's cell model to the pack's history.
 
     To continue from earlier runs, call ``load``, restore the estimator's state, and call ``resume``, before the first
     sample.
@@ -126,16 +124,11 @@ class SlowFit:
         h = self._h
         h["enabled"], h["event_s"] = 1, self._interval()
 
-    def run(self, block: SampleBlock) -> NDArray[np.void]:
-        """Process a block of samples. Return one row of dtype TRACE for each accepted sample."""
-        trace, rows, start = np.zeros(block.size, TRACE), 0, 0
-        while start < block.size:
-            used, written = self.estimator.run_part(block[start:], trace[rows:])
-            start, rows = start + used, rows + written
-            self.take_rows()
-            if self._h["elapsed_s"] >= self._h["event_s"]:
-                self._handle_event()
-        return trace[:rows]
+    def advance(self) -> None:
+        """Take completed rows, and begin or end a fit that is due. Call it each time ``Estimator.run_part`` stops."""
+        self.take_rows()
+        if self._h["elapsed_s"] >= self._h["event_s"]:
+            self._handle_event()
 
     def load(self, history: History, fit: PackFit | None, state_fit: PackFit | None) -> None:
         """Set history and fit of earlier runs, and adopt the curves.

@@ -3,22 +3,19 @@
 import asyncio
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import structlog
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
-from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.forecast.forecast import ForecastRows
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.health import HookHealth
+from bms_estimator.pack.pack import Pack, Step
 from bms_estimator.settings.alarm_limits import min_charge_current_a, monitored_alarms, silent_limit_s
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples, Source
-from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST, AlarmEvaluator
+from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.message import Change
@@ -26,7 +23,10 @@ from bms_estimator.telemetry.alarms.sensor_faults import BoardResets
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.impossible import PackBounds
-from bms_estimator.telemetry.weakest_cell_values import WeakestCellValues
+from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
+
+if TYPE_CHECKING:
+    from bms_estimator.estimator.cell_estimator import CellDeviations
 
 UNUSABLE_KINDS = "not_finite", "range", "saturated"
 """Kinds of dropped samples that indicate a sensor fault."""
@@ -43,14 +43,11 @@ class AlarmMonitor:
 
     Args:
         settings: The pack's settings.
-        cell: Model of the whole pack.
-        estimator: Estimator; read only.
+        pack: The pack; read only.
         source: Supplies counters, and the reason why no samples arrive.
         clock: The clocks.
         on_alarm: Called with each change of an alarm, as soon as it occurs.
         hooks: Successes and failures of alarm hooks; None without hooks.
-        weakest_cell: Returns the values of the weakest cell.
-        cells: Estimators of the single cells; read only; None: none.
 
     Attributes:
         alarms: The monitored alarms and their states.
@@ -65,21 +62,18 @@ class AlarmMonitor:
     def __init__(
         self,
         settings: Settings,
-        cell: PackModel,
-        estimator: Estimator,
+        pack: Pack,
         source: Source,
         clock: Clock,
         on_alarm: Callable[[Change], object],
         hooks: Callable[[], HookHealth | None] = lambda: None,
-        weakest_cell: Callable[[], WeakestCellValues] = WeakestCellValues,
-        cells: CellEstimator | None = None,
     ) -> None:
-        self._hooks, self._weakest_cell, self._cells = hooks, weakest_cell, cells
+        self._pack, self._hooks, cell = pack, hooks, pack.model
         self._cells_seen: CellDeviations | None = None  # evaluated last
         self._board_resets = BoardResets()
         self._relay_resets = 0  # number of resets that undid a relay level, at the last evaluation
-        self._estimator, self._source, self._clock, self._on_alarm = estimator, source, clock, on_alarm
-        gap_s = float(estimator.settings["gap_s"][0])
+        self._estimator, self._source, self._clock, self._on_alarm = pack.estimator, source, clock, on_alarm
+        gap_s = float(pack.estimator.settings["gap_s"][0])
         inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
         self.alarms = AlarmEvaluator(
             monitored_alarms(settings, cell),
@@ -95,27 +89,19 @@ class AlarmMonitor:
         self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
 
-    def add(
-        self,
-        received: ReceivedSamples,
-        trace: TraceBlock,
-        now_s: float,
-        forecasts: ForecastRows = NO_FORECAST,
-        cells_fault: str = "",
-    ) -> bool:
+    def add(self, received: ReceivedSamples, step: Step, now_s: float, cells_fault: str = "") -> bool:
         """Add received samples and their estimates; evaluate the alarms if this is due.
 
         Args:
             received: Samples and cell voltages.
-            trace: Estimates of the accepted samples.
+            step: Result of the samples.
             now_s: Monotonic clock [s].
-            forecasts: Forecast at each row of ``trace``.
             cells_fault: Reason why the cell voltages cannot be used; empty if they can.
 
         Returns:
             True if an alarm has changed.
         """
-        self.alarms.add(received.samples, trace, received.cells_v, forecasts, cells_fault, received.probes)
+        self.alarms.add(received.samples, step.trace, received.cells_v, step.forecasts, cells_fault, received.probes)
         self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
         is_due = now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS
         return is_due and self.evaluate(now_s)
@@ -134,8 +120,8 @@ class AlarmMonitor:
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
         self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts, self._source.clock_fault)
-        self.alarms.evaluate_weak_cell(self._weakest_cell().deviation_std, self._arrival_s)
-        cells = self._cells.deviations if self._cells else None
+        self.alarms.evaluate_weak_cell(weakest_cell_values(self._pack.slow_fit).deviation_std, self._arrival_s)
+        cells = self._pack.cells.deviations if self._pack.cells else None
         if cells is not None and cells is not self._cells_seen:
             self._cells_seen = cells
             self.alarms.evaluate_cells(cell_faults(cells), self._arrival_s)

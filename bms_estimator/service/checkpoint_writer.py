@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import structlog
@@ -15,14 +14,13 @@ import structlog
 from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile
 from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.checkpoint.run_file import RunCounters
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.saved_load import load_arrays
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack.pack import Pack
+from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.alarm_hooks import AlarmHooks
-from bms_estimator.service.publisher import Publisher
+from bms_estimator.service.alarm_monitor import AlarmMonitor
+from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.telemetry.alarms.evaluator import INPUTS, PENDING, PROBES, SILENCE, AlarmEvaluator
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
@@ -46,56 +44,44 @@ FINAL_SAVE_S = 20.0
 log = structlog.get_logger(__name__)
 
 
-class SeenLoad(NamedTuple):
-    """Forecaster with the observed load, and the file of this load."""
-
-    forecaster: Forecaster
-    file: HistoryFile
-
-
 class CheckpointWriter:
     """Saves the estimator's state in a thread of its own, so that a slow disk delays nothing else.
 
     Args:
-        checkpoint: Destination.
-        estimator: Estimator; read only.
-        publisher: Publishes the outcome of each save.
+        pack: The pack; read only.
+        checkpoint: Destination of the state.
+        history: File of the history, which is saved when the ``revision`` of the slow fit changes; None: it is not saved.
+        load_file: File of the observed load, which is saved every ``LOAD_SAVE_S``; None: it is not saved.
+        alarms: Monitor of the alarms.
         totals: Totals over restarts.
-        restarts: Number of starts that found files of an earlier run.
-        interval_s: Maximum interval between two saves [s].
-        pack_model: Slow fit, whose history is saved when its ``revision`` changes; None: no history.
-        history: File of the history; None: no history.
-        seen_load: Observed load, which is saved every ``LOAD_SAVE_S``; None: it is not saved.
-        cells: Estimators of the single cells; read only; None: none.
         hooks: Alarm hooks; read only.
+        status: Receives the outcome of each save.
+        interval_s: Maximum interval between two saves [s].
     """
 
     def __init__(
         self,
+        pack: Pack,
         checkpoint: CheckpointFile,
-        estimator: Estimator,
-        publisher: Publisher,
-        totals: LifetimeTotals,
+        history: HistoryFile | None,
+        load_file: HistoryFile | None,
         *,
-        restarts: int,
-        interval_s: float,
-        pack_model: SlowFit | None = None,
-        history: HistoryFile | None = None,
-        seen_load: SeenLoad | None = None,
-        cells: CellEstimator | None = None,
+        alarms: AlarmMonitor,
+        totals: LifetimeTotals,
         hooks: AlarmHooks,
+        status: ServiceStatus,
+        interval_s: float,
     ) -> None:
-        self._interval_s, self._seen_load, self._cells, self._hooks = interval_s, seen_load, cells, hooks
+        self._pack, self._checkpoint, self._history, self._load_file = pack, checkpoint, history, load_file
+        self._monitor, self._totals, self._hooks = alarms, totals, hooks
+        self._status, self._interval_s = status, interval_s
         self._samples_of_saved_load = 0
-        self._pack_model, self._history = pack_model, history
-        self._saved_revision = pack_model.revision if pack_model else 0
+        self._saved_revision = pack.slow_fit.revision if pack.slow_fit else 0
         self._discarded = 0  # number of histories whose files were quarantined
-        self._checkpoint, self._estimator, self._publisher = checkpoint, estimator, publisher
-        self._totals, self._restarts = totals, restarts
         self._saved_counters: RunCounters | None = None
         """Counters and alarms of the last save; None before the first save of this run."""
-        publisher.saved_flow = totals.flow
-        self._saved_fit = pack_model.fit if pack_model else None  # fit of the saved state
+        status.saved_flow = totals.flow
+        self._saved_fit = self._fit  # fit of the saved state
         self._saved_progress: tuple[int, float] | None = None
         """Samples and SOC (``_progress``) of the last saved state; None: this run has not saved a state."""
 
@@ -126,11 +112,11 @@ class CheckpointWriter:
 
     def _raise_state_lost(self) -> None:
         name = self._checkpoint.run_file.path.name
-        self._publisher.alarm_monitor.raise_state_lost(f"{name} cannot be written, so that a restart loses alarms")
+        self._monitor.raise_state_lost(f"{name} cannot be written, so that a restart loses alarms")
 
     async def _wait_for_alarm(self, pause_s: float) -> None:
         """Wait for ``pause_s``, or until an alarm changes: its cause may be about to cut the power of this computer."""
-        changed = self._publisher.alarm_monitor.changed
+        changed = self._monitor.changed
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(pause_s):
                 await changed.wait()
@@ -152,22 +138,26 @@ class CheckpointWriter:
             log.warning("the disk hangs: the last checkpoint is not written", file=str(self._checkpoint.path))
 
     @property
+    def _fit(self) -> PackFit | None:
+        return self._pack.slow_fit.fit if self._pack.slow_fit else None
+
+    @property
     def _alarms(self) -> AlarmEvaluator:
-        return self._publisher.alarm_monitor.alarms
+        return self._monitor.alarms
 
     @property
     def _needs_save(self) -> bool:
         """True if the state has changed enough to be saved before the interval ends."""
         if self._saved_progress is None:
             return True
-        if self._pack_model and self._pack_model.revision != self._saved_revision:
+        if self._pack.slow_fit and self._pack.slow_fit.revision != self._saved_revision:
             return True
-        return bool(abs(self._estimator.state["soc"][0] - self._saved_progress[1]) >= SOC_CHANGE)
+        return bool(abs(self._pack.estimator.state["soc"][0] - self._saved_progress[1]) >= SOC_CHANGE)
 
     @property
     def _progress(self) -> tuple[int, float]:
         """Number of samples and SOC. A fuel cell has the SOC NaN, which is replaced by 0 because NaN is not equal to itself."""
-        state = self._estimator.state[0]
+        state = self._pack.estimator.state[0]
         return int(state["samples"]), float(np.nan_to_num(state["soc"]))
 
     @property
@@ -193,15 +183,15 @@ class CheckpointWriter:
     async def _save_counters(self, *, clean: bool = False) -> bool:
         """Save counters and alarms if they have changed. Return False if they cannot be written."""
         hooks = self._hooks.finished_hashes if clean else None  # after a crash all hooks repeat their jobs
-        counters = RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state, hooks)
+        counters = RunCounters(self._status.restarts, self._totals.total, clean, self._alarms.saved_state, hooks)
         file = self._checkpoint.run_file
         if counters == self._saved_counters:
             return True
         if not await self._write(lambda: file.save(counters), file.path):
-            self._publisher.saved_flow = None  # the unsaved totals are published
+            self._status.saved_flow = None  # the unsaved totals are published
             return False
         self._saved_counters = counters
-        self._publisher.saved_flow = ChargeEnergy.from_totals(counters.total)
+        self._status.saved_flow = ChargeEnergy.from_totals(counters.total)
         return True
 
     async def _save(self, *, whole: bool = False) -> bool:
@@ -215,16 +205,16 @@ class CheckpointWriter:
         progress = self._progress
         if not progress[0] or (progress == self._saved_progress and not self._curves_changed):
             return True
-        state, fit = self._estimator.record.copy(), self._pack_model.fit if self._pack_model else None
-        curves, cells = curve_arrays(fit), self._cells.saved_state if self._cells else None
+        state, fit = self._pack.estimator.record.copy(), self._fit
+        curves, cells = curve_arrays(fit), self._pack.cells.saved_state if self._pack.cells else None
         if not await self._write(lambda: self._checkpoint.save(state, curves, cells, whole=whole)):
             return False
-        self._publisher.checkpoint, self._saved_progress, self._saved_fit = "saved", progress, fit
+        self._status.checkpoint, self._saved_progress, self._saved_fit = "saved", progress, fit
         return True
 
     async def _save_history(self, *, is_last: bool = False) -> bool:
         """Save the history if its revision has changed, or at the end. Return False if it cannot be written."""
-        model, file = self._pack_model, self._history
+        model, file = self._pack.slow_fit, self._history
         if model is None:
             return True
         if is_last:
@@ -247,10 +237,9 @@ class CheckpointWriter:
 
     async def _save_load(self) -> None:
         """Save the observed load, if there are new samples."""
-        samples = self._progress[0]
-        if self._seen_load is None or samples == self._samples_of_saved_load:
+        samples, forecaster, file = self._progress[0], self._pack.forecaster, self._load_file
+        if forecaster is None or file is None or samples == self._samples_of_saved_load:
             return
-        forecaster, file = self._seen_load
         arrays = load_arrays(forecaster.load, forecaster.past)
         if await self._write(lambda: file.save(arrays), file.path):
             self._samples_of_saved_load = samples
@@ -258,7 +247,7 @@ class CheckpointWriter:
     @property
     def _curves_changed(self) -> bool:
         """True if the state is relative to other curves than the saved one."""
-        return self._pack_model is not None and self._pack_model.fit is not self._saved_fit
+        return self._fit is not self._saved_fit
 
     async def _write(self, write: Callable[[], None], path: Path | None = None) -> bool:
         """Call ``write``, which writes ``path`` or the checkpoint, in the disk's thread. Return False if it fails."""
@@ -268,12 +257,12 @@ class CheckpointWriter:
             # asyncio.wait_for of Python 3.11 may swallow a cancellation
             await asyncio.wait({future}, timeout=DISK_HUNG_S)
             if not future.done():
-                self._publisher.checkpoint = "not saved: the disk hangs"
+                self._status.checkpoint = "not saved: the disk hangs"
                 log.warning("checkpoint cannot be saved", file=file, error="the disk hangs")
             await future
-            self._publisher.disk_free_mib = self._checkpoint.disk_free_mib
+            self._status.disk_free_mib = self._checkpoint.disk_free_mib
         except OSError as error:
-            self._publisher.checkpoint = f"cannot be saved: {error}"
+            self._status.checkpoint = f"cannot be saved: {error}"
             log.warning("checkpoint cannot be saved", file=file, error=str(error))
             return False
         return True

@@ -6,38 +6,15 @@ from concurrent.futures import Executor, Future
 
 import structlog
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.model.clock import Clock
 from bms_estimator.pack_model.fit import PackFit
-from bms_estimator.pack_model.learning import SlowFit, Submit, run_now
 from bms_estimator.process.disk_thread import DiskThread
-from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.pack_model import FitTimes
 
 LOG_S = 3600.0
 """Minimum interval between two log lines for each kind of exception [s]; all failures are counted."""
 
 log = structlog.get_logger(__name__)
-
-
-def new_slow_fit(
-    settings: Settings,
-    estimator: Estimator,
-    *,
-    submit: Submit = run_now,
-    on_failure: Callable[[BaseException], None] = lambda _: None,
-) -> SlowFit | None:
-    """Return the slow fit of a new estimator; None for a fuel cell and where the settings disable it.
-
-    Args:
-        settings: The pack's settings.
-        estimator: New estimator.
-        submit: Runs a fit; default: at once, and the samples wait for it.
-        on_failure: Called with the exception of a failed fit.
-    """
-    if not (estimator.identifying and settings.identifier.pack_model):
-        return None
-    return SlowFit(estimator, submit=submit, on_failure=on_failure)
 
 
 class FitThread:

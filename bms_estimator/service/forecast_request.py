@@ -10,7 +10,6 @@ import numpy as np
 
 from bms_estimator.forecast.forecast import Forecast
 from bms_estimator.forecast.forecaster import Forecaster
-from bms_estimator.forecast.forecaster_copy import copy_forecaster
 from bms_estimator.forecast.trip import MAX_LOAD, MAX_TRIP_S, LoadQuantity, Trip, constant_trip, profile_trip
 from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
 from bms_estimator.model.errors import UserError
@@ -89,7 +88,7 @@ async def forecast_in_thread(forecaster: Forecaster, trip: Trip | None) -> dict[
         forecaster: As for ``forecast_data``.
         trip: As for ``forecast_data``.
     """
-    return await asyncio.to_thread(forecast_data, copy_forecaster(forecaster), trip)
+    return await asyncio.to_thread(forecast_data, forecaster.copy(), trip)
 
 
 def forecast_data(forecaster: Forecaster, trip: Trip | None) -> dict[str, Any]:

@@ -4,18 +4,21 @@ import gc
 
 import numpy as np
 
+from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.kernels.least_squares import add_residuals, backward_substitution, forward_substitution
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.curve_change import return_to_cell_file
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import neutral_fit
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.kernel_subtrees import CELL, second_process
-from bms_estimator.service.pack_forecaster import load_forecast_kernels
 from bms_estimator.settings.alarm_limits import MIN_CELLS
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
@@ -23,6 +26,8 @@ from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 
+WARM_UP_S = 330
+"""Duration of the load with which the kernels of a forecast are called [s], longer than ``forecaster.MIN_LOAD_S``."""
 COLLECT_AFTER = 50_000
 """Number of new objects after which garbage is collected while kernels compile. numba creates many objects that stay."""
 
@@ -68,3 +73,16 @@ def _load_fit_kernels() -> None:
     one = np.ones((1, 1))
     add_residuals(one, one[0], np.zeros((1, 1), np.intp), one, one[0])
     backward_substitution(one, forward_substitution(one, one))
+
+
+def load_forecast_kernels() -> None:
+    """Compile the kernels of a forecast, or load them from the cache, so that no sample waits for them."""
+    cell = load_cell(CELL)
+    estimator = Estimator(cell, initial_soc=0.5)
+    samples = np.zeros(WARM_UP_S, SAMPLE)
+    samples["time_s"], samples["temperature_c"] = np.arange(WARM_UP_S), 25.0
+    samples["voltage_v"], samples["current_a"] = cell.cell.nominal_voltage_v, 0.1 * cell.cell.capacity_ah
+    forecaster = Forecaster(estimator, cutoff_v=cell.cell.voltage_min_v)
+    Pack(estimator, forecaster=forecaster).run(samples)
+    forecaster.forecast()
+    forecaster.trip_curve(constant_trip("power_w", 1.0, 60.0).load)

@@ -26,6 +26,7 @@ from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import has_relay
 from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.exports.influx import InfluxSink
@@ -144,11 +145,9 @@ async def run_pack_service(
             stop=stop,
             checkpoint=checkpoint,
             requests=requests,
-            delivery=delivery,
+            status=ServiceStatus(delivery, source.health, partial(recording_health, tap)),
             current_zero=source.current_zero,
             notifier=notifier,
-            source_health=source.health,
-            recording=partial(recording_health, tap),
             hooks=hooks,
             edge=edge,
             history=pack_history,

@@ -5,46 +5,35 @@ from collections.abc import Callable, Mapping, Sequence
 
 import structlog
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
-from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.forecast import ForecastReport
-from bms_estimator.model.payloads.health import (
-    FRESH_PERIODS,
-    EdgeHealth,
-    Health,
-    HookHealth,
-    LoopHealth,
-    RecordingHealth,
-)
+from bms_estimator.model.payloads.health import FRESH_PERIODS, Health, LoopHealth
 from bms_estimator.model.payloads.info import Info
-from bms_estimator.model.payloads.pack_model import PackModelHealth
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.pack.pack import Pack, Step
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.latency import Latency
+from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
-from bms_estimator.sources.source import ReceivedSamples, Source, SourceHealth
-from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST
+from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
 from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
+from bms_estimator.telemetry.pack_model import pack_model_health
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window, WindowSummary
 from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.rest_detector import RestDetector
 from bms_estimator.telemetry.state import make_info_payload, make_state_payload
-from bms_estimator.telemetry.weakest_cell_values import WeakestCellValues, bank_fields
+from bms_estimator.telemetry.weakest_cell_values import bank_fields, weakest_cell_values
 
 log = structlog.get_logger(__name__)
 
@@ -63,31 +52,16 @@ class Publisher:
 
     Args:
         settings: The pack's settings.
-        cell: Model of the whole pack.
-        estimator: Estimator; read only.
+        pack: The pack; read only.
         source: Supplies counters, message and board.
         sinks: Destinations of the snapshots.
         clock: The clocks.
+        status: State of the service around the pack.
         totals: Totals over restarts; default: new totals.
-        restarts: Number of starts that found files of an earlier run.
-        checkpoint: Outcome of restoring the checkpoint at the start.
-        delivery: Counters of sent messages and received requests.
-        source_health: Returns the health of the source; None: not reported.
-        recording: Returns the state of a recording; None where nothing is recorded.
-        edge: Returns the state of the fleet edge; None without one.
-        hooks: Returns successes and failures of alarm hooks; None without hooks.
-        pack_model: Returns the state of the slow fit; None without one.
-        weakest_cell: Returns the values of the weakest cell.
-        cells: Estimators of the single cells; read only; None: none.
         on_alarm: Called with each alarm that is raised or cleared.
-        forecaster: Supplies the forecasts; None: there are none.
 
     Attributes:
         alarm_monitor: Alarm monitor.
-        checkpoint: Outcome of the last restore or save of a checkpoint.
-        disk_free_mib: Free space in the state folder [MiB].
-        log_lines_lost: Number of log lines dropped since start.
-        saved_flow: Saved charge and energy; None if they are not saved.
         latest: The last estimate.
         snapshot: The last snapshot.
     """
@@ -95,49 +69,33 @@ class Publisher:
     def __init__(
         self,
         settings: Settings,
-        cell: PackModel,
-        estimator: Estimator,
+        pack: Pack,
         *,
         source: Source,
         sinks: Sequence[Sink],
         clock: Clock,
+        status: ServiceStatus | None = None,
         totals: LifetimeTotals | None = None,
-        restarts: int = 0,
-        checkpoint: str = "off",
-        delivery: DeliveryStats | None = None,
-        source_health: Callable[[], SourceHealth] | None = None,
-        recording: Callable[[], RecordingHealth | None] = lambda: None,
-        edge: Callable[[], EdgeHealth | None] = lambda: None,
-        hooks: Callable[[], HookHealth | None] = lambda: None,
-        pack_model: Callable[[], PackModelHealth | None] = lambda: None,
-        weakest_cell: Callable[[], WeakestCellValues] = WeakestCellValues,
-        cells: CellEstimator | None = None,
         on_alarm: Callable[[Change], object] = lambda _: None,
-        forecaster: Forecaster | None = None,
     ) -> None:
-        self._settings, self._cell, self._estimator = settings, cell, estimator
+        cell, estimator = pack.model, pack.estimator
+        self._settings, self._pack, self._cell, self._estimator = settings, pack, cell, estimator
+        self._status = status or ServiceStatus()
         self._source, self._sinks, self._clock = source, sinks, clock
         self._totals = totals or LifetimeTotals(estimator, new_totals(clock.wall()))
-        self._restarts, self._delivery = restarts, delivery or DeliveryStats()
         self._rest = RestDetector(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
-        self._source_health, self._recording, self._edge, self._latency = source_health, recording, edge, Latency()
-        self._hooks, self._pack_model, self._weakest_cell = hooks, pack_model, weakest_cell
-        self._forecaster, self._forecast_s = forecaster, -math.inf  # time of the last payload of the curves
+        self._latency = Latency()
+        self._forecast_s = -math.inf  # time of the last payload of the curves
         is_battery = isinstance(cell, CellModel)
         self._no_forecast = no_forecast(
             "the identifier is switched off" if is_battery else "a fuel cell has no state of charge"
         )
-        self.checkpoint, self.log_lines_lost = checkpoint, 0
-        self.disk_free_mib: float | None = None
-        self.saved_flow: ChargeEnergy | None = None
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
-        self._window, self._cells = Window(), cells
+        self._window = Window()
         self._cells_s = -math.inf  # time of the last comparison of the cells, monotonic clock
-        self.alarm_monitor = AlarmMonitor(
-            settings, cell, estimator, source, clock, on_alarm, hooks, weakest_cell, cells
-        )
+        self.alarm_monitor = AlarmMonitor(settings, pack, source, clock, on_alarm, self._status.hooks)
         self._short_limit_a = short_limit_a(settings, cell)
         self._logged_faults = 0  # bits of ``InputFault``
         self._lag_s = 0.0
@@ -161,17 +119,17 @@ class Publisher:
         """Return the time until a snapshot is overdue, which shows that no samples arrive [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
-    def add(self, received: ReceivedSamples, trace: TraceBlock, cells_fault: str = "") -> None:
+    def add(self, received: ReceivedSamples, step: Step, cells_fault: str = "") -> None:
         """Add received samples and their estimates; publish if a snapshot is due or an alarm has changed.
 
         Args:
             received: Samples and cell voltages.
-            trace: Estimates of the accepted samples.
+            step: Result of the samples.
             cells_fault: Reason why the cell voltages cannot be used (``CellSlots.fault``); empty if they can.
         """
-        if self._source_health:
-            self._latency.add(self._source_health().block_age_s)
-        now_s = self._clock.monotonic()
+        if self._status.source_health:
+            self._latency.add(self._status.source_health().block_age_s)
+        now_s, trace = self._clock.monotonic(), step.trace
         if trace.size:
             self._window.add(trace, self._clock.wall(), received.cells_v, received.probes)
             self._sample_s = now_s
@@ -182,8 +140,7 @@ class Publisher:
         is_due = now_s >= self._due_s
         if is_due and self.latest:  # before the alarms, so that their evaluation does not delay the estimate
             self._publish_snapshot(now_s)
-        forecasts = self._forecaster.rows if self._forecaster else NO_FORECAST
-        alarm_changed = self.alarm_monitor.add(received, trace, now_s, forecasts, cells_fault)
+        alarm_changed = self.alarm_monitor.add(received, step, now_s, cells_fault)
         if is_due and not self.latest:  # the first snapshot lists the alarms that the first samples permit
             self.publish()
         elif alarm_changed:
@@ -226,7 +183,8 @@ class Publisher:
     def alive(self) -> bool:
         """True while samples arrive or the task of the source runs."""
         fresh = self._clock.monotonic() - self._sample_s <= self._fresh_s
-        return fresh or self._source_health is None or self._source_health().task_idle_s <= SOURCE_HUNG_S
+        health = self._status.source_health
+        return fresh or health is None or health().task_idle_s <= SOURCE_HUNG_S
 
     @property
     def status(self) -> str:
@@ -273,13 +231,13 @@ class Publisher:
 
     @property
     def _deviations(self) -> CellDeviations | None:
-        return self._cells.deviations if self._cells else None
+        return self._pack.cells.deviations if self._pack.cells else None
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         # only saved values, so that the next run continues from there
-        self._flow = self._flow.at_least(self.saved_flow or self._totals.flow)
+        self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
         capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
-        forecast = self._forecaster.latest if self._forecaster else self._no_forecast
+        forecast = self._pack.forecaster.latest if self._pack.forecaster else self._no_forecast
         cell_fields = weakest_cell_fields(self._deviations) if self._deviations else {}
         return make_state_payload(
             window,
@@ -289,15 +247,15 @@ class Publisher:
             wall_s,
             self._flow,
             capacity_ah,
-            bank_fields(self._weakest_cell()) | cell_fields,
+            bank_fields(weakest_cell_values(self._pack.slow_fit)) | cell_fields,
         )
 
     def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:
-        forecaster = self._forecaster
+        forecaster = self._pack.forecaster
         return make_forecast_payload(forecaster.latest, forecaster.cutoff_v, window, wall_s) if forecaster else None
 
     def _health(self, now_s: float, message: str | None) -> Health:
-        lag_s, self._lag_s = self._lag_s, 0.0
+        lag_s, self._lag_s, status, slow_fit = self._lag_s, 0.0, self._status, self._pack.slow_fit
         return make_health_payload(
             self._estimator.record[0],
             self._estimator.settings_record[0],
@@ -305,18 +263,18 @@ class Publisher:
             now_s=self._clock.wall(),
             uptime_s=now_s - self._started_s,
             loop_lag_s=lag_s,
-            restarts=self._restarts,
-            checkpoint=self.checkpoint,
+            restarts=status.restarts,
+            checkpoint=status.checkpoint,
             sensor_message=message,
-            delivery=self._delivery,
+            delivery=status.delivery,
             clock_ppm=self._source.clock_ppm,
             total=self._totals.total,
             unseen_s=self._totals.unseen_s,
             loop=self._loop(),
-            recording=self._recording(),
-            edge=self._edge(),
-            hooks=self._hooks(),
-            pack_model=self._pack_model(),
+            recording=status.recording(),
+            edge=status.edge(),
+            hooks=status.hooks(),
+            pack_model=pack_model_health(slow_fit, status.fit_times()) if slow_fit else None,
         )
 
     def _log_input_faults(self, health: Health) -> None:
@@ -328,14 +286,15 @@ class Publisher:
 
     def _loop(self) -> LoopHealth:
         p50_s, p99_s, max_s = self._latency.take() or (None, None, None)
+        status = self._status
         return LoopHealth(
             latency_p50_s=p50_s,
             latency_p99_s=p99_s,
             latency_max_s=max_s,
-            reads_waiting=self._source_health().queued_reads if self._source_health else 0,
-            messages_waiting=self._delivery.waiting,
-            log_lines_lost=self.log_lines_lost,
-            disk_free_mib=self.disk_free_mib,
+            reads_waiting=status.source_health().queued_reads if status.source_health else 0,
+            messages_waiting=status.delivery.waiting,
+            log_lines_lost=status.log_lines_lost,
+            disk_free_mib=status.disk_free_mib,
         )
 
     def _info(self) -> Info:

@@ -6,10 +6,8 @@ from typing import Any
 
 import structlog
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.errors import UserError
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack.pack import Pack
 from bms_estimator.service.forecast_request import forecast_in_thread, requested_trip
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ
@@ -22,23 +20,13 @@ class RequestHandlers:
     """Handlers of the requests of one pack; each method is named after its request.
 
     Args:
-        estimator: Estimator of the pack.
+        pack: The pack.
         publisher: Publisher of the pack.
         zero_board: Makes the board store the present current as zero; None: the source has no such command.
-        pack_model: Slow fit of the pack's model; None: none.
-        forecaster: Forecaster of the pack; None: there are no forecasts for it.
     """
 
-    def __init__(
-        self,
-        estimator: Estimator,
-        publisher: Publisher,
-        zero_board: Callable[[], Awaitable[None]] | None,
-        pack_model: SlowFit | None = None,
-        forecaster: Forecaster | None = None,
-    ) -> None:
-        self._estimator, self._publisher, self._zero_board = estimator, publisher, zero_board
-        self._pack_model, self._forecaster = pack_model, forecaster
+    def __init__(self, pack: Pack, publisher: Publisher, zero_board: Callable[[], Awaitable[None]] | None) -> None:
+        self._pack, self._estimator, self._publisher, self._zero_board = pack, pack.estimator, publisher, zero_board
 
     def register(self, requests: RequestDispatcher) -> None:
         """Register all handlers."""
@@ -115,12 +103,12 @@ class RequestHandlers:
         Raises:
             UserError: The service fits no model of the pack, or no sample has been taken yet.
         """
-        if self._pack_model is None:
+        if self._pack.slow_fit is None:
             raise UserError("nothing is learned from this pack: identifier.pack_model or identifier.enabled is false")
         if not self._estimator.state["started"][0]:
             raise UserError("no sample has been taken yet")
-        rows = int(self._pack_model.history.rows.size)
-        self._pack_model.forget()
+        rows = int(self._pack.slow_fit.history.rows.size)
+        self._pack.slow_fit.forget()
         log.info("history and model of the pack discarded on request", rows=rows)
         return {"rows": rows}
 
@@ -130,6 +118,6 @@ class RequestHandlers:
         Raises:
             UserError: An argument is invalid, or there are no forecasts for this pack.
         """
-        if self._forecaster is None:
+        if self._pack.forecaster is None:
             raise UserError("there are no forecasts for a fuel cell, or with identifier.enabled = false")
-        return await forecast_in_thread(self._forecaster, requested_trip(arguments))
+        return await forecast_in_thread(self._pack.forecaster, requested_trip(arguments))

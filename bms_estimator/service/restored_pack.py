@@ -9,43 +9,35 @@ from bms_estimator.checkpoint.history_file import HistoryFile, RejectedHistoryEr
 from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.checkpoint.run_file import RunCounters, SavedRun
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.clock import Clock
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.curve_change import return_to_cell_file
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import adopt_curves
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import fit_of_curves, history_of
 from bms_estimator.telemetry.lifetime_totals import new_totals
 
 log = structlog.get_logger(__name__)
 
 
-def restore_pack(
-    estimator: Estimator,
-    pack_model: SlowFit | None,
-    checkpoint: CheckpointFile | None,
-    history: HistoryFile | None,
-    cells: CellEstimator | None = None,
-) -> str:
+def restore_pack(pack: Pack, checkpoint: CheckpointFile | None, history: HistoryFile | None) -> str:
     """Restore a valid checkpoint and a valid history; rejected files are quarantined.
 
     The curves are adopted first, because the state is relative to them. The history is resumed last, because it depends on
     whether the state was restored.
 
     Args:
-        estimator: New estimator.
-        pack_model: New slow fit of the estimator; None: the estimator runs without one.
+        pack: New pack.
         checkpoint: File of the state; None: the state is not saved.
         history: File of the history; None: the history is not saved.
-        cells: New estimators of the single cells; None: none.
 
     Returns:
         Outcome of the checkpoint as text.
     """
     if checkpoint is None:
         return "off"
+    estimator, pack_model, cells = pack.estimator, pack.slow_fit, pack.cells
     content = checkpoint.load()
     state_fit = _fit_of_state(content)
     if pack_model:
@@ -70,6 +62,8 @@ def restore_pack(
             pack_model.resume(gap_s, restored=restored)
     if cells and restored and (reason := cells.restore(content.cells, content.unseen_s)):
         log.warning("the state of the single cells was dropped", reason=reason)
+    if pack.forecaster and cells:
+        pack.forecaster.deviations = cells.deviations
     if refused := outcome.startswith(REJECTED):
         outcome = f"{outcome}; {checkpoint.quarantine()}"
     write_log = log.warning if refused else log.info

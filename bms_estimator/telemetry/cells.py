@@ -1,11 +1,13 @@
-"""Payload of the topic ``cells``, and faults of single cells as inputs of the alarms."""
+"""Values of single cells: payload of the topic ``cells``, columns of a table of estimates, and inputs of the alarms."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.kernels.cells.records import ReadingFault
+from bms_estimator.model.arrays import Records
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.cells import CellFaultName, CellReport, CellsReport
 from bms_estimator.telemetry.state import finite
@@ -16,6 +18,17 @@ _FAULT_NAMES: dict[ReadingFault, CellFaultName] = {
     ReadingFault.OFFSET: "wrong reading",
     ReadingFault.SENSE_WIRE: "sense wire",
 }
+
+CELL_COLUMNS = np.dtype(
+    [
+        ("weakest_cell", "f8"),  # number of the cell with the lowest SOC, from 1
+        ("weakest_cell_soc", "f8"),  # its SOC, 0..1
+        ("weakest_cell_soc_std", "f8"),  # standard deviation of this SOC
+        ("cell_soc_spread", "f8"),  # highest minus lowest SOC of the cells
+        ("cell_r_spread", "f8"),  # highest minus lowest resistance, relative to the median
+    ]
+)
+"""Values of a row; NaN before the first estimate of the cells."""
 
 
 class CellFault(NamedTuple):
@@ -114,3 +127,12 @@ def weakest_cell_fields(cells: CellDeviations) -> dict[str, float | int | None]:
         "cell_soc_spread": float(np.ptp(cells.soc_deviation)),
         "cell_r_spread": float(np.ptp(cells.resistance_ratio)),
     }
+
+
+def cell_columns(cells: CellDeviations | None, count: int) -> Records:
+    """Return the present values in ``count`` equal rows, dtype ``CELL_COLUMNS``; NaN without an estimate of the cells."""
+    rows = np.full(count, math.nan).astype(CELL_COLUMNS)
+    if cells is not None:
+        for name, value in weakest_cell_fields(cells).items():
+            rows[name] = math.nan if value is None else value
+    return rows

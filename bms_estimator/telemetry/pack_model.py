@@ -18,6 +18,9 @@ class FitTimes(NamedTuple):
     duration_s: float | None
 
 
+NO_FIT = FitTimes(None, None)
+
+
 def pack_model_health(model: SlowFit, times: FitTimes) -> PackModelHealth:
     """Return the state of the slow fit.
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 import bms_estimator
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit, fit
 from bms_estimator.pack_model.learning import SlowFit
@@ -158,6 +159,7 @@ class RecordedBank:
         self._bank = SimulatedBank(c.cell, cells, full_v=c.full_v * series, cutoff_v=c.cutoff_v * series)
         estimator = Estimator(c.file.pack(series, 1), voltage_resolution_v=RESOLUTION_V)
         self._slow_fit = SlowFit(estimator, interval_s=np.inf)  # fits are made once a cycle
+        self._pack = Pack(estimator, self._slow_fit)
         self._number, self._fits, self._steps = 0, list[PackFit](), list[Step]()
 
     def run_cycles(self, cycles: int) -> None:
@@ -204,7 +206,7 @@ class RecordedBank:
         samples = history.samples(self._rng, NOISE_V * np.sqrt(series), RESOLUTION_V)
         drawn = np.cumsum(history.current_a) * STEP_S / 3600.0 / self._one_c
         for begin in range(0, samples.size, BLOCK):
-            self._slow_fit.run(samples[begin : begin + BLOCK])
+            self._pack.run(samples[begin : begin + BLOCK])
             rows, last = self._slow_fit.history.rows.size, min(begin + BLOCK, samples.size) - 1
             if is_discharge and (not self._steps or rows > self._steps[-1].rows):
                 true_soc = max(float(history.cell_soc[last].min()), 0.0)

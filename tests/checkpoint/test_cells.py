@@ -8,6 +8,7 @@ import structlog
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.pack.pack import Pack
 from bms_estimator.service.restored_pack import restore_pack
 from bms_estimator.settings.pack import Settings
 from tests.simulated_pack import SimulatedPack
@@ -24,7 +25,7 @@ def restarted(file: CheckpointFile, pack: SimulatedPack) -> CellEstimator:
     """Return the estimators of the cells of the next run."""
     estimator = Estimator(pack.model)
     cells = CellEstimator(estimator)
-    restore_pack(estimator, None, file, None, cells)
+    restore_pack(Pack(estimator, cells=cells), file, None)
     return cells
 
 

@@ -16,6 +16,7 @@ from bms_estimator.checkpoint.identity import fields
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.protocols.firmware.messages import ResetCause
 from bms_estimator.simulation.simulated_pack import SimulatedPack, pulses
@@ -225,9 +226,9 @@ async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
     settings, cell = load_pack(pack)
     live = CheckpointFile(tmp_path / "state", settings, cell).load().state
     replayed = new_estimator(settings, cell)
-    runner, capture_file = SlowFit(replayed), RawCapture(capture)
+    pack_replay, capture_file = Pack(replayed, SlowFit(replayed)), RawCapture(capture)
     for block in capture_file:
-        runner.run(block)
+        pack_replay.run(block)
     counters = capture_file.decoder.counters
     assert counters["frames_lost"] > 0
     assert counters["crc_errors"] > 0

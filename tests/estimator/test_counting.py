@@ -13,6 +13,7 @@ from scipy.stats import chi2
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import IdentifiedValue, current_offset, relative_capacity
 from bms_estimator.kernels.kalman_filter.records import LN_Q
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
 from tests.estimator.anywhere.cases import Capture, Case, capture
 from tests.estimator.anywhere.use import DAY_S, cycles, days
@@ -54,7 +55,7 @@ def estimate_cycles(case: Case, initial_soc_error: float) -> Estimator:
     recording = capture(case, cycles(rng, case.truth.capacity_ah, count=3, by_soc=0.7, rest_s=600))
     estimator = Estimator(recording.cell, initial_soc=float(np.clip(recording.soc[0] + initial_soc_error, 0.0, 1.0)))
     with fits_every(FIT_INTERVAL_S):
-        SlowFit(estimator, interval_s=FIT_INTERVAL_S).run(recording.samples)
+        Pack(estimator, SlowFit(estimator, interval_s=FIT_INTERVAL_S)).run(recording.samples)
     return estimator
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.pack.pack import Pack
 from tests.estimator.simulated_cell import TRUTH, measured
 
 CUTOFF_V = 3.0
@@ -26,10 +27,10 @@ def constant_load(current_a: float, seconds: int, soc: float = 0.9) -> SampleBlo
     return measured(np.full(seconds, current_a), soc, np.random.default_rng(1))[0]
 
 
-def forecaster(soc: float = 0.9, cutoff_v: float = CUTOFF_V) -> Forecaster:
-    """Return a forecaster whose estimator starts at ``soc``."""
+def forecasting_pack(soc: float = 0.9, cutoff_v: float = CUTOFF_V) -> Pack:
+    """Return a pack with forecasts whose estimator starts at ``soc``."""
     estimator = Estimator(TRUTH, initial_soc=soc)
-    return Forecaster(estimator, estimator, cutoff_v=cutoff_v)
+    return Pack(estimator, forecaster=Forecaster(estimator, cutoff_v=cutoff_v))
 
 
 def cutoff_s(block: SampleBlock, cutoff_v: float = CUTOFF_V) -> float:

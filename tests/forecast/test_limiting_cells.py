@@ -11,6 +11,7 @@ from bms_estimator.forecast.capability import PowerLimits, write_capability
 from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.cells.records import ReadingFault
+from bms_estimator.pack.pack import Pack
 from bms_estimator.simulation.simulated_bank import BankCells
 from tests.simulated_pack import CAPACITY_AH, CELLS, SimulatedPack
 
@@ -90,12 +91,12 @@ def test_any_division_into_blocks_gives_the_same_power_of_the_weakest_cell_to_th
     samples, rows = history.samples(np.random.default_rng(1)), []
     for length in (1, 7, 200):
         estimator = Estimator(SimulatedPack(cells).model)
-        forecaster = Forecaster(estimator, estimator, cutoff_v=CUTOFF_V, cells=CellEstimator(estimator))
-        parts = []
+        forecaster = Forecaster(estimator, cutoff_v=CUTOFF_V)
+        pack, parts = Pack(estimator, cells=CellEstimator(estimator), forecaster=forecaster), []
         for begin in range(0, samples.size, length):
-            forecaster.run(samples[begin : begin + length], history.cell_v[begin : begin + length])
-            parts.append(forecaster.rows)
+            step = pack.run(samples[begin : begin + length], history.cell_v[begin : begin + length])
+            parts.append(step.forecasts)
         rows.append(np.concatenate(parts).tobytes())
     assert rows[0] == rows[1] == rows[2]
-    without = Forecaster(estimator, estimator, cutoff_v=CUTOFF_V).forecast().values["usable_capacity_ah"][0]
+    without = Forecaster(estimator, cutoff_v=CUTOFF_V).forecast().values["usable_capacity_ah"][0]
     assert forecaster.forecast().values["usable_capacity_ah"][0] < 0.99 * without

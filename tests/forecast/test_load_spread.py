@@ -9,7 +9,7 @@ from scipy import stats
 from bms_estimator.forecast.load_spread import load_spread
 from bms_estimator.kernels.forecast.draws import DRAW, MAX_LOAD_FACTOR, draw_load_factors
 from tests.estimator.simulated_cell import measured
-from tests.forecast.simulated_load import forecaster
+from tests.forecast.simulated_load import forecasting_pack
 
 TRIP_S, LEVEL_S = 1200, 20
 
@@ -74,8 +74,8 @@ def test_load_factors_have_the_quantiles_of_students_t_distribution():
 def test_the_band_is_wider_after_two_different_trips_than_after_one_repeated_trip():
     bands = []
     for means_a in ((0.8, 0.8), (0.4, 1.2)):
-        forecasting = forecaster()
+        forecasting = forecasting_pack()
         forecasting.run(measured(trips(*means_a), 0.9, np.random.default_rng(1))[0])
-        values = forecasting.forecast().values
+        values = forecasting.forecaster.forecast().values
         bands.append(np.log(values["time_to_cutoff_p95_s"] / values["time_to_cutoff_p05_s"]).item())
     assert bands[1] > 1.2 * bands[0]

@@ -12,6 +12,7 @@ from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.pack.pack import Pack
 from bms_estimator.settings.pack import PackSettings, Settings
 
 CELL = load_cell("ncr18650")
@@ -26,10 +27,10 @@ def array(*values: float) -> np.ndarray:
 def forecaster() -> Forecaster:
     """Return the forecaster of a cell at rest at SOC 0.5."""
     estimator = new_estimator(Settings(pack=PackSettings(initial_soc=0.5)), CELL)
-    forecaster = Forecaster(estimator, estimator, cutoff_v=CUTOFF_V)
+    forecaster = Forecaster(estimator, cutoff_v=CUTOFF_V)
     samples = np.zeros(60, SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(60), 3.62, 25.0
-    forecaster.run(samples)
+    Pack(estimator, forecaster=forecaster).run(samples)
     return forecaster
 
 

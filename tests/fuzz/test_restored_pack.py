@@ -23,12 +23,13 @@ from bms_estimator.kernels.cells.records import CELL as CELL_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.pack import pack
+from bms_estimator.pack.pack import make_forecaster
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning, solve
 from bms_estimator.pack_model.history import ReferenceDischarges, WeakCellTime
 from bms_estimator.pack_model.learning import SlowFit, Submit, run_now
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays, neutral_fit
-from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.service.restored_pack import restore_pack
 from bms_estimator.settings.pack import Settings
 
@@ -94,14 +95,13 @@ class Pack:
         self.checkpoint, self.history = CheckpointFile(folder, SETTINGS, CELL), HistoryFile(folder, SETTINGS, CELL)
         self.load = HistoryFile(folder, SETTINGS, CELL, LOAD_SUFFIX)
         self.estimator = new_estimator(SETTINGS, CELL)
-        self.cells, self.slow_fit = (
-            CellEstimator(self.estimator),
-            SlowFit(self.estimator, interval_s=FIT_S, submit=submit),
-        )
-        restore_pack(self.estimator, self.slow_fit, self.checkpoint, self.history, self.cells)
-        forecaster = new_forecaster(SETTINGS, CELL, self.estimator, self.slow_fit, self.cells)
+        self.cells = CellEstimator(self.estimator)
+        self.slow_fit = SlowFit(self.estimator, interval_s=FIT_S, submit=submit)
+        forecaster = make_forecaster(SETTINGS, CELL, self.estimator)
         assert forecaster
         self.forecaster = forecaster
+        self.pack = pack.Pack(self.estimator, self.slow_fit, self.cells, forecaster, has_forecasts=False)
+        restore_pack(self.pack, self.checkpoint, self.history)
         restore_seen_load(self.load, forecaster)
 
     def save(self) -> None:
@@ -112,10 +112,7 @@ class Pack:
 
     def run(self, hours: float) -> None:
         """Process samples with cell voltages, without forecasts."""
-        samples, cells_v = samples_of(hours)
-        trace = self.slow_fit.run(samples)
-        self.cells.run(samples, cells_v, trace)
-        self.forecaster.load.add(trace)
+        self.pack.run(*samples_of(hours))
 
 
 @pytest.fixture(scope="module", autouse=True)

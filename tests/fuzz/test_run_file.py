@@ -12,6 +12,7 @@ from bms_estimator.checkpoint.checksum import add_checksum
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
+from bms_estimator.pack.pack import Pack
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.restored_pack import read_counters
 from bms_estimator.settings.pack import Settings
@@ -69,7 +70,7 @@ def restore(folder: Path, content: bytes) -> set[str]:
     checkpoint, clock = CheckpointFile(folder, SETTINGS, CELL), Clock()
     checkpoint.run_file.path.write_bytes(content)
     saved = read_counters(checkpoint, clock)
-    monitor = AlarmMonitor(SETTINGS, CELL, ESTIMATOR, ScriptedSource(), clock, lambda _: None)
+    monitor = AlarmMonitor(SETTINGS, Pack(ESTIMATOR), ScriptedSource(), clock, lambda _: None)
     if reason := saved.lost_reason or monitor.restore(saved.counters.alarms):
         monitor.raise_state_lost(reason)
     monitor.evaluate(clock.monotonic())

@@ -9,6 +9,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAUS, WEAK_J
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.cell_curves import arrhenius
 from bms_estimator.pack_model.fit import SOC, PackFit, fit
@@ -95,8 +96,8 @@ def test_exchange_raises_the_diagnostic(monkeypatch: pytest.MonkeyPatch) -> None
     block = measured(current_a, 0.7, np.random.default_rng(1))[0]
     slow_fit = SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah), initial_soc=0.7), interval_s=5000.0)
     suspects = slow_fit.estimator.record[0]["checks"]
-    slow_fit.run(block[:1500])
+    Pack(slow_fit.estimator, slow_fit).run(block[:1500])
     assert InputFault.PACK not in InputFault(int(suspects["suspects"]))
-    slow_fit.run(block[1500:])
+    Pack(slow_fit.estimator, slow_fit).run(block[1500:])
     assert slow_fit.fits > 0
     assert InputFault.PACK in InputFault(int(suspects["suspects"]))

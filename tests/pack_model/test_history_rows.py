@@ -12,6 +12,7 @@ from bms_estimator.kernels.accumulators.history import (
     ROW_SOC,
 )
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.settings.sampling import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured
@@ -40,7 +41,7 @@ def samples() -> SampleBlock:
 @pytest.fixture(scope="module")
 def rows(samples: SampleBlock) -> np.ndarray:
     slow_fit = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
-    slow_fit.run(samples)
+    Pack(slow_fit.estimator, slow_fit).run(samples)
     return slow_fit.history.rows
 
 
@@ -117,7 +118,7 @@ def test_gap_that_may_hide_a_charge_begins_a_segment(samples: SampleBlock) -> No
     later = samples.copy()
     later["time_s"][3000:] += 7200.0
     slow_fit = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
-    slow_fit.run(later)
+    Pack(slow_fit.estimator, slow_fit).run(later)
     rows = slow_fit.history.rows
     assert np.unique(rows["segment"]).size == 2
     first, second = rows[rows["segment"] == rows["segment"][0]], rows[rows["segment"] == rows["segment"][-1]]
@@ -132,7 +133,7 @@ def test_gap_that_may_hide_a_charge_begins_a_segment(samples: SampleBlock) -> No
 def test_blocks_of_any_size_record_the_same_rows(samples: SampleBlock, rows: np.ndarray) -> None:
     slow_fit = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
     for part in np.array_split(samples, 97):
-        slow_fit.run(part)
+        Pack(slow_fit.estimator, slow_fit).run(part)
     assert slow_fit.history.rows.tobytes() == rows[: slow_fit.history.rows.size].tobytes()
     assert slow_fit.history.rows.size > 0.8 * rows.size
 
@@ -145,7 +146,7 @@ def test_rows_of_a_slow_source_contain_the_uncertainty_of_the_current_between_sa
     block, _ = measured(levels_a, 0.95, rng)
     slow = block[::step_s]
     slow_fit = SlowFit(Estimator(TRUTH, initial_soc=0.95, sampling=Sampling(period_s=float(step_s))), interval_s=np.inf)
-    slow_fit.run(slow)
+    Pack(slow_fit.estimator, slow_fit).run(slow)
     rows = slow_fit.history.rows
     assert (rows["skew_a2"] == 0.0).all()
     if step_s == 1:

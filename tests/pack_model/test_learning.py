@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET, SOC, STATES
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock, SampleStatus
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.cell_curves import SOC_GRID
@@ -35,6 +37,11 @@ def samples() -> SampleBlock:
     return block
 
 
+def run(slow_fit: SlowFit, samples: SampleBlock) -> TraceBlock:
+    """Process samples with the estimator and its slow fit. Return the trace."""
+    return Pack(slow_fit.estimator, slow_fit).run(samples).trace
+
+
 def new_slow_fit() -> SlowFit:
     return SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah), initial_soc=0.5), interval_s=INTERVAL_S)
 
@@ -44,7 +51,7 @@ def run_in_parts(samples: SampleBlock, sizes: tuple[int, ...]) -> tuple[SlowFit,
     slow_fit, traces, start, turn = new_slow_fit(), [], 0, 0
     while start < samples.size:
         size = sizes[turn % len(sizes)]
-        traces.append(slow_fit.run(samples[start : start + size]).copy())
+        traces.append(run(slow_fit, samples[start : start + size]).copy())
         start, turn = start + size, turn + 1
     return slow_fit, np.concatenate(traces)
 
@@ -76,7 +83,7 @@ def test_there_is_no_fit_while_the_current_at_the_times_of_the_voltages_is_unkno
     samples = measured(current_a, 0.9, rng)[0][:: period_s // 2].copy()
     samples["status"][::2], samples["status"][1::2] = SampleStatus.CURRENT_HELD, SampleStatus.VOLTAGE_HELD
     slow_fit = SlowFit(Estimator(TRUTH, sampling=Sampling(period_s=period_s)), interval_s=INTERVAL_S)
-    slow_fit.run(samples)
+    run(slow_fit, samples)
     assert slow_fit.history.rows.size > 5 * learning.MIN_ROWS
     assert bool(slow_fit.fits) == is_fitted
 
@@ -112,7 +119,7 @@ def test_adopted_state_is_that_of_the_fit(samples: SampleBlock, monkeypatch: pyt
         adopted.append((f["mean"][0].copy(), f["covariance"][0].copy(), float(h["charge_as"]), float(f["soc"])))
 
     monkeypatch.setattr(learning, "adopt_state", adopt_and_copy)
-    slow_fit.run(samples)
+    run(slow_fit, samples)
     mean, covariance, charge_as, soc = adopted[-1]
     fitted, p = slow_fit.fit, slow_fit.estimator.settings_record[0]["filter"]
     assert fitted is not None
@@ -134,10 +141,10 @@ def test_adopted_state_is_that_of_the_fit(samples: SampleBlock, monkeypatch: pyt
 def test_hypotheses_keep_their_soc_if_a_gap_followed_the_fit(samples: SampleBlock) -> None:
     """The gap may hide a charge, so that the fit has no information on the present SOC."""
     slow_fit = new_slow_fit()
-    slow_fit.run(samples)
+    run(slow_fit, samples)
     later = samples[:3].copy()
     later["time_s"] += samples["time_s"][-1] + 86400.0
-    slow_fit.run(later)
+    run(slow_fit, later)
     fitted, estimator = slow_fit.fit, slow_fit.estimator
     assert fitted is not None
     f = estimator.record[0]["filter"]
@@ -165,9 +172,9 @@ def test_a_fit_of_less_than_a_cycle_is_adopted_only_if_its_std_is_small(
     monkeypatch.setattr(learning, "fit", fit_with_std)
     slow_fit = new_slow_fit()
     begin = int(first_s)
-    slow_fit.run(samples[:begin])
+    run(slow_fit, samples[:begin])
     assert slow_fit.fits == 0
-    slow_fit.run(samples[begin : begin + 300])
+    run(slow_fit, samples[begin : begin + 300])
     assert slow_fit.fits == 1
 
 
@@ -189,14 +196,14 @@ def test_a_fit_after_few_rows_and_restarts_does_not_enlarge_the_std(
     slow_fit = new_slow_fit()
     for start in range(6):
         part = samples[300 * start : 300 * (start + 1)]
-        slow_fit.run(part)
+        run(slow_fit, part)
         slow_fit.estimator.resume(600.0)
         slow_fit.resume(600.0, restored=True)
     assert np.unique(slow_fit.history.rows["segment"]).size > 3
     while slow_fit.estimator.record[0]["history"]["elapsed_s"] < 2.0 * INTERVAL_S:
         part = part.copy()
         part["time_s"] += 300.0
-        slow_fit.run(part)
+        run(slow_fit, part)
     assert (slow_fit.fits > 0) == is_adopted
     assert slow_fit.saved_fit is not None
 
@@ -212,7 +219,7 @@ def test_a_short_history_is_fitted_more_often(samples: SampleBlock, monkeypatch:
     slow_fit = SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah)), submit=submit, interval_s=3600.0)
     day = np.tile(samples, 6)
     day["time_s"] = np.arange(day.size)
-    slow_fit.run(day)
+    run(slow_fit, day)
     intervals_s = np.diff(times_s)
     assert intervals_s[0] == pytest.approx(1800.0, abs=15.0)
     assert intervals_s[-1] == pytest.approx(3600.0, abs=15.0)

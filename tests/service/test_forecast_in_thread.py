@@ -14,6 +14,7 @@ from bms_estimator.kernels.forecast.given_load import simulate_given_load
 from bms_estimator.kernels.forecast.observed_load import record_curves, simulate_observed_load
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.pack.pack import Pack
 from bms_estimator.service import forecast_request
 from bms_estimator.service.forecast_request import forecast_data, forecast_in_thread
 
@@ -23,19 +24,26 @@ SAMPLES["voltage_v"] = 3.9 - 1e-4 * np.arange(SAMPLES.size)
 SAMPLES["current_a"] = np.where(np.arange(SAMPLES.size) % 60 < 30, 0.8, 0.2)
 
 
+def loaded_pack() -> Pack:
+    """Return a cell after 400 s of load."""
+    estimator = Estimator(load_cell("chen_mora"), initial_soc=0.9)
+    pack = Pack(estimator, forecaster=Forecaster(estimator, cutoff_v=3.0))
+    pack.run(SAMPLES[:400])
+    return pack
+
+
 @pytest.fixture
 def forecaster() -> Forecaster:
     """Return the forecaster of a cell after 400 s of load."""
-    estimator = Estimator(load_cell("chen_mora"), initial_soc=0.9)
-    forecaster = Forecaster(estimator, estimator, cutoff_v=3.0)
-    forecaster.run(SAMPLES[:400])
-    return forecaster
+    return loaded_pack().forecaster
 
 
 @pytest.mark.parametrize("trip", [None, constant_trip("power_w", 2.0, 600.0)], ids=["observed load", "given load"])
 async def test_samples_that_arrive_meanwhile_do_not_change_the_forecast(
-    forecaster: Forecaster, trip: Trip | None, monkeypatch: pytest.MonkeyPatch
+    trip: Trip | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    pack = loaded_pack()
+    forecaster = pack.forecaster
     expected, samples_processed = forecast_data(forecaster, trip), threading.Event()
 
     def forecast_later(*arguments: Any) -> dict[str, Any]:
@@ -45,21 +53,19 @@ async def test_samples_that_arrive_meanwhile_do_not_change_the_forecast(
     monkeypatch.setattr(forecast_request, "forecast_data", forecast_later)
     response = asyncio.create_task(forecast_in_thread(forecaster, trip))
     await asyncio.sleep(0)  # the task takes its copy
-    forecaster.run(SAMPLES[400:])
+    pack.run(SAMPLES[400:])
     samples_processed.set()
     assert await response == expected
     assert forecast_data(forecaster, trip) != expected
 
 
-async def test_a_forecast_in_a_thread_does_not_change_later_estimates(forecaster: Forecaster) -> None:
-    estimator = Estimator(load_cell("chen_mora"), initial_soc=0.9)
-    undisturbed = Forecaster(estimator, estimator, cutoff_v=3.0)
-    undisturbed.run(SAMPLES[:400])
-    await forecast_in_thread(forecaster, constant_trip("power_w", 2.0, 600.0))
-    for each in (forecaster, undisturbed):
+async def test_a_forecast_in_a_thread_does_not_change_later_estimates() -> None:
+    asked, undisturbed = loaded_pack(), loaded_pack()
+    await forecast_in_thread(asked.forecaster, constant_trip("power_w", 2.0, 600.0))
+    for each in (asked, undisturbed):
         each.run(SAMPLES[400:])
-    assert forecaster.estimator.record.tobytes() == undisturbed.estimator.record.tobytes()
-    assert forecaster.latest.values.tobytes() == undisturbed.latest.values.tobytes()
+    assert asked.estimator.record.tobytes() == undisturbed.estimator.record.tobytes()
+    assert asked.forecaster.latest.values.tobytes() == undisturbed.forecaster.latest.values.tobytes()
 
 
 @pytest.mark.parametrize(

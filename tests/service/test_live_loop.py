@@ -25,6 +25,7 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.live_loop import LAG_STEP_S, run_estimation_loop
+from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
@@ -70,7 +71,7 @@ async def run_loop(settings: Settings = SETTINGS, cell: CellModel = CELL, **opti
     """Run the loop, and stop it at the end. ``options`` are arguments of ``run_estimation_loop``."""
     source, sink, stop, delivery = ScriptedSource(), Collector(), asyncio.Event(), DeliveryStats()
     requests = RequestDispatcher(delivery, ("set_soc", "current_zero", "publish_rate"))
-    arguments = {"requests": requests, "delivery": delivery}
+    arguments = {"requests": requests, "status": ServiceStatus(delivery)}
     task = asyncio.create_task(
         run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=stop, **arguments, **options)
     )

@@ -23,11 +23,11 @@ from bms_estimator.model.payloads.pack_model import PackModelHealth
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.service.live_loop import run_estimation_loop
-from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sources.source import ReceivedSamples
@@ -129,16 +129,14 @@ async def test_service_and_replay_agree_to_the_last_bit(
     monkeypatch.setattr(fit_module, "STARTS", fit_module.STARTS[:1])  # for a shorter test
     part = day[: 17 * HOUR]  # with the first hourly fits
     live = await run_service(part, tmp_path)  # the first start with a state folder
-    replayed = new_estimator(SETTINGS, CELL)
-    slow_fit = SlowFit(replayed)
-    forecaster = new_forecaster(SETTINGS, CELL, replayed, slow_fit)
-    assert forecaster
-    trace = forecaster.run(part)
+    pack = new_pack(SETTINGS, CELL)
+    replayed, slow_fit, step = pack.estimator, pack.slow_fit, pack.run(part)
+    assert slow_fit
     assert slow_fit.fits >= 3
     assert (live.model.fits, live.model.late, live.model.failed) == (slow_fit.fits, 0, 0)
     assert live.estimator.settings_record.tobytes() == replayed.settings_record.tobytes()
     same_fields(live.estimator, replayed)
-    same_forecasts(live.sink.snapshots, trace, forecaster.rows)
+    same_forecasts(live.sink.snapshots, step.trace, step.forecasts)
 
 
 def same_forecasts(snapshots: list[Snapshot], trace: np.ndarray, rows: np.ndarray) -> None:
@@ -355,7 +353,7 @@ async def test_forget_pack_starts_again_as_with_a_new_pack(day: SampleBlock, tmp
         source = Source(day[: 3 * HOUR + BLOCK], executor)
         forgetful = await run_service(day, tmp_path, source=source, fit_executor=executor, requests=requests)
     new = new_estimator(SETTINGS, CELL)
-    SlowFit(new).run(day[3 * HOUR : 3 * HOUR + BLOCK])
+    Pack(new, SlowFit(new)).run(day[3 * HOUR : 3 * HOUR + BLOCK])
     assert answers[0]["data"]["rows"] > 0
     assert forgetful.estimator.state["samples"][0] == 3 * HOUR + BLOCK  # the counters go on
     same_fields(forgetful.estimator, new, without=("observer.samples", "observer.gaps"))

@@ -9,7 +9,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
-from bms_estimator.service.pack_forecaster import new_forecaster
+from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples
@@ -22,7 +22,7 @@ def test_suspected_input_faults_are_logged_when_their_set_changes() -> None:
     estimator = Estimator(cell, initial_soc=0.5)
     estimator.step(0.0, 0.0, 3.8, temperature_c=25.0)
     clock = Clock(monotonic=lambda: now_s)
-    publisher = Publisher(Settings(), cell, estimator, source=ScriptedSource(), sinks=[], clock=clock)
+    publisher = Publisher(Settings(), Pack(estimator), source=ScriptedSource(), sinks=[], clock=clock)
     logged_suspects = []
     for temperature_c, suspects in (
         (41.0, InputFault.TEMPERATURE),
@@ -46,10 +46,11 @@ def test_a_raised_alarm_is_published_before_the_next_snapshot_is_due() -> None:
     settings = Settings.model_validate({"publish": {"rate_hz": 0.1}, "alarms": {"pack_over_voltage": {"delay_s": 0.0}}})
     estimator = Estimator(cell, initial_soc=0.5)
     clock = Clock(monotonic=lambda: now_s)
-    publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock)
+    pack = Pack(estimator)
+    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
     for now_s, voltage_v in ((0.0, 3.8), (1.0, 3.8), (2.0, 6.0), (3.0, 6.0)):
         block = np.array([(now_s, 0.0, voltage_v, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
-        publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
+        publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
     raised_alarms = [[alarm.name for alarm in each.alarms if alarm.active] for each in sink.snapshots]
     assert raised_alarms == [[], ["pack_over_voltage"]]
     # the second snapshot has no estimate, because the publish window has not ended
@@ -62,10 +63,11 @@ def test_an_estimate_that_is_due_is_published_before_the_alarm_of_the_same_sampl
     settings = Settings.model_validate({"publish": {"rate_hz": 1.0}, "alarms": limits})
     estimator = Estimator(cell, initial_soc=0.5)
     clock = Clock(monotonic=lambda: now_s)
-    publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock)
+    pack = Pack(estimator)
+    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
     for now_s, voltage_v in ((0.0, 3.8), (1.0, 4.05)):
         block = np.array([(now_s, 0.0, voltage_v, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
-        publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
+        publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
     assert [
         (each.estimate and each.estimate.voltage_v, any(alarm.active for alarm in each.alarms))
         for each in sink.snapshots
@@ -74,16 +76,13 @@ def test_an_estimate_that_is_due_is_published_before_the_alarm_of_the_same_sampl
 
 def test_the_curves_of_a_forecast_are_published_once_a_minute() -> None:
     now_s, cell, sink = 0.0, load_cell("chen_mora"), Collector()
-    settings, estimator = Settings.model_validate({"publish": {"rate_hz": 0.1}}), Estimator(cell, initial_soc=0.5)
-    forecaster = new_forecaster(settings, cell, estimator, None)
-    assert forecaster
+    settings = Settings.model_validate({"publish": {"rate_hz": 0.1}, "pack": {"initial_soc": 0.5}})
+    pack = new_pack(settings, cell)
     clock = Clock(monotonic=lambda: now_s)
-    publisher = Publisher(
-        settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=clock, forecaster=forecaster
-    )
+    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
     for now_s in np.arange(0.0, 181.0, 10.0):
         block = np.array([(now_s, 0.1, 3.8, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
-        publisher.add(ReceivedSamples(block, NO_CELLS), forecaster.run(block))
+        publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
     reports = [each.forecast for each in sink.snapshots if each.forecast]
     assert len({id(report) for report in reports}) == 4  # at 0, 60, 120 and 180 s
     assert reports[0].cutoff_v == pytest.approx(2.7)  # default limit of the alarm pack_under_voltage
@@ -91,11 +90,12 @@ def test_the_curves_of_a_forecast_are_published_once_a_minute() -> None:
 
 def test_a_pack_without_the_identifier_has_no_forecast_and_a_reason() -> None:
     cell, sink = load_cell("chen_mora"), Collector()
-    settings, estimator = Settings(), Estimator(cell, identifier=None, initial_soc=0.5)
-    assert new_forecaster(settings, cell, estimator, None) is None
-    publisher = Publisher(settings, cell, estimator, source=ScriptedSource(), sinks=[sink], clock=Clock())
+    settings = Settings.model_validate({"identifier": {"enabled": False}, "pack": {"initial_soc": 0.5}})
+    pack = new_pack(settings, cell)
+    assert pack.forecaster is None
+    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=Clock())
     block = np.array([(0.0, 0.1, 3.8, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
-    publisher.add(ReceivedSamples(block, NO_CELLS), estimator.run(block))
+    publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
     [snapshot] = sink.snapshots
     assert snapshot.estimate
     assert (snapshot.estimate.forecast_reason, snapshot.forecast) == ("the identifier is switched off", None)

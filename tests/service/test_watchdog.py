@@ -12,6 +12,7 @@ from bms_estimator.service import publisher
 from bms_estimator.service.latency import Latency
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.service.pack_service import recording_health
+from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
@@ -69,7 +70,9 @@ async def test_a_hanging_source_stops_the_watchdog_notifications(systemd: System
     health = SourceHealth(task_idle_s=0.0, block_age_s=0.0, queued_reads=0)
     source, sink = ScriptedSource(), Collector()
     arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
-    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **arguments, source_health=lambda: health))
+    task = asyncio.create_task(
+        run_estimation_loop(SETTINGS, CELL, **arguments, status=ServiceStatus(source_health=lambda: health))
+    )
     await systemd.wait_for("WATCHDOG=1")  # no sample arrives, but the source still tries
     health = health._replace(task_idle_s=publisher.SOURCE_HUNG_S + 1.0)
     for _ in range(3):
@@ -126,7 +129,7 @@ async def test_health_contains_the_latency_of_samples_and_the_number_of_waiting_
     source, sink = ScriptedSource(), Collector()
     health = SourceHealth(task_idle_s=0.0, block_age_s=0.3, queued_reads=7)
     arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
-    live = run_estimation_loop(SETTINGS, CELL, **arguments, source_health=lambda: health)
+    live = run_estimation_loop(SETTINGS, CELL, **arguments, status=ServiceStatus(source_health=lambda: health))
     task = asyncio.create_task(live)
     first = await sink.until(lambda _: True)
     assert first.health.loop.latency_p50_s is None

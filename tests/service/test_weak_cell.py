@@ -10,6 +10,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.sample import NO_CELLS
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.service.publisher import Publisher
@@ -17,7 +18,6 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_bank import BankCells
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
 from tests.collector import Collector
 from tests.pack_model.bank_cycles import ONE_C, cycle, new_bank
 from tests.scripted_source import ScriptedSource
@@ -42,15 +42,14 @@ def run() -> Run:
     now_s, number, rng, result, sink = 0.0, 0, np.random.default_rng(3), Run([], []), Collector()
     healthy = BankCells.drawn(rng, SERIES, ONE_C)
     bank, cell = new_bank(healthy), load_cell("ncr18650").pack(SERIES, 1)
-    slow_fit = SlowFit(Estimator(cell), interval_s=FIT_S)
+    estimator = Estimator(cell)
+    pack = Pack(estimator, SlowFit(estimator, interval_s=FIT_S))
     publisher = Publisher(
         Settings.model_validate({"publish": {"rate_hz": 0.1}}),
-        cell,
-        slow_fit.estimator,
+        pack,
         source=ScriptedSource(),
         sinks=[sink],
         clock=Clock(monotonic=lambda: now_s, wall=lambda: now_s),
-        weakest_cell=lambda: weakest_cell_values(slow_fit),
         on_alarm=lambda change: result.changes.append((number, change)) if change.alarm.name == "weak_cell" else None,
     )
     for number in range(CYCLES):
@@ -60,7 +59,7 @@ def run() -> Run:
             for begin in range(0, samples.size, BLOCK):
                 block = samples[begin : begin + BLOCK]
                 now_s = float(block["time_s"][-1])
-                publisher.add(ReceivedSamples(block, NO_CELLS), slow_fit.run(block))
+                publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
                 if sink.snapshots and (estimate := sink.snapshots.pop().estimate):
                     true_soc = history.cell_soc[begin + block.size - 1].min()
                     result.published.append((number, estimate, max(float(true_soc), 0.0)))

@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.service.pack_forecaster import new_forecaster
+from bms_estimator.pack.pack import new_pack
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header
@@ -136,26 +135,16 @@ async def replayed(
     """
     now_s, result, sink = 0.0, ReplayResult(), Collector()
     source = Replay(open_capture(path, settings_.sensor), max_block_s=math.inf if at_once else 0.05)
-    estimator = new_estimator(settings_, cell)
-    forecaster = new_forecaster(settings_, cell, estimator, None)
-    runner = forecaster or estimator
+    identifier = settings_.identifier.model_copy(update={"pack_model": False})
+    pack = new_pack(settings_.model_copy(update={"identifier": identifier}), cell)
     clock = Clock(wall=lambda: begin_s + now_s, monotonic=lambda: now_s)
-    publisher = Publisher(
-        settings_,
-        cell,
-        estimator,
-        source=source,
-        sinks=[sink],
-        clock=clock,
-        on_alarm=result.changes.append,
-        forecaster=forecaster,
-    )
+    publisher = Publisher(settings_, pack, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append)
     publisher.alarm_monitor.restore(saved_state)
     slots = CellSlots(cell.cell.series_count)
     async for each in source:
         received = each._replace(cells_v=slots.select(each.cells_v))
         now_s = float(received.samples["time_s"][-1])
-        publisher.add(received, runner.run(received.samples), slots.fault)
+        publisher.add(received, pack.run(received.samples), slots.fault)
     publisher.publish_last()
     result.snapshots, result.saved_state = sink.snapshots, publisher.alarm_monitor.alarms.saved_state
     return result

@@ -28,19 +28,15 @@ from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.cli.options.silenced_log import silenced_log
-from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.pack.pack import new_pack
 from bms_estimator.service.alarm_monitor import AlarmMonitor
-from bms_estimator.service.fit_thread import new_slow_fit
-from bms_estimator.service.pack_forecaster import load_forecast_kernels, new_forecaster
+from bms_estimator.service.kernel_warm_up import load_forecast_kernels
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, no_samples_error, open_capture
-from bms_estimator.telemetry.alarms.evaluator import NO_FORECAST
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
 
 MAX_BLOCK_S = 1.0
 """Maximum duration of a block [s]. Alarms are evaluated after each block, by the capture's clock."""
@@ -117,31 +113,17 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     """Run estimator and alarms over a capture."""
     now_s, changes = 0.0, list[Change]()
     with show_compile_progress():
-        estimator = new_estimator(settings, model)
+        pack = new_pack(settings, model)
         load_forecast_kernels()
     without_hooks = settings.alarms.model_copy(update={"hook": ()})
     settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
-    cells = CellEstimator(estimator)
-    slow_fit = new_slow_fit(settings, estimator)
-    forecaster = new_forecaster(settings, model, estimator, slow_fit, cells)
-    runner, slots = slow_fit or estimator, CellSlots(model.cell.series_count)
-    monitor = AlarmMonitor(
-        settings,
-        model,
-        estimator,
-        source,
-        clock,
-        changes.append,
-        cells=cells,
-        weakest_cell=lambda: weakest_cell_values(slow_fit),
-    )
+    slots, monitor = CellSlots(model.cell.series_count), AlarmMonitor(settings, pack, source, clock, changes.append)
     with progress_bar("replaying") as bar:
         async for each in source:
             received = each._replace(cells_v=slots.select(each.cells_v))
             now_s = max(now_s, float(received.samples["time_s"][-1]))
-            trace = forecaster.run(received.samples, received.cells_v) if forecaster else runner.run(received.samples)
-            monitor.add(received, trace, now_s, forecaster.rows if forecaster else NO_FORECAST, slots.fault)
+            monitor.add(received, pack.run(received.samples, received.cells_v), now_s, slots.fault)
             bar.update(source.fraction)
     if slots.reason:
         typer.echo(f"warning: no estimates of single cells: {slots.reason}", err=True)

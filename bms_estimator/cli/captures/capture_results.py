@@ -12,8 +12,6 @@ from bms_estimator.calibration.verdict import is_fitted_to
 from bms_estimator.cli.options.capture_input import read_with_bar
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.progress_bar import progress_bar
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
@@ -21,6 +19,7 @@ from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
 from bms_estimator.model.sample import SampleBlock, fill_temperature
+from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.plot.thinning import kept_indices
 from bms_estimator.reports.capture_report import CaptureResult, Estimates
 from bms_estimator.settings.pack import Settings
@@ -63,9 +62,9 @@ def capture_result(
         is_fitted = is_fitted_to(model, rows)
         fill_temperature(rows, temperature_c)
         validation = validate(Columns(rows, name), model, initial_soc=initial_soc)
-        estimator = new_estimator(settings, model)
+        pack = new_pack(settings, model, has_forecasts=False)
     with progress_bar(f"estimating {name}") as bar:
-        estimates = _estimate(estimator, rows, validation, bar.update)
+        estimates = _estimate(pack, rows, validation, bar.update)
     raw = opened if isinstance(opened, RawCapture) else None
     return CaptureResult(
         name,
@@ -78,8 +77,8 @@ def capture_result(
     )
 
 
-def _estimate(estimator: Estimator, rows: SampleBlock, validation: Validation, progress: Progress) -> Estimates:
-    """Run the estimator over the samples of a capture, without the fit to the pack's history.
+def _estimate(pack: Pack, rows: SampleBlock, validation: Validation, progress: Progress) -> Estimates:
+    """Run the pack over the samples of a capture.
 
     Raises:
         UserError: The estimator accepted no sample.
@@ -93,7 +92,8 @@ def _estimate(estimator: Estimator, rows: SampleBlock, validation: Validation, p
         counted.append(block_counted[kept])
         progress(fraction)
 
-    errors = soc_errors(estimator, rows, validation, keep)
+    estimator = pack.estimator
+    errors = soc_errors(estimator, rows, validation, keep, lambda samples: pack.run(samples).trace)
     if not any(trace.size for trace in traces):
         raise UserError("the estimator accepted no sample of the capture")
     trace = np.concatenate(traces)

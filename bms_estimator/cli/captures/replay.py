@@ -1,15 +1,17 @@
 """``bms-estimator replay``: estimates from a capture."""
 
 import asyncio
+import itertools
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, nullcontext
+from collections.abc import Iterator
+from contextlib import AsyncExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich import box
 from rich.console import Console
@@ -33,33 +35,30 @@ from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_broker, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.estimator import TraceBlock, new_estimator
-from bms_estimator.forecast.forecaster import Forecaster, Runner
+from bms_estimator.model.arrays import Records
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.pack_model.learning import SlowFit
-from bms_estimator.service.fit_thread import new_slow_fit
-from bms_estimator.service.pack_forecaster import load_forecast_kernels, new_forecaster
+from bms_estimator.pack.pack import Pack, Step, new_pack
+from bms_estimator.service.kernel_warm_up import load_forecast_kernels
 from bms_estimator.service.publisher import Publisher
+from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.sinks.trace_file import TableSink, join_columns, table_sink
 from bms_estimator.sources.captures.replay import RawCapture, Replay, no_samples_error, open_capture
+from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.store.outbox import Outbox
-from bms_estimator.telemetry.cell_columns import CellColumns
+from bms_estimator.telemetry.cells import cell_columns
 from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
-from bms_estimator.telemetry.pack_model import FitTimes, pack_model_health
-from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
 
+CELLS_S = 10.0
+"""Interval at which the columns of the cells are updated [s]. It equals the averaging window of the cell estimator."""
 RARE_FAULT_FRACTION = 0.01
 """Maximum fraction of samples with a fault for which no likely cause is reported."""
 
@@ -156,39 +155,38 @@ async def _replay(
     settings: Settings, model: PackModel, source: Replay, table: TableSink | None, *, fit_pack: bool
 ) -> ReplayResult:
     """Run the estimator over a source, and pass the estimates to table, summary and broker."""
-    with show_compile_progress():
-        estimator, summary = new_estimator(settings, model), Summary()
-        if estimator.identifying:
-            load_forecast_kernels()
     errors: dict[str, str] = {}  # the last text of each kind
-    pack_model = None
-    if fit_pack:
-        pack_model = new_slow_fit(
-            settings, estimator, on_failure=lambda error: errors.update({type(error).__name__: str(error)})
+    if not fit_pack:
+        identifier = settings.identifier.model_copy(update={"pack_model": False})
+        settings = settings.model_copy(update={"identifier": identifier})
+    with show_compile_progress():
+        pack = new_pack(
+            settings,
+            model,
+            on_failure=lambda error: errors.update({type(error).__name__: str(error)}),
+            # forecasts at intervals take longer than the estimates, and the summary needs only the last one
+            has_forecasts=bool(table or settings.mqtt),
         )
-    cells = CellEstimator(estimator)
-    cell_columns, slots = CellColumns(cells), CellSlots(model.cell.series_count)
-    forecaster = new_forecaster(settings, model, estimator, pack_model, cell_columns if table else cells)
-    # forecasts at intervals take longer than the estimates, and the summary needs only the last one
-    run = _run_function(forecaster, pack_model or estimator, with_forecasts=bool(table or settings.mqtt))
+        if pack.forecaster:
+            load_forecast_kernels()
+    summary, slots = Summary(), CellSlots(model.cell.series_count)
     async with AsyncExitStack() as stack:
-        publisher = await _open_publisher(stack, settings, model, estimator, pack_model, forecaster, cells, source)
-        stack.enter_context(table or nullcontext())
+        publisher = await _open_publisher(stack, settings, pack, source)
+        rows = _TableRows(stack.enter_context(table) if table else None, pack)
         bar = stack.enter_context(progress_bar("replaying"))
         started_s, impossible = time.perf_counter(), None
         async for each in source:
             received = each._replace(cells_v=slots.select(each.cells_v))
-            trace = run(received.samples, received.cells_v)
-            summary.add(trace)
-            if trace.size < received.samples.size:  # samples were dropped
-                impossible = out_of_range_reason(received.samples, estimator.settings[0]) or impossible
-            if table:
-                table.write(
-                    join_columns(trace, *([forecaster.rows] if forecaster else []), *cell_columns.take_rows(trace.size))
-                )
-            if publisher:
-                publisher.add(received, trace, slots.fault)
-                await asyncio.sleep(0)  # the MQTT client runs in this event loop
+            for part in rows.parts(received):
+                step = pack.run(part.samples, part.cells_v)
+                summary.add(step.trace)
+                rows.add(step)
+                if step.trace.size < part.samples.size:  # samples were dropped
+                    impossible = out_of_range_reason(part.samples, pack.estimator.settings[0]) or impossible
+                if publisher:
+                    publisher.add(part, step, slots.fault)
+                    await asyncio.sleep(0)  # the MQTT client runs in this event loop
+            rows.write()
             bar.update(source.fraction)
         wall_s = time.perf_counter() - started_s
         if publisher:
@@ -197,30 +195,51 @@ async def _replay(
         typer.echo(f"warning: a fit of the pack's model failed: {kind}: {text}", err=True)
     if slots.reason:
         typer.echo(f"warning: no estimates of single cells: {slots.reason}", err=True)
-    limit_a = short_limit_a(settings, model)
-    result = summary.result(estimator, pack_model, forecaster, cells, limit_a, source.samples, wall_s)
+    result = summary.result(pack, short_limit_a(settings, model), source.samples, wall_s)
     return replace(result, impossible=impossible, temperatures_dropped=source.counters.get("implausible", 0))
 
 
-def _run_function(
-    forecaster: Forecaster | None, runner: Runner, *, with_forecasts: bool
-) -> Callable[[SampleBlock, CellBlock], TraceBlock]:
-    """Return a function that processes samples and cell voltages, and returns the estimates."""
-    if forecaster is None:
-        return lambda samples, _: runner.run(samples)
-    return forecaster.run if with_forecasts else forecaster.run_without_forecast
+class _TableRows:
+    """Rows of a table: estimates, forecasts and, if the first block has cell voltages, columns of the cells.
+
+    Args:
+        table: The table; None: no rows are kept.
+        pack: The pack.
+    """
+
+    def __init__(self, table: TableSink | None, pack: Pack) -> None:
+        self._table, self._pack = table, pack
+        self._has_cells: bool | None = None  # all rows of a table have the same columns
+        self._rows = list[Records]()
+
+    def parts(self, received: ReceivedSamples) -> Iterator[ReceivedSamples]:
+        """Yield a block in parts of ``CELLS_S``, after each of which the columns of the cells change; whole without them."""
+        if self._has_cells is None:
+            has_rows = self._table is not None and self._pack.forecaster is not None
+            self._has_cells = has_rows and received.cells_v.size > 0
+        changes = np.diff(received.samples["time_s"] // CELLS_S) if self._has_cells else np.zeros(0)
+        edges = [0, *(np.flatnonzero(changes) + 1).tolist(), received.samples.size]
+        for begin, end in itertools.pairwise(edges):
+            part = slice(begin, end)
+            yield ReceivedSamples(received.samples[part], received.cells_v[part], received.probes[part])
+
+    def add(self, step: Step) -> None:
+        """Append the rows of a part."""
+        if self._table is None:
+            return
+        columns = [step.forecasts] if self._pack.forecaster else []
+        if self._has_cells and self._pack.cells:
+            columns.append(cell_columns(self._pack.cells.deviations, step.trace.size))
+        self._rows.append(join_columns(step.trace, *columns))
+
+    def write(self) -> None:
+        """Write the appended rows to the table."""
+        if self._table is not None:
+            self._table.write(np.concatenate(self._rows))
+            self._rows.clear()
 
 
-async def _open_publisher(
-    stack: AsyncExitStack,
-    settings: Settings,
-    model: PackModel,
-    estimator: Estimator,
-    pack_model: SlowFit | None,
-    forecaster: Forecaster | None,
-    cells: CellEstimator,
-    source: Replay,
-) -> Publisher | None:
+async def _open_publisher(stack: AsyncExitStack, settings: Settings, pack: Pack, source: Replay) -> Publisher | None:
     """Return the publisher; None without a broker."""
     if settings.mqtt is None:
         return None
@@ -231,19 +250,7 @@ async def _open_publisher(
         settings.mqtt, settings.pack.name, RequestDispatcher(delivery), delivery, outbox, home_assistant=home
     )
     sinks = [await stack.enter_async_context(mqtt)]
-    return Publisher(
-        settings,
-        model,
-        estimator,
-        source=source,
-        sinks=sinks,
-        clock=Clock(),
-        delivery=delivery,
-        pack_model=lambda: pack_model_health(pack_model, FitTimes(None, None)) if pack_model else None,
-        weakest_cell=lambda: weakest_cell_values(pack_model),
-        forecaster=forecaster,
-        cells=cells,
-    )
+    return Publisher(settings, pack, source=source, sinks=sinks, clock=Clock(), status=ServiceStatus(delivery))
 
 
 def result_table(title: str, result: ReplayResult) -> Table:

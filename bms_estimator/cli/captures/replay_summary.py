@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.pack_model.learning import SlowFit
-from bms_estimator.telemetry.cell_columns import CELL_COLUMNS
-from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
+from bms_estimator.pack.pack import Pack
+from bms_estimator.telemetry.cells import CELL_COLUMNS, make_cells_payload, weakest_cell_fields
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.stability_margin import applicable_margin
@@ -134,27 +133,16 @@ class Summary:
         self._error_sum += float(error_v @ error_v)
         self._soc_difference_sum += float(soc_difference @ soc_difference)
 
-    def result(
-        self,
-        estimator: Estimator,
-        pack_model: SlowFit | None,
-        forecaster: Forecaster | None,
-        cells: CellEstimator,
-        short_limit_a: float,
-        sample_count: int,
-        wall_s: float,
-    ) -> ReplayResult:
+    def result(self, pack: Pack, short_limit_a: float, sample_count: int, wall_s: float) -> ReplayResult:
         """Return the result of the replay, without ``impossible`` and ``temperatures_dropped``, which the caller sets.
 
         Args:
-            estimator: Estimator after the last sample.
-            pack_model: Slow fit of the estimator; None without one.
-            forecaster: Forecaster after the last sample; None without one.
-            cells: Estimators of the single cells after the last sample.
+            pack: The pack after the last sample.
             short_limit_a: Limit of the alarm ``cell_short`` [A].
             sample_count: Number of samples in the capture, including dropped samples.
             wall_s: Duration of the replay [s].
         """
+        estimator, slow_fit = pack.estimator, pack.slow_fit
         record, settings = estimator.record[0], estimator.settings_record[0]
         observer = record["observer"]
         counters = sample_counters(observer)
@@ -189,10 +177,10 @@ class Summary:
             stability_margin=None if self._last is None else finite(applicable_margin(self._last, self._soc_known)),
             capacity_ah=capacity.value * declared_ah if capacity else None,
             capacity_std_ah=capacity.std * declared_ah if capacity else None,
-            fits=pack_model.fits if pack_model else 0,
-            failed_fits=pack_model.failed if pack_model else 0,
-            **_last_forecast(forecaster),
-            **_last_cells(cells, short_limit_a),
+            fits=slow_fit.fits if slow_fit else 0,
+            failed_fits=slow_fit.failed if slow_fit else 0,
+            **_last_forecast(pack.forecaster),
+            **_last_cells(pack.cells.deviations if pack.cells else None, short_limit_a),
             samples_per_s=sample_count / wall_s if wall_s > 0.0 else None,
             wall_s=wall_s,
         )
@@ -219,9 +207,8 @@ def _last_forecast(forecaster: Forecaster | None) -> dict[str, Any]:
     return {"forecast": values, "forecast_reason": forecast.reason}
 
 
-def _last_cells(cells: CellEstimator, short_limit_a: float) -> dict[str, Any]:
+def _last_cells(deviations: CellDeviations | None, short_limit_a: float) -> dict[str, Any]:
     """Return the fields of ``ReplayResult`` with the cells in series."""
-    deviations = cells.deviations
     if deviations is None:
         return {**dict.fromkeys(CELL_COLUMNS.names or ()), "cells": []}
     report = make_cells_payload(deviations, short_limit_a, now_s=0.0)  # the time is not part of the result

@@ -9,15 +9,14 @@ from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
 from bms_estimator.checkpoint.learned_state import estimator_of, load_valid
 from bms_estimator.checkpoint.load_file import restore_seen_load
-from bms_estimator.cli.options.capture_input import capture_file, print_guesses, read_with_bar
+from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses
 from bms_estimator.cli.options.capture_options import MappedColumns, SignOfCurrent
-from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.pack.pack import make_forecaster, new_pack
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.service.fit_thread import new_slow_fit
-from bms_estimator.service.pack_forecaster import new_forecaster
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import open_capture
 
@@ -46,7 +45,7 @@ def saved_state(settings: Settings, model: PackModel) -> InitialState:
     folder = state_folder(settings)
     file = CheckpointFile(folder, settings, model)
     content = load_valid(file, settings)
-    forecaster = new_forecaster(settings, model, estimator_of(content, file, settings, model), None)
+    forecaster = make_forecaster(settings, model, estimator_of(content, file, settings, model))
     if forecaster is None:
         raise _no_forecaster(model)
     load_file = HistoryFile(folder, settings, model, LOAD_SUFFIX)
@@ -74,14 +73,17 @@ def end_of_capture(
             path, settings.sensor if has_pack else None, current_sign=current_sign, column_map=column_map
         )
         print_guesses(path.name, source)
-        estimator = new_estimator(settings, model)
-        forecaster = new_forecaster(settings, model, estimator, new_slow_fit(settings, estimator))
-        if forecaster is None:
+        pack = new_pack(settings, model, has_forecasts=False)
+        if pack.forecaster is None:
             raise _no_forecaster(model)
-        forecaster.run(read_with_bar(path, source))
-        if not estimator.state["samples"][0]:
+        slots = CellSlots(model.cell.series_count)
+        with long_file_bar("reading", path) as progress:
+            for samples in source:
+                pack.run(samples, slots.select(source.cells))
+                progress(source.fraction)
+        if not pack.estimator.state["samples"][0]:
             raise UserError(f"{path}: no usable sample")
-    return InitialState(path.name, forecaster, None)
+    return InitialState(path.name, pack.forecaster, None)
 
 
 def _no_forecaster(model: PackModel) -> UserError:

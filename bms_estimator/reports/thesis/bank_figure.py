@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.bank_comparison import MIN_ROWS, SINCE_EARLIER, Comparison, Reference, ReferenceCurve
 from bms_estimator.pack_model.bank_monitor import is_discharge
 from bms_estimator.pack_model.cell_curves import CellCurves
@@ -116,7 +117,7 @@ class BankExperiment:
         history = bank.run(np.full(int(3600.0 / LOAD_C / STEP_S), LOAD_C * one_c), STEP_S)
         estimator = Estimator(self._cell.pack(SERIES, 1), voltage_resolution_v=RESOLUTION_V, initial_soc=1.0)
         recorder = SlowFit(estimator, interval_s=np.inf)
-        recorder.run(history.samples(np.random.default_rng(seed), NOISE_V, RESOLUTION_V))
+        Pack(estimator, recorder).run(history.samples(np.random.default_rng(seed), NOISE_V, RESOLUTION_V))
         rows = recorder.history.rows
         return rows[is_discharge(rows)]
 

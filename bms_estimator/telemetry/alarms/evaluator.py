@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.forecast.forecast import ForecastRows, unknown_values
+from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.alarm import Alarm
@@ -55,8 +55,6 @@ PROBES = "probes"
 """Key of the number of temperature probes, in the saved state. All keys but these four are names of alarms."""
 MIN_WATCHED_S = 10.0
 """Minimum duration of the samples after which alarms count as watched [s]. The delays of most critical alarms are not longer."""
-NO_FORECAST = unknown_values()
-"""Forecast at all samples of a pack without a forecaster."""
 WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
 """Text of a wrong clock that is right again at the end of a recorded block."""
 BROKEN_WIRE_V = 0.1

@@ -10,6 +10,7 @@ from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.pack.pack import Pack
 from tests.benchmarks.forecast.captures import Case
 from tests.benchmarks.forecast.scores import Outcome, Quantiles
 from tests.benchmarks.forecast.truth import Discharge
@@ -41,12 +42,13 @@ def forecasts(discharge: Discharge, cell: CellModel, interval_s: float) -> Itera
     The first SOC is that of the OCV, as it is without a setting.
     """
     estimator = Estimator(cell)
-    forecaster = Forecaster(estimator, estimator, cutoff_v=discharge.cutoff_v)
+    forecaster = Forecaster(estimator, cutoff_v=discharge.cutoff_v)
+    pack = Pack(estimator, forecaster=forecaster)
     samples, end_s = discharge.samples, discharge.end_s
     due_s = np.arange(end_s - interval_s, samples["time_s"][0], -interval_s)[::-1]
     start = 0
     for end in np.unique(np.searchsorted(samples["time_s"], due_s, side="right")).tolist():
-        forecaster.run(samples[start:end])
+        pack.run(samples[start:end])
         start = end
         yield end_s - float(samples["time_s"][end - 1]), forecaster.forecast()
 

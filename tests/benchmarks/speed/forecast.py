@@ -14,6 +14,7 @@ from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 from bms_estimator.kernels.forecast.observed_load import simulate_observed_load
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
 from bms_estimator.model.cell import load_cell
+from bms_estimator.pack.pack import Pack
 from tests.benchmarks.load import CELL, pulses
 from tests.benchmarks.table import Row
 
@@ -29,8 +30,8 @@ CUTOFF_V = 18.0
 def rows() -> Iterator[Row]:
     """Measure the draws of an hour, the table of the longest load history, and whole forecasts on full history."""
     estimator = Estimator(load_cell(CELL))
-    forecaster = Forecaster(estimator, estimator, cutoff_v=CUTOFF_V)
-    forecaster.run(pulses(MAX_LOAD_S + HOUR_S, rate_hz=1))
+    forecaster = Forecaster(estimator, cutoff_v=CUTOFF_V)
+    Pack(estimator, forecaster=forecaster).run(pulses(MAX_LOAD_S + HOUR_S, rate_hz=1))
     mean_a, max_a = forecaster.load.mean_and_max()
     pack, blocks, draws = (
         np.zeros(1, PROJECTED_PACK),

@@ -11,6 +11,7 @@ from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import Trip, constant_trip, profile_trip
 from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 from bms_estimator.model.cell import load_cell
+from bms_estimator.pack.pack import Pack
 from bms_estimator.service.forecast_request import forecast_data, forecast_in_thread
 from tests.benchmarks.load import CELL, pulses
 from tests.benchmarks.speed.forecast import CUTOFF_V
@@ -27,8 +28,8 @@ POWER_W = 20.0
 def rows() -> Iterator[Row]:
     """Measure the requests under the observed load, under a constant power for an hour, and under a profile of an hour."""
     estimator = Estimator(load_cell(CELL))
-    forecaster = Forecaster(estimator, estimator, cutoff_v=CUTOFF_V)
-    forecaster.run(pulses(MAX_LOAD_S, rate_hz=1))
+    forecaster = Forecaster(estimator, cutoff_v=CUTOFF_V)
+    Pack(estimator, forecaster=forecaster).run(pulses(MAX_LOAD_S, rate_hz=1))
     time_s = np.arange(3600.0)
     trips: dict[str, Trip | None] = {
         "observed load": None,

@@ -15,6 +15,7 @@ from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from tests.benchmarks.load import CELL, pulses
@@ -105,18 +106,19 @@ def both_laws_ns(block: SampleBlock) -> tuple[float, float]:
 
 def whole_step_ns(block: SampleBlock) -> float:
     """Return the time per sample of ``run`` with the filter, including updates, fits and the rows of the history [ns]."""
-    runner = runner_with_history()
-    runner.run(block)
+    pack = pack_with_history()
+    pack.run(block)
     best = np.inf
     for _ in range(ROUNDS):
-        runner.estimator.state["started"] = 0
-        best = min(best, elapsed_ns(lambda: runner.run(block)))
+        pack.estimator.state["started"] = 0
+        best = min(best, elapsed_ns(lambda: pack.run(block)))
     return best / BLOCK
 
 
-def runner_with_history() -> SlowFit:
-    """Return an estimator that records its history, as in the service, and never fits it."""
-    return SlowFit(Estimator(load_cell(CELL), identifier=IdentifierSettings()), interval_s=math.inf)
+def pack_with_history() -> Pack:
+    """Return a pack that records its history, as in the service, and never fits it."""
+    estimator = Estimator(load_cell(CELL), identifier=IdentifierSettings())
+    return Pack(estimator, SlowFit(estimator, interval_s=math.inf))
 
 
 def learning_at_1_hz_ns() -> float:
@@ -138,8 +140,8 @@ def steps_at_1_hz_ns() -> tuple[float, float, float]:
     edges = 0, SAMPLES_WITH_ALL_HYPOTHESES, samples_with_several_hypotheses(block), SAMPLES_AT_1_HZ
     best = np.full(3, np.inf)
     for _ in range(ROUNDS):
-        runner = runner_with_history()
-        parts = [functools.partial(runner.run, block[a:b]) for a, b in itertools.pairwise(edges)]
+        pack = pack_with_history()
+        parts = [functools.partial(pack.run, block[a:b]) for a, b in itertools.pairwise(edges)]
         best = np.minimum(best, [elapsed_ns(part) for part in parts])
     all_ns, several_ns, one_ns = (best / np.diff(edges)).tolist()
     return all_ns, several_ns, one_ns
@@ -147,10 +149,10 @@ def steps_at_1_hz_ns() -> tuple[float, float, float]:
 
 def samples_with_several_hypotheses(block: SampleBlock) -> int:
     """Return the number of samples after switch-on during which the filter has several hypotheses."""
-    runner, last = runner_with_history(), 0
+    pack, last = pack_with_history(), 0
     for begin in range(0, SAMPLES_UNTIL_ONE_HYPOTHESIS, SAMPLES_WITH_ALL_HYPOTHESES):
-        runner.run(block[begin : begin + SAMPLES_WITH_ALL_HYPOTHESES])
-        if runner.estimator.record[0]["filter"]["count"] > 1:
+        pack.run(block[begin : begin + SAMPLES_WITH_ALL_HYPOTHESES])
+        if pack.estimator.record[0]["filter"]["count"] > 1:
             last = begin + SAMPLES_WITH_ALL_HYPOTHESES
     return last
 

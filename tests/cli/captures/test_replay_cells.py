@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
-from bms_estimator.telemetry.cell_columns import CELL_COLUMNS
+from bms_estimator.telemetry.cells import CELL_COLUMNS
 from tests.command_line import run
 
 OHM = 0.01

@@ -10,11 +10,10 @@ import pytest
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.service.pack_forecaster import new_forecaster
+from bms_estimator.pack.pack import new_pack
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from tests.command_line import run
 
@@ -42,10 +41,10 @@ def pack(tmp_path_factory: pytest.TempPathFactory, samples: SampleBlock) -> Path
         f'[pack]\nname = "bike"\ncell = "{CELL}"\ninitial_soc = 0.7\ncutoff_v = 2.8\n[state]\nfolder = "{folder / "state"}"\n'
     )
     settings, cell = load_pack(file)
-    estimator = new_estimator(settings, cell)
-    forecaster = new_forecaster(settings, cell, estimator, None)
+    pack = new_pack(settings, cell)
+    pack.run(samples)
+    estimator, forecaster = pack.estimator, pack.forecaster
     assert forecaster
-    forecaster.run(samples)
     (folder / "state").mkdir()
     CheckpointFile(folder / "state", settings, cell).save(estimator.record)
     HistoryFile(folder / "state", settings, cell, LOAD_SUFFIX).save(load_arrays(forecaster.load, forecaster.past))

@@ -9,6 +9,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.settings.charge_limits import ChargeLimits
 from bms_estimator.sources.captures.replay import load_capture
@@ -54,7 +55,7 @@ def test_the_ends_of_charge_keep_the_soc_of_a_generic_cell_right() -> None:
     samples, soc = days_with_a_charge()
     estimator = Estimator(load_cell("nmc", CAPACITY_AH), limits=ChargeLimits(full_voltage_v=FULL_V))
     with fits_every(FIT_INTERVAL_S):
-        trace = SlowFit(estimator, interval_s=FIT_INTERVAL_S).run(samples)
+        trace = Pack(estimator, SlowFit(estimator, interval_s=FIT_INTERVAL_S)).run(samples).trace
     assert identifier_counters(estimator.record[0])["full_anchors"] == DAYS
     after_first_day = slice(DAY_S, None)
     error = trace["soc"][after_first_day] - soc[after_first_day]

@@ -19,6 +19,7 @@ from bms_estimator.kernels.kalman_filter.records import LN_Q
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, rising
 from tests.estimator.anywhere.score import Score, score
@@ -171,7 +172,7 @@ def row(cycle: Cycle) -> CycleRow:
     """Run the estimator and its slow fit with the generic cell file and without an initial SOC."""
     samples, soc = capture(cycle)
     estimator = Estimator(load_cell(cycle.chemistry, CAPACITY_AH))
-    trace = SlowFit(estimator).run(samples)
+    trace = Pack(estimator, SlowFit(estimator)).run(samples).trace
     result = score(samples["time_s"], trace["soc"], trace["soc_std"], soc, AFTER_S)
     assert result is not None
     f = estimator.record[0]["filter"]

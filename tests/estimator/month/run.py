@@ -9,6 +9,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.learning import SlowFit
 from tests.benchmarks.observability import bound, curves
@@ -76,9 +77,9 @@ def bound_of(case: Case, cell: CellCurves, truth: np.ndarray) -> float:
 
 def run_blocks(slow_fit: SlowFit, samples: SampleBlock) -> tuple[Floats, Floats, Floats]:
     """Run the estimator over samples, and return time, SOC and std of the SOC at each accepted sample."""
-    parts = []
+    parts, pack = [], Pack(slow_fit.estimator, slow_fit)
     for begin in range(0, samples.size, BLOCK):
-        trace = slow_fit.run(samples[begin : begin + BLOCK])
+        trace = pack.run(samples[begin : begin + BLOCK]).trace
         parts.append([trace[name].copy() for name in ("time_s", "soc", "soc_std")])
     time_s, soc, soc_std = np.concatenate(parts, axis=1)
     return time_s, soc, soc_std

@@ -16,6 +16,7 @@ from bms_estimator.kernels.kalman_filter.ocv_correction import (
 from bms_estimator.kernels.kalman_filter.records import NODE, NODES, STATES
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
 from tests.estimator.anywhere.cases import OXIDE, Case, cell_file, load_a
 from tests.estimator.anywhere.truth import simulate
@@ -94,8 +95,8 @@ def simulate_partial_cycles(
     estimator = Estimator(cell, initial_soc=soc + 0.1)
     throughput = np.cumsum(np.abs(current_a)) / 3600.0 / OXIDE.capacity_ah
     with fits_every(FIT_INTERVAL_S):
-        runner = SlowFit(estimator, interval_s=FIT_INTERVAL_S) if slow_fit else estimator
-        trace = runner.run(samples[throughput < passes])
+        pack = Pack(estimator, SlowFit(estimator, interval_s=FIT_INTERVAL_S) if slow_fit else None)
+        trace = pack.run(samples[throughput < passes]).trace
     true_soc = true_soc[: trace.size]
     return trace["soc"] - true_soc, trace["soc_std"].copy(), estimator
 

@@ -1,0 +1,65 @@
+"""A pack with all its stages: the same results for any division of the samples into blocks, to the last bit."""
+
+import numpy as np
+import pytest
+
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.pack.pack import Pack, new_pack
+from bms_estimator.pack_model import learning
+from bms_estimator.settings.pack import Settings
+from tests.pack_model.quick_fit import quick_fit
+from tests.simulated_pack import CAPACITY_AH, SimulatedPack
+
+HOURS, STEP_S = 4, 10.0
+
+
+@pytest.fixture(scope="module")
+def recording() -> tuple[np.ndarray, np.ndarray]:
+    """Return samples of a discharge with rests, and the voltages of the cells. One sample is rejected."""
+    pack = SimulatedPack()
+    phase = np.arange(round(HOURS * 3600.0 / STEP_S))
+    history = pack.bank.run(CAPACITY_AH * np.where(phase % 60 < 40, 0.2, 0.0), STEP_S)
+    samples = history.samples(np.random.default_rng(1), 2e-3, 0.01)
+    assert samples.dtype == SAMPLE
+    samples["voltage_v"][700] = np.nan
+    return samples, np.round(history.cell_v, 3)
+
+
+def run_in_blocks(recording: tuple[np.ndarray, np.ndarray], size: int) -> tuple[Pack, bytes, bytes]:
+    """Return a pack after blocks of ``size`` samples, and all rows of its trace and forecasts."""
+    samples, cells_v = recording
+    pack = new_pack(Settings(), SimulatedPack().model)
+    steps = []
+    for begin in range(0, samples.size, size):
+        step = pack.run(samples[begin : begin + size], cells_v[begin : begin + size])
+        steps.append((step.trace.tobytes(), step.forecasts.tobytes()))
+    traces, forecasts = zip(*steps, strict=True)
+    return pack, b"".join(traces), b"".join(forecasts)
+
+
+def test_estimates_forecasts_and_cells_do_not_depend_on_the_division_into_blocks(
+    recording: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learning, "fit", quick_fit)
+    monkeypatch.setattr(learning, "MIN_THROUGHPUT_SOC", 0.0)
+    whole, trace, forecasts = run_in_blocks(recording, recording[0].size)
+    assert whole.slow_fit
+    assert whole.slow_fit.fits >= 2  # in the middle of the only block
+    assert whole.cells
+    for size in (1, 613):
+        pack, other_trace, other_forecasts = run_in_blocks(recording, size)
+        assert pack.slow_fit
+        assert pack.slow_fit.fits == whole.slow_fit.fits
+        assert other_trace == trace
+        assert other_forecasts == forecasts
+        assert pack.cells
+        assert pack.cells.cells.tobytes() == whole.cells.cells.tobytes()
+
+
+def test_a_pack_without_forecasts_still_observes_the_load(recording: tuple[np.ndarray, np.ndarray]) -> None:
+    pack = new_pack(Settings(), SimulatedPack().model, has_forecasts=False)
+    step = pack.run(*recording)
+    assert pack.forecaster
+    assert np.isnan(step.forecasts["time_to_cutoff_s"]).all()
+    assert pack.forecaster.load.seconds > 0
+    assert pack.forecaster.past.mean_a.size > 0
