@@ -4,7 +4,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
-from bms_estimator.forecast.capability import power_limits
+from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.forecast.forecaster import CellRunner, Forecaster
 from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.model.cell import CellModel, load_cell
