@@ -8,17 +8,18 @@ import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
+from itertools import chain
 from typing import TYPE_CHECKING, Self
 
 from bms_estimator.demo.broker import LOOPBACK, DemoBroker, choose_port
 from bms_estimator.demo.true_soc import TrueSoc
-from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.settings.observer import ObserverSettings
+from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings, parse_listen
 from bms_estimator.settings.sensor import SensorSettings
@@ -38,6 +39,11 @@ TRUE_SOC = 0.9
 """True SOC at the start."""
 INITIAL_SOC = 0.7
 """Wrong initial SOC of the estimator, which assumes a std of 0.2."""
+SLOWDOWN = 500.0
+"""Factor by which the thesis's weights of the bounds in (3.18) are divided. With the printed weights a1..a12 reach their limits within
+half a second, too fast to be watched. A common factor does not change the limits."""
+REST_S = 60.0
+"""Rest of the cell while a1..a12 move [s]. (4.2) needs their limits, and starts from rest, where the RC voltages are known."""
 RESOLUTION_V = 5e-3
 """Resolution of the board's voltage [V]. The board averages noisy conversions, so that it is a fifth of the converter's
 step."""
@@ -55,6 +61,7 @@ async def run_demo(
     port: int | None,
     page_port: int | None,
     seconds: float | None,
+    thesis: bool,
     log: Iterable[str],
     opened: Callable[[str], object],
 ) -> str:
@@ -66,6 +73,7 @@ async def run_demo(
         port: Port of the broker; None: 1883, or any free one.
         page_port: Port of the live page; None: 8765, or any free one.
         seconds: Duration [s]; None: until a signal.
+        thesis: True to run the thesis's method without the identifier. It counts the SOC, and therefore starts with the true one.
         log: Log lines that the terminal view shows.
         opened: Called with the address of the live page once it is served.
 
@@ -74,8 +82,10 @@ async def run_demo(
     """
     stop = stop_on_signal()
     cell = load_cell(CELL)
-    truth = TrueSoc(SimulatedPack(cell, random_steps(LOAD_A), soc=TRUE_SOC))
-    result = DemoResult(INITIAL_SOC - TRUE_SOC, truth.soc)
+    load = chain([(REST_S, 0.0)] if thesis else [], random_steps(LOAD_A))
+    truth = TrueSoc(SimulatedPack(cell, load, soc=TRUE_SOC))
+    initial_soc = TRUE_SOC if thesis else INITIAL_SOC
+    result = DemoResult(initial_soc - TRUE_SOC, truth.soc)
     async with DemoBroker(port) as broker, _running_board(truth, rate_hz, speed) as board:
         page = f"{LOOPBACK}:{choose_port(page_port, parse_listen(DEFAULT_LISTEN).port)}"
         hint = f"live page: http://{page}/; in a second terminal: {broker.subscribe_command}"
@@ -83,7 +93,10 @@ async def run_demo(
             sys.stdout.write(f"{hint}\n")
         if seconds is not None:
             asyncio.get_running_loop().call_later(seconds, stop.set)
-        settings = _settings(board, broker.url, page, rate_hz)
+        settings = _settings(board, broker.url, page, rate_hz, initial_soc)
+        if thesis:
+            settings = settings.model_copy(update={"identifier": IdentifierSettings(enabled=False)})
+            cell = _with_slow_law(cell)
         view = TerminalSink(log=log, hint=hint, true_soc=truth.soc)
         pages = Pages(opened)
         # the settings contain no state folder, so that each run starts with the initial state
@@ -103,9 +116,20 @@ async def _running_board(truth: TrueSoc, rate_hz: int, speed: float) -> AsyncIte
             await asyncio.gather(task, return_exceptions=True)
 
 
-def _settings(path: str, url: str, page: str, rate_hz: int) -> Settings:
+def _with_slow_law(cell: CellModel) -> CellModel:
+    """Return the cell with the weights of its bounds divided by ``SLOWDOWN``."""
+    slow = {
+        name: bounds.model_copy(
+            update={key: getattr(bounds, key) / SLOWDOWN for key in ("weight_upper", "weight_lower")}
+        )
+        for name, bounds in cell.adaptation.items()
+    }
+    return cell.model_copy(update={"adaptation": slow})
+
+
+def _settings(path: str, url: str, page: str, rate_hz: int, initial_soc: float) -> Settings:
     return Settings(
-        pack=PackSettings(name="demo", cell=CELL, initial_soc=INITIAL_SOC),
+        pack=PackSettings(name="demo", cell=CELL, initial_soc=initial_soc),
         sensor=SensorSettings(port=path, sample_rate_hz=rate_hz, voltage_resolution_v=RESOLUTION_V),
         observer=ObserverSettings.model_validate({"lambda": LAMBDA}),
         publish=PublishSettings(rate_hz=PUBLISH_RATE_HZ),
@@ -143,12 +167,15 @@ class DemoResult:
     def summary(self) -> str:
         """Return a summary of the run in one line."""
         estimate, elapsed_s = self._last, time.monotonic() - self._started_s
-        if estimate is None or estimate.soc is None or estimate.soc_std is None:
+        if estimate is None or estimate.soc is None:
             return f"{elapsed_s:.1f} s, no sample arrived"
-        soc_error, band = estimate.soc - self._last_true_soc, BAND_STDS * estimate.soc_std
-        inside = "inside" if abs(soc_error) <= band else "outside"
+        soc_error, compared = estimate.soc - self._last_true_soc, f"beside the counted {estimate.soc:.2%}"
+        if estimate.soc_std is not None:
+            band = BAND_STDS * estimate.soc_std
+            inside = "inside" if abs(soc_error) <= band else "outside"
+            compared = f"{inside} the estimate {estimate.soc:.2%} ± {band:.2%} (2 std)"
         return (
             f"{elapsed_s:.1f} s: {estimate.frames_received:,} frames, {estimate.frames_lost} lost, {estimate.crc_errors} CRC errors; "
             f"SOC error {self._initial_error:+.2%} at the start, {soc_error:+.2%} at the end: true SOC {self._last_true_soc:.2%} "
-            f"{inside} the estimate {estimate.soc:.2%} ± {band:.2%} (2 std); observer {'in lock' if estimate.lock else 'out of lock'}"
+            f"{compared}; observer {'in lock' if estimate.lock else 'out of lock'}"
         )

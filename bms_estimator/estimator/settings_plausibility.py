@@ -1,5 +1,6 @@
 """Checks for valid but implausible settings, such as a wrong unit or a wrong number of cells."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -11,6 +12,7 @@ from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.can import CanSource
 from bms_estimator.settings.sources.modbus import ModbusSource
@@ -54,7 +56,11 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
             _more_cells_than_series,
         )
         full_v = float(ocv_grid(cell)[0][-1])
-        lines = [*(check(settings, cell) for check in checks), _voltage_out_of_range(settings, full_v, "when full")]
+        lines = [
+            *(check(settings, cell) for check in checks),
+            _voltage_out_of_range(settings, full_v, "when full"),
+            *_current_limits_without_effect(settings, cell),
+        ]
     return [line for line in lines if line]
 
 
@@ -153,6 +159,19 @@ def _more_cells_than_series(settings: Settings, cell: CellModel) -> str | None:
     if count <= series:
         return None
     return f"source.cells: {count} cells, but the pack has {series} in series: the others must read 0 V; is pack.series right?"
+
+
+def _current_limits_without_effect(settings: Settings, cell: CellModel) -> Iterator[str]:
+    """Yield a line for each current limit above the limit of an alarm or of the cell file, which then applies."""
+    alarms: dict[str, float] = {alarm.name: alarm.limit for alarm in monitored_alarms(settings, cell)}
+    for key, alarm in (("max_discharge_a", "discharge_over_current"), ("max_charge_a", "charge_over_current")):
+        limit_a, alarm_a, file_a = getattr(settings.pack, key), alarms.get(alarm, math.inf), cell.cell.current_max_a
+        if limit_a is not None and limit_a > min(alarm_a, file_a):
+            lower = f"the alarm {alarm}" if alarm_a < file_a else "valid samples (current_max_a of the cell file)"
+            yield (
+                f"pack.{key} = {limit_a:g}: above {min(alarm_a, file_a):.4g} A, the limit of {lower}, which bounds the "
+                "available power instead; is it the current of the whole pack?"
+            )
 
 
 def _voltage_out_of_range(settings: Settings, highest_v: float, when: str) -> str | None:

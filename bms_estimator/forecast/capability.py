@@ -3,73 +3,19 @@
 These values need no forecast of the load, and therefore exist at rest and during a charge, too.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
+from bms_estimator.forecast.available_power import DURATIONS_S, PowerLimits, known_power_w
 from bms_estimator.forecast.forecast import ForecastRows
 from bms_estimator.forecast.limiting_cells import charge_limiting_states, discharge_limiting_states
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
 from bms_estimator.kernels.forecast.draws import DRAW
 from bms_estimator.kernels.forecast.mean_discharge import charge_to_cutoff
-from bms_estimator.kernels.forecast.power import available_power, new_scratch
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
 from bms_estimator.model.arrays import Records
-from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.settings.alarm_limits import monitored_alarms
-from bms_estimator.settings.pack import Settings
-
-QUANTILE_STDS = 1.645
-"""Distance of the 5 % quantile of a normal distribution from its mean, in standard deviations."""
-DURATIONS_S = 10.0, 60.0
-"""Durations of the available power [s]."""
-
-
-@dataclass(frozen=True)
-class PowerLimits:
-    """Limits of current and temperature that bound the available power.
-
-    Attributes:
-        discharge_a: Largest discharge current [A], above 0.
-        charge_a: Largest charge current [A], above 0.
-        charge_min_c: Temperature below which the pack must not be charged [C].
-    """
-
-    discharge_a: float
-    charge_a: float
-    charge_min_c: float = 0.0
-
-
-def cell_power_limits(cell: PackModel) -> PowerLimits:
-    """Return the limits of the cell file: ``current_max_a`` in both directions.
-
-    Args:
-        cell: Model of the whole pack.
-    """
-    return PowerLimits(cell.cell.current_max_a, cell.cell.current_max_a)
-
-
-def power_limits(settings: Settings, cell: CellModel) -> PowerLimits:
-    """Return the limits that the pack's alarms set. A current limit is never above the limit of the cell file.
-
-    If the alarm on a current is switched off, the limit of the cell file applies. If the alarm on charging below freezing is
-    switched off, no temperature limits the charge.
-
-    Args:
-        settings: Settings of the pack.
-        cell: Model of the whole pack.
-    """
-    alarms = {alarm.name: alarm.limit for alarm in monitored_alarms(settings, cell)}
-    max_a = cell.cell.current_max_a
-    return PowerLimits(
-        min(alarms.get("discharge_over_current", max_a), max_a),
-        min(alarms.get("charge_over_current", max_a), max_a),
-        alarms.get("charging_below_freezing", -np.inf),
-    )
 
 
 def write_capability(
@@ -100,17 +46,16 @@ def write_capability(
         return
     anchors = estimator.settings_record[0]["anchors"]
     full_v, tail_a = float(anchors["charger_v"]), float(anchors["tail_a"])
-    charge_a = limits.charge_a if state["temperature_c"] >= limits.charge_min_c else 0.0
-    scratch = new_scratch()
-    states_by_name = {
-        "discharge": [states, *discharge_limiting_states(states, cells)],
-        "charge": [states, *charge_limiting_states(states, cells)],
-    }
+    charge_a = limits.charge_limit_a(float(state["temperature_c"]))
+    discharging = [states, *discharge_limiting_states(states, cells)]
+    charging = [states, *charge_limiting_states(states, cells)]
     for duration_s in DURATIONS_S:
-        for name, limit_v, max_a in (("discharge", cutoff_v, limits.discharge_a), ("charge", full_v, -charge_a)):
-            values[f"available_{name}_power_{duration_s:.0f}s_w"] = min(
-                available_power(each[0], settings, duration_s, limit_v, max_a, QUANTILE_STDS, scratch)
-                for each in states_by_name[name]
+        for name, each, limit_v, max_a in (
+            ("discharge", discharging, cutoff_v, limits.discharge_a),
+            ("charge", charging, full_v, -charge_a),
+        ):
+            values[f"available_{name}_power_{duration_s:.0f}s_w"] = known_power_w(
+                each, settings, duration_s, limit_v, max_a
             )
     write_usable_charge(values, estimator, cutoff_v, largest_a, cells)
     present_a = charge_current(state, settings)

@@ -2,6 +2,7 @@
 
 import math
 from copy import copy
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -9,7 +10,8 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.forecast.capability import PowerLimits, cell_power_limits, projected_pack, write_capability
+from bms_estimator.forecast.available_power import PowerLimits, PresentPower, cell_power_limits, raise_to_present
+from bms_estimator.forecast.capability import projected_pack, write_capability
 from bms_estimator.forecast.forecast import Forecast, ForecastCurve, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import LoadHistory
@@ -115,6 +117,19 @@ class Forecaster:
         other.load.record = self.load.record.copy()
         return other
 
+    def latest_at(self, voltage_v: float, current_a: float, power_w: float) -> Forecast:
+        """Return the last forecast, in which no known available power is below the present power.
+
+        Args:
+            voltage_v: Present voltage [V].
+            current_a: Present current [A], positive on discharge.
+            power_w: Present power [W], positive on discharge.
+        """
+        values, temperature_c = self.latest.values.copy(), float(self.estimator.record["filter"]["temperature_c"][0])
+        present = PresentPower(voltage_v, current_a, power_w, temperature_c)
+        raise_to_present(values, present, self._limits, self.cutoff_v)
+        return replace(self.latest, values=values)
+
     def forecast(self, load: GivenLoad | None = None) -> Forecast:
         """Return a forecast from the present state.
 
@@ -122,7 +137,8 @@ class Forecaster:
             load: Expected load; None: a load like the observed one.
         """
         values, time_s = unknown_values(), float(self.estimator.state["time_s"][0])
-        write_capability(values, self.estimator, self.cutoff_v, self._limits, self._largest_a, self.deviations)
+        limits = self._limits.with_seen(*self.load.seen_a)
+        write_capability(values, self.estimator, self.cutoff_v, limits, self._largest_a, self.deviations)
         reason = self._missing_state()
         if reason is None and load is None:
             reason = self._missing_load()

@@ -46,6 +46,12 @@ class LoadHistory:
         return bool(row["filtered_a"] < -CHARGE_C * self._one_c_a and row["last_a"] < -REST_C * self._one_c_a)
 
     @property
+    def seen_a(self) -> tuple[float, float]:
+        """Largest mean currents of a second so far [A], at least 0: of discharge and of charge."""
+        row = self.record[0]
+        return float(row["seen_discharge_a"]), float(row["seen_charge_a"])
+
+    @property
     def mean_a(self) -> Floats:
         """Mean current of each second [A], oldest first, positive on discharge."""
         return self.mean_and_max()[0]

@@ -15,6 +15,9 @@ MAX_CURRENT_A = 1e6
 MAX_REST_S = 1e10
 """Maximum plausible duration of a rest [s]: 300 years."""
 
+SCALARS = "filtered_a", "last_a", "rest_s", "seen_discharge_a", "seen_charge_a"
+"""Saved fields of ``LOAD`` that are numbers."""
+
 
 def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]:
     """Return the load as arrays by name, for ``restore_load``."""
@@ -23,9 +26,7 @@ def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]
     return {
         "mean_a": mean_a.astype(np.float32),
         "max_a": max_a.astype(np.float32),
-        "filtered_a": np.array(row["filtered_a"]),
-        "last_a": np.array(row["last_a"]),
-        "rest_s": np.array(row["rest_s"]),
+        **{name: np.array(row[name]) for name in SCALARS},
         "minutes_mean_a": past.mean_a.astype(np.float32),
         "minutes_max_a": past.max_a.astype(np.float32),
     }
@@ -33,6 +34,8 @@ def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]
 
 def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Restore a load.
+
+    Arrays without the largest currents so far, as the version before saved them, leave them 0.
 
     Args:
         load: Empty load to fill; unchanged if the arrays are invalid.
@@ -42,10 +45,11 @@ def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDAr
     Raises:
         ValueError: An array is missing, or has another shape or implausible values.
     """
+    arrays = {"seen_discharge_a": np.array(0.0), "seen_charge_a": np.array(0.0), **arrays}
     missing = [name for name in load_arrays(load, past) if name not in arrays]
     if missing:
         raise ValueError(f"{', '.join(missing)}: missing")
-    mean_a, max_a, scalars = arrays["mean_a"], arrays["max_a"], [arrays[n] for n in ("filtered_a", "last_a", "rest_s")]
+    mean_a, max_a, scalars = arrays["mean_a"], arrays["max_a"], [arrays[name] for name in SCALARS]
     minutes_mean_a, minutes_max_a = arrays["minutes_mean_a"], arrays["minutes_max_a"]
     for mean, largest, max_size in ((mean_a, max_a, MAX_LOAD_S), (minutes_mean_a, minutes_max_a, MAX_MINUTES)):
         if mean.ndim != 1 or mean.shape != largest.shape or mean.size > max_size or any(v.ndim for v in scalars):
@@ -59,7 +63,7 @@ def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDAr
     if arrays["rest_s"] < 0:
         raise ValueError("the duration of the rest is negative")
     row = load.record[0]
-    for name in ("filtered_a", "last_a", "rest_s"):
+    for name in SCALARS:
         row[name] = arrays[name]
     row["count"], row["next"] = mean_a.size, mean_a.size % MAX_LOAD_S
     row["mean_a"][: mean_a.size], row["max_a"][: mean_a.size] = mean_a, np.maximum(mean_a, max_a)

@@ -9,7 +9,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import TraceBlock, new_estimator
-from bms_estimator.forecast.capability import power_limits
+from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.trace import TRACE

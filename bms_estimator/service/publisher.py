@@ -237,7 +237,9 @@ class Publisher:
         # only saved values, so that the next run continues from there
         self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
         capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
-        forecast = self._pack.forecaster.latest if self._pack.forecaster else self._no_forecast
+        forecast, forecaster = self._no_forecast, self._pack.forecaster
+        if forecaster:
+            forecast = forecaster.latest_at(window.voltage_v, window.current_a, window.power_w)
         cell_fields = weakest_cell_fields(self._deviations) if self._deviations else {}
         return make_state_payload(
             window,

@@ -98,6 +98,14 @@ class PackSettings(PackValues, _PackNames):
         default=None,
         description="voltage at the terminals of the pack at which the load is switched off, which ends the forecast; default: cutoff_voltage_v, otherwise the limit of the alarm pack_under_voltage, otherwise OCV of the cell file at SOC 0",
     )
+    max_discharge_a: Positive | None = Field(
+        default=None,
+        description="largest discharge current of the pack by its rating or its BMS, which bounds the available power; default: 1 C, or the largest current that the pack has supplied for a second",
+    )
+    max_charge_a: Positive | None = Field(
+        default=None,
+        description="largest charge current of the pack by its rating or its BMS, which bounds the available power; default: C/2, or the largest current that the pack has accepted for a second",
+    )
 
 
 class PublishSettings(Strict):

@@ -37,6 +37,10 @@ class Answers:
     """Capacity of one cell [Ah]."""
     series: int | None = None
     parallel: int | None = None
+    max_discharge_a: float | None = None
+    """Largest discharge current of the pack [A]; None: no limit is configured."""
+    max_charge_a: float | None = None
+    """Largest charge current of the pack [A]; None: no limit is configured."""
     broker: str | None = None
     """URL of the broker to which the service publishes; empty: no broker."""
     found_broker: str | None = None
@@ -48,6 +52,8 @@ class Answers:
     def tables(self) -> GivenSettings:
         """Settings of the pack by section and key."""
         pack = {key: getattr(self, key) for key in ("name", "cell", "capacity_ah", "series", "parallel")}
+        limits = {"max_discharge_a": self.max_discharge_a, "max_charge_a": self.max_charge_a}
+        pack |= {key: limit_a for key, limit_a in limits.items() if limit_a is not None}
         tables: dict[str, dict[str, object]] = {"pack": pack}
         for section, values in self.device.tables.items():
             tables[section] = dict(values)

@@ -33,6 +33,8 @@ SYNONYMS = {
 """Names of the generic cells by the names in their descriptions, in lower case."""
 NO_BROKER = "none"
 """Answer for a service that publishes nothing over MQTT."""
+NO_LIMIT = "none"
+"""Answer for a current without a configured limit."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,14 @@ def _parse_parallel(text: str, _: Answers) -> object:
     return _validated(PackSettings, "parallel", _integer(text))
 
 
+def _parse_max_discharge(text: str, _: Answers) -> object:
+    return None if text == NO_LIMIT else _validated(PackSettings, "max_discharge_a", parse_number(text, "A"))
+
+
+def _parse_max_charge(text: str, _: Answers) -> object:
+    return None if text == NO_LIMIT else _validated(PackSettings, "max_charge_a", parse_number(text, "A"))
+
+
 def _parse_broker(text: str, _: Answers) -> object:
     if text == NO_BROKER:
         return ""
@@ -168,6 +178,20 @@ QUESTIONS = (
     ),
     Question("series", "Cells in series", "number of cells in series", _parse_series, _suggest_series),
     Question("parallel", "Cells in parallel", "number of cells in parallel", _parse_parallel, lambda _: "1"),
+    Question(
+        "max_discharge_a",
+        "Largest discharge current of the pack by its rating or its BMS [A]",
+        f"largest discharge current of the pack [A]; {NO_LIMIT}: unknown",
+        _parse_max_discharge,
+        lambda _: NO_LIMIT,
+    ),
+    Question(
+        "max_charge_a",
+        "Largest charge current of the pack by its rating or its BMS [A]",
+        f"largest charge current of the pack [A]; {NO_LIMIT}: unknown",
+        _parse_max_charge,
+        lambda _: NO_LIMIT,
+    ),
     Question(
         "broker",
         "MQTT broker to publish to",

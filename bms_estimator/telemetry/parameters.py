@@ -30,13 +30,17 @@ from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.payloads.parameters import OcvCurve, Parameter, ParameterReport
 from bms_estimator.telemetry.fuel_cell_parameters import VALID_STD, fuel_cell_parameters
 from bms_estimator.telemetry.ocv_formula import fit_ocv_formula
-from bms_estimator.telemetry.series_resistance import series_resistance_parameters
+from bms_estimator.telemetry.series_resistance import series_resistance_parameters, settling_reason
 from bms_estimator.telemetry.state import finite
 
 OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
 """SOCs at which the OCV is published."""
-CONFIGURED_REASON = "configured value: no data has identified it"
-"""Reason why a configured value is not valid."""
+CONFIGURED_REASON = "from the cell file: no data has identified it"
+"""Reason why a value of the cell file is not valid."""
+MOVED_REASON = "moved by the adaptive law of the thesis, which does not identify it"
+"""Reason why a value that a law of the thesis has changed is not valid."""
+MOVED_RATIO = 1e-6
+"""Relative change above which a law of the thesis has changed a value of the cell file. Near the limit of (3.18), e^2 changes it less."""
 LEARNED_REASON = "learned by the adaptive law, which gives no std"
 """Reason why a value of the learning law is not valid."""
 VALID_FIT_STD = 0.5
@@ -90,14 +94,18 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
     health: dict[str, Parameter] = {}
     learning, record = bool(estimator.settings_record["learning"]["enabled"][0]), estimator.record[0]
     from_data = _is_data_driven(estimator)
+    unlearned_reason = _unlearned_reason(estimator)
     for i in range(1, 16):
-        observer_value = parameters[f"a{i}"] = _mark_source(parameters[f"a{i}"], from_data[i], learning)
+        observer_value = _with_reason(parameters[f"a{i}"], unlearned_reason[i])
+        observer_value = parameters[f"a{i}"] = _mark_source(observer_value, from_data[i], learning)
         if estimator.identifying and not learning:
             parameters[f"a{i}"] = _with_fit_std(observer_value, fitted_parameter(record, i), now_s)
             if i in CAPACITANCE_PARAMETERS:
                 parameters[f"a{i}"] = _with_tau_validity(parameters[f"a{i}"], estimator)
     for e, name in enumerate(ELEMENT_NAMES):  # each element has three parameters, from a1 on
-        elements[name] = _mark_source(elements[name], from_data[3 * e + 1 : 3 * e + 4].any(), learning)
+        own = slice(3 * e + 1, 3 * e + 4)
+        reason = next((each for each in unlearned_reason[own] if each != CONFIGURED_REASON), CONFIGURED_REASON)
+        elements[name] = _mark_source(_with_reason(elements[name], reason), from_data[own].any(), learning)
     if estimator.identifying:
         for name, identified in present_elements(record).items():
             elements[name] = _identified(identified, elements[name], VALID_STD, now_s)
@@ -209,6 +217,21 @@ def _is_data_driven(estimator: Estimator) -> np.ndarray:
     if settings["learning"]["enabled"]:
         return np.asarray(state["a"] != settings["learning"]["file"])
     return np.asarray(state["target"] != settings["observer"]["target"])
+
+
+def _unlearned_reason(estimator: Estimator) -> list[str]:
+    """Return the reason why a1..a15, at index 1..15, are not valid without data."""
+    record, settings = estimator.record[0], estimator.settings_record[0]
+    if settings["learning"]["enabled"]:
+        return [settling_reason(float(record["learning"]["settle_s"])) or CONFIGURED_REASON] * 16
+    file_a = settings["configured"]
+    moved = np.abs(record["observer"]["a"] - file_a) > MOVED_RATIO * np.abs(file_a)
+    return [MOVED_REASON if each else CONFIGURED_REASON for each in moved]
+
+
+def _with_reason(parameter: Parameter, reason: str) -> Parameter:
+    """Return a value of the cell file with its reason. A missing value keeps the reason why it is missing."""
+    return parameter if parameter.value is None else parameter.model_copy(update={"reason": reason})
 
 
 def _mark_source(observer_value: Parameter, from_data: np.bool_, learning: bool) -> Parameter:

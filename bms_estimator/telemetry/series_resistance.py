@@ -10,6 +10,17 @@ REASON = "by (4.2), step 3 of the thesis; includes errors of the OCV and of a1..
 """Reason why the published parameters are not valid."""
 
 
+def settling_reason(settle_s: float) -> str | None:
+    """Return the reason why nothing is learned while the RC voltages depend on an unmeasured load; None afterwards.
+
+    Args:
+        settle_s: Remaining time [s].
+    """
+    if settle_s <= 0.0:
+        return None
+    return f"settling after a start under load or a gap: nothing is learned for another {settle_s / 60.0:.0f} min"
+
+
 def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
     """Return ``r_s_ohm``, and a13..a15 once the swept range of SOC is large enough to fit (2.9).
 
@@ -29,7 +40,8 @@ def series_resistance_parameters(estimator: Estimator) -> dict[str, Parameter]:
     square_a2 = float(sums["square_a2"].sum())
     if square_a2 == 0.0:
         smallest_a = MIN_CURRENT_C * float(estimator.settings[0]["capacity_as"]) / 3600.0
-        missing = f"(4.2) needs a current: none above {smallest_a:.3g} A has flowed"
+        settling = settling_reason(float(sums["settle_s"]))
+        missing = settling or f"(4.2) needs a current: none above {smallest_a:.3g} A has flowed"
         return {"r_s_ohm": Parameter(value=None, std=None, valid=False, source="identified", reason=missing)}
     try:
         fit = fit_series_resistance(series_resistance_from_sums(record), LOWEST_SOC)

@@ -11,9 +11,16 @@ from bms_estimator.estimator.stability_conditions import failed_conditions, lemm
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.cell import load_cell, shipped_cells
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
+from bms_estimator.settings.observer import ObserverSettings
+from bms_estimator.telemetry.parameters import make_parameters_payload
+from tests.estimator.simulated_cell import pulses
 
 CAPACITY_AS = 3.0 * 3600
 """Capacity of the cell ncr18650 [A s]."""
+
+ELEMENTS = "r_s_ohm", "r_ts_ohm", "tau_ts_s", "r_tl_ohm", "tau_tl_s"
+ESTIMATES = "soc", "soc_std", "innovation_v", *ELEMENTS
+"""Columns of the trace with estimates of the identifier."""
 
 
 def noisy_load(n: int = 5000) -> SampleBlock:
@@ -51,6 +58,24 @@ def test_soc_and_its_std_are_those_of_the_last_row(series: int) -> None:
     assert math.isnan(estimator.soc_std)
     last = estimator.run(samples)[-1]
     assert (estimator.soc, estimator.soc_std) == (last["soc"], last["soc_std"])
+
+
+def test_the_gain_of_the_observer_changes_no_estimate() -> None:
+    """With the identifier, the observer's voltage error changes only the observer, and a1..a12 by the e^2 of (3.18)."""
+    samples = pulses()[0]
+    on, off = (Estimator(load_cell("nca", 3.0), ObserverSettings(gain_limit=g), initial_soc=0.8) for g in (1e3, 1e-300))
+    traces = [estimator.run(samples) for estimator in (on, off)]
+    assert np.ptp(traces[0]["voltage_estimate_v"] - traces[1]["voltage_estimate_v"]) > 0.01
+    of_the_filter = [name for name in on.record.dtype.names or () if name not in ("observer", "learning")]
+    assert all(on.record[name].tobytes() == off.record[name].tobytes() for name in of_the_filter)
+    assert all(traces[0][name].tobytes() == traces[1][name].tobytes() for name in ESTIMATES)
+    reports = [make_parameters_payload(estimator, 0.0) for estimator in (on, off)]
+    valid = {name for name, element in reports[0].elements.items() if element.valid}
+    assert "r_s_ohm" in valid
+    assert all(reports[0].elements[name] == reports[1].elements[name] for name in valid)
+    assert reports[0].state_of_health == reports[1].state_of_health
+    for name, parameter in reports[0].a.items():
+        assert parameter.value == pytest.approx(reports[1].a[name].value, rel=1e-6)
 
 
 def test_soc_has_no_std_without_the_identifier() -> None:

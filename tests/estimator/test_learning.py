@@ -58,6 +58,20 @@ def test_random_current_steps_determine_r_s_and_both_time_constants(
     assert error[TIME_CONSTANTS].max() < 0.02
 
 
+def test_the_reasons_are_settling_after_a_start_under_load_and_then_learned() -> None:
+    block = random_steps(1.0)
+    block = block[int(np.argmax(block["current_a"] > 0.1)) :]
+    estimator, reasons = learner(TRUTH), []
+    for part in (block[:60], block[60:]):
+        estimator.run(part)
+        report = make_parameters_payload(estimator, 0.0)
+        reasons.append({report.a["a13"].reason, report.elements["r_s_ohm"].reason})
+    assert reasons == [
+        {"settling after a start under load or a gap: nothing is learned for another 19 min"},
+        {"learned by the adaptive law, which gives no std"},
+    ]
+
+
 def test_a_constant_current_does_not_determine_the_parameters() -> None:
     """In steady state only the sum of the resistances can be observed, and no time constant."""
     factors = (2.0, 0.5, 1.0, 2.0, 0.5)

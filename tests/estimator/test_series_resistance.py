@@ -137,7 +137,10 @@ def test_nothing_is_summed_while_the_rc_voltages_are_unknown(load: SampleBlock) 
     """After a start under load and after a gap, the RC voltages depend on an unmeasured load."""
     under_load = int(np.argmax(np.abs(load["current_a"]) > 0.5))
     estimator = make_thesis_estimator()
-    estimator.run(load[under_load : under_load + 1000])
+    estimator.run(load[under_load : under_load + 10])
+    reason = make_parameters_payload(estimator, 0.0).elements["r_s_ohm"].reason
+    assert reason == "settling after a start under load or a gap: nothing is learned for another 20 min"
+    estimator.run(load[under_load + 10 : under_load + 1000])
     assert not estimator.record["series_resistance"]["samples"].any()
     after_gap = make_thesis_estimator()
     after_gap.run(load[:1000])

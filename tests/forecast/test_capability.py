@@ -9,13 +9,8 @@ from scipy.optimize import brentq
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.forecast.capability import (
-    QUANTILE_STDS,
-    PowerLimits,
-    cell_power_limits,
-    power_limits,
-    write_capability,
-)
+from bms_estimator.forecast.available_power import QUANTILE_STDS, PowerLimits, cell_power_limits
+from bms_estimator.forecast.capability import write_capability
 from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES, TAUS
@@ -24,7 +19,6 @@ from bms_estimator.kernels.forecast.power import available_power, new_scratch
 from bms_estimator.kernels.kalman_filter.records import STATES
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.settings.pack import Settings
 from tests.estimator.anchors.chargers import CAPACITY_AH, SERIES, Charged, Meter
 from tests.estimator.simulated_cell import TRUTH, measured
 
@@ -156,19 +150,6 @@ def test_the_current_limits_bound_the_power() -> None:
     values = capability(rested(0.8), limits=PowerLimits(2.0, 1.0))
     assert 2.0 * 3.5 < values["available_discharge_power_10s_w"] < 2.0 * 4.2
     assert 1.0 * 3.5 < values["available_charge_power_10s_w"] < 1.0 * 4.2
-
-
-def test_the_limits_of_a_pack_are_those_of_its_alarms() -> None:
-    settings = Settings.model_validate(
-        {
-            "alarms": {
-                "discharge_over_current": {"limit_a": 7.0},
-                "charge_over_current": {"enabled": False},
-                "charging_below_freezing": {"limit_c": 5.0, "clear_c": 7.0},
-            }
-        }
-    )
-    assert power_limits(settings, TRUTH) == PowerLimits(7.0, TRUTH.cell.current_max_a, 5.0)
 
 
 def test_usable_capacity_and_remaining_energy_are_charge_and_energy_that_a_constant_load_draws() -> None:

@@ -7,7 +7,8 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
-from bms_estimator.forecast.capability import PowerLimits, write_capability
+from bms_estimator.forecast.available_power import PowerLimits
+from bms_estimator.forecast.capability import write_capability
 from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.cells.records import ReadingFault

@@ -84,6 +84,24 @@ def test_load_of_an_earlier_version_with_too_small_largest_currents_is_restored(
     assert load.max_a[7] == load.mean_a[7]
 
 
+def test_largest_currents_survive_a_charge_and_a_restart() -> None:
+    load, past, restored = observed_load(400), PastMinutes(), LoadHistory(CAPACITY_AS)
+    charge = drive(2000, 400.0)
+    charge["current_a"] = -1.2
+    load.add(charge)
+    assert load.seconds == 0
+    restore_load(restored, PastMinutes(), load_arrays(load, past))
+    assert restored.seen_a == load.seen_a == pytest.approx((2.0, 1.2), rel=0.01)
+
+
+def test_load_of_an_earlier_version_without_largest_currents_is_restored() -> None:
+    load, past, arrays = LoadHistory(CAPACITY_AS), PastMinutes(), load_arrays(observed_load(400), PastMinutes())
+    del arrays["seen_discharge_a"], arrays["seen_charge_a"]
+    restore_load(load, past, arrays)
+    assert load.seconds > 390
+    assert load.seen_a == (0.0, 0.0)
+
+
 def test_load_is_restored_after_a_rest_of_a_year() -> None:
     load, past = LoadHistory(CAPACITY_AS), PastMinutes()
     restore_load(load, past, load_arrays(observed_load(400), past) | {"rest_s": np.array(365 * 86_400)})

@@ -88,6 +88,26 @@ def test_the_curves_of_a_forecast_are_published_once_a_minute() -> None:
     assert reports[0].cutoff_v == pytest.approx(2.7)  # default limit of the alarm pack_under_voltage
 
 
+@pytest.mark.parametrize(("current_a", "direction"), [(9.0, "discharge"), (-6.0, "charge")])
+def test_no_published_available_power_is_below_the_present_power(current_a: float, direction: str) -> None:
+    """The load rises to 3 C, and the charge to 2 C, after a forecast that assumes less."""
+    now_s, cell, sink = 0.0, load_cell("nmc", 3.0), Collector()
+    limits = {"charge_over_current": {"limit_a": 10.0}}
+    settings = Settings.model_validate({"alarms": limits, "pack": {"initial_soc": 0.5}})
+    pack, clock = new_pack(settings, cell), Clock(monotonic=lambda: now_s)
+    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
+    for now_s in range(40):
+        present_a = current_a if now_s > 35 else 0.0
+        block = np.array([(now_s, present_a, 3.7 - 0.03 * present_a, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
+        publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
+    estimate = sink.snapshots[-1].estimate
+    assert estimate
+    names = [f"available_{direction}_power_{seconds}s_w" for seconds in (10, 60)]
+    assert pack.forecaster
+    assert max(pack.forecaster.latest.values[name][0] for name in names) < abs(estimate.power_w)
+    assert [getattr(estimate, name) for name in names] == pytest.approx([abs(estimate.power_w)] * 2)
+
+
 def test_a_pack_without_the_identifier_has_no_forecast_and_a_reason() -> None:
     cell, sink = load_cell("chen_mora"), Collector()
     settings = Settings.model_validate({"identifier": {"enabled": False}, "pack": {"initial_soc": 0.5}})

@@ -4,6 +4,7 @@ import math
 
 from bms_estimator.calibration.guided_test.plan import Limits
 from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.model.cell import CellModel
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
@@ -38,6 +39,6 @@ def pack_limits(settings: Settings, pack: CellModel) -> Limits:
         cutoff_v=cutoff_v,
         min_cell_v=alarms.get("cell_under_voltage", cutoff_v / cells - CUTOFF_MARGIN_V) + CUTOFF_MARGIN_V,
         max_cell_v=alarms.get("cell_over_voltage", full_v / cells + CUTOFF_MARGIN_V),
-        max_discharge_a=min(alarms.get("discharge_over_current", math.inf), pack.cell.current_max_a),
+        max_discharge_a=power_limits(settings, pack).discharge_a,
         max_temperature_c=alarms.get("over_temperature", DEFAULT_MAX_TEMPERATURE_C),
     )

@@ -41,6 +41,13 @@ def demo(
     speed: Annotated[
         float, typer.Option(parser=decimal(0.1, 10.0), help="speed of the board's clock relative to real time")
     ] = 1.0,
+    thesis: Annotated[
+        bool,
+        typer.Option(
+            "--thesis",
+            help="run the method of the thesis alone: counted SOC, a1 to a12 by (3.18), R_s by (4.2), without the identifier",
+        ),
+    ] = False,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="open the page in a browser if there is a desktop")
     ] = True,
@@ -49,7 +56,7 @@ def demo(
 
     The simulated board measures a simulated 275 mAh cell under a changing load.
     The service reads the board through a pseudo-terminal, and publishes to the broker on the loopback interface.
-    The initial SOC is 20 % wrong. The true SOC is shown beside the estimate.
+    The initial SOC is 20 % wrong, or with --thesis the true one. The true SOC is shown beside the estimate.
     """
     log = deque[str](maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)
@@ -63,6 +70,7 @@ def demo(
                 port=port,
                 page_port=page_port,
                 seconds=seconds,
+                thesis=thesis,
                 log=log,
                 opened=open_browser if browser else _ignore_url,
             )

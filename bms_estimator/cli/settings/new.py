@@ -79,7 +79,9 @@ def new(
     capacity_ah: Annotated[str | None, typer.Option(help=QUESTIONS[2].help, show_default=False)] = None,
     series: Annotated[str | None, typer.Option(help=QUESTIONS[3].help, show_default=False)] = None,
     parallel: Annotated[str | None, typer.Option(help=QUESTIONS[4].help, show_default=False)] = None,
-    broker: Annotated[str | None, typer.Option(help=QUESTIONS[5].help, show_default=False)] = None,
+    max_discharge_a: Annotated[str | None, typer.Option(help=QUESTIONS[5].help, show_default=False)] = None,
+    max_charge_a: Annotated[str | None, typer.Option(help=QUESTIONS[6].help, show_default=False)] = None,
+    broker: Annotated[str | None, typer.Option(help=QUESTIONS[7].help, show_default=False)] = None,
     estimate: Annotated[
         bool, typer.Option("--estimate/--no-estimate", help="run the estimator for some seconds, and show the SOC")
     ] = True,
@@ -107,7 +109,7 @@ def new(
         sensor = compare_with_multimeter(prompts, answers.device, options) if measured else ()
         voltage_v = measured.voltage_v if measured else None
         answers = replace(answers, voltage_v=voltage_v, name=file.stem, sensor=sensor)
-        given = (name, cell, capacity_ah, series, parallel, broker)
+        given = (name, cell, capacity_ah, series, parallel, max_discharge_a, max_charge_a, broker)
         for question, option in zip(QUESTIONS, given, strict=True):
             answers = _ask(prompts, question, option, answers)
         pack = create_pack(file, answers)

@@ -31,6 +31,8 @@ LOAD = np.dtype(
         ("filtered_a", "f8"),  # current, filtered with the time constant ``TAU_S[CHARGE]`` [A]
         ("last_a", "f8"),  # mean current of the last complete second [A]
         ("rest_s", "i8"),  # duration of the present rest [s]
+        ("seen_discharge_a", "f8"),  # largest mean current of a second so far [A], at least 0
+        ("seen_charge_a", "f8"),  # largest mean charge current of a second so far [A], at least 0
         ("count", "i8"),  # number of seconds in the ring buffer
         ("next", "i8"),  # index of the next second in the ring buffer
         ("mean_a", "f4", MAX_LOAD_S),  # mean current of each second [A]
@@ -95,6 +97,8 @@ def add_second(load: Record, mean_a: float, max_a: float, one_c_a: float) -> Non
     A long charge empties the ring buffer. The first second of discharge ends the charge.
     """
     load.last_a = mean_a
+    load.seen_discharge_a = max(load.seen_discharge_a, mean_a)
+    load.seen_charge_a = max(load.seen_charge_a, -mean_a)
     load.filtered_a += CHARGE_WEIGHT * (mean_a - load.filtered_a)
     load.rest_s = load.rest_s + 1 if abs(mean_a) <= REST_C * one_c_a else 0
     if load.filtered_a < -CHARGE_C * one_c_a:

@@ -109,14 +109,14 @@ class Estimate(Payload):
     available_discharge_power_10s_w: Annotated[
         float | None,
         Quantity(Entity("Available discharge power, 10 s", "W", 0, 5.0, "power", is_primary=True), packs="batteries"),
-    ] = Field(description="constant power that the pack supplies for 10 s [W]")
+    ] = Field(description="constant power that the pack supplies for 10 s [W]; null while the SOC is too uncertain")
     available_discharge_power_60s_w: Annotated[
         float | None, Quantity(raw_entity("Available discharge power, 60 s", "W", 0, "power"), packs="batteries")
     ] = Field(description="constant power that the pack supplies for 60 s [W]")
     available_charge_power_10s_w: Annotated[
         float | None,
         Quantity(Entity("Available charge power, 10 s", "W", 0, 5.0, "power", is_primary=True), packs="batteries"),
-    ] = Field(description="constant power that the pack accepts for 10 s [W]")
+    ] = Field(description="constant power that the pack accepts for 10 s [W]; null while the SOC is too uncertain")
     available_charge_power_60s_w: Annotated[
         float | None, Quantity(raw_entity("Available charge power, 60 s", "W", 0, "power"), packs="batteries")
     ] = Field(description="constant power that the pack accepts for 60 s [W]")

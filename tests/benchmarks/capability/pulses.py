@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from bms_estimator.forecast.capability import DURATIONS_S, QUANTILE_STDS
+from bms_estimator.forecast.available_power import DURATIONS_S, QUANTILE_STDS
 from bms_estimator.kernels.forecast.power import available_power, new_scratch
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock

@@ -71,6 +71,29 @@ async def test_client_receives_states_from_start_to_offline():
     assert "Traceback" not in err
 
 
+async def test_the_method_of_the_thesis_runs_alone_and_moves_its_parameters_to_the_limits_of_their_bounds():
+    port = free_port()
+    async with demo("--thesis", "--speed", 5, "--rate-hz", 20, "--port", port) as process:
+        listener = await connect_listener(port)
+        try:
+            first = await listener.wait_json("bms/demo/parameters", lambda p: p["a"] and p["a"]["a1"]["value"] > 1.0)
+            state = await listener.wait_json("bms/demo/state", lambda s: s["soc"] < 0.897)
+            last = await listener.wait_json("bms/demo/parameters", lambda p: p["soc"] and p["soc"] < 0.897)
+        finally:
+            await listener.__aexit__(None, None, None)
+        process.terminate()
+        async with asyncio.timeout(LONG_S):
+            out, _ = await process.communicate()
+    assert first["a"]["a4"]["value"] > 1.5 * last["a"]["a4"]["value"]
+    limits = {"a1": 0.55, "a2": 30.0, "a4": 5.5, "a6": 0.055}  # mean of upper and lower bound: their weights are equal
+    assert {name: last["a"][name]["value"] for name in limits} == pytest.approx(limits, rel=0.02)
+    assert last["elements"]["r_s_ohm"]["value"] == pytest.approx(0.0745, rel=0.1)  # true R_s, by (4.2)
+    assert (state["soc_std"], state["time_to_cutoff_s"]) == (None, None)
+    assert state["delta_2"] > 0.01
+    assert state["nussbaum_gain"] == pytest.approx(1.0, abs=0.01)
+    assert b"beside the counted" in out
+
+
 @pytest.mark.thorough
 async def test_estimate_follows_a_demo_that_runs_faster_than_the_wall_clock():
     port = free_port()

@@ -211,6 +211,12 @@ def cell_file(tmp_path):
         ({}, "series = 2\ncutoff_v = 3.3", "pack.cutoff_v = 3.3: the OCV of"),
         (
             {},
+            "max_discharge_a = 60",
+            "pack.max_discharge_a = 60: above 15 A, the limit of valid samples (current_max_a",
+        ),
+        ({}, "max_charge_a = 9", "pack.max_charge_a = 9: above 3 A, the limit of the alarm charge_over_current, which"),
+        (
+            {},
             (
                 'series = 2\n[source]\nkind = "modbus"\nport = "localhost:502"\n'
                 "voltage = {address = 0}\ncurrent = {address = 1}\ncells = {address = 2, count = 4}"
@@ -236,6 +242,7 @@ def test_check_warns_about_implausible_settings(cell, settings, message, cell_fi
         'cell = "leaf"\nseries = 4\nparallel = 2',
         'cell = "lfp"\ncapacity_ah = 100\nseries = 4',
         'cell = "lfp"\ncapacity_ah = 100\nseries = 4\nfull_voltage_v = 13.8\ntail_current_a = 4\ncutoff_voltage_v = 11.2',
+        'cell = "lfp"\ncapacity_ah = 100\nseries = 4\nmax_discharge_a = 200\nmax_charge_a = 100',
     ],
 )
 def test_check_accepts_plausible_packs(settings, pack, capsys):

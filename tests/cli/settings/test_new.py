@@ -29,6 +29,8 @@ ANSWERS = {
     "--capacity-ah": "100",
     "--series": "8",
     "--parallel": "1",
+    "--max-discharge-a": "60",
+    "--max-charge-a": "none",
     "--broker": "none",
 }
 """Answers about a pack of eight cells."""
@@ -87,7 +89,10 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
         ("Cells in series", "4", "4: the device reports 8 cells in series"),
         ("Cells in series", "", "Cells in parallel"),
         ("Cells in parallel", "1.5", "1.5: must be a whole number"),
-        ("Cells in parallel", "", "MQTT broker"),
+        ("Cells in parallel", "", "Largest discharge current"),
+        ("Largest discharge current", "-5", "-5.0: must be greater than 0"),
+        ("Largest discharge current", "60 A", "Largest charge current"),
+        ("Largest charge current", "", "MQTT broker"),
         ("MQTT broker", "localhost", "localhost: must be mqtt://host:port"),
         ("MQTT broker", "mqtt://localhost:99999", "mqtt://localhost:99999: Port out of range 0-65535"),
         ("MQTT broker", "none", "pack.toml: written; house: lfp, 8 in series"),
@@ -110,6 +115,7 @@ def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
     assert tomllib.loads(file.read_text())["pack"]["name"] == "house"
     settings = load_settings(file)
     assert (settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == ("lfp", 40.0, 8)
+    assert (settings.pack.max_discharge_a, settings.pack.max_charge_a) == (60.0, None)
     assert (settings.sensor.port, settings.sensor.protocol, settings.mqtt) == (path, "jk", None)
     assert (settings.sensor.voltage_gain, settings.sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
 
@@ -139,7 +145,7 @@ def test_options_answer_all_questions_without_a_terminal(file, capsys, long_time
     assert f"{file}: written; house: lfp, 8 in series, 26 V, 100 Ah; jk on {path}; no broker" in out
     written = tomllib.loads(file.read_text())
     assert written["sensor"] == {"port": path, "protocol": "jk"}
-    pack = {"name": "house", "cell": "lfp", "capacity_ah": 100.0, "series": 8, "parallel": 1}
+    pack = {"name": "house", "cell": "lfp", "capacity_ah": 100.0, "series": 8, "parallel": 1, "max_discharge_a": 60.0}
     assert written["pack"] == pack
 
 
