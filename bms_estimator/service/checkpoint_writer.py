@@ -19,6 +19,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.saved_load import load_arrays
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.alarm_hooks import AlarmHooks
@@ -68,6 +69,7 @@ class CheckpointWriter:
         seen_load: Observed load, which is saved every ``LOAD_SAVE_S``; None: it is not saved.
         cells: Estimators of the single cells; read only; None: none.
         hooks: Alarm hooks; read only.
+        slots: Cell slots of the source; read only.
     """
 
     def __init__(
@@ -84,7 +86,9 @@ class CheckpointWriter:
         seen_load: SeenLoad | None = None,
         cells: CellEstimator | None = None,
         hooks: AlarmHooks,
+        slots: CellSlots,
     ) -> None:
+        self._slots = slots
         self._interval_s, self._seen_load, self._cells, self._hooks = interval_s, seen_load, cells, hooks
         self._samples_of_saved_load = 0
         self._pack_model, self._history = pack_model, history
@@ -193,7 +197,8 @@ class CheckpointWriter:
     async def _save_counters(self, *, clean: bool = False) -> bool:
         """Save counters and alarms if they have changed. Return False if they cannot be written."""
         hooks = self._hooks.finished_hashes if clean else None  # after a crash all hooks repeat their jobs
-        counters = RunCounters(self._restarts, self._totals.total, clean, self._alarms.saved_state, hooks)
+        alarms, slots = self._alarms.saved_state, self._slots.known
+        counters = RunCounters(self._restarts, self._totals.total, clean, alarms, hooks, slots)
         file = self._checkpoint.run_file
         if counters == self._saved_counters:
             return True

@@ -137,6 +137,8 @@ async def run_estimation_loop(
     if lost_reason := saved_run.lost_reason or unrestored:
         # after the restored alarms, because the hooks announce this one
         publisher.alarm_monitor.raise_state_lost(lost_reason)
+    # with a raised alarm the slots of the earlier run, so that a floating slot does not replace the cell that raised it
+    slots = CellSlots(cell.cell.series_count, counters.cell_slots if publisher.alarm_monitor.alarms.active else ())
     if requests is not None:
         RequestHandlers(estimator, publisher, current_zero, pack_model, forecaster).register(requests)
     interval_s = settings.state.checkpoint_s
@@ -153,6 +155,7 @@ async def run_estimation_loop(
             seen_load=seen_load,
             cells=cells,
             hooks=hooks,
+            slots=slots,
         )
         if checkpoint
         else None
@@ -174,7 +177,7 @@ async def run_estimation_loop(
                 publisher,
                 edge,
                 restored_s,
-                CellSlots(cell.cell.series_count),
+                slots,
             ),
             _keep_alive(publisher, notifier, name, clock),
             _measure_lag(publisher),

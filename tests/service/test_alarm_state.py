@@ -20,6 +20,7 @@ from bms_estimator.checkpoint.checksum import add_checksum
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import checkpoint_writer
@@ -87,6 +88,7 @@ async def run(
     acknowledge: str = "",
     signal_after: asyncio.Barrier | None = None,
     added_hooks: Sequence[dict[str, Any]] = (),
+    slots_v: CellBlock = NO_CELLS,
 ) -> Run:
     """Run the service over samples, at least until the alarms fulfil a condition.
 
@@ -99,6 +101,7 @@ async def run(
         acknowledge: Alarm to acknowledge; empty: none.
         signal_after: Barrier, after which one of the packs that wait there acknowledges with a signal; None: with a request.
         added_hooks: Hooks besides ``HOOKS``.
+        slots_v: Voltages of the cell slots at each sample [V]; empty without any.
     """
     source, sink, board, messages = ScriptedSource(), Collector(), RecordingBoard(), list[str]()
     relay = board.levels
@@ -122,7 +125,7 @@ async def run(
         )
     )
     volts = cell.cell.series_count
-    source.give(*((t, a, v * volts, c, s) for t, a, v, c, s in rows))
+    source.give_block(np.array([(t, a, v * volts, c, c, c, s) for t, a, v, c, s in rows], SAMPLE), slots_v)
     await sink.until(lambda s: s.estimate is not None and until(by_name(s.alarms)))
     if acknowledge:
         if signal_after is None:
@@ -572,6 +575,21 @@ async def test_a_signal_acknowledges_the_alarms_of_all_packs(folder: Path, tmp_p
     both = asyncio.Barrier(2)
     packs = (run(each, NORMAL, acknowledge="pack_over_voltage", signal_after=both) for each in (folder, another))
     assert all(all(each.relay) for each in await asyncio.gather(*packs))
+
+
+async def test_a_slot_that_floats_at_a_restart_does_not_replace_the_dead_cell_that_raised_an_alarm(
+    tmp_path: Path,
+) -> None:
+    """The device has six slots. A pack without a raised alarm may have been wired to others."""
+    rows, name = [(float(t), 0.0, 3.3, 25.0, 0) for t in range(60)], "cell_under_voltage"
+    low, dead = np.full((60, 6), 3.7), np.full((60, 6), 3.7)
+    low[:, 4:], low[20:, 1] = 0.0, 2.0
+    dead[:, 1], dead[:, 5] = 0.02, 0.0
+    pack = CELL.pack(4, 1)
+    assert (await run(tmp_path, rows, cell=pack, slots_v=low, until=lambda a: a[name].active)).alarms[name].active
+    assert (await run(tmp_path, rows, cell=pack, slots_v=dead)).alarms[name].active
+    assert (await run(tmp_path, rows, cell=pack, slots_v=np.flip(dead, axis=1))).alarms[name].active
+    assert not (await run(tmp_path / "new", rows, cell=pack, slots_v=dead)).alarms[name].active
 
 
 def alarm_state(**acknowledged: bool) -> str:
