@@ -11,6 +11,7 @@ from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import ForecastRows
 from bms_estimator.model.clock import Clock
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.health import HookHealth
@@ -94,6 +95,7 @@ class AlarmMonitor:
         # arrival of the last sample, accepted or not, on the monotonic clock and on the wall clock [s]
         self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
+        self._is_stopped = False
 
     def add(
         self,
@@ -121,7 +123,7 @@ class AlarmMonitor:
         return is_due and self.evaluate(now_s)
 
     def evaluate(self, now_s: float) -> bool:
-        """Evaluate the alarms from the samples since the last call, or from their absence.
+        """Evaluate the alarms from the samples since the last call, or from their absence; no effect after ``stop``.
 
         Args:
             now_s: Monotonic clock [s].
@@ -129,6 +131,8 @@ class AlarmMonitor:
         Returns:
             True if an alarm has changed.
         """
+        if self._is_stopped:
+            return False
         elapsed_s, self._evaluated_s = now_s - self._evaluated_s, now_s
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))
@@ -148,15 +152,28 @@ class AlarmMonitor:
             self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall(), is_undone=is_undone)
         return self._report_changes()
 
+    def stop(self) -> None:
+        """Change no alarm from now on. The final save would lack the change, although hooks have reported it."""
+        self._is_stopped = True
+
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
-        """Acknowledge an alarm; None: all alarms. Return the acknowledged alarms."""
+        """Acknowledge an alarm; None: all alarms. Return the acknowledged alarms.
+
+        Raises:
+            UserError: The service is stopping.
+        """
+        if self._is_stopped:
+            raise UserError("the service is stopping")
         acknowledged = self.alarms.acknowledge(name)
         self._report_changes()
         return acknowledged
 
     def acknowledge_on_signal(self) -> None:
         """Acknowledge all alarms, because a person on this machine requested it with a signal."""
-        log.info("alarms acknowledged by SIGUSR1", alarms=self.acknowledge(None))
+        try:
+            log.info("alarms acknowledged by SIGUSR1", alarms=self.acknowledge(None))
+        except UserError as error:
+            log.warning("alarms not acknowledged by SIGUSR1", reason=str(error))
 
     def restore(self, saved_state: str, *, crashed: bool = False) -> str:
         """Restore the ``alarms.saved_state`` of an earlier run, which may have ``crashed``.

@@ -187,10 +187,12 @@ async def run_estimation_loop(
         clean = False
         try:
             await until_first_ends(*tasks, stop.wait())
+            publisher.alarm_monitor.evaluate(clock.monotonic())  # samples since the last evaluation, for the final save
             clean = True
         finally:  # an exception ends the loop, too
             notifier.stopping(name)
             hooks.stop_watching()
+            publisher.alarm_monitor.stop()
             if writer:
                 # before the sinks close, because closing may take seconds, and the service may be killed meanwhile
                 await writer.save_final(clean=clean)

@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import subprocess
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +18,9 @@ import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.checksum import add_checksum
+from bms_estimator.checkpoint.run_file import RunCounters
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.clock import Clock
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock
@@ -433,6 +436,64 @@ async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
             await asyncio.sleep(0.01)
     source.finish()
     await asyncio.wait_for(task, LONG_S)
+
+
+async def test_the_final_save_has_an_alarm_of_samples_that_arrived_since_the_last_evaluation(tmp_path: Path) -> None:
+    """The clock stands, so that the next evaluation is not due."""
+    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    clock, stop = Clock(monotonic=lambda: 0.0), asyncio.Event()
+    task = asyncio.create_task(
+        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=stop, checkpoint=checkpoint, clock=clock)
+    )
+    source.give(*NORMAL)
+    await sink.until(lambda s: s.estimate is not None)
+    source.give(*((12.0 + t, 0.0, 4.4, 25.0, 0) for t in range(5)))
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+    assert by_name(sink.snapshots[-1].alarms)["pack_over_voltage"].active
+    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
+
+
+async def test_an_acknowledgement_during_the_final_save_is_rejected(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer, the hooks and the saved alarms agree."""
+    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(folder, SETTINGS, CELL)
+    requests, save, is_saving, may_save = (
+        RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",)),
+        checkpoint.run_file.save,
+        threading.Event(),
+        threading.Event(),
+    )
+
+    def save_slowly(counters: RunCounters) -> None:
+        if counters.clean:
+            is_saving.set()
+            may_save.wait(LONG_S)
+        save(counters)
+
+    monkeypatch.setattr(checkpoint.run_file, "save", save_slowly)
+    task = asyncio.create_task(
+        run_estimation_loop(
+            SETTINGS,
+            CELL,
+            source=source,
+            sinks=[sink],
+            stop=asyncio.Event(),
+            checkpoint=checkpoint,
+            requests=requests,
+        )
+    )
+    source.give(*NORMAL)
+    source.finish()
+    await asyncio.to_thread(is_saving.wait, LONG_S)
+    response = json.loads(await requests.handle("acknowledge_alarm", b"{}") or b"{}")
+    os.kill(os.getpid(), signal.SIGUSR1)
+    may_save.set()
+    await asyncio.wait_for(task, LONG_S)
+    assert response["error"] == "the service is stopping"
+    assert is_latched(by_name(sink.snapshots[-1].alarms))
+    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
 
 
 async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
