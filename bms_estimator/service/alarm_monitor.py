@@ -15,6 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.health import HookHealth
+from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarm_limits import min_charge_current_a, monitored_alarms, silent_limit_s
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
@@ -190,8 +191,20 @@ class AlarmMonitor:
 
     def raise_state_lost(self, reason: str) -> None:
         """Raise ``alarm_state_lost``, and pass it to the callback."""
-        self.alarms.raise_state_lost(reason, self._clock.wall())
+        self.alarms.raise_state_lost(reason, self._clock.wall(), self._measured)
         self._report_changes()
+
+    @property
+    def _measured(self) -> dict[Quantity, int]:
+        """Number of values in a sample by quantity, as far as the state of the estimators shows that they were measured."""
+        if not self._estimator.state["started"][0]:
+            return {}
+        measured: dict[Quantity, int] = {"voltage": 1, "current": 1}
+        if self._estimator.record["filter"]["sensed"][0]:
+            measured["temperature"] = 1
+        if self._cells and self._cells.cells.size:
+            measured["cells"] = self._cells.cells.size - 1  # one may never have been measured
+        return measured
 
     def _counts(self) -> SampleCounts:
         """Return the sample counters.

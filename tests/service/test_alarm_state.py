@@ -410,6 +410,25 @@ async def test_a_lost_sensor_stays_lost_after_edited_settings(tmp_path: Path, ed
     assert not any(restarted.relay)
 
 
+async def test_a_lost_sensor_stays_lost_after_damaged_alarms_and_their_acknowledgement(tmp_path: Path) -> None:
+    """The estimator's checkpoint shows that the temperature was measured."""
+    await run(tmp_path, NO_TEMPERATURE, until=is_temperature_lost)
+    (tmp_path / "pack.run").write_bytes(b"damaged")
+    rows = [(float(t), 0.0, 3.8, math.nan, 0) for t in range(30)]
+    restarted = await run(tmp_path, rows, acknowledge="alarm_state_lost")
+    assert is_temperature_lost(restarted.alarms)
+    assert not any(restarted.relay)
+
+
+async def test_lost_cells_stay_lost_after_damaged_alarms(tmp_path: Path) -> None:
+    pack, rows = CELL.pack(4, 1), [(float(t), 0.0, 3.8, 25.0, 0) for t in range(30)]
+    await run(tmp_path, rows, cell=pack, slots_v=np.full((30, 4), 3.8))
+    (tmp_path / "pack.run").write_bytes(b"damaged")
+    two = np.full((30, 4), [3.8, 3.8, math.nan, math.nan])
+    restarted = await run(tmp_path, rows, cell=pack, slots_v=two)
+    assert not restarted.alarms["cell_over_voltage"].watched
+
+
 async def test_fewer_cells_in_series_than_measured_before_drop_no_alarm(tmp_path: Path) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL).run_file
     saved = file.load().counters
