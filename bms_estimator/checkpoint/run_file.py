@@ -5,10 +5,10 @@ import io
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 import structlog
@@ -25,6 +25,8 @@ MAX_FILE_BYTES = 1 << 16
 """Maximum size of the file [bytes]. A file with all alarms raised has about 4 kB."""
 MAX_CHECKPOINT_BYTES = 1 << 20
 """Maximum size of a checkpoint of a former version [bytes]. A normal one has about 112 kB."""
+MAX_SLOTS = 1024
+"""Maximum plausible number of cell slots of a device."""
 MAX_COUNT = 1e15
 """Maximum plausible value of a counter: the number of samples of 30,000 years at 1,000 a second."""
 
@@ -41,6 +43,7 @@ class RunCounters:
         clean: True if the last run ended without a crash or kill; False while it runs.
         alarms: State of the alarms, in the format of ``AlarmEvaluator.saved_state``.
         hooks: Hashes of the alarm hooks without unfinished or failed jobs at a clean end; None: unknown.
+        cell_slots: Slots of the cells (``CellSlots.known``).
     """
 
     restarts: int
@@ -48,6 +51,7 @@ class RunCounters:
     clean: bool = False
     alarms: str = ""
     hooks: list[str] | None = None
+    cell_slots: list[int] = field(default_factory=list)
 
 
 class SavedRun(NamedTuple):
@@ -186,8 +190,14 @@ class RunFile:
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
             log.warning("the saved counters are invalid and restart from zero", reason=str(error))
             restarts, total = 1, new_totals(self._wall_s())
-        hooks = values.get("hooks")
-        return RunCounters(restarts, total, alarms=alarms, hooks=hooks if isinstance(hooks, list) else None)
+        hooks, slots = values.get("hooks"), values.get("cell_slots")
+        return RunCounters(
+            restarts,
+            total,
+            alarms=alarms,
+            hooks=hooks if isinstance(hooks, list) else None,
+            cell_slots=slots if _are_slots(slots) else [],
+        )
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -200,6 +210,13 @@ def _read(path: Path) -> dict[str, Any]:
     if values["format"] != FORMAT:
         raise ValueError(f"format {values['format']}, this version reads {FORMAT}")
     return values
+
+
+def _are_slots(slots: Any) -> TypeGuard[list[int]]:
+    """Return True for a list of increasing numbers of cell slots."""
+    if not isinstance(slots, list) or not all(type(slot) is int and 0 <= slot < MAX_SLOTS for slot in slots):
+        return False
+    return slots == sorted(set(slots))
 
 
 def _former_counters(path: Path) -> dict[str, Any]:

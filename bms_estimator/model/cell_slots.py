@@ -1,5 +1,7 @@
 """Selection of the cells of a pack from the cell slots that its device reports."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,17 +25,24 @@ class CellSlots:
 
     Args:
         series: Number of cells in series.
+        slots: Slots of the cells in an earlier run (``known``). Another number than ``series`` has no effect.
 
     Attributes:
         fault: Fault of the last block if it has more live slots than cells in series, as a sentence; empty otherwise.
     """
 
-    def __init__(self, series: int) -> None:
-        self._series, self._slots, self._is_known = series, np.arange(series), False
+    def __init__(self, series: int, slots: Sequence[int] = ()) -> None:
+        self._series, self._is_known = series, len(slots) == series
+        self._slots = np.array(slots) if self._is_known else np.arange(series)
         self.fault = self._excess_text = ""
         self._excess_samples = 0  # number of successive samples with too many live slots
         # until enough cells are live: number of samples with live slots, and the largest number of live slots
         self._samples = self._max_cells = 0
+
+    @property
+    def known(self) -> list[int]:
+        """Slots of the cells, counted from 0; empty until a sample has as many live slots as cells in series."""
+        return self._slots.tolist() if self._is_known else []
 
     @property
     def reason(self) -> str:
@@ -90,7 +99,7 @@ class CellSlots:
             self._excess_samples, self._excess_text = self._excess_samples + len(slots_v), self.fault
             return np.full((len(slots_v), self._series), np.nan)
         self._excess_samples = 0
-        if count == self._series:
+        if count == self._series and not self._is_known:  # later, a floating slot would replace a failed cell
             self._slots, self._is_known = np.flatnonzero(live), True
         if self._is_known:
             return slots_v[:, self._slots]

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import structlog
 
 from bms_estimator.model.clock import Clock
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.pack.pack import Pack, Step
+from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarm_limits import min_charge_current_a, monitored_alarms, silent_limit_s
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
@@ -88,6 +90,7 @@ class AlarmMonitor:
         # arrival of the last sample, accepted or not, on the monotonic clock and on the wall clock [s]
         self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
         self._evaluated_s = -math.inf
+        self._is_stopped = False
 
     def add(self, received: ReceivedSamples, step: Step, now_s: float, cells_fault: str = "") -> bool:
         """Add received samples and their estimates; evaluate the alarms if this is due.
@@ -107,7 +110,7 @@ class AlarmMonitor:
         return is_due and self.evaluate(now_s)
 
     def evaluate(self, now_s: float) -> bool:
-        """Evaluate the alarms from the samples since the last call, or from their absence.
+        """Evaluate the alarms from the samples since the last call, or from their absence; no effect after ``stop``.
 
         Args:
             now_s: Monotonic clock [s].
@@ -115,6 +118,8 @@ class AlarmMonitor:
         Returns:
             True if an alarm has changed.
         """
+        if self._is_stopped:
+            return False
         elapsed_s, self._evaluated_s = now_s - self._evaluated_s, now_s
         record = self._estimator.record[0]
         suspects = InputFault(int(record["checks"]["suspects"]))
@@ -134,15 +139,28 @@ class AlarmMonitor:
             self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall(), is_undone=is_undone)
         return self._report_changes()
 
+    def stop(self) -> None:
+        """Change no alarm from now on. The final save would lack the change, although hooks have reported it."""
+        self._is_stopped = True
+
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
-        """Acknowledge an alarm; None: all alarms. Return the acknowledged alarms."""
+        """Acknowledge an alarm; None: all alarms. Return the acknowledged alarms.
+
+        Raises:
+            UserError: The service is stopping.
+        """
+        if self._is_stopped:
+            raise UserError("the service is stopping")
         acknowledged = self.alarms.acknowledge(name)
         self._report_changes()
         return acknowledged
 
     def acknowledge_on_signal(self) -> None:
         """Acknowledge all alarms, because a person on this machine requested it with a signal."""
-        log.info("alarms acknowledged by SIGUSR1", alarms=self.acknowledge(None))
+        try:
+            log.info("alarms acknowledged by SIGUSR1", alarms=self.acknowledge(None))
+        except UserError as error:
+            log.warning("alarms not acknowledged by SIGUSR1", reason=str(error))
 
     def restore(self, saved_state: str, *, crashed: bool = False) -> str:
         """Restore the ``alarms.saved_state`` of an earlier run, which may have ``crashed``.
@@ -159,8 +177,20 @@ class AlarmMonitor:
 
     def raise_state_lost(self, reason: str) -> None:
         """Raise ``alarm_state_lost``, and pass it to the callback."""
-        self.alarms.raise_state_lost(reason, self._clock.wall())
+        self.alarms.raise_state_lost(reason, self._clock.wall(), self._measured)
         self._report_changes()
+
+    @property
+    def _measured(self) -> dict[Quantity, int]:
+        """Number of values in a sample by quantity, as far as the state of the estimators shows that they were measured."""
+        if not self._estimator.state["started"][0]:
+            return {}
+        measured: dict[Quantity, int] = {"voltage": 1, "current": 1}
+        if self._estimator.record["filter"]["sensed"][0]:
+            measured["temperature"] = 1
+        if self._pack.cells and self._pack.cells.cells.size:
+            measured["cells"] = self._pack.cells.cells.size - 1  # one may never have been measured
+        return measured
 
     def _counts(self) -> SampleCounts:
         """Return the sample counters.

@@ -15,6 +15,7 @@ from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile
 from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.checkpoint.run_file import RunCounters
 from bms_estimator.forecast.saved_load import load_arrays
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
@@ -55,6 +56,7 @@ class CheckpointWriter:
         alarms: Monitor of the alarms.
         totals: Totals over restarts.
         hooks: Alarm hooks; read only.
+        slots: Cell slots of the source; read only.
         status: Receives the outcome of each save.
         interval_s: Maximum interval between two saves [s].
     """
@@ -69,11 +71,12 @@ class CheckpointWriter:
         alarms: AlarmMonitor,
         totals: LifetimeTotals,
         hooks: AlarmHooks,
+        slots: CellSlots,
         status: ServiceStatus,
         interval_s: float,
     ) -> None:
         self._pack, self._checkpoint, self._history, self._load_file = pack, checkpoint, history, load_file
-        self._monitor, self._totals, self._hooks = alarms, totals, hooks
+        self._monitor, self._totals, self._hooks, self._slots = alarms, totals, hooks, slots
         self._status, self._interval_s = status, interval_s
         self._samples_of_saved_load = 0
         self._saved_revision = pack.slow_fit.revision if pack.slow_fit else 0
@@ -183,7 +186,8 @@ class CheckpointWriter:
     async def _save_counters(self, *, clean: bool = False) -> bool:
         """Save counters and alarms if they have changed. Return False if they cannot be written."""
         hooks = self._hooks.finished_hashes if clean else None  # after a crash all hooks repeat their jobs
-        counters = RunCounters(self._status.restarts, self._totals.total, clean, self._alarms.saved_state, hooks)
+        alarms, slots = self._alarms.saved_state, self._slots.known
+        counters = RunCounters(self._status.restarts, self._totals.total, clean, alarms, hooks, slots)
         file = self._checkpoint.run_file
         if counters == self._saved_counters:
             return True

@@ -43,7 +43,8 @@ class Job(NamedTuple):
 class HookJobs:
     """Waiting jobs: at most one for each alarm, and one for all alarms together.
 
-    A change that undoes a waiting job removes it, because the program or the device already has the present state.
+    A change that undoes a waiting job removes it, because the program or the device already has the present state. A raised
+    alarm of a hook that acts on no end is reported although it has ended, so that it is not missed.
 
     Args:
         on: Events that cause a job.
@@ -52,6 +53,7 @@ class HookJobs:
 
     def __init__(self, on: Sequence[HookEvent], raised: Mapping[str, Alarm]) -> None:
         self._on, self._raised = on, raised
+        self._reports_ends = "cleared" in on or "last_cleared" in on
         self._waiting: dict[str, Job] = {}
 
     def add(self, alarm: Alarm) -> None:
@@ -62,8 +64,12 @@ class HookJobs:
             self._add(Job(alarm, state, _ANY), _EVENTS_OF_ANY[state])
 
     def _add(self, job: Job, event: HookEvent) -> None:
-        if self._waiting.pop(job.key, None) is None and event in self._on:
-            self._waiting[job.key] = job
+        waiting = self._waiting.get(job.key)
+        if waiting is None:
+            if event in self._on:
+                self._waiting[job.key] = job
+        elif self._reports_ends or waiting.state == "cleared":
+            del self._waiting[job.key]
 
     def next(self) -> Job | None:
         """Return the next job: critical alarms first, then the oldest; None if no job is waiting."""
@@ -76,10 +82,11 @@ class HookJobs:
         return job
 
     def put_back(self, job: Job) -> None:
-        """Put back a job that was not done. If its alarm has changed since, neither the job nor its opposite is due."""
+        """Put back a job that was not done. If its alarm has changed since, neither it nor its opposite is due."""
         is_raised = job.key in self._raised if job.key else bool(self._raised)
         if is_raised != (job.state == "raised"):
-            self._waiting.pop(job.key, None)
+            if self._reports_ends:
+                self._waiting.pop(job.key, None)
         else:
             self._waiting = {job.key: job} | self._waiting
 

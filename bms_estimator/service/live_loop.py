@@ -117,6 +117,8 @@ async def run_estimation_loop(
     if lost_reason := saved_run.lost_reason or unrestored:
         # after the restored alarms, because the hooks announce this one
         monitor.raise_state_lost(lost_reason)
+    # with a raised alarm the slots of the earlier run, so that a floating slot does not replace the cell that raised it
+    slots = CellSlots(cell.cell.series_count, counters.cell_slots if monitor.alarms.active else ())
     if requests is not None:
         RequestHandlers(pack, publisher, current_zero).register(requests)
     writer = (
@@ -128,6 +130,7 @@ async def run_estimation_loop(
             alarms=monitor,
             totals=totals,
             hooks=hooks,
+            slots=slots,
             status=status,
             interval_s=settings.state.checkpoint_s,
         )
@@ -142,7 +145,7 @@ async def run_estimation_loop(
         stack.enter_context(acknowledge_on_signal(monitor.acknowledge_on_signal))
         notifier.ready(name)
         tasks = [
-            _estimate(source, pack, totals, publisher, edge, restored_s),
+            _estimate(source, pack, slots, totals, publisher, edge, restored_s),
             _keep_alive(publisher, status, notifier, name, clock),
             _measure_lag(publisher),
         ]
@@ -151,10 +154,12 @@ async def run_estimation_loop(
         clean = False
         try:
             await until_first_ends(*tasks, stop.wait())
+            monitor.evaluate(clock.monotonic())  # samples since the last evaluation, for the final save
             clean = True
         finally:  # an exception ends the loop, too
             notifier.stopping(name)
             hooks.stop_watching()
+            monitor.stop()
             if writer:
                 # before the sinks close, because closing may take seconds, and the service may be killed meanwhile
                 await writer.save_final(clean=clean)
@@ -165,6 +170,7 @@ async def run_estimation_loop(
 async def _estimate(
     source: Source,
     pack: Pack,
+    slots: CellSlots,
     totals: LifetimeTotals,
     publisher: Publisher,
     edge: BlockSender | None,
@@ -175,13 +181,14 @@ async def _estimate(
     Args:
         source: Supplies the blocks.
         pack: The pack.
+        slots: Cell slots of the source.
         totals: Totals over restarts.
         publisher: Publisher.
         edge: Sender that receives all samples; None: no sender.
         restored_s: Time since boot at which the state was restored [s].
     """
-    estimator, slots = pack.estimator, CellSlots(pack.model.cell.series_count)
-    unseen_s, logged_reason = estimator.record["unseen_s"].copy(), ""
+    estimator, logged_reason = pack.estimator, ""
+    unseen_s = estimator.record["unseen_s"].copy()
     async for each in source:
         received = each._replace(cells_v=slots.select(each.cells_v))
         if slots.reason != logged_reason:

@@ -86,7 +86,7 @@ class RequestHandlers:
         """Acknowledge the alarm ``name``, or all alarms.
 
         Raises:
-            UserError: There is no such alarm.
+            UserError: There is no such alarm, or the service is stopping.
         """
         name, alarm_names = arguments.get("name"), self._publisher.alarm_monitor.alarms.names()
         if name is not None and name not in alarm_names:

@@ -114,7 +114,7 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
     ),
     "alarm_state_lost": AlarmKind(
         "raised alarms of an earlier run may be missing, so that all hooks count an alarm",
-        "check the pack, then acknowledge this alarm (request acknowledge_alarm, or SIGUSR1 to the service)",
+        "check the pack, and that each sensor measures, then acknowledge this alarm (request acknowledge_alarm, or SIGUSR1 to the service)",
     ),
 }
 """All alarms by name."""

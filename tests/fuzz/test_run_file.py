@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -11,6 +12,7 @@ from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.checksum import add_checksum
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.service.alarm_monitor import AlarmMonitor
@@ -43,6 +45,7 @@ COUNTERS = {
         "charge_in_ah": 2.0,
     },
     "clean": True,
+    "cell_slots": [0, 1, 5],
 }
 
 
@@ -70,6 +73,7 @@ def restore(folder: Path, content: bytes) -> set[str]:
     checkpoint, clock = CheckpointFile(folder, SETTINGS, CELL), Clock()
     checkpoint.run_file.path.write_bytes(content)
     saved = read_counters(checkpoint, clock)
+    assert len(CellSlots(3, saved.counters.cell_slots).select(np.full((2, 6), 3.7))) == 2
     monitor = AlarmMonitor(SETTINGS, Pack(ESTIMATOR), ScriptedSource(), clock, lambda _: None)
     if reason := saved.lost_reason or monitor.restore(saved.counters.alarms):
         monitor.raise_state_lost(reason)

@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import subprocess
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,9 +18,12 @@ import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.checksum import add_checksum
+from bms_estimator.checkpoint.run_file import RunCounters
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.clock import Clock
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import checkpoint_writer
@@ -87,6 +91,7 @@ async def run(
     acknowledge: str = "",
     signal_after: asyncio.Barrier | None = None,
     added_hooks: Sequence[dict[str, Any]] = (),
+    slots_v: CellBlock = NO_CELLS,
 ) -> Run:
     """Run the service over samples, at least until the alarms fulfil a condition.
 
@@ -99,6 +104,7 @@ async def run(
         acknowledge: Alarm to acknowledge; empty: none.
         signal_after: Barrier, after which one of the packs that wait there acknowledges with a signal; None: with a request.
         added_hooks: Hooks besides ``HOOKS``.
+        slots_v: Voltages of the cell slots at each sample [V]; empty without any.
     """
     source, sink, board, messages = ScriptedSource(), Collector(), RecordingBoard(), list[str]()
     relay = board.levels
@@ -122,7 +128,7 @@ async def run(
         )
     )
     volts = cell.cell.series_count
-    source.give(*((t, a, v * volts, c, s) for t, a, v, c, s in rows))
+    source.give_block(np.array([(t, a, v * volts, c, c, c, s) for t, a, v, c, s in rows], SAMPLE), slots_v)
     await sink.until(lambda s: s.estimate is not None and until(by_name(s.alarms)))
     if acknowledge:
         if signal_after is None:
@@ -404,6 +410,25 @@ async def test_a_lost_sensor_stays_lost_after_edited_settings(tmp_path: Path, ed
     assert not any(restarted.relay)
 
 
+async def test_a_lost_sensor_stays_lost_after_damaged_alarms_and_their_acknowledgement(tmp_path: Path) -> None:
+    """The estimator's checkpoint shows that the temperature was measured."""
+    await run(tmp_path, NO_TEMPERATURE, until=is_temperature_lost)
+    (tmp_path / "pack.run").write_bytes(b"damaged")
+    rows = [(float(t), 0.0, 3.8, math.nan, 0) for t in range(30)]
+    restarted = await run(tmp_path, rows, acknowledge="alarm_state_lost")
+    assert is_temperature_lost(restarted.alarms)
+    assert not any(restarted.relay)
+
+
+async def test_lost_cells_stay_lost_after_damaged_alarms(tmp_path: Path) -> None:
+    pack, rows = CELL.pack(4, 1), [(float(t), 0.0, 3.8, 25.0, 0) for t in range(30)]
+    await run(tmp_path, rows, cell=pack, slots_v=np.full((30, 4), 3.8))
+    (tmp_path / "pack.run").write_bytes(b"damaged")
+    two = np.full((30, 4), [3.8, 3.8, math.nan, math.nan])
+    restarted = await run(tmp_path, rows, cell=pack, slots_v=two)
+    assert not restarted.alarms["cell_over_voltage"].watched
+
+
 async def test_fewer_cells_in_series_than_measured_before_drop_no_alarm(tmp_path: Path) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL).run_file
     saved = file.load().counters
@@ -430,6 +455,64 @@ async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
             await asyncio.sleep(0.01)
     source.finish()
     await asyncio.wait_for(task, LONG_S)
+
+
+async def test_the_final_save_has_an_alarm_of_samples_that_arrived_since_the_last_evaluation(tmp_path: Path) -> None:
+    """The clock stands, so that the next evaluation is not due."""
+    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    clock, stop = Clock(monotonic=lambda: 0.0), asyncio.Event()
+    task = asyncio.create_task(
+        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=stop, checkpoint=checkpoint, clock=clock)
+    )
+    source.give(*NORMAL)
+    await sink.until(lambda s: s.estimate is not None)
+    source.give(*((12.0 + t, 0.0, 4.4, 25.0, 0) for t in range(5)))
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+    assert by_name(sink.snapshots[-1].alarms)["pack_over_voltage"].active
+    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
+
+
+async def test_an_acknowledgement_during_the_final_save_is_rejected(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer, the hooks and the saved alarms agree."""
+    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(folder, SETTINGS, CELL)
+    requests, save, is_saving, may_save = (
+        RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",)),
+        checkpoint.run_file.save,
+        threading.Event(),
+        threading.Event(),
+    )
+
+    def save_slowly(counters: RunCounters) -> None:
+        if counters.clean:
+            is_saving.set()
+            may_save.wait(LONG_S)
+        save(counters)
+
+    monkeypatch.setattr(checkpoint.run_file, "save", save_slowly)
+    task = asyncio.create_task(
+        run_estimation_loop(
+            SETTINGS,
+            CELL,
+            source=source,
+            sinks=[sink],
+            stop=asyncio.Event(),
+            checkpoint=checkpoint,
+            requests=requests,
+        )
+    )
+    source.give(*NORMAL)
+    source.finish()
+    await asyncio.to_thread(is_saving.wait, LONG_S)
+    response = json.loads(await requests.handle("acknowledge_alarm", b"{}") or b"{}")
+    os.kill(os.getpid(), signal.SIGUSR1)
+    may_save.set()
+    await asyncio.wait_for(task, LONG_S)
+    assert response["error"] == "the service is stopping"
+    assert is_latched(by_name(sink.snapshots[-1].alarms))
+    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
 
 
 async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
@@ -572,6 +655,21 @@ async def test_a_signal_acknowledges_the_alarms_of_all_packs(folder: Path, tmp_p
     both = asyncio.Barrier(2)
     packs = (run(each, NORMAL, acknowledge="pack_over_voltage", signal_after=both) for each in (folder, another))
     assert all(all(each.relay) for each in await asyncio.gather(*packs))
+
+
+async def test_a_slot_that_floats_at_a_restart_does_not_replace_the_dead_cell_that_raised_an_alarm(
+    tmp_path: Path,
+) -> None:
+    """The device has six slots. A pack without a raised alarm may have been wired to others."""
+    rows, name = [(float(t), 0.0, 3.3, 25.0, 0) for t in range(60)], "cell_under_voltage"
+    low, dead = np.full((60, 6), 3.7), np.full((60, 6), 3.7)
+    low[:, 4:], low[20:, 1] = 0.0, 2.0
+    dead[:, 1], dead[:, 5] = 0.02, 0.0
+    pack = CELL.pack(4, 1)
+    assert (await run(tmp_path, rows, cell=pack, slots_v=low, until=lambda a: a[name].active)).alarms[name].active
+    assert (await run(tmp_path, rows, cell=pack, slots_v=dead)).alarms[name].active
+    assert (await run(tmp_path, rows, cell=pack, slots_v=np.flip(dead, axis=1))).alarms[name].active
+    assert not (await run(tmp_path / "new", rows, cell=pack, slots_v=dead)).alarms[name].active
 
 
 def alarm_state(**acknowledged: bool) -> str:

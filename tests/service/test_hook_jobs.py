@@ -44,7 +44,8 @@ class Hook:
     [
         # each step: changes, then the jobs that are taken after them
         (("raised", "cleared"), [("+a -a +a +b -b", "+a"), ("-a +a", ""), ("-a +B +c", "+B -a +c")]),
-        (("raised",), [("+a -a", ""), ("+a", "+a"), ("-a +a", "+a"), ("-a", "")]),
+        (("raised",), [("+a -a", "+a"), ("+a", "+a"), ("-a +a", "+a"), ("-a", ""), ("+a -a +B +a -a", "+B +a")]),
+        (("first_raised",), [("+a -a", "+a"), ("+a +b -a -b +B", "+B"), ("-B", "")]),
         (("cleared",), [("+a -a", "-a"), ("+a", ""), ("-a +a", ""), ("-a", "-a")]),
         (
             ("first_raised", "last_cleared"),
@@ -62,7 +63,20 @@ def test_each_alarm_has_one_job_with_its_newest_state(on: tuple[HookEvent, ...],
         assert hook.take_all() == taken
 
 
-@pytest.mark.parametrize("on", [("raised", "cleared"), ("raised",), ("first_raised", "last_cleared")])
+@pytest.mark.parametrize(("changes", "taken"), [("", "+a"), ("-a", ""), ("-a +a", "+a"), ("-a +a -a", "+a")])
+def test_a_hook_without_ends_reports_a_second_alarm_if_the_job_of_the_first_was_not_done(
+    changes: str, taken: str
+) -> None:
+    hook = Hook("raised")
+    hook.change("+a")
+    job = hook.jobs.take()
+    assert job is not None
+    hook.change(*changes.split())
+    hook.jobs.put_back(job)
+    assert hook.take_all() == taken
+
+
+@pytest.mark.parametrize("on", [("raised", "cleared"), ("first_raised", "last_cleared")])
 @pytest.mark.parametrize(("changes", "taken"), [("", "+a"), ("-a", ""), ("-a +a", "+a"), ("-a +a -a", "")])
 def test_a_job_that_was_not_done_is_put_back_only_while_its_alarm_has_not_ended(
     on: tuple[HookEvent, ...], changes: str, taken: str

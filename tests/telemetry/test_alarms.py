@@ -740,10 +740,35 @@ def test_only_an_acknowledgement_with_a_faulty_probe_ends_over_temperature_with_
     alarms = make_evaluator()
     faulty = int(SampleStatus.PROBE_FAULT)
     add_samples(alarms, *range(20), temperature_c=70.0)
-    add_samples(alarms, *range(20, 25), temperature_c=70.0, status=faulty if is_faulty else 0)
+    add_samples(alarms, *range(20, 25), temperature_c=57.0 if is_faulty else 70.0, status=faulty if is_faulty else 0)
     alarms.acknowledge("over_temperature")
     add_samples(alarms, *range(25, 100), temperature_c=25.0, status=faulty)
     assert ("over_temperature" in alarms.active) == (not is_faulty)
+
+
+@pytest.mark.parametrize("second_c", [57.0, 64.0], ids=["second probe hot after", "second probe hot before"])
+def test_an_acknowledgement_with_a_faulty_probe_does_not_cover_the_loss_of_a_second_hot_one(second_c: float) -> None:
+    alarms, faulty = make_evaluator(), int(SampleStatus.PROBE_FAULT)
+    add_samples(alarms, *range(20), temperature_c=70.0)
+    add_samples(alarms, *range(20, 30), temperature_c=second_c, status=faulty)
+    alarms.acknowledge("over_temperature")
+    if second_c < 60.0:
+        add_samples(alarms, *range(30, 35), temperature_c=64.0, status=faulty)
+    add_samples(alarms, *range(35, 200), temperature_c=35.0, status=faulty)
+    assert "over_temperature" in alarms.active
+    alarms.acknowledge("over_temperature")
+    add_samples(alarms, *range(200, 300), temperature_c=35.0, status=faulty)
+    assert "over_temperature" not in alarms.active
+
+
+def test_an_acknowledgement_with_a_broken_wire_does_not_cover_that_of_a_second_full_cell() -> None:
+    alarms = make_evaluator({"cell_over_voltage": {"latch": False}})
+    add_samples(alarms, *range(20), cells_v=(4.3, 4.2))
+    add_samples(alarms, *range(20, 30), cells_v=(0.3, 4.2))
+    alarms.acknowledge("cell_over_voltage")
+    add_samples(alarms, *range(30, 35), cells_v=(0.3, 4.3))
+    add_samples(alarms, *range(35, 100), cells_v=(0.3, 0.3))
+    assert "cell_over_voltage" in alarms.active
 
 
 async def test_an_alarm_of_a_cell_does_not_end_when_the_wire_of_the_cell_breaks(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ alarms as the live run. Alarms use raw values, including glitches that the estim
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -326,13 +326,15 @@ class AlarmEvaluator:
         self._save_state()
         return f"no longer monitored, but raised before the restart: {', '.join(missing)}" if missing else ""
 
-    def raise_state_lost(self, reason: str, now_s: float) -> None:
+    def raise_state_lost(self, reason: str, now_s: float, measured: Mapping[Quantity, int]) -> None:
         """Raise ``alarm_state_lost`` until it is acknowledged.
 
         Args:
             reason: Reason for which raised alarms may be missing.
             now_s: Wall clock [s since 1970].
+            measured: Number of values in a sample of the earlier run, by quantity. One that does not arrive is lost.
         """
+        self._inputs.expect(measured)
         self._alarms.set_reasons(STATE_LOST.name, reason)
         self._alarms.raise_at(STATE_LOST.name, self._at_s, RaisedAlarm(now_s, None))
         self._alarms.states[STATE_LOST.name].cause_cleared = True  # an acknowledgement ends it at once

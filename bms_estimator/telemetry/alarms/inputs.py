@@ -104,6 +104,11 @@ class Inputs:
         """Return True if all these quantities were measured at some time."""
         return all(self._inputs[name].max_count for name in names)
 
+    def expect(self, counts: Mapping[Quantity, int]) -> None:
+        """Expect at least these numbers of values in a sample, because an earlier run measured them."""
+        for name, count in counts.items():
+            self._inputs[name].max_count = max(self._inputs[name].max_count, count)
+
     def update(self, times_s: Floats, steps_s: Floats, counts: Mapping[Quantity, Counts]) -> list[float]:
         """Process the number of values in each sample.
 

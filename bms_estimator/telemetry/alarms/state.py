@@ -53,9 +53,9 @@ class AlarmState:
     _held_s: float | None = None
     """Time for which the condition of the next state has held [s]; None: it does not hold."""
     _is_uncertain: bool = False
-    """True if the last value was uncertain."""
+    """True if the last value was uncertain, and the measured one was not beyond the limit."""
     _accepts_uncertain: bool = False
-    """True if the alarm was acknowledged at an uncertain value."""
+    """True if the alarm was acknowledged at an uncertain value, and no measured value has been beyond the limit since."""
 
     @property
     def is_pending(self) -> bool:
@@ -78,7 +78,8 @@ class AlarmState:
             values: Values in the unit of the limit, shape (n,). NaN (not measured) neither raises nor ends the alarm.
             wall_offset_s: Wall clock minus the samples' clock [s].
             uncertain: True where the true value may be beyond the limit, shape (n,). Such a value neither ends the alarm nor its
-                delay, unless the alarm was acknowledged at such a value. None: nowhere.
+                delay, unless the alarm was acknowledged at such a value and no measured one has been beyond the limit since.
+                None: nowhere.
 
         Returns:
             Transitions, oldest first.
@@ -93,15 +94,16 @@ class AlarmState:
         are_uncertain = [False] * values.size if uncertain is None else uncertain.tolist()
         rows = zip(times_s.tolist(), steps_s.tolist(), signed.tolist(), are_uncertain, strict=True)
         for at_s, step_s, measured, is_uncertain in rows:
-            self._is_uncertain = is_uncertain
+            is_beyond = measured >= sign * self.definition.limit
+            self._is_uncertain = is_uncertain and not is_beyond
+            if is_beyond:  # the acknowledgment did not cover the loss of this sensor
+                self._accepts_uncertain = False
             keeps_state = is_uncertain and (self.is_pending or (self.raised and not self._accepts_uncertain))
             value = max(sign * self.definition.limit, measured) if keeps_state else measured
             if math.isnan(value):
                 self._missing_s += step_s
                 continue
             self.has_value = True
-            if not is_uncertain and value >= sign * self.definition.limit:
-                self._accepts_uncertain = False  # the acknowledgement was of an earlier cause
             missing_s, self._missing_s = self._missing_s, 0.0
             if self._is_due(value, step_s + (missing_s if missing_s < self.lost_s else 0.0), sign):
                 transitions += self._next_state(at_s, sign * value, wall_offset_s)
