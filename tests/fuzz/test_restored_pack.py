@@ -72,7 +72,7 @@ PLACES: tuple[Place, ...] = (
     *((SUFFIX, name, "") for name in (*FIT_FIELDS, *(f"bank_{name}" for name in FIT_FIELDS))),
     *((SUFFIX, name, "") for name in ("weak_cell_times", "row_elapsed_s", "row_soc", "curves")),
     *((LOAD_SUFFIX, name, "") for name in ("mean_a", "max_a", "filtered_a", "last_a", "rest_s")),
-    *((LOAD_SUFFIX, name, "") for name in ("minutes_mean_a", "minutes_max_a")),
+    *((LOAD_SUFFIX, name, "") for name in ("minutes_mean_a", "minutes_max_a", "seen_discharge_a", "seen_charge_a")),
 )
 
 

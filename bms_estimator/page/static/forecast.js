@@ -29,7 +29,7 @@ export function drawForecast({ topics: { forecast: report, state } }) {
 }
 
 export function drawForecastValues(s) {
-	const both = (name) => `${f.watts(s[`${name}_10s_w`])}, ${f.watts(s[`${name}_60s_w`])}`;
+	const both = (name) => ["10s", "60s"].map((time) => f.watts(s[`${name}_${time}_w`]) || "–").join(", ");
 	put("cutoff_within", [2, 5, 15].map((minutes) => `${f.percent(s[`cutoff_within_${minutes}min`], 0)} %`).join(", "));
 	put("discharge_power", both("available_discharge_power"));
 	put("charge_power", both("available_charge_power"));
