@@ -9,11 +9,11 @@ import numpy as np
 from bms_estimator.calibration.cleaning.mismatched_steps import are_mismatched
 from bms_estimator.calibration.elements.replay_score import MIN_SOC, SETTLING_S
 from bms_estimator.calibration.validate import Validation
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SampleBlock, SampleStatus
+from bms_estimator.pack.pack import Pack
 
 BLOCK_SAMPLES = 1 << 16
 """Number of samples in a block. The trace of one block at a time is in memory."""
@@ -48,25 +48,18 @@ def first_time_s(rows: SampleBlock) -> float:
     return float(rows["time_s"][np.isfinite(rows["time_s"])][0])
 
 
-def soc_errors(
-    estimator: Estimator,
-    rows: SampleBlock,
-    validation: Validation,
-    on_block: OnBlock = ignore_block,
-    run: Callable[[SampleBlock], TraceBlock] | None = None,
-) -> SocErrors:
-    """Run an estimator over the samples of a validation, and compare its SOC with coulomb counting.
+def soc_errors(pack: Pack, rows: SampleBlock, validation: Validation, on_block: OnBlock = ignore_block) -> SocErrors:
+    """Run a pack over the samples of a validation, and compare its SOC with coulomb counting.
 
     The first ``SETTLING_S`` are not scored, because the estimator searches its initial SOC. SOCs below ``MIN_SOC`` are not
     scored either. If voltage and current of a sample are of different sides of a step, the voltage is marked as held.
     Otherwise the resistance would seem to be 0 or negative.
 
     Args:
-        estimator: New estimator that has processed no samples.
+        pack: New pack that has processed no samples.
         rows: All samples of the capture, dtype ``SAMPLE``.
         validation: Validation of the capture. If it begins later than the capture, the estimator begins there as well.
         on_block: Receives each block of the trace.
-        run: Runs the estimator and further stages of its pack; None: the estimator alone.
     """
     first_s, start_s = first_time_s(rows), float(validation.time_s[0])
     if start_s > 0.0:
@@ -74,7 +67,7 @@ def soc_errors(
     squares, within, samples = 0.0, 0, 0
     for begin in range(0, rows.size, BLOCK_SAMPLES):
         block = rows[begin : begin + BLOCK_SAMPLES]
-        trace = (run or estimator.run)(_with_held_voltages(block))
+        trace = pack.run(_with_held_voltages(block)).trace
         time_s = trace["time_s"] - first_s
         counted = np.interp(time_s, validation.time_s, validation.soc)
         scored = (time_s - start_s >= SETTLING_S) & (counted >= MIN_SOC)
@@ -83,7 +76,7 @@ def soc_errors(
         within += int(np.count_nonzero(np.abs(error) <= 2.0 * trace["soc_std"][scored]))
         samples += error.size
         on_block(trace, counted, (begin + block.size) / rows.size)
-    faults = InputFault(int(estimator.record[0]["checks"]["suspects"]))
+    faults = InputFault(int(pack.estimator.record[0]["checks"]["suspects"]))
     if samples == 0:
         return SocErrors(math.nan, math.nan, 0, faults)
     return SocErrors(math.sqrt(squares / samples), within / samples, samples, faults)

@@ -12,6 +12,7 @@ from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
+from bms_estimator.pack.pack import Pack
 from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import LADDER, TRUTH, capture, constant, ladder_capture, steps
 
@@ -154,6 +155,6 @@ def test_voltages_of_the_other_side_of_a_step_are_no_wrong_sign():
     samples = capture(load)[::10].copy()
     first = np.flatnonzero(np.diff(samples["current_a"])) + 1
     samples["voltage_v"][first] = samples["voltage_v"][first - 1]
-    errors = soc_errors(Estimator(TRUTH), samples, validate(Columns(samples, "cycler"), TRUTH))
+    errors = soc_errors(Pack(Estimator(TRUTH)), samples, validate(Columns(samples, "cycler"), TRUTH))
     assert errors.faults == InputFault(0)
     assert errors.rms < 0.01

@@ -18,10 +18,11 @@ from bms_estimator.calibration.ocv.source import ExternalCurve
 from bms_estimator.calibration.soc_errors import soc_errors
 from bms_estimator.calibration.validate import Validation, validate
 from bms_estimator.calibration.verdict import Run, Verdict, coverage, judge, voltage_errors
-from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.pack.pack import Pack, new_pack
+from bms_estimator.settings.pack import Settings
 
 MAX_FULL_DEVIATION_V = 0.45
 """Maximum difference between the highest voltages of captures of one cell [V]. It allows the 0.31 V between a full LFP cell at rest
@@ -113,7 +114,7 @@ def calibrate(
     if not validations:
         raise UserError("\n".join(failures))
     runs = [
-        Run(capture.name, validation, soc_errors(Estimator(validated_model.cell), capture.rows, validation))
+        Run(capture.name, validation, soc_errors(_validating_pack(validated_model.cell), capture.rows, validation))
         for capture, validation in validations
     ]
     errors = voltage_errors([run.validation for run in runs], validated_model.cell)
@@ -195,6 +196,11 @@ def _fit_both(
         note = f"the model was fitted without the data held back, because with all data {model.reason}"
         return validated_model, validated_model, [note]
     return validated_model, model, []
+
+
+def _validating_pack(cell: CellModel) -> Pack:
+    """Return a pack of one cell as `validate` and `report` run it."""
+    return new_pack(Settings(), cell, has_forecasts=False)
 
 
 def _validate_all(

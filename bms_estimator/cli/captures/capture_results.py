@@ -92,8 +92,7 @@ def _estimate(pack: Pack, rows: SampleBlock, validation: Validation, progress: P
         counted.append(block_counted[kept])
         progress(fraction)
 
-    estimator = pack.estimator
-    errors = soc_errors(estimator, rows, validation, keep, lambda samples: pack.run(samples).trace)
+    estimator, errors = pack.estimator, soc_errors(pack, rows, validation, keep)
     if not any(trace.size for trace in traces):
         raise UserError("the estimator accepted no sample of the capture")
     trace = np.concatenate(traces)

@@ -32,11 +32,11 @@ from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
-from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.arrays import Records, structured_array
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import fill_temperature
+from bms_estimator.pack.pack import new_pack
 from bms_estimator.sinks.trace_file import table_sink
 
 
@@ -80,9 +80,9 @@ def validate_command(
     residual_sink = table_sink(out) if out else None
     validation = validate(loaded, model, initial_soc=soc)
     with show_compile_progress():
-        estimator = new_estimator(settings, model)
+        pack = new_pack(settings, model, has_forecasts=False)
     with progress_bar("estimating") as bar:
-        errors = soc_errors(estimator, loaded.rows, validation, lambda _trace, _counted, fraction: bar.update(fraction))
+        errors = soc_errors(pack, loaded.rows, validation, lambda _trace, _counted, fraction: bar.update(fraction))
     verdict = judge([Run(loaded.name, validation, errors, is_fitted)], model)
     for line in validation.warnings:
         typer.echo(f"warning: {line}", err=True)
