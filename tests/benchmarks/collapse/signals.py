@@ -103,7 +103,8 @@ def signal_rows(trace: TraceBlock, forecast: np.ndarray, last: np.ndarray, cutof
         np.ascontiguousarray(trace[name]) for name in ("time_s", "voltage_v", "k", "tracking_error_v")
     )
     rows = np.zeros(last.size, SIGNALS)
-    rows["time_s"], rows["soc"], rows["margin"] = time_s[last], trace["soc"][last], trace["stability_margin"][last]
+    rows["time_s"], rows["soc"] = time_s[last], trace["soc"][last]
+    rows["margin"] = rows["soc"] - np.maximum(trace["delta_1"][last], trace["delta_2"][last])
     rows["within_2min"] = forecast["cutoff_within_2min"][last]
     rows["within_5min"] = forecast["cutoff_within_5min"][last]
     rows["within_15min"] = forecast["cutoff_within_15min"][last]
