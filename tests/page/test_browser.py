@@ -275,12 +275,12 @@ async def test_lock_and_e_of_the_observer_are_shown_under_its_name_and_not_on_th
     async with dashboard_of(browser, programs, "cellar") as page_tab:
         page = page_tab.page
         observer = {"lock": True, "converged": False, "tracking_error_v": -0.0027, "nussbaum_gain": 0.8}
+        await publish_state(programs.live, **STATE_VALUES | observer | {"soc_std": None})  # without the identifier
+        await page_tab.until_text("innovation_of", "of the observer")
         await publish_state(programs.live, **STATE_VALUES | observer)
         row = page.locator("#facts div").filter(has=page.get_by_text("Observer", exact=True))
         await row.get_by_text(f"in lock, converging, e {MINUS}2.7 mV").wait_for()
         assert "lock" not in await page.inner_text(".hero") + await page.inner_text(".tiles")
-        await publish_state(programs.live, **STATE_VALUES | observer | {"soc_std": None})  # without the identifier
-        await page_tab.until_text("innovation_of", "of the observer")
         assert page_tab.errors == []
 
 

@@ -12,7 +12,7 @@ export function drawHealth({ topics: { health: h, info, state } }) {
 	}
 	const of = (x, unit) => f.isNumber(x) && `${f.digits(x, 3)} ${unit}`;
 	const e = f.millivolts(state?.tracking_error_v);
-	const tracking = e && `${state.lock ? "in lock" : "no lock"}, ${state.converged ? "converged" : "converging"}, e ${e}`;
+	const tracking = e && `${state.lock ? "in" : "no"} lock, ${state.converged ? "converged" : "converging"}, e ${e}`;
 	const facts = {
 		Sensor: h.sensor_online ? "online" : "offline", "Sample rate": of(state?.sample_rate_hz, "Hz"), Frames: h.line?.frames_received,
 		"Frames lost": h.line?.frames_lost, "Wrong checksums": h.line?.crc_errors, "Line reopened": h.reconnects,

@@ -32,7 +32,7 @@ export function drawState(state) {
 	put("time_left_label", label);
 	put("time_left_band", band);
 	put("way", s.current_a > 0 ? "discharging" : s.current_a < 0 ? "charging" : "at rest");
-	put("stability_margin_std", f.percent(f.isNumber(s.stability_margin_std) ? 2 * s.stability_margin_std : null));
+	put("stability_margin_std", f.percent(2 * (s.stability_margin_std ?? NaN)));
 	put("innovation_of", f.isNumber(state.soc_std) ? "measured − predicted" : "of the observer"); // without the identifier
 	hide($("soc"), !known);
 	hide($("unknownsoc"), known);
