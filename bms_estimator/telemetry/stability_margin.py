@@ -1,4 +1,4 @@
-"""Stability margin, and the reason why there is none."""
+"""Stability margin, and the reason for its absence."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ NOT_IDENTIFIED = "delta_1 and delta_2 follow from a7..a12, which are not valid: 
 
 
 def known_margin(trace: Any, soc_known: Any) -> Any:
-    """Return the stability margin of rows of dtype TRACE, NaN where there is none or the SOC is not known.
+    """Return the stability margin of rows of dtype TRACE, NaN without a margin or a known SOC.
 
     Args:
         trace: One row, or shape (n,).
