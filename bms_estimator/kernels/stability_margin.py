@@ -28,16 +28,15 @@ def margin_with_std(s: Record, p: Record, soc_std: float) -> tuple[float, float]
     """
     o = s.observer
     e = CAPACITANCES[0] if o.delta_1 >= o.delta_2 else CAPACITANCES[1]
-    limit = max(o.delta_1, o.delta_2)
-    is_identified = p.identify and not p.learning.enabled and p.filter.r_std < VALID_STD
+    limit, limit_std = max(o.delta_1, o.delta_2), s.fit.delta_std[e]
+    # ``limit_std`` is 0 from a checkpoint of an earlier version until the next fit
+    is_identified = p.identify and not p.learning.enabled and p.filter.r_std < VALID_STD and limit_std > 0.0
     if not (limit > 0.0 and is_identified and has_valid_parameters(s, p, 2) and has_valid_parameters(s, p, 3)):
         return math.nan, math.nan
     i = 3 * e + 1
     # the observer's parameters differ from the fit while they converge, and if a bound limits them
     difference = delta(s.fit.a[i + 1], s.fit.a[i + 2], s.fit.a[i]) - limit
-    return o.soc - limit, math.sqrt(
-        soc_std * soc_std + s.fit.delta_std[e] * s.fit.delta_std[e] + difference * difference
-    )
+    return o.soc - limit, math.sqrt(soc_std * soc_std + limit_std * limit_std + difference * difference)
 
 
 @njit(cache=True)

@@ -280,10 +280,10 @@ def write_observer_trace(row: Record, s: Record, p: Record, x: Record) -> None:
 def write_filter_trace(row: Record, s: Record, p: Record) -> None:
     """Write the filter's columns. ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
 
-    Without the filter, ``innovation_v`` and ``voltage_estimate_v`` are the observer's e and y^, ``r_s_ohm`` is R_s by (4.2) if enabled, and the
-    other columns are NaN. ``soc_ocv`` is then NaN, because the observer's v_ts and v_tl absorb any error of the SOC, so that
-    the inverted OCV (7.1) would return the observer's own SOC. It is also NaN with a held voltage or current, because both
-    do not belong to one time.
+    Without the filter, ``innovation_v`` and ``voltage_estimate_v`` are the observer's e and y^, ``r_s_ohm`` is R_s by (4.2)
+    if enabled, and the other columns are NaN. ``soc_ocv`` is then NaN, because the observer's v_ts and v_tl absorb any error
+    of the SOC, so that the inverted OCV (7.1) would return the observer's own SOC. It is also NaN with a held voltage or
+    current, because both do not belong to one time.
     """
     if not p.identify:
         row.innovation_v, row.voltage_estimate_v = s.observer.innovation_v, s.observer.voltage_estimate_v
