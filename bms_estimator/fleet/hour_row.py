@@ -49,7 +49,7 @@ class Hour(Payload):
     temperature_max_c: float | None
     innovation_rms_v: float | None = Field(description="measured less predicted voltage [V]")
     stability_margin_min: float | None = Field(
-        description="minimum of soc - max(delta_1, delta_2) in the hour, over samples with delta_1 or delta_2 above 0"
+        description="minimum of soc - max(delta_1, delta_2) in the hour, over samples that have a stability margin"
     )
     soc: float | None = Field(description="state of charge 0..1 at the end of the hour, as are all following values")
     soc_std: float | None = Field(description="standard deviation of the emptiest series cell's SOC, as published")

@@ -20,6 +20,7 @@ from bms_estimator.kernels.observer.series_resistance import (
     series_resistance,
     series_resistance_step,
 )
+from bms_estimator.kernels.stability_margin import is_delta_configured, margin_with_std
 from bms_estimator.kernels.start import initialize_state, restart_after_unknown_gap, store_temperature
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.model.sample import SampleStatus
@@ -246,6 +247,7 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
         if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status, x.temperature_c) == _ACCEPTED:
             write_observer_trace(trace[rows], state[0].observer, settings[0], x)
             write_filter_trace(trace[rows], state[0], settings[0])
+            write_margin(trace[rows], state[0], settings[0])
             rows += 1
             if needs_caller(state[0].history):
                 return j + 1, rows
@@ -263,14 +265,12 @@ def write_observer_trace(row: Record, s: Record, p: Record, x: Record) -> None:
     row.current_a = x.current_a
     row.temperature_c = x.temperature_c
     row.soc = s.soc
-    row.voltage_estimate_v = s.voltage_estimate_v
     row.tracking_error_v = s.innovation_v
     row.nussbaum_gain = math.nan if p.learning.enabled else s.gain
     row.adaptation_gain_hz = s.gain if p.learning.enabled else math.nan
     row.k = s.k
     row.delta_1 = s.delta_1
     row.delta_2 = s.delta_2
-    row.stability_margin = s.soc - max(s.delta_1, s.delta_2)
     row.lock = s.lock
     row.converged = 1 if abs(s.innovation_v) < p.observer.epsilon_v else 0
     row.soc_coulomb = s.soc_coulomb
@@ -280,20 +280,20 @@ def write_observer_trace(row: Record, s: Record, p: Record, x: Record) -> None:
 def write_filter_trace(row: Record, s: Record, p: Record) -> None:
     """Write the filter's columns. ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
 
-    Without the filter, ``innovation_v`` is the observer's output error e, ``r_s_ohm`` is R_s by (4.2) if enabled, and the
-    other columns are NaN. ``soc_ocv`` is then NaN, because the observer's v_ts and v_tl absorb any error of the SOC, so that
-    the inverted OCV (7.1) would return the observer's own SOC. It is also NaN with a held voltage or current, because both
-    do not belong to one time.
+    Without the filter, ``innovation_v`` and ``voltage_estimate_v`` are the observer's e and y^, ``r_s_ohm`` is R_s by (4.2)
+    if enabled, and the other columns are NaN. ``soc_ocv`` is then NaN, because the observer's v_ts and v_tl absorb any error
+    of the SOC, so that the inverted OCV (7.1) would return the observer's own SOC. It is also NaN with a held voltage or
+    current, because both do not belong to one time.
     """
     if not p.identify:
-        row.innovation_v = s.observer.innovation_v
+        row.innovation_v, row.voltage_estimate_v = s.observer.innovation_v, s.observer.voltage_estimate_v
         row.soc_ocv = row.soc_std = math.nan
         row.r_s_ohm = series_resistance(s) if p.series_resistance else math.nan
         row.r_ts_ohm = row.tau_ts_s = row.r_tl_ohm = row.tau_tl_s = math.nan
         row.r_s_std_ohm = row.r_ts_std_ohm = row.tau_ts_std_s = row.r_tl_std_ohm = row.tau_tl_std_s = math.nan
         return
     f, e = s.filter, s.elements
-    row.innovation_v = f.innovation_v
+    row.innovation_v, row.voltage_estimate_v = f.innovation_v, f.voltage_v
     row.soc_ocv = math.nan
     if s.observer.voltage_age_s == 0.0 and s.observer.time_s == row.time_s:
         e_o = open_circuit(f, p.filter, e, row.current_a, row.voltage_v)
@@ -304,6 +304,13 @@ def write_filter_trace(row: Record, s: Record, p: Record) -> None:
     row.tau_ts_s, row.tau_ts_std_s = value_and_std(e, TAU_TS)
     row.r_tl_ohm, row.r_tl_std_ohm = value_and_std(e, R_TL)
     row.tau_tl_s, row.tau_tl_std_s = value_and_std(e, TAU_TL)
+
+
+@njit(cache=True)
+def write_margin(row: Record, s: Record, p: Record) -> None:
+    """Write the columns of the stability margin. ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS."""
+    row.delta_configured = is_delta_configured(s, p)
+    row.stability_margin, row.stability_margin_std = margin_with_std(s, p, row.soc_std)
 
 
 @njit(cache=True)

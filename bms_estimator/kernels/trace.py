@@ -12,7 +12,10 @@ TRACE = np.dtype(
         ("current_a", "f8"),  # positive on discharge
         ("temperature_c", "f8"),
         ("soc", "f8"),
-        ("voltage_estimate_v", "f8"),
+        (
+            "voltage_estimate_v",
+            "f8",
+        ),  # predicted by the identifier for its last update; without the identifier, the observer's y^ [V]
         (
             "innovation_v",
             "f8",
@@ -23,7 +26,9 @@ TRACE = np.dtype(
         ("k", "f8"),  # adaptive gain state (3.13)
         ("delta_1", "f8"),  # SOC below which C_ts of the model is negative (2.11)
         ("delta_2", "f8"),  # SOC below which C_tl of the model is negative (2.12)
-        ("stability_margin", "f8"),  # soc - max(delta_1, delta_2)
+        ("delta_configured", "i8"),  # 1: no data have changed delta_1 and delta_2
+        ("stability_margin", "f8"),  # soc - max(delta_1, delta_2), or NaN (``kernels/stability_margin.py``)
+        ("stability_margin_std", "f8"),
         ("lock", "i8"),  # 1 while the observer tracks the voltage
         ("converged", "i8"),  # 1: |e| < eps2 of Algorithm 1
         ("soc_coulomb", "f8"),  # by coulomb counting alone

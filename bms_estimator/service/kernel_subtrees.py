@@ -29,7 +29,7 @@ from bms_estimator.kernels.kalman_filter import (
     window,
 )
 from bms_estimator.kernels.observer import learning_law, observer
-from bms_estimator.kernels.step import write_filter_trace
+from bms_estimator.kernels.step import write_filter_trace, write_margin
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.numba_cache import CACHE_FOLDER
@@ -78,6 +78,7 @@ def compile_subtrees() -> None:
         (learning_law.learning_step, (s, p, real, real, real)),
         (observer.observer_step, (s.typeof("observer"), p.typeof("observer"), real, real)),
         (write_filter_trace, (row, s, p)),
+        (write_margin, (row, s, p)),
     )
     for kernel, signature in signatures:
         kernel.compile(signature)

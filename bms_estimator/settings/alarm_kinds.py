@@ -73,8 +73,8 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
         ("voltage", "current"),
     ),
     "stability_margin_low": AlarmKind(
-        "the SOC is close to the value below which the model is unstable",
-        "charge",
+        "the SOC is close to the value below which the thesis's model is not valid",
+        "charge; not this value but the cut-off voltage limits the discharge",
         ("voltage", "current"),
         is_upper_limit=False,
     ),

@@ -6,12 +6,10 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.fuel_cell import ACTIVATION, NAMES, TAFEL
+from bms_estimator.kernels.stability_margin import VALID_STD
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.parameters import Parameter
 from bms_estimator.telemetry.state import finite
-
-VALID_STD = 0.3
-"""Maximum relative std of an identified element or parameter."""
 
 
 def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parameter]:

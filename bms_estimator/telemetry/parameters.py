@@ -24,11 +24,12 @@ from bms_estimator.estimator.identified_parameters import (
 )
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
+from bms_estimator.kernels.stability_margin import VALID_FIT_STD, VALID_STD
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.payloads.parameters import OcvCurve, Parameter, ParameterReport
-from bms_estimator.telemetry.fuel_cell_parameters import VALID_STD, fuel_cell_parameters
+from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.ocv_formula import fit_ocv_formula
 from bms_estimator.telemetry.series_resistance import series_resistance_parameters, settling_reason
 from bms_estimator.telemetry.state import finite
@@ -43,8 +44,6 @@ MOVED_RATIO = 1e-6
 """Relative change above which a law of the thesis has changed a value of the cell file. Near the limit of (3.18), e^2 changes it less."""
 LEARNED_REASON = "learned by the adaptive law, which gives no std"
 """Reason why a value of the learning law is not valid."""
-VALID_FIT_STD = 0.5
-"""Maximum relative std of a valid a1..a15. Amplitudes and exponents can be separated only after a sweep of the SOC."""
 CAPACITANCE_PARAMETERS = range(7, 13)
 """a7..a12, the parameters of C_ts and C_tl, (2.7) and (2.8)."""
 VALID_CAPACITY_STD = 0.02

@@ -21,7 +21,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import forecast_fields
 from bms_estimator.telemetry.publish_window import WindowSummary
-from bms_estimator.telemetry.stability_margin import applicable_margin
+from bms_estimator.telemetry.stability_margin import known_margin, missing_margin_reason
 from bms_estimator.version import __version__
 
 NO_CELL_FIELDS: Mapping[str, Any] = MappingProxyType(
@@ -34,8 +34,11 @@ NO_CELL_FIELDS: Mapping[str, Any] = MappingProxyType(
     )
 )
 """Fields of ``Estimate`` about estimates of single cells, without any."""
-COMPUTED = {"voltage_v", "current_a", "temperature_c", "stability_margin", "converged", "lock"}
-"""Columns of the trace whose field of ``Estimate`` is computed: means, a margin that may not apply, and booleans from integers."""
+COMPUTED = {
+    *("voltage_v", "current_a", "temperature_c", "stability_margin", "stability_margin_std"),
+    *("delta_configured", "converged", "lock"),
+}
+"""Columns of the trace whose field of ``Estimate`` is computed: means, a margin that needs a known SOC, and booleans from integers."""
 COPIED = tuple(name for name in TRACE.names or () if name in Estimate.model_fields and name not in COMPUTED)
 """Columns of the trace whose last value is copied to the field of ``Estimate`` with an equal name."""
 
@@ -71,7 +74,7 @@ def make_state_payload(
     # a tuple of plain numbers, because reading the fields of a numpy record one by one is slow
     values = zip(TRACE.names or (), window.last.item(), strict=True)
     last = {name: value if math.isfinite(value) else None for name, value in values}
-    soc = last["soc"]
+    soc, margin = last["soc"], finite(known_margin(window.last, window.soc_known))
     return Estimate(
         time=iso_utc(window.arrival_s),
         publish_time=iso_utc(now_s),
@@ -85,14 +88,15 @@ def make_state_payload(
         **{name: last[name] for name in COPIED},
         soc_percent=None if soc is None else 100.0 * soc,
         soc_known=soc is not None and window.soc_known,
-        stability_margin=finite(applicable_margin(window.last, window.soc_known)),
+        stability_margin=margin,
+        stability_margin_std=None if margin is None else last["stability_margin_std"],
+        stability_margin_reason=missing_margin_reason(window.last, soc_known=window.soc_known),
         remaining_capacity_ah=finite(remaining_capacity_ah),
         **forecast_fields(forecast, float(window.last["time_s"])),
         **{**NO_CELL_FIELDS, **cell_fields},
         **flow._asdict(),
         equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
-        # the learning law does not change delta1 and delta2, and only this law has an adaptation gain
-        delta_configured=last["adaptation_gain_hz"] is not None and last["delta_1"] is not None,
+        delta_configured=bool(last["delta_configured"]),
         adaptive_gain_k=last["k"],
         converged=bool(last["converged"]),
         lock=bool(last["lock"]),

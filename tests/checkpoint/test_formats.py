@@ -22,7 +22,7 @@ def test_formats_have_their_numbers() -> None:
     assert (checkpoint_file.FORMER_FORMAT, checkpoint_file.FORMAT) == (7, 8)
     assert (history_file.FORMAT, run_file.FORMAT) == (1, 1)
     assert (format_versions.FORMAT, format_versions.INCREMENT_FORMAT) == (3, 3)
-    assert (block.VERSION, PAYLOAD_VERSION) == (3, 2)
+    assert (block.VERSION, PAYLOAD_VERSION) == (3, 3)
 
 
 @pytest.mark.parametrize(

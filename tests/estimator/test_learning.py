@@ -314,8 +314,8 @@ def test_learned_parameters_are_published_with_their_source(ten_hours: SampleBlo
 
 
 def test_the_learning_law_publishes_gamma_k_and_the_improved_law_publishes_n_of_k(ten_hours: SampleBlock) -> None:
-    """The Nussbaum gain N(k) belongs to the laws of the thesis. They also adapt the parameters of the limits delta1 and
-    delta2, so that ``delta_configured`` is false."""
+    """The Nussbaum gain N(k) belongs to the laws of the thesis. Without the identifier, no law changes the limits delta1 and
+    delta2 by data, so that ``delta_configured`` is true."""
     states = {}
     for law in ("learning", "improved"):
         estimator = Estimator(
@@ -334,5 +334,5 @@ def test_the_learning_law_publishes_gamma_k_and_the_improved_law_publishes_n_of_
     assert learning.adaptive_gain_k is not None
     assert learning.adaptation_gain_hz == pytest.approx(learning.adaptive_gain_k / 60.0)  # gamma is 1/60 s
     assert (learning.nussbaum_gain, learning.delta_configured) == (None, True)
-    assert (improved.adaptation_gain_hz, improved.delta_configured) == (None, False)
+    assert (improved.adaptation_gain_hz, improved.delta_configured) == (None, True)
     assert improved.nussbaum_gain is not None

@@ -60,6 +60,7 @@ STATE_VALUES = {  # as published in ``state``
     "weakest_cell_soc_std": 0.0184,
     "stability_margin": 0.3532,
     "nussbaum_gain": 0.97,
+    "stability_margin_std": 0.021,
     "cells_v": [3.271, 3.2755, None, 3.2688],
 }
 SHOWN_TEXTS = {  # by quantity (attribute ``data-q``)
@@ -72,6 +73,7 @@ SHOWN_TEXTS = {  # by quantity (attribute ``data-q``)
     "power_w": f"{MINUS}646 W",
     "temperature_c": "21.4 °C",
     "innovation_v": f"{MINUS}54.3 mV",
+    "innovation_of": f"measured {MINUS} predicted",
     "remaining_energy_wh": "2346 Wh",
     "remaining_capacity_ah": "45.68 Ah",
     "time_left": "3 h 12 min",
@@ -83,6 +85,7 @@ SHOWN_TEXTS = {  # by quantity (attribute ``data-q``)
     "weakest_cell_soc": "38.7",
     "weakest_cell_soc_std": "3.7",  # two std in percent
     "stability_margin": "35.3",
+    "stability_margin_std": "4.2",  # two std in percent
     "celllow": "3.269 V · cell 4",
     "cellhigh": "3.276 V · cell 2",
     "cellmean": "3.272 V",
@@ -254,19 +257,35 @@ async def test_unknown_values_are_hidden(browser: Browser, programs: RunningProg
         assert page_tab.errors == []
 
 
-async def test_the_limit_of_the_model_is_marked_only_above_0_and_is_no_instruction(
+async def test_the_limit_of_the_model_is_marked_only_with_a_margin_and_is_no_instruction(
     browser: Browser, programs: RunningPrograms
 ) -> None:
     async with dashboard_of(browser, programs, "cellar") as page_tab:
         page = page_tab.page
-        for delta_2 in (0.0789, -0.0205, 0.0789, None):
-            is_shown = delta_2 is not None and delta_2 > 0.0
-            await publish_state(programs.live, **STATE_VALUES | {"delta_1": -0.0205, "delta_2": delta_2})
+        for margin in (0.3532, None, 0.3532):
+            is_shown = margin is not None
+            values = {"delta_1": -0.0205, "delta_2": 0.0789, "stability_margin": margin}
+            await publish_state(programs.live, **STATE_VALUES | values)
             await page.locator("#invalidmark").wait_for(state="visible" if is_shown else "hidden")
-            assert await page.get_by_text("model not valid below").is_visible() is is_shown
+            assert await page.get_by_text("the thesis's model is not valid below 7.9 %").is_visible() is is_shown
             meter_text = await page.get_by_role("meter", name="State of charge").get_attribute("aria-valuetext")
-            assert ("model not valid below 8 %" in (meter_text or "")) is is_shown
+            assert ("the thesis's model is not valid below 8 %" in (meter_text or "")) is is_shown
             assert "stop discharging" not in await page.inner_text(".hero")
+        assert page_tab.errors == []
+
+
+async def test_lock_and_e_of_the_observer_are_shown_under_its_name_and_not_on_the_tiles(
+    browser: Browser, programs: RunningPrograms
+) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        page = page_tab.page
+        observer = {"lock": True, "converged": False, "tracking_error_v": -0.0027, "nussbaum_gain": 0.8}
+        await publish_state(programs.live, **STATE_VALUES | observer | {"soc_std": None})  # without the identifier
+        await page_tab.until_text("innovation_of", "of the observer")
+        await publish_state(programs.live, **STATE_VALUES | observer)
+        row = page.locator("#facts div").filter(has=page.get_by_text("Observer", exact=True))
+        await row.get_by_text(f"in lock, converging, e {MINUS}2.7 mV").wait_for()
+        assert "lock" not in await page.inner_text(".hero") + await page.inner_text(".tiles")
         assert page_tab.errors == []
 
 

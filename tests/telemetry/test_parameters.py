@@ -85,23 +85,27 @@ def test_a_value_that_the_law_of_the_thesis_has_moved_is_not_said_to_be_from_the
     assert reasons == [(moved, moved, from_file), (from_file, from_file, from_file)]
 
 
-@pytest.mark.parametrize(("ladder_std", "any_valid"), [(0.1, True), (0.35, False)])
-def test_capacitances_are_valid_only_if_data_determined_the_time_constants(
-    ladder_std: float, any_valid: bool, three_hours: SampleBlock
-) -> None:
-    """The RC ladder of the file is exact, and its declared std says whether it was fitted to data."""
+def file_with_ladder(std: float) -> CellModel:
+    """Return the file of the true cell with its exact RC ladder. The declared std says whether the ladder was fitted to data."""
     half_ohm = (0.5 * ladder_of_branches(TRUTH).T).tolist()
     ladder = Ladder.model_validate(
         {
             "soc": SOC_GRID.tolist(),
             "weak_ohm": half_ohm,
             "strong_ohm": half_ohm,
-            "std": ladder_std,
+            "std": std,
             "error_v": 0.001,
             "temperature_c": (15.0, 35.0),
         }
     )
-    parameters = parameters_after(TRUTH.model_copy(update={"ladder": ladder}), three_hours)
+    return TRUTH.model_copy(update={"ladder": ladder})
+
+
+@pytest.mark.parametrize(("ladder_std", "any_valid"), [(0.1, True), (0.35, False)])
+def test_capacitances_are_valid_only_if_data_determined_the_time_constants(
+    ladder_std: float, any_valid: bool, three_hours: SampleBlock
+) -> None:
+    parameters = parameters_after(file_with_ladder(ladder_std), three_hours)
     assert any(parameters[name].valid for name in CAPACITANCE_NAMES) == any_valid
     if not any_valid:
         reasons = [parameters[name].reason or "" for name in CAPACITANCE_NAMES]

@@ -1,4 +1,4 @@
-"""Alarms while the SOC is not known, or the stability margin does not apply."""
+"""Alarms while the SOC is not known, or there is no stability margin."""
 
 import json
 from typing import Any
@@ -11,10 +11,11 @@ from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.settings.alarm_limits import monitored_alarms
-from bms_estimator.telemetry.alarms.estimate_alarms import NO_MARGIN, UNKNOWN_SOC
+from bms_estimator.telemetry.alarms.estimate_alarms import UNKNOWN_SOC
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
+from bms_estimator.telemetry.stability_margin import ALWAYS_STABLE, NOT_IDENTIFIED
 from tests.telemetry.alarm_captures import PACK, WALL_S, settings
 
 
@@ -27,8 +28,13 @@ class Pack:
         self.evaluator.restore(saved_state)
         self._time_s = 0.0
 
-    def estimate(self, soc: float, soc_std: float, seconds: int = 100, delta: float = 0.01) -> None:
-        """Evaluate an estimate that is constant for some time, with one sample a second."""
+    def estimate(
+        self, soc: float, soc_std: float, seconds: int = 100, delta: float = 0.01, delta_valid: bool = True
+    ) -> None:
+        """Evaluate an estimate that is constant for some time, with one sample a second.
+
+        The parameters of ``delta`` are valid if ``delta_valid``.
+        """
         trace, samples = np.zeros(seconds, TRACE), np.zeros(seconds, SAMPLE)
         trace["time_s"] = samples["time_s"] = self._time_s + np.arange(seconds)
         samples["voltage_v"], samples["temperature_c"] = 7.4, 25.0
@@ -39,7 +45,7 @@ class Pack:
             delta,
             delta,
         )
-        trace["stability_margin"] = soc - delta
+        trace["stability_margin"] = soc - delta if delta > 0.0 and delta_valid else np.nan
         self._time_s += seconds
         self.evaluator.add(samples, trace, NO_CELLS)
         self.evaluator.evaluate(WALL_S + self._time_s, SampleCounts(0, 0), InputFault(0), ())
@@ -90,15 +96,28 @@ def test_an_acknowledged_alarm_does_not_end_while_the_soc_is_not_known() -> None
     assert not pack.alarm().active
 
 
-def test_a_margin_that_does_not_apply_is_not_judged() -> None:
+@pytest.mark.parametrize(
+    ("without_margin", "reason"),
+    [({"delta": -0.02}, ALWAYS_STABLE), ({"delta_valid": False}, NOT_IDENTIFIED)],
+    ids=["stable at each SOC", "a7..a12 not valid"],
+)
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_pack_without_a_margin_has_no_alarm_of_the_margin(
+    without_margin: dict[str, Any], reason: str, restart: bool
+) -> None:
+    """An alarm that an earlier version raised at such a margin ends, too."""
     pack = Pack()
-    pack.estimate(soc=0.04, soc_std=0.02, delta=-0.02)
+    pack.estimate(soc=0.04, soc_std=0.02, **without_margin)
     assert pack.evaluator.active == ("soc_low",)
-    assert pack.alarm("stability_margin_low").unknown_reason == NO_MARGIN
-    pack.estimate(soc=0.04, soc_std=0.02, delta=0.01)
-    assert pack.evaluator.active == ("soc_low", "stability_margin_low")
-    pack.estimate(soc=0.9, soc_std=0.02, delta=-0.02)
-    assert pack.evaluator.active == ("stability_margin_low",)
+    assert pack.alarm("stability_margin_low").unknown_reason == reason
+    assert pack.alarm("stability_margin_low").watched
+    pack.estimate(soc=0.04, soc_std=0.02)
+    assert pack.alarm("stability_margin_low").active
+    if restart:
+        pack = Pack(pack.evaluator.saved_state)
+    pack.estimate(soc=0.04, soc_std=0.02, **without_margin)
+    assert pack.evaluator.active == ("soc_low",)
+    assert pack.alarm("stability_margin_low").unknown_reason == reason
 
 
 def test_pack_without_an_soc_has_no_unknown_alarm() -> None:

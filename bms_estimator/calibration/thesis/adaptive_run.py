@@ -35,7 +35,8 @@ SNAPSHOT_FIELDS = (
     "voltage_estimate_v",
     "k",
     "nussbaum_gain",
-    "stability_margin",
+    "delta_1",
+    "delta_2",
 )
 """Fields of the trace that each snapshot contains."""
 
@@ -140,7 +141,8 @@ def adaptive_run(
     recorded = {name: snapshots[name][:snapshot_count].copy() for name in SNAPSHOT_FIELDS}
     error, parameters = error_v[:snapshot_count], parameters[:snapshot_count]
     epsilon_v = float(estimator.settings["epsilon_v"][0])
-    margin = recorded["stability_margin"] - float(estimator.settings["margin_guard"][0])
+    unstable_soc = np.maximum(recorded["delta_1"], recorded["delta_2"])
+    margin = recorded["soc"] - unstable_soc - float(estimator.settings["margin_guard"][0])
     window = averaging_window(
         recorded["time_s"],
         error,

@@ -268,9 +268,9 @@ def result_table(title: str, result: ReplayResult) -> Table:
         "duration": _number_text(result.duration_s, ",.1f", "s"),
         **({} if is_fuel_cell else _soc_rows(result)),
         "innovation, RMS": _number_text(result.innovation_rms_v, ".3f", "mV", 1e3),
-        "voltage error, RMS": _number_text(result.voltage_rms_error_v, ".3f", "mV", 1e3),
-        "lock": lock_text,
-        "k at the end": _number_text(result.k_final, ".4g", "V²s"),
+        "observer: tracking error, RMS": _number_text(result.tracking_error_rms_v, ".3f", "mV", 1e3),
+        "observer: lock": lock_text,
+        "observer: k at the end": _number_text(result.k_final, ".4g", "V²s"),
         "speed": f"{_number_text(result.samples_per_s, ',.0f')} samples/s, {result.wall_s:.2f} s",
     }
     parameter_rows = {

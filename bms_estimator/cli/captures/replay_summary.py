@@ -17,7 +17,7 @@ from bms_estimator.pack.pack import Pack
 from bms_estimator.telemetry.cells import CELL_COLUMNS, make_cells_payload, weakest_cell_fields
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.stability_margin import applicable_margin
+from bms_estimator.telemetry.stability_margin import known_margin, missing_margin_reason
 from bms_estimator.telemetry.state import finite
 
 
@@ -44,10 +44,11 @@ class ReplayResult:
     """Standard deviation by the identifier; None if the identifier is off."""
     soc_rms_difference_to_coulomb: float | None
     innovation_rms_v: float | None
-    """RMS of measured minus predicted voltage, before the correction by the measurement."""
-    voltage_rms_error_v: float | None
-    """RMS of measured minus estimated voltage, after the correction by the measurement."""
+    """RMS of measured minus predicted voltage, before the correction by the measurement. Without the identifier, that of the observer."""
+    tracking_error_rms_v: float | None
+    """RMS of the observer's tracking error e, (3.15)."""
     lock_lost: bool
+    """True if the observer lost its lock."""
     lock_losses: int
     k_final: float | None
     """Adaptive gain of the observer at the end [V²s]."""
@@ -73,7 +74,9 @@ class ReplayResult:
     delta_2: float | None
     """SOC below which C_tl is negative, (2.12)."""
     stability_margin: float | None
-    """SOC at the end minus the larger of both; None where it does not apply (``applicable_margin``)."""
+    """SOC at the end minus the larger of both; None where ``stability_margin_reason`` has a reason, and for a fuel cell."""
+    stability_margin_std: float | None
+    stability_margin_reason: str | None
     capacity_ah: float | None
     """Learned capacity at the end [Ah]; None without the identifier."""
     capacity_std_ah: float | None
@@ -113,7 +116,7 @@ class Summary:
         self._duration_s = 0.0
         self._soc_known = False  # True if the SOC was known at the last row
         # sums of squares
-        self._innovation_sum = self._error_sum = self._soc_difference_sum = 0.0
+        self._innovation_sum = self._tracking_sum = self._soc_difference_sum = 0.0
 
     def add(self, trace: NDArray[np.void]) -> None:
         """Add a block of dtype TRACE."""
@@ -127,10 +130,9 @@ class Summary:
         self._last = trace[-1].copy()
         self._soc_known = bool(known_rows(trace, self._soc_known)[-1])
         self._row_count += trace.size
-        error_v = trace["voltage_v"] - trace["voltage_estimate_v"]
         soc_difference = trace["soc"] - trace["soc_coulomb"]
         self._innovation_sum += float(trace["innovation_v"] @ trace["innovation_v"])
-        self._error_sum += float(error_v @ error_v)
+        self._tracking_sum += float(trace["tracking_error_v"] @ trace["tracking_error_v"])
         self._soc_difference_sum += float(soc_difference @ soc_difference)
 
     def result(self, pack: Pack, short_limit_a: float, sample_count: int, wall_s: float) -> ReplayResult:
@@ -157,7 +159,7 @@ class Summary:
             soc_std_final=_finite_field(self._last, "soc_std"),
             soc_rms_difference_to_coulomb=self._rms(self._soc_difference_sum),
             innovation_rms_v=self._rms(self._innovation_sum),
-            voltage_rms_error_v=self._rms(self._error_sum),
+            tracking_error_rms_v=self._rms(self._tracking_sum),
             lock_lost=bool(observer["lock_losses"]),
             lock_losses=int(observer["lock_losses"]),
             k_final=finite(observer["k"]),
@@ -174,7 +176,7 @@ class Summary:
             parameters=_learned_parameters(estimator),
             delta_1=_finite_field(self._last, "delta_1"),
             delta_2=_finite_field(self._last, "delta_2"),
-            stability_margin=None if self._last is None else finite(applicable_margin(self._last, self._soc_known)),
+            **self._margin_fields(),
             capacity_ah=capacity.value * declared_ah if capacity else None,
             capacity_std_ah=capacity.std * declared_ah if capacity else None,
             fits=slow_fit.fits if slow_fit else 0,
@@ -184,6 +186,17 @@ class Summary:
             samples_per_s=sample_count / wall_s if wall_s > 0.0 else None,
             wall_s=wall_s,
         )
+
+    def _margin_fields(self) -> dict[str, Any]:
+        """Return the fields of ``ReplayResult`` with the stability margin at the last row."""
+        if self._last is None:
+            return dict.fromkeys(("stability_margin", "stability_margin_std", "stability_margin_reason"))
+        margin = finite(known_margin(self._last, self._soc_known))
+        return {
+            "stability_margin": margin,
+            "stability_margin_std": None if margin is None else finite(self._last["stability_margin_std"]),
+            "stability_margin_reason": missing_margin_reason(self._last, soc_known=self._soc_known),
+        }
 
     def _rms(self, sum_of_squares: float) -> float | None:
         return finite(math.sqrt(sum_of_squares / self._row_count)) if self._row_count else None

@@ -39,7 +39,7 @@ HOUR_SUMS = np.dtype(
         ("max_c", "f8"),
         ("innovations", "i8"),  # samples with an innovation
         ("sum_innovation_v2", "f8"),
-        ("min_margin", "f8"),  # soc - max(delta_1, delta_2)
+        ("min_margin", "f8"),  # soc - max(delta_1, delta_2), NaN if no sample has a margin
     ],
     align=True,
 )
@@ -106,9 +106,7 @@ def add_values(h: Record, x: Record) -> None:
     h.sum_a += x.current_a
     h.min_a = x.current_a if first else min(h.min_a, x.current_a)
     h.max_a = x.current_a if first else max(h.max_a, x.current_a)
-    # the margin applies only if the model is unstable below an SOC above 0
-    margin = x.stability_margin if max(x.delta_1, x.delta_2) > 0.0 else math.nan
-    h.min_margin = margin if first else np.fmin(h.min_margin, margin)
+    h.min_margin = x.stability_margin if first else np.fmin(h.min_margin, x.stability_margin)
     if math.isfinite(x.innovation_v):
         h.innovations += 1
         h.sum_innovation_v2 += x.innovation_v * x.innovation_v

@@ -58,6 +58,11 @@ ELEMENT_FIT = np.dtype(
     [
         ("a", "f8", PARAMETERS),  # a1..a15 at their own index
         ("std", "f8", PARAMETERS),  # standard errors, NaN without data
+        (
+            "delta_std",
+            "f8",
+            ELEMENTS,
+        ),  # standard error of ``delta`` of the element, (2.11) and (2.12); NaN without data
         ("bins", "i8", ELEMENTS),  # number of bins with data of the element
         ("soc", "f8", BINS),  # data of the last fit: SOC
         ("value", "f8", BINS),  # data of the last fit: element at ``soc``
@@ -113,11 +118,12 @@ def fit_element(m: Record, e: int, prior: Floats, fit: Record) -> None:
         for i in range(base, base + 3):
             fit.a[i] = prior[i]
             fit.std[i] = math.nan
+        fit.delta_std[e] = math.nan
         return
     exponent = _best_exponent(prior[base + 1], sign, x, y, w)
     amplitude, offset, _ = _linear_part(exponent, sign, x, y, w)
     fit.a[base], fit.a[base + 1], fit.a[base + 2] = amplitude, exponent, offset
-    _standard_errors(fit, base, sign, x, w, _common_variance(m, e))
+    fit.delta_std[e] = _standard_errors(fit, base, sign, x, w, _common_variance(m, e))
 
 
 @njit(cache=True)
@@ -266,11 +272,12 @@ def _common_variance(m: Record, e: int) -> float:
 
 
 @njit(cache=True)
-def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats, common: float) -> None:
-    """Write the standard errors; NaN if the matrix J' W J is singular.
+def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats, common: float) -> float:
+    """Write the standard errors, and return that of ln(amplitude / offset) / exponent; NaN if the matrix J' W J is singular.
 
     The variances are the diagonal of (J' W J)^-1, computed by elimination, for independent errors of the bins. Amplitude and
-    offset are proportional to the common factor of the bins, so that its relative variance ``common`` is added to theirs.
+    offset are proportional to the common factor of the bins, so that its relative variance ``common`` is added to theirs. It
+    cancels out of their ratio.
     """
     amplitude, exponent, offset = fit.a[base], fit.a[base + 1], fit.a[base + 2]
     # a weak prior keeps the matrix regular: each parameter has a std of 3 times its value
@@ -288,16 +295,21 @@ def _standard_errors(fit: Record, base: int, sign: float, x: Floats, w: Floats, 
     for i in range(base, base + 3):
         fit.std[i] = math.nan
     if not h00 > 0.0:
-        return
+        return math.nan
     l10, l20 = h01 / h00, h02 / h00
     d1 = h11 - l10 * h01
     if not d1 > 0.0:
-        return
+        return math.nan
     l21 = (h12 - l10 * h02) / d1
     d2 = h22 - l20 * h02 - l21 * l21 * d1
     if not d2 > 0.0:
-        return
+        return math.nan
     amplitude_variance = 1.0 / h00 + l10 * l10 / d1 + (l10 * l21 - l20) ** 2 / d2
     fit.std[base] = math.sqrt(amplitude_variance + common * amplitude * amplitude)
     fit.std[base + 1] = math.sqrt(1.0 / d1 + l21 * l21 / d2)
     fit.std[base + 2] = math.sqrt(1.0 / d2 + common * offset * offset)
+    # gradient of ln(amplitude / offset) / exponent, and the solution of L z = gradient with J' W J = L D L'
+    z0 = 1.0 / (amplitude * exponent)
+    z1 = -math.log(amplitude / offset) / (exponent * exponent) - l10 * z0
+    z2 = -1.0 / (offset * exponent) - l20 * z0 - l21 * z1
+    return math.sqrt(z0 * z0 / h00 + z1 * z1 / d1 + z2 * z2 / d2)

@@ -169,12 +169,16 @@ class Estimate(Payload):
         float | None, Quantity(total_entity("Equivalent cycles", None, 2), packs="batteries")
     ] = Field(description="charge_out_ah divided by the rated capacity; null for a fuel cell")
     voltage_estimate_v: Annotated[float | None, Quantity(raw_entity("Estimated voltage", "V", 2, "voltage"))] = Field(
-        description="terminal voltage of the observer, (4.1) [V]"
+        description="terminal voltage that the identifier's filter predicts before the correction, at its last update [V]; without the "
+        "identifier and for a fuel cell the observer's, after the correction"
     )
     innovation_v: Annotated[float | None, Quantity(raw_entity("Innovation", "V", 3, "voltage"))] = Field(
-        description="measured minus predicted voltage before the correction [V]"
+        description="measured minus predicted voltage at the filter's last update [V]: the error of the model; without the identifier and "
+        "for a fuel cell equal to tracking_error_v"
     )
-    tracking_error_v: float | None = Field(description="tracking error e of the observer, (3.15) [V]")
+    tracking_error_v: float | None = Field(
+        description="the observer's tracking error e, (3.15) [V]; it is small even with a wrong model"
+    )
     delta_1: Annotated[
         float | None, Quantity(raw_entity("delta 1", None, 4), packs="batteries", prometheus="ratio")
     ] = Field(description="SOC below which C_ts is negative, (2.11)")
@@ -182,13 +186,20 @@ class Estimate(Payload):
         float | None, Quantity(raw_entity("delta 2", None, 4), packs="batteries", prometheus="ratio")
     ] = Field(description="SOC below which C_tl is negative, (2.12)")
     delta_configured: bool = Field(
-        description="true: delta_1 and delta_2 are constants of the cell file, because the learning law does not change the "
-        "shape of C_ts and C_tl over SOC"
+        description="true: delta_1 and delta_2 follow from the cell file and its bounds alone; false: the identifier has changed them by data, "
+        "or a fuel cell, which has neither"
     )
     stability_margin: Annotated[
         float | None, Quantity(raw_entity("Stability margin", None, 3), packs="batteries", prometheus="ratio")
     ] = Field(
-        description="soc - max(delta_1, delta_2); null unless soc_known is true and delta_1 or delta_2 is above 0"
+        description="soc - max(delta_1, delta_2), the distance to the SOC below which the thesis's model is not valid; null with a "
+        "stability_margin_reason, and for a fuel cell"
+    )
+    stability_margin_std: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
+        description="standard deviation of stability_margin"
+    )
+    stability_margin_reason: str | None = Field(
+        description="reason why stability_margin is null: the SOC is not known, neither delta_1 nor delta_2 is above 0, or a7..a12 are not valid"
     )
     adaptive_gain_k: Annotated[float | None, Quantity(raw_entity("Adaptive gain k", "V²s", 6))] = Field(
         description="adaptive gain state k, (3.13) [V^2 s]"
@@ -199,8 +210,10 @@ class Estimate(Payload):
     adaptation_gain_hz: Annotated[float | None, Quantity(raw_entity("Adaptation gain", "1/s", 4))] = Field(
         description="gamma k of the learning law [1/s]; null with a law of the thesis"
     )
-    converged: bool = Field(description="|tracking_error_v| is below eps2 of Algorithm 1")
-    lock: bool = Field(description="the observer tracks the measured voltage")
+    converged: bool = Field(description="the observer's |tracking_error_v| is below eps2 of Algorithm 1")
+    lock: bool = Field(
+        description="the observer tracks the measured voltage; this does not show that the model is right"
+    )
     frames_received: Annotated[int, Quantity(prometheus="counter")] = Field(description="valid frames since start")
     frames_lost: Annotated[int, Quantity(counter_entity("Frames lost"), prometheus="counter")] = Field(
         description="missing frames by sequence number since start"

@@ -12,7 +12,10 @@ class Parameter(Payload):
 
     value: float | None = Field(description="value in the unit of its name, or in ``unit``")
     std: float | None = Field(description="standard deviation in the same unit; null if unknown")
-    valid: bool = Field(description="true: data support the value; a configured value is never valid")
+    valid: bool = Field(
+        description="true: data have determined the value, with a std below the limit that ``reason`` gives otherwise; a7..a12 also need time "
+        "constants from data. A configured value is never valid"
+    )
     source: Literal["configured", "identified"]
     updated: str | None = Field(default=None, description="time of the last informative data, ISO 8601, UTC")
     reason: str | None = Field(default=None, description="reason why the value is not valid, with numbers")

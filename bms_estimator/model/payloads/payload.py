@@ -8,7 +8,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict
 
-PAYLOAD_VERSION = 2
+PAYLOAD_VERSION = 3
 """Version of all payloads; ``sinks/mqtt/topics.py`` defines when it increases."""
 
 

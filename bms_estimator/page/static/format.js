@@ -35,6 +35,8 @@ export const percent = (x, decimals = 1) => (isNumber(x) ? fixed(100 * x, decima
 export const ampereHours = (x) => unit(plain(x), "Ah");
 export const wattHours = (x) =>
 	Math.abs(x) >= 9999.5 ? unit(plain(x / 1e3), "kWh") : unit(fixed(x, Math.abs(x) < 9.995 ? 2 : Math.abs(x) < 999.5 ? 1 : 0), "Wh");
+/** δ₁ and δ₂ in percent of SOC. */
+export const deltas = (s) => [s.delta_1, s.delta_2].map((d, i) => isNumber(d) && `δ${"₁₂"[i]} ${percent(d)} %`).filter(Boolean).join(", ");
 
 /** Hours and minutes; only minutes below an hour, days from two days on. */
 export function duration(seconds) {

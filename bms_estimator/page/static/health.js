@@ -11,12 +11,14 @@ export function drawHealth({ topics: { health: h, info, state } }) {
 		$("suspects").replaceChildren(...(faults.length ? faults.map((w) => node("li", { class: "bad" }, w)) : [node("li", { class: "good" }, "Nothing is suspected of the input.")]));
 	}
 	const of = (x, unit) => f.isNumber(x) && `${f.digits(x, 3)} ${unit}`;
+	const e = f.millivolts(state?.tracking_error_v);
+	const tracking = e && `${state.lock ? "in" : "no"} lock, ${state.converged ? "converged" : "converging"}, e ${e}`;
 	const facts = {
 		Sensor: h.sensor_online ? "online" : "offline", "Sample rate": of(state?.sample_rate_hz, "Hz"), Frames: h.line?.frames_received,
 		"Frames lost": h.line?.frames_lost, "Wrong checksums": h.line?.crc_errors, "Line reopened": h.reconnects,
 		"Latency, median": of(1e3 * h.loop?.latency_p50_s || null, "ms"), "Board's clock": of(h.clock_ppm, "ppm"), "Observer's gain N": of(state?.nussbaum_gain, ""), Broker: h.broker_trouble,
 		"Waiting for it": h.publish_waiting, Disk: h.store_trouble, Checkpoint: h.checkpoint, "Running for": f.duration(h.uptime_s),
-		Crashes: h.total?.crashes, Version: info?.version,
+		Crashes: h.total?.crashes, Observer: tracking, "Observer, N(k)": f.digits(state?.nussbaum_gain, 3), "Observer, limits": f.deltas(state ?? {}), Version: info?.version,
 	};
 	for (const [name, value] of Object.entries(facts)) {
 		const row = (rows[name] ??= $("facts").appendChild(node("div", {}, node("dt", {}, name), node("dd", {}))));

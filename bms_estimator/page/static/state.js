@@ -32,7 +32,8 @@ export function drawState(state) {
 	put("time_left_label", label);
 	put("time_left_band", band);
 	put("way", s.current_a > 0 ? "discharging" : s.current_a < 0 ? "charging" : "at rest");
-	put("lock", `${s.lock ? "in lock" : "no lock"}, ${s.converged ? "converged" : "converging"}`);
+	put("stability_margin_std", f.percent(2 * (s.stability_margin_std ?? NaN)));
+	put("innovation_of", f.isNumber(state.soc_std) ? "measured − predicted" : "of the observer"); // without the identifier
 	hide($("soc"), !known);
 	hide($("unknownsoc"), known);
 	hide($("scale"), !known);
@@ -40,7 +41,7 @@ export function drawState(state) {
 }
 
 function drawScale(s) {
-	const known = [s.delta_1, s.delta_2].filter(f.isNumber), invalid = Math.max(0, ...known), band = 2 * (s.soc_std ?? 0);
+	const invalid = f.isNumber(s.stability_margin) ? Math.max(s.delta_1, s.delta_2) : 0, band = 2 * (s.soc_std ?? 0);
 	const place = (id, name, x) => {
 		const value = `${(100 * clip(x)).toFixed(2)}%`, element = $(id);
 		if (element[name] !== value) element.style[name] = element[name] = value;
@@ -53,8 +54,8 @@ function drawScale(s) {
 	for (const [id, x] of [["invalid", invalid], ["invalidmark", invalid], ["d1", s.delta_1], ["d2", s.delta_2]]) place(id, id === "invalid" ? "width" : "left", x ?? 0);
 	attribute($("invalidmark"), "class", invalid > 0.5 ? "left" : "");
 	put("invalid_below", f.percent(invalid));
-	put("deltas", [s.delta_1, s.delta_2].map((d, i) => f.isNumber(d) && `δ${"₁₂"[i]} ${f.percent(d)} %`).filter(Boolean).join(", "));
+	put("deltas", f.deltas(s));
 	attribute($("fill"), "class", s.soc <= 0.1 ? "bad" : s.soc < 0.2 ? "low" : "");
 	attribute($("scale"), "aria-valuenow", String(Math.round(100 * s.soc)));
-	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %${invalid > 0 ? `; model not valid below ${f.percent(invalid, 0)} %` : ""}`);
+	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %${invalid > 0 ? `; the thesis's model is not valid below ${f.percent(invalid, 0)} %` : ""}`);
 }

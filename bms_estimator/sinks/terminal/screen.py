@@ -45,7 +45,7 @@ def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:
     table.add_column(f"State at\n{clock_text(view.now_s)}", no_wrap=True)
     is_wide = width >= MIN_WIDE_TABLE_CELLS
     remaining = ("Remaining\nAh",) if is_wide else ()
-    for heading in ("Voltage\nV", "Current\nA", "Power\nW", *remaining, "To cut-off\nh, 90 %", "Stability\nmargin"):
+    for heading in ("Voltage\nV", "Current\nA", "Power\nW", *remaining, "To cut-off\nh, 90 %", "Innovation\nmV"):
         table.add_column(heading, justify="right", no_wrap=True)
     state, is_stale = pack.fields("state"), pack.stale_since() is not None
     table.add_row(
@@ -58,7 +58,7 @@ def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:
         state.number_text("power_w", "+.2f"),
         *([state.number_text("remaining_capacity_ah", ".3f")] if is_wide else []),
         cutoff_band_text(state),
-        "NO LOCK" if state and not state.flag("lock") else state.number_text("stability_margin", ".4f"),
+        state.number_text("innovation_v", "+.1f", 1e3),
         style="dim" if is_stale else "",
     )
     return table

@@ -36,8 +36,8 @@ def _state_line(device: str, state: JsonFields, true_soc: float | None) -> str:
         f"{number('voltage_v', '.3f')} V  {number('current_a', '+.3f')} A  {number('power_w', '+.2f')} W  "
         f"to cut-off {cutoff}  margin {number('stability_margin', '.4f')}  "
         f"delta1 {number('delta_1', '.4f')}  delta2 {number('delta_2', '.4f')}  "
+        f"innovation {number('innovation_v', '+.2f', 1e3)} mV  observer {'in' if state.flag('lock') else 'OUT OF'} lock, "
+        f"{'converged' if state.flag('converged') else 'converging'}, e {number('tracking_error_v', '+.2f', 1e3)} mV  "
         f"{gain}  k {number('adaptive_gain_k', '.3g')}  "
-        f"innovation {number('innovation_v', '+.2f', 1e3)} mV  {'lock' if state.flag('lock') else 'NO LOCK'}  "
-        f"{'converged' if state.flag('converged') else 'converging'}  "
         f"frames {state.count('frames_received')}  lost {state.count('frames_lost')}"
     )

@@ -7,22 +7,16 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import ForecastRows
-from bms_estimator.kernels.accumulators.soc_certainty import MIN_UNKNOWN_STD, known_rows
+from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.alarm_list import AlarmList
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
-from bms_estimator.telemetry.stability_margin import applicable_margin
+from bms_estimator.telemetry.stability_margin import UNKNOWN_SOC, known_margin, missing_margin_reason
 
 MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV
 """Input faults that raise ``model_mismatch``."""
-SOC_ALARMS: tuple[AlarmName, ...] = ("soc_low", "stability_margin_low")
-"""Alarms that need a known SOC. The probability of ``collapse_risk`` includes the uncertainty of the SOC."""
-UNKNOWN_SOC = f"the SOC is not known yet: it is known once its standard deviation has fallen below {100.0 * MIN_UNKNOWN_STD:.0f} %"
-"""Reason of ``SOC_ALARMS``."""
-NO_MARGIN = "the margin does not apply: the cell model is stable at each SOC"
-"""Reason of ``stability_margin_low`` with a known SOC."""
 
 
 class EstimateAlarms:
@@ -72,15 +66,17 @@ def estimated_values(
 ) -> dict[AlarmName, Floats]:
     """Return the values of the alarms on estimates, each of shape (n,). Values that need an unknown SOC are NaN.
 
+    Without a margin, ``stability_margin_low`` has an infinite value, which ends an alarm that an earlier margin raised.
+
     Args:
         trace: Shape (n,), dtype TRACE.
         is_mismatch: True where the filter suspects a wrong cell model, or the observer is out of lock; shape (n,).
         soc_known: True where the SOC is known, shape (n,).
     """
-    std = trace["soc_std"]
+    std, has_margin = trace["soc_std"], ~np.isnan(trace["stability_margin"]) | np.isnan(trace["soc"])
     return {
         "soc_low": np.where(soc_known, trace["soc"] - np.where(np.isnan(std), 0.0, std), np.nan),
-        "stability_margin_low": applicable_margin(trace, soc_known),
+        "stability_margin_low": np.where(has_margin, known_margin(trace, soc_known), np.inf),
         "model_mismatch": np.where(is_mismatch, np.inf, np.abs(trace["innovation_v"])),
     }
 
@@ -88,7 +84,7 @@ def estimated_values(
 def find_unknown(row: np.void, *, soc_known: bool) -> dict[AlarmName, str]:
     """Return the alarms whose value is not known although the quantities that they need are measured, each with the reason.
 
-    A fuel cell has no such alarm, because it has no SOC.
+    A fuel cell has no such alarm, because it has no SOC. The probability of ``collapse_risk`` includes the uncertainty of the SOC.
 
     Args:
         row: The last estimate, dtype TRACE.
@@ -96,9 +92,11 @@ def find_unknown(row: np.void, *, soc_known: bool) -> dict[AlarmName, str]:
     """
     if math.isnan(row["soc"]):
         return {}
-    if not soc_known:
-        return dict.fromkeys(SOC_ALARMS, UNKNOWN_SOC)
-    return {"stability_margin_low": NO_MARGIN} if np.isnan(applicable_margin(row, soc_known)) else {}
+    reasons: dict[AlarmName, str | None] = {
+        "soc_low": None if soc_known else UNKNOWN_SOC,
+        "stability_margin_low": missing_margin_reason(row, soc_known=soc_known),
+    }
+    return {name: reason for name, reason in reasons.items() if reason}
 
 
 def collapse_risks(forecasts: ForecastRows, is_charging: np.ndarray) -> Floats:

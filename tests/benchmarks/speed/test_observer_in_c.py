@@ -28,7 +28,7 @@ def test_the_observer_in_c_gives_the_results_of_the_kernel(settings, tmp_path):
     trace = np.zeros(block.size, dtype=TRACE)
     rows = ObserverInC(tmp_path).run(c_estimator.state, c_estimator.settings, block, trace)
     assert rows == expected.size == block.size - 10
-    for name in ("soc", "voltage_estimate_v", "innovation_v", "nussbaum_gain", "k", "delta_1", "stability_margin"):
+    for name in ("soc", "voltage_estimate_v", "innovation_v", "nussbaum_gain", "k", "delta_1", "delta_2"):
         np.testing.assert_allclose(trace[name][:rows], expected[name], rtol=1e-9, atol=1e-12, err_msg=name)
     assert np.array_equal(trace["lock"][:rows], expected["lock"])
     assert c_estimator.state["dropped_not_finite"][0] == 10

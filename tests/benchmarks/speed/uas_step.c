@@ -333,7 +333,7 @@ static void write_row(trace_t *row, const state_t *s, const settings_t *p, const
     row->k = s->k;
     row->delta_1 = s->delta_1;
     row->delta_2 = s->delta_2;
-    row->stability_margin = s->soc - fmax(s->delta_1, s->delta_2);
+    row->stability_margin = row->stability_margin_std = NAN;
     row->lock = s->lock;
     row->converged = fabs(s->innovation_v) < p->epsilon_v;
     row->soc_coulomb = s->soc_coulomb;

@@ -302,11 +302,7 @@ class TestPublishedMessages:
         result = stream.send("a", one_block(samples[580:600], 30))
         state = Estimate.model_validate_json(result.state)
         last = make_estimator(SETTINGS, CELL).run(samples[:600])[-1]
-        assert (state.soc, state.soc_std, state.stability_margin) == (
-            last["soc"],
-            last["soc_std"],
-            last["stability_margin"],
-        )
+        assert (state.soc, state.soc_std, state.delta_1) == (last["soc"], last["soc_std"], last["delta_1"])
         assert state.voltage_v == pytest.approx(samples["voltage_v"][580:600].mean())
         steps_ah = 0.5 * (samples["current_a"][:599] + samples["current_a"][1:600]) / 3600.0
         assert state.charge_out_ah - state.charge_in_ah == pytest.approx(steps_ah.sum())

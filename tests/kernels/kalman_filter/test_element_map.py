@@ -68,10 +68,29 @@ def test_true_offsets_lie_within_three_standard_errors() -> None:
         assert abs(fit["a"][i] - TRUTH[i]) < 3 * fit["std"][i] < 0.2 * TRUTH[i]
 
 
+def test_the_std_of_delta_is_that_of_linear_error_propagation_without_the_common_factor() -> None:
+    table, fit, c_ts = fill_map(0.02, 1.0, noise=0.01), np.zeros(1, dtype=ELEMENT_FIT), 2
+    fit_element(table[0], c_ts, TRUTH, fit[0])
+    amplitude, exponent, offset = fit[0]["a"][7:10]
+    decay = np.exp(-exponent * fit[0]["soc"])
+    jacobian = np.column_stack([-decay, fit[0]["soc"] * amplitude * decay, np.ones(BINS)])
+    prior = np.diag((3.0 * np.array([amplitude, exponent, offset])) ** -2)
+    covariance = np.linalg.inv(jacobian.T @ (fit[0]["weight"][:, None] * jacobian) + prior)
+
+    def delta_of(a: np.ndarray) -> float:
+        return chen_mora.delta(a[1], a[2], a[0])
+
+    a = np.array([amplitude, exponent, offset])
+    steps = np.diag(1e-6 * a)
+    gradient = np.array([(delta_of(a + step) - delta_of(a - step)) / (2.0 * step.sum()) for step in steps])
+    assert fit[0]["delta_std"][c_ts] == pytest.approx(math.sqrt(gradient @ covariance @ gradient), rel=1e-6)
+
+
 def test_an_empty_map_gives_the_prior_values_without_std() -> None:
     fit = fit_map(np.zeros(1, dtype=ELEMENT_MAP), TRUTH)
     assert list(fit["bins"]) == [0] * ELEMENTS
     assert fit["a"][1:] == pytest.approx(TRUTH[1:16])
+    assert np.isnan(fit["delta_std"]).all()
     assert np.isnan(fit["std"][1:]).all()
 
 

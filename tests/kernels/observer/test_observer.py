@@ -222,7 +222,6 @@ def test_adaptation_stops_below_delta1_and_delta2_and_the_stop_is_reported() -> 
     samples["current_a"] *= 1.2  # the counted SOC reaches 0 before the true SOC does
     trace = estimator.run(samples)
     assert trace["soc"][-1] < max(trace["delta_1"][-1], trace["delta_2"][-1])
-    assert trace["stability_margin"][-1] < 0
     assert estimator.state["adapting"][0] == 0
     assert np.isfinite(trace["voltage_estimate_v"]).all()
     assert np.isfinite(estimator.state["a"][0]).all()

@@ -17,7 +17,15 @@ from tests.sinks.snapshots import CELL_SNAPSHOT, NOW, SNAPSHOT_WITHOUT_SAMPLES, 
 
 LOG = [f"12:00:0{n}Z [warning] faults on the line frames_lost={n} crc_errors={n} overruns={n}" for n in range(5)]
 HINT = "live page: http://127.0.0.1:8765/; in a second terminal: mosquitto_sub -p 18833 -t 'bms/#' -v"
-ESTIMATE = {"soc_percent": 50.0, "soc_std": 0.02, "voltage_v": 24.123, "current_a": 12.5, "power_w": 301.54}
+ESTIMATE = {
+    "soc_percent": 50.0,
+    "soc_std": 0.02,
+    "voltage_v": 24.123,
+    "current_a": 12.5,
+    "power_w": 301.54,
+    "innovation_v": -0.0543,
+    "tracking_error_v": 0.0027,
+}
 
 
 def pack_view(topics: dict[str, Any] | None = None, snapshot: Snapshot = CELL_SNAPSHOT) -> PackView:
@@ -68,12 +76,17 @@ def test_an_soc_that_is_not_known_is_not_shown_as_a_number() -> None:
     assert "soc 50.00 ± 4.00 %" in (text_line(DeviceMessage("pack", "state", state | {"soc_known": True})) or "")
 
 
+def test_a_line_of_text_has_the_lock_and_the_error_under_the_name_of_the_observer() -> None:
+    line = text_line(DeviceMessage("pack", "state", ESTIMATE | {"lock": True, "converged": False})) or ""
+    assert "  innovation -54.30 mV  observer in lock, converging, e +2.70 mV  " in line
+
+
 def test_80_by_24_cells_show_a_pack_with_three_alarms_and_the_log_and_the_hint() -> None:
     alarms = alarm("soc_low", "warning") | alarm("cell_over_voltage", "critical") | alarm("cell_imbalance", "warning")
     topics = alarms | alarm("link_lost", "critical", active=False) | {"state": ESTIMATE}
     view = ViewState(NOW, pack_view(topics), LOG, HINT, true_soc=0.497)
     text = " ".join(" ".join(lines_of(view, 80, 24)).split())
-    assert "pack 50.00 ± 4.00 49.70 live 24.123 +12.500 +301.54 - NO LOCK" in text
+    assert "pack 50.00 ± 4.00 49.70 live 24.123 +12.500 +301.54 - -54.3" in text
     assert LOG[-1][:50] in text
     assert HINT in text
     critical_at = text.index("critical since 2024-05-01T12:00:00.000Z: cell_over_voltage: 12.3 % is below the limit")
