@@ -182,8 +182,8 @@ async def test_page_shows_the_published_values_with_units(browser: Browser, prog
         await publish_state(programs.live, **STATE_VALUES)
         await page_tab.until_text("soc", SHOWN_TEXTS["soc"])
         assert {name: await page_tab.text(name) for name in SHOWN_TEXTS} == SHOWN_TEXTS
-        gain = page_tab.page.locator("#facts div", has_text="Observer's gain N")
-        assert await gain.inner_text() == "Observer's gain N\n0.97"
+        gain = page_tab.page.locator("#facts div", has_text="Observer, N(k)")
+        assert await gain.inner_text() == "Observer, N(k)\n0.97"
         meter = page_tab.page.get_by_role("meter", name="State of charge")
         assert await meter.get_attribute("aria-valuenow") == "43"
         cell = page_tab.page.get_by_role("img", name="cell 4: 3.269 V, lowest")
