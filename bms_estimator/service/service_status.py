@@ -12,7 +12,7 @@ from bms_estimator.telemetry.pack_model import NO_FIT, FitTimes
 
 @dataclass
 class ServiceStatus:
-    """What the parts of the service report; each part writes its own fields."""
+    """Reports of the parts of the service. Each part writes its own fields."""
 
     delivery: DeliveryStats = field(default_factory=DeliveryStats)
     """Counters of sent messages and received requests."""

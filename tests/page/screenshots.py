@@ -148,10 +148,13 @@ async def main() -> None:
         folder = Path(temporary)
         async with chromium() as browser:
             await shoot_setup(folder, browser)
-        await record_history(folder / "attic.sqlite", make_day_before())
         broker = Broker(folder).start()
         try:
             async with Service(folder, broker, free_port(), simulated(soc=END_SOC)) as service, chromium() as browser:
+                # after the first start, because a history without saved alarms would raise alarm_state_lost
+                await service.kill()
+                await record_history(folder / "attic.sqlite", make_day_before())
+                await service.start()
                 await shoot_all(service, browser)
         finally:
             broker.stop()
