@@ -12,6 +12,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition
 from bms_estimator.pack_model.equations import Equations
 from bms_estimator.pack_model.exchange import is_exchanged
+from bms_estimator.pack_model.intervals import DAY_S
 from bms_estimator.pack_model.prediction import Reference
 from bms_estimator.pack_model.solve import Minimum, minimize, single_threaded
 from bms_estimator.pack_model.unknowns import CURVE_NODES, SCALES, SHAPE_NODES
@@ -19,6 +20,8 @@ from bms_estimator.pack_model.unknowns import CURVE_NODES, SCALES, SHAPE_NODES
 STARTS = ((0.0, 0.0), (0.08, 0.0), (-0.08, 0.0), (0.16, 0.0), (-0.16, 0.0), (0.0, 0.08), (0.0, -0.08))
 """Starts of the minimization: shift of all SOCs, and ln of the true over the declared capacity. The cost of a flat curve has
 several minima over the SOC."""
+REACH_SOC, REACH_STD = 0.02, 4.0
+"""Largest shift of a start near a previous fit: an SOC plus a multiple of the std of its SOC."""
 LIKELIHOOD_EXPONENT = 0.5
 """Exponent of the likelihood in the weights of minima. It is below 1, because errors of different passes are not quite
 independent."""
@@ -148,9 +151,19 @@ def distinct_minima(equations: Equations, from_starts: list[Floats]) -> list[Min
 
 
 def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
-    """Return the starts of the minimization: those near the previous fit, then those around the filter's SOC."""
-    results = [] if previous is None else starts_near(equations, previous)
+    """Return the starts of the minimization: those near the previous fit, then those around the filter's SOC.
+
+    A shift that exceeds the uncertainty of the previous fit is left out, except in the first fit of a day and after a gap.
+    """
+    results, reach = [], math.inf
+    if previous is not None:
+        results = starts_near(equations, previous)
+        last = equations.rows[-1]
+        if last["segment"] == previous.segment and last["elapsed_s"] // DAY_S == previous.elapsed_s // DAY_S:
+            reach = REACH_SOC + REACH_STD * math.sqrt(previous.covariance[SOC, SOC])
     for shift, ln_q in STARTS:
+        if abs(shift) > reach:
+            continue
         x = equations.prior.mean.copy()
         x[equations.u.soc] = filter_soc(equations, ln_q) + shift
         x[equations.u.ln_q] = ln_q

@@ -1,19 +1,21 @@
 """Vector of the slow fit's unknowns.
 
 SOC at the start, offset and capacity are unknowns of each interval of about a day. Offset and capacity change little from one
-interval to the next.
+interval to the next. The unknowns of one segment are the first, because their equations are sparse (``solve.cholesky``).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS, Values
+from bms_estimator.model.arrays import Floats
 
 CURVE_NODES, DIRECTION_NODES, SHAPE_NODES = 101, 51, 6
 """Number of SOC nodes of the OCV's error, of the error by direction, and of the error of the resistances."""
 DIRECTIONS = 3
 """Charge, rest and discharge."""
-RESISTANCE_GROUPS = (0, 1, 1, 1, 2, 2, 2)
-"""Group of each resistance: 0 series resistance, 1 RC pairs up to 30 s, 2 slower RC pairs. Those of a group share a scale."""
 SCALES = 1 + RESISTANCE_GROUPS[-1]
 """Number of groups of resistances."""
 
@@ -22,6 +24,10 @@ SCALES = 1 + RESISTANCE_GROUPS[-1]
 class Unknowns:
     """Positions of the unknowns in their vector, for K intervals and S segments."""
 
+    start_hysteresis: slice
+    """Fast and slow part of the hysteresis at the start of each segment."""
+    start_load: slice
+    """Load before the start of each segment, when the RC pairs are reset, in std (``prediction.START_LOAD_C``)."""
     soc: slice
     """SOC at the start of each interval."""
     offset: slice
@@ -36,10 +42,6 @@ class Unknowns:
     """Error of ln of all resistances at ``SHAPE_NODES`` SOCs, added to ``ln_r``."""
     hysteresis: slice
     """Factors on the file's hysteresis in its fast and in its slow part."""
-    start_hysteresis: slice
-    """Fast and slow part of the hysteresis at the start of each segment."""
-    start_load: slice
-    """Load before the start of each segment, when the RC pairs are reset, in std (``prediction.START_LOAD_C``)."""
     entropy: slice
     """Error of the OCV's temperature coefficient [V/K]."""
     arrhenius: slice
@@ -56,9 +58,32 @@ class Unknowns:
         """Number of unknowns."""
         return int(self.direction.stop)
 
+    @property
+    def first(self) -> NDArray[np.intp]:
+        """First column of each kind of unknown on which a voltage depends, for ``pack_voltage.voltage_derivatives``."""
+        parts = (self.start_hysteresis, self.start_load, self.soc, self.offset, self.ln_q, self.ln_r, self.aging, self.shape,
+                 self.hysteresis, self.entropy, self.arrhenius, self.curve, self.direction)  # fmt: skip
+        return np.array([part.start for part in parts], np.intp)
+
+    def values(self, x: Floats) -> Values:
+        """Return the unknowns ``x`` on which a voltage depends besides its SOC."""
+        return Values(
+            start_hysteresis=x[self.start_hysteresis].reshape(-1, 2),
+            start_load=x[self.start_load],
+            offset=x[self.offset],
+            r=np.exp(x[self.ln_r]),
+            aging=float(x[self.aging.start]),
+            shape=x[self.shape],
+            hysteresis=x[self.hysteresis],
+            entropy=float(x[self.entropy.start]),
+            arrhenius=float(x[self.arrhenius.start]),
+            curve=x[self.curve],
+            direction=x[self.direction].reshape(DIRECTIONS, -1),
+        )
+
     @classmethod
     def of(cls, intervals: int, segments: int) -> "Unknowns":
         """Return the positions for a number of intervals and segments."""
-        sizes = (intervals, intervals, intervals, SCALES, 1, SHAPE_NODES, 2, 2 * segments, segments, 1, 1, 1)
+        sizes = (2 * segments, segments, intervals, intervals, intervals, SCALES, 1, SHAPE_NODES, 2, 1, 1, 1)
         ends = np.cumsum([*sizes, CURVE_NODES, DIRECTIONS * DIRECTION_NODES]).tolist()
         return cls(*(slice(a, b) for a, b in zip([0, *ends], ends, strict=False)))

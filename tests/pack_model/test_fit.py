@@ -1,5 +1,7 @@
 """Fits of histories with known true values, and of unusual histories."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
@@ -9,7 +11,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.fit import LN_Q, LN_R, OFFSET, SOC, FitError, PackFit, fit
+from bms_estimator.pack_model.fit import LN_Q, LN_R, OFFSET, SOC, STARTS, FitError, PackFit, fit, starts
+from bms_estimator.pack_model.intervals import DAY_S
 from tests.pack_model.histories import (
     CAPACITY_AH,
     Truth,
@@ -145,6 +148,20 @@ def test_next_fit_starts_at_the_previous_one() -> None:
     second = fit(cell, rows, first)
     assert second.cost <= first.cost + 0.3
     assert abs(second.mean[SOC] - first.mean[SOC]) < std_of(first)[SOC]
+
+
+def test_starts_beyond_the_uncertainty_of_the_previous_fit_are_left_out() -> None:
+    """The first fit of a day, the first after a gap, and the first of all have all starts."""
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell), Truth())
+    first = fit(cell, np.concatenate([rows, reference_row(rows, end_soc(cell, rows, Truth()), 0.005)]))
+    assert std_of(first)[SOC] < 0.01
+    near = len(first.curves[:2])
+    equations = equations_of(cell, rows)
+    assert len(starts(equations, None)) == len(STARTS)
+    assert len(starts(equations, first)) == near + sum(shift == 0.0 for shift, _ in STARTS)
+    for earlier in (replace(first, elapsed_s=first.elapsed_s - DAY_S), replace(first, segment=first.segment - 1.0)):
+        assert len(starts(equations, earlier)) == near + len(STARTS)
 
 
 def all_rest(rows: np.ndarray) -> np.ndarray:
