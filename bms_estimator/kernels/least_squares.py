@@ -49,27 +49,18 @@ def eliminate_sparse(a: Floats, count: int) -> None:
 
 @njit(cache=True)
 def forward_substitution(lower: Floats, b: Floats) -> Floats:
-    """Return the solution y of L y = b, shape of ``b``: (n, m)."""
+    """Return the solution y of L y = b, shape (n,)."""
     y = b.copy()
-    for i in range(y.shape[0]):
-        for j in range(i):
-            factor = lower[i, j]
-            for k in range(y.shape[1]):
-                y[i, k] -= factor * y[j, k]
-        for k in range(y.shape[1]):
-            y[i, k] /= lower[i, i]
+    for i in range(y.size):
+        y[i] = (y[i] - np.sum(lower[i, :i] * y[:i])) / lower[i, i]
     return y
 
 
 @njit(cache=True)
 def backward_substitution(lower: Floats, y: Floats) -> Floats:
-    """Return the solution x of L^T x = y, shape of ``y``: (n, m)."""
+    """Return the solution x of L^T x = y, shape (n,)."""
     x = y.copy()
-    for i in range(x.shape[0] - 1, -1, -1):
-        for k in range(x.shape[1]):
-            x[i, k] /= lower[i, i]
-        for j in range(i):
-            factor = lower[i, j]
-            for k in range(x.shape[1]):
-                x[j, k] -= factor * x[i, k]
+    for i in range(x.size - 1, -1, -1):
+        x[i] /= lower[i, i]
+        x[:i] -= x[i] * lower[i, :i]
     return x

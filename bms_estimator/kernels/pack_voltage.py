@@ -4,7 +4,6 @@ Equation and symbols: docs/theory/pack-model.md. All voltages are of one cell.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +12,13 @@ from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
+CURVE_NODES, DIRECTION_NODES, SHAPE_NODES = 101, 51, 6
+"""Number of SOC nodes of the OCV's error, of the error by direction, and of the error of the resistances."""
 RESISTANCE_GROUPS = (0, 1, 1, 1, 2, 2, 2)
 """Group of each resistance: 0 series resistance, 1 RC pairs up to 30 s, 2 slower RC pairs. Those of a group share a scale."""
 MODEL_ROW = np.dtype(
     [
+        ("one_c_a", "f8"),  # current of 1 C [A]
         ("interval", "i8"),  # interval of the row
         ("segment", "i8"),  # segment of the row, counted from 0
         ("direction", "i8"),  # 0 charge, 1 rest, 2 discharge
@@ -38,42 +40,11 @@ COLUMNS = 20
 """Number of unknowns on which the voltage of one row depends."""
 
 
-class CellTables(NamedTuple):
-    """Curves of the cell file on evenly spaced SOCs 0..1."""
-
-    one_c_a: float
-    """Current of 1 C [A]."""
-    ocv_v: Floats
-    """OCV [V]."""
-    low_slope_v: float
-    """Slope of the OCV below SOC 0 [V per unit SOC]."""
-    high_slope_v: float
-    """Slope of the OCV above SOC 1 [V per unit SOC]."""
-    parts_ohm: Floats
-    """Parts of each resistance with the low, then with the high activation energy, shape (n, 2 * RESISTANCES) [ohm]."""
-    hysteresis_v: Floats
-    """Half of the difference of the OCV after charge and after discharge [V]."""
-    per_kelvin_v: Floats
-    """Temperature coefficient of the OCV [V/K]."""
-
-
-class Values(NamedTuple):
-    """Unknowns by kind, see ``pack_model.unknowns.Unknowns``."""
-
-    start_hysteresis: Floats
-    """Shape (segments, 2)."""
-    start_load: Floats
-    offset: Floats
-    r: Floats
-    """Factor on the resistances of each group: exp of the unknown ``ln_r``."""
-    aging: float
-    shape: Floats
-    hysteresis: Floats
-    entropy: float
-    arrhenius: float
-    curve: Floats
-    direction: Floats
-    """Shape (directions, nodes)."""
+START_H, START_LOAD, SOC, OFFSET, LN_Q, LN_R, AGING, SHAPE, HYSTERESIS, ENTROPY, ARRHENIUS, CURVE, DIRECTION = range(13)
+"""Kinds of unknowns in the order of their columns. ``first`` is an array of their first columns in the vector of unknowns."""
+FILE_HYSTERESIS, FILE_ENTROPY = 2 * RESISTANCES, 2 * RESISTANCES + 1
+"""Columns of the table of a cell file. The first are the parts of each resistance with the low, then with the high activation
+energy. Its rows are evenly spaced SOCs 0..1."""
 
 
 @njit(cache=True)
@@ -88,114 +59,107 @@ def node_below(soc: float, nodes: int) -> tuple[int, float]:
 
 
 @njit(cache=True)
-def interpolate(values: Floats, soc: float) -> float:
-    """Return a piecewise linear function with the given values at evenly spaced SOCs."""
-    below, high = node_below(soc, values.size)
-    return (1.0 - high) * values[below] + high * values[below + 1]
+def interpolate(values: Floats, start: int, nodes: int, soc: float) -> float:
+    """Return the piecewise linear function whose values at evenly spaced SOCs begin at ``values[start]``."""
+    below, high = node_below(soc, nodes)
+    return (1.0 - high) * values[start + below] + high * values[start + below + 1]
 
 
 @njit(cache=True)
-def pack_resistances(rows: NDArray[np.void], cell: CellTables, v: Values, soc: Floats) -> Floats:
-    """Return the resistances of the pack at the SOCs and temperatures of rows, shape (n, RESISTANCES) [ohm]."""
-    ohm = np.empty((soc.size, RESISTANCES))
+def resistances_and_currents(
+    rows: NDArray[np.void], table: Floats, x: Floats, first: NDArray[np.intp], soc: Floats
+) -> tuple[Floats, Floats]:
+    """Return resistances of the pack [ohm] and true currents through them [A], each of shape (n, RESISTANCES).
+
+    The true currents are without the sensor's offset, and with the load before the segment.
+    """
+    ohm, current_a = np.empty((soc.size, RESISTANCES)), np.empty((soc.size, RESISTANCES))
+    r = np.exp(x[first[LN_R] : first[LN_R] + 3])
     for j in range(soc.size):
-        row = rows[j]
-        below, high = node_below(soc[j], cell.parts_ohm.shape[0])
-        common = math.exp(interpolate(v.shape, soc[j]) + v.arrhenius * row.above_25_c_k + v.aging * row.aging_trend)
+        row, (below, high) = rows[j], node_below(soc[j], table.shape[0])
+        common = math.exp(
+            interpolate(x, first[SHAPE], SHAPE_NODES, soc[j])
+            + x[first[ARRHENIUS]] * row.above_25_c_k
+            + x[first[AGING]] * row.aging_trend
+        )
+        offset_a, load = x[first[OFFSET] + row.interval] * row.one_c_a, x[first[START_LOAD] + row.segment]
         for k in range(RESISTANCES):
-            weak_ohm = (1.0 - high) * cell.parts_ohm[below, k] + high * cell.parts_ohm[below + 1, k]
-            i = RESISTANCES + k
-            strong_ohm = (1.0 - high) * cell.parts_ohm[below, i] + high * cell.parts_ohm[below + 1, i]
-            ohm[j, k] = common * v.r[RESISTANCE_GROUPS[k]] * (row.weak * weak_ohm + row.strong * strong_ohm)
-    return ohm
-
-
-@njit(cache=True)
-def true_currents(rows: NDArray[np.void], one_c_a: float, v: Values) -> Floats:
-    """Return the currents without the sensor's offset, with the load before the segment, shape (n, RESISTANCES) [A]."""
-    current_a = np.empty((rows.size, RESISTANCES))
-    for j in range(rows.size):
-        row = rows[j]
-        offset_a, load = v.offset[row.interval] * one_c_a, v.start_load[row.segment]
-        for k in range(RESISTANCES):
+            scale, i = common * r[RESISTANCE_GROUPS[k]], RESISTANCES + k
+            weak_ohm = row.weak * ((1.0 - high) * table[below, k] + high * table[below + 1, k])
+            ohm[j, k] = scale * (weak_ohm + row.strong * ((1.0 - high) * table[below, i] + high * table[below + 1, i]))
             current_a[j, k] = row.current_a[k] - offset_a + load * row.start_load_a[k]
-    return current_a
+    return ohm, current_a
 
 
 @njit(cache=True)
-def hysteresis_states(rows: NDArray[np.void], v: Values) -> Floats:
-    """Return the fast and the slow part of the hysteresis, -1..1, shape (n, 2)."""
-    states = np.empty((rows.size, 2))
-    for j in range(rows.size):
-        row = rows[j]
-        for i in range(2):
-            states[j, i] = row.hysteresis[i] + row.start_h_decay[i] * v.start_hysteresis[row.segment, i]
-    return states
+def voltages(
+    rows: NDArray[np.void], table: Floats, x: Floats, first: NDArray[np.intp], soc: Floats, ocv_v: Floats
+) -> Floats:
+    """Return the voltages of rows, shape (n,) [V].
 
-
-@njit(cache=True)
-def voltages(rows: NDArray[np.void], cell: CellTables, v: Values, soc: Floats) -> Floats:
-    """Return the voltages of rows at the SOCs ``soc``, shape (n,) [V]. ``rows`` has the dtype MODEL_ROW."""
-    ohm, current_a = pack_resistances(rows, cell, v, soc), true_currents(rows, cell.one_c_a, v)
-    states, voltage_v = hysteresis_states(rows, v), np.empty(soc.size)
+    Args:
+        rows: Shape (n,), dtype MODEL_ROW.
+        table: Curves of the cell file, see ``FILE_HYSTERESIS``.
+        x: Unknowns.
+        first: First column of each kind of unknown.
+        soc: SOC of each row.
+        ocv_v: OCV of the cell file at these SOCs [V].
+    """
+    ohm, current_a = resistances_and_currents(rows, table, x, first, soc)
+    voltage_v = ocv_v.copy()
     for j in range(soc.size):
-        row, z = rows[j], soc[j]
-        ocv_v = interpolate(cell.ocv_v, z) + cell.low_slope_v * min(z, 0.0) + cell.high_slope_v * max(z - 1.0, 0.0)
-        ocv_v += interpolate(v.curve, z) + row.above_25_c_k * (v.entropy + interpolate(cell.per_kelvin_v, z))
-        state = v.hysteresis[0] * states[j, 0] + v.hysteresis[1] * states[j, 1]
-        ocv_v += row.hysteresis_factor * interpolate(cell.hysteresis_v, z) * state
-        ocv_v += row.direction_v * interpolate(v.direction[row.direction], z)
+        row, z, (below, high) = rows[j], soc[j], node_below(soc[j], table.shape[0])
+        entropy = (1.0 - high) * table[below, FILE_ENTROPY] + high * table[below + 1, FILE_ENTROPY]
+        voltage_v[j] += interpolate(x, first[CURVE], CURVE_NODES, z) + row.above_25_c_k * (x[first[ENTROPY]] + entropy)
+        voltage_v[j] += row.direction_v * interpolate(
+            x, first[DIRECTION] + row.direction * DIRECTION_NODES, DIRECTION_NODES, z
+        )
+        hysteresis_v = (1.0 - high) * table[below, FILE_HYSTERESIS] + high * table[below + 1, FILE_HYSTERESIS]
+        for i in range(2):
+            state = row.hysteresis[i] + row.start_h_decay[i] * x[first[START_H] + 2 * row.segment + i]
+            voltage_v[j] += x[first[HYSTERESIS] + i] * row.hysteresis_factor * hysteresis_v * state
         for k in range(RESISTANCES):
-            ocv_v -= ohm[j, k] * current_a[j, k]
-        voltage_v[j] = ocv_v
+            voltage_v[j] -= ohm[j, k] * current_a[j, k]
     return voltage_v
 
 
 @njit(cache=True)
 def voltage_derivatives(
-    rows: NDArray[np.void],
-    cell: CellTables,
-    v: Values,
-    soc: Floats,
-    by_soc: Floats,
-    first: NDArray[np.intp],
+    rows: NDArray[np.void], table: Floats, x: Floats, first: NDArray[np.intp], soc: Floats, by_soc: Floats
 ) -> tuple[NDArray[np.intp], Floats]:
     """Return the non-zero derivatives of the voltages by the unknowns: columns, increasing in each row, and values.
 
     Args:
         rows: Shape (n,), dtype MODEL_ROW.
-        cell: Curves of the cell file.
-        v: Unknowns.
+        table: Curves of the cell file, see ``FILE_HYSTERESIS``.
+        x: Unknowns.
+        first: First column of each kind of unknown.
         soc: SOC of each row.
         by_soc: Derivatives of the voltages by SOC, offset and ln_q of the interval at constant currents, shape (n, 3).
-        first: First column of start_hysteresis, start_load, soc, offset, ln_q, ln_r, aging, shape, hysteresis, entropy,
-            arrhenius, curve and direction.
     """
-    columns, values = np.empty((soc.size, COLUMNS), np.intp), np.empty((soc.size, COLUMNS))
-    ohm, current_a = pack_resistances(rows, cell, v, soc), true_currents(rows, cell.one_c_a, v)
-    states = hysteresis_states(rows, v)
+    columns, values = np.empty((soc.size, COLUMNS), np.intp), np.zeros((soc.size, COLUMNS))
+    ohm, current_a = resistances_and_currents(rows, table, x, first, soc)
     for j in range(soc.size):
-        row, at, d = rows[j], columns[j], values[j]
-        hysteresis_v = row.hysteresis_factor * interpolate(cell.hysteresis_v, soc[j])
+        row, at, d, (below, high) = rows[j], columns[j], values[j], node_below(soc[j], table.shape[0])
+        file_v = (1.0 - high) * table[below, FILE_HYSTERESIS] + high * table[below + 1, FILE_HYSTERESIS]
         for i in range(2):
-            at[i], d[i] = first[0] + 2 * row.segment + i, hysteresis_v * v.hysteresis[i] * row.start_h_decay[i]
-            at[12 + i], d[12 + i] = first[8] + i, hysteresis_v * states[j, i]
-        at[2], d[2] = first[1] + row.segment, 0.0
+            at[i], at[12 + i] = first[START_H] + 2 * row.segment + i, first[HYSTERESIS] + i
+            d[12 + i] = row.hysteresis_factor * file_v * (row.hysteresis[i] + row.start_h_decay[i] * x[at[i]])
+            d[i] = row.hysteresis_factor * file_v * x[at[12 + i]] * row.start_h_decay[i]
+        at[2], at[9] = first[START_LOAD] + row.segment, first[AGING]
         for i in range(3):
-            at[3 + i], d[3 + i] = first[2 + i] + row.interval, by_soc[j, i]
-            at[6 + i], d[6 + i] = first[5] + i, 0.0
+            at[3 + i], at[6 + i], d[3 + i] = first[SOC + i] + row.interval, first[LN_R] + i, by_soc[j, i]
         for k in range(RESISTANCES):
             d[2] -= ohm[j, k] * row.start_load_a[k]
-            d[4] += ohm[j, k] * cell.one_c_a  # the offset lowers the current through the resistances
+            d[4] += ohm[j, k] * row.one_c_a  # the offset lowers the current through the resistances
             d[6 + RESISTANCE_GROUPS[k]] -= ohm[j, k] * current_a[j, k]
-        by_common = d[6] + d[7] + d[8]
-        at[9], d[9] = first[6], row.aging_trend * by_common
-        at[14], d[14] = first[9], row.above_25_c_k
-        at[15], d[15] = first[10], row.above_25_c_k * by_common
-        _write_nodes(at, d, 10, first[7], soc[j], v.shape.size, by_common)
-        _write_nodes(at, d, 16, first[11], soc[j], v.curve.size, 1.0)
-        nodes = v.direction.shape[1]
-        _write_nodes(at, d, 18, first[12] + row.direction * nodes, soc[j], nodes, row.direction_v)
+        by_ln_r = d[6] + d[7] + d[8]
+        at[14], at[15] = first[ENTROPY], first[ARRHENIUS]
+        d[9], d[14], d[15] = row.aging_trend * by_ln_r, row.above_25_c_k, row.above_25_c_k * by_ln_r
+        _write_nodes(at, d, 10, first[SHAPE], soc[j], SHAPE_NODES, by_ln_r)
+        _write_nodes(at, d, 16, first[CURVE], soc[j], CURVE_NODES, 1.0)
+        by_direction = first[DIRECTION] + row.direction * DIRECTION_NODES
+        _write_nodes(at, d, 18, by_direction, soc[j], DIRECTION_NODES, row.direction_v)
     return columns, values
 
 

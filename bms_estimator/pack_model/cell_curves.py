@@ -11,7 +11,6 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     REFERENCE_C,
     RESISTANCES,
 )
-from bms_estimator.kernels.pack_voltage import CellTables
 from bms_estimator.model.arrays import Floats
 
 SOC_GRID = np.linspace(0.0, 1.0, GRID)
@@ -77,17 +76,8 @@ class CellCurves:
         self.offset_s = float(settings["offset_s"])
         """Correlation time of the drifting part of the current sensor's offset [s]."""
         self.offset_std_a = float(settings["offset_c"]) * self.one_c_a
-
-        self.tables = CellTables(
-            self.one_c_a,
-            self._ocv_v,
-            float(self._low_slope_v),
-            float(self._high_slope_v),
-            self._parts_ohm,
-            self.hysteresis_v,
-            self.per_kelvin_v,
-        )
-        """The curves as arguments of kernels."""
+        self.table = np.column_stack([self._parts_ohm, self.hysteresis_v, self.per_kelvin_v])
+        """Curves over ``SOC_GRID`` for the kernels, see ``pack_voltage.FILE_HYSTERESIS``."""
 
     def ocv(self, soc: Floats) -> Floats:
         """Return the OCV at 25 C [V], with linear extrapolation beyond SOC 0 and 1."""

@@ -93,7 +93,7 @@ class VoltageModel:
             rows["direction"] + 1.0,
         )
         terms["above_25_c_k"], terms["weak"], terms["strong"] = temperature_c - REFERENCE_C, weak, strong
-        terms["hysteresis_factor"] = arrhenius(HYSTERESIS_J, temperature_c)
+        terms["one_c_a"], terms["hysteresis_factor"] = cell.one_c_a, arrhenius(HYSTERESIS_J, temperature_c)
         terms["current_a"], terms["hysteresis"] = current_a, rows["hysteresis"]
         # the hysteresis at the start of the segment, an unknown, decays with the throughput
         terms["start_h_decay"] = np.exp(-rows["throughput_soc"][:, None] / np.array(HYSTERESIS_SOC))
@@ -145,7 +145,7 @@ class VoltageModel:
 
     def _voltages(self, x: Floats, z: Floats) -> Floats:
         """Return the voltages that ``x`` predicts if the rows' SOCs are ``z`` [V]."""
-        return voltages(self.rows, self.cell.tables, self.u.values(x), z)
+        return voltages(self.rows, self.cell.table, x, self.u.first, z, self.cell.ocv(z))
 
     def derivatives(self, x: Floats, p: Prediction, *, use_file_slope: bool) -> Derivatives:
         """Return the derivatives of the predicted voltages.
@@ -158,7 +158,7 @@ class VoltageModel:
         """
         slope_v = self.cell.slope(p.soc) if use_file_slope else self._slope_v(x, p.soc)
         by_soc = self.soc_derivatives(x)[1] * slope_v[:, None]
-        return voltage_derivatives(self.rows, self.cell.tables, self.u.values(x), p.soc, by_soc, self.u.first)
+        return voltage_derivatives(self.rows, self.cell.table, x, self.u.first, p.soc, by_soc)
 
     def _slope_v(self, x: Floats, z: Floats) -> Floats:
         """Return the slope of the predicted voltages over SOC [V per unit SOC], as a secant over the SOC range of a row.

@@ -27,8 +27,8 @@ NEGLIGIBLE_COST = 40.0
 """Excess of the cost over that of the best minimum at which a minimum is left out. Its weight in the mixture would be 5e-5."""
 STEP_FRACTIONS = (1.0, 0.4, 0.15, 0.05)
 """Fractions of a step that are tried before the damping is increased."""
-FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e3
-"""Relative damping of the diagonal at the start, and its limits."""
+FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-9
+"""Relative damping of the diagonal at the start, and its minimum."""
 LESS_DAMPING, MORE_DAMPING = 0.2, 100.0
 """Factors on the damping after a step that lowers the cost, and after a step that does not."""
 
@@ -58,8 +58,8 @@ class Minimum:
 
     def covariance_of(self, select: Floats) -> Floats:
         """Return the covariance of ``select`` @ x."""
-        half = forward_substitution(self.factor, select.T.copy())
-        return np.asarray(half.T @ half)
+        half = np.array([forward_substitution(self.factor, row) for row in select])
+        return np.asarray(half @ half.T)
 
 
 def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ()) -> Minimum | None:
@@ -71,7 +71,10 @@ def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ())
         full = step(normal, damping, equations.u)
         if 2.0 * (normal.b @ full) < CONVERGED:  # the linearized decrease
             break
-        trial = shortened_step(equations, now, full)
+        for fraction in STEP_FRACTIONS:
+            trial = equations.residuals(now.x + fraction * full)
+            if trial.cost < now.cost:
+                break
         decrease = now.cost - trial.cost
         if decrease > 0.0:
             now, damping = trial, max(LESS_DAMPING * damping, MIN_DAMPING)
@@ -82,21 +85,10 @@ def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ())
             normal = equations.normal_equations(now)
         else:
             damping = max(MORE_DAMPING * damping, FIRST_DAMPING)
-            if damping > MAX_DAMPING:
-                break
     if now.cost > limit or any(is_same(equations, now, other) for other in known):
         return None
     precision = equations.normal_equations(now, use_file_slope=True).a
     return Minimum(now.x, now.cost, cholesky(precision, equations.u.soc.start))
-
-
-def shortened_step(equations: Equations, now: Residuals, full: Floats) -> Residuals:
-    """Return the residuals after the longest part of a step that lowers the cost, or after the shortest part."""
-    for fraction in STEP_FRACTIONS:
-        trial = equations.residuals(now.x + fraction * full)
-        if trial.cost < now.cost:
-            break
-    return trial
 
 
 def is_same(equations: Equations, now: Residuals, other: Minimum) -> bool:
@@ -110,7 +102,7 @@ def step(normal: NormalEquations, damping: float, u: Unknowns) -> Floats:
     a = normal.a.copy()
     a.ravel()[:: u.size + 1] *= 1.0 + damping
     lower = cholesky(a, u.soc.start)
-    full = backward_substitution(lower, forward_substitution(lower, normal.b[:, None]))[:, 0]
+    full = backward_substitution(lower, forward_substitution(lower, normal.b))
     largest = float(np.abs(full[u.soc]).max())
     return full * min(1.0, MAX_STEP_SOC / largest) if largest > 0.0 else full
 

@@ -9,11 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS, Values
-from bms_estimator.model.arrays import Floats
+from bms_estimator.kernels.pack_voltage import CURVE_NODES, DIRECTION_NODES, RESISTANCE_GROUPS, SHAPE_NODES
 
-CURVE_NODES, DIRECTION_NODES, SHAPE_NODES = 101, 51, 6
-"""Number of SOC nodes of the OCV's error, of the error by direction, and of the error of the resistances."""
 DIRECTIONS = 3
 """Charge, rest and discharge."""
 SCALES = 1 + RESISTANCE_GROUPS[-1]
@@ -60,26 +57,10 @@ class Unknowns:
 
     @property
     def first(self) -> NDArray[np.intp]:
-        """First column of each kind of unknown on which a voltage depends, for ``pack_voltage.voltage_derivatives``."""
+        """First column of each kind of unknown on which a voltage depends, in the order of ``pack_voltage``."""
         parts = (self.start_hysteresis, self.start_load, self.soc, self.offset, self.ln_q, self.ln_r, self.aging, self.shape,
                  self.hysteresis, self.entropy, self.arrhenius, self.curve, self.direction)  # fmt: skip
         return np.array([part.start for part in parts], np.intp)
-
-    def values(self, x: Floats) -> Values:
-        """Return the unknowns ``x`` on which a voltage depends besides its SOC."""
-        return Values(
-            start_hysteresis=x[self.start_hysteresis].reshape(-1, 2),
-            start_load=x[self.start_load],
-            offset=x[self.offset],
-            r=np.exp(x[self.ln_r]),
-            aging=float(x[self.aging.start]),
-            shape=x[self.shape],
-            hysteresis=x[self.hysteresis],
-            entropy=float(x[self.entropy.start]),
-            arrhenius=float(x[self.arrhenius.start]),
-            curve=x[self.curve],
-            direction=x[self.direction].reshape(DIRECTIONS, -1),
-        )
 
     @classmethod
     def of(cls, intervals: int, segments: int) -> "Unknowns":

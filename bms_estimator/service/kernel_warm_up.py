@@ -13,12 +13,9 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.curve_change import return_to_cell_file
-from bms_estimator.pack_model.equations import Equations
+from bms_estimator.pack_model.fit import fit
 from bms_estimator.pack_model.learning import SlowFit
-from bms_estimator.pack_model.prediction import Reference
 from bms_estimator.pack_model.saved import neutral_fit
-from bms_estimator.pack_model.solve import minimize
-from bms_estimator.pack_model.unknowns import SCALES
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.kernel_subtrees import CELL, second_process
 from bms_estimator.service.pack_forecaster import load_forecast_kernels
@@ -73,7 +70,4 @@ def _load_fit_kernels(estimator: Estimator) -> None:
     """Call the kernels of the slow fit once, with a history of one row."""
     row = np.zeros(1, HISTORY_ROW)
     row["reference_soc"] = np.nan
-    equations = Equations(CellCurves(estimator.cell_file_settings), row, Reference(row["soc"], np.zeros(SCALES)))
-    minimum = minimize(equations, equations.prior.mean)
-    if minimum is not None:
-        minimum.covariance_of(np.eye(1, equations.u.size))
+    fit(CellCurves(estimator.cell_file_settings), row)

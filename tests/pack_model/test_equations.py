@@ -160,11 +160,10 @@ def test_normal_equations_sum_the_products_of_all_derivatives(equations: Equatio
     np.testing.assert_allclose(a, np.tril(expected), rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("columns", [1, 27])
-def test_triangular_solutions(columns: int) -> None:
+def test_triangular_solutions() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(40, 60))
-    a, b = root @ root.T, rng.normal(size=(40, columns))
+    a, b = root @ root.T, rng.normal(size=40)
     lower = np.linalg.cholesky(a)
     x = backward_substitution(lower, forward_substitution(lower, b))
     np.testing.assert_allclose(a @ x, b, rtol=1e-9, atol=1e-9)
