@@ -158,8 +158,9 @@ def voltage_derivatives(
         d[9], d[14], d[15] = row.aging_trend * by_ln_r, row.above_25_c_k, row.above_25_c_k * by_ln_r
         _write_nodes(at, d, 10, first[SHAPE], soc[j], SHAPE_NODES, by_ln_r)
         _write_nodes(at, d, 16, first[CURVE], soc[j], CURVE_NODES, 1.0)
-        by_direction = first[DIRECTION] + row.direction * DIRECTION_NODES
-        _write_nodes(at, d, 18, by_direction, soc[j], DIRECTION_NODES, row.direction_v)
+        _write_nodes(
+            at, d, 18, first[DIRECTION] + row.direction * DIRECTION_NODES, soc[j], DIRECTION_NODES, row.direction_v
+        )
     return columns, values
 
 

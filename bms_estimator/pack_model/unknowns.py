@@ -58,9 +58,9 @@ class Unknowns:
     @property
     def first(self) -> NDArray[np.intp]:
         """First column of each kind of unknown on which a voltage depends, in the order of ``pack_voltage``."""
-        parts = (self.start_hysteresis, self.start_load, self.soc, self.offset, self.ln_q, self.ln_r, self.aging, self.shape,
-                 self.hysteresis, self.entropy, self.arrhenius, self.curve, self.direction)  # fmt: skip
-        return np.array([part.start for part in parts], np.intp)
+        return np.array([part.start for part in (
+            self.start_hysteresis, self.start_load, self.soc, self.offset, self.ln_q, self.ln_r, self.aging, self.shape,
+            self.hysteresis, self.entropy, self.arrhenius, self.curve, self.direction)], np.intp)  # fmt: skip
 
     @classmethod
     def of(cls, intervals: int, segments: int) -> "Unknowns":
