@@ -92,9 +92,9 @@ def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ())
 
 
 def is_same(equations: Equations, now: Residuals, other: Minimum) -> bool:
-    """Return True if the SOCs equal those of another minimum, and the cost is not lower."""
+    """Return True if cost and SOCs equal those of another minimum."""
     difference = np.abs(now.x[equations.u.soc] - other.x[equations.u.soc]).max()
-    return now.cost > other.cost - SAME_COST and bool(difference < SAME_SOC)
+    return abs(now.cost - other.cost) < SAME_COST and bool(difference < SAME_SOC)
 
 
 def step(normal: NormalEquations, damping: float, u: Unknowns) -> Floats:
