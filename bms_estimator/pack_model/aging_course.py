@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS, SHAPE_NODES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.aging import RESISTANCE, AgingVariance
 from bms_estimator.pack_model.cell_curves import CellCurves, NodePosition
@@ -21,7 +22,6 @@ from bms_estimator.pack_model.fit import (
 )
 from bms_estimator.pack_model.intervals import HOUR_S
 from bms_estimator.pack_model.solve import Minimum, single_threaded
-from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS, SHAPE_NODES
 
 RESISTANCE_SOC = np.array([0.5])
 """SOC at which resistances are compared."""

@@ -76,6 +76,8 @@ class CellCurves:
         self.offset_s = float(settings["offset_s"])
         """Correlation time of the drifting part of the current sensor's offset [s]."""
         self.offset_std_a = float(settings["offset_c"]) * self.one_c_a
+        self.table = np.column_stack([self._parts_ohm, self.hysteresis_v, self.per_kelvin_v])
+        """Curves over ``SOC_GRID`` for the kernels, see ``pack_voltage.FILE_HYSTERESIS``."""
 
     def ocv(self, soc: Floats) -> Floats:
         """Return the OCV at 25 C [V], with linear extrapolation beyond SOC 0 and 1."""

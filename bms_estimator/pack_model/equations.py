@@ -34,7 +34,7 @@ class Block:
     error: Floats
     """Measured minus predicted value, in std of the measurement, shape (n,)."""
     columns: NDArray[np.intp]
-    """Indices of the unknowns, shape (n, k)."""
+    """Indices of the unknowns, increasing in each row, shape (n, k)."""
     values: Floats
     """Derivatives of the prediction by these unknowns, in std, shape (n, k)."""
 
@@ -154,8 +154,8 @@ class Equations:
         total = np.where(is_gap, normal + event, 1.0)
         cost = np.where(is_gap, -2.0 * np.log(total), error**2).sum()
         weight = np.where(is_gap, np.sqrt(normal / total), 1.0)
-        columns = np.column_stack([u.soc.start + later, u.soc.start + k, u.ln_q.start + k, u.offset.start + k])
-        values = np.column_stack([np.ones(k.size), -np.ones(k.size), -drawn, -links.hours * inverse_q])
+        columns = np.column_stack([u.soc.start + k, u.soc.start + later, u.offset.start + k, u.ln_q.start + k])
+        values = np.column_stack([-np.ones(k.size), np.ones(k.size), -links.hours * inverse_q, -drawn])
         return float(cost), Block(weight * error, columns, (weight / links.std)[:, None] * values)
 
 

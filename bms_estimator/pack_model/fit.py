@@ -8,17 +8,20 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.kalman_filter.records import NODES
+from bms_estimator.kernels.pack_voltage import CURVE_NODES, SHAPE_NODES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition
 from bms_estimator.pack_model.equations import Equations
 from bms_estimator.pack_model.exchange import is_exchanged
 from bms_estimator.pack_model.prediction import Reference
 from bms_estimator.pack_model.solve import Minimum, minimize, single_threaded
-from bms_estimator.pack_model.unknowns import CURVE_NODES, SCALES, SHAPE_NODES
+from bms_estimator.pack_model.unknowns import SCALES
 
 STARTS = ((0.0, 0.0), (0.08, 0.0), (-0.08, 0.0), (0.16, 0.0), (-0.16, 0.0), (0.0, 0.08), (0.0, -0.08))
 """Starts of the minimization: shift of all SOCs, and ln of the true over the declared capacity. The cost of a flat curve has
 several minima over the SOC."""
+REACH_SOC, REACH_STD = 0.02, 4.0
+"""Largest shift of a start near a previous fit: an SOC plus a multiple of the std of its SOC."""
 LIKELIHOOD_EXPONENT = 0.5
 """Exponent of the likelihood in the weights of minima. It is below 1, because errors of different passes are not quite
 independent."""
@@ -148,9 +151,21 @@ def distinct_minima(equations: Equations, from_starts: list[Floats]) -> list[Min
 
 
 def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
-    """Return the starts of the minimization: those near the previous fit, then those around the filter's SOC."""
-    results = [] if previous is None else starts_near(equations, previous)
+    """Return the starts of the minimization: those near the previous fit, then those around the filter's SOC.
+
+    A shift that exceeds the uncertainty of the previous fit is left out, unless the age of the history has doubled or a long
+    gap may hide a charge.
+    """
+    rows, results, reach = equations.rows, [], math.inf
+    if previous is not None:
+        results = starts_near(equations, previous)
+        gap_s = rows["gap_s"][rows["segment"] > previous.segment].max(initial=0.0)
+        has_doubled = math.frexp(rows["elapsed_s"][-1])[1] != math.frexp(previous.elapsed_s)[1]
+        if not has_doubled and gap_s < equations.model.cell.event_s:
+            reach = REACH_SOC + REACH_STD * math.sqrt(previous.covariance[SOC, SOC])
     for shift, ln_q in STARTS:
+        if abs(shift) > reach:
+            continue
         x = equations.prior.mean.copy()
         x[equations.u.soc] = filter_soc(equations, ln_q) + shift
         x[equations.u.ln_q] = ln_q

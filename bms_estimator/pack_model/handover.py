@@ -21,6 +21,7 @@ from bms_estimator.kernels.kalman_filter.records import (
     SOC,
     Noise,
 )
+from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.fit import CURVE as FIT_CURVE
@@ -30,7 +31,6 @@ from bms_estimator.pack_model.fit import NODE_SOC, PackFit
 from bms_estimator.pack_model.fit import OFFSET as FIT_OFFSET
 from bms_estimator.pack_model.fit import SOC as FIT_SOC
 from bms_estimator.pack_model.intervals import HOUR_S
-from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS
 
 MIN_CURVE_STD_V = 0.003
 """Minimum std of the OCV of one cell [V]. Assumed."""

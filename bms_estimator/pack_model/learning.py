@@ -35,6 +35,8 @@ ADOPT_DELAY_S = 120.0
 another thread. A replay waits for the fit, and adopts it at the same sample."""
 MIN_ROWS = 8
 """Minimum number of new rows for a fit."""
+MIN_GROWTH = 0.04
+"""Minimum number of new rows for a fit, as a fraction of all rows. Fewer rows hardly change a fit of a long history."""
 MAX_UNKNOWN_CURRENT = 0.05
 """Maximum variance of the current at the times of the voltages, as a fraction of its mean square, for a fit. An error of the current
 makes the fitted resistances too small by about this fraction, because least squares assume exact currents. The error of the resistances
@@ -257,9 +259,10 @@ class SlowFit:
     def _begin_fit(self) -> None:
         """Begin a fit if there is enough new data with known currents, and set the time of the next event."""
         h = self._h
-        if self._new_rows >= MIN_ROWS and unknown_current(self.history.rows) <= MAX_UNKNOWN_CURRENT:
+        rows, previous = self.history.rows, self.saved_fit
+        min_rows = max(MIN_ROWS, MIN_GROWTH * rows.size)
+        if self._new_rows >= min_rows and unknown_current(rows) <= MAX_UNKNOWN_CURRENT:
             self._new_rows = 0
-            rows, previous = self.history.rows, self.saved_fit
             self._pending = self._submit(lambda: fit(self.cell, rows, previous))
             h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
             return

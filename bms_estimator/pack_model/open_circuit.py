@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.bank_simulation import COLLAPSE_V
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
+from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import (
     SECANT_HALF_WIDTH_SOC,
@@ -20,7 +21,6 @@ from bms_estimator.pack_model.cell_curves import (
     arrhenius,
 )
 from bms_estimator.pack_model.fit import LN_Q, OFFSET, SOC, PackFit
-from bms_estimator.pack_model.unknowns import RESISTANCE_GROUPS
 
 
 @dataclass(frozen=True)

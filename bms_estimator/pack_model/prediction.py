@@ -16,19 +16,13 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.accumulators.history import HYSTERESIS_SOC, ROW_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, TAUS, WEAK_J
+from bms_estimator.kernels.pack_voltage import MODEL_ROW, RESISTANCE_GROUPS, voltage_derivatives, voltages
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.aging import RESISTANCE, AgingVariance
-from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition, arrhenius
+from bms_estimator.pack_model.cell_curves import CellCurves, arrhenius
 from bms_estimator.pack_model.intervals import Intervals
 from bms_estimator.pack_model.prior import variance_between_nodes
-from bms_estimator.pack_model.unknowns import (
-    CURVE_NODES,
-    DIRECTION_NODES,
-    RESISTANCE_GROUPS,
-    SCALES,
-    SHAPE_NODES,
-    Unknowns,
-)
+from bms_estimator.pack_model.unknowns import SCALES, Unknowns
 
 PASS_FRACTION = 0.75
 """Std of the part of the overpotential's error that differs from pass to pass, as a fraction of the std of the part that
@@ -52,30 +46,12 @@ Derivatives = tuple[NDArray[np.intp], Floats]
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted voltages of n rows, and their terms."""
+    """Predicted voltages of n rows."""
 
     voltage_v: Floats
     """Predicted voltage [V]."""
     soc: Floats
     """SOC z."""
-    ohm: Floats
-    """Resistances of the cell file at z and T, shape (n, RESISTANCES) [ohm]."""
-    scale: Floats
-    """Factor on the resistances of each group, shape (n, SCALES)."""
-    drops_v: Floats
-    """Voltage drop over the resistances of each group, positive on discharge, shape (n, SCALES) [V]."""
-    drop_v: Floats
-    """Overpotential: sum of ``drops_v`` [V]."""
-    hysteresis_v: Floats
-    """M: half of the difference of the OCV after charge and after discharge [V]."""
-    h: Floats
-    """Fast and slow part of the hysteresis, -1..1, shape (n, 2)."""
-    shape_at: NodePosition
-    """Position of z on the nodes of the resistances' error."""
-    curve_at: NodePosition
-    """Position of z on the nodes of the OCV's error."""
-    direction_at: NodePosition
-    """Position of z on the nodes of the error by direction."""
 
 
 @dataclass(frozen=True)
@@ -105,27 +81,30 @@ class VoltageModel:
         self.cell, self.u, self.intervals = cell, u, intervals
         rows = intervals.rows
         temperature_c: Floats = rows["temperature_c"]
-        self.above_25_c_k: Floats = temperature_c - REFERENCE_C
-        self.weak, self.strong = arrhenius(WEAK_J, temperature_c), arrhenius(STRONG_J, temperature_c)
-        self.hysteresis_factor = arrhenius(HYSTERESIS_J, temperature_c)
-        self.current_a = np.column_stack([rows["current_a"], rows["x_a"]])
-        self.counted_h: Floats = rows["hysteresis"]
-        # the hysteresis at the start of the segment, an unknown, decays with the throughput
-        self.start_h_decay = np.exp(-rows["throughput_soc"][:, None] / np.array(HYSTERESIS_SOC))
-        self.start_h_at = u.start_hysteresis.start + 2 * intervals.segment
-        # currents that the RC pairs keep from a load of one std before their reset; the load is an unknown
-        self.start_load_a = START_LOAD_C * cell.one_c_a * kept_fraction(rows)
-        self.start_load_at = u.start_load.start + intervals.segment
-        self.aging_trend = AgingVariance(RESISTANCE, cell, intervals).trend[intervals.of_row]
-        direction = (rows["direction"] + 1.0).astype(np.intp)
-        self.direction_start = u.direction.start + direction * DIRECTION_NODES
+        weak, strong = arrhenius(WEAK_J, temperature_c), arrhenius(STRONG_J, temperature_c)
+        current_a = np.column_stack([rows["current_a"], rows["x_a"]])
         z = np.clip(reference.soc, 0.0, 1.0)
-        ohm = cell.resistances(z, self.weak, self.strong)
-        drop_v = by_group(ohm * self.current_a) @ np.exp(reference.ln_r)
-        self.direction_v = np.sqrt(
+        ohm = cell.resistances(z, weak, strong)
+        drop_v = by_group(ohm * current_a) @ np.exp(reference.ln_r)
+        terms = np.zeros(rows.size, MODEL_ROW)
+        terms["interval"], terms["segment"], terms["direction"] = (
+            intervals.of_row,
+            intervals.segment,
+            rows["direction"] + 1.0,
+        )
+        terms["above_25_c_k"], terms["weak"], terms["strong"] = temperature_c - REFERENCE_C, weak, strong
+        terms["one_c_a"], terms["hysteresis_factor"] = cell.one_c_a, arrhenius(HYSTERESIS_J, temperature_c)
+        terms["current_a"], terms["hysteresis"] = current_a, rows["hysteresis"]
+        # the hysteresis at the start of the segment, an unknown, decays with the throughput
+        terms["start_h_decay"] = np.exp(-rows["throughput_soc"][:, None] / np.array(HYSTERESIS_SOC))
+        # currents that the RC pairs keep from a load of one std before their reset; the load is an unknown
+        terms["start_load_a"] = START_LOAD_C * cell.one_c_a * kept_fraction(rows)
+        terms["aging_trend"] = AgingVariance(RESISTANCE, cell, intervals).trend[intervals.of_row]
+        terms["direction_v"] = np.sqrt(
             cell.direction_std_v**2 + (cell.drop_std * drop_v) ** 2 + variance_between_nodes(cell, z)
         )
-        """Std of the error by direction [V]."""
+        self.rows = terms
+        """Quantities of each row, dtype MODEL_ROW."""
         scaled_ohm = ohm * np.exp(reference.ln_r)[np.array(RESISTANCE_GROUPS)]
         self.variance_v2 = self._variance(z, drop_v) + by_sampling(rows, scaled_ohm)
         """Variance of each row's voltage about its prediction [V^2]."""
@@ -161,38 +140,12 @@ class VoltageModel:
 
     def predict(self, x: Floats) -> Prediction:
         """Return the predicted voltages."""
-        return self._predict_at(x, self.soc(x))
+        soc = self.soc(x)
+        return Prediction(self._voltages(x, soc), soc)
 
-    def _predict_at(self, x: Floats, z: Floats) -> Prediction:
-        """Return the voltages that ``x`` predicts if the rows' SOCs are ``z``."""
-        u, cell = self.u, self.cell
-        shape_at, curve_at = NodePosition.of(z, SHAPE_NODES), NodePosition.of(z, CURVE_NODES)
-        direction_at = NodePosition.of(z, DIRECTION_NODES)
-        ohm = cell.resistances(z, self.weak, self.strong)
-        ln_shape = shape_at.interpolate(x[u.shape]) + x[u.arrhenius] * self.above_25_c_k + x[u.aging] * self.aging_trend
-        scale = np.exp(x[u.ln_r] + ln_shape[:, None])
-        true_a = self.current_a - (x[u.offset][self.intervals.of_row] * cell.one_c_a)[:, None]
-        true_a += x[self.start_load_at][:, None] * self.start_load_a
-        drops_v = scale * by_group(ohm * true_a)
-        drop_v = drops_v.sum(axis=1)
-        hysteresis_v = self.hysteresis_factor * np.interp(z, SOC_GRID, cell.hysteresis_v)
-        h = self.counted_h + self.start_h_decay * np.column_stack([x[self.start_h_at], x[self.start_h_at + 1]])
-        ocv_v = cell.ocv(z) + curve_at.interpolate(x[u.curve])
-        ocv_v += self.above_25_c_k * (x[u.entropy] + np.interp(z, SOC_GRID, cell.per_kelvin_v))
-        by_direction_v = self.direction_v * direction_at.interpolate(x, self.direction_start)
-        return Prediction(
-            voltage_v=ocv_v - drop_v + hysteresis_v * (h @ x[u.hysteresis]) + by_direction_v,
-            soc=z,
-            ohm=ohm,
-            scale=scale,
-            drops_v=drops_v,
-            drop_v=drop_v,
-            hysteresis_v=hysteresis_v,
-            h=h,
-            shape_at=shape_at,
-            curve_at=curve_at,
-            direction_at=direction_at,
-        )
+    def _voltages(self, x: Floats, z: Floats) -> Floats:
+        """Return the voltages that ``x`` predicts if the rows' SOCs are ``z`` [V]."""
+        return voltages(self.rows, self.cell.table, x, self.u.first, z, self.cell.ocv(z))
 
     def derivatives(self, x: Floats, p: Prediction, *, use_file_slope: bool) -> Derivatives:
         """Return the derivatives of the predicted voltages.
@@ -203,48 +156,16 @@ class VoltageModel:
             use_file_slope: True: the derivative by SOC is the slope of the cell file's OCV, for the covariance. The fitted
                 correction is rough, and its slopes would count as information on the SOC.
         """
-        u, n, m = self.u, p.soc.size, x[self.u.hysteresis]
-        soc_columns, by_soc = self._derivatives_by_soc(x, p, use_file_slope=use_file_slope)
-        shape_low, shape_high = p.shape_at.weights
-        curve_low, curve_high = p.curve_at.weights
-        direction_low, direction_high = p.direction_at.weights
-        by_start_load = -(p.scale * by_group(p.ohm * self.start_load_a)).sum(axis=1)
-        by_start_h = p.hysteresis_v[:, None] * m * self.start_h_decay
-        direction_at = self.direction_start + p.direction_at.below
-        terms = [
-            *zip(soc_columns.T, by_soc.T, strict=True),
-            *((np.full(n, u.ln_r.start + j), -p.drops_v[:, j]) for j in range(SCALES)),
-            (np.full(n, u.aging.start), -self.aging_trend * p.drop_v),
-            (u.shape.start + p.shape_at.below, -shape_low * p.drop_v),
-            (u.shape.start + p.shape_at.below + 1, -shape_high * p.drop_v),
-            *((np.full(n, u.hysteresis.start + j), p.hysteresis_v * p.h[:, j]) for j in range(2)),
-            *((self.start_h_at + j, by_start_h[:, j]) for j in range(2)),
-            (self.start_load_at, by_start_load),
-            (np.full(n, u.entropy.start), self.above_25_c_k),
-            (np.full(n, u.arrhenius.start), -self.above_25_c_k * p.drop_v),
-            (u.curve.start + p.curve_at.below, curve_low),
-            (u.curve.start + p.curve_at.below + 1, curve_high),
-            (direction_at, self.direction_v * direction_low),
-            (direction_at + 1, self.direction_v * direction_high),
-        ]
-        columns, values = zip(*terms, strict=True)
-        return np.column_stack(columns), np.column_stack(values)
-
-    def _derivatives_by_soc(self, x: Floats, p: Prediction, *, use_file_slope: bool) -> Derivatives:
-        """Return the derivatives by SOC, offset and capacity of the interval."""
         slope_v = self.cell.slope(p.soc) if use_file_slope else self._slope_v(x, p.soc)
-        columns, by_soc = self.soc_derivatives(x)
-        by_soc *= slope_v[:, None]
-        # the offset (column 1) also lowers the current through the resistances
-        by_soc[:, 1] += (p.scale * by_group(p.ohm)).sum(axis=1) * self.cell.one_c_a
-        return columns, by_soc
+        by_soc = self.soc_derivatives(x)[1] * slope_v[:, None]
+        return voltage_derivatives(self.rows, self.cell.table, x, self.u.first, p.soc, by_soc)
 
     def _slope_v(self, x: Floats, z: Floats) -> Floats:
         """Return the slope of the predicted voltages over SOC [V per unit SOC], as a secant over the SOC range of a row.
 
         The fitted curves are piecewise linear, so that the slope at a point changes at the next node.
         """
-        above_v, below_v = (self._predict_at(x, z + shift).voltage_v for shift in (ROW_SOC / 2.0, -ROW_SOC / 2.0))
+        above_v, below_v = (self._voltages(x, z + shift) for shift in (ROW_SOC / 2.0, -ROW_SOC / 2.0))
         return (above_v - below_v) / ROW_SOC
 
 

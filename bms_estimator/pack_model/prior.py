@@ -12,18 +12,12 @@ from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.kernels.kalman_filter.ekf import INDEPENDENT_R_STD
 from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
 from bms_estimator.kernels.kalman_filter.ocv_correction import CORRELATION_SOC
+from bms_estimator.kernels.pack_voltage import CURVE_NODES, DIRECTION_NODES, SHAPE_NODES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.aging import CAPACITY, RESISTANCE, AgingVariance
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.intervals import Intervals
-from bms_estimator.pack_model.unknowns import (
-    CURVE_NODES,
-    DIRECTION_NODES,
-    DIRECTIONS,
-    SCALES,
-    SHAPE_NODES,
-    Unknowns,
-)
+from bms_estimator.pack_model.unknowns import DIRECTIONS, SCALES, Unknowns
 
 SLIP_SOC = 0.02
 """Std of the slip: distance along SOC between a knee or step of the pack's OCV and that of the file."""

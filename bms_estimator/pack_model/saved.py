@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
+from bms_estimator.kernels.pack_voltage import CURVE_NODES, DIRECTION_NODES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import CURVE, PackFit
 from bms_estimator.pack_model.history import MAX_ROWS, History, ReferenceDischarges, WeakCellTime
-from bms_estimator.pack_model.unknowns import CURVE_NODES, DIRECTION_NODES, DIRECTIONS
+from bms_estimator.pack_model.unknowns import DIRECTIONS
 
 SAVED_MINIMA = 2
 """Number of a fit's minima that are saved. The next fit starts from two minima (``fit.starts``)."""

@@ -1,5 +1,6 @@
 """Damped Gauss-Newton (Levenberg-Marquardt) minimization of the slow fit's cost."""
 
+import math
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -8,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from bms_estimator.kernels.least_squares import backward_substitution, forward_substitution
+from bms_estimator.kernels.least_squares import backward_substitution, eliminate_sparse, forward_substitution
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.equations import Equations, NormalEquations, Residuals
+from bms_estimator.pack_model.unknowns import Unknowns
 
 MAX_ITERATIONS = 30
 """Maximum number of steps from one start."""
@@ -21,9 +23,13 @@ CONVERGED = 0.02
 SAME_COST, SAME_SOC = 0.3, 0.01
 """Differences of cost and SOC below which two minima count as one. They exceed the differences that an unfinished minimization
 leaves (``CONVERGED``)."""
-FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
-"""Relative damping of the diagonal at the start, and its limits."""
-LESS_DAMPING, MORE_DAMPING = 0.2, 8.0
+NEGLIGIBLE_COST = 40.0
+"""Excess of the cost over that of the best minimum at which a minimum is left out. Its weight in the mixture would be 5e-5."""
+STEP_FRACTIONS = (1.0, 0.4, 0.15, 0.05)
+"""Fractions of a step that are tried before the damping is increased."""
+FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-9
+"""Relative damping of the diagonal at the start, and its minimum."""
+LESS_DAMPING, MORE_DAMPING = 0.2, 100.0
 """Factors on the damping after a step that lowers the cost, and after a step that does not."""
 
 _ONE_FIT = threading.Lock()
@@ -52,30 +58,37 @@ class Minimum:
 
     def covariance_of(self, select: Floats) -> Floats:
         """Return the covariance of ``select`` @ x."""
-        half = forward_substitution(self.factor, select.T.copy())
-        return np.asarray(half.T @ half)
+        half = np.array([forward_substitution(self.factor, row) for row in select])
+        return np.asarray(half @ half.T)
 
 
 def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ()) -> Minimum | None:
-    """Return the local minimum that is reached from ``start``; None if it is one of the known ones."""
+    """Return the local minimum that is reached from ``start``; None if it is a known one, or too far above the best of them."""
     now, damping = equations.residuals(start), FIRST_DAMPING
     normal = equations.normal_equations(now)
-    for _ in range(MAX_ITERATIONS):
-        trial = equations.residuals(now.x + step(normal, damping, equations.u.soc))
+    limit = min((other.cost for other in known), default=math.inf) + NEGLIGIBLE_COST
+    for steps_left in range(MAX_ITERATIONS, 0, -1):
+        full = step(normal, damping, equations.u)
+        if 2.0 * (normal.b @ full) < CONVERGED:  # the linearized decrease
+            break
+        for fraction in STEP_FRACTIONS:
+            trial = equations.residuals(now.x + fraction * full)
+            if trial.cost < now.cost:
+                break
         decrease = now.cost - trial.cost
         if decrease > 0.0:
             now, damping = trial, max(LESS_DAMPING * damping, MIN_DAMPING)
+            if any(is_same(equations, now, other) for other in known) or now.cost - steps_left * decrease > limit:
+                return None
             if decrease < CONVERGED:
                 break
             normal = equations.normal_equations(now)
         else:
-            damping *= MORE_DAMPING
-            if damping > MAX_DAMPING:
-                break
-    if any(is_same(equations, now, other) for other in known):
+            damping = max(MORE_DAMPING * damping, FIRST_DAMPING)
+    if now.cost > limit or any(is_same(equations, now, other) for other in known):
         return None
     precision = equations.normal_equations(now, use_file_slope=True).a
-    return Minimum(now.x, now.cost, cholesky(precision))
+    return Minimum(now.x, now.cost, cholesky(precision, equations.u.soc.start))
 
 
 def is_same(equations: Equations, now: Residuals, other: Minimum) -> bool:
@@ -84,18 +97,26 @@ def is_same(equations: Equations, now: Residuals, other: Minimum) -> bool:
     return abs(now.cost - other.cost) < SAME_COST and bool(difference < SAME_SOC)
 
 
-def step(normal: NormalEquations, damping: float, soc: slice) -> Floats:
+def step(normal: NormalEquations, damping: float, u: Unknowns) -> Floats:
     """Return the damped step, shortened so that no SOC changes by more than ``MAX_STEP_SOC``."""
-    lower = cholesky(normal.a + damping * np.diag(np.diag(normal.a)))
-    full = backward_substitution(lower, forward_substitution(lower, normal.b[:, None]))[:, 0]
-    largest = float(np.abs(full[soc]).max())
+    a = normal.a.copy()
+    a.ravel()[:: u.size + 1] *= 1.0 + damping
+    lower = cholesky(a, u.soc.start)
+    full = backward_substitution(lower, forward_substitution(lower, normal.b))
+    largest = float(np.abs(full[u.soc]).max())
     return full * min(1.0, MAX_STEP_SOC / largest) if largest > 0.0 else full
 
 
-def cholesky(a: Floats) -> Floats:
-    """Return the lower Cholesky factor of a matrix whose lower triangle is valid.
+def cholesky(a: Floats, sparse: int) -> Floats:
+    """Return the lower Cholesky factor of a matrix whose lower triangle is valid. Its upper triangle is not.
+
+    Args:
+        a: Matrix; overwritten.
+        sparse: Number of first columns with few non-zero elements.
 
     Raises:
         numpy.linalg.LinAlgError: The matrix is not positive definite, or not finite.
     """
-    return np.linalg.cholesky(a).astype(np.float64, copy=False)
+    eliminate_sparse(a, sparse)
+    a[sparse:, sparse:] = np.linalg.cholesky(a[sparse:, sparse:])
+    return a

@@ -1,19 +1,18 @@
 """Vector of the slow fit's unknowns.
 
 SOC at the start, offset and capacity are unknowns of each interval of about a day. Offset and capacity change little from one
-interval to the next.
+interval to the next. The unknowns of one segment are the first, because their equations are sparse (``solve.cholesky``).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-CURVE_NODES, DIRECTION_NODES, SHAPE_NODES = 101, 51, 6
-"""Number of SOC nodes of the OCV's error, of the error by direction, and of the error of the resistances."""
+from bms_estimator.kernels.pack_voltage import CURVE_NODES, DIRECTION_NODES, RESISTANCE_GROUPS, SHAPE_NODES
+
 DIRECTIONS = 3
 """Charge, rest and discharge."""
-RESISTANCE_GROUPS = (0, 1, 1, 1, 2, 2, 2)
-"""Group of each resistance: 0 series resistance, 1 RC pairs up to 30 s, 2 slower RC pairs. Those of a group share a scale."""
 SCALES = 1 + RESISTANCE_GROUPS[-1]
 """Number of groups of resistances."""
 
@@ -22,6 +21,10 @@ SCALES = 1 + RESISTANCE_GROUPS[-1]
 class Unknowns:
     """Positions of the unknowns in their vector, for K intervals and S segments."""
 
+    start_hysteresis: slice
+    """Fast and slow part of the hysteresis at the start of each segment."""
+    start_load: slice
+    """Load before the start of each segment, when the RC pairs are reset, in std (``prediction.START_LOAD_C``)."""
     soc: slice
     """SOC at the start of each interval."""
     offset: slice
@@ -36,10 +39,6 @@ class Unknowns:
     """Error of ln of all resistances at ``SHAPE_NODES`` SOCs, added to ``ln_r``."""
     hysteresis: slice
     """Factors on the file's hysteresis in its fast and in its slow part."""
-    start_hysteresis: slice
-    """Fast and slow part of the hysteresis at the start of each segment."""
-    start_load: slice
-    """Load before the start of each segment, when the RC pairs are reset, in std (``prediction.START_LOAD_C``)."""
     entropy: slice
     """Error of the OCV's temperature coefficient [V/K]."""
     arrhenius: slice
@@ -56,9 +55,16 @@ class Unknowns:
         """Number of unknowns."""
         return int(self.direction.stop)
 
+    @property
+    def first(self) -> NDArray[np.intp]:
+        """First column of each kind of unknown on which a voltage depends, in the order of ``pack_voltage``."""
+        return np.array([part.start for part in (
+            self.start_hysteresis, self.start_load, self.soc, self.offset, self.ln_q, self.ln_r, self.aging, self.shape,
+            self.hysteresis, self.entropy, self.arrhenius, self.curve, self.direction)], np.intp)  # fmt: skip
+
     @classmethod
     def of(cls, intervals: int, segments: int) -> "Unknowns":
         """Return the positions for a number of intervals and segments."""
-        sizes = (intervals, intervals, intervals, SCALES, 1, SHAPE_NODES, 2, 2 * segments, segments, 1, 1, 1)
+        sizes = (2 * segments, segments, intervals, intervals, intervals, SCALES, 1, SHAPE_NODES, 2, 1, 1, 1)
         ends = np.cumsum([*sizes, CURVE_NODES, DIRECTIONS * DIRECTION_NODES]).tolist()
         return cls(*(slice(a, b) for a, b in zip([0, *ends], ends, strict=False)))

@@ -9,12 +9,14 @@ from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import constant_trip
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows
-from bms_estimator.kernels.least_squares import add_residuals, backward_substitution, forward_substitution
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
+from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.curve_change import return_to_cell_file
+from bms_estimator.pack_model.fit import fit
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import neutral_fit
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
@@ -61,18 +63,18 @@ def _call_kernels() -> None:
     estimator.resume(0.0)
     make_parameters_payload(estimator, 0.0)
     SlowFit(estimator).adopt(neutral_fit())
-    _load_fit_kernels()
+    _load_fit_kernels(estimator)
     return_to_cell_file(estimator)
     remaining_capacity_ah(estimator)
     load_forecast_kernels()
     _ = FrameDecoder().clock_ppm
 
 
-def _load_fit_kernels() -> None:
-    """Call the kernels of the slow fit once."""
-    one = np.ones((1, 1))
-    add_residuals(one, one[0], np.zeros((1, 1), np.intp), one, one[0])
-    backward_substitution(one, forward_substitution(one, one))
+def _load_fit_kernels(estimator: Estimator) -> None:
+    """Call the kernels of the slow fit once, with a history of one row."""
+    row = np.zeros(1, HISTORY_ROW)
+    row["reference_soc"] = np.nan
+    fit(CellCurves(estimator.cell_file_settings), row)
 
 
 def load_forecast_kernels() -> None:

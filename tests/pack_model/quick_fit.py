@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.kalman_filter.records import NODES
+from bms_estimator.kernels.pack_voltage import CURVE_NODES, DIRECTION_NODES
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.fit import CURVE, LN_Q, SOC, PackFit
-from bms_estimator.pack_model.unknowns import CURVE_NODES, DIRECTION_NODES, DIRECTIONS
+from bms_estimator.pack_model.unknowns import DIRECTIONS
 
 LN_CAPACITY = -0.1
 """ln of the fitted over the declared capacity."""

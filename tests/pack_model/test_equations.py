@@ -1,12 +1,14 @@
 """Derivatives of the predicted voltages, and the minimization of the cost."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bms_estimator.kernels.accumulators.history import ROW_SOC
 from bms_estimator.kernels.least_squares import backward_substitution, forward_substitution
 from bms_estimator.pack_model.equations import BEYOND_SOC, Equations
-from bms_estimator.pack_model.solve import minimize
+from bms_estimator.pack_model.solve import NEGLIGIBLE_COST, cholesky, minimize
 from tests.pack_model.histories import (
     Truth,
     cell_curves,
@@ -129,6 +131,17 @@ def test_a_known_minimum_is_not_found_again(equations: Equations) -> None:
     assert minimize(equations, start, [minimum]) is None
 
 
+def test_a_start_far_above_the_best_minimum_is_abandoned(equations: Equations) -> None:
+    start = unknowns_of(equations, Truth(ln_r=(0.3, 0.3, 0.3)))
+    minimum = minimize(equations, start)
+    assert minimum is not None
+    other_x = minimum.x.copy()
+    other_x[equations.u.soc] -= 0.1
+    for excess, is_abandoned in ((0.5 * NEGLIGIBLE_COST, False), (2.0 * NEGLIGIBLE_COST, True)):
+        best = replace(minimum, x=other_x, cost=minimum.cost - excess)
+        assert (minimize(equations, start, [best]) is None) == is_abandoned
+
+
 def test_normal_equations_sum_the_products_of_all_derivatives(equations: Equations) -> None:
     """The sum has the prior, the voltages and the known SOC. No SOC is beyond its range."""
     r = equations.residuals(unknowns_of(equations, Truth()))
@@ -147,11 +160,26 @@ def test_normal_equations_sum_the_products_of_all_derivatives(equations: Equatio
     np.testing.assert_allclose(a, np.tril(expected), rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("columns", [1, 27])
-def test_triangular_solutions(columns: int) -> None:
+def test_triangular_solutions() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(40, 60))
-    a, b = root @ root.T, rng.normal(size=(40, columns))
+    a, b = root @ root.T, rng.normal(size=40)
     lower = np.linalg.cholesky(a)
     x = backward_substitution(lower, forward_substitution(lower, b))
     np.testing.assert_allclose(a @ x, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("segments", [1, 4])
+def test_cholesky_factor_of_sparse_columns(segments: int) -> None:
+    """The unknowns of one segment are the first. They are independent of those of other segments."""
+    cell = cell_curves()
+    parts = [
+        with_voltages(cell, measured_rows(cell, days=1, segment=k, gap_s=7200.0), Truth()) for k in range(segments)
+    ]
+    for k, part in enumerate(parts):
+        part["elapsed_s"] += k * 1e5
+    history = equations_of(cell, np.concatenate(parts))
+    a = history.normal_equations(history.residuals(history.prior.mean)).a
+    expected = np.linalg.cholesky(np.tril(a) + np.tril(a, -1).T)
+    factor = cholesky(a, history.u.soc.start)
+    np.testing.assert_allclose(np.tril(factor), expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())

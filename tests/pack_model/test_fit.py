@@ -1,5 +1,7 @@
 """Fits of histories with known true values, and of unusual histories."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
@@ -9,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.fit import LN_Q, LN_R, OFFSET, SOC, FitError, PackFit, fit
+from bms_estimator.pack_model.fit import LN_Q, LN_R, OFFSET, SOC, STARTS, FitError, PackFit, fit, starts
 from tests.pack_model.histories import (
     CAPACITY_AH,
     Truth,
@@ -145,6 +147,24 @@ def test_next_fit_starts_at_the_previous_one() -> None:
     second = fit(cell, rows, first)
     assert second.cost <= first.cost + 0.3
     assert abs(second.mean[SOC] - first.mean[SOC]) < std_of(first)[SOC]
+
+
+def test_starts_beyond_the_uncertainty_of_the_previous_fit_are_left_out() -> None:
+    """The first fit, the first after a long gap, and the first after the age has doubled have all starts."""
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell), Truth())
+    first = fit(cell, np.concatenate([rows, reference_row(rows, end_soc(cell, rows, Truth()), 0.005)]))
+    assert std_of(first)[SOC] < 0.01
+    certain = len(first.curves[:2]) + sum(shift == 0.0 for shift, _ in STARTS)
+    after_gap = rows.copy()
+    after_gap["segment"][-20:] += 1.0
+    for gap_s, expected in ((0.1 * cell.event_s, certain), (2.0 * cell.event_s, len(first.curves[:2]) + len(STARTS))):
+        after_gap["gap_s"][-20:] = gap_s
+        assert len(starts(equations_of(cell, after_gap), first)) == expected
+    assert len(starts(equations_of(cell, rows), None)) == len(STARTS)
+    assert len(starts(equations_of(cell, rows), first)) == certain
+    half = replace(first, elapsed_s=0.5 * first.elapsed_s)
+    assert len(starts(equations_of(cell, rows), half)) == len(first.curves[:2]) + len(STARTS)
 
 
 def all_rest(rows: np.ndarray) -> np.ndarray:

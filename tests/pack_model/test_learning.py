@@ -208,8 +208,26 @@ def test_a_fit_after_few_rows_and_restarts_does_not_enlarge_the_std(
     assert slow_fit.saved_fit is not None
 
 
+def test_a_fit_waits_until_the_history_has_grown(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learning, "fit", quick_fit)
+    monkeypatch.setattr(learning, "MIN_GROWTH", 0.3)
+    sizes: list[int] = []
+
+    def submit(call: Callable[[], PackFit]) -> Future[PackFit]:
+        sizes.append(slow_fit.history.rows.size)
+        return run_now(call)
+
+    slow_fit = SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah)), submit=submit, interval_s=3600.0)
+    day = np.tile(samples, 6)
+    day["time_s"] = np.arange(day.size)
+    slow_fit.run(day)
+    assert len(sizes) > 3
+    assert (np.diff(sizes) >= 0.3 * np.array(sizes[1:])).all()
+
+
 def test_a_short_history_is_fitted_more_often(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "fit", quick_fit)
+    monkeypatch.setattr(learning, "MIN_GROWTH", 0.0)
     times_s: list[float] = []
 
     def submit(call: Callable[[], PackFit]) -> Future[PackFit]:

@@ -74,8 +74,8 @@ def after_init(owner: type, change: Callable[..., None]) -> Patch:
 
 def count_direction_as_noise(model: VoltageModel, *_: object) -> None:
     """Replace the error that recurs at each pass in one direction by independent noise of the same variance."""
-    model.variance_v2 = model.variance_v2 + model.direction_v**2
-    model.direction_v = np.zeros_like(model.direction_v)
+    model.variance_v2 = model.variance_v2 + model.rows["direction_v"] ** 2
+    model.rows["direction_v"] = 0.0
 
 
 def fix_hysteresis(*parts: float | None) -> Patch:
@@ -125,7 +125,7 @@ def rough_derivatives(model: VoltageModel, x: Any, p: Any, *, use_file_slope: bo
 
 
 ORIGINAL_LINKS = Links.of
-ORIGINAL_DERIVATIVES = VoltageModel._derivatives_by_soc
+ORIGINAL_DERIVATIVES = VoltageModel.derivatives
 
 NOTHING = "nothing"
 PARTS: dict[str, Part] = {
@@ -166,7 +166,7 @@ PARTS: dict[str, Part] = {
     "several starts": Part(((fit, "STARTS", fit.STARTS[:1]),)),
     "weights of minima with a small exponent": Part(((fit, "LIKELIHOOD_EXPONENT", 1.0),)),
     "secant over a row as slope": Part(((VoltageModel, "_slope_v", lambda model, _, z: model.cell.slope(z)),)),
-    "slope of the file in the covariance": Part(((VoltageModel, "_derivatives_by_soc", rough_derivatives),)),
+    "slope of the file in the covariance": Part(((VoltageModel, "derivatives", rough_derivatives),)),
     "minimum std after a fit": Part(((handover, "MIN_SOC_STD_FRACTION", 0.0),)),
     "std of the voltage gain": Part(gains={"voltage_gain_std": 0.0}),
     "std of the current gain": Part(gains={"current_gain_std": 0.0}),

@@ -48,9 +48,9 @@ def recording() -> Recording:
 
 @pytest.fixture(autouse=True, scope="module")
 def few_fits() -> Iterator[None]:
-    """Fit at ``INTERVAL_S`` only, and begin each fit at two starts."""
+    """Fit at ``INTERVAL_S`` only, and begin each fit at three starts."""
     with fits_every(INTERVAL_S), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, "STARTS", fit.STARTS[:2])
+        patch.setattr(fit, "STARTS", fit.STARTS[:3])
         yield
 
 
