@@ -220,7 +220,7 @@ def test_a_fit_waits_until_the_history_has_grown(samples: SampleBlock, monkeypat
     slow_fit = SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah)), submit=submit, interval_s=3600.0)
     day = np.tile(samples, 6)
     day["time_s"] = np.arange(day.size)
-    slow_fit.run(day)
+    run(slow_fit, day)
     assert len(sizes) > 3
     assert (np.diff(sizes) >= 0.3 * np.array(sizes[1:])).all()
 
