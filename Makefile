@@ -41,10 +41,11 @@ $(CORE): requirements-core.lock pyproject.toml
 apt: ## the Debian packages of the tests: installs missing ones if permitted, otherwise names them
 	@.ci/apt $(APT)
 
-check: venv ## style, import order of the layers, and types, in seconds
+check: venv ## style, import order of the layers, number of statements, and types, in seconds
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/lint-imports --no-logo
+	$(BIN)/python .ci/statements.py
 	$(BIN)/mypy
 
 test: prepared ## style, types, firmware, and all tests except the redundant and longer ones
