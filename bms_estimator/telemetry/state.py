@@ -35,7 +35,7 @@ NO_CELL_FIELDS: Mapping[str, Any] = MappingProxyType(
 )
 """Fields of ``Estimate`` about estimates of single cells, without any."""
 COMPUTED = {
-    *("voltage_v", "current_a", "temperature_c", "stability_margin", "stability_margin_std"),
+    *("voltage_estimate_v", "voltage_v", "current_a", "temperature_c", "stability_margin", "stability_margin_std"),
     *("delta_configured", "converged", "lock"),
 }
 """Columns of the trace whose field of ``Estimate`` is computed: means, a margin that needs a known SOC, and booleans from integers."""
@@ -74,7 +74,7 @@ def make_state_payload(
     # a tuple of plain numbers, because reading the fields of a numpy record one by one is slow
     values = zip(TRACE.names or (), window.last.item(), strict=True)
     last = {name: value if math.isfinite(value) else None for name, value in values}
-    soc, margin = last["soc"], finite(known_margin(window.last, window.soc_known))
+    innovation_v, soc, margin = last["innovation_v"], last["soc"], finite(known_margin(window.last, window.soc_known))
     return Estimate(
         time=iso_utc(window.arrival_s),
         publish_time=iso_utc(now_s),
@@ -86,6 +86,7 @@ def make_state_payload(
         **_probes(window.probes),
         **_cells(window.cells_v),
         **{name: last[name] for name in COPIED},
+        voltage_estimate_v=None if innovation_v is None else window.voltage_v - innovation_v,
         soc_percent=None if soc is None else 100.0 * soc,
         soc_known=soc is not None and window.soc_known,
         stability_margin=margin,

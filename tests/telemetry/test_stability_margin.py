@@ -140,3 +140,13 @@ def test_innovation_and_not_the_error_of_the_observer_shows_resistances_that_are
     innovation_v, tracking_v = np.sqrt(np.mean(np.square(np.array(errors, float)), axis=0))
     assert innovation_v > 0.1
     assert tracking_v < 0.02
+
+
+def test_the_estimated_voltage_belongs_to_the_mean_voltage_of_the_publish_window() -> None:
+    block = pulses(hours=0.1)[0]
+    estimator = Estimator(wrong_cell(1.0), identifier=IdentifierSettings(), initial_soc=1.0)
+    trace = estimator.run(block)
+    assert np.ptp(trace["voltage_v"]) > 0.1
+    state = published_state(estimator, trace)
+    assert state.voltage_estimate_v is not None
+    assert state.innovation_v == pytest.approx(state.voltage_v - state.voltage_estimate_v, abs=1e-12)

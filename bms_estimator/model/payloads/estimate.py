@@ -169,8 +169,7 @@ class Estimate(Payload):
         float | None, Quantity(total_entity("Equivalent cycles", None, 2), packs="batteries")
     ] = Field(description="charge_out_ah divided by the rated capacity; null for a fuel cell")
     voltage_estimate_v: Annotated[float | None, Quantity(raw_entity("Estimated voltage", "V", 2, "voltage"))] = Field(
-        description="terminal voltage that the identifier's filter predicts before the correction, at its last update [V]; without the "
-        "identifier and for a fuel cell the observer's, after the correction"
+        description="terminal voltage by the model: voltage_v less innovation_v [V]"
     )
     innovation_v: Annotated[float | None, Quantity(raw_entity("Innovation", "V", 3, "voltage"))] = Field(
         description="measured minus predicted voltage at the filter's last update [V]: the error of the model; without the identifier and "
