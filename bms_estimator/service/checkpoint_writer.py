@@ -273,7 +273,9 @@ class CheckpointWriter:
 
 
 def lacks_alarm(saved: str, present: str) -> bool:
-    """Return True if a restart from ``saved`` would lack an alarm, a delay, a measured quantity or an acknowledgement.
+    """Return True if a restart from ``saved`` would lack an alarm, a delay, a measured quantity, a probe or an acknowledgement.
+
+    It is also True if an acknowledged alarm has ended: after a restart its acknowledgement would cover a new cause.
 
     Args:
         saved: Saved state of the alarms, as from ``AlarmEvaluator.saved_state``.
@@ -284,7 +286,10 @@ def lacks_alarm(saved: str, present: str) -> bool:
         return True
     if set(after.pop(PENDING, [])) - set(before.pop(PENDING, [])):
         return True
-    after.pop(PROBES, None)  # saved with an alarm
+    if after.pop(PROBES, 0) > before.pop(PROBES, 0):
+        return True
+    if any(each["acknowledged"] and name not in after for name, each in before.items()):
+        return True
     return any(
         name not in before
         or before[name]["acknowledged"] != each["acknowledged"]

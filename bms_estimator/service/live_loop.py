@@ -117,8 +117,9 @@ async def run_estimation_loop(
     if lost_reason := saved_run.lost_reason or unrestored:
         # after the restored alarms, because the hooks announce this one
         monitor.raise_state_lost(lost_reason)
-    # with a raised alarm the slots of the earlier run, so that a floating slot does not replace the cell that raised it
-    slots = CellSlots(cell.cell.series_count, counters.cell_slots if monitor.alarms.active else ())
+    # with a raised alarm or a lost cell the slots of the earlier run, so that a floating slot does not replace this cell
+    is_known = monitor.alarms.active or monitor.alarms.unwatched_critical
+    slots = CellSlots(cell.cell.series_count, counters.cell_slots if is_known else ())
     if requests is not None:
         RequestHandlers(pack, publisher, current_zero).register(requests)
     writer = (

@@ -672,6 +672,22 @@ async def test_a_slot_that_floats_at_a_restart_does_not_replace_the_dead_cell_th
     assert not (await run(tmp_path / "new", rows, cell=pack, slots_v=dead)).alarms[name].active
 
 
+async def test_a_slot_that_floats_at_a_restart_does_not_replace_a_lost_cell_without_the_alarm_of_the_sensor(
+    tmp_path: Path,
+) -> None:
+    rule = SETTINGS.alarms.sensor_fault.model_copy(update={"enabled": False})
+    settings = SETTINGS.model_copy(update={"alarms": SETTINGS.alarms.model_copy(update={"sensor_fault": rule})})
+    rows, pack = [(float(t), 0.0, 3.8, 25.0, 0) for t in range(60)], CELL.pack(4, 1)
+    lost, floating = np.full((60, 6), 3.8), np.full((60, 6), 3.8)
+    lost[:, 4:], lost[20:, 1] = 0.0, np.nan
+    floating[:, 1], floating[:, 5] = np.nan, 0.0
+    for slots_v in (lost, floating):
+        run_ = await run(
+            tmp_path, rows, settings, pack, lambda a: a["cell_under_voltage"].unwatched_reason, slots_v=slots_v
+        )
+        assert run_.alarms["cell_under_voltage"].unwatched_reason
+
+
 def alarm_state(**acknowledged: bool) -> str:
     return json.dumps({name: {"acknowledged": flag, "gone": flag} for name, flag in acknowledged.items()})
 
@@ -684,6 +700,9 @@ def test_only_what_a_restart_would_lack_is_saved_at_once() -> None:
     assert lacks_alarm("{}", '{"silence": "no samples"}')
     assert not lacks_alarm(alarm_state(a=False, b=False), alarm_state(b=False))
     assert not lacks_alarm(alarm_state(a=False), "")
+    assert lacks_alarm(alarm_state(a=True), "")  # the acknowledgement would cover a new cause
+    assert lacks_alarm('{"probes": 2}', '{"probes": 3}')
+    assert not lacks_alarm('{"probes": 3}', '{"probes": 2}')
     gone, returned = (json.dumps({"a": {"acknowledged": False, "gone": flag}}) for flag in (True, False))
     assert lacks_alarm(gone, returned)
     assert not lacks_alarm(returned, gone)
