@@ -35,8 +35,9 @@ ADOPT_DELAY_S = 120.0
 another thread. A replay waits for the fit, and adopts it at the same sample."""
 MIN_ROWS = 8
 """Minimum number of new rows for a fit."""
-MIN_GROWTH = 0.04
-"""Minimum number of new rows for a fit, as a fraction of all rows. Fewer rows hardly change a fit of a long history."""
+MIN_GROWTH, MAX_CERTAIN_STD = 0.04, 0.015
+"""Minimum number of new rows for a fit, as a fraction of all rows, if the std of the previous fit's SOC is at most ``MAX_CERTAIN_STD``.
+Fewer rows hardly change such a fit. With a larger std, a few rows may decide between several minima."""
 MAX_UNKNOWN_CURRENT = 0.05
 """Maximum variance of the current at the times of the voltages, as a fraction of its mean square, for a fit. An error of the current
 makes the fitted resistances too small by about this fraction, because least squares assume exact currents. The error of the resistances
@@ -260,8 +261,7 @@ class SlowFit:
         """Begin a fit if there is enough new data with known currents, and set the time of the next event."""
         h = self._h
         rows, previous = self.history.rows, self.saved_fit
-        min_rows = max(MIN_ROWS, MIN_GROWTH * rows.size)
-        if self._new_rows >= min_rows and unknown_current(rows) <= MAX_UNKNOWN_CURRENT:
+        if self._has_grown() and unknown_current(rows) <= MAX_UNKNOWN_CURRENT:
             self._new_rows = 0
             self._pending = self._submit(lambda: fit(self.cell, rows, previous))
             h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
@@ -270,6 +270,13 @@ class SlowFit:
         if self.unsaved_rows:
             self.unsaved_rows = 0
             self.revision += 1
+
+    def _has_grown(self) -> bool:
+        """Return True if the history has enough new rows for a fit."""
+        previous, min_rows = self.saved_fit, float(MIN_ROWS)
+        if previous is not None and previous.covariance[FIT_SOC, FIT_SOC] <= MAX_CERTAIN_STD**2:
+            min_rows = max(min_rows, MIN_GROWTH * self.history.rows.size)
+        return self._new_rows >= min_rows
 
     def _end_fit(self, done: "Future[PackFit]") -> None:
         """Adopt the result of a completed fit if it is ready for use, or report its failure."""

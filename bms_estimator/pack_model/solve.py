@@ -1,6 +1,5 @@
 """Damped Gauss-Newton (Levenberg-Marquardt) minimization of the slow fit's cost."""
 
-import math
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,13 +22,9 @@ CONVERGED = 0.02
 SAME_COST, SAME_SOC = 0.3, 0.01
 """Differences of cost and SOC below which two minima count as one. They exceed the differences that an unfinished minimization
 leaves (``CONVERGED``)."""
-NEGLIGIBLE_COST = 40.0
-"""Excess of the cost over that of the best minimum at which a minimum is left out. Its weight in the mixture would be 5e-5."""
-STEP_FRACTIONS = (1.0, 0.4, 0.15, 0.05)
-"""Fractions of a step that are tried before the damping is increased."""
-FIRST_DAMPING, MIN_DAMPING = 1e-3, 1e-9
-"""Relative damping of the diagonal at the start, and its minimum."""
-LESS_DAMPING, MORE_DAMPING = 0.2, 100.0
+FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
+"""Relative damping of the diagonal at the start, and its limits."""
+LESS_DAMPING, MORE_DAMPING = 0.2, 8.0
 """Factors on the damping after a step that lowers the cost, and after a step that does not."""
 
 _ONE_FIT = threading.Lock()
@@ -63,29 +58,22 @@ class Minimum:
 
 
 def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ()) -> Minimum | None:
-    """Return the local minimum that is reached from ``start``; None if it is a known one, or too far above the best of them."""
+    """Return the local minimum that is reached from ``start``; None if it is one of the known ones."""
     now, damping = equations.residuals(start), FIRST_DAMPING
     normal = equations.normal_equations(now)
-    limit = min((other.cost for other in known), default=math.inf) + NEGLIGIBLE_COST
-    for steps_left in range(MAX_ITERATIONS, 0, -1):
-        full = step(normal, damping, equations.u)
-        if 2.0 * (normal.b @ full) < CONVERGED:  # the linearized decrease
-            break
-        for fraction in STEP_FRACTIONS:
-            trial = equations.residuals(now.x + fraction * full)
-            if trial.cost < now.cost:
-                break
+    for _ in range(MAX_ITERATIONS):
+        trial = equations.residuals(now.x + step(normal, damping, equations.u))
         decrease = now.cost - trial.cost
         if decrease > 0.0:
             now, damping = trial, max(LESS_DAMPING * damping, MIN_DAMPING)
-            if any(is_same(equations, now, other) for other in known) or now.cost - steps_left * decrease > limit:
-                return None
             if decrease < CONVERGED:
                 break
             normal = equations.normal_equations(now)
         else:
-            damping = max(MORE_DAMPING * damping, FIRST_DAMPING)
-    if now.cost > limit or any(is_same(equations, now, other) for other in known):
+            damping *= MORE_DAMPING
+            if damping > MAX_DAMPING:
+                break
+    if any(is_same(equations, now, other) for other in known):
         return None
     precision = equations.normal_equations(now, use_file_slope=True).a
     return Minimum(now.x, now.cost, cholesky(precision, equations.u.soc.start))

@@ -1,14 +1,12 @@
 """Derivatives of the predicted voltages, and the minimization of the cost."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from bms_estimator.kernels.accumulators.history import ROW_SOC
 from bms_estimator.kernels.least_squares import backward_substitution, forward_substitution
 from bms_estimator.pack_model.equations import BEYOND_SOC, Equations
-from bms_estimator.pack_model.solve import NEGLIGIBLE_COST, cholesky, minimize
+from bms_estimator.pack_model.solve import cholesky, minimize
 from tests.pack_model.histories import (
     Truth,
     cell_curves,
@@ -129,17 +127,6 @@ def test_a_known_minimum_is_not_found_again(equations: Equations) -> None:
     minimum = minimize(equations, start)
     assert minimum is not None
     assert minimize(equations, start, [minimum]) is None
-
-
-def test_a_start_far_above_the_best_minimum_is_abandoned(equations: Equations) -> None:
-    start = unknowns_of(equations, Truth(ln_r=(0.3, 0.3, 0.3)))
-    minimum = minimize(equations, start)
-    assert minimum is not None
-    other_x = minimum.x.copy()
-    other_x[equations.u.soc] -= 0.1
-    for excess, is_abandoned in ((0.5 * NEGLIGIBLE_COST, False), (2.0 * NEGLIGIBLE_COST, True)):
-        best = replace(minimum, x=other_x, cost=minimum.cost - excess)
-        assert (minimize(equations, start, [best]) is None) == is_abandoned
 
 
 def test_normal_equations_sum_the_products_of_all_derivatives(equations: Equations) -> None:

@@ -208,9 +208,14 @@ def test_a_fit_after_few_rows_and_restarts_does_not_enlarge_the_std(
     assert slow_fit.saved_fit is not None
 
 
-def test_a_fit_waits_until_the_history_has_grown(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("max_certain_std", "waits"), [(0.04, True), (0.02, False)])
+def test_a_fit_after_a_certain_one_waits_until_the_history_has_grown(
+    samples: SampleBlock, monkeypatch: pytest.MonkeyPatch, max_certain_std: float, waits: bool
+) -> None:
+    """The std of the SOC is 0.03."""
     monkeypatch.setattr(learning, "fit", quick_fit)
     monkeypatch.setattr(learning, "MIN_GROWTH", 0.3)
+    monkeypatch.setattr(learning, "MAX_CERTAIN_STD", max_certain_std)
     sizes: list[int] = []
 
     def submit(call: Callable[[], PackFit]) -> Future[PackFit]:
@@ -222,12 +227,11 @@ def test_a_fit_waits_until_the_history_has_grown(samples: SampleBlock, monkeypat
     day["time_s"] = np.arange(day.size)
     run(slow_fit, day)
     assert len(sizes) > 3
-    assert (np.diff(sizes) >= 0.3 * np.array(sizes[1:])).all()
+    assert (np.diff(sizes) >= 0.3 * np.array(sizes[1:])).all() == waits
 
 
 def test_a_short_history_is_fitted_more_often(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(learning, "fit", quick_fit)
-    monkeypatch.setattr(learning, "MIN_GROWTH", 0.0)
     times_s: list[float] = []
 
     def submit(call: Callable[[], PackFit]) -> Future[PackFit]:
