@@ -65,7 +65,7 @@ def test_the_gain_of_the_observer_changes_no_estimate() -> None:
     samples = pulses()[0]
     on, off = (Estimator(load_cell("nca", 3.0), ObserverSettings(gain_limit=g), initial_soc=0.8) for g in (1e3, 1e-300))
     traces = [estimator.run(samples) for estimator in (on, off)]
-    assert np.ptp(traces[0]["voltage_estimate_v"] - traces[1]["voltage_estimate_v"]) > 0.01
+    assert np.ptp(traces[0]["tracking_error_v"] - traces[1]["tracking_error_v"]) > 0.01
     of_the_filter = [name for name in on.record.dtype.names or () if name not in ("observer", "learning")]
     assert all(on.record[name].tobytes() == off.record[name].tobytes() for name in of_the_filter)
     assert all(traces[0][name].tobytes() == traces[1][name].tobytes() for name in ESTIMATES)

@@ -8,11 +8,11 @@ import pytest
 from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.cli.captures.replay_summary import Summary
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.pack.pack import Pack
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
@@ -146,7 +146,7 @@ def test_a_replay_prints_numbers_or_none(state_value: float, printed: float | No
     estimator = Estimator(PEM)
     estimator.run(simulate_model(np.ones(PARAMETERS), 2.0))
     estimator.state["a"][0, 1] = state_value
-    result = Summary().result(estimator, None, None, CellEstimator(estimator), math.inf, 1, 1.0)
+    result = Summary().result(Pack(estimator), math.inf, 1, 1.0)
     r_ohm = result.parameters["r_ohm"]
     assert (r_ohm.value, r_ohm.std) == (printed, printed)
 

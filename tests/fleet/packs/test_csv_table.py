@@ -146,9 +146,10 @@ def test_columns_are_the_settings_of_a_pack_file_that_change_an_estimate():
     handled_by_the_edge = {"port", "serial", "address", "batteries", "baud", "sample_rate_hz", "current_sign"} | set(
         CORRECTIONS
     )
-    fixed_by_the_worker = {"enabled", "pack_model", "cutoff_v"}  # cutoff_v: a worker makes no forecasts
+    fixed_by_the_worker = {"enabled", "pack_model"}
+    for_forecasts = {"cutoff_v", "max_discharge_a", "max_charge_a"}  # a worker makes none
     settings = {name for section in (PackSettings, SensorSettings, IdentifierSettings) for name in section.model_fields}
-    assert settings - handled_by_the_edge - fixed_by_the_worker == set(COLUMNS) - {"pack"} | {"name"}
+    assert settings - handled_by_the_edge - fixed_by_the_worker - for_forecasts == set(COLUMNS) - {"pack"} | {"name"}
 
 
 def test_limits_and_uncertainties_of_a_row_are_those_of_a_pack_file(write_table):
