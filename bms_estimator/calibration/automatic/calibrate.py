@@ -21,7 +21,7 @@ from bms_estimator.calibration.verdict import Run, Verdict, coverage, judge, vol
 from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.pack.pack import Pack, new_pack
+from bms_estimator.pack.pack import new_pack
 from bms_estimator.settings.pack import Settings
 
 MAX_FULL_DEVIATION_V = 0.45
@@ -113,10 +113,10 @@ def calibrate(
         validations = [(split.held_back.capture, validation)]
     if not validations:
         raise UserError("\n".join(failures))
-    runs = [
-        Run(capture.name, validation, soc_errors(_validating_pack(validated_model.cell), capture.rows, validation))
-        for capture, validation in validations
-    ]
+    runs = []
+    for capture, validation in validations:
+        pack = new_pack(Settings(), validated_model.cell, has_forecasts=False)  # as `validate` and `report` run it
+        runs.append(Run(capture.name, validation, soc_errors(pack, capture.rows, validation)))
     errors = voltage_errors([run.validation for run in runs], validated_model.cell)
     contradictions = [
         *chemistry_warnings(given, capacity, model.ocv),
@@ -196,11 +196,6 @@ def _fit_both(
         note = f"the model was fitted without the data held back, because with all data {model.reason}"
         return validated_model, validated_model, [note]
     return validated_model, model, []
-
-
-def _validating_pack(cell: CellModel) -> Pack:
-    """Return a pack of one cell as `validate` and `report` run it."""
-    return new_pack(Settings(), cell, has_forecasts=False)
 
 
 def _validate_all(
