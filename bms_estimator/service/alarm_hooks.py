@@ -102,10 +102,10 @@ class AlarmHooks:
         raised = [alarm for alarm in alarms if counts_as_raised(alarm)]
         failed = [alarm for alarm in raised if alarm.name == "hook_failed"]
         for hook in self._hooks:
-            is_new = known is not None and _hash(hook.settings) not in known
-            if failed or crashed or is_new:
-                for alarm in raised:
-                    if alarm not in failed and hook.covers(alarm.name):
+            is_unfinished = crashed or (known is not None and _hash(hook.settings) not in known)
+            if failed or is_unfinished:
+                for alarm in raised:  # a finished hook does not announce hook_failed again
+                    if (is_unfinished or alarm not in failed) and hook.covers(alarm.name):
                         hook.on_alarm_change(alarm)
                 hook.restore_active(failed)  # hook_failed itself is not announced again
             else:

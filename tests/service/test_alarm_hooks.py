@@ -180,6 +180,15 @@ async def test_all_raised_alarms_are_reported_after_a_crash() -> None:
     assert output == ["soc_low"]
 
 
+@pytest.mark.parametrize(("is_finished", "crashed"), [(True, False), (True, True), (False, False)])
+async def test_an_interrupted_job_for_the_failure_of_another_hook_is_repeated(is_finished: bool, crashed: bool) -> None:
+    output, failed = list[str](), RAISED.model_copy(update={"name": "hook_failed"})
+    hook = {"alarms": ["hook_failed"], "topic": "load/set", "payload": "$name"}
+    async with run_hooks(hook, publish=acknowledge_in(output)) as running:
+        running.restore_active([failed], running.finished_hashes if is_finished else [], crashed=crashed)
+    assert output == ([] if is_finished and not crashed else ["hook_failed"])
+
+
 async def test_a_hook_that_was_added_or_changed_before_a_restart_acts_on_an_alarm_that_is_already_raised() -> None:
     output: list[str] = []
     first, second = ({"topic": topic, "payload": f"{topic} $name"} for topic in ("first", "second"))
