@@ -25,24 +25,28 @@ class CellSlots:
 
     Args:
         series: Number of cells in series.
-        slots: Slots of the cells in an earlier run (``known``). Another number than ``series`` has no effect.
+        slots: Slots of the cells. Another number than ``series`` has no effect.
+        former: Slots of the cells in an earlier run (``known``), if the cells may have other slots now.
 
     Attributes:
         fault: Fault of the last block if it has more live slots than cells in series, as a sentence; empty otherwise.
+        moved: Reason why a cell may be missing, as a sentence, if the last block has shown the cells in other slots than
+            ``former``; empty otherwise.
     """
 
-    def __init__(self, series: int, slots: Sequence[int] = ()) -> None:
+    def __init__(self, series: int, slots: Sequence[int] = (), former: Sequence[int] = ()) -> None:
         self._series, self._is_known = series, len(slots) == series
         self._slots = np.array(slots) if self._is_known else np.arange(series)
-        self.fault = self._excess_text = ""
+        self._former = list(former) if len(former) == series else []
+        self.fault = self.moved = self._excess_text = ""
         self._excess_samples = 0  # number of successive samples with too many live slots
         # until enough cells are live: number of samples with live slots, and the largest number of live slots
         self._samples = self._max_cells = 0
 
     @property
     def known(self) -> list[int]:
-        """Slots of the cells, counted from 0; empty until a sample has as many live slots as cells in series."""
-        return self._slots.tolist() if self._is_known else []
+        """Slots of the cells, counted from 0; those of the earlier run until a sample has as many live slots as cells in series."""
+        return self._slots.tolist() if self._is_known else self._former
 
     @property
     def reason(self) -> str:
@@ -71,7 +75,7 @@ class CellSlots:
         Args:
             cells_v: Voltages of the slots [V], NaN if not measured, shape (n, slots).
         """
-        self.fault = ""
+        self.fault = self.moved = ""
         if not cells_v.size:
             return cells_v
         if not self._has_enough:
@@ -101,6 +105,11 @@ class CellSlots:
         self._excess_samples = 0
         if count == self._series and not self._is_known:  # later, a floating slot would replace a failed cell
             self._slots, self._is_known = np.flatnonzero(live), True
+            if self._former and self._former != self.known:
+                slots, former = (", ".join(str(slot + 1) for slot in each) for each in (self.known, self._former))
+                self.moved = (
+                    f"cells are measured in slots {slots}, and were in {former} before the restart: check their wires"
+                )
         if self._is_known:
             return slots_v[:, self._slots]
         # the live slots, and the first of the others: one of them is a cell with a broken wire

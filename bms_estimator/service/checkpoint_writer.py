@@ -166,7 +166,7 @@ class CheckpointWriter:
     @property
     def _delay_of_counters_s(self) -> float:
         """Minimum interval between two saves of counters and alarms [s]; 0 if the next one is urgent."""
-        if self._saved_counters is None:
+        if self._saved_counters is None or self._slots.known != self._saved_counters.cell_slots:
             return 0.0
         if self._alarms.saved_state == self._saved_counters.alarms:
             return self._interval_s

@@ -119,7 +119,7 @@ async def run_estimation_loop(
         monitor.raise_state_lost(lost_reason)
     # with a raised alarm or a lost cell the slots of the earlier run, so that a floating slot does not replace this cell
     is_known = monitor.alarms.active or monitor.alarms.unwatched_critical
-    slots = CellSlots(cell.cell.series_count, counters.cell_slots if is_known else ())
+    slots = CellSlots(cell.cell.series_count, counters.cell_slots if is_known else (), counters.cell_slots)
     if requests is not None:
         RequestHandlers(pack, publisher, current_zero).register(requests)
     writer = (
@@ -196,6 +196,8 @@ async def _estimate(
             logged_reason = slots.reason
             if logged_reason:
                 log.warning("no estimates of single cells", reason=logged_reason)
+        if slots.moved:
+            publisher.alarm_monitor.raise_state_lost(slots.moved)
         if estimator.state["started"][0] and not estimator.state["samples"][0]:
             # the gap before the first sample after a restart also includes the wait for that sample
             estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s

@@ -708,3 +708,17 @@ def test_only_what_a_restart_would_lack_is_saved_at_once() -> None:
     assert not lacks_alarm(returned, gone)
     assert lacks_alarm("", '{"pending": ["a"]}')
     assert not lacks_alarm('{"pending": ["a"]}', "")
+async def test_cells_in_other_slots_than_before_a_restart_need_an_acknowledgement(tmp_path: Path) -> None:
+    """The wire of a cell broke shortly before the restart, and the slot behind the last cell floats."""
+    rows, pack, whole = [(float(t), 0.0, 3.8, 25.0, 0) for t in range(12)], CELL.pack(4, 1), np.full((12, 6), 3.8)
+    whole[:, 4:] = 0.0
+    floating = whole[:, [0, 4, 2, 3, 1, 5]]
+    assert all((await run(tmp_path, rows, cell=pack, slots_v=whole)).relay)
+    assert all((await run(tmp_path, rows, cell=pack, slots_v=whole)).relay)
+    moved = await run(tmp_path, rows, cell=pack, slots_v=floating)
+    assert "in slots 1, 3, 4, 5, and were in 1, 2, 3, 4" in moved.alarms["alarm_state_lost"].text
+    assert not any(moved.relay)
+    assert all((await run(tmp_path, rows, cell=pack, slots_v=floating, acknowledge="alarm_state_lost")).relay)
+    assert all((await run(tmp_path, rows, cell=pack, slots_v=floating)).relay)
+
+
