@@ -155,18 +155,23 @@ class RunFile:
 
     def _has_other_files(self) -> bool:
         """Return True if an earlier run has left any other file."""
-        suffixes = r".*\.npz|changes-\d|sqlite.*|board\.json|refused\.run|new"
-        pattern = re.compile(rf"{re.escape(self._name)}(-[0-9a-f]{{8}})?\.({suffixes})")
+        # another pack may have a name like this one's with an identity, but no file of both kinds has the same suffix
+        suffixes = r"\.((refused|later).*|sqlite.*|board\.json|new)|-[0-9a-f]{8}\.(((history|load)\.)?npz|changes-\d)"
+        pattern = re.compile(rf"{re.escape(self._name)}({suffixes})")
         return any(pattern.fullmatch(path.name) for path in self._folder_content())
 
     def _other_pack_with_alarm(self) -> str:
-        """Return a reason if another pack has a raised critical alarm or a lost sensor: this one may be that pack, renamed."""
+        """Return a reason if another pack has a raised or due critical alarm or a lost sensor: this one may be that pack, renamed."""
         for path in self._folder_content():
             if path.suffix == ".run" and not path.name.endswith(".refused.run"):
                 with contextlib.suppress(Exception):  # a damaged file concerns the other pack
                     alarms = json.loads(_read(path)["alarms"] or "{}")
                     inputs = alarms.pop("inputs", {}).values()
-                    if any(lost for _, lost in inputs) or '"severity": "critical"' in json.dumps(alarms):
+                    if (
+                        alarms.get("pending")
+                        or any(lost for _, lost in inputs)
+                        or '"severity": "critical"' in json.dumps(alarms)
+                    ):
                         return f"{path.stem} has an alarm in {path.name}, and this pack may be {path.stem}, renamed"
         return ""
 

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import structlog
@@ -41,6 +42,8 @@ LOAD_SAVE_S = 300.0
 """Interval between two saves of the observed load [s]. A crash loses at most the load of this time."""
 FINAL_SAVE_S = 20.0
 """Timeout of the save at shutdown [s]. A busy SD card may take several seconds. systemd waits 90 s before it kills a service."""
+
+T = TypeVar("T")
 
 log = structlog.get_logger(__name__)
 
@@ -93,17 +96,17 @@ class CheckpointWriter:
         loop = asyncio.get_running_loop()
         tried_s, failed, load_tried_s = -math.inf, False, loop.time()
         # until the final save marks the run as clean, the next start counts it as crashed
-        run_failed, run_tried_s = not await self._save_counters(), loop.time()
-        if run_failed:
+        run_failures, run_tried_s = 0 if await self._save_counters() else 1, loop.time()
+        if run_failures:
             self._raise_state_lost()
         while True:
             await self._wait_for_alarm(min(CHECK_S, self._interval_s))
-            run_delay_s = RETRY_S if run_failed else self._delay_of_counters_s
-            if not run_failed and await self._is_run_file_missing():
+            run_delay_s = RETRY_S if run_failures else self._delay_of_counters_s
+            if not run_failures and await self._is_run_file_missing():
                 self._saved_counters, run_delay_s = None, 0.0
             if loop.time() >= run_tried_s + run_delay_s:
-                run_failed, run_tried_s = not await self._save_counters(), loop.time()
-                if run_failed and self._lacks_alarm:
+                run_failures, run_tried_s = 0 if await self._save_counters() else run_failures + 1, loop.time()
+                if run_failures > 1 and self._lacks_alarm:  # the cause of a single failure may pass
                     self._raise_state_lost()
             if loop.time() >= tried_s + self._interval_s or (self._needs_save and not failed):
                 history_saved = await self._save_history()
@@ -181,7 +184,7 @@ class CheckpointWriter:
     async def _is_run_file_missing(self) -> bool:
         """Return True if the file with counters and alarms was deleted."""
         path = self._checkpoint.run_file.path
-        return not await asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, os.path.exists, path)
+        return not await self._call_disk(lambda: os.path.exists(path), path)  # noqa: PTH110 - False if it cannot be read
 
     async def _save_counters(self, *, clean: bool = False) -> bool:
         """Save counters and alarms if they have changed. Return False if they cannot be written."""
@@ -255,21 +258,25 @@ class CheckpointWriter:
 
     async def _write(self, write: Callable[[], None], path: Path | None = None) -> bool:
         """Call ``write``, which writes ``path`` or the checkpoint, in the disk's thread. Return False if it fails."""
-        file = str(path or self._checkpoint.path)
-        future = asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, write)
+        file = path or self._checkpoint.path
         try:
-            # asyncio.wait_for of Python 3.11 may swallow a cancellation
-            await asyncio.wait({future}, timeout=DISK_HUNG_S)
-            if not future.done():
-                self._status.checkpoint = "not saved: the disk hangs"
-                log.warning("checkpoint cannot be saved", file=file, error="the disk hangs")
-            await future
+            await self._call_disk(write, file)
             self._status.disk_free_mib = self._checkpoint.disk_free_mib
         except OSError as error:
             self._status.checkpoint = f"cannot be saved: {error}"
-            log.warning("checkpoint cannot be saved", file=file, error=str(error))
+            log.warning("checkpoint cannot be saved", file=str(file), error=str(error))
             return False
         return True
+
+    async def _call_disk(self, call: Callable[[], T], file: Path) -> T:
+        """Call a function that accesses ``file`` in the disk's thread. Report a disk that hangs."""
+        future = asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, call)
+        # asyncio.wait_for of Python 3.11 may swallow a cancellation
+        await asyncio.wait({future}, timeout=DISK_HUNG_S)
+        if not future.done():
+            self._status.checkpoint = "not saved: the disk hangs"
+            log.warning("checkpoint cannot be saved", file=str(file), error="the disk hangs")
+        return await future
 
 
 def lacks_alarm(saved: str, present: str) -> bool:

@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import errno
 import json
 import math
 import os
@@ -305,10 +306,20 @@ async def test_a_damaged_file_with_alarms_is_renamed(folder: Path) -> None:
     assert (folder / "pack.refused.run").read_bytes() == b"damaged"
 
 
-async def test_a_first_start_raises_no_alarm_and_neither_does_one_beside_another_pack(tmp_path: Path) -> None:
-    (tmp_path / "pack-2.sqlite").write_bytes(b"of another pack")
-    (tmp_path / "pack-2-0123abcd.npz").write_bytes(b"of another pack")
-    first = await run(tmp_path, NORMAL)
+@pytest.mark.parametrize(
+    ("name", "others"),
+    [
+        ("pack", ["pack-2.sqlite", "pack-2-0123abcd.npz"]),
+        ("pack", ["pack-0123abcd.sqlite", "pack-0123abcd.board.json", "pack-0123abcd.refused.npz"]),
+        ("pack-0123abcd", ["pack-0123abcd.npz", "pack-0123abcd.history.npz", "pack-0123abcd.changes-0"]),
+    ],
+)
+async def test_a_first_start_raises_no_alarm_and_neither_does_one_beside_another_pack(
+    tmp_path: Path, name: str, others: list[str]
+) -> None:
+    for other in others:
+        (tmp_path / other).write_bytes(b"of another pack")
+    first = await run(tmp_path, NORMAL, edit_settings("pack", name=name))
     assert not first.alarms["alarm_state_lost"].active
     assert all(first.relay)
     assert first.restarts == 0
@@ -324,7 +335,7 @@ async def test_an_alarm_that_is_disabled_while_it_is_raised_needs_an_acknowledge
     disabled = edit_settings("alarms", pack_over_voltage={"enabled": False})
     restarted = await run(folder, NORMAL, disabled)
     assert restarted.alarms["alarm_state_lost"].text.endswith(
-        "no longer monitored, but raised before the restart: pack_over_voltage"
+        "no longer monitored, but raised or due before the restart: pack_over_voltage"
     )
     assert not any(restarted.relay)
 
@@ -584,6 +595,52 @@ async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
     await asyncio.wait_for(task, LONG_S)
 
 
+async def test_a_disk_that_hangs_between_two_saves_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "DISK_HUNG_S", 0.01)
+    settings, may_continue = edit_settings("state", checkpoint_s=1e6), threading.Event()
+    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, settings, CELL)
+    task = asyncio.create_task(
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    source.give(*NORMAL)
+    await sink.until(lambda s: s.health.checkpoint == "saved")
+    checkpoint.thread.submit(may_continue.wait)
+    await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs", skip=len(sink.snapshots))
+    may_continue.set()
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+
+
+async def test_an_alarm_that_is_saved_at_the_second_attempt_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    save, failures = checkpoint.run_file.save, [OSError(errno.EROFS, "read-only")]
+
+    def save_after_a_failure(counters: RunCounters) -> None:
+        if "pack_over_voltage" in counters.alarms and failures:
+            raise failures.pop()
+        save(counters)
+
+    monkeypatch.setattr(checkpoint.run_file, "save", save_after_a_failure)
+    task = asyncio.create_task(
+        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+    )
+    async with asyncio.timeout(LONG_S):
+        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+        source.give(*OVER_VOLTAGE)
+        while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
+            await asyncio.sleep(0.01)
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+    assert not failures
+    assert not by_name(sink.snapshots[-1].alarms)["alarm_state_lost"].active
+
+
 async def test_a_kill_within_the_delay_of_an_alarm_raises_it_although_its_cause_is_gone(tmp_path: Path) -> None:
     source, checkpoint = ScriptedSource(), CheckpointFile(tmp_path, SETTINGS, CELL)
     task = asyncio.create_task(
@@ -688,6 +745,20 @@ async def test_a_slot_that_floats_at_a_restart_does_not_replace_a_lost_cell_with
         assert run_.alarms["cell_under_voltage"].unwatched_reason
 
 
+async def test_cells_in_other_slots_than_before_a_restart_need_an_acknowledgement(tmp_path: Path) -> None:
+    """The wire of a cell broke shortly before the restart, and the slot behind the last cell floats."""
+    rows, pack, whole = [(float(t), 0.0, 3.8, 25.0, 0) for t in range(12)], CELL.pack(4, 1), np.full((12, 6), 3.8)
+    whole[:, 4:] = 0.0
+    floating = whole[:, [0, 4, 2, 3, 1, 5]]
+    assert all((await run(tmp_path, rows, cell=pack, slots_v=whole)).relay)
+    assert all((await run(tmp_path, rows, cell=pack, slots_v=whole)).relay)
+    moved = await run(tmp_path, rows, cell=pack, slots_v=floating)
+    assert "in slots 1, 3, 4, 5, and were in 1, 2, 3, 4" in moved.alarms["alarm_state_lost"].text
+    assert not any(moved.relay)
+    assert all((await run(tmp_path, rows, cell=pack, slots_v=floating, acknowledge="alarm_state_lost")).relay)
+    assert all((await run(tmp_path, rows, cell=pack, slots_v=floating)).relay)
+
+
 def alarm_state(**acknowledged: bool) -> str:
     return json.dumps({name: {"acknowledged": flag, "gone": flag} for name, flag in acknowledged.items()})
 
@@ -708,17 +779,3 @@ def test_only_what_a_restart_would_lack_is_saved_at_once() -> None:
     assert not lacks_alarm(returned, gone)
     assert lacks_alarm("", '{"pending": ["a"]}')
     assert not lacks_alarm('{"pending": ["a"]}', "")
-async def test_cells_in_other_slots_than_before_a_restart_need_an_acknowledgement(tmp_path: Path) -> None:
-    """The wire of a cell broke shortly before the restart, and the slot behind the last cell floats."""
-    rows, pack, whole = [(float(t), 0.0, 3.8, 25.0, 0) for t in range(12)], CELL.pack(4, 1), np.full((12, 6), 3.8)
-    whole[:, 4:] = 0.0
-    floating = whole[:, [0, 4, 2, 3, 1, 5]]
-    assert all((await run(tmp_path, rows, cell=pack, slots_v=whole)).relay)
-    assert all((await run(tmp_path, rows, cell=pack, slots_v=whole)).relay)
-    moved = await run(tmp_path, rows, cell=pack, slots_v=floating)
-    assert "in slots 1, 3, 4, 5, and were in 1, 2, 3, 4" in moved.alarms["alarm_state_lost"].text
-    assert not any(moved.relay)
-    assert all((await run(tmp_path, rows, cell=pack, slots_v=floating, acknowledge="alarm_state_lost")).relay)
-    assert all((await run(tmp_path, rows, cell=pack, slots_v=floating)).relay)
-
-

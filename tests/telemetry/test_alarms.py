@@ -804,6 +804,12 @@ def test_restarts_within_the_delay_of_a_critical_alarm_do_not_prevent_it() -> No
     add_samples(after, 1.0, 2.0, temperature_c=70.0)
     assert not after.active, "a value below the limit restarts the delay"
 
+def test_an_alarm_that_is_disabled_within_its_delay_is_missing_after_a_restart() -> None:
+    before, after = make_evaluator(), make_evaluator({"over_temperature": {"enabled": False}})
+    add_samples(before, 0.0, 1.0, temperature_c=70.0)
+    assert "over_temperature" in after.restore(before.saved_state)
+
+
 
 def test_damaged_saved_quantities_are_rejected() -> None:
     alarms = make_evaluator()

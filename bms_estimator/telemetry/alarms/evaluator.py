@@ -305,7 +305,7 @@ class AlarmEvaluator:
                 cut its power. Alarms whose delay ran are then raised. None: it ended cleanly, and the delays resume.
 
         Returns:
-            Reason for which raised critical alarms are missing; empty if none are.
+            Reason for which raised or due critical alarms are missing; empty if none are.
 
         Raises:
             ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError: The saved state is damaged.
@@ -321,10 +321,11 @@ class AlarmEvaluator:
         for name in pending:
             if crashed_s is not None:
                 self._alarms.raise_at(name, self._at_s, RaisedAlarm(crashed_s, None))
+        missing += [name for name in pending if name not in self._alarms.states]
             elif state := self._alarms.states.get(name):
                 state.resume_delay()
         self._save_state()
-        return f"no longer monitored, but raised before the restart: {', '.join(missing)}" if missing else ""
+        return f"no longer monitored, but raised or due before the restart: {', '.join(missing)}" if missing else ""
 
     def raise_state_lost(self, reason: str, now_s: float, measured: Mapping[Quantity, int]) -> None:
         """Raise ``alarm_state_lost`` until it is acknowledged.
