@@ -6,21 +6,21 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 
+def since_boot() -> float:
+    """Return the time since boot, including suspended time [s]. The load continues while the host is suspended."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
 @dataclass(frozen=True)
 class Clock:
-    """Pair of clocks: ``wall`` for the time of day, which may be set, and ``monotonic`` for durations [s]."""
+    """Pair of clocks [s]: ``wall`` for the time of day, which may be set, and ``monotonic`` for durations, including suspended time."""
 
     wall: Callable[[], float] = time.time
-    monotonic: Callable[[], float] = time.monotonic
+    monotonic: Callable[[], float] = since_boot
 
     def utc(self) -> str:
         """Return the present wall clock time in ISO 8601."""
         return iso_utc(self.wall())
-
-
-def since_boot() -> float:
-    """Return the time since boot, including suspended time [s]. The load continues while the host is suspended."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def iso_utc(epoch_s: float) -> str:

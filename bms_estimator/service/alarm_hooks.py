@@ -30,7 +30,7 @@ class AlarmHooks:
         clock: Time since boot of the host [s].
 
     Attributes:
-        is_watching: Returns True once due alarms would be raised (``AlarmEvaluator.is_watching``).
+        is_watching: Returns True once due alarms would be raised (``AlarmMonitor.check_silence``).
 
     Raises:
         UserError: A hook needs something that is missing.
@@ -107,7 +107,7 @@ class AlarmHooks:
                 for alarm in raised:  # a finished hook does not announce hook_failed again
                     if (is_unfinished or alarm not in failed) and hook.covers(alarm.name):
                         hook.on_alarm_change(alarm)
-                hook.restore_active(failed)  # hook_failed itself is not announced again
+                hook.restore_active(failed)
             else:
                 hook.restore_active(raised)
 

@@ -130,7 +130,7 @@ class AlarmMonitor:
         if cells is not None and cells is not self._cells_seen:
             self._cells_seen = cells
             self.alarms.evaluate_cells(cell_faults(cells), self._arrival_s)
-        self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), self._source.silence_reason or "")
+        self._evaluate_silence(now_s)
         resets = self._source.counters.get("resets", 0)
         self.alarms.evaluate_resets(self._board_resets.update(resets, now_s), self._clock.wall())
         if (hooks := self._hooks()) is not None:
@@ -138,6 +138,16 @@ class AlarmMonitor:
             self._relay_resets = hooks.relay_resets
             self.alarms.evaluate_hooks(hooks.failing, elapsed_s, self._clock.wall(), is_undone=is_undone)
         return self._report_changes()
+
+    def check_silence(self) -> bool:
+        """Evaluate the time since the last sample, before a sample or a relay command that follows a suspend hides it.
+
+        Returns:
+            True once due alarms would be raised (``AlarmEvaluator.is_watching``).
+        """
+        self._evaluate_silence(self._clock.monotonic())
+        self._report_changes()
+        return self.alarms.is_watching
 
     def stop(self) -> None:
         """Change no alarm from now on. The final save would lack the change, although hooks have reported it."""
@@ -179,6 +189,10 @@ class AlarmMonitor:
         """Raise ``alarm_state_lost``, and pass it to the callback."""
         self.alarms.raise_state_lost(reason, self._clock.wall(), self._measured)
         self._report_changes()
+
+    def _evaluate_silence(self, now_s: float) -> None:
+        reason = self._source.silence_reason or ""
+        self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), reason, now_s)
 
     @property
     def _measured(self) -> dict[Quantity, int]:

@@ -112,7 +112,7 @@ async def run_estimation_loop(
     )
     monitor = publisher.alarm_monitor
     unrestored = monitor.restore(counters.alarms, crashed=saved_run.crashed)
-    hooks.is_watching = lambda: monitor.alarms.is_watching
+    hooks.is_watching = monitor.check_silence
     hooks.restore_active(monitor.report, counters.hooks, crashed=saved_run.crashed)
     if lost_reason := saved_run.lost_reason or unrestored:
         # after the restored alarms, because the hooks announce this one
@@ -203,6 +203,7 @@ async def _estimate(
             estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s
         if edge:
             edge.take(received.samples, received.cells_v)
+        publisher.alarm_monitor.check_silence()
         step = pack.run(received.samples, received.cells_v)
         totals.add(step.trace)
         publisher.add(received, step, slots.fault)

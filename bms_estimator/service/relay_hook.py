@@ -172,7 +172,7 @@ class RelayHook(Hook):
 
     async def _send_level(self) -> str:
         """Send the level that is allowed now. Return why the board does not confirm it; empty if it does."""
-        self.has_watched = self.has_watched or self._is_watching()
+        self.has_watched = self._is_watching() or self.has_watched  # first, because it may raise alarms
         if not (self._raised or self.has_watched):
             return ""
         level = self._hold.level(high=self._wants_high, now_s=self._clock())

@@ -27,7 +27,7 @@ from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.protocols.base.relay import Relay
-from bms_estimator.service import checkpoint_writer
+from bms_estimator.service import checkpoint_writer, relay_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import lacks_alarm
 from bms_estimator.service.live_loop import run_estimation_loop
@@ -639,6 +639,39 @@ async def test_an_alarm_that_is_saved_at_the_second_attempt_is_not_lost(
     await asyncio.wait_for(task, LONG_S)
     assert not failures
     assert not by_name(sink.snapshots[-1].alarms)["alarm_state_lost"].active
+
+
+async def test_after_a_suspend_the_relay_stays_open_until_new_samples_are_watched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first samples after it are old, from the buffers of the port. The pack has become hot meanwhile."""
+    monkeypatch.setattr(relay_hook, "RELAY_S", relay_hook.RESET_POLL_S)
+    now_s, source, sink, board = 0.0, ScriptedSource(), Collector(), RecordingBoard()
+    hooks, clock = AlarmHooks([AlarmHook.model_validate(HOOKS[0])], "pack", None, board), Clock(monotonic=lambda: now_s)
+    stop, checkpoint = asyncio.Event(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    task = asyncio.create_task(
+        run_estimation_loop(
+            SETTINGS, CELL, source=source, sinks=[sink], stop=stop, checkpoint=checkpoint, clock=clock, hooks=hooks
+        )
+    )
+    source.give(*NORMAL)
+    async with asyncio.timeout(LONG_S):
+        while not board.levels:  # noqa: ASYNC110 - a relay has no event
+            await asyncio.sleep(0.01)
+        assert all(board.levels)
+        board.levels.clear()
+        now_s = 100.0
+        source.give(*((float(t), 0.0, 3.8, 25.0, 0) for t in range(12, 32)))
+        for t in range(100, 120):
+            commands = len(board.levels)
+            while len(board.levels) < commands + 2:  # noqa: ASYNC110 - a relay has no event
+                await asyncio.sleep(0.01)
+            now_s = t + 1.0
+            source.give((float(t), 0.0, 3.8, 70.0, 0))
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
+    assert by_name(sink.snapshots[-1].alarms)["over_temperature"].active
+    assert not any(board.levels)
 
 
 async def test_a_kill_within_the_delay_of_an_alarm_raises_it_although_its_cause_is_gone(tmp_path: Path) -> None:

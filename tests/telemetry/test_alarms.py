@@ -490,9 +490,9 @@ def test_a_latched_link_lost_is_active_again_during_a_second_silence() -> None:
     # gone: the cause of the alarm has ended
     saved = {"since_s": WALL_S, "value": 10.0, "gone": True, "acknowledged": False, "severity": "warning"}
     alarms.restore(json.dumps({"link_lost": saved}))
-    alarms.on_silence(1.0, WALL_S, "")
+    alarms.on_silence(1.0, WALL_S, "", 0.0)
     assert json.loads(alarms.saved_state)["link_lost"]["gone"]
-    alarms.on_silence(1000.0, WALL_S, "")
+    alarms.on_silence(1000.0, WALL_S, "", 0.0)
     assert json.loads(alarms.saved_state)["link_lost"] == saved | {"gone": False}
     assert alarms.acknowledge(None) == ["link_lost"]
     assert alarms.active == ("link_lost",), "the cause is still there"
@@ -630,10 +630,12 @@ def test_alarms_are_unwatched_during_silence_and_the_first_10_s_of_samples() -> 
     # Time of a sample [s], None: no sample; duration of the silence [s], and the expected state of an alarm.
     steps = [(None, 9.9, True), (None, 10.0, False), (20.0, 0.0, False), (None, 10.0, False), (50.0, 0.0, False)]
     steps += [(50.0 + after_s, 0.0, after_s >= 10.0) for after_s in (5.0, 9.9, 10.0)]
+    now_s = 0.0
     for time_s, silent_s, is_watched in steps:
         if time_s is not None:
             add_samples(alarms, time_s)
-        alarms.on_silence(silent_s, WALL_S, "no cable")
+        now_s = max(now_s, time_s or 0.0) + silent_s
+        alarms.on_silence(silent_s, WALL_S, "no cable", now_s)
         reported = {alarm.name: alarm for alarm in alarms.report()}
         over_voltage = reported["pack_over_voltage"]
         assert (over_voltage.watched, over_voltage.unwatched_reason) == (is_watched, None if is_watched else "no cable")
@@ -654,22 +656,35 @@ def test_a_temperature_that_only_faulty_probes_measure_is_lost_from_the_start_an
 def test_a_relay_does_not_close_between_a_silence_and_an_alarm_whose_cause_arose_meanwhile() -> None:
     alarms = make_evaluator()
     add_samples(alarms, 0.0, temperature_c=25.0)
-    alarms.on_silence(10.0, WALL_S, "no cable")
+    alarms.on_silence(10.0, WALL_S, "no cable", 10.0)
     for time_s in range(20, 40):
         add_samples(alarms, float(time_s), temperature_c=80.0)
-        alarms.on_silence(0.0, WALL_S, "")
+        alarms.on_silence(0.0, WALL_S, "", float(time_s))
         assert {"over_temperature"} & {*alarms.unwatched_critical, *alarms.active}
+
+
+@pytest.mark.parametrize("seconds", [15, 60])
+def test_an_alarm_with_a_long_delay_stays_unwatched_while_a_lost_sensor_returns_hot(seconds: int) -> None:
+    alarms = make_evaluator({"over_temperature": {"delay_s": 30.0}})
+    add_samples(alarms, 0.0, temperature_c=25.0)
+    add_samples(alarms, *range(1, 20), temperature_c=NAN)
+    for time_s in range(20, 20 + seconds):
+        add_samples(alarms, float(time_s), temperature_c=80.0)
+        assert {"over_temperature"} & {*alarms.unwatched_critical, *alarms.active}
+    assert ("over_temperature" in alarms.active) == (seconds > 30)
+    add_samples(alarms, 100.0, temperature_c=25.0)
+    assert "over_temperature" not in alarms.unwatched_critical
 
 
 def test_an_alarm_unwatched_by_silence_stays_so_over_a_restart_until_samples_arrive() -> None:
     before, after = (make_evaluator() for _ in range(2))
     add_samples(before, 0.0)
-    before.on_silence(10.0, WALL_S, "no cable")
+    before.on_silence(10.0, WALL_S, "no cable", 10.0)
     after.restore(before.saved_state)
-    after.on_silence(0.0, WALL_S, "")
+    after.on_silence(0.0, WALL_S, "", 20.0)
     assert "pack_over_voltage" in after.unwatched_critical, "no sample has come since the restart"
     add_samples(after, *range(11))
-    after.on_silence(0.0, WALL_S, "")
+    after.on_silence(0.0, WALL_S, "", 20.0)
     changed = {change.alarm.name: change for change in after.changes()}
     assert (changed["pack_over_voltage"].field, changed["pack_over_voltage"].alarm.watched) == ("watched", True)
     assert after.unwatched_critical == ()
@@ -789,6 +804,12 @@ def test_a_crash_within_the_delay_of_a_critical_alarm_raises_it() -> None:
     assert after.active == ("over_temperature",)
 
 
+def test_an_alarm_that_is_disabled_within_its_delay_is_missing_after_a_restart() -> None:
+    before, after = make_evaluator(), make_evaluator({"over_temperature": {"enabled": False}})
+    add_samples(before, 0.0, 1.0, temperature_c=70.0)
+    assert "over_temperature" in after.restore(before.saved_state)
+
+
 def test_restarts_within_the_delay_of_a_critical_alarm_do_not_prevent_it() -> None:
     before, after = (make_evaluator({"cell_over_voltage": {"severity": "warning"}}) for _ in range(2))
     add_samples(before, 0.0, 1.0, temperature_c=70.0)
@@ -803,12 +824,6 @@ def test_restarts_within_the_delay_of_a_critical_alarm_do_not_prevent_it() -> No
     add_samples(after, 0.0, temperature_c=25.0)
     add_samples(after, 1.0, 2.0, temperature_c=70.0)
     assert not after.active, "a value below the limit restarts the delay"
-
-def test_an_alarm_that_is_disabled_within_its_delay_is_missing_after_a_restart() -> None:
-    before, after = make_evaluator(), make_evaluator({"over_temperature": {"enabled": False}})
-    add_samples(before, 0.0, 1.0, temperature_c=70.0)
-    assert "over_temperature" in after.restore(before.saved_state)
-
 
 
 def test_damaged_saved_quantities_are_rejected() -> None:

@@ -166,9 +166,14 @@ class AlarmList:
         self._input_faults = texts
 
     def set_unwatched(self, unwatched: UnwatchedAlarms, at_s: float) -> None:
-        """Replace the alarms that cannot be watched, and record the changes at ``at_s`` on the samples' clock [s]."""
-        before, self._unwatched = self._unwatched, unwatched
-        for name in sorted(before.reasons.keys() ^ unwatched.reasons.keys()):
+        """Replace the alarms that cannot be watched, and record the changes at ``at_s`` on the samples' clock [s].
+
+        A critical alarm whose delay runs stays unwatched, so that a relay does not close before the alarm is raised.
+        """
+        before, pending = self._unwatched.reasons, self.pending
+        held = {name: reason for name, reason in before.items() if name in pending}
+        self._unwatched = UnwatchedAlarms(held | unwatched.reasons, unwatched.loss_texts)
+        for name in sorted(before.keys() ^ self._unwatched.reasons.keys()):
             self._changes.append(Change(at_s, self._payload(self.states[name]), "watched"))
 
     def set_unknown(self, reasons: Mapping[AlarmName, str]) -> None:

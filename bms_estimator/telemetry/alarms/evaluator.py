@@ -97,6 +97,7 @@ class AlarmEvaluator:
         self._inputs, self._silence_limit_s = inputs, silence_limit_s
         self._bounds, self._input_faults, self._probe_faults = bounds, FaultTexts(), ProbeFaults()
         self._silence_reason = ""  # reason why no samples arrive; empty while they do
+        self._silence_s = -math.inf  # end of the last silence on the monotonic clock [s]
         self._watched_s: float | None = (
             None  # duration of the samples since the start or the last silence, without gaps
         )
@@ -179,19 +180,21 @@ class AlarmEvaluator:
             self._estimates.evaluate(trace, forecasts, suspects, arrival_s - float(trace["time_s"][-1]))
         self._save_state()
 
-    def on_silence(self, silent_s: float, now_s: float, reason: str) -> None:
+    def on_silence(self, silent_s: float, now_s: float, reason: str, steady_s: float) -> None:
         """Handle missing samples.
 
         Args:
             silent_s: Time since the last sample on the monotonic clock [s].
             now_s: Wall clock [s since 1970].
             reason: Reason for the silence; empty if unknown.
+            steady_s: Monotonic clock [s].
         """
         is_silent = silent_s >= self._silence_limit_s
         if is_silent:
-            self._watched_s = None
+            self._watched_s, self._silence_s = None, steady_s
         elif self._silence_reason:  # alarms are raised before it ends, so that a relay does not close in between
-            is_silent = not self.is_watching
+            # the first samples may have waited in the buffers of a suspended process
+            is_silent = steady_s - self._silence_s < MIN_WATCHED_S or not self.is_watching
         if is_silent != bool(self._silence_reason):
             self._silence_reason = (reason or "no samples arrive") if is_silent else ""
             self._update_unwatched(self._at_s)
@@ -318,10 +321,10 @@ class AlarmEvaluator:
         pending = list(entries.pop(PENDING, []))
         unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, {})
         missing = self._alarms.restore(entries, unwatched)
+        missing += [name for name in pending if name not in self._alarms.states]
         for name in pending:
             if crashed_s is not None:
                 self._alarms.raise_at(name, self._at_s, RaisedAlarm(crashed_s, None))
-        missing += [name for name in pending if name not in self._alarms.states]
             elif state := self._alarms.states.get(name):
                 state.resume_delay()
         self._save_state()
@@ -370,6 +373,8 @@ class AlarmEvaluator:
         unusable["voltage"] = is_wire_broken | is_saturated | unusable.get("voltage", False)
         for quantity, rows in unusable.items():
             counts[quantity][rows] = UNUSABLE
+        if self.unwatched_critical:  # the delay of one that waited for it may have ended
+            self._update_unwatched(self._at_s)
         for at_s in self._inputs.update(times_s, observed_s, counts):
             self._update_unwatched(at_s)
             if self._is_blinded():  # without the delay of the alarm, because a quantity has been missing for ``lost_s``
