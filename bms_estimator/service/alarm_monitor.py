@@ -145,8 +145,10 @@ class AlarmMonitor:
         Returns:
             True once due alarms would be raised (``AlarmEvaluator.is_watching``).
         """
-        self._evaluate_silence(self._clock.monotonic())
-        self._report_changes()
+        now_s = self._clock.monotonic()
+        if now_s - self._evaluated_s >= EVALUATION_S:
+            self._evaluate_silence(now_s)
+            self._report_changes()
         return self.alarms.is_watching
 
     def stop(self) -> None:

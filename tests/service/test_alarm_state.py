@@ -325,7 +325,12 @@ async def test_a_first_start_raises_no_alarm_and_neither_does_one_beside_another
     assert first.restarts == 0
 
 
-async def test_a_renamed_pack_takes_the_safe_side_while_its_former_name_has_an_alarm(folder: Path) -> None:
+@pytest.mark.parametrize("edit", [bytes, with_alarms('{"pending": ["over_temperature"]}')])
+async def test_a_renamed_pack_takes_the_safe_side_while_its_former_name_has_an_alarm(
+    folder: Path, edit: Callable[[bytes], bytes]
+) -> None:
+    file = folder / "pack.run"
+    file.write_bytes(edit(file.read_bytes()))
     renamed = await run(folder, NORMAL, edit_settings("pack", name="renamed"))
     assert "pack has an alarm in pack.run" in renamed.alarms["alarm_state_lost"].text
     assert not any(renamed.relay)
