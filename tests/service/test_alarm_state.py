@@ -10,7 +10,8 @@ import shutil
 import signal
 import subprocess
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,6 +44,7 @@ from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
 from tests.service.test_alarm_hooks import acknowledge_in
+from tests.sinks.sink_helpers import until as wait_until
 
 OVER_VOLTAGE = [(float(t), 0.0, 4.4 if t < 5 else 3.8, 25.0, 0) for t in range(20)]
 """Samples that raise ``pack_over_voltage``, whose cause is then gone: it is latched."""
@@ -107,46 +109,39 @@ async def run(
         added_hooks: Hooks besides ``HOOKS``.
         slots_v: Voltages of the cell slots at each sample [V]; empty without any.
     """
-    source, sink, board, messages = ScriptedSource(), Collector(), RecordingBoard(), list[str]()
-    relay = board.levels
-    hooks = AlarmHooks(
-        [AlarmHook.model_validate(table) for table in (*HOOKS, *added_hooks)],
-        "pack",
-        acknowledge_in(messages),
-        board,
-    )
+    board, messages = RecordingBoard(), list[str]()
+    tables = [AlarmHook.model_validate(table) for table in (*HOOKS, *added_hooks)]
+    hooks = AlarmHooks(tables, "pack", acknowledge_in(messages), board)
     requests = RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",))
-    task = asyncio.create_task(
-        run_estimation_loop(
-            settings,
-            cell,
-            source=source,
-            sinks=[sink],
-            stop=asyncio.Event(),
-            checkpoint=CheckpointFile(folder, settings, cell),
-            hooks=hooks,
-            requests=requests,
-        )
-    )
-    volts = cell.cell.series_count
-    source.give_block(np.array([(t, a, v * volts, c, c, c, s) for t, a, v, c, s in rows], SAMPLE), slots_v)
-    await sink.until(lambda s: s.estimate is not None and until(by_name(s.alarms)))
-    if acknowledge:
-        if signal_after is None:
-            await requests.handle("acknowledge_alarm", json.dumps({"name": acknowledge}).encode())
-        elif await signal_after.wait() == 0:
-            os.kill(os.getpid(), signal.SIGUSR1)
-        await sink.until(lambda s: not by_name(s.alarms)[acknowledge].active)
-        relay.clear()
-    async with asyncio.timeout(LONG_S):
-        while not relay:  # noqa: ASYNC110 - a relay has no event
-            await asyncio.sleep(0.01)
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+    checkpoint, volts = CheckpointFile(folder, settings, cell), cell.cell.series_count
+    async with running(checkpoint, settings, cell, hooks=hooks, requests=requests) as (source, sink):
+        source.give_block(np.array([(t, a, v * volts, c, c, c, s) for t, a, v, c, s in rows], SAMPLE), slots_v)
+        await sink.until(lambda s: s.estimate is not None and until(by_name(s.alarms)))
+        if acknowledge:
+            if signal_after is None:
+                await requests.handle("acknowledge_alarm", json.dumps({"name": acknowledge}).encode())
+            elif await signal_after.wait() == 0:
+                os.kill(os.getpid(), signal.SIGUSR1)
+            await sink.until(lambda s: not by_name(s.alarms)[acknowledge].active)
+            board.levels.clear()
+        await wait_until(lambda: board.levels)
     pairs = zip([None, *sink.snapshots[:-1]], sink.snapshots, strict=True)
     raised = [each.text for pair in pairs for each in events(*pair) if each.name == "alarm_raised"]
     health = sink.snapshots[0].health
-    return Run(by_name(sink.snapshots[-1].alarms), relay, messages, raised, health.restarts, health.checkpoint)
+    return Run(by_name(sink.snapshots[-1].alarms), board.levels, messages, raised, health.restarts, health.checkpoint)
+
+
+@asynccontextmanager
+async def running(
+    checkpoint: CheckpointFile, settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any
+) -> AsyncIterator[tuple[ScriptedSource, Collector]]:
+    """Run the service. At the end its source ends. ``options`` are arguments of ``run_estimation_loop``."""
+    source, sink, stop = ScriptedSource(), Collector(), asyncio.Event()
+    loop = run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=stop, checkpoint=checkpoint, **options)
+    task = asyncio.create_task(loop)
+    yield source, sink
+    source.finish()
+    await asyncio.wait_for(task, LONG_S)
 
 
 def by_name(alarms: tuple[Alarm, ...]) -> dict[str, Alarm]:
@@ -459,32 +454,21 @@ async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 1e6)
     settings = edit_settings("state", checkpoint_s=1e6)
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, settings, CELL)
-    task = asyncio.create_task(
-        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
-    )
-    async with asyncio.timeout(LONG_S):
-        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
+    checkpoint = CheckpointFile(tmp_path, settings, CELL)
+    async with running(checkpoint, settings) as (source, _):
+        await wait_until(checkpoint.run_file.path.exists)
         source.give(*OVER_VOLTAGE)
-        while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+        await wait_until(lambda: "pack_over_voltage" in checkpoint.run_file.load().counters.alarms)
 
 
 async def test_the_final_save_has_an_alarm_of_samples_that_arrived_since_the_last_evaluation(tmp_path: Path) -> None:
     """The clock stands, so that the next evaluation is not due."""
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, SETTINGS, CELL)
-    clock, stop = Clock(monotonic=lambda: 0.0), asyncio.Event()
-    task = asyncio.create_task(
-        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=stop, checkpoint=checkpoint, clock=clock)
-    )
-    source.give(*NORMAL)
-    await sink.until(lambda s: s.estimate is not None)
-    source.give(*((12.0 + t, 0.0, 4.4, 25.0, 0) for t in range(5)))
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
+    clock = Clock(monotonic=lambda: 0.0)
+    async with running(checkpoint, clock=clock) as (source, sink):
+        source.give(*NORMAL)
+        await sink.until(lambda s: s.estimate is not None)
+        source.give(*((12.0 + t, 0.0, 4.4, 25.0, 0) for t in range(5)))
     assert by_name(sink.snapshots[-1].alarms)["pack_over_voltage"].active
     assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
 
@@ -493,7 +477,7 @@ async def test_an_acknowledgement_during_the_final_save_is_rejected(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The answer, the hooks and the saved alarms agree."""
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(folder, SETTINGS, CELL)
+    checkpoint = CheckpointFile(folder, SETTINGS, CELL)
     requests, save, is_saving, may_save = (
         RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",)),
         checkpoint.run_file.save,
@@ -508,24 +492,13 @@ async def test_an_acknowledgement_during_the_final_save_is_rejected(
         save(counters)
 
     monkeypatch.setattr(checkpoint.run_file, "save", save_slowly)
-    task = asyncio.create_task(
-        run_estimation_loop(
-            SETTINGS,
-            CELL,
-            source=source,
-            sinks=[sink],
-            stop=asyncio.Event(),
-            checkpoint=checkpoint,
-            requests=requests,
-        )
-    )
-    source.give(*NORMAL)
-    source.finish()
-    await asyncio.to_thread(is_saving.wait, LONG_S)
-    response = json.loads(await requests.handle("acknowledge_alarm", b"{}") or b"{}")
-    os.kill(os.getpid(), signal.SIGUSR1)
-    may_save.set()
-    await asyncio.wait_for(task, LONG_S)
+    async with running(checkpoint, requests=requests) as (source, sink):
+        source.give(*NORMAL)
+        source.finish()
+        await asyncio.to_thread(is_saving.wait, LONG_S)
+        response = json.loads(await requests.handle("acknowledge_alarm", b"{}") or b"{}")
+        os.kill(os.getpid(), signal.SIGUSR1)
+        may_save.set()
     assert response["error"] == "the service is stopping"
     assert is_latched(by_name(sink.snapshots[-1].alarms))
     assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
@@ -536,19 +509,12 @@ async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     settings = edit_settings("state", checkpoint_s=1e6)
-    source, checkpoint = ScriptedSource(), CheckpointFile(folder, settings, CELL)
-    task = asyncio.create_task(
-        run_estimation_loop(settings, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=checkpoint)
-    )
-    async with asyncio.timeout(LONG_S):
-        while json.loads(checkpoint.run_file.path.read_bytes().partition(b"\n")[2])["clean"]:  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
+    checkpoint = CheckpointFile(folder, settings, CELL)
+    async with running(checkpoint, settings):
+        await wait_until(lambda: not json.loads(checkpoint.run_file.path.read_bytes().partition(b"\n")[2])["clean"])
         shutil.rmtree(folder)
-        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
-    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+        await wait_until(checkpoint.run_file.path.exists)
+        assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
 
 
 async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full(
@@ -560,20 +526,13 @@ async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full
     settings = edit_settings("state", checkpoint_s=1e6)
     blocked = tmp_path / "state"
     blocked.write_text("a file instead of the folder")
-    source, sink = ScriptedSource(), Collector()
     checkpoint = CheckpointFile(blocked, settings, CELL)
-    task = asyncio.create_task(
-        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
-    )
-    source.give(*OVER_VOLTAGE)
-    await sink.until(lambda s: is_latched(by_name(s.alarms)))
-    await sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved"))
-    blocked.unlink()
-    async with asyncio.timeout(LONG_S):
-        while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+    async with running(checkpoint, settings) as (source, sink):
+        source.give(*OVER_VOLTAGE)
+        await sink.until(lambda s: is_latched(by_name(s.alarms)))
+        await sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved"))
+        blocked.unlink()
+        await wait_until(lambda: "pack_over_voltage" in checkpoint.run_file.load().counters.alarms)
 
 
 async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
@@ -582,39 +541,29 @@ async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
     folder = tmp_path / "state"
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(folder, SETTINGS, CELL)
-    task = asyncio.create_task(
-        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
-    )
-    async with asyncio.timeout(LONG_S):
-        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
-    folder.rename(tmp_path / "former")
-    folder.write_text("a file instead of the folder")
-    source.give(*OVER_VOLTAGE)
-    await sink.until(
-        lambda s: "alarm_state_lost" in (alarms := by_name(s.alarms)) and alarms["alarm_state_lost"].active
-    )
-    assert "cannot be written" in by_name(sink.snapshots[-1].alarms)["alarm_state_lost"].text
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+    checkpoint = CheckpointFile(folder, SETTINGS, CELL)
+    async with running(checkpoint) as (source, sink):
+        await wait_until(checkpoint.run_file.path.exists)
+        folder.rename(tmp_path / "former")
+        folder.write_text("a file instead of the folder")
+        source.give(*OVER_VOLTAGE)
+        await sink.until(
+            lambda s: "alarm_state_lost" in (alarms := by_name(s.alarms)) and alarms["alarm_state_lost"].active
+        )
+        assert "cannot be written" in by_name(sink.snapshots[-1].alarms)["alarm_state_lost"].text
 
 
 async def test_a_disk_that_hangs_between_two_saves_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     monkeypatch.setattr(checkpoint_writer, "DISK_HUNG_S", 0.01)
     settings, may_continue = edit_settings("state", checkpoint_s=1e6), threading.Event()
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, settings, CELL)
-    task = asyncio.create_task(
-        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
-    )
-    source.give(*NORMAL)
-    await sink.until(lambda s: s.health.checkpoint == "saved")
-    checkpoint.thread.submit(may_continue.wait)
-    await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs", skip=len(sink.snapshots))
-    may_continue.set()
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+    checkpoint = CheckpointFile(tmp_path, settings, CELL)
+    async with running(checkpoint, settings) as (source, sink):
+        source.give(*NORMAL)
+        await sink.until(lambda s: s.health.checkpoint == "saved")
+        checkpoint.thread.submit(may_continue.wait)
+        await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs", skip=len(sink.snapshots))
+        may_continue.set()
 
 
 async def test_an_alarm_that_is_saved_at_the_second_attempt_is_not_lost(
@@ -622,7 +571,7 @@ async def test_an_alarm_that_is_saved_at_the_second_attempt_is_not_lost(
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
     save, failures = checkpoint.run_file.save, [OSError(errno.EROFS, "read-only")]
 
     def save_after_a_failure(counters: RunCounters) -> None:
@@ -631,17 +580,10 @@ async def test_an_alarm_that_is_saved_at_the_second_attempt_is_not_lost(
         save(counters)
 
     monkeypatch.setattr(checkpoint.run_file, "save", save_after_a_failure)
-    task = asyncio.create_task(
-        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
-    )
-    async with asyncio.timeout(LONG_S):
-        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
+    async with running(checkpoint) as (source, sink):
+        await wait_until(checkpoint.run_file.path.exists)
         source.give(*OVER_VOLTAGE)
-        while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+        await wait_until(lambda: "pack_over_voltage" in checkpoint.run_file.load().counters.alarms)
     assert not failures
     assert not by_name(sink.snapshots[-1].alarms)["alarm_state_lost"].active
 
@@ -651,46 +593,31 @@ async def test_after_a_suspend_the_relay_stays_open_until_new_samples_are_watche
 ) -> None:
     """The first samples after it are old, from the buffers of the port. The pack has become hot meanwhile."""
     monkeypatch.setattr(relay_hook, "RELAY_S", relay_hook.RESET_POLL_S)
-    now_s, source, sink, board = 0.0, ScriptedSource(), Collector(), RecordingBoard()
+    now_s, board = 0.0, RecordingBoard()
     hooks, clock = AlarmHooks([AlarmHook.model_validate(HOOKS[0])], "pack", None, board), Clock(monotonic=lambda: now_s)
-    stop, checkpoint = asyncio.Event(), CheckpointFile(tmp_path, SETTINGS, CELL)
-    task = asyncio.create_task(
-        run_estimation_loop(
-            SETTINGS, CELL, source=source, sinks=[sink], stop=stop, checkpoint=checkpoint, clock=clock, hooks=hooks
-        )
-    )
-    source.give(*NORMAL)
-    async with asyncio.timeout(LONG_S):
-        while not board.levels:  # noqa: ASYNC110 - a relay has no event
-            await asyncio.sleep(0.01)
+    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
+    async with running(checkpoint, clock=clock, hooks=hooks) as (source, sink):
+        source.give(*NORMAL)
+        await wait_until(lambda: board.levels)
         assert all(board.levels)
         board.levels.clear()
         now_s = 100.0
         source.give(*((float(t), 0.0, 3.8, 25.0, 0) for t in range(12, 32)))
+        await wait_until(lambda: board.levels)
         for t in range(100, 120):
-            commands = len(board.levels)
-            while len(board.levels) < commands + 2:  # noqa: ASYNC110 - a relay has no event
-                await asyncio.sleep(0.01)
-            now_s = t + 1.0
-            source.give((float(t), 0.0, 3.8, 70.0, 0))
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+            commands, now_s = len(board.levels), t + 1.0
+            source.give((float(t), 0.0, 3.8, 25.0 if t < 103 else 70.0, 0))
+            await wait_until(lambda least=commands + 2: len(board.levels) >= least)
     assert by_name(sink.snapshots[-1].alarms)["over_temperature"].active
     assert not any(board.levels)
 
 
 async def test_a_kill_within_the_delay_of_an_alarm_raises_it_although_its_cause_is_gone(tmp_path: Path) -> None:
-    source, checkpoint = ScriptedSource(), CheckpointFile(tmp_path, SETTINGS, CELL)
-    task = asyncio.create_task(
-        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=checkpoint)
-    )
-    source.give(*OVER_VOLTAGE[:1])
-    async with asyncio.timeout(LONG_S):
-        while "pending" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
-    killed = Path(shutil.copytree(tmp_path, tmp_path / "killed"))
-    source.finish()
-    await asyncio.wait_for(task, LONG_S)
+    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
+    async with running(checkpoint) as (source, _):
+        source.give(*OVER_VOLTAGE[:1])
+        await wait_until(lambda: "pending" in checkpoint.run_file.load().counters.alarms)
+        killed = Path(shutil.copytree(tmp_path, tmp_path / "killed"))
     restarted = await run(killed, NORMAL)
     assert restarted.alarms["pack_over_voltage"].active
     assert not any(restarted.relay)
