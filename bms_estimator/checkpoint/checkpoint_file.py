@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, Base, ChangesFile
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX
-from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity, without_observer
+from bms_estimator.checkpoint.identity import observer_identity, pack_identity, without_observer
 from bms_estimator.checkpoint.run_file import RunFile
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
 from bms_estimator.process.disk_thread import DiskThread

@@ -1,9 +1,9 @@
 """Estimator with the learned state of a pack's checkpoint."""
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointContent, CheckpointFile
-from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.restore import restore_state
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.pack_model.handover import adopt_curves

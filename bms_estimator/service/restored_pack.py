@@ -6,9 +6,9 @@ import structlog
 
 from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointContent, CheckpointFile
 from bms_estimator.checkpoint.history_file import HistoryFile, RejectedHistoryError
-from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.checkpoint.run_file import RunCounters, SavedRun
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.restore import restore_state
 from bms_estimator.model.clock import Clock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.curve_change import return_to_cell_file

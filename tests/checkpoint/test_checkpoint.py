@@ -17,12 +17,13 @@ import pytest
 from numpy.lib.recfunctions import repack_fields
 
 from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_FILES, CheckpointFile
-from bms_estimator.checkpoint.identity import fields, pack_identity
-from bms_estimator.checkpoint.restore import restore_state
+from bms_estimator.checkpoint.identity import pack_identity
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.kernels.kalman_filter.records import OFFSET
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.service import checkpoint_writer, live_loop

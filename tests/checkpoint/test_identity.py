@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity
+from bms_estimator.checkpoint.identity import observer_identity, pack_identity
 from bms_estimator.fleet.packs.pack_type import config_digest
 from bms_estimator.kernels.records import ESTIMATOR_STATE
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import PackModel, load_any
 from bms_estimator.process.boot_clock import BootTimestamp

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.identity import fields
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX, HistoryFile
-from bms_estimator.checkpoint.identity import fields
 from bms_estimator.checkpoint.load_file import restore_seen_load
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import new_estimator
@@ -21,6 +20,7 @@ from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.cells.records import BANK as BANK_STATE
 from bms_estimator.kernels.cells.records import CELL as CELL_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack import pack

@@ -13,10 +13,10 @@ import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.history_file import FORMAT, HistoryFile
-from bms_estimator.checkpoint.identity import fields
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity, relative_series_resistance
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads.pack_model import PackModelHealth
