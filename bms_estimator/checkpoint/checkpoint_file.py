@@ -11,21 +11,20 @@ import re
 import secrets
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.checkpoint.arrays_file import HISTORY_SUFFIX, LOAD_SUFFIX
 from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, Base, ChangesFile
-from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX
 from bms_estimator.checkpoint.identity import observer_identity, pack_identity, without_observer
-from bms_estimator.checkpoint.run_file import RunFile
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.pack.state import CHECKPOINT, REFUSED, PackState
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
-from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.pack import Settings
 
@@ -40,31 +39,12 @@ MAX_FILE_BYTES = 1 << 20
 """Maximum size of a checkpoint file [bytes]. A file of the former format has about 112 kB."""
 MAX_FILES = 8
 """Maximum number of checkpoint files of one pack; older ones are deleted."""
-REJECTED = "refused: "
-"""Prefix of the reason for rejecting a file."""
 MAX_LATER_FILES = 4
 """Maximum number of quarantined files of later formats, which serve a return to the later version."""
 _CELLS = "cells."
 """Prefix of the names of the arrays of single cells in the file."""
 _CURVES = "fit."
 """Prefix of the names of the fit's arrays in the file."""
-
-
-@dataclass(frozen=True)
-class CheckpointContent:
-    """Content of a checkpoint file."""
-
-    state: Mapping[str, NDArray[Any]]
-    """Fields of ESTIMATOR_STATE by their names, as from ``fields``; empty if the file was rejected."""
-    unseen_s: float
-    """Time since the state was saved [s]; infinite if unknown."""
-    reason: str
-    """Reason for the rejection; empty if the file is valid."""
-    curves: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """Arrays of the fit to whose curves the state is relative (``pack_model.saved.curve_arrays``); empty: the curves are
-    those of the cell file."""
-    cells: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """State of the estimators of single cells (``CellEstimator.saved_state``); empty without cell voltages."""
 
 
 class CheckpointFile:
@@ -86,12 +66,8 @@ class CheckpointFile:
         self._is_later = False  # the file has a later format
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
         self._changes = ChangesFile(self.path)
-        self.run_file = RunFile(folder, self._name, lambda: now().wall_s)
-        """Counters and alarms of the pack."""
         self.disk_free_mib: float | None = None
         """Free space on the disk at the last write [MiB]."""
-        self.thread = DiskThread("checkpoint")
-        """Thread for all writes of the pack's state. A call that timed out still finishes before the next one."""
 
     def save(
         self,
@@ -136,17 +112,17 @@ class CheckpointFile:
         self._changes.set_base(Base(token, state.copy(), curves, now))
         self._remove_oldest()
 
-    def load(self) -> CheckpointContent:
-        """Read the file. An error is returned as the result's ``reason``."""
+    def load(self) -> PackState:
+        """Read the state of estimator and single cells. An error is returned in the result's ``reasons``."""
         try:
             with np.load(io.BytesIO(read_private(self.path, MAX_FILE_BYTES)), allow_pickle=False) as file:
                 return self._validate(file)
         except FileNotFoundError:
-            return CheckpointContent({}, 0.0, "none found")
+            return _empty_state("none found")
         except (_RejectedError, UnsafeFileError) as error:
-            return CheckpointContent({}, 0.0, f"{REJECTED}{error}")
+            return _empty_state(f"{REFUSED}{error}")
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return CheckpointContent({}, 0.0, f"{REJECTED}damaged, perhaps by a power cut ({type(error).__name__})")
+            return _empty_state(f"{REFUSED}damaged, perhaps by a power cut ({type(error).__name__})")
 
     def quarantine(self) -> str:
         """Rename a rejected file, so that the next save does not overwrite it. Return a description for the user.
@@ -172,7 +148,7 @@ class CheckpointFile:
             f"stop the service and `{command}`"
         )
 
-    def _validate(self, content: Mapping[str, NDArray[Any]]) -> CheckpointContent:
+    def _validate(self, content: Mapping[str, NDArray[Any]]) -> PackState:
         """Return the content of a file.
 
         Raises:
@@ -191,13 +167,13 @@ class CheckpointFile:
         )
         if version == FORMAT and (changes := self._changes.load(str(file["token"]), file["state"].dtype)):
             state, saved = state | changes.state, changes.saved
-        unseen_s = self._now().since(saved)
-        if self._longest_days is not None and self._longest_days * DAY_S < unseen_s < math.inf:
-            days = f"{unseen_s / DAY_S:.1f} days old"
+        gap_s = self._now().since(saved)
+        if self._longest_days is not None and self._longest_days * DAY_S < gap_s < math.inf:
+            days = f"{gap_s / DAY_S:.1f} days old"
             raise _RejectedError(f"it is {days}, state.longest_days is {self._longest_days:g}")
         if str(file["observer"]) != self._observer:
             state = without_observer(state)
-        return CheckpointContent(state, unseen_s, "", _with_prefix(file, _CURVES), _with_prefix(file, _CELLS))
+        return PackState(state, _with_prefix(file, _CURVES), _with_prefix(file, _CELLS), gap_s=gap_s)
 
     def _remove_oldest(self) -> None:
         """Remove the pack's oldest files beyond ``MAX_FILES``, because each configured cell leaves a file."""
@@ -206,12 +182,16 @@ class CheckpointFile:
         others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
         for path in others[MAX_FILES - 1 :]:
             path.unlink(missing_ok=True)
-            for suffix in (SUFFIX, LOAD_SUFFIX, *CHANGES_SUFFIXES):
+            for suffix in (HISTORY_SUFFIX, LOAD_SUFFIX, *CHANGES_SUFFIXES):
                 path.with_suffix(suffix).unlink(missing_ok=True)
 
 
 class _RejectedError(Exception):
     """Reason for rejecting a checkpoint."""
+
+
+def _empty_state(reason: str) -> PackState:
+    return PackState(reasons={CHECKPOINT: reason})
 
 
 def _with_prefix(file: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:

@@ -197,6 +197,11 @@ class Estimator:
             self.record["filter"]["soc"] = self.state["soc"]
             self.record["filter"]["smallest_a"] = 0.0  # the resolution is measured again
 
+    def extend_gap(self, wait_s: float) -> None:
+        """Extend the gap of ``resume`` by a further time without samples [s]."""
+        self.record["unseen_s"] += wait_s
+        self.record["history"]["gap_s"] += wait_s
+
 
 def make_estimator(settings: Settings, cell: PackModel) -> Estimator:
     """Create the estimator of a pack.

@@ -224,7 +224,7 @@ async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
             await listener.wait_json("bms/pack/health", lambda h: h["line"]["resets"] and h["samples"]["samples"] > 450)
         running.cancel()
     settings, cell = load_pack(pack)
-    live = CheckpointFile(tmp_path / "state", settings, cell).load().state
+    live = CheckpointFile(tmp_path / "state", settings, cell).load().record
     replayed = new_estimator(settings, cell)
     pack_replay, capture_file = Pack(replayed, SlowFit(replayed)), RawCapture(capture)
     for block in capture_file:

@@ -19,6 +19,7 @@ import pytest
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.checksum import add_checksum
 from bms_estimator.checkpoint.run_file import RunCounters
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.events import events
@@ -29,7 +30,7 @@ from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import checkpoint_writer
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import lacks_alarm
-from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
@@ -122,9 +123,8 @@ async def run(
             source=source,
             sinks=[sink],
             stop=asyncio.Event(),
-            checkpoint=CheckpointFile(folder, settings, cell),
-            hooks=hooks,
-            requests=requests,
+            files=StateFiles(folder, settings, cell),
+            parts=ServiceParts(hooks=hooks, requests=requests),
         )
     )
     volts = cell.cell.series_count
@@ -274,7 +274,7 @@ async def test_lost_alarms_keep_the_relay_at_its_level_until_they_are_acknowledg
 def test_damaged_alarms_are_recognized(latched: Path, tmp_path: Path, damage: str) -> None:
     shutil.copy(latched / "pack.run", tmp_path)
     shutil.copy(CheckpointFile(latched, SETTINGS, CELL).path, tmp_path)
-    file, edit = CheckpointFile(tmp_path, SETTINGS, CELL).run_file, DAMAGES[damage]
+    file, edit = StateFiles(tmp_path, SETTINGS, CELL).run_file, DAMAGES[damage]
     if edit is None:
         file.path.unlink()
     else:
@@ -293,7 +293,7 @@ def restore_fails(alarms: str) -> bool:
 
 
 def test_a_crashed_run_is_recognized(folder: Path) -> None:
-    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    file = StateFiles(folder, SETTINGS, CELL).run_file
     assert not file.load().crashed
     file.save(file.load().counters)
     assert file.load().crashed
@@ -369,7 +369,7 @@ def remove_run_file(folder: Path) -> None:
 
 
 def copy_from_another_pack(folder: Path) -> None:
-    another = CheckpointFile(folder, edit_settings("pack", name="another"), CELL).run_file
+    another = StateFiles(folder, edit_settings("pack", name="another"), CELL).run_file
     another.save(another.load().counters)
     another.path.replace(folder / "pack.run")
 
@@ -430,7 +430,7 @@ async def test_lost_cells_stay_lost_after_damaged_alarms(tmp_path: Path) -> None
 
 
 async def test_fewer_cells_in_series_than_measured_before_drop_no_alarm(tmp_path: Path) -> None:
-    file = CheckpointFile(tmp_path, SETTINGS, CELL).run_file
+    file = StateFiles(tmp_path, SETTINGS, CELL).run_file
     saved = file.load().counters
     state = json.dumps(RAISED | {"inputs": {"cells": [16, False]}})
     file.save(type(saved)(saved.restarts, saved.total, clean=True, alarms=state))
@@ -443,15 +443,15 @@ async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 1e6)
     settings = edit_settings("state", checkpoint_s=1e6)
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, settings, CELL)
+    source, sink, files = ScriptedSource(), Collector(), StateFiles(tmp_path, settings, CELL)
     task = asyncio.create_task(
-        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), files=files)
     )
     async with asyncio.timeout(LONG_S):
-        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
+        while not files.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
             await asyncio.sleep(0.01)
         source.give(*OVER_VOLTAGE)
-        while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
+        while "pack_over_voltage" not in files.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
             await asyncio.sleep(0.01)
     source.finish()
     await asyncio.wait_for(task, LONG_S)
@@ -459,10 +459,10 @@ async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
 
 async def test_the_final_save_has_an_alarm_of_samples_that_arrived_since_the_last_evaluation(tmp_path: Path) -> None:
     """The clock stands, so that the next evaluation is not due."""
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    source, sink, files = ScriptedSource(), Collector(), StateFiles(tmp_path, SETTINGS, CELL)
     clock, stop = Clock(monotonic=lambda: 0.0), asyncio.Event()
     task = asyncio.create_task(
-        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=stop, checkpoint=checkpoint, clock=clock)
+        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=stop, files=files, clock=clock)
     )
     source.give(*NORMAL)
     await sink.until(lambda s: s.estimate is not None)
@@ -470,17 +470,17 @@ async def test_the_final_save_has_an_alarm_of_samples_that_arrived_since_the_las
     source.finish()
     await asyncio.wait_for(task, LONG_S)
     assert by_name(sink.snapshots[-1].alarms)["pack_over_voltage"].active
-    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
+    assert "pack_over_voltage" in files.run_file.load().counters.alarms
 
 
 async def test_an_acknowledgement_during_the_final_save_is_rejected(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The answer, the hooks and the saved alarms agree."""
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(folder, SETTINGS, CELL)
+    source, sink, files = ScriptedSource(), Collector(), StateFiles(folder, SETTINGS, CELL)
     requests, save, is_saving, may_save = (
         RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",)),
-        checkpoint.run_file.save,
+        files.run_file.save,
         threading.Event(),
         threading.Event(),
     )
@@ -491,7 +491,7 @@ async def test_an_acknowledgement_during_the_final_save_is_rejected(
             may_save.wait(LONG_S)
         save(counters)
 
-    monkeypatch.setattr(checkpoint.run_file, "save", save_slowly)
+    monkeypatch.setattr(files.run_file, "save", save_slowly)
     task = asyncio.create_task(
         run_estimation_loop(
             SETTINGS,
@@ -499,8 +499,8 @@ async def test_an_acknowledgement_during_the_final_save_is_rejected(
             source=source,
             sinks=[sink],
             stop=asyncio.Event(),
-            checkpoint=checkpoint,
-            requests=requests,
+            files=files,
+            parts=ServiceParts(requests=requests),
         )
     )
     source.give(*NORMAL)
@@ -512,7 +512,7 @@ async def test_an_acknowledgement_during_the_final_save_is_rejected(
     await asyncio.wait_for(task, LONG_S)
     assert response["error"] == "the service is stopping"
     assert is_latched(by_name(sink.snapshots[-1].alarms))
-    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
+    assert "pack_over_voltage" in files.run_file.load().counters.alarms
 
 
 async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
@@ -520,17 +520,17 @@ async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     settings = edit_settings("state", checkpoint_s=1e6)
-    source, checkpoint = ScriptedSource(), CheckpointFile(folder, settings, CELL)
+    source, files = ScriptedSource(), StateFiles(folder, settings, CELL)
     task = asyncio.create_task(
-        run_estimation_loop(settings, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=checkpoint)
+        run_estimation_loop(settings, CELL, source=source, sinks=[], stop=asyncio.Event(), files=files)
     )
     async with asyncio.timeout(LONG_S):
-        while json.loads(checkpoint.run_file.path.read_bytes().partition(b"\n")[2])["clean"]:  # noqa: ASYNC110 - a file has no event
+        while json.loads(files.run_file.path.read_bytes().partition(b"\n")[2])["clean"]:  # noqa: ASYNC110 - a file has no event
             await asyncio.sleep(0.01)
         shutil.rmtree(folder)
-        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
+        while not files.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
             await asyncio.sleep(0.01)
-    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
+    assert "pack_over_voltage" in files.run_file.load().counters.alarms
     source.finish()
     await asyncio.wait_for(task, LONG_S)
 
@@ -545,16 +545,16 @@ async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full
     blocked = tmp_path / "state"
     blocked.write_text("a file instead of the folder")
     source, sink = ScriptedSource(), Collector()
-    checkpoint = CheckpointFile(blocked, settings, CELL)
+    files = StateFiles(blocked, settings, CELL)
     task = asyncio.create_task(
-        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), files=files)
     )
     source.give(*OVER_VOLTAGE)
     await sink.until(lambda s: is_latched(by_name(s.alarms)))
     await sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved"))
     blocked.unlink()
     async with asyncio.timeout(LONG_S):
-        while "pack_over_voltage" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
+        while "pack_over_voltage" not in files.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
             await asyncio.sleep(0.01)
     source.finish()
     await asyncio.wait_for(task, LONG_S)
@@ -566,12 +566,12 @@ async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
     folder = tmp_path / "state"
-    source, sink, checkpoint = ScriptedSource(), Collector(), CheckpointFile(folder, SETTINGS, CELL)
+    source, sink, files = ScriptedSource(), Collector(), StateFiles(folder, SETTINGS, CELL)
     task = asyncio.create_task(
-        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), files=files)
     )
     async with asyncio.timeout(LONG_S):
-        while not checkpoint.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
+        while not files.run_file.path.exists():  # noqa: ASYNC110 - a file has no event
             await asyncio.sleep(0.01)
     folder.rename(tmp_path / "former")
     folder.write_text("a file instead of the folder")
@@ -585,13 +585,13 @@ async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
 
 
 async def test_a_kill_within_the_delay_of_an_alarm_raises_it_although_its_cause_is_gone(tmp_path: Path) -> None:
-    source, checkpoint = ScriptedSource(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    source, files = ScriptedSource(), StateFiles(tmp_path, SETTINGS, CELL)
     task = asyncio.create_task(
-        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=checkpoint)
+        run_estimation_loop(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), files=files)
     )
     source.give(*OVER_VOLTAGE[:1])
     async with asyncio.timeout(LONG_S):
-        while "pending" not in checkpoint.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
+        while "pending" not in files.run_file.load().counters.alarms:  # noqa: ASYNC110 - a file has no event
             await asyncio.sleep(0.01)
     killed = Path(shutil.copytree(tmp_path, tmp_path / "killed"))
     source.finish()
@@ -604,7 +604,7 @@ async def test_a_kill_within_the_delay_of_an_alarm_raises_it_although_its_cause_
 def test_an_alarm_is_saved_in_a_folder_that_cannot_be_written(folder: Path) -> None:
     if os.geteuid() != 0 or subprocess.run(["chattr", "+i", folder], check=False).returncode != 0:
         pytest.skip("no folder can be made immutable here")
-    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    file = StateFiles(folder, SETTINGS, CELL).run_file
     try:
         file.save(dataclasses.replace(file.load().counters, alarms=json.dumps(RAISED | {"silence": "no samples"})))
     finally:
@@ -614,10 +614,10 @@ def test_an_alarm_is_saved_in_a_folder_that_cannot_be_written(folder: Path) -> N
 
 def test_an_alarm_is_saved_on_a_full_disk(folder: Path, full_disk: Path) -> None:
     path = (full_disk / "file").rename(full_disk / "pack.run")  # the only block of this disk
-    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    file = StateFiles(folder, SETTINGS, CELL).run_file
     counters = file.load().counters
     shutil.copy(file.path, path)
-    full = CheckpointFile(full_disk, SETTINGS, CELL).run_file
+    full = StateFiles(full_disk, SETTINGS, CELL).run_file
     full.save(dataclasses.replace(counters, alarms=json.dumps(RAISED)))
     assert full.load().counters.alarms == json.dumps(RAISED)
     assert not full.load().lost_reason

@@ -5,17 +5,14 @@ from pathlib import Path
 
 import typer
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
-from bms_estimator.checkpoint.learned_state import estimator_of, load_valid
-from bms_estimator.checkpoint.load_file import restore_seen_load
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses
 from bms_estimator.cli.options.capture_options import MappedColumns, SignOfCurrent
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.pack.pack import make_forecaster, new_pack
+from bms_estimator.pack.pack import new_pack
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import open_capture
@@ -42,16 +39,13 @@ def saved_state(settings: Settings, model: PackModel) -> InitialState:
     Raises:
         UserError: There is no valid checkpoint, or no forecast for this pack.
     """
-    folder = state_folder(settings)
-    file = CheckpointFile(folder, settings, model)
-    content = load_valid(file, settings)
-    forecaster = make_forecaster(settings, model, estimator_of(content, file, settings, model))
-    if forecaster is None:
+    files = StateFiles(state_folder(settings), settings, model)
+    saved = files.saved_pack()
+    if saved.pack.forecaster is None:
         raise _no_forecaster(model)
-    load_file = HistoryFile(folder, settings, model, LOAD_SUFFIX)
-    if reason := restore_seen_load(load_file, forecaster):
-        typer.echo(f"warning: {load_file.path}: the observed load is unknown: {reason}", err=True)
-    return InitialState(settings.pack.name, forecaster, content.unseen_s)
+    if saved.load_reason:
+        typer.echo(f"warning: {files.load.path}: the observed load is unknown: {saved.load_reason}", err=True)
+    return InitialState(settings.pack.name, saved.pack.forecaster, saved.age_s)
 
 
 def end_of_capture(

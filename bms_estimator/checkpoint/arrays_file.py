@@ -17,18 +17,18 @@ FORMAT = 1
 """Version of the file's layout. Increment it when a field changes its meaning."""
 MAX_FILE_BYTES = 4 << 20
 """Maximum size of a file [bytes]. A full history of 5000 rows has about 1 MB before compression."""
-SUFFIX = ".history.npz"
+HISTORY_SUFFIX = ".history.npz"
 """End of the name of the file with the history."""
 LOAD_SUFFIX = ".load.npz"
 """End of the name of the file with the load."""
 
 
-class RejectedHistoryError(Exception):
-    """A history file cannot be used. The message gives the reason."""
+class RejectedFileError(Exception):
+    """A file cannot be used. The message gives the reason."""
 
 
-class HistoryFile:
-    """One pack's history, ``<pack.name>-<identity>.history.npz``, or another file of arrays.
+class ArraysFile:
+    """File of arrays of one pack, ``<pack.name>-<identity><suffix>``.
 
     Args:
         folder: Folder of the file.
@@ -37,7 +37,7 @@ class HistoryFile:
         suffix: End of the file's name.
     """
 
-    def __init__(self, folder: Path, settings: Settings, cell: PackModel, suffix: str = SUFFIX) -> None:
+    def __init__(self, folder: Path, settings: Settings, cell: PackModel, suffix: str) -> None:
         self._suffix = suffix
         self._name, self._identity = settings.pack.name, pack_identity(settings, cell)
         self._is_later = False
@@ -55,11 +55,11 @@ class HistoryFile:
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_private(self.path, packed.getbuffer())
 
-    def load(self) -> dict[str, NDArray[Any]] | None:
-        """Return the saved arrays; None without a file.
+    def load(self) -> dict[str, NDArray[Any]]:
+        """Return the saved arrays; an empty dictionary without a file.
 
         Raises:
-            RejectedHistoryError: The file is damaged, has another format, or belongs to another pack.
+            RejectedFileError: The file is damaged, has another format, or belongs to another pack.
         """
         self._is_later = False
         try:
@@ -67,16 +67,16 @@ class HistoryFile:
                 arrays = dict(file)
             version, identity = int(arrays.pop("format")), str(arrays.pop("identity"))
         except FileNotFoundError:
-            return None
+            return {}
         except UnsafeFileError as error:
-            raise RejectedHistoryError(str(error)) from error
+            raise RejectedFileError(str(error)) from error
         except Exception as error:  # a damaged file may raise anything, and is reported
-            raise RejectedHistoryError(f"damaged, perhaps by a power cut ({type(error).__name__})") from error
+            raise RejectedFileError(f"damaged, perhaps by a power cut ({type(error).__name__})") from error
         self._is_later = version > FORMAT
         if version != FORMAT:
-            raise RejectedHistoryError(f"format {version}, this version reads {FORMAT}")
+            raise RejectedFileError(f"format {version}, this version reads {FORMAT}")
         if identity != self._identity:
-            raise RejectedHistoryError("it belongs to another pack or cell")
+            raise RejectedFileError("it belongs to another pack or cell")
         return arrays
 
     def quarantine(self) -> str:
