@@ -21,9 +21,8 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.pack.state import CELLS, CHECKPOINT, CURVES, HISTORY, LOAD, REFUSED, Arrays, PackState
-from bms_estimator.pack_model.curve_change import return_to_cell_file
 from bms_estimator.pack_model.fit import PackFit
-from bms_estimator.pack_model.handover import adopt_curves
+from bms_estimator.pack_model.handover import use_fitted_curves
 from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.learning import SlowFit, Submit, run_now
 from bms_estimator.pack_model.saved import fit_of_curves, history_of
@@ -156,12 +155,12 @@ class Pack:
             saved = _converted(HISTORY, lambda: history_of(state.history), outcomes) if state.history else None
             self.slow_fit.load(*(saved or (History(), None)), curves)
         elif curves:
-            adopt_curves(self.estimator.settings_record[0]["filter"], self.estimator.cell_file_settings, curves)
+            use_fitted_curves(self.estimator, curves)
         is_restored = self._restore_record(state, gap_s, outcomes)
         if state.curves and (self.slow_fit is None or curves is None):
             # Without a slow fit the resistances are converted to the curves of the cell file. If the saved curves are damaged,
             # this is impossible, and the resistances start with the std of the cell file again.
-            return_to_cell_file(self.estimator)
+            self.estimator.return_to_cell_file()
         if self.slow_fit:
             self._resume_history(
                 self.slow_fit, gap_s if is_restored else math.inf, curves, outcomes, restored=is_restored
@@ -194,8 +193,7 @@ class Pack:
         except Exception as error:  # noqa: BLE001 - a damaged file must not end the service at each start
             outcomes[HISTORY] = _refusal(error)
             slow_fit.load(History(), None, curves)
-            h = self.estimator.record["history"]
-            h["count"] = h["sums"]["duration_s"] = 0  # without the earlier rows of the discarded history
+            self.estimator.discard_rows()
             slow_fit.resume(gap_s, restored=restored)
 
     def _restore_load(self, forecaster: Forecaster, load: Arrays, outcomes: dict[str, str]) -> None:
